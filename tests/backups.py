@@ -1,4 +1,4 @@
-"""A backup of a memory, and putting it back while programs have the database open: what a failover that loses does."""
+"""Back up a memory, and restore it while programs have the database open, as a failover that loses events does."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["Backup"]
 
 
 class Backup:
-    """Of the database of this URL, as it is when this is made. `server` may be None for SQLite."""
+    """A backup of the database of this URL, made at once. `server` may be None for SQLite."""
 
     def __init__(self, url: str, server: Server | None) -> None:
         self._url = url
@@ -27,7 +27,7 @@ class Backup:
             self._clone(self._name, f"{self._name}_backup")
 
     def restore(self) -> None:
-        """The database is as it was. Connections to a server are cut; those to a file stay."""
+        """Restore the database. Connections to a server are cut; those to a file stay open."""
         if self._server is None:
             _copy(f"{self._file}.backup", self._file)
         else:
@@ -35,7 +35,7 @@ class Backup:
             self._clone(f"{self._name}_backup", self._name)
 
     def drop(self) -> None:
-        """The server has room for others."""
+        """Delete the backup on the server, so that its space is free."""
         if self._server is not None:
             ask(self._server.url(), f"DROP DATABASE IF EXISTS {self._name}_backup WITH (FORCE)")
 
@@ -45,7 +45,7 @@ class Backup:
 
     def _clone(self, source: str, target: str) -> None:
         assert self._server is not None
-        while True:  # connections come back as fast as they are cut
+        while True:  # new connections come as fast as old ones are cut
             ask(
                 self._server.url(),
                 "SELECT pg_terminate_backend(pid, 10000) FROM pg_stat_activity WHERE datname = $1",
@@ -57,6 +57,6 @@ class Backup:
 
 
 def _copy(source: str, target: str) -> None:
-    """As one transaction, which those who have it open see."""
+    """Copy it in one transaction, which programs that have it open see."""
     with closing(sqlite3.connect(source)) as read, closing(sqlite3.connect(target, timeout=10)) as written:
         read.backup(written)

@@ -1,4 +1,4 @@
-"""Runs the command `pycrorm` as a user does: in a process of its own."""
+"""Run the command `pycrorm` as a user does: in a process of its own."""
 
 import atexit
 import json
@@ -21,7 +21,7 @@ COMMAND = [sys.executable, "-W", "error", "-m", "pycrorm_async"]
 
 
 def environment() -> dict[str, str]:
-    """The user's, without settings of ours, wide enough that no line is wrapped."""
+    """Return the user's environment without the package's settings, and wide enough that no line is wrapped."""
     kept = {name: value for name, value in os.environ.items() if not name.startswith("PYCRORM_")}
     return kept | {"COLUMNS": "200", "PYTHONPATH": str(Path(__file__).parent.parent), "NO_COLOR": "1"}
 
@@ -30,7 +30,7 @@ _VERBS = "copy demo episodes events learn rebuild run show spool status verify w
 _LOADED = [*(f"pycrorm_async.cli.{name}" for name in ("main", *_VERBS)), "tests.preloaded"]
 _starting = threading.Lock()
 FORKED: Final = multiprocessing.get_context("forkserver")
-"""Makes processes by forking one that has loaded the program. A process of tests has one such server, see `fork`."""
+"""Makes processes by forking one that has loaded the program. A test process has one such server, see `fork`."""
 
 
 def fork(process: ForkServerProcess) -> None:
@@ -43,10 +43,10 @@ def fork(process: ForkServerProcess) -> None:
 
 
 def pycrorm(*arguments: str | Path, cwd: Path, timeout_s: float = 300) -> subprocess.CompletedProcess[str]:
-    """The command's exit code, stdout and stderr.
+    """Return the command's exit code, stdout and stderr.
 
-    The process is forked from one that has loaded the program and done nothing else: loading it takes a second, and
-    there are hundreds of calls. Those that are started as `COMMAND` show that it makes no difference.
+    The process is forked from one that has loaded the program and done nothing else, because loading takes a second and
+    there are hundreds of calls. Calls that start `COMMAND` show that the result is the same.
     """
     with tempfile.TemporaryDirectory() as folder:
         told = [Path(folder) / name for name in ("out", "err")]
@@ -88,14 +88,14 @@ def _run(arguments: list[str], cwd: str, out: str, err: str) -> NoReturn:
 
 
 def answer(*arguments: str | Path, cwd: Path, code: int = 0) -> Any:
-    """The JSON document of a `--json` call that ends with this code."""
+    """Return the JSON document of a `--json` call that ends with this code."""
     done = pycrorm(*arguments, "--json", cwd=cwd)
     assert done.returncode == code, done.stderr
     return json.loads(done.stdout)
 
 
 def one_line_of(done: subprocess.CompletedProcess[str]) -> str:
-    """The one line on stderr; fails if there is a traceback or more than that line."""
+    """Return the one line on stderr; fail if there is a traceback or more than that line."""
     assert "Traceback" not in done.stderr, done.stderr
     lines = [line for line in done.stderr.splitlines() if line.strip()]
     assert len(lines) == 1, done.stderr

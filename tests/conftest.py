@@ -1,4 +1,4 @@
-"""One PostgreSQL server for all tests that want one; it starts in half a second, at the first of them."""
+"""Fixtures for databases: all tests share one PostgreSQL server, which starts in half a second at the first use."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from tests.soak_turns import current_commit, place_of, turn_of
 
 @pytest.fixture(scope="session")
 def server() -> Iterator[Server]:
-    """A server with short paths, as a socket's has to be."""
+    """A server whose paths are short enough for a socket."""
     with server_in_memory() as running:
         yield running
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])
 def database_url(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str]:
-    """Each test that asks for this runs on both kinds of database, each time on a new one."""
+    """The URL of a new database, for each test on both kinds of database."""
     if request.param == "sqlite":
         yield f"sqlite:///{tmp_path / 'memory.db'}"
         return
     running: Server = request.getfixturevalue("server")
     url = running.new_database()
     yield url
-    running.drop(url)  # some hundred files, which would be written to the disk and deleted at the end of all
+    running.drop(url)  # several hundred files, which would be written to the disk and deleted at the end
 
 
 @pytest.fixture(scope="module", params=["sqlite", "postgresql"])
 def module_database_url(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """A new database of each kind for all tests of a module, which fill it once and only read it."""
+    """A new database of each kind for all tests of a module, which fill it once and then only read it."""
     if request.param == "sqlite":
         yield f"sqlite:///{tmp_path_factory.mktemp('memory') / 'memory.db'}"
         return
@@ -56,13 +56,15 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure() -> None:
-    if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # a shell starts commands in the background so
-        signal.signal(signal.SIGINT, signal.default_int_handler)  # or the commands of the tests would ignore Ctrl-C too
+    if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # a shell starts background commands with SIGINT ignored
+        signal.signal(
+            signal.SIGINT, signal.default_int_handler
+        )  # otherwise the commands of the tests would ignore Ctrl-C too
 
 
 @pytest.hookimpl(tryfirst=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Mark the variants that `soak_on` names as soak, and leave of the soak only the turn that was asked for."""
+    """Mark the variants that `soak_on` names as soak, and keep of the soak only the requested turn."""
     for item in items:
         variants = (
             item.callspec.params.values() if isinstance(item, pytest.Function) and hasattr(item, "callspec") else ()
@@ -80,12 +82,14 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def pytest_collection_finish() -> None:
-    """Leave the tests out of garbage collections: each looked at 300,000 objects that stay, for a third of a second."""
+    """Freeze the collected tests, because each garbage collection would scan their 300,000 objects for a third of a
+    second.
+    """
     gc.collect()
     gc.freeze()
 
 
 @pytest.fixture
 def in_turn(request: pytest.FixtureRequest) -> bool:
-    """True in a turn of the soak, where loops of thousands of rounds are shortened."""
+    """Return True in a turn of the soak, where loops of thousands of rounds are shortened."""
     return request.config.getoption("--soak-turn") is not None

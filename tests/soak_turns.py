@@ -1,11 +1,11 @@
-"""Chooses the turn of the soak that a commit runs: a tenth of the tests marked `soak`, another one at another commit.
+"""Choose the turn of the soak that a commit runs: a tenth of the tests marked `soak`, another one at another commit.
 
     python -m pytest -m soak --soak-turn              the turn of the commit that is checked out, as .ci/run does
     python -m pytest -m soak --soak-turn=4f1c2ab      the turn of that commit, again
     python -m pytest -m soak                          every test, in full length
 
-A test's place is the hash of its node id, so that it stays where it is when others come or go. Outside of a git
-checkout the turn is that of `FIXED`.
+The hash of its node id gives a test its turn, so that other tests may come and go. Outside a git checkout the turn is
+that of `FIXED`.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Final
 
 TURNS: Final = 10
-"""Ten turns keep each within a few minutes of two cores."""
+"""Ten turns limit each to a few minutes of two cores."""
 FIXED: Final = "0"
 
 

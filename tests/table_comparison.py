@@ -1,8 +1,8 @@
-"""What a memory holds, in a form that compares across databases: read with plain SQL, past every class of ours.
+"""Read the content of a memory with plain SQL, in a form that can be compared across databases.
 
-The number of an episode belongs to its database, and so do the ids of rows, which are made of it. Here an episode is
-its UUID and a row (UUID, sequence, slot), wherever an id stands. NULL is left out: a table that another episode's
-declaration has given one column more holds the same.
+Each database assigns its own episode numbers, and row ids contain them. Here an episode is a UUID and a row is
+(UUID, sequence, slot), in every id column. NULL is left out, so that a table with an additional column, which
+another episode's declaration added, compares as equal.
 
 >>> differences(tables_of("sqlite:///merged.db"), united(tables_of("sqlite:///a.db"), tables_of("sqlite:///b.db")))
 []
@@ -21,7 +21,7 @@ __all__ = ["Tables", "Logs", "tables_of", "logs_of", "declarations_of", "united"
 
 Key: TypeAlias = tuple[Any, ...]
 Tables: TypeAlias = dict[str, dict[Key, dict[str, Any]]]
-"""By table and by key what is in the columns. The key of most is one (UUID, sequence, slot)."""
+"""By table and by key the values of the columns. The key of most is one (UUID, sequence, slot)."""
 Logs: TypeAlias = dict[str, list[tuple[Any, ...]]]
 """By UUID (sequence, type, version, wall ns, monotonic ns, payload) of every event."""
 
@@ -36,7 +36,7 @@ _KEYS = {
 }
 _OF_EPISODES = ("process_metadata", "simulated_episode")
 _IDS = ("key", "row", "pose", "object")
-"""What the layout calls a column of ids, of the tables that designator types brought."""
+"""The name of an id column in the layout of the tables of designator types."""
 
 _SHOWN = "SELECT generation, layout FROM {}pycrorm_generation WHERE projection = 'tables'"
 _COLUMNS_SQLITE = """
@@ -49,7 +49,7 @@ ORDER BY table_name, ordinal_position"""
 
 
 def tables_of(place: str | Path) -> Tables:
-    """The rows of the tables people see now, those without rows left out. `place` is a URL, or a SQLite file's path."""
+    """Return the rows of the visible tables that have any. `place` is a URL, or a SQLite file's path."""
     episodes = dict(ask(place, "SELECT number, id FROM episode"))
     on_server = str(place).startswith("postgresql:")
     schema = "memory_tables." if on_server else ""
@@ -101,7 +101,7 @@ def _portable(name: str, column: str, leaf: Mapping[str, str] | None, value: Any
 
 
 def logs_of(place: str | Path) -> Logs:
-    """Every event of every episode, in the order of its episode."""
+    """Return every event of every episode, in the order of its episode."""
     found: Logs = {}
     for identity, *event in ask(
         place,
@@ -113,12 +113,14 @@ def logs_of(place: str | Path) -> Logs:
 
 
 def declarations_of(place: str | Path) -> set[tuple[str, str]]:
-    """Fingerprint and payload of every designator type that the log knows."""
+    """Return fingerprint and payload of every designator type in the log."""
     return {(name, payload) for name, payload in ask(place, "SELECT fingerprint, payload FROM pycrorm_declaration")}
 
 
 def united(*memories: Tables) -> Tables:
-    """What a memory must hold that holds all of these. What two of them have under one key must be the same."""
+    """Return the content of a memory that holds all of these. Values that two of them have under one key must be the
+    same.
+    """
     whole: Tables = {}
     for tables in memories:
         for name, rows in tables.items():
@@ -129,7 +131,7 @@ def united(*memories: Tables) -> Tables:
 
 
 def differences(one: Tables, other: Tables) -> list[str]:
-    """A line for each row that only one of them has, or that they have differently; none if they hold the same."""
+    """Return a line for each row that only one of them has, or that differs; none if they hold the same."""
     return [
         f"{name} {key}: {one.get(name, {}).get(key)} and {other.get(name, {}).get(key)}"
         for name in sorted(one.keys() | other.keys())

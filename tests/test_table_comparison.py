@@ -1,4 +1,4 @@
-"""The comparison of two memories sees what it is for, and not the numbers that databases give."""
+"""The comparison of two memories detects every difference except the numbers that databases assign."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ COUNTING = declared("CountingAction", "counting_action", field("robot_id", "inte
 
 
 def episode(number: int) -> Script:
-    """A robot is there, drives, counts and says so; one of each kind of column of ids."""
+    """Return an episode in which a robot is added, drives, counts and speaks; it has each kind of id column."""
     script = Script(number)
     script.put(EpisodeStarted(description=f"e{number}", created_by="me", host="h", software="0", python="3"))
     robot = script.put(ObjectAdded(name="pr2", object_type="ROBOT", pose=pose(number)))
@@ -110,7 +110,7 @@ async def test_the_same_episodes_under_other_numbers_on_another_kind_of_database
         ("UPDATE process_metadata__1 SET created_at = created_at + 1 WHERE id = 1", "process_metadata"),
     ],
 )
-def test_whatever_differs_is_told(three_episodes: Path, tmp_path: Path, change: str, table: str) -> None:
+def test_every_difference_is_reported(three_episodes: Path, tmp_path: Path, change: str, table: str) -> None:
     one, other = f"sqlite:///{three_episodes}", f"sqlite:///{tmp_path}/b.db"
     shutil.copy(three_episodes, tmp_path / "b.db")
     assert differences(tables_of(one), tables_of(other)) == []

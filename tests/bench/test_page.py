@@ -1,4 +1,4 @@
-"""The page of all figures shows every measurement, and for each budget of the design if it is met."""
+"""The page of all figures: every measurement is shown, and each budget of the design has its verdict."""
 
 import ast
 from importlib import import_module
@@ -44,7 +44,7 @@ def test_a_quick_run_is_not_compared_with_a_budget() -> None:
     assert result == Verdict("not measured", None)
 
 
-def test_the_largest_number_of_nodes_that_was_measured_is_judged() -> None:
+def test_the_largest_measured_number_of_nodes_is_judged() -> None:
     def of(*sizes: tuple[int, float]) -> dict[str, Any]:
         return {**ABOUT, "sqlite": [{"nodes": nodes, "times_faster": {"median": times}} for nodes, times in sizes]}
 
@@ -53,7 +53,7 @@ def test_the_largest_number_of_nodes_that_was_measured_is_judged() -> None:
     assert result == Verdict("49.9 times at 488,043 nodes", met=False)
 
 
-def test_of_all_logs_that_were_rebuilt_the_largest_is_judged() -> None:
+def test_of_all_rebuilt_logs_the_largest_is_judged() -> None:
     def of(database: str, events: int, times: float, mb: float) -> dict[str, Any]:
         sizes = [{"events": 100}, {"events": events}]
         return {**ABOUT, "database": database, "by_workers": {"1": sizes}, "growth": {"1": _grown(times, mb)}}
@@ -77,14 +77,14 @@ def _grown(times: float, mb: float) -> dict[str, float]:
     return {"us_per_event": times, "mb": mb}
 
 
-def test_a_library_that_is_missing_leaves_its_budget_unmeasured_and_is_on_the_page() -> None:
+def test_a_missing_library_leaves_its_budget_unmeasured_and_is_on_the_page() -> None:
     message = "missing: pip install '.[bench]'"
     lines = {"others": {"bench": "others", **ABOUT, "postgresql": {"eventsource-py": message}}}
     assert verdict("full spool → log against eventsource-py", lines) == Verdict("not measured", None)
     assert f"| postgresql, eventsource-py | {message} |" in page(lines, [])
 
 
-def test_every_figure_is_on_the_page_with_its_path_and_a_spread_is_one() -> None:
+def test_every_figure_is_on_the_page_with_its_path_and_a_spread_is_one_figure() -> None:
     figures = {
         "sqlite": {"ours": {"median": 1234, "least": 1.5, "most": 2_000_000}},
         "backlog": [1, 22],
@@ -98,7 +98,7 @@ def test_every_figure_is_on_the_page_with_its_path_and_a_spread_is_one() -> None
     ]
 
 
-def test_what_is_measured_again_replaces_its_line_and_nothing_else(tmp_path: Path) -> None:
+def test_a_repeated_measurement_replaces_its_line_and_nothing_else(tmp_path: Path) -> None:
     _note(tmp_path, "plan", plan(0.04, 0.0)["plan"])
     _note(tmp_path, "hook", {"bench": "hook", **ABOUT})
     _note(tmp_path, "plan", plan(0.02, 0.0)["plan"])
@@ -108,7 +108,7 @@ def test_what_is_measured_again_replaces_its_line_and_nothing_else(tmp_path: Pat
     assert "thread +2.0%" in (tmp_path / "figures.md").read_text()
 
 
-def test_every_run_names_a_script_that_is_there() -> None:
+def test_every_run_names_an_existing_script() -> None:
     for run in RUNS:
         assert (ROOT / "bench" / f"{run.script}.py").is_file()
 
@@ -121,12 +121,12 @@ def test_the_readme_shows_the_budgets_as_they_were_measured() -> None:
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "bench").rglob("*.py")), ids=lambda each: each.stem)
-def test_every_module_of_the_bench_imports_what_the_package_still_has(path: Path) -> None:
-    """Most scripts run on demand only, so a renamed import would otherwise stay unnoticed until the next run."""
+def test_every_name_that_the_bench_imports_still_exists(path: Path) -> None:
+    """Most scripts run on demand only, so that a renamed import would otherwise stay unnoticed until the next run."""
     tree = ast.parse(path.read_text())
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and node.module is not None and node.module.startswith("pycrorm_async"):
             module = import_module(node.module)
             for each in node.names:
                 if not hasattr(module, each.name):
-                    import_module(f"{node.module}.{each.name}")  # a module, or it is gone
+                    import_module(f"{node.module}.{each.name}")  # a module, which must exist

@@ -30,7 +30,7 @@ def measure(script: str, *options: str) -> dict[str, Any]:
 
 
 @pytest.mark.soak
-def test_what_a_hook_costs_is_measured_with_the_database_up_slow_and_down() -> None:
+def test_the_cost_of_a_hook_is_measured_with_the_database_up_slow_and_down() -> None:
     result = measure("hook")
     states = [f"{writer}, {state}" for writer in ("thread", "daemon") for state in ("up", "slow", "down")]
     assert [name for name in result if isinstance(result[name], dict)] == ["none", *states]

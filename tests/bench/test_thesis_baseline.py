@@ -95,14 +95,16 @@ def test_the_same_seed_makes_the_same_tree_and_another_one_another() -> None:
     assert tree(500, seed=7) != tree(500, seed=8)
 
 
-# --- the same facts on both sides -----------------------------------------------------------------------------------
+# --- the same facts on both sides -------------------------------------------------------------------------------------
 
 Fact = tuple[Any, ...]
-"""A node: type, start and end in µs, status, why it failed, its parent's start, then the values of its fields."""
+"""A node: type, start and end in µs, status, reason of its failure, its parent's start, then the values of its
+fields.
+"""
 
 
 class Stored(NamedTuple):
-    """Places of the values of a designator: in a pose, in an object, in columns."""
+    """The places of a designator's values: in a pose, in an object, in columns."""
 
     pose: str | None
     object: str | None

@@ -1,4 +1,4 @@
-"""Bad input gets one line that says who is at fault, the documented exit code, and loses nothing recorded."""
+"""Bad input: one line that names the fault, the documented exit code, and no loss of recorded events."""
 
 import os
 import signal
@@ -133,9 +133,7 @@ def folder(tmp_path: Path) -> Path:
         (["ran", "plans.py"], 2, "no such command 'ran'"),
     ],
 )
-def test_a_call_that_cannot_be_carried_out_is_one_line(
-    folder: Path, arguments: list[str], code: int, line: str
-) -> None:
+def test_an_impossible_call_is_reported_in_one_line(folder: Path, arguments: list[str], code: int, line: str) -> None:
     done = pycrorm(*arguments, cwd=folder)
     assert line in one_line_of(done)
     assert done.returncode == code
@@ -152,7 +150,7 @@ def test_a_call_that_cannot_be_carried_out_is_one_line(
         ("two_episodes", "is open in this task already", "ERROR"),
     ],
 )
-def test_a_plan_that_goes_wrong_ends_with_one_line_and_what_it_did_is_remembered(
+def test_a_plan_that_fails_ends_with_one_line_and_what_it_did_is_recorded(
     folder: Path, function: str, line: str, status: str
 ) -> None:
     done = pycrorm("run", f"plans.py:{function}", cwd=folder)
@@ -172,7 +170,7 @@ def test_a_plan_that_goes_wrong_ends_with_one_line_and_what_it_did_is_remembered
         ("twins", "plans.NoteActionPerformable already has the dtype or table 'NoteAction'", None),
     ],
 )
-def test_a_plan_with_what_cannot_be_recorded_runs_to_its_end_with_a_warning(
+def test_a_plan_with_an_unrecordable_value_runs_to_its_end_with_a_warning(
     folder: Path, function: str, line: str, second: str | None
 ) -> None:
     done = pycrorm("run", f"plans.py:{function}", cwd=folder)
@@ -193,7 +191,7 @@ def test_a_plan_with_nan_in_a_pose_fails_with_a_memory_as_it_does_without(folder
     assert answer("show", "last", cwd=folder)["episode"]["status"] == "ERROR"
 
 
-def test_a_plan_that_leaves_the_program_has_failed_and_keeps_its_record(folder: Path) -> None:
+def test_a_plan_that_exits_the_program_has_failed_and_keeps_its_record(folder: Path) -> None:
     done = pycrorm("run", "plans.py:leaves", cwd=folder)
     assert "the plan plans.py:leaves failed: SystemExit: 5 (plans.py:" in one_line_of(done)
     assert done.returncode == 1
@@ -236,7 +234,7 @@ def test_ctrl_c_in_a_plan_that_never_suspends_ends_the_episode_as_interrupted(
     assert shown["tree"][0]["status"] == "CANCELLED"
 
 
-def test_a_database_of_another_program_is_left_alone(folder: Path) -> None:
+def test_a_database_of_another_program_is_left_unchanged(folder: Path) -> None:
     other = folder / "other.db"
     with sqlite3.connect(other) as connection:
         connection.execute("CREATE TABLE recipe (name TEXT)")
@@ -249,7 +247,7 @@ def test_a_database_of_another_program_is_left_alone(folder: Path) -> None:
     assert other.read_bytes() == before
 
 
-def test_a_file_that_is_no_database_is_left_alone(folder: Path) -> None:
+def test_a_file_that_is_no_database_is_left_unchanged(folder: Path) -> None:
     for arguments in (["run", "plans.py"], ["episodes"]):
         done = pycrorm(*arguments, "--url", "sqlite:///plans.py", cwd=folder)
         assert "plans.py" in one_line_of(done)
@@ -257,9 +255,9 @@ def test_a_file_that_is_no_database_is_left_alone(folder: Path) -> None:
     assert (folder / "plans.py").read_text() == PLANS
 
 
-def test_a_database_beside_which_nothing_can_be_written_is_told_with_its_path(folder: Path) -> None:
+def test_a_database_in_a_folder_without_write_permission_is_reported_with_its_path(folder: Path) -> None:
     assert pycrorm("run", "plans.py", cwd=folder).returncode == 0
-    (folder / "pycrorm.db-wal").mkdir()  # SQLite cannot make its file there: as on a disk that is read-only
+    (folder / "pycrorm.db-wal").mkdir()  # SQLite cannot make its file there: as on a read-only disk
     for arguments in (["run", "plans.py"], ["episodes"]):
         done = pycrorm(*arguments, "--url", f"sqlite:///{folder}/pycrorm.db", cwd=folder)
         assert one_line_of(done) == (
@@ -282,7 +280,7 @@ def test_a_database_of_a_newer_version_is_refused(folder: Path) -> None:
         assert done.returncode == 3
 
 
-def test_a_spool_of_another_database_is_refused_and_nothing_in_it_is_lost(folder: Path) -> None:
+def test_a_spool_of_another_database_is_refused_and_loses_nothing(folder: Path) -> None:
     assert pycrorm("run", "plans.py", "--spool", "spool", cwd=folder).returncode == 0
     assert pycrorm("run", "plans.py", "--spool", "spool", "--writer", "daemon", cwd=folder).returncode == 0
     done = pycrorm("run", "plans.py", "--spool", "spool", "--url", "sqlite:///second.db", cwd=folder)
@@ -298,7 +296,7 @@ def test_an_unknown_episode_is_a_usage_error(folder: Path, episode: str) -> None
     assert done.returncode == 2
 
 
-def test_nothing_is_left_in_the_spool_of_a_plan_that_ended(folder: Path) -> None:
+def test_a_plan_that_ended_leaves_nothing_in_the_spool(folder: Path) -> None:
     assert pycrorm("run", "plans.py", cwd=folder).returncode == 0
     assert [path for path in (folder / "pycrorm.db.spool").iterdir() if path.is_dir() and path.name != "stored"] == []
 
@@ -323,7 +321,7 @@ def test_a_json_answer_is_one_document_whatever_the_plan_prints(folder: Path) ->
     assert [each["status"] for each in failed["episodes"]] == ["INTERRUPTED"]
 
 
-def test_an_answer_that_cannot_be_written_is_one_line(folder: Path) -> None:
+def test_an_answer_that_cannot_be_written_is_reported_in_one_line(folder: Path) -> None:
     assert pycrorm("run", "plans.py", cwd=folder).returncode == 0
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(

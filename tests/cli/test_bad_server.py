@@ -1,4 +1,4 @@
-"""A server that does not let us in, or is too old: one line, exit code 3, no password, and what was recorded stays."""
+"""A server that refuses the login, or is too old: one line, exit code 3, no password, and recorded events stay."""
 
 import asyncio
 from pathlib import Path
@@ -12,7 +12,7 @@ from tests.databases import Server, ask
 from tests.store.test_postgresql_refusals import WRITTEN, guarded_in
 
 pytestmark = pytest.mark.soak
-"""Each test starts many processes anew."""
+"""Each of these tests starts many processes."""
 
 PLAN = '''
 from dataclasses import dataclass
@@ -28,14 +28,14 @@ async def plan():
     await NoteActionPerformable("a").perform()
 '''
 EVENTS = 7
-"""Of the plan, with the declaration."""
+"""The events of the plan, with the declaration."""
 VERBS = [["run", "notes.py"], ["writer"], ["writer", "--once"], ["episodes"]]
 NOTES = "SELECT text FROM note_action"
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """With a spool in which a plan has left its events."""
+    """A folder with a spool in which a plan has left its events."""
     (tmp_path / "notes.py").write_text(PLAN)
     left = pycrorm("run", "notes.py", "--writer", "daemon", "--spool", "spool", cwd=tmp_path)
     assert left.returncode == 0
@@ -57,7 +57,7 @@ def drained(url: str, folder: Path) -> int:
     return stored
 
 
-def test_a_wrong_password_is_one_line_and_the_right_one_stores_what_waited(server: Server, folder: Path) -> None:
+def test_a_wrong_password_is_one_line_and_the_right_one_stores_the_waiting_events(server: Server, folder: Path) -> None:
     database = guarded_in(server)
     refused(
         server.url(database, user="guarded", password="s3cr-wrong"),
@@ -68,7 +68,7 @@ def test_a_wrong_password_is_one_line_and_the_right_one_stores_what_waited(serve
     assert ask(server.url(database), NOTES) == [("a",)]
 
 
-def test_a_wrong_name_of_the_database_is_one_line_and_the_right_one_stores_what_waited(
+def test_a_wrong_database_name_is_one_line_and_the_right_one_stores_the_waiting_events(
     server: Server, folder: Path
 ) -> None:
     refused(server.url("nothing", password="s3cr"), folder, 'database "nothing" does not exist')
@@ -81,7 +81,7 @@ async def test_a_server_that_is_too_old_is_one_line_and_nothing_is_made_there(se
     url = server.new_database()
     [[version]] = ask(url, "SELECT current_setting('server_version_num')::int")
     async with proxy_before(server.folder) as proxy:
-        # A real server, of which only the answer to this question is another on the way.
+        # A real server, of which a proxy replaces only the answer with its version.
         proxy.falsify(version.to_bytes(4), (130_011).to_bytes(4))
         through = proxy.url(urlsplit(url).path.removeprefix("/"), password="s3cr")
         await asyncio.to_thread(refused, through, folder, "PostgreSQL 14 or newer is needed, this is 13")

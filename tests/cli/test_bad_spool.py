@@ -1,4 +1,4 @@
-"""A spool that cannot be used, or holds what it should not: one line, the documented exit code, nothing lost."""
+"""A spool that is unusable or holds foreign content: one line, the documented exit code, no loss."""
 
 import shutil
 import sqlite3
@@ -14,11 +14,11 @@ from tests.commands import answer, environment, one_line_of, pycrorm
 from tests.databases import ask
 
 pytestmark = pytest.mark.soak
-"""Each test starts many processes anew."""
+"""Each of these tests starts many processes."""
 
 NOTES = "SELECT text FROM note_action ORDER BY id"
 EVENTS = 11
-"""Of the plan, with the declaration."""
+"""The events of the plan, with the declaration."""
 
 
 @pytest.fixture
@@ -28,7 +28,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def left_in(spool: Path, folder: Path) -> Path:
-    """The folder of a recorder that nobody drained."""
+    """Return the folder of a recorder that was never drained."""
     assert pycrorm("run", "notes.py", "--writer", "daemon", "--spool", spool, cwd=folder).returncode == 0
     return recorder_in(spool)
 
@@ -42,7 +42,7 @@ def notes(folder: Path) -> list[str]:
     return [text for (text,) in ask(folder / "pycrorm.db", NOTES)]
 
 
-# --- a disk that takes nothing ------------------------------------------------------------------------------------
+# --- a disk without space or permission -------------------------------------------------------------------------------
 
 REFUSING = """
 import errno, os, sys
@@ -60,11 +60,11 @@ if fault == errno.EROFS:
 from pycrorm_async.cli.main import main
 main()
 """
-"""The command, on a machine where nothing can be made below a place: for those that give no right to mount one."""
+"""Run the command on a machine that can make no file below a place, for machines that permit no mount."""
 
 
 class Disk:
-    """A disk of its own, or a folder that is said to be one."""
+    """A mounted disk, or a folder that simulates one."""
 
     def __init__(self, place: Path, size: str) -> None:
         self.place = place
@@ -106,7 +106,7 @@ def disk(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Disk]:
     made.release()
 
 
-def test_a_spool_on_a_read_only_disk_is_one_line_and_nothing_in_it_is_lost(folder: Path, disk: Disk) -> None:
+def test_a_spool_on_a_read_only_disk_is_reported_in_one_line_and_loses_nothing(folder: Path, disk: Disk) -> None:
     spool = disk.place / "spool"
     left_in(spool, folder)
     disk.make_read_only("ro")
@@ -125,7 +125,7 @@ def test_a_spool_on_a_read_only_disk_is_one_line_and_nothing_in_it_is_lost(folde
     assert notes(folder) == ["a", "b", "c"]
 
 
-def test_a_spool_for_which_a_full_disk_has_no_room_is_one_line(folder: Path, disk: Disk) -> None:
+def test_a_spool_on_a_full_disk_is_refused_in_one_line(folder: Path, disk: Disk) -> None:
     done = disk.pycrorm("ENOSPC", "run", "notes.py", "--spool", disk.place / "spool", cwd=folder)
     assert one_line_of(done).startswith(f"pycrorm: spool {disk.place}/spool/")
     assert one_line_of(done).endswith("No space left on device")
@@ -135,10 +135,10 @@ def test_a_spool_for_which_a_full_disk_has_no_room_is_one_line(folder: Path, dis
     assert notes(folder) == ["a", "b", "c"]
 
 
-# --- what is not ours ---------------------------------------------------------------------------------------------
+# --- foreign content --------------------------------------------------------------------------------------------------
 
 
-def test_foreign_files_in_a_spool_are_left_alone_and_nothing_is_lost(folder: Path) -> None:
+def test_foreign_files_in_a_spool_are_not_touched_and_no_event_is_lost(folder: Path) -> None:
     spool = folder / "pycrorm.db.spool"
     recorder = left_in(spool, folder)
     strangers = [spool / "notes.txt", spool / "photos" / "robot.jpg", recorder / "core.1234"]
@@ -171,7 +171,7 @@ def test_a_folder_of_a_newer_version_is_named_and_kept_and_the_others_are_draine
     assert notes(folder) == ["a", "b", "c"] * 2
 
 
-# --- what contradicts what is stored ------------------------------------------------------------------------------
+# --- contradictions ---------------------------------------------------------------------------------------------------
 
 
 def test_the_same_event_with_other_bytes_is_damage_and_both_are_kept(folder: Path) -> None:
@@ -179,7 +179,7 @@ def test_the_same_event_with_other_bytes_is_damage_and_both_are_kept(folder: Pat
     recorder = left_in(spool, folder)
     shutil.copytree(recorder, folder / "kept" / recorder.name)
     assert pycrorm("writer", "--once", cwd=folder).returncode == 0
-    with sqlite3.connect(folder / "pycrorm.db") as connection:  # by someone who gets round the log's own refusal
+    with sqlite3.connect(folder / "pycrorm.db") as connection:  # by an operator who bypasses the log's own refusal
         connection.executescript(
             "DROP TRIGGER event_is_not_updated;"
             "UPDATE event SET payload = replace(payload, '\"b\"', '\"B\"') WHERE sequence = 5"

@@ -1,4 +1,4 @@
-"""`pycrorm copy` as an operator meets it: in processes of its own."""
+"""`pycrorm copy` as an operator uses it: in processes of its own."""
 
 import asyncio
 import contextlib
@@ -21,7 +21,7 @@ from tests.test_table_comparison import episode as hand_written
 from tests.test_table_comparison import fill
 
 pytestmark = [pytest.mark.soak_on("postgresql"), pytest.mark.slow]
-"""On a server these take long; there they run in turns, and other modules show that it answers alike."""
+"""These tests take long on a server, where they run in turns; other modules show that the server behaves alike."""
 
 PLAN = """
 from dataclasses import dataclass
@@ -39,7 +39,7 @@ async def plan():
 
 @pytest.fixture
 async def folder(tmp_path: Path) -> Path:
-    """With a memory of two episodes."""
+    """A folder with a memory of two episodes."""
     await fill(f"sqlite:///{tmp_path}/a.db", [hand_written(1), hand_written(2)])
     return tmp_path
 
@@ -48,7 +48,7 @@ def ids(number: int) -> str:
     return f"00000000-0000-7000-8000-{number:012}"
 
 
-def test_a_copy_says_what_it_did_and_the_copy_of_the_copy_is_the_same(folder: Path, server: Server) -> None:
+def test_a_copy_reports_what_it_did_and_the_copy_of_the_copy_is_the_same(folder: Path, server: Server) -> None:
     there = server.new_database()
     document = answer("copy", "--from", "sqlite:///a.db", "--to", there, cwd=folder)
     assert document == {
@@ -66,7 +66,7 @@ def test_a_copy_says_what_it_did_and_the_copy_of_the_copy_is_the_same(folder: Pa
     assert_same(f"sqlite:///{folder}/a.db", f"sqlite:///{folder}/b.db")
 
 
-def test_the_memory_to_copy_can_be_said_by_the_environment(folder: Path) -> None:
+def test_the_environment_may_name_the_source(folder: Path) -> None:
     done = subprocess.run(
         [*COMMAND, "copy", "--to", "sqlite:///b.db"],
         cwd=folder,
@@ -91,7 +91,7 @@ def test_the_memory_to_copy_can_be_said_by_the_environment(folder: Path) -> None
         (["--to", "postgresql://ada:s3cr@127.0.0.1:1/b"], 3, "ada:***@127.0.0.1:1/b: cannot be reached"),
     ],
 )
-def test_what_cannot_be_copied_is_one_line_and_makes_nothing(
+def test_an_impossible_copy_is_one_line_and_makes_nothing(
     folder: Path, arguments: list[str], code: int, reason: str
 ) -> None:
     done = pycrorm("copy", "--from", "sqlite:///a.db", *arguments, cwd=folder)
@@ -101,13 +101,13 @@ def test_what_cannot_be_copied_is_one_line_and_makes_nothing(
     assert {path.name for path in folder.iterdir()} <= {"a.db", "a.db-wal", "a.db-shm"}
 
 
-def test_without_a_place_to_copy_to_it_is_usage(folder: Path) -> None:
+def test_a_copy_without_a_target_is_a_usage_error(folder: Path) -> None:
     done = pycrorm("copy", cwd=folder)
     assert done.returncode == 2
     assert "--to" in done.stderr
 
 
-async def test_two_memories_that_contradict_each_other_are_told_and_the_rest_is_copied(folder: Path) -> None:
+async def test_two_memories_that_contradict_each_other_are_reported_and_the_rest_is_copied(folder: Path) -> None:
     other = f"sqlite:///{folder}/b.db"
     await append(other, [hand_written(1).records[0]._replace(monotonic_ns=6)], folded=False)
     done = pycrorm("copy", "--from", "sqlite:///a.db", "--to", "sqlite:///b.db", cwd=folder)
@@ -120,7 +120,7 @@ async def test_two_memories_that_contradict_each_other_are_told_and_the_rest_is_
     assert [(each["copied"], each["damage"] is None) for each in document["episodes"]] == [(0, False), (0, True)]
 
 
-async def test_an_episode_that_cannot_be_shown_is_copied_and_told(folder: Path) -> None:
+async def test_an_episode_that_cannot_be_folded_is_copied_and_reported(folder: Path) -> None:
     await append(f"sqlite:///{folder}/c.db", [record(episode(9), 1, kind="HandShaken", payload=b"{}")])
     done = pycrorm("copy", "--from", "sqlite:///c.db", "--to", "sqlite:///b.db", cwd=folder)
     assert done.returncode == 1
@@ -134,13 +134,13 @@ def test_a_copy_is_interrupted_at_once_and_the_next_one_takes_the_rest(tmp_path:
     source, target = f"sqlite:///{tmp_path}/pycrorm.db", server.new_database()
     asyncio.run(append(source, run_of(episode(1), 1, 2_000), folded=False))
     asyncio.run(append(target, run_of(episode(1), 1, 500)))
-    # A terminal, on which it shows how far it is.
+    # A terminal, so that the copy shows its progress.
     ours, its = pty.openpty()
     with asyncio.Runner() as runner:
-        # Its append waits for this lock.
+        # The append of the copy waits for this lock.
         holding = runner.run(asyncpg.connect(target))
         runner.run(holding.execute("BEGIN; LOCK TABLE pycrorm.event IN EXCLUSIVE MODE"))
-        before = signal.signal(signal.SIGINT, signal.default_int_handler)  # or it is ignored there too
+        before = signal.signal(signal.SIGINT, signal.default_int_handler)  # or the signal is ignored there too
         process = subprocess.Popen(
             [*COMMAND, "copy", "--to", target],
             cwd=tmp_path,
@@ -170,7 +170,7 @@ def test_a_copy_is_interrupted_at_once_and_the_next_one_takes_the_rest(tmp_path:
     assert logs_of(target) == logs_of(source)
 
 
-def test_what_waits_beside_the_memory_to_copy_is_told(folder: Path) -> None:
+def test_events_in_the_spool_beside_the_source_are_reported(folder: Path) -> None:
     (folder / "notes.py").write_text(PLAN)
     assert pycrorm("run", "notes.py", "--writer", "daemon", "--url", "sqlite:///a.db", cwd=folder).returncode == 0
     done = pycrorm("copy", "--from", "sqlite:///a.db", "--to", "sqlite:///b.db", cwd=folder)

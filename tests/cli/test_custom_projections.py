@@ -1,4 +1,4 @@
-"""Projections of one's own with the command: named, or offered by a package that is installed."""
+"""Custom projections with the command: named by an option, or offered by an installed package."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import pytest
 from tests.commands import COMMAND, answer, environment, one_line_of, pycrorm
 
 pytestmark = pytest.mark.soak
-"""Each test starts many processes anew."""
+"""Each of these tests starts many processes."""
 
 PLAN = '''
 from dataclasses import dataclass
@@ -85,7 +85,7 @@ def weighed(folder: Path) -> list[Any]:
 
 
 def offered(folder: Path, **entries: str) -> None:
-    """As an installation leaves it: a folder beside the modules that says what they offer."""
+    """Write what an installation leaves: a folder beside the modules that names its entry points."""
     place = folder / "site" / "lab-1.0.dist-info"
     place.mkdir(parents=True)
     (place / "METADATA").write_text("Metadata-Version: 2.1\nName: lab\nVersion: 1.0\n")
@@ -95,7 +95,7 @@ def offered(folder: Path, **entries: str) -> None:
 
 
 def with_site(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    """The command where that package is installed."""
+    """Run the command where that package is installed."""
     settings = environment()
     settings["PYTHONPATH"] = os.pathsep.join([settings["PYTHONPATH"], str(cwd / "site")])
     return subprocess.run(
@@ -103,7 +103,7 @@ def with_site(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_a_named_projection_is_kept_with_the_run_rebuilt_and_verified(lab: Path) -> None:
+def test_a_named_projection_is_folded_by_the_run_rebuilt_and_verified(lab: Path) -> None:
     assert pycrorm("run", "weighing.py", "--projection", "lab:Weighed", cwd=lab).returncode == 1  # the plan failed
     assert weighed(lab) == WEIGHED
     done = answer("rebuild", "weighed", "--projection", "lab:Weighed", cwd=lab)
@@ -124,14 +124,14 @@ def test_a_named_projection_is_kept_with_the_run_rebuilt_and_verified(lab: Path)
     assert weighed(lab) == WEIGHED
 
 
-def test_a_writer_that_knows_it_catches_up(lab: Path) -> None:
+def test_a_writer_with_the_projection_catches_up(lab: Path) -> None:
     pycrorm("run", "weighing.py", cwd=lab)
     done = pycrorm("writer", "--once", "--projection", "lab:Weighed", cwd=lab)
     assert (done.returncode, done.stderr) == (0, "")
     assert weighed(lab) == WEIGHED
 
 
-def test_what_an_installed_package_offers_is_kept_without_a_word(lab: Path) -> None:
+def test_the_projection_of_an_installed_package_is_folded_without_an_option(lab: Path) -> None:
     offered(lab, weighed="lab:Weighed")
     with_site("run", "weighing.py", cwd=lab)
     assert weighed(lab) == WEIGHED
@@ -142,7 +142,7 @@ def test_what_an_installed_package_offers_is_kept_without_a_word(lab: Path) -> N
     assert state["projections"] == [{"name": "weighed", "version": 1, "behind": 0, "parked": {}, "fault": None}]
 
 
-def test_a_package_that_offers_nonsense_is_told_in_a_line_and_the_others_go_on(lab: Path) -> None:
+def test_a_package_with_an_invalid_projection_is_reported_in_a_line_and_the_others_continue(lab: Path) -> None:
     offered(lab, a="lab:Strange", b="nowhere:At", c="lab:Weighed", d="lab:NoTables")
     done = with_site("writer", "--once", "--url", f"sqlite:///{lab}/pycrorm.db", cwd=lab)
     assert done.returncode == 0
@@ -155,7 +155,7 @@ def test_a_package_that_offers_nonsense_is_told_in_a_line_and_the_others_go_on(l
     assert weighed(lab) == []
 
 
-def test_one_whose_code_is_not_here_is_left_as_it_is_and_told(lab: Path) -> None:
+def test_a_projection_whose_code_is_missing_is_left_unchanged_and_reported(lab: Path) -> None:
     pycrorm("run", "weighing.py", "--projection", "lab:Weighed", cwd=lab)
     told = pycrorm("rebuild", cwd=lab)
     assert told.returncode == 0
@@ -169,7 +169,7 @@ def test_one_whose_code_is_not_here_is_left_as_it_is_and_told(lab: Path) -> None
     assert one_line_of(told) == "the projection weighed was not verified: its code is not installed here"
 
 
-def test_status_tells_what_a_projection_cannot_fold_and_which_version_is_not_folded(lab: Path) -> None:
+def test_status_reports_what_a_projection_cannot_fold_and_which_version_is_not_folded(lab: Path) -> None:
     ran = pycrorm("run", "weighing.py", "--projection", "lab:Picky", cwd=lab)
     assert "episode 1 is parked in the projection weighed: event 5: weighed raised ValueError: no water" in ran.stderr
     state = answer("status", cwd=lab, code=1)
@@ -202,7 +202,7 @@ def test_status_tells_what_a_projection_cannot_fold_and_which_version_is_not_fol
         ),
     ],
 )
-def test_what_cannot_be_is_refused_in_one_line(lab: Path, arguments: list[str], said: str) -> None:
+def test_an_impossible_projection_is_refused_in_one_line(lab: Path, arguments: list[str], said: str) -> None:
     if arguments[-1] == "scales":
         pycrorm("writer", "--once", cwd=lab)
     done = pycrorm(*arguments, cwd=lab)

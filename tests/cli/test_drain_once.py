@@ -1,4 +1,4 @@
-"""The exit code of `pycrorm writer --once`: 1 where the database refused anything, with and without --json."""
+"""The exit code of `pycrorm writer --once`: 1 if the database refused anything, with and without --json."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.commands import answer, one_line_of, pycrorm
 from tests.databases import ask, ask_to_change
 
 pytestmark = [pytest.mark.slow, pytest.mark.soak_on("postgresql")]
-"""The promise is kept in files or by a process, with no SQL of its own; on a server it is tested in turns."""
+"""Files and processes keep this promise, without SQL of their own, so that servers test it in turns."""
 
 RECORDER, EPISODE = "0190a000-0000-7000-8000-000000000001", "0190a000-0000-7000-8000-000000000002"
 FULL = (
@@ -24,7 +24,7 @@ FULL = (
 )
 
 
-def use_up_the_numbers(url: str) -> None:
+def use_up_episode_numbers(url: str) -> None:
     taken = f"INSERT INTO episode (number, id, head, started_wall_ns) VALUES ({EPISODE_NUMBER_MAX}, 'x', 0, 0)"
     ask_to_change(url, taken)
     if url.startswith("postgresql:"):
@@ -35,7 +35,7 @@ def test_an_episode_without_a_number_is_a_problem_each_time_and_is_kept(database
     (tmp_path / "notes.py").write_text(NOTES_PLAN)
     where = ("--url", database_url, "--spool", tmp_path / "spool")
     assert answer("writer", "--once", *where, cwd=tmp_path)["dead_letters"] == {}
-    use_up_the_numbers(database_url)
+    use_up_episode_numbers(database_url)
     pycrorm("run", "notes.py", "--writer", "daemon", *where, cwd=tmp_path)
     document = answer("writer", "--once", *where, cwd=tmp_path, code=1)
     [(episode, folder)] = document["dead_letters"].items()
@@ -48,7 +48,7 @@ def test_an_episode_without_a_number_is_a_problem_each_time_and_is_kept(database
 
 
 @pytest.mark.parametrize("alive", [True, False])
-def test_what_was_refused_earlier_is_a_problem_also_while_its_recorder_lives(tmp_path: Path, *, alive: bool) -> None:
+def test_an_earlier_refusal_is_a_problem_even_while_its_recorder_is_alive(tmp_path: Path, *, alive: bool) -> None:
     spool = tmp_path / "pycrorm.db.spool"
     folder, lock = make_folder(spool, RECORDER)
     refused = DeadLetters(folder)

@@ -1,4 +1,4 @@
-"""`pycrorm events`: the log of an episode as its user reads it, or a program."""
+"""`pycrorm events`: the log of an episode as text for its user, or as JSON for a program."""
 
 import asyncio
 import json
@@ -17,7 +17,7 @@ from tests.store.factories import episode, run_of
 from tests.test_table_comparison import episode as hand_written
 
 pytestmark = [pytest.mark.slow, pytest.mark.soak_on("postgresql")]
-"""The promise is kept in files or by a process, with no SQL of its own; on a server it is tested in turns."""
+"""Files and processes keep this promise, without SQL of their own, so that servers test it in turns."""
 
 URL = "sqlite:///pycrorm.db"
 IDENTITY = "00000000-0000-7000-8000-000000000001"
@@ -28,8 +28,8 @@ def lines_of(done: subprocess.CompletedProcess[str], code: int = 0) -> list[dict
     return [json.loads(line) for line in done.stdout.splitlines()]
 
 
-def said(record: Record, time: str) -> dict[str, Any]:
-    """The line of an event."""
+def text_of(record: Record, time: str) -> dict[str, Any]:
+    """Return the line of an event."""
     return {
         "sequence": record.sequence,
         "type": record.type,
@@ -41,12 +41,12 @@ def said(record: Record, time: str) -> dict[str, Any]:
     }
 
 
-async def test_every_event_is_a_line_with_all_that_was_recorded(database_url: str, tmp_path: Path) -> None:
+async def test_every_event_is_a_line_with_all_its_fields(database_url: str, tmp_path: Path) -> None:
     script = hand_written(1)
     script.put_payload("HandShaken", '{"of": "a newer version", "ü": 1.50}'.encode(), 7)
     script.records[1] = script.records[1]._replace(wall_ns=1_700_000_000_000_000_009)
     await append(database_url, script.records, folded=False)
-    expected = [said(each, f"2023-11-14T22:13:{20 + each.sequence:02}.000000000Z") for each in script.records]
+    expected = [text_of(each, f"2023-11-14T22:13:{20 + each.sequence:02}.000000000Z") for each in script.records]
     expected[1]["time"] = "2023-11-14T22:13:20.000000009Z"
     assert lines_of(pycrorm("events", "1", "--url", database_url, cwd=tmp_path)) == expected
     assert lines_of(pycrorm("events", "last", "--after", "11", "--url", database_url, cwd=tmp_path)) == expected[11:]
@@ -56,7 +56,7 @@ async def test_every_event_is_a_line_with_all_that_was_recorded(database_url: st
     assert lines_of(some) == [each for each in expected if each["type"] in ("NodeEnded", "ObjectAdded")]
 
 
-def test_no_character_is_lost_where_the_terminal_knows_ascii_alone(tmp_path: Path) -> None:
+def test_no_character_is_lost_on_a_terminal_with_ascii_alone(tmp_path: Path) -> None:
     script = Script(1)
     script.put_payload("NodeStarted", '{"kind":"root","text":"Grüße, 牛奶"}'.encode())
     asyncio.run(append(f"sqlite:///{tmp_path}/pycrorm.db", script.records, folded=False))
@@ -70,7 +70,7 @@ def test_no_character_is_lost_where_the_terminal_knows_ascii_alone(tmp_path: Pat
     assert json.loads(done.stdout)["payload"]["text"] == "Grüße, 牛奶"
 
 
-def test_a_reader_that_has_enough_ends_it_without_a_word(tmp_path: Path) -> None:
+def test_a_reader_that_closes_the_pipe_ends_the_command_without_a_message(tmp_path: Path) -> None:
     asyncio.run(append(f"sqlite:///{tmp_path}/pycrorm.db", run_of(episode(1), 1, 5_000), folded=False))
     process = subprocess.Popen(
         [*COMMAND, "events", "1"], cwd=tmp_path, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE
@@ -84,7 +84,7 @@ def test_a_reader_that_has_enough_ends_it_without_a_word(tmp_path: Path) -> None
     process.stderr.close()
 
 
-async def test_of_a_damaged_log_what_comes_before_the_damage_is_printed(tmp_path: Path) -> None:
+async def test_of_a_damaged_log_the_events_before_the_damage_are_printed(tmp_path: Path) -> None:
     url = f"sqlite:///{tmp_path}/pycrorm.db"
     await append(url, hand_written(1).records, folded=False)
     ask_to_change(url, "DROP TRIGGER event_is_not_deleted")
@@ -113,7 +113,7 @@ async def test_of_a_damaged_log_what_comes_before_the_damage_is_printed(tmp_path
         (["1", "--url", "postgresql://ada:s3cr@127.0.0.1:1/memory"], 3, "cannot be reached: Connection refused"),
     ],
 )
-async def test_what_cannot_be_printed_is_one_line(tmp_path: Path, arguments: list[str], code: int, reason: str) -> None:
+async def test_an_impossible_request_is_one_line(tmp_path: Path, arguments: list[str], code: int, reason: str) -> None:
     url = f"sqlite:///{tmp_path}/pycrorm.db"
     await append(url, [*hand_written(1).records, *hand_written(2).records], folded=False)
     done = pycrorm("events", *arguments, cwd=tmp_path)

@@ -1,4 +1,4 @@
-"""Ctrl-C while what a plan recorded cannot be stored: it leaves at once, and nothing is lost."""
+"""Ctrl-C while a plan's events cannot be stored: the command ends at once, and loses nothing."""
 
 from __future__ import annotations
 
@@ -73,7 +73,9 @@ def _appears(path: Path) -> bool:
 
 
 @pytest.mark.slow
-def test_a_plan_whose_database_is_away_at_its_end_is_left_with_ctrl_c_and_stored_later(tmp_path: Path) -> None:
+def test_a_plan_whose_database_is_unavailable_at_its_end_is_interrupted_by_ctrl_c_and_stored_later(
+    tmp_path: Path,
+) -> None:
     (tmp_path / "waits.py").write_text(PLAN)
     running = subprocess.Popen(
         [sys.executable, "-m", "pycrorm_async", "run", "waits.py"],
@@ -88,9 +90,9 @@ def test_a_plan_whose_database_is_away_at_its_end_is_left_with_ctrl_c_and_stored
             other.execute("BEGIN IMMEDIATE")
             (tmp_path / "go").touch()
             assert _appears(tmp_path / "done")
-            time.sleep(1)  # it has begun to wait for the database
+            time.sleep(1)  # the plan waits for the database
             running.send_signal(signal.SIGINT)
-            _, told = running.communicate(timeout=60)  # and not the five minutes that closing would wait
+            _, told = running.communicate(timeout=60)  # and not after the five minutes that closing would wait
     finally:
         running.kill()
     assert running.returncode == 130
@@ -101,7 +103,7 @@ def test_a_plan_whose_database_is_away_at_its_end_is_left_with_ctrl_c_and_stored
     assert [node["status"] for node in answer("show", "1", cwd=tmp_path)["tree"]] == ["SUCCEEDED", "SUCCEEDED"]
 
 
-def test_interrupted_while_it_loads_it_says_so_in_a_line(tmp_path: Path) -> None:
+def test_an_interrupt_during_loading_is_one_line(tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-c", LOADING], cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False
     )
@@ -109,7 +111,7 @@ def test_interrupted_while_it_loads_it_says_so_in_a_line(tmp_path: Path) -> None
     assert not list(tmp_path.iterdir())
 
 
-def test_interrupted_while_it_prints_a_line_it_leaves_with_the_last_one(tmp_path: Path) -> None:
+def test_an_interrupt_during_output_comes_after_the_last_line(tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-c", SPEAKING], cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False
     )

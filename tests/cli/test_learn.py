@@ -1,4 +1,4 @@
-"""`pycrorm learn` as a user meets it: what it prints and leaves behind, resumed, interrupted, and told off."""
+"""`pycrorm learn` as a user runs it: its output and its files, resumed, interrupted, and refused."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.slow
 
 SMALL = ("learn", "--rollouts", "400", "--evaluate", "150", "--held-out", "150")
 BY_ONE = (*SMALL, "--workers", "1")
-"""The same rollouts. A worker takes two seconds to start, much longer than its rollouts."""
+"""The settings of the same rollouts. A worker takes two seconds to start, much longer than its rollouts."""
 
 
 @pytest.fixture(scope="module")
@@ -29,11 +29,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def document(folder: Path) -> Any:
-    """Of a small experiment, done in the folder."""
+    """The result of a small experiment, run in the folder."""
     return answer(*SMALL, cwd=folder)
 
 
-def test_it_tells_what_was_done_what_it_came_to_and_where_the_policy_is(document: Any, folder: Path) -> None:
+def test_learn_prints_the_rollouts_the_rates_and_the_path_of_the_policy(document: Any, folder: Path) -> None:
     default, learned, held_out = document["phases"]
     assert (default["rollouts"], learned["rollouts"], held_out["rollouts"]) == (400, 150, 150)
     assert 0.08 < default["success_rate"] < 0.25 < learned["success_rate"]
@@ -52,7 +52,7 @@ def test_it_tells_what_was_done_what_it_came_to_and_where_the_policy_is(document
     assert ask(folder / "pycrorm.db", tried) == [(700,)]
 
 
-def test_what_is_remembered_is_not_done_again(document: Any, folder: Path) -> None:
+def test_recorded_rollouts_are_not_repeated(document: Any, folder: Path) -> None:
     refused = pycrorm(*SMALL, cwd=folder)
     line = one_line_of(refused)
     assert "400 rollouts of this experiment are recorded already" in line
@@ -68,14 +68,14 @@ def test_what_is_remembered_is_not_done_again(document: Any, folder: Path) -> No
     assert (folder / "two.svg").read_text().startswith("<?xml")
 
 
-def test_a_study_asks_what_else_the_policy_is_worth(document: Any, folder: Path) -> None:
+def test_a_study_evaluates_the_policy_under_other_conditions(document: Any, folder: Path) -> None:
     studied = answer(*BY_ONE, "--resume", "--study", "4", cwd=folder)["study"]
     assert len(studied["elsewhere"]) > 8
     assert {each["default"]["rollouts"] for each in studied["elsewhere"]} == {4}
     assert document["study"] is None
 
 
-def test_interrupted_it_says_so_in_a_line_and_goes_on_with_resume(tmp_path: Path) -> None:
+def test_an_interrupt_is_one_line_and_resume_continues(tmp_path: Path) -> None:
     longer = ("--rollouts", "1500")
     command = [*COMMAND, *SMALL, *longer, "--workers", "2"]
     process = subprocess.Popen(command, cwd=tmp_path, env=environment(), stderr=subprocess.PIPE, text=True)
@@ -91,14 +91,14 @@ def test_interrupted_it_says_so_in_a_line_and_goes_on_with_resume(tmp_path: Path
     assert 0 < document["phases"][0]["done_now"] < 1_500
 
 
-def test_interrupted_twice_it_leaves_at_once_and_goes_on_with_resume(tmp_path: Path) -> None:
+def test_a_second_interrupt_ends_at_once_and_resume_continues(tmp_path: Path) -> None:
     command = [*COMMAND, *BY_ONE, "--rollouts", "100000", "--json"]
     process = subprocess.Popen(
         command, cwd=tmp_path, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
     assert process.stderr is not None
     await_events(tmp_path / "pycrorm.db", 500)
-    # While another process holds the database, nothing can be stored: the second Ctrl-C comes before the end of that.
+    # Another process locks the database, so that nothing can be stored: the second Ctrl-C comes before the lock ends.
     with contextlib.closing(sqlite3.connect(tmp_path / "pycrorm.db", isolation_level=None, timeout=60)) as other:
         other.execute("BEGIN IMMEDIATE")
         process.send_signal(signal.SIGINT)
@@ -134,8 +134,8 @@ def test_bad_input_is_one_line(tmp_path: Path, arguments: tuple[str, ...], code:
     assert done.returncode == code
 
 
-def test_without_the_extra_it_says_what_to_install(tmp_path: Path) -> None:
-    (tmp_path / "jpt.py").write_text("raise ImportError")  # found before the real one
+def test_without_the_extra_the_error_names_it(tmp_path: Path) -> None:
+    (tmp_path / "jpt.py").write_text("raise ImportError")  # imported before the real one
     done = pycrorm(*SMALL, cwd=tmp_path)
     assert one_line_of(done).endswith("pyjpt is not installed: pip install 'pycrorm-async[learning]'")
     assert done.returncode == 2

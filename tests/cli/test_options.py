@@ -18,7 +18,7 @@ from tests.commands import answer, environment, pycrorm
 pytestmark = pytest.mark.slow
 
 
-def test_every_verb_that_opens_a_database_takes_its_spool_too() -> None:
+def test_every_verb_that_opens_a_database_accepts_its_spool_too() -> None:
     group = typer.main.get_command(app())
     assert isinstance(group, TyperGroup)
     options = {name: {option for each in verb.params for option in each.opts} for name, verb in group.commands.items()}
@@ -60,7 +60,7 @@ def test_verify_and_rebuild_name_the_events_that_wait_in_the_spool(tmp_path: Pat
 
 
 @pytest.mark.parametrize("verb", ["verify", "rebuild"])
-def test_a_private_database_is_refused_in_one_line(tmp_path: Path, verb: str) -> None:
+def test_a_temporary_database_is_refused_in_one_line(tmp_path: Path, verb: str) -> None:
     done = pycrorm(verb, "--url", "sqlite://", cwd=tmp_path)
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == "pycrorm: sqlite:// exists only in its own process, no other can open it: name a file\n"

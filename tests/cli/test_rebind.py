@@ -1,4 +1,4 @@
-"""`pycrorm spool rebind` and a deleted database, as a newcomer meets them."""
+"""`pycrorm spool rebind` and a deleted database, for a new user."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_a_database_that_was_deleted_is_made_afresh_by_the_next_run(folder: Path) -> None:
+def test_the_next_run_makes_a_deleted_database_again(folder: Path) -> None:
     for _ in range(2):
         [episode] = answer("run", "notes.py", cwd=folder)["episodes"]
         assert (episode["number"], episode["status"]) == (1, "SUCCEEDED")
@@ -34,7 +34,7 @@ def test_with_events_in_the_spool_the_refusal_names_the_command_that_stores_them
     document = answer("spool", "rebind", cwd=folder)
     assert (document["events_found"], document["events_stored"], document["dead_letters"]) == (11, 11, {})
     assert document["log_before"] != document["log"]
-    # The first one was stored in the deleted database, and comes from the segments that were kept of it.
+    # The first event was stored in the deleted database, and comes from its kept segments.
     assert [each["description"] for each in answer("episodes", cwd=folder)] == ["Take three notes."] * 2
     assert len(answer("run", "notes.py", cwd=folder)["episodes"]) == 1
     again = pycrorm("spool", "rebind", cwd=folder)

@@ -1,4 +1,4 @@
-"""`pycrorm rebuild` as a user meets it: in a process of its own that knows nothing of the plan."""
+"""`pycrorm rebuild` as an operator runs it: in a process of its own without the code of the plan."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ async def plan():
 '''
 
 
-def test_it_needs_no_code_of_the_plan_and_says_what_it_made(tmp_path: Path) -> None:
+def test_a_rebuild_needs_no_code_of_the_plan_and_reports_what_it_made(tmp_path: Path) -> None:
     (tmp_path / "weighing.py").write_text(PLAN)
     assert pycrorm("run", "weighing.py", cwd=tmp_path).returncode == 0
     (tmp_path / "weighing.py").unlink()
@@ -57,7 +57,7 @@ def test_it_needs_no_code_of_the_plan_and_says_what_it_made(tmp_path: Path) -> N
     assert told.stdout.startswith("generation 3: 6 events of 1 episodes in ")
 
 
-def test_an_episode_that_cannot_be_folded_is_told_and_is_a_problem(tmp_path: Path) -> None:
+def test_an_episode_that_cannot_be_folded_is_reported_and_is_a_problem(tmp_path: Path) -> None:
     asyncio.run(store(f"sqlite:///{tmp_path}/pycrorm.db", [*TYPES, *picking(1).records, *parking(2).records]))
     done = pycrorm("rebuild", cwd=tmp_path)
     assert done.returncode == 1
@@ -80,7 +80,7 @@ def test_bad_input_is_one_line(tmp_path: Path, arguments: Sequence[str], code: i
     assert [each.name for each in tmp_path.iterdir()] == ["text.db"]
 
 
-async def test_a_second_one_is_refused_with_one_line(database_url: str, tmp_path: Path) -> None:
+async def test_a_second_rebuild_is_refused_with_one_line(database_url: str, tmp_path: Path) -> None:
     await store(database_url, [*TYPES, *picking(1).records])
     log = await EventLog.open(DatabaseAddress.parse(database_url), create=True)
     async with claimed(log):
@@ -100,7 +100,7 @@ def start_rebuild(folder: Path, workers: str) -> subprocess.Popen[str]:
 
 
 @pytest.mark.parametrize("workers", ["1", "2"])
-def test_interrupted_it_leaves_with_130_and_the_next_one_goes_on(tmp_path: Path, workers: str) -> None:
+def test_an_interrupted_rebuild_exits_with_130_and_the_next_one_continues(tmp_path: Path, workers: str) -> None:
     url = f"sqlite:///{tmp_path}/pycrorm.db"
     asyncio.run(store(url, [*TYPES, *(each for number in range(1, 100) for each in picking(number).records)]))
     before = tables_of(url)
@@ -110,7 +110,7 @@ def test_interrupted_it_leaves_with_130_and_the_next_one_goes_on(tmp_path: Path,
         process = start_rebuild(tmp_path, workers)
         while not ask(url, making) and process.poll() is None:
             time.sleep(0.001)
-        blocker.execute("BEGIN IMMEDIATE")  # no process writes until it is rolled back
+        blocker.execute("BEGIN IMMEDIATE")  # no process writes until the transaction is rolled back
         unfinished = ask(url, making)
         if unfinished:
             break

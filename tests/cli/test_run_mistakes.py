@@ -60,7 +60,7 @@ def test_a_missing_resolve_is_named(tmp_path: Path) -> None:
     assert "Traceback" not in ran.stderr
 
 
-def test_a_plan_that_ends_itself_is_said_to_have_done_so(tmp_path: Path) -> None:
+def test_a_plan_that_exits_the_program_is_reported_as_such(tmp_path: Path) -> None:
     (tmp_path / "plan.py").write_text(PLAN)
     for name, line in (("leaving", 16), ("leaving_in_a_task", 20)):
         ran = pycrorm("run", f"plan.py:{name}", cwd=tmp_path)

@@ -1,4 +1,4 @@
-"""`pycrorm run` takes the settings of a recording as options, and refuses a wrong one in one line."""
+"""`pycrorm run` accepts the settings of a recording as options, and refuses a wrong one in one line."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_the_robot_is_sampled_at_the_interval_of_the_option(folder: Path) -> Non
     assert {"base.x", "torso_lift_joint"} <= set(samples(folder))
 
 
-def test_a_parameter_that_cannot_be_recorded_is_recorded_as_missing_or_refused(folder: Path) -> None:
+def test_an_unrecordable_parameter_is_recorded_as_missing_or_refused(folder: Path) -> None:
     for options in ((), ("--on-unrecordable", "record_missing")):
         ran = pycrorm("run", "plan.py:unrecordable", *options, cwd=folder)
         assert (ran.returncode, "performed" in ran.stdout) == (0, True), ran.stderr
@@ -65,7 +65,7 @@ def test_a_parameter_that_cannot_be_recorded_is_recorded_as_missing_or_refused(f
 
 
 @pytest.mark.parametrize(("options", "on_full"), [((), "wait"), (("--on-full", "fail"), "fail")])
-def test_what_a_full_spool_does_is_an_option(folder: Path, options: tuple[str, ...], on_full: str) -> None:
+def test_the_reaction_to_a_full_spool_is_an_option(folder: Path, options: tuple[str, ...], on_full: str) -> None:
     ran = pycrorm("run", "plan.py:full", *options, cwd=folder)
     assert (ran.returncode, ran.stdout.splitlines()[0]) == (0, f"on_full is {on_full}"), ran.stderr
 

@@ -1,4 +1,6 @@
-"""`pycrorm show`: an episode's task tree; and with `--at`, tree and world at any moment, also of what died."""
+"""`pycrorm show`: an episode's task tree, and with `--at` its tree and world at any moment, also of a killed
+process.
+"""
 
 import signal
 from pathlib import Path
@@ -38,9 +40,9 @@ async def dies():
     await plan(last=True)
 '''
 
-# Events: 1 start, 2 root, 3 pr2, 4 milk, 5 attached, 6 NavigateAction, 7 MoveMotion, 8 pr2 moved, 9 milk moved,
-# 10 and 11 their ends, 12 HoldAction, 13 MoveTorsoAction, 14 MoveJointsMotion, 15 joints, 16 milk (its hand rose),
-# 17 and 18 ends, 19 HoldAction's.
+# Events: 1 start, 2 root, 3 pr2, 4 milk, 5 attached, 6 NavigateAction, 7 MoveMotion, 8 pr2 moved, 9 milk moved, 10 and
+# 11 their ends, 12 HoldAction, 13 MoveTorsoAction, 14 MoveJointsMotion, 15 joints, 16 milk (its hand rose), 17 and 18
+# ends, 19 HoldAction's.
 
 EVENTS = ["e2-e22", "e6-e11", "e7-e10", "e12-e19", "e13-e18", "e14-e17"]
 """The start and the end of each node."""
@@ -48,7 +50,7 @@ EVENTS = ["e2-e22", "e6-e11", "e7-e10", "e12-e19", "e13-e18", "e14-e17"]
 
 @pytest.fixture(scope="module")
 def ridden(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where a ride that went well is remembered."""
+    """Return the folder with the memory of a successful ride."""
     return after_a_ride(tmp_path_factory.mktemp("ridden"), "plan", code=0)
 
 
@@ -125,13 +127,13 @@ def test_nodes_are_shown_with_the_events_of_their_start_and_end(ridden: Path) ->
     assert [line.split()[-1] for line in shown.splitlines() if line.endswith("-")] == ["e2-", "e6-", "e7-"]
 
 
-def test_what_a_killed_robot_was_doing_is_shown(tmp_path: Path) -> None:
+def test_the_running_nodes_of_a_killed_robot_are_shown(tmp_path: Path) -> None:
     place = after_a_ride(tmp_path, "dies", code=-signal.SIGKILL)
     assert pycrorm("writer", "--once", cwd=place).returncode == 0
     end = answer("show", "1", "--at", "1e6", cwd=place)
     assert statuses(end)[3] == ("HoldAction", "LOST")
     assert (end["status"], end["sequence"]) == ("LOST", 19)
-    # What was in its world when it died is told, with the milk in the hand.
+    # Its world at its death is shown, with the milk in the hand.
     assert [each["attached_to"] for each in end["world"]["objects"]] == [None, ["pr2", "l_gripper_tool_frame"]]
     before = answer("show", "1", "--at", "#18", cwd=place)
     assert statuses(before)[3:5] == [("HoldAction", "RUNNING"), ("MoveTorsoAction", "SUCCEEDED")]
@@ -148,7 +150,7 @@ def test_what_a_killed_robot_was_doing_is_shown(tmp_path: Path) -> None:
         (["7", "--at", "1"], "there is no episode '7' (`pycrorm episodes` lists the 1 there are)"),
     ],
 )
-def test_what_is_no_moment_of_an_episode_is_one_line(ridden: Path, arguments: list[str], said: str) -> None:
+def test_an_invalid_moment_of_an_episode_is_one_line(ridden: Path, arguments: list[str], said: str) -> None:
     done = pycrorm("show", *arguments, cwd=ridden)
     assert (done.returncode, done.stdout) == (2, "")
     assert one_line_of(done) == f"pycrorm: {said}"
@@ -191,7 +193,7 @@ def failed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place
 
 
-def test_a_message_and_a_text_that_are_cut_end_with_an_ellipsis(failed: Path) -> None:
+def test_a_shortened_message_and_text_end_with_an_ellipsis(failed: Path) -> None:
     for moment in ((), ("--at", "1e6")):
         shown = " ".join(pycrorm("show", "1", *moment, cwd=failed).stdout.replace("│", " ").split())
         assert f"PlanFailure: {'m' * 96} end" in shown
@@ -200,16 +202,16 @@ def test_a_message_and_a_text_that_are_cut_end_with_an_ellipsis(failed: Path) ->
         assert f"text=500{'t' * 57}… numbers=3 entries weight=? FAILED" in shown
 
 
-def test_full_shows_all_of_it(failed: Path) -> None:
+def test_full_shows_the_whole_text(failed: Path) -> None:
     for moment in ((), ("--at", "1e6")):
         done = pycrorm("show", "1", "--full", *moment, cwd=failed)
         assert (done.returncode, "…" in done.stdout) == (0, False)
-        shown = "".join(done.stdout.replace("│", " ").split())  # without the breaks of the lines
+        shown = "".join(done.stdout.replace("│", " ").split())  # without the line breaks
         assert f"text=500{'t' * 300}numbers=[1,2,3]weight=?(" in shown
         assert f"PlanFailure:{'m' * 500}end" in shown
 
 
-def test_a_document_is_never_cut(failed: Path) -> None:
+def test_a_json_document_is_never_shortened(failed: Path) -> None:
     for moment in ((), ("--at", "1e6")):
         last = answer("show", "1", *moment, cwd=failed)["tree"][-1]
         assert last["failure_message"] == "m" * 500 + " end"

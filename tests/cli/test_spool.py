@@ -1,4 +1,4 @@
-"""`pycrorm spool`: what an operator sees of a spool's files, and what is stored after they were mended."""
+"""`pycrorm spool`: the files of a spool for an operator, and the events that are stored after a repair."""
 
 import os
 import signal
@@ -38,7 +38,7 @@ async def forever(memory):
 
 @pytest.fixture
 def left(tmp_path: Path) -> Path:
-    """The spool that a killed plan left; its writer may have stored some of it."""
+    """Return the spool that a killed plan left; its writer may have stored some of it."""
     (tmp_path / "notes.py").write_text(PLAN)
     plan = subprocess.Popen(
         [*COMMAND, "run", "notes.py:forever"], cwd=tmp_path, env=environment(), stdout=subprocess.PIPE, bufsize=0
@@ -58,7 +58,7 @@ def segment(spool: Path) -> Path:
     return found
 
 
-def test_a_killed_plans_spool_is_told_and_is_no_problem(left: Path) -> None:
+def test_a_killed_plans_spool_is_reported_and_is_no_problem(left: Path) -> None:
     document = answer("spool", "inspect", left, cwd=left.parent)
     [recorder] = document["recorders"]
     assert (recorder["alive"], recorder["damage"], recorder["refused"], recorder["first"]) == (False, None, None, 1)
@@ -74,7 +74,7 @@ def test_a_killed_plans_spool_is_told_and_is_no_problem(left: Path) -> None:
     assert (whole.returncode, whole.stdout, whole.stderr) == (0, "nothing is damaged\n", "")
 
 
-def test_a_damaged_spool_is_mended_and_what_is_whole_is_stored(left: Path) -> None:
+def test_a_damaged_spool_is_repaired_and_its_whole_records_are_stored(left: Path) -> None:
     path = segment(left)
     content = path.read_bytes()
     at = content.index(b'"index":150') if b'"index":150' in content else content.index(b"150", 20_000)
@@ -108,7 +108,7 @@ def test_a_damaged_spool_is_mended_and_what_is_whole_is_stored(left: Path) -> No
     assert (after["recorders"], after["set_aside"]) == ([], [Path(mended["set_aside"]).name])
 
 
-def test_a_mended_spool_says_what_to_do_next(left: Path) -> None:
+def test_a_repaired_spool_names_the_next_command(left: Path) -> None:
     overwrite(segment(left), 20_000, bytes(8))
     done = pycrorm("spool", "repair", left, cwd=left.parent)
     assert done.returncode == 1
@@ -119,7 +119,7 @@ def test_a_mended_spool_says_what_to_do_next(left: Path) -> None:
     assert any(line.startswith("  not kept: position ") for line in lines)
 
 
-def test_a_living_plans_spool_is_told_and_not_mended(tmp_path: Path) -> None:
+def test_a_live_plans_spool_is_reported_and_not_repaired(tmp_path: Path) -> None:
     (tmp_path / "notes.py").write_text(PLAN)
     plan = subprocess.Popen(
         [*COMMAND, "run", "notes.py:forever"], cwd=tmp_path, env=environment(), stdout=subprocess.PIPE, bufsize=0
@@ -146,7 +146,7 @@ def test_a_living_plans_spool_is_told_and_not_mended(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("verb", ["inspect", "repair"])
-def test_what_is_no_spool_is_one_line(tmp_path: Path, verb: str) -> None:
+def test_a_folder_that_is_no_spool_is_one_line(tmp_path: Path, verb: str) -> None:
     (tmp_path / "photos").mkdir()
     for name, reason in (("photos", "is not a spool"), ("none", "does not exist")):
         done = pycrorm("spool", verb, name, cwd=tmp_path)
@@ -163,7 +163,7 @@ def test_what_is_no_spool_is_one_line(tmp_path: Path, verb: str) -> None:
         assert f"{folder}: does not exist" in one_line_of(done)
 
 
-def test_what_the_database_refused_is_told_with_its_place_by_status_and_inspect(tmp_path: Path) -> None:
+def test_dead_letters_are_reported_with_their_place_by_status_and_inspect(tmp_path: Path) -> None:
     folder = tmp_path
     assert pycrorm("writer", "--once", cwd=folder).returncode == 0
     spool = folder / "pycrorm.db.spool"
@@ -184,7 +184,7 @@ def test_what_the_database_refused_is_told_with_its_place_by_status_and_inspect(
     )
     [inspected] = answer("spool", "inspect", spool, cwd=folder)["recorders"]
     assert (inspected["name"], inspected["types"]) == (place.name, {"NodeStarted": 1})
-    assert pycrorm("episodes", cwd=folder).stderr == ""  # no news each time
+    assert pycrorm("episodes", cwd=folder).stderr == ""  # unchanged each time
     once = answer("writer", "--once", cwd=folder, code=1)
     assert list(once["stopped"].values()) == ["events 1 to 4 did not arrive before event 5"]
     assert place.exists()

@@ -24,7 +24,7 @@ async def plan():
 
 
 @pytest.mark.parametrize("verb", [["episodes"], ["show", "last"], ["run", "plan.py"], ["writer", "--once"]])
-def test_a_server_that_cannot_be_reached(tmp_path: Path, verb: list[str]) -> None:
+def test_an_unreachable_server_is_one_line_without_a_password(tmp_path: Path, verb: list[str]) -> None:
     (tmp_path / "plan.py").write_text(PLAN)
     done = pycrorm(*verb, "--url", "postgresql://ada:s3cr@127.0.0.1:1/memory", cwd=tmp_path)
     assert (done.returncode, done.stdout) == (3, "")
@@ -41,7 +41,7 @@ def test_a_server_that_cannot_be_reached(tmp_path: Path, verb: list[str]) -> Non
         ("postgresql://ada:s3cr@lab", "a PostgreSQL URL names its database"),
     ],
 )
-def test_a_url_that_cannot_be(tmp_path: Path, url: str, reason: str) -> None:
+def test_an_invalid_url_is_one_line_without_a_password(tmp_path: Path, url: str, reason: str) -> None:
     done = pycrorm("episodes", "--url", url, cwd=tmp_path)
     assert (done.returncode, done.stdout) == (2, "")
     said = one_line_of(done)

@@ -1,4 +1,4 @@
-"""`pycrorm verify` as an operator meets it: what it prints, its exit codes, and who may ask."""
+"""`pycrorm verify` as an operator runs it: its output, its exit codes, and the rights it needs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.projections.verify_cases import fold_in_batches, full, opened, visibl
 from tests.store.factories import declaration
 
 pytestmark = [pytest.mark.soak_on("postgresql"), pytest.mark.slow]
-"""On a server these take long; there they run in turns, and other modules show that it answers alike."""
+"""These tests take long on a server, where they run in turns; other modules show that the server behaves alike."""
 
 ID = "00000000-0000-7000-8000-00000000000{}"
 
@@ -31,7 +31,7 @@ async def memory(url: str) -> None:
 
 @pytest.fixture
 async def folder(tmp_path: Path) -> Path:
-    """With a memory of three episodes of twenty events, the last only thought through."""
+    """A folder with a memory of three episodes of twenty events, the last one a simulation."""
     await memory(f"sqlite:///{tmp_path}/pycrorm.db")
     return tmp_path
 
@@ -41,7 +41,7 @@ def number_of_rows(url: str) -> int:
     return sum(counts)
 
 
-def test_a_memory_that_is_as_it_should_be(folder: Path) -> None:
+def test_an_intact_memory_is_reported_as_such(folder: Path) -> None:
     rows = number_of_rows(f"sqlite:///{folder}/pycrorm.db")
     done = pycrorm("verify", cwd=folder)
     assert (done.returncode, done.stderr) == (0, "")
@@ -53,7 +53,7 @@ def test_a_memory_that_is_as_it_should_be(folder: Path) -> None:
     }  # fmt: skip
 
 
-def test_what_differs_is_told_with_both_values_and_ends_with_1_and_damage_with_4(folder: Path) -> None:
+def test_differences_are_printed_with_both_values_and_exit_with_1_and_damage_with_4(folder: Path) -> None:
     file = folder / "pycrorm.db"
     ask_to_change(file, "UPDATE detection__1 SET name = '[b]mïlk' WHERE id >> 31 = 2 AND position = 0")
     ask_to_change(file, "DELETE FROM object_removal__1 WHERE id >> 31 = 3")
@@ -67,7 +67,7 @@ def test_what_differs_is_told_with_both_values_and_ends_with_1_and_damage_with_4
     assert lines[3].endswith("the log is intact, but the tables differ from it; run `pycrorm rebuild`")
     assert len(lines) == 4
     assert pycrorm("verify", "--episode", ID.format(2), cwd=folder).stdout.splitlines()[0] == lines[1]
-    # `last` is the last that really happened.
+    # `last` is the last real episode.
     document = answer("verify", "--episode", "last", cwd=folder, code=1)
     assert (document["episodes"], document["drift"]) == (1, 1)
     [difference] = document["differences"]
@@ -99,7 +99,7 @@ def test_of_many_findings_the_first_are_shown_and_all_are_counted(folder: Path) 
     assert (document["drift"], len(document["differences"])) == (count, min(count, 100))
 
 
-def test_what_cannot_be_verified_is_one_line(folder: Path) -> None:
+def test_an_impossible_verification_is_one_line(folder: Path) -> None:
     done = pycrorm("verify", "--episode", "7", cwd=folder)
     assert (done.returncode, done.stdout) == (2, "")
     assert "there is no episode '7'" in one_line_of(done)
@@ -109,7 +109,7 @@ def test_what_cannot_be_verified_is_one_line(folder: Path) -> None:
     assert "a table is missing: run `pycrorm rebuild`" in one_line_of(done)
 
 
-def test_a_log_without_tables_and_what_is_no_memory_at_all_are_one_line(tmp_path: Path) -> None:
+def test_a_log_without_tables_and_a_database_without_a_memory_are_one_line_each(tmp_path: Path) -> None:
     async def made() -> None:
         log = await EventLog.open(DatabaseAddress.parse(f"sqlite:///{tmp_path}/bare.db"), create=True)
         await log.append(full(1).records)
@@ -130,7 +130,7 @@ def test_a_log_without_tables_and_what_is_no_memory_at_all_are_one_line(tmp_path
         assert reason in one_line_of(done)
 
 
-async def test_what_is_not_in_the_tables_at_all_is_told_a_line_each_and_ends_with_1(folder: Path) -> None:
+async def test_rows_missing_from_the_tables_are_printed_one_a_line_and_exit_with_1(folder: Path) -> None:
     file = folder / "pycrorm.db"
     ask_to_change(file, "UPDATE episode SET parked = 'event 7: by hand' WHERE number = 2")
     ask_to_change(file, "UPDATE episode SET refused = 'events 8 to 9 did not arrive' WHERE number = 3")
@@ -164,14 +164,14 @@ async def test_what_is_not_in_the_tables_at_all_is_told_a_line_each_and_ends_wit
     assert answer("verify", cwd=folder, code=1)["outdated"].endswith("run `pycrorm rebuild`")
 
 
-async def test_on_postgresql_whoever_may_read_may_verify(server: Server, tmp_path: Path) -> None:
+async def test_on_postgresql_every_role_that_may_read_may_verify(server: Server, tmp_path: Path) -> None:
     url = server.new_database()
     database = urlsplit(url).path.removeprefix("/")
     await memory(url)
     for statement in GRANTS:
         ask(url, statement)
     ask(url, f"CREATE ROLE ada_of_{database} LOGIN IN ROLE pycrorm_reader")
-    # Tables that a folder makes later are his to read too.
+    # The role may also read tables that a folder makes later.
     ask(url, f"CREATE ROLE robot_of_{database} LOGIN IN ROLE pycrorm_folder")
     ask(url, f"ALTER ROLE robot_of_{database} IN DATABASE {database} SET role = 'pycrorm_folder'")
     reader = server.url(database, user=f"ada_of_{database}")

@@ -1,4 +1,4 @@
-"""`pycrorm writer` as a daemon and `pycrorm status`, as a user meets them: in processes of their own."""
+"""`pycrorm writer` as a daemon and `pycrorm status`, as users run them: in processes of their own."""
 
 import json
 import signal
@@ -56,8 +56,8 @@ def daemon(folder: Path) -> Iterator[subprocess.Popen[str]]:
     process.communicate()
 
 
-def left(process: subprocess.Popen[str], with_signal: int) -> list[str]:
-    """The lines it said until it left, with exit code 0, within the time it names."""
+def output_until_exit(process: subprocess.Popen[str], with_signal: int) -> list[str]:
+    """Return the lines until it exits, with code 0, within the time that it names."""
     process.send_signal(with_signal)
     _, errors = process.communicate(timeout=15)
     assert process.returncode == 0, errors
@@ -66,12 +66,12 @@ def left(process: subprocess.Popen[str], with_signal: int) -> list[str]:
 
 
 @pytest.mark.parametrize("with_signal", [signal.SIGTERM, signal.SIGINT])
-def test_a_plan_beside_a_daemon_is_in_the_database_when_it_is_over(
+def test_a_plan_beside_a_daemon_is_in_the_database_at_its_end(
     folder: Path, daemon: subprocess.Popen[str], with_signal: int
 ) -> None:
     done = answer("run", "notes.py", "--writer", "daemon", cwd=folder)
     assert [(each["number"], each["status"], each["nodes"]) for each in done["episodes"]] == [(1, "SUCCEEDED", 4)]
-    [appeared, ended, goodbye] = left(daemon, with_signal)
+    [appeared, ended, goodbye] = output_until_exit(daemon, with_signal)
     name = appeared.split()[1]
     assert appeared == f"recorder {name} appeared"
     assert ended == f"recorder {name} has ended; 11 events stored"
@@ -79,7 +79,7 @@ def test_a_plan_beside_a_daemon_is_in_the_database_when_it_is_over(
     assert [path for path in (folder / "pycrorm.db.spool").iterdir() if path.is_dir() and path.name != "stored"] == []
 
 
-def test_who_writes_can_be_said_by_the_environment_and_without_a_daemon_nothing_is_lost(folder: Path) -> None:
+def test_the_environment_may_select_the_writer_and_without_a_daemon_nothing_is_lost(folder: Path) -> None:
     process = start("run", "notes.py", cwd=folder, PYCRORM_WRITER="daemon")
     output, errors = process.communicate(timeout=60)
     assert (process.returncode, output) == (0, "")
@@ -113,7 +113,7 @@ def test_a_plan_killed_beside_a_daemon_is_recovered_by_it(folder: Path, daemon: 
     plan.kill()
     plan.communicate()
     until(folder, lambda document: not document["recorders"])
-    lines = left(daemon, signal.SIGTERM)
+    lines = output_until_exit(daemon, signal.SIGTERM)
     assert [line.split(" ", 2)[2] for line in lines[:4]] == [
         "appeared",
         f"died; {recorder['stored']} events stored",
@@ -124,7 +124,7 @@ def test_a_plan_killed_beside_a_daemon_is_recovered_by_it(folder: Path, daemon: 
 
 
 def until(folder: Path, wanted: Any) -> Any:
-    """What this finds in the status, as soon as it finds anything."""
+    """Return the result of this query on the status, once it has one."""
     deadline = time.monotonic() + 60
     while True:
         done = pycrorm("status", "--json", cwd=folder)
@@ -134,19 +134,19 @@ def until(folder: Path, wanted: Any) -> Any:
         assert time.monotonic() < deadline, done.stdout
 
 
-def test_a_writing_plan_of_its_own_is_left_alone(folder: Path, daemon: subprocess.Popen[str]) -> None:
+def test_a_plan_with_its_own_writer_is_not_drained_by_a_daemon(folder: Path, daemon: subprocess.Popen[str]) -> None:
     plan = start("run", "notes.py:waits", cwd=folder)
     assert plan.stdout is not None
     assert plan.stdout.readline() == "waiting\n"
-    time.sleep(1.2)  # the daemon looks round twice
+    time.sleep(1.2)  # the daemon scans twice
     [recorder] = answer("status", cwd=folder)["recorders"]
     assert (recorder["alive"], recorder["drained"], recorder["synced"]) == (True, "itself", None)
     plan.send_signal(signal.SIGINT)
     plan.communicate(timeout=60)
-    assert left(daemon, signal.SIGTERM) == ["stopped after 0 events of 0 recorders"]
+    assert output_until_exit(daemon, signal.SIGTERM) == ["stopped after 0 events of 0 recorders"]
 
 
-def test_status_says_what_is_stopped_and_how_far_the_tables_are_behind(folder: Path) -> None:
+def test_status_reports_stopped_episodes_and_how_far_the_tables_are_behind(folder: Path) -> None:
     assert pycrorm("run", "notes.py", cwd=folder).returncode == 0
     document = answer("status", cwd=folder)
     assert (document["recorders"], document["episodes"], document["database"]) == ([], [], "ok")

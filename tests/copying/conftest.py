@@ -1,4 +1,6 @@
-"""Memories to be made: `new_url` gives the URL of one that is not there yet, for each kind of database in turn."""
+"""Fixtures for memories to be made: `new_url` returns the URL of one that does not exist yet, for each kind of
+database.
+"""
 
 from __future__ import annotations
 

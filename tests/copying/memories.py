@@ -1,4 +1,4 @@
-"""Memories to copy: random plans, a plan in a real world, a thought, an episode that was lost."""
+"""Memories to copy: random plans, a plan in a real world, a simulation, and an episode that was lost."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ PATIENT = Settings(connect_timeout_s=120)
 
 
 async def random_plans(url: str, seeds: Iterable[int]) -> None:
-    """Each in an episode of its own; some fail, some are cancelled."""
+    """Perform random plans, each in an episode of its own; some fail, some are cancelled."""
     async with Memory.open(url, settings=PATIENT) as memory:
         for seed in seeds:
             await play(seed, memory)
 
 
 async def everything(url: str) -> None:
-    """Of every kind of event and of row some: a world, motions, a thought, random plans, one that was lost."""
+    """Fill it with every kind of event and row: a world, motions, a simulation, random plans, and a lost episode."""
     await random_plans(url, range(12))
     async with Memory.open(url, settings=PATIENT) as memory, memory.episode(description="in the kitchen"):
         with kitchen() as scene:
@@ -49,7 +49,7 @@ async def everything(url: str) -> None:
 
 
 def lost(number: int) -> Script:
-    """An episode that recovery ended, after its first node had begun."""
+    """Return an episode that recovery ended, after its first node had begun."""
     script = Script(number)
     script.records = hand_written(number).records[:5]
     script.put_payload(EpisodeEnded.__name__, LOST)
@@ -57,14 +57,14 @@ def lost(number: int) -> Script:
 
 
 async def notes(url: str, *texts: str) -> None:
-    """An episode of these notes."""
+    """Record an episode of these notes."""
     async with Memory.open(url, settings=PATIENT) as memory, memory.episode(description="notes"):
         for text in texts:
             await NoteActionPerformable(text).perform()
 
 
 async def append(url: str, records: Iterable[Record], *, folded: bool = True) -> None:
-    """Into a log that is opened for that alone."""
+    """Append to a log that is opened for this call alone."""
     log = await EventLog.open(DatabaseAddress.parse(url), create=True)
     try:
         assert await log.append(list(records)) == {}
@@ -76,15 +76,15 @@ async def append(url: str, records: Iterable[Record], *, folded: bool = True) ->
         await log.close()
 
 
-def append_in_a_thread_of_its_own(url: str, records: Iterable[Record]) -> None:
-    """The same for who cannot wait."""
+def append_in_own_thread(url: str, records: Iterable[Record]) -> None:
+    """Append in the same way, for callers that cannot await."""
     thread = threading.Thread(target=lambda: asyncio.run(append(url, records, folded=False)))
     thread.start()
     thread.join()
 
 
 def assert_same(one: str, other: str) -> None:
-    """Both hold the same events, declarations and rows."""
+    """Assert that both hold the same events, declarations and rows."""
     assert logs_of(one) == logs_of(other)
     assert declarations_of(one) == declarations_of(other)
     assert differences(tables_of(one), tables_of(other)) == []
@@ -92,7 +92,7 @@ def assert_same(one: str, other: str) -> None:
 
 
 def assert_merged(target: str, *sources: str) -> None:
-    """The target holds what the sources hold, and nothing else."""
+    """Assert that the target holds the content of the sources, and nothing else."""
     logs = [logs_of(each) for each in sources]
     assert logs_of(target) == {episode: events for each in logs for episode, events in each.items()}
     assert declarations_of(target) == set().union(*map(declarations_of, sources))

@@ -1,4 +1,4 @@
-"""What a copy holds is what its source holds, whatever happened on the way."""
+"""A copy holds what its source holds, whatever interrupts it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from pycrorm_async.settings import Settings
 from tests.copying.memories import (
     PATIENT,
     append,
-    append_in_a_thread_of_its_own,
+    append_in_own_thread,
     assert_merged,
     assert_same,
     everything,
@@ -37,10 +37,10 @@ from tests.test_table_comparison import episode as hand_written
 from tests.test_table_comparison import fill
 
 pytestmark = [pytest.mark.soak_on("postgresql"), pytest.mark.slow]
-"""On a server these take long; there they run in turns, and other modules show that it answers alike."""
+"""These tests take long on a server, where they run in turns; other modules show that the server behaves alike."""
 
 SMALL = Settings(batch_events_max=40, batch_bytes_max=8_000)
-"""So that a copy is many batches, and ends of them fall into episodes."""
+"""Small batches, so that a copy takes many and their boundaries fall within episodes."""
 
 New = Callable[[], str]
 
@@ -54,7 +54,7 @@ def path_of(url: str) -> Path:
     return Path(url.removeprefix("sqlite:///"))
 
 
-# --- all of it --------------------------------------------------------------------------------------------------------
+# --- complete copies --------------------------------------------------------------------------------------------------
 
 
 async def test_a_memory_copied_to_a_server_and_back_is_the_same_and_the_source_is_not_written(
@@ -74,7 +74,7 @@ async def test_a_memory_copied_to_a_server_and_back_is_the_same_and_the_source_i
     assert hashlib.sha256(path_of(source).read_bytes()).digest() == before
 
 
-async def test_what_is_there_already_is_copied_once(new_url: New, new_file: New) -> None:
+async def test_events_that_the_target_has_are_not_copied_again(new_url: New, new_file: New) -> None:
     source, target = new_file(), new_url()
     await notes(source, "a", "b")
     await notes(source, "c")
@@ -86,7 +86,7 @@ async def test_what_is_there_already_is_copied_once(new_url: New, new_file: New)
     assert_same(source, target)
 
 
-async def test_only_the_episodes_asked_for_are_copied_with_their_own_types(new_file: New) -> None:
+async def test_only_the_requested_episodes_are_copied_with_their_own_types(new_file: New) -> None:
     source, target = new_file(), new_file()
     await notes(source, "a")
     await random_plans(source, [1])
@@ -101,7 +101,7 @@ async def test_only_the_episodes_asked_for_are_copied_with_their_own_types(new_f
     assert_same(source, target)
 
 
-async def test_an_episode_that_is_longer_in_the_target_stays_as_it_is(new_file: New) -> None:
+async def test_an_episode_that_is_longer_in_the_target_is_not_changed(new_file: New) -> None:
     source, target = new_file(), new_file()
     records = hand_written(1).records
     await fill(target, [hand_written(1)])
@@ -111,7 +111,7 @@ async def test_an_episode_that_is_longer_in_the_target_stays_as_it_is(new_file: 
     assert_same(target, source)
 
 
-async def test_an_end_that_was_computed_is_copied_as_any_event(new_url: New, new_file: New) -> None:
+async def test_a_computed_end_is_copied_like_any_event(new_url: New, new_file: New) -> None:
     source, target = new_file(), new_url()
     await fill(source, [hand_written(2), lost(1)])
     await copy_episodes(source, target)
@@ -124,7 +124,7 @@ async def test_an_end_that_was_computed_is_copied_as_any_event(new_url: New, new
 # --- two sources ------------------------------------------------------------------------------------------------------
 
 
-async def test_two_memories_in_one_are_the_same_in_any_order_and_at_once(new_url: New, new_file: New) -> None:
+async def test_two_memories_merge_into_the_same_one_in_any_order_and_concurrently(new_url: New, new_file: New) -> None:
     one, other = new_file(), new_file()
     await random_plans(one, range(20, 30))
     await random_plans(other, range(25, 35))
@@ -134,16 +134,16 @@ async def test_two_memories_in_one_are_the_same_in_any_order_and_at_once(new_url
         await copy_episodes(source, first)
     for source in (other, one):
         await copy_episodes(source, second)
-    await copy_episodes(one, at_once, episodes=["3"])  # who makes the tables is not the question here
+    await copy_episodes(one, at_once, episodes=["3"])  # so that the tables are made before the concurrent copies
     await asyncio.gather(*(copy_episodes(each, at_once, settings=SMALL) for each in (one, other, one)))
     for target in (first, second, at_once):
         assert_merged(target, one, other)
 
 
-# --- while somebody records -------------------------------------------------------------------------------------------
+# --- concurrent recorders ---------------------------------------------------------------------------------------------
 
 
-async def test_what_is_being_recorded_is_copied_as_far_as_it_is_and_then_the_rest(new_url: New, new_file: New) -> None:
+async def test_a_running_episode_is_copied_as_far_as_it_is_and_later_completed(new_url: New, new_file: New) -> None:
     source, target = new_file(), new_url()
     await notes(source, "before")
     copies = 0
@@ -210,7 +210,7 @@ def copy_and_print(source: str, target: str) -> None:
     asyncio.run(copy_episodes(source, target, settings=SMALL, watch=lambda done, _: print(done)))
 
 
-async def test_a_copy_that_is_killed_and_repeated_is_whole(new_url: New, new_file: New) -> None:
+async def test_a_copy_that_is_killed_and_repeated_is_complete(new_url: New, new_file: New) -> None:
     rounds = 10
     source, target = new_file(), new_url()
     await random_plans(source, range(40, 56))
@@ -239,7 +239,7 @@ async def test_a_copy_that_is_killed_and_repeated_is_whole(new_url: New, new_fil
     assert_same(source, target)
 
 
-async def test_what_was_appended_and_not_folded_before_a_kill_is_folded_by_the_next_copy(new_file: New) -> None:
+async def test_events_appended_but_not_folded_before_a_kill_are_folded_by_the_next_copy(new_file: New) -> None:
     source, target = new_file(), new_file()
     await fill(source, [hand_written(1)])
     await append(target, [*declarations_as_records(source), *hand_written(1).records], folded=False)
@@ -255,7 +255,7 @@ def declarations_as_records(url: str) -> list[Record]:
 # --- damage -----------------------------------------------------------------------------------------------------------
 
 
-async def test_other_bytes_under_one_key_are_told_and_the_other_episodes_are_copied(
+async def test_other_bytes_under_one_key_are_reported_and_the_other_episodes_are_copied(
     new_url: New, new_file: New
 ) -> None:
     source, target = new_file(), new_url()
@@ -279,7 +279,7 @@ async def test_other_bytes_under_one_key_are_told_and_the_other_episodes_are_cop
     assert after == there
 
 
-async def test_other_bytes_that_come_at_the_same_moment_are_told_and_the_other_episodes_are_copied(
+async def test_other_bytes_that_arrive_during_the_copy_are_reported_and_the_other_episodes_are_copied(
     new_url: New, new_file: New
 ) -> None:
     source, target = new_file(), new_url()
@@ -287,13 +287,13 @@ async def test_other_bytes_that_come_at_the_same_moment_are_told_and_the_other_e
     other = [each._replace(monotonic_ns=4) for each in hand_written(2).records]
     told = 0
 
-    def watch(_done: int, _of: int) -> None:  # events were read and are not appended yet
+    def append_other_bytes(_done: int, _of: int) -> None:  # events were read and are not appended yet
         nonlocal told
         if told == 0:
-            append_in_a_thread_of_its_own(target, other)
+            append_in_own_thread(target, other)
         told += 1
 
-    done = await copy_episodes(source, target, watch=watch)
+    done = await copy_episodes(source, target, watch=append_other_bytes)
     assert [each.damage is None for each in done.episodes] == [True, False, True]
     assert done.episodes[1].damage is not None
     assert "another event is stored under this number" in done.episodes[1].damage
@@ -304,7 +304,7 @@ async def test_other_bytes_that_come_at_the_same_moment_are_told_and_the_other_e
 
 
 @pytest.mark.parametrize("sequence", [1, 7, 12])
-async def test_of_an_episode_with_a_gap_what_comes_before_it_is_copied(new_file: New, sequence: int) -> None:
+async def test_of_an_episode_with_a_gap_the_events_before_it_are_copied(new_file: New, sequence: int) -> None:
     source, target = new_file(), new_file()
     await fill(source, [hand_written(number) for number in (1, 2)])
     ask_to_change(source, "DROP TRIGGER event_is_not_deleted")
@@ -321,7 +321,7 @@ async def test_of_an_episode_with_a_gap_what_comes_before_it_is_copied(new_file:
 
 @pytest.mark.parametrize("damaged", [0, 1])
 @pytest.mark.parametrize("sequence", [1, 7, 12])
-async def test_a_gap_in_what_both_have_is_told(new_file: New, sequence: int, damaged: int) -> None:
+async def test_a_gap_in_both_memories_is_reported(new_file: New, sequence: int, damaged: int) -> None:
     source, target = both = new_file(), new_file()
     for url in both:
         await fill(url, [hand_written(number) for number in (1, 2)])
@@ -333,7 +333,7 @@ async def test_a_gap_in_what_both_have_is_told(new_file: New, sequence: int, dam
 
 
 @pytest.mark.parametrize("payload", ["", "{", '{"node":"four"}', "[1]", '{"node":4,"status":"SUCCEEDED"} x'])
-async def test_of_an_episode_with_an_unreadable_event_what_comes_before_it_is_copied(
+async def test_of_an_episode_with_an_unreadable_event_the_events_before_it_are_copied(
     new_file: New, payload: str
 ) -> None:
     source, target = new_file(), new_file()
@@ -346,7 +346,7 @@ async def test_of_an_episode_with_an_unreadable_event_what_comes_before_it_is_co
     assert (bad.head, good.head, good.damage) == (4, 12, None)
 
 
-async def test_what_a_newer_version_recorded_is_copied_as_it_is(new_url: New, new_file: New) -> None:
+async def test_events_of_a_newer_version_are_copied_unchanged(new_url: New, new_file: New) -> None:
     source, target = new_file(), new_url()
     script = Script(1)
     script.put_payload("HandShaken", b'{"whom": "Ada", "firm": 1.50}')
@@ -358,7 +358,7 @@ async def test_what_a_newer_version_recorded_is_copied_as_it_is(new_url: New, ne
     assert logs_of(target) == logs_of(source)
 
 
-async def test_an_episode_whose_type_the_target_knows_otherwise_is_copied_and_parked_there(new_file: New) -> None:
+async def test_an_episode_whose_type_contradicts_the_target_is_copied_and_parked_there(new_file: New) -> None:
     source, target = new_file(), new_file()
     await notes(target, "a text")
     number = declared("NoteAction", "note_action", field("text", "integer", 2))
@@ -378,7 +378,7 @@ async def test_an_episode_whose_type_the_target_knows_otherwise_is_copied_and_pa
         assert await texts(reading) == ["a text"]
 
 
-# --- wrong usage ------------------------------------------------------------------------------------------------------
+# --- wrong use --------------------------------------------------------------------------------------------------------
 
 
 async def test_a_memory_is_not_copied_into_itself(new_url: New, tmp_path: Path) -> None:
@@ -390,7 +390,7 @@ async def test_a_memory_is_not_copied_into_itself(new_url: New, tmp_path: Path) 
     assert logs_of(url) == before
 
 
-async def test_a_copy_of_the_files_of_a_memory_is_told_apart_from_a_new_one(new_file: New) -> None:
+async def test_a_copy_of_the_files_of_a_memory_is_recognised_as_the_same_memory(new_file: New) -> None:
     source, target = new_file(), new_file()
     await notes(source, "a")
     shutil.copy(path_of(source), path_of(target))
@@ -398,7 +398,7 @@ async def test_a_copy_of_the_files_of_a_memory_is_told_apart_from_a_new_one(new_
         await copy_episodes(source, target)
 
 
-async def test_what_cannot_be_copied_makes_no_target(new_file: New) -> None:
+async def test_an_impossible_copy_makes_no_target(new_file: New) -> None:
     source, target = new_file(), new_file()
     with pytest.raises(DatabaseUnavailable, match="does not exist"):
         await copy_episodes(source, target)
@@ -408,7 +408,7 @@ async def test_what_cannot_be_copied_makes_no_target(new_file: New) -> None:
     assert not path_of(target).exists()
 
 
-async def test_events_that_are_large_are_copied_in_small_batches(new_file: New) -> None:
+async def test_large_events_are_copied_in_small_batches(new_file: New) -> None:
     source, target = new_file(), new_file()
     big = b'{"kind":"action","parameters":{"text":"%s"}}' % (b"x" * 100_000)
     records = [record(episode(1), sequence, payload=big) for sequence in range(1, 1001)]

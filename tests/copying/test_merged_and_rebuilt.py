@@ -1,4 +1,4 @@
-"""Two memories in one, and its tables made anew from its log: what both held, under keys of no database."""
+"""Two memories in one, with tables rebuilt from its log: the content of both, under keys that no database assigned."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ New = Callable[[], str]
 
 
 async def merged(new_file: New, new_url: New, fill_other: Callable[[str], Awaitable[None]]) -> tuple[str, str, str]:
-    """Two sources that share episodes, under numbers of their own, and both of them in a third."""
+    """Two sources that share episodes under numbers of their own, and a third memory with the content of both."""
     one, recorded, other, target = new_file(), new_file(), new_url(), new_url()
     await random_plans(one, range(20, 26))
     await fill(one, [hand_written(1), lost(2)])
@@ -45,7 +45,7 @@ async def test_two_memories_merged_and_then_rebuilt_hold_row_for_row_what_both_h
     assert_merged(target, one, other)
     at = "memory_tables." if target.startswith("postgresql:") else ""
     for change in ("DELETE FROM {}pose__1", "UPDATE {}task_tree_node__1 SET status = 'RUNNING'"):
-        ask_to_change(target, change.format(at))  # what is compared below is none of what was merged
+        ask_to_change(target, change.format(at))  # the comparison below does not use the merged tables
     done = await rebuild_memory(target)
     assert (done.generation, done.parked, done.left) == (2, {}, [])
     assert_merged(target, one, other)
@@ -53,7 +53,7 @@ async def test_two_memories_merged_and_then_rebuilt_hold_row_for_row_what_both_h
 
 
 @pytest.mark.soak_on("postgresql")
-async def test_it_makes_no_difference_which_of_them_was_rebuilt_before(new_url: New, new_file: New) -> None:
+async def test_earlier_rebuilds_of_the_sources_make_no_difference(new_url: New, new_file: New) -> None:
     one, other, target = await merged(new_file, new_url, lambda url: random_plans(url, range(6)))
     before = tables_of(target)
     for each in (one, other):

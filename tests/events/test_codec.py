@@ -1,4 +1,4 @@
-"""Payloads hold what they were given, exactly, or are refused with the path to the fault."""
+"""Payloads hold the recorded values exactly, or are refused with the path to the fault."""
 
 import json
 import math
@@ -30,7 +30,7 @@ def test_a_pose_with_nan_inside_a_value_is_refused() -> None:
 
 
 @pytest.mark.parametrize(("text", "reason"), [("a\x00b", "U\\+0000"), ("\ud800", "surrogate")])
-def test_a_text_the_database_refuses_is_refused_here(text: str, reason: str) -> None:
+def test_a_text_that_the_database_refuses_is_refused_by_the_codec(text: str, reason: str) -> None:
     with pytest.raises(NotEncodable, match=reason) as refused:
         encode(NodeStarted("action", parameters={"text": text}))
     assert refused.value.path == "parameters.text"
@@ -78,7 +78,7 @@ def test_other_bytes_are_a_decode_error() -> None:
 
 
 def test_a_fingerprint_is_the_hash_of_the_bytes() -> None:
-    # reckoned with `printf abc | b2sum -l 128`
+    # computed with `printf abc | b2sum -l 128`
     assert fingerprint(b"abc") == "cf4ab791c62b8d2b2109c90275287816"
 
 

@@ -15,7 +15,7 @@ from pycrorm_async.events.values import FieldDeclared, FieldType
         ("Pour2CupsAction", "pour2_cups_action"),
     ],
 )
-def test_a_table_is_named_as_people_would(dtype: str, table: str) -> None:
+def test_a_table_has_the_snake_case_name_of_its_type(dtype: str, table: str) -> None:
     assert table_name(dtype) == table
 
 
@@ -38,7 +38,7 @@ def test_two_fields_that_share_a_column_are_refused_with_both_names() -> None:
     assert fault_in_fields([declared("a"), declared("A")]) == "fields 'a' and 'A' would share the name 'a'"
 
 
-def test_the_names_pose_and_object_are_kept_for_the_first_of_their_type() -> None:
+def test_the_names_pose_and_object_are_reserved_for_the_first_of_their_type() -> None:
     assert fault_in_fields([declared("pose", "pose"), declared("other", "pose")]) is None
     assert fault_in_fields([declared("other", "pose"), declared("pose", "pose")]) == (
         "field 'pose': the name 'pose' is reserved for the first pose field"
@@ -54,7 +54,7 @@ def test_more_fields_than_slots_are_refused() -> None:
 
 
 @pytest.mark.parametrize("table", ["action", "pose", "event", "pycrorm_log", "sqlite_master", "Object", "pose__1"])
-def test_a_table_of_the_memory_itself_is_refused(table: str) -> None:
+def test_the_name_of_a_table_of_the_memory_itself_is_refused(table: str) -> None:
     fault = fault_in_table(table)
     assert fault is not None
     assert table in fault

@@ -1,4 +1,4 @@
-"""The bytes of every released event shape are frozen: a log written today is read for ever."""
+"""The bytes of every released event shape are frozen: a log written today can be read by all later versions."""
 
 import base64
 import json
@@ -47,8 +47,8 @@ def test_every_event_type_has_a_golden_line() -> None:
     assert {kind for kind, _ in GOLDEN} == set(EVENT_TYPES)
 
 
-def test_the_golden_bytes_mean_what_they_say() -> None:
-    """Values written out by hand, for the shapes that carry the most."""
+def test_the_golden_bytes_decode_to_the_documented_values() -> None:
+    """Values written by hand, for the shapes with the most fields."""
     expected: dict[int, Happening] = {
         2: EpisodeEnded("LOST"),
         3: EpisodeEnded(

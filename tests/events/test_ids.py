@@ -1,4 +1,4 @@
-"""Ids are exact where people use them, and come apart again."""
+"""Ids are exact in every representation, and can be split again."""
 
 import json
 import uuid
@@ -37,7 +37,7 @@ def test_a_row_id_is_packed_as_documented() -> None:
 
 
 @given(numbers, sequences, slots)
-def test_a_row_id_comes_apart_into_what_it_was_made_of(number: int, sequence: int, slot: int) -> None:
+def test_a_row_id_splits_into_its_parts(number: int, sequence: int, slot: int) -> None:
     assert row_key(row_id(number, sequence, slot)) == (number, sequence, slot)
 
 
@@ -47,7 +47,7 @@ def test_row_ids_order_as_episode_sequence_slot(a: tuple[int, int, int], b: tupl
 
 
 @pytest.mark.parametrize("outside", [(2**22, 0, 0), (0, 2**26, 0), (0, 0, 32), (-1, 0, 0)])
-def test_a_row_id_out_of_range_is_never_made(outside: tuple[int, int, int]) -> None:
+def test_a_row_id_out_of_range_is_refused(outside: tuple[int, int, int]) -> None:
     with pytest.raises(AssertionError):
         row_id(*outside)
 

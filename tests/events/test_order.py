@@ -1,4 +1,4 @@
-"""The legal order finds what is broken, says where, and lets honest plans pass."""
+"""The check of legal order reports every violation with its place, and accepts correct plans."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""What an earlier version wrote is read as the present shape, through every version between."""
+"""Events of an earlier version are read in the current shape, through every version between."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SAYING = GOLDEN[4][1]
 
 
 class Placed(Happening, frozen=True):
-    """The third shape of ObjectAdded: the pose has another name, the type is required to be a path."""
+    """The third shape of ObjectAdded: the pose has another name, and the type must be a path."""
 
     version = 3
 
@@ -52,31 +52,31 @@ def test_a_golden_event_of_the_first_version_is_read_in_its_third_shape() -> Non
     assert LATER.decode("ObjectAdded", MILK, 1) == AS_PLACED
 
 
-def test_one_of_the_second_version_takes_the_last_step_alone() -> None:
+def test_an_event_of_the_second_version_takes_the_last_step_alone() -> None:
     second = MILK.replace(b'"pose"', b'"placed"')
     assert LATER.decode("ObjectAdded", second, 2) == AS_PLACED
 
 
 @pytest.mark.parametrize("version", [3, None])
-def test_one_of_the_present_version_takes_no_step(version: int | None) -> None:
+def test_an_event_of_the_current_version_takes_no_step(version: int | None) -> None:
     assert LATER.decode("ObjectAdded", encode(AS_PLACED), version) == AS_PLACED
     with pytest.raises(msgspec.DecodeError):
         LATER.decode("ObjectAdded", MILK, version)
 
 
 @pytest.mark.parametrize("version", [4, 0, -1])
-def test_a_version_that_is_not_known_is_told_with_the_one_that_is(version: int) -> None:
+def test_an_unknown_version_is_refused_with_the_known_one(version: int) -> None:
     with pytest.raises(UnknownShape, match=rf"^ObjectAdded has version {version}, this version knows 3$"):
         LATER.decode("ObjectAdded", MILK, version)
 
 
 @pytest.mark.parametrize("payload", [b'{"name":"milk"}', b"[]", b"{", b'{"pose":1,"object_type":"MILK","name":"m"}'])
-def test_old_bytes_that_are_not_of_their_shape_are_a_decode_error(payload: bytes) -> None:
+def test_old_bytes_that_do_not_have_their_shape_are_a_decode_error(payload: bytes) -> None:
     with pytest.raises(msgspec.DecodeError):
         LATER.decode("ObjectAdded", payload, 1)
 
 
-def test_numbers_and_texts_that_no_step_touches_are_exactly_the_same() -> None:
+def test_numbers_and_texts_that_no_step_changes_stay_exactly_the_same() -> None:
     pose = PoseValue((5e-324, -0.0, 0.1), (1e308, 0.0, 0.0, 1.0), "ü", 2**63 - 1)
     old = encode(ObjectAdded("\u2028\U0001f95b", "MILK", pose, {"a": 1.7976931348623157e308}, 2**53 + 1))
     read = LATER.decode("ObjectAdded", old, 1)
@@ -84,7 +84,7 @@ def test_numbers_and_texts_that_no_step_touches_are_exactly_the_same() -> None:
     assert b'"position":[5e-324,-0.0,0.1]' in encode(read)
 
 
-def test_a_shape_of_which_a_step_is_missing_is_refused_before_anything_is_read() -> None:
+def test_a_shape_without_one_of_its_steps_is_refused_before_anything_is_read() -> None:
     with pytest.raises(AssertionError):
         Decoder(EVENT_TYPES | {"ObjectAdded": Placed}, {("ObjectAdded", 1): renamed})
 
@@ -98,7 +98,7 @@ def test_there_is_a_step_for_every_version_that_was_ever_written() -> None:
 
 
 class Described(Happening, frozen=True):
-    """A second shape of DesignatorTypeDeclared. That it is the second must stand in its bytes."""
+    """A second shape of DesignatorTypeDeclared, whose bytes must contain its version."""
 
     version = 2
 
@@ -107,7 +107,7 @@ class Described(Happening, frozen=True):
     fields: tuple[FieldDeclared, ...] = ()
 
 
-def test_a_declaration_says_its_version_in_its_bytes() -> None:
+def test_the_bytes_of_a_declaration_contain_its_version() -> None:
     def described(old: dict[str, Any]) -> dict[str, Any]:
         return old | {"names": [old["dtype"], old["table"]]}
 
@@ -118,8 +118,8 @@ def test_a_declaration_says_its_version_in_its_bytes() -> None:
         assert later.decode("DesignatorTypeDeclared", payload, version) == expected
 
 
-def test_a_declaration_of_a_newer_version_is_refused_by_its_own_name_and_no_other_is() -> None:
-    newer = b'{"version":2,' + SAYING[1:]  # it could be read, and might mean something else
+def test_a_declaration_of_a_newer_version_is_refused_by_its_name_and_no_other_is() -> None:
+    newer = b'{"version":2,' + SAYING[1:]  # it could be read, and might have another meaning
     united = unite(Layout(), [newer, SAYING])
     assert list(united.accepted) == [fingerprint(SAYING)]
     assert united.refused == {
@@ -128,10 +128,10 @@ def test_a_declaration_of_a_newer_version_is_refused_by_its_own_name_and_no_othe
     }
 
 
-def test_the_first_version_of_a_declaration_has_the_bytes_and_the_name_it_ever_had() -> None:
+def test_the_first_version_of_a_declaration_has_its_original_bytes_and_name() -> None:
     declared = DesignatorTypeDeclared(
         "action", "SayingAction", "saying_action", fields=(FieldDeclared("text", "text", "text", 2),)
     )
     assert encode(declared) == SAYING
-    # reckoned with `printf %s PAYLOAD | b2sum -l 128`
+    # computed with `printf %s PAYLOAD | b2sum -l 128`
     assert fingerprint(SAYING) == "998d14b09808e3a24f67631e0e367fcb"

@@ -1,4 +1,6 @@
-"""Pick-ups of the standard experiment by geometry and inverse kinematics alone: thousands in a second, no world."""
+"""Compute pick-ups of the standard experiment by geometry and inverse kinematics alone: thousands a second, no
+world.
+"""
 
 from __future__ import annotations
 
@@ -16,8 +18,8 @@ from pycrorm_async.world.robots.robot_description import PR2
 MILK = Pose((1.3, 1.0, 0.9))
 
 
-def works(choice: PickUpChoice, milk: Pose = MILK) -> bool:
-    """Whether a PR2 that faces the milk from there, torso down, arms stretched ahead, picks it up."""
+def succeeds(choice: PickUpChoice, milk: Pose = MILK) -> bool:
+    """Return whether a PR2 that faces the milk from there, torso down, arms stretched ahead, picks it up."""
     floor = milk @ Pose((choice.relative_x, choice.relative_y, -milk.position.z))
     ahead = math.atan2(milk.position.y - floor.position.y, milk.position.x - floor.position.x)
     base = Pose(floor.position, yaw_quaternion(ahead))
@@ -30,7 +32,7 @@ def works(choice: PickUpChoice, milk: Pose = MILK) -> bool:
 
 
 def frame_of(choices: Iterable[PickUpChoice]) -> pd.DataFrame:
-    """As a memory's `dataframe` gives them: members by name."""
+    """Return them as a memory's `dataframe` does, with enum members by name."""
     return pd.DataFrame(
         [(each.arm.name, each.grasp.name, each.relative_x, each.relative_y) for each in choices],
         columns=["arm", "grasp", "object_x", "object_y"],

@@ -12,17 +12,17 @@ from pycrorm_async.learning.policies.policy import PickUpChoice, Policy
 from pycrorm_async.world.enums import Arms, Grasp
 
 RETAINED = 0.94107
-"""Of the normal distribution, what lies in the square and not in the hole: 0.9953² - 0.2227²."""
+"""The share of the normal distribution in the square and outside the hole: 0.9953² - 0.2227²."""
 
 
 def density(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    """By hand: a variance of 0.5 in both directions, cut to where the robot may stand."""
+    """Compute it by hand: a variance of 0.5 in both directions, cut to the possible base positions."""
     allowed = (np.maximum(abs(x), abs(y)) < 2.0) & (np.maximum(abs(x), abs(y)) > 0.2)
     return np.where(allowed, np.exp(-(x**2) - y**2) / math.pi, 0.0) / RETAINED
 
 
 def integral(x_min: float, x_max: float, y_min: float, y_max: float) -> float:
-    """Of that density, by the middles of 1000 x 1000 cells."""
+    """Return the integral of that density, by the midpoints of 1000 x 1000 cells."""
     x, dx = np.linspace(x_min, x_max, 1000, endpoint=False, retstep=True)
     y, dy = np.linspace(y_min, y_max, 1000, endpoint=False, retstep=True)
     values = density(x[:, None] + dx / 2, y[None, :] + dy / 2)
@@ -34,7 +34,7 @@ def test_the_hole_and_the_edges_leave_094107_of_the_normal_distribution() -> Non
     assert whole_plane.probability(Evidence(region=AROUND_OBJECT)) == pytest.approx(RETAINED, abs=5e-6)
 
 
-def test_the_density_is_that_of_two_normal_distributions_an_eighth_for_each_arm_and_grasp() -> None:
+def test_the_density_is_that_of_two_normal_distributions_and_an_eighth_for_each_arm_and_grasp() -> None:
     x, y = np.random.default_rng(1).uniform(-2.2, 2.2, (2, 1000))
     x[:200], y[:200] = x[:200] / 10, y[:200] / 10
     choices = [PickUpChoice(Arms.RIGHT, Grasp.TOP, *place) for place in zip(x.tolist(), y.tolist(), strict=True)]
@@ -47,7 +47,7 @@ def test_probabilities_of_rectangles_are_the_integrals_of_the_density(corner: tu
     assert default_policy().probability(there) == pytest.approx(integral(*corner) / 2, rel=1e-3)
 
 
-def test_samples_are_spread_as_the_density_says() -> None:
+def test_samples_are_distributed_as_the_density() -> None:
     choices = default_policy().sample(np.random.default_rng(69), 40_000)
     places = np.array([choice[2:] for choice in choices])
     farthest = abs(places).max(axis=1)
@@ -63,7 +63,7 @@ def test_samples_are_spread_as_the_density_says() -> None:
 
 
 @pytest.mark.slow
-def test_a_conditioned_policy_draws_what_is_left_when_all_else_is_thrown_away() -> None:
+def test_a_conditioned_policy_samples_the_matching_part_of_the_distribution() -> None:
     evidence = Evidence(
         arms=frozenset({Arms.RIGHT}),
         region=Region((Rectangle(-1.0, 0.3, -0.5, 0.5), Rectangle(0.3, 0.6, 0.1, 1.2))),
@@ -98,13 +98,13 @@ def test_its_mode_is_the_four_places_next_to_the_hole() -> None:
     }
 
 
-def test_it_is_the_same_at_every_height() -> None:
+def test_the_policy_is_the_same_at_every_height() -> None:
     conditioned = default_policy().condition(Evidence(height=(0.5, 0.6)))
     choices = default_policy().sample(np.random.default_rng(4), 10)
     assert conditioned.likelihood(choices).tolist() == default_policy().likelihood(choices).tolist()
 
 
-def test_nobody_stands_in_the_hole_or_beyond_the_edges() -> None:
+def test_no_sample_is_in_the_hole_or_beyond_the_edges() -> None:
     for nowhere in (Rectangle(-0.2, 0.2, -0.2, 0.2), Rectangle(2.0, 3.0, 0.0, 1.0)):
         evidence = Evidence(region=Region((nowhere,)))
         assert default_policy().probability(evidence) == 0.0

@@ -1,4 +1,6 @@
-"""The whole experiment with real worker processes: counted and remembered alike, killed, interrupted and resumed."""
+"""The whole experiment with real worker processes: counts and records agree, also when killed, interrupted and
+resumed.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,7 @@ pytestmark = pytest.mark.slow
 
 SMALL = Experiment(rollouts=700, evaluate=200, held_out=200, workers=2)
 LONGER = Experiment(rollouts=1_500, evaluate=50, held_out=50, workers=2)
-"""At its first news most of it is still to be done, also when the machine is busy and news are looked at late."""
+"""At its first report most of it must remain, also when the machine is busy and reports are read late."""
 
 
 @pytest.fixture
@@ -46,20 +48,20 @@ def workers_running() -> list[psutil.Process]:
 
 
 def after(rollouts: int, act: Callable[[], None]) -> Callable[[str, int, int, Tally], None]:
-    """A watch that acts once, when so many rollouts are done."""
+    """Return a progress callback that acts once, when this many rollouts are done."""
     acted = False
 
-    def watch(_name: str, done: int, _total: int, _tally: Tally) -> None:
+    def report(_name: str, done: int, _total: int, _tally: Tally) -> None:
         nonlocal acted
         if done >= rollouts and not acted:
             acted = True
             act()
 
-    return watch
+    return report
 
 
 @pytest.mark.soak_on("postgresql")
-async def test_learned_from_what_is_remembered_it_succeeds_several_times_as_often(place: MemoryLocation) -> None:
+async def test_a_policy_learned_from_the_memory_succeeds_several_times_as_often(place: MemoryLocation) -> None:
     told: dict[str, tuple[int, int]] = {}
     learned = await run(SMALL, place, lambda name, done, total, _: told.update({name: (done, total)}))
     assert [(each.name, each.tally.rollouts) for each in learned.phases] == [
@@ -91,7 +93,7 @@ async def test_learned_from_what_is_remembered_it_succeeds_several_times_as_ofte
     assert {each.rollouts for each in studied.costs} == {240, 200}
     turned = [each for each in studied.scenes if each.scene.yaw]
     assert turned
-    for each in turned:  # in the object's own frame nothing is other than it was
+    for each in turned:  # in the object's own frame nothing else has changed
         assert each.learned == studied.scenes[0].learned
     assert ask(place.url, f"SELECT count(*) FROM {MoveAndPickUpAction.__tablename__}") == [(everything,)]
 
@@ -108,7 +110,7 @@ async def fails_without_resume(place: MemoryLocation) -> None:
 
 
 async def finished(experiment: Experiment, place: MemoryLocation) -> ExperimentResult:
-    """What is left of it, held against an experiment that nothing happened to."""
+    """Compare what is left of it with an experiment that was not disturbed."""
     learned = await run(replace(experiment, resume=True, workers=1), place)
     for phase in learned.phases:
         async with Reading.open(place.url) as reading:
@@ -127,7 +129,7 @@ def kill_one() -> None:
     workers_running()[0].kill()
 
 
-async def test_a_worker_that_is_killed_is_told_and_resumed_nothing_is_lost_or_counted_twice(tmp_path: Path) -> None:
+async def test_a_killed_worker_is_reported_and_resuming_loses_and_doubles_nothing(tmp_path: Path) -> None:
     place = MemoryLocation(f"sqlite:///{tmp_path}/memory.db")
     with pytest.raises(WorkerLost, match="a rollout worker was killed by SIGKILL; its finished rollouts are recorded"):
         await run(LONGER, place, after(1, kill_one))
@@ -139,7 +141,9 @@ async def test_a_worker_that_is_killed_is_told_and_resumed_nothing_is_lost_or_co
     assert learned.default.done_now == 1_500 - len(before)
 
 
-async def test_interrupted_the_workers_stop_after_the_rollout_they_are_at_and_it_can_be_resumed(tmp_path: Path) -> None:
+async def test_interrupted_workers_finish_their_current_rollout_and_the_experiment_can_be_resumed(
+    tmp_path: Path,
+) -> None:
     place = MemoryLocation(f"sqlite:///{tmp_path}/memory.db")
     task: asyncio.Task[ExperimentResult]
 
@@ -155,7 +159,7 @@ async def test_interrupted_the_workers_stop_after_the_rollout_they_are_at_and_it
     assert 0 < learned.default.done_now < 1_500
 
 
-async def test_when_the_one_who_started_them_dies_the_workers_end_and_nothing_is_lost(tmp_path: Path) -> None:
+async def test_the_workers_end_when_their_parent_dies_and_nothing_is_lost(tmp_path: Path) -> None:
     url = f"sqlite:///{tmp_path}/memory.db"
     command = [sys.executable, "-m", "pycrorm_async", "learn", "--url", url, "--rollouts", "5000", "--workers", "2"]
     process = await asyncio.create_subprocess_exec(*command, cwd=tmp_path, stderr=asyncio.subprocess.PIPE)
@@ -168,7 +172,7 @@ async def test_when_the_one_who_started_them_dies_the_workers_end_and_nothing_is
     await finished(replace(SMALL, workers=1, evaluate=50, held_out=50), MemoryLocation(url))
 
 
-async def test_the_one_who_drains_may_leave_and_what_comes_after_is_drained_too(tmp_path: Path) -> None:
+async def test_the_drainer_may_exit_and_later_records_are_drained_too(tmp_path: Path) -> None:
     place = MemoryLocation(f"sqlite:///{tmp_path}/memory.db")
     job = Job(Scene(), default_policy(), 5)
     leave, ready = asyncio.Event(), asyncio.Event()
@@ -184,7 +188,7 @@ async def test_the_one_who_drains_may_leave_and_what_comes_after_is_drained_too(
         assert len(await read_rollouts(reading, Scene(), name_of(default_policy()), 5, 20)) == 20
 
 
-async def test_of_experiments_on_one_memory_the_one_that_is_over_first_leaves_the_other_at_work(tmp_path: Path) -> None:
+async def test_of_two_experiments_on_one_memory_the_first_to_end_leaves_the_other_running(tmp_path: Path) -> None:
     place = MemoryLocation(f"sqlite:///{tmp_path}/memory.db")
     small = replace(SMALL, rollouts=150, evaluate=20, held_out=60, workers=1, min_samples_leaf=5)
     first, second = await asyncio.gather(run(small, place), run(replace(small, seed=70, rollouts=500), place))
@@ -217,10 +221,10 @@ async def test_held_out_rollouts_without_a_success_leave_the_coverage_unknown(tm
     assert learned.coverage is None
 
 
-async def test_a_study_looks_at_the_rollouts_of_its_experiment_and_no_others(
+async def test_a_study_evaluates_the_rollouts_of_its_experiment_and_no_others(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """There are 500 here, but of the first 500 not all."""
+    """There are 500 rollouts here, but not all of them among the first 500."""
     monkeypatch.setattr("pycrorm_async.learning.evaluation.scene_variants", lambda _scene: ())
     place = MemoryLocation(f"sqlite:///{tmp_path}/memory.db")
     async with Workers(1, place) as workers:
@@ -233,13 +237,13 @@ async def test_a_study_looks_at_the_rollouts_of_its_experiment_and_no_others(
 
 
 @pytest.mark.parametrize("collisions", [True, False])
-def test_a_policy_is_tried_elsewhere_with_collisions_and_without(collisions: bool) -> None:
+def test_a_policy_is_evaluated_elsewhere_with_collisions_and_without(collisions: bool) -> None:
     scenes = scene_variants(Scene(collisions=collisions))
     assert len(set(scenes)) == len(scenes)
     assert replace(scenes[0], collisions=not collisions) in scenes
 
 
-async def test_too_few_successes_are_told_and_all_rollouts_kept(tmp_path: Path) -> None:
+async def test_too_few_successes_are_reported_and_all_rollouts_kept(tmp_path: Path) -> None:
     place = MemoryLocation(f"sqlite:///{tmp_path}/memory.db")
     with pytest.raises(NotEnoughExperience, match="too few to learn from"):
         await run(replace(SMALL, rollouts=40, workers=1), place)
@@ -256,7 +260,7 @@ async def test_a_second_round_learns_from_the_first_ones_policy_too(tmp_path: Pa
     assert learned.evaluation.tally.success_rate > 0.5
 
 
-async def test_what_is_rolled_out_is_not_rolled_out_again_when_learning_from_it_had_failed(
+async def test_rollouts_are_not_repeated_when_learning_from_them_had_failed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     place = MemoryLocation(f"sqlite:///{tmp_path}/memory.db")
@@ -288,7 +292,7 @@ async def test_each_rollout_may_be_an_episode(tmp_path: Path) -> None:
     assert recorded_rollouts.tally_of(frame) == tally
 
 
-async def test_what_is_not_to_be_remembered_leaves_no_trace_beside_what_is(tmp_path: Path) -> None:
+async def test_rollouts_without_recording_leave_no_trace_beside_recorded_ones(tmp_path: Path) -> None:
     place = MemoryLocation(f"sqlite:///{tmp_path}/memory.db")
     async with Workers(1, place) as workers:
         job = Job(Scene(), default_policy(), 5)
@@ -300,7 +304,7 @@ async def test_what_is_not_to_be_remembered_leaves_no_trace_beside_what_is(tmp_p
         assert len(await read_rollouts(reading, Scene(), name_of(default_policy()), 5, 30)) == 30
 
 
-async def test_what_a_worker_raises_is_told_in_one_line(tmp_path: Path) -> None:
+async def test_an_exception_of_a_worker_is_reported_in_one_line(tmp_path: Path) -> None:
     job = Job(Scene(position=(float("nan"), 0.0, 0.0)), default_policy(), 1)
     async with Workers(1, MemoryLocation(f"sqlite:///{tmp_path}/memory.db")) as workers:
         with pytest.raises(WorkerLost, match="a rollout worker failed: PoseRefused") as told:
@@ -308,7 +312,7 @@ async def test_what_a_worker_raises_is_told_in_one_line(tmp_path: Path) -> None:
     assert "\n" not in str(told.value)
 
 
-def test_what_cannot_be_an_experiment_is_refused() -> None:
+def test_an_impossible_experiment_is_refused() -> None:
     with pytest.raises(CallerError, match="needs held-out >= 1, got 0"):
         Experiment(held_out=0)
     with pytest.raises(CallerError, match="needs workers >= 1, got 0"):

@@ -1,4 +1,4 @@
-"""A tree of far more leaves than Python lets a function call itself: learned, asked, saved and read again."""
+"""A tree with far more leaves than Python's recursion limit: learned, queried, saved and read again."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_a_tree_has_more_leaves_than_python_nests_calls(learned: Policy, choices
     assert learned.probability(LEFT) == pytest.approx(np.mean([each.arm is Arms.LEFT for each in choices]))
 
 
-def test_it_answers_under_evidence(learned: Policy) -> None:
+def test_a_large_tree_answers_under_evidence(learned: Policy) -> None:
     conditioned = learned.condition(LEFT).condition(BESIDE)
     drawn = conditioned.sample(np.random.default_rng(7), 500)
     assert {each.arm for each in drawn} == {Arms.LEFT}
@@ -50,7 +50,7 @@ def test_it_answers_under_evidence(learned: Policy) -> None:
     assert conditioned.mode().probability(BESIDE) == pytest.approx(1.0)
 
 
-def test_it_is_the_same_from_its_file(learned: Policy, tmp_path: Path) -> None:
+def test_a_large_tree_is_the_same_from_its_file(learned: Policy, tmp_path: Path) -> None:
     save_policy(learned, tmp_path / "policy.json")
     loaded = load_policy(tmp_path / "policy.json")
     assert loaded == learned

@@ -1,4 +1,4 @@
-"""Moving and picking up as a policy would have it: which alternatives there are, and where they stand."""
+"""MoveAndPickUp with a policy: its alternatives, and the base poses that they have."""
 
 from __future__ import annotations
 
@@ -38,21 +38,21 @@ def kitchen() -> Iterator[Stage]:
 
 
 def at(x: float, y: float, *, height: tuple[float, float] | None = None) -> Policy:
-    """A policy that stands in one square of a millimetre only."""
+    """A policy whose samples are all within one square millimetre."""
     here, there = (Linear((each - 5e-4, each + 5e-4), (0.0, 1.0)) for each in (x, y))
     known = None if height is None else Linear(height, (0.0, 1.0))
     return Policy((Leaf(1.0, (0.5, 0.5), (0.25,) * len(GRASPS), here, there, known),))
 
 
 def seen_from_object(target: Pose, base: Pose) -> tuple[float, float]:
-    """By trigonometry: where the base is in the axes of an upright object."""
+    """Return, by trigonometry, the base position in the axes of an upright object."""
     dx, dy = base.position.x - target.position.x, base.position.y - target.position.y
     turned = -2 * math.atan2(target.orientation.z, target.orientation.w)
     return dx * math.cos(turned) - dy * math.sin(turned), dx * math.sin(turned) + dy * math.cos(turned)
 
 
 @pytest.mark.parametrize("degrees", [0, 90, -135])
-def test_the_base_stands_where_the_choice_says_in_the_objects_own_axes(degrees: float) -> None:
+def test_the_base_has_the_chosen_position_in_the_objects_own_axes(degrees: float) -> None:
     with Scene(position=(-0.4, 2.0, 0.8), yaw=math.radians(degrees)).entered() as there:
         action = MoveAndPickUp(there.target)
         done = action.chosen(PickUpChoice(Arms.RIGHT, Grasp.LEFT, -0.6, 0.25))
@@ -61,7 +61,7 @@ def test_the_base_stands_where_the_choice_says_in_the_objects_own_axes(degrees: 
         assert seen_from_object(there.target.pose, done.standing_position) == pytest.approx((-0.6, 0.25))
 
 
-def test_for_an_object_that_leans_the_base_is_on_the_floor_where_its_frame_has_that_place(stage: Stage) -> None:
+def test_for_a_tilted_object_the_base_is_on_the_floor_below_the_chosen_position(stage: Stage) -> None:
     leaning = Pose([1.3, 1.0, 0.9], [0.2, -0.1, 0.3, 0.9])
     stage.target.set_pose(leaning)
     stand = MoveAndPickUp(stage.target).chosen(PickUpChoice(Arms.LEFT, Grasp.FRONT, 0.5, -0.4)).standing_position
@@ -72,7 +72,7 @@ def test_for_an_object_that_leans_the_base_is_on_the_floor_where_its_frame_has_t
         MoveAndPickUp(stage.target).chosen(PickUpChoice(Arms.LEFT, Grasp.FRONT, 0.5, -0.4))
 
 
-def test_plain_samples_are_those_the_policy_draws_and_chance_is_the_callers(stage: Stage) -> None:
+def test_plain_samples_are_those_of_the_policy_and_the_generator_is_the_callers(stage: Stage) -> None:
     np.random.seed(1)
     before = np.random.get_state()[1].copy()  # type: ignore[index]
     drawn = default_policy().sample(np.random.default_rng(3), 7)
@@ -84,7 +84,7 @@ def test_plain_samples_are_those_the_policy_draws_and_chance_is_the_callers(stag
     assert (np.random.get_state()[1] == before).all()  # type: ignore[index]
 
 
-def test_arms_and_grasps_that_are_asked_for_are_the_only_ones(stage: Stage) -> None:
+def test_only_the_requested_arms_and_grasps_are_sampled(stage: Stage) -> None:
     action = MoveAndPickUp(stage.target, [Arms.RIGHT], [Grasp.TOP, Grasp.LEFT], samples=40)
     assert {each.arm for each in action.plain()} == {Arms.RIGHT}
     assert {each.grasp for each in action.plain()} == {Grasp.TOP, Grasp.LEFT}
@@ -94,13 +94,13 @@ def test_arms_and_grasps_that_are_asked_for_are_the_only_ones(stage: Stage) -> N
         MoveAndPickUp(stage.target, samples=0)
 
 
-def test_samples_that_fit_the_scene_are_clear_of_it_and_see_the_object(kitchen: Stage) -> None:
+def test_samples_for_the_scene_are_free_of_obstacles_and_see_the_object(kitchen: Stage) -> None:
     action = MoveAndPickUp(kitchen.target, samples=60, rng=np.random.default_rng(1))
     stands = [each.standing_position for each in action]
     assert len(stands) == 60
     anywhere = MoveAndPickUp(kitchen.target, samples=60, rng=np.random.default_rng(1)).plain()
     clear = [each for each in anywhere if nearest_furniture(kitchen, each.standing_position) >= 0.25]
-    assert len(clear) < 50  # else the kitchen would be in nobody's way
+    assert len(clear) < 50  # otherwise the kitchen would block no sample
     for stand in stands:
         assert nearest_furniture(kitchen, stand) >= 0.25  # 0.3 m, but for half the diagonal of a cell
         eye = (stand.position.x, stand.position.y, 1.45)
@@ -108,7 +108,7 @@ def test_samples_that_fit_the_scene_are_clear_of_it_and_see_the_object(kitchen: 
 
 
 def nearest_furniture(stage: Stage, stand: Pose) -> float:
-    """Asked of Bullet: how far a thin post on that place, as high as the robot, is from the kitchen."""
+    """Return Bullet's distance between the kitchen and a thin post at that place, as high as the robot."""
     bullet, client = engine(), stage.world.client
     shape = bullet.createCollisionShape(bullet.GEOM_CYLINDER, radius=0.001, height=1.6, physicsClientId=client)
     post = bullet.createMultiBody(
@@ -119,18 +119,18 @@ def nearest_furniture(stage: Stage, stand: Pose) -> float:
     return float(min(point[8] for point in points))
 
 
-def test_the_likeliest_come_first(kitchen: Stage) -> None:
+def test_the_most_likely_samples_come_first(kitchen: Stage) -> None:
     action = MoveAndPickUp(kitchen.target, samples=30, rng=np.random.default_rng(2))
     densities = []
     for each in action:
         x, y = seen_from_object(kitchen.target.pose, each.standing_position)
-        densities.append(math.exp(-(x**2) - y**2))  # the default policy's, but for a constant
+        densities.append(math.exp(-(x**2) - y**2))  # the default policy's, up to a constant
     assert densities == sorted(densities, reverse=True)
     assert len(set(densities)) == 30
     assert action.resolve() is not None
 
 
-def test_what_begins_at_the_mode_stands_where_the_density_is_highest(stage: Stage) -> None:
+def test_a_sequence_that_begins_with_the_mode_starts_where_the_density_is_highest(stage: Stage) -> None:
     crowded, thin = at(-0.6, 0.0).leaves[0], at(0.6, 0.0).leaves[0]
     policy = Policy((replace(thin, weight=0.3), replace(crowded, weight=0.7)))
     action = MoveAndPickUp(stage.target, policy=policy, samples=20)
@@ -138,7 +138,7 @@ def test_what_begins_at_the_mode_stands_where_the_density_is_highest(stage: Stag
     assert places == [pytest.approx((-0.6, 0.0), abs=1e-3)] * 20
 
 
-def test_where_nobody_can_stand_the_object_is_unreachable(kitchen: Stage) -> None:
+def test_an_object_without_a_free_base_position_is_unreachable(kitchen: Stage) -> None:
     inside = MoveAndPickUp(kitchen.target, policy=at(0.1, -0.3))  # in the worktop
     with pytest.raises(ObjectUnreachable, match="no way to pick up milk in this scene"):
         inside.resolve()
@@ -147,7 +147,7 @@ def test_where_nobody_can_stand_the_object_is_unreachable(kitchen: Stage) -> Non
     assert len(list(inside.plain())) == 20  # whatever is around
 
 
-def test_experience_with_other_heights_is_none_with_this_one(stage: Stage) -> None:
+def test_experience_with_other_heights_does_not_apply_to_this_one(stage: Stage) -> None:
     policy = at(-0.6, 0.0, height=(0.55, 0.65))
     with pytest.raises(ObjectUnreachable, match="no way to pick up milk at this height"):
         list(MoveAndPickUp(stage.target, policy=policy).plain())
@@ -157,7 +157,7 @@ def test_experience_with_other_heights_is_none_with_this_one(stage: Stage) -> No
     assert len(list(MoveAndPickUp(stage.target, policy=policy).plain())) == 20
 
 
-async def test_tried_in_turn_some_sample_succeeds(stage: Stage) -> None:
+async def test_one_of_the_samples_succeeds_when_tried_in_turn(stage: Stage) -> None:
     action = MoveAndPickUp(stage.target, samples=60, rng=np.random.default_rng(69))
     await Retry(action, max_tries=60).perform()
     assert stage.target.attached_to is stage.robot
@@ -177,7 +177,7 @@ async def test_an_arm_that_would_be_in_the_furniture_is_a_failure_where_collisio
                 assert there.target.attached_to is None
 
 
-async def test_what_an_arm_holds_counts_as_the_arm_does() -> None:
+async def test_a_held_object_counts_as_the_arm_does() -> None:
     with Scene(collisions=True).entered() as there:
         await MoveAndPickUp(there.target).chosen(PickUpChoice(Arms.LEFT, Grasp.FRONT, -0.67, 0.0)).perform()
         goal = there.robot.link_pose("l_gripper_tool_frame")
@@ -204,7 +204,7 @@ def test_cells_become_rectangles_that_cover_them_once() -> None:
 
 
 @pytest.mark.parametrize("yaw", [math.pi / 2, 0.7])
-def test_a_turned_object_is_grounded_in_the_same_places_of_the_map(yaw: float) -> None:
+def test_a_rotated_object_has_the_same_grounded_places_in_the_map(yaw: float) -> None:
     east, north = np.random.default_rng(1).uniform(-1.4, 1.4, (2, 4_000))
     inside = []
     for turn in (0.0, yaw):
@@ -217,7 +217,7 @@ def test_a_turned_object_is_grounded_in_the_same_places_of_the_map(yaw: float) -
     assert (inside[0] == inside[1]).mean() > 0.95  # but for cells on the edges
 
 
-def test_without_a_world_or_a_robot_it_says_so() -> None:
+def test_without_a_world_or_a_robot_an_error_is_raised() -> None:
     with BulletWorld():
         milk = Object("milk", ObjectType.MILK)
         with pytest.raises(NoRobotHere, match="no robot in the world"):

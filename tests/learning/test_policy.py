@@ -63,7 +63,7 @@ def test_the_first_and_the_last_knot_belong_to_a_leaf() -> None:
     assert (TWO.likelihood(ends) > 0).all()
 
 
-def test_evidence_on_the_height_weighs_the_leaves_anew() -> None:
+def test_evidence_on_the_height_changes_the_weights_of_the_leaves() -> None:
     low, high = TWO.condition(Evidence(height=(0.5, 0.6))), TWO.condition(Evidence(height=(0.75, 0.9)))
     assert low.probability(Evidence(arms=LEFT)) == pytest.approx(1.0)
     assert high.probability(Evidence(arms=LEFT)) == pytest.approx(0.2)
@@ -99,7 +99,7 @@ def test_conditioning_twice_is_conditioning_on_both() -> None:
     assert TWO.condition(first).probability(second) == pytest.approx(TWO.probability(both) / TWO.probability(first))
 
 
-def test_what_contradicts_itself_is_impossible() -> None:
+def test_contradicting_evidence_is_impossible() -> None:
     apart = [
         (Evidence(arms=LEFT), Evidence(arms=RIGHT)),
         (Evidence(height=(0.5, 0.6)), Evidence(height=(0.6, 0.7))),
@@ -114,7 +114,7 @@ def test_what_contradicts_itself_is_impossible() -> None:
             policy.condition(second)
 
 
-def test_conditioned_samples_match_and_are_possible() -> None:
+def test_conditioned_samples_match_the_evidence_and_are_possible() -> None:
     region = Region((Rectangle(-0.9, -0.7, 0.1, 0.2), Rectangle(0.6, 0.7, -0.1, 0.0)))
     policy = TWO.condition(Evidence(region=region, grasps=frozenset({Grasp.FRONT, Grasp.TOP})))
     choices = policy.sample(np.random.default_rng(5), 20_000)
@@ -130,7 +130,7 @@ def test_conditioned_samples_match_and_are_possible() -> None:
     assert region.contains(x, y).all()
 
 
-def test_the_same_generator_gives_the_same_samples_however_they_are_asked_for() -> None:
+def test_the_same_generator_gives_the_same_samples_in_any_batches() -> None:
     at_once = TWO.sample(np.random.default_rng(6), 50)
     one_by_one = np.random.default_rng(6)
     assert [TWO.sample(one_by_one)[0] for _ in range(50)] == at_once
@@ -150,13 +150,13 @@ def test_the_least_and_the_most_likely_draws_are_possible_too(drawn: float) -> N
         assert policy.coverage([choice]) == 1.0
 
 
-def test_sampling_leaves_the_global_generator_alone() -> None:
+def test_sampling_does_not_change_the_global_generator() -> None:
     before = np.random.get_state(legacy=False)["state"]
     TWO.sample(np.random.default_rng(6), 50)
     assert repr(np.random.get_state(legacy=False)["state"]) == repr(before)
 
 
-def test_the_mode_is_the_square_that_holds_most() -> None:
+def test_the_mode_is_the_square_with_the_highest_probability() -> None:
     mode = TWO.mode(width_m=0.1)
     # 0.25 * 0.5 * 0.4 * 0.2 in the west is less than 0.75 * 0.8 * 0.2 * 0.1 in the east
     assert mode.evidence.arms == RIGHT
@@ -170,7 +170,7 @@ def test_the_mode_is_the_square_that_holds_most() -> None:
     assert west.evidence.region.rectangles[0] == pytest.approx((-0.85, -0.75, 0.42, 0.5))
 
 
-def test_a_window_holds_as_much_as_one_of_its_width_can() -> None:
+def test_a_window_holds_as_much_as_any_of_its_width_can() -> None:
     linear = WEST.x
     assert linear.peak(-5.0, 5.0, 4.0).probability == pytest.approx(1.0)
     assert linear.peak(-5.0, 5.0, 0.3) == pytest.approx((-1.0, -0.7, 0.8 + 0.2 / 3))
@@ -190,12 +190,12 @@ def test_a_window_holds_as_much_as_one_of_its_width_can() -> None:
         ([Rectangle(0, math.nan, 0, 1)], "finite limits, the smaller first"),
     ],
 )
-def test_a_region_is_of_rectangles_that_do_not_overlap(rectangles: list[Rectangle], said: str) -> None:
+def test_a_region_consists_of_rectangles_that_do_not_overlap(rectangles: list[Rectangle], said: str) -> None:
     with pytest.raises(CallerError, match=said):
         Region(tuple(rectangles))
 
 
-def test_what_no_evidence_can_be_is_refused() -> None:
+def test_invalid_evidence_is_refused() -> None:
     with pytest.raises(CallerError, match="evidence on arms takes members of Arms"):
         Evidence(arms=frozenset({Grasp.LEFT}))  # type: ignore[arg-type]
     with pytest.raises(CallerError, match="evidence on grasps takes members of Grasp"):

@@ -48,7 +48,9 @@ print(policy.likelihood(choices).tolist())
 
 @pytest.mark.slow
 @pytest.mark.parametrize("policy", [default_policy(), LEARNED], ids=["default", "learned"])
-def test_a_policy_is_the_same_in_another_process_without_what_learning_needs(policy: Policy, tmp_path: Path) -> None:
+def test_a_policy_is_the_same_in_another_process_without_the_libraries_for_learning(
+    policy: Policy, tmp_path: Path
+) -> None:
     path = tmp_path / "policy.json"
     save_policy(policy, path)
     assert load_policy(path) == policy
@@ -59,7 +61,7 @@ def test_a_policy_is_the_same_in_another_process_without_what_learning_needs(pol
     assert json.loads(there) == here
 
 
-def test_a_policy_takes_the_place_of_the_one_before_and_leaves_nothing_beside(tmp_path: Path) -> None:
+def test_a_saved_policy_replaces_the_one_before_and_leaves_no_other_file(tmp_path: Path) -> None:
     path = tmp_path / "policy.json"
     save_policy(default_policy(), path)
     save_policy(LEARNED, path)
@@ -67,7 +69,7 @@ def test_a_policy_takes_the_place_of_the_one_before_and_leaves_nothing_beside(tm
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_the_file_is_json_with_members_by_name(tmp_path: Path) -> None:
+def test_the_file_is_json_with_enum_members_by_name(tmp_path: Path) -> None:
     save_policy(LEARNED, tmp_path / "policy.json")
     heading, content = (json.loads(line) for line in (tmp_path / "policy.json").read_text().splitlines())
     assert (heading["format"], heading["version"]) == ("pycrorm policy", 1)
@@ -101,7 +103,7 @@ def test_no_cut_gives_another_policy(tmp_path: Path) -> None:
         load_policy(path)
 
 
-def test_another_version_is_named(tmp_path: Path) -> None:
+def test_another_version_is_refused_by_its_number(tmp_path: Path) -> None:
     path = tmp_path / "policy.json"
     path.write_text('{"format":"pycrorm policy","version":2,"crc32":0,"more":1}\n{"nodes":[]}\n')
     with pytest.raises(PolicyFileRefused, match="has format version 2, but this program reads 1"):
@@ -111,14 +113,14 @@ def test_another_version_is_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "content", [b"", b"\n\n", b"PK\x03\x04", b"[1]\n", b'{"format":"else","version":1,"crc32":0}\n']
 )
-def test_another_file_is_no_policy(content: bytes, tmp_path: Path) -> None:
+def test_a_file_of_another_kind_is_no_policy(content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "model.bin"
     path.write_bytes(content)
     with pytest.raises(PolicyFileRefused, match="holds no policy"):
         load_policy(path)
 
 
-def test_what_cannot_be_read_or_written_is_told_in_one_line(tmp_path: Path) -> None:
+def test_a_file_that_cannot_be_read_or_written_is_reported_in_one_line(tmp_path: Path) -> None:
     with pytest.raises(PolicyFileRefused, match=r"nothing\.json: cannot be read: No such file"):
         load_policy(tmp_path / "nothing.json")
     with pytest.raises(PolicyFileRefused, match="cannot be read: Is a directory"):
@@ -143,7 +145,7 @@ def test_what_cannot_be_read_or_written_is_told_in_one_line(tmp_path: Path) -> N
         ({"evidence": {"arms": None, "grasps": None, "region": None, "height": [2, 1]}}, "interval"),
     ],
 )
-def test_a_file_made_by_hand_is_checked_although_its_checksum_fits(
+def test_a_crafted_file_is_checked_although_its_checksum_matches(
     change: dict[str, object], said: str, tmp_path: Path
 ) -> None:
     _refused(change, said, tmp_path)
@@ -166,7 +168,7 @@ def test_a_file_made_by_hand_is_checked_although_its_checksum_fits(
         ({"x": {"type": "uniform"}}, "uniform"),
     ],
 )
-def test_a_leaf_made_by_hand_is_checked(change: dict[str, object], said: str, tmp_path: Path) -> None:
+def test_a_crafted_leaf_is_checked(change: dict[str, object], said: str, tmp_path: Path) -> None:
     save_policy(default_policy(), tmp_path / "policy.json")
     leaf = json.loads((tmp_path / "policy.json").read_text().splitlines()[1])["leaves"][0]
     _refused({"leaves": [leaf | change]}, said, tmp_path)

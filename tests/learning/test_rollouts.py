@@ -1,4 +1,4 @@
-"""Many rollouts: the same for the same seed and index, however they are done, and all of them remembered."""
+"""Many rollouts: the same for the same seed and index in any order, and all of them recorded."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from pycrorm_async.orm import BatchRolloutAction, PickUpAction, ProcessMetaData,
 from pycrorm_async.plan.task_tree import collected_tree
 from pycrorm_async.world import Grasp, ObjectType
 from pycrorm_async.world.robots.robot_description import Limits
-from tests.learning.geometric_rollouts import works
+from tests.learning.geometric_rollouts import succeeds
 
 pytestmark = pytest.mark.slow
 
@@ -78,19 +78,19 @@ async def test_within_hard_limits_twice_as_many_succeed() -> None:
     assert 0.27 < tally.success_rate < 0.33
 
 
-async def test_every_rollout_ends_as_geometry_and_inverse_kinematics_alone_say() -> None:
+async def test_every_rollout_ends_as_geometry_and_inverse_kinematics_alone_predict() -> None:
     ends: list[int] = []
     await rolled_out(400, seed=7, tell=lambda tally: ends.append(tally.successes))
-    expected = [works(default_policy().sample(np.random.default_rng((7, index)))[0]) for index in range(400)]
+    expected = [succeeds(default_policy().sample(np.random.default_rng((7, index)))[0]) for index in range(400)]
     assert np.diff([0, *ends]).astype(bool).tolist() == expected
 
 
-async def test_seed_and_index_make_a_rollout_in_whatever_pieces_and_world_it_is_done() -> None:
+async def test_seed_and_index_determine_a_rollout_in_any_batch_and_any_world() -> None:
     whole: list[int] = []
     await rolled_out(120, tell=lambda tally: whole.append(tally.successes))
     pieces: list[int] = []
     for first, count in ((80, 40), (0, 30), (30, 50)):
-        np.random.seed(first)  # of no influence
+        np.random.seed(first)  # without influence
         random.seed(first)
         ends: list[int] = []
         await rolled_out(count, first=first, tell=lambda tally, ends=ends: ends.append(tally.successes))
@@ -101,7 +101,7 @@ async def test_seed_and_index_make_a_rollout_in_whatever_pieces_and_world_it_is_
     assert (await rolled_out(120, seed=70)).successes != 0
 
 
-async def test_what_is_remembered_is_what_was_counted_with_the_stage_each_failed_at(
+async def test_records_and_counts_agree_on_the_stage_at_which_each_rollout_failed(
     database_url: str, tmp_path: Path
 ) -> None:
     counted: list[Tally] = []
@@ -129,8 +129,10 @@ async def test_what_is_remembered_is_what_was_counted_with_the_stage_each_failed
 
 
 def again(first: int, count: int) -> Tally:
-    """The same rollouts by geometry alone."""
-    ends = [works(default_policy().sample(np.random.default_rng((69, first + number)))[0]) for number in range(count)]
+    """Return the same rollouts by geometry alone."""
+    ends = [
+        succeeds(default_policy().sample(np.random.default_rng((69, first + number)))[0]) for number in range(count)
+    ]
     return Tally(sum(ends), Counter({"IKError": count - sum(ends)}))
 
 
@@ -139,10 +141,10 @@ async def won(memory: Memory, seed: int) -> int:
 
 
 async def by_node_arithmetic(memory: Memory, frame: Any) -> dict[str, int]:
-    """Section 4.3 of the facts on the original: how many motions a pick-up got to is where it failed.
+    """Count the motions of each pick-up, as in section 4.3 of the facts on the original: the stage is where it failed.
 
     One goal of the hand: the pre-pose failed. Opening the gripper and a second: the grasp. Closing it and a third: the
-    lift. Asked of the nodes, whatever the question above makes of them.
+    lift. The motions come from the nodes, whatever the named query makes of them.
     """
     async with memory.session() as session:
         node = TaskTreeNode
@@ -171,7 +173,7 @@ async def test_each_rollout_can_be_an_episode_of_its_own(tmp_path: Path) -> None
         assert [each.description.split(" under")[0] for each in episodes] == [f"rollout {index}" for index in range(12)]
 
 
-async def test_told_to_stop_it_ends_before_the_next_one(tmp_path: Path) -> None:
+async def test_a_stop_request_ends_a_batch_before_the_next_rollout(tmp_path: Path) -> None:
     async with Memory.open(f"sqlite:///{tmp_path}/memory.db", settings=PATIENT) as memory:
         seen: list[int] = []
         tally = await rolled_out(100, stop=lambda: len(seen) == 7, tell=lambda tally: seen.append(tally.rollouts))
@@ -183,10 +185,10 @@ async def test_told_to_stop_it_ends_before_the_next_one(tmp_path: Path) -> None:
         assert (await rolled_out(5, stop=lambda: True)).rollouts == 0
 
 
-async def test_what_is_interrupted_in_the_middle_does_not_count_and_is_done_again(
+async def test_an_interrupted_rollout_does_not_count_and_is_repeated(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """In the middle of its pick-up: a rollout that did not get that far has no row to be counted."""
+    """Interrupt it in the middle of its pick-up: an earlier interruption leaves no row that could be counted."""
 
     class Enough(BaseException):
         pass
@@ -218,7 +220,7 @@ async def test_what_is_interrupted_in_the_middle_does_not_count_and_is_done_agai
         assert [(each.first, each.count, each.seed) for each in batches] == [(0, 10, 69), (4, 6, 69)]
 
 
-async def test_rollouts_that_were_done_twice_count_once(tmp_path: Path) -> None:
+async def test_rollouts_that_were_repeated_count_once(tmp_path: Path) -> None:
     async with Memory.open(f"sqlite:///{tmp_path}/memory.db", settings=PATIENT) as memory:
         for first, count in ((0, 20), (10, 20)):
             await rolled_out(count, first=first)
@@ -227,7 +229,7 @@ async def test_rollouts_that_were_done_twice_count_once(tmp_path: Path) -> None:
 
 
 @pytest.mark.soak  # test_experiment learns from a memory too
-async def test_a_policy_is_learned_from_the_memory_and_does_better(tmp_path: Path) -> None:
+async def test_a_policy_learned_from_the_memory_succeeds_more_often(tmp_path: Path) -> None:
     async with Memory.open(f"sqlite:///{tmp_path}/memory.db", settings=PATIENT) as memory:
         default = await rolled_out(1_500)
         await memory.flush()
@@ -251,13 +253,13 @@ async def test_a_fault_in_the_plan_ends_the_batch(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("wrong", [{"seed": -1}, {"first": -1}, {"count": -1}])
-async def test_what_cannot_be_counted_is_refused(wrong: dict[str, Any]) -> None:
+async def test_invalid_counts_are_refused(wrong: dict[str, Any]) -> None:
     with pytest.raises(CallerError, match="must be >= 0, got"):
         await rolled_out(**({"count": 1} | wrong))
 
 
-def test_scenes_that_differ_have_words_that_differ() -> None:
-    """By these words rollouts are told apart."""
+def test_scenes_that_differ_have_different_texts() -> None:
+    """Rollouts are distinguished by this text."""
     scenes = [
         Scene(),
         Scene(object_type=ObjectType.BOWL),
@@ -292,7 +294,7 @@ def test_rates_come_with_an_interval() -> None:
     assert Tally().success_rate != Tally().success_rate  # NaN
 
 
-def test_what_is_missing_comes_in_runs() -> None:
+def test_missing_rollouts_are_listed_in_runs() -> None:
     assert list(recorded_rollouts.missing_runs([], 5, length_max=2)) == [(0, 2), (2, 2), (4, 1)]
     assert list(recorded_rollouts.missing_runs([0, 1, 5], 8, length_max=10)) == [(2, 3), (6, 2)]
     assert list(recorded_rollouts.missing_runs(range(8), 8, length_max=10)) == []

@@ -21,7 +21,7 @@ from pycrorm_async.learning.policies.policy import PickUpChoice, Policy
 from pycrorm_async.learning.policies.policy_file import save_policy
 from pycrorm_async.learning.policies.tree import learn
 from pycrorm_async.world.enums import Arms, Grasp
-from tests.learning.geometric_rollouts import frame_of, works
+from tests.learning.geometric_rollouts import frame_of, succeeds
 
 pytestmark = pytest.mark.slow
 
@@ -30,12 +30,12 @@ ALIKE = {"arm": ["LEFT"] * 30, "grasp": ["FRONT"] * 30, "object_x": [0.5] * 30, 
 
 
 def successes_of(rollouts: int, seed: int) -> list[PickUpChoice]:
-    return [each for each in default_policy().sample(np.random.default_rng(seed), rollouts) if works(each)]
+    return [each for each in default_policy().sample(np.random.default_rng(seed), rollouts) if succeeds(each)]
 
 
 @pytest.fixture(scope="module")
 def successes() -> list[PickUpChoice]:
-    """Of 2,000 pick-ups of the default policy: about 320."""
+    """Return the successes of 2,000 pick-ups of the default policy: about 320."""
     return successes_of(2000, 69)
 
 
@@ -46,7 +46,7 @@ def learned(successes: list[PickUpChoice]) -> Policy:
 
 @pytest.fixture(scope="module")
 def oracle(successes: list[PickUpChoice]) -> Iterator[Any]:
-    """The tree as pyjpt makes it when it is asked without any of our code."""
+    """Return the tree that pyjpt learns without any code of the package."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         from jpt.distributions import Numeric, SymbolicType
@@ -67,22 +67,22 @@ def oracle(successes: list[PickUpChoice]) -> Iterator[Any]:
         yield tree
 
 
-def test_what_is_learned_succeeds_far_more_often_than_the_default_policy(
+def test_a_learned_policy_succeeds_far_more_often_than_the_default_one(
     learned: Policy, successes: list[PickUpChoice]
 ) -> None:
     assert 0.14 < len(successes) / 2000 < 0.18
     tries = learned.sample(np.random.default_rng(1), 1000)
-    assert np.mean([works(each) for each in tries]) > 0.5
+    assert np.mean([succeeds(each) for each in tries]) > 0.5
 
 
 def test_its_mode_succeeds_more_often_still(learned: Policy) -> None:
     mode = learned.mode()
     tries = mode.sample(np.random.default_rng(1), 200)
     assert len({each[:2] for each in tries}) == 1
-    assert np.mean([works(each) for each in tries]) > 0.9
+    assert np.mean([succeeds(each) for each in tries]) > 0.9
 
 
-def test_all_it_learned_from_is_possible_and_what_never_went_well_is_not(
+def test_all_successes_it_learned_from_are_possible_and_regions_without_one_are_not(
     learned: Policy, successes: list[PickUpChoice]
 ) -> None:
     assert learned.coverage(successes) == 1.0
@@ -92,19 +92,19 @@ def test_all_it_learned_from_is_possible_and_what_never_went_well_is_not(
         learned.condition(Evidence(grasps=frozenset({Grasp.TOP})))
 
 
-def test_likelihoods_are_those_of_pyjpt(learned: Policy, oracle: Any, successes: list[PickUpChoice]) -> None:
+def test_likelihoods_equal_those_of_pyjpt(learned: Policy, oracle: Any, successes: list[PickUpChoice]) -> None:
     choices = [*successes, *learned.sample(np.random.default_rng(2), 200)]
     coded = frame_of(choices).assign(
         arm=[each.arm - 1 for each in choices], grasp=[each.grasp.value for each in choices]
     )
-    # its JPT.likelihood leaves the weights of the leaves out
+    # its JPT.likelihood omits the weights of the leaves
     theirs = sum(leaf.prior * leaf.likelihood(coded)[:, 0] for leaf in oracle.leaves.values())
     alike = np.isclose(learned.likelihood(choices), theirs, rtol=1e-6)
 
     assert alike.all()
 
 
-def test_the_leaves_are_those_of_pyjpt_in_the_same_order_and_to_the_digit(learned: Policy, oracle: Any) -> None:
+def test_the_leaves_equal_those_of_pyjpt_in_order_and_to_the_digit(learned: Policy, oracle: Any) -> None:
     rows = sum(leaf.samples for leaf in oracle.leaves.values())
     theirs = []
     for _, leaf in sorted(oracle.leaves.items()):
@@ -116,7 +116,7 @@ def test_the_leaves_are_those_of_pyjpt_in_the_same_order_and_to_the_digit(learne
     assert ours == theirs
 
 
-def test_probabilities_and_conditioned_ones_are_those_of_pyjpt(learned: Policy, oracle: Any) -> None:
+def test_probabilities_and_conditioned_ones_equal_those_of_pyjpt(learned: Policy, oracle: Any) -> None:
     from jpt.base.intervals import ContinuousSet
 
     for x_min, x_max, y_min, y_max in [(-0.8, 0.0, -0.5, 0.5), (0.3, 0.7, 0.0, 1.0), (-1.0, 1.0, -0.8, -0.3)]:
@@ -145,7 +145,7 @@ def test_a_hundred_generators_never_fail_and_repeat_themselves(learned: Policy) 
         assert all(abs(x) <= 0.9 and (x <= 0.0 or y >= 0.2) and abs(y) <= 0.9 for _, _, x, y in kept)
 
 
-def test_samples_are_spread_as_the_successes_are(learned: Policy, successes: list[PickUpChoice]) -> None:
+def test_samples_are_distributed_as_the_successes(learned: Policy, successes: list[PickUpChoice]) -> None:
     drawn = learned.sample(np.random.default_rng(3), 20_000)
     for part in (2, 3):
         apart = [
@@ -159,7 +159,7 @@ def test_learning_again_gives_the_same_policy(learned: Policy, successes: list[P
     assert learn(frame_of(successes)) == learned
 
 
-def test_what_was_learned_is_the_same_in_another_process_without_pyjpt(learned: Policy, tmp_path: Path) -> None:
+def test_a_learned_policy_is_the_same_in_another_process_without_pyjpt(learned: Policy, tmp_path: Path) -> None:
     from tests.learning.test_policy_file import ELSEWHERE
 
     save_policy(learned, tmp_path / "policy.json")
@@ -187,12 +187,12 @@ assert not changed, changed
 """
 
 
-def test_the_first_learning_of_a_process_changes_nothing_else_in_it() -> None:
+def test_the_first_learning_of_a_process_changes_no_other_state_of_it() -> None:
     done = subprocess.run([sys.executable, "-c", FIRST_OF_ALL], check=False, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_a_height_that_never_changed_is_noted_and_says_nothing_of_others(successes: list[PickUpChoice]) -> None:
+def test_a_height_that_never_changed_is_noted_and_does_not_apply_to_others(successes: list[PickUpChoice]) -> None:
     frame = frame_of(successes).assign(height=0.9)
     policy = learn(frame)
     assert policy.constant_height == 0.9
@@ -202,7 +202,7 @@ def test_a_height_that_never_changed_is_noted_and_says_nothing_of_others(success
     )
 
 
-def test_where_to_stand_is_learned_for_each_height() -> None:
+def test_base_positions_are_learned_for_each_height() -> None:
     chance = np.random.default_rng(4)
     heights = chance.uniform(0.6, 1.0, 400)
     frame = pd.DataFrame(
@@ -224,7 +224,7 @@ def test_where_to_stand_is_learned_for_each_height() -> None:
         policy.condition(Evidence(height=(1.5, 1.6)))
 
 
-def test_a_few_heights_are_told_apart() -> None:
+def test_a_few_heights_are_distinguished() -> None:
     heights = np.repeat([0.6, 0.9], 100)
     places = np.tile(np.linspace(-0.05, 0.05, 100), 2)
     frame = pd.DataFrame(
@@ -235,7 +235,7 @@ def test_a_few_heights_are_told_apart() -> None:
     assert all(each.relative_x > 0.9 for each in policy.condition(Evidence(height=(0.89, 0.91))).sample(rng(), 100))
 
 
-def test_from_one_place_only_that_place_is_learned() -> None:
+def test_from_a_single_base_position_only_that_one_is_learned() -> None:
     policy = learn(pd.DataFrame(ALIKE))
     choices = policy.sample(rng(), 100)
     assert {each[:2] for each in choices} == {(Arms.LEFT, Grasp.FRONT)}
@@ -244,7 +244,7 @@ def test_from_one_place_only_that_place_is_learned() -> None:
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_every_frame_of_repeated_and_lonely_values_is_learned_whole(seed: int) -> None:
+def test_every_frame_of_repeated_and_isolated_values_is_learned_whole(seed: int) -> None:
     chance = np.random.default_rng(seed)
     rows = int(chance.choice([2, 5, 40, 150]))
 
@@ -288,13 +288,13 @@ def test_every_frame_of_repeated_and_lonely_values_is_learned_whole(seed: int) -
         ({"height": [None] * 30}, "height has no finite number in 30 of 30 rows"),
     ],
 )
-def test_what_cannot_be_learned_from_is_named(change: dict[str, Any], said: str) -> None:
+def test_invalid_successes_are_refused_by_name(change: dict[str, Any], said: str) -> None:
     with pytest.raises(CallerError) as raised:
         learn(pd.DataFrame(ALIKE | change))
     assert said in str(raised.value)
 
 
-def test_a_column_that_is_missing_is_named() -> None:
+def test_a_missing_column_is_named() -> None:
     frame = pd.DataFrame(ALIKE).rename(columns={"object_x": "relative_x"})
     with pytest.raises(CallerError, match="the frame has no column object_x: select arm, grasp, object_x, object_y"):
         learn(frame)
@@ -316,10 +316,10 @@ def test_without_pyjpt_the_extra_to_install_is_named(monkeypatch: pytest.MonkeyP
 
 @pytest.mark.soak
 @pytest.mark.parametrize("seed", [69, 70])
-def test_ten_thousand_tries_teach_enough_and_do_not_only_teach_to_repeat(seed: int) -> None:
+def test_ten_thousand_attempts_teach_more_than_their_own_repetition(seed: int) -> None:
     policy = learn(frame_of(successes_of(10_000, seed)))
     tries = policy.sample(np.random.default_rng(1), 10_000)
-    assert np.mean([works(each) for each in tries]) >= 0.78
+    assert np.mean([succeeds(each) for each in tries]) >= 0.78
     assert policy.coverage(successes_of(10_000, seed + 1000)) >= 0.85
 
 
@@ -331,7 +331,7 @@ def test_the_mode_for_every_arm_and_grasp_succeeds_nearly_always() -> None:
             known = Evidence(arms=frozenset({arm}), grasps=frozenset({grasp}))
             tries = policy.condition(known).mode().sample(np.random.default_rng(1), 100)
             assert {each[:2] for each in tries} == {(arm, grasp)}
-            assert np.mean([works(each) for each in tries]) >= 0.95, known
+            assert np.mean([succeeds(each) for each in tries]) >= 0.95, known
 
 
 def rng() -> np.random.Generator:

@@ -239,7 +239,7 @@ ALL_STARTED = threading.Barrier(6)
 
 
 async def test_concurrent_plans_never_nest_into_each_other(tmp_path: Path) -> None:
-    def in_a_loop_of_its_own(owner: str) -> None:
+    def run_in_own_loop(owner: str) -> None:
         asyncio.run(SlowActionPerformable(owner).perform())
 
     ALL_STARTED.reset()
@@ -247,7 +247,7 @@ async def test_concurrent_plans_never_nest_into_each_other(tmp_path: Path) -> No
         tasks = [asyncio.create_task(SlowActionPerformable(f"task {index}").perform()) for index in range(3)]
         contexts = [copy_context() for _ in range(3)]
         threads = [
-            threading.Thread(target=context.run, args=(in_a_loop_of_its_own, f"thread {index}"))
+            threading.Thread(target=context.run, args=(run_in_own_loop, f"thread {index}"))
             for index, context in enumerate(contexts)
         ]
         for thread in threads:

@@ -45,7 +45,7 @@ from pycrorm_async.query.snapshot import AttachmentThen, Moment, NodeThen, Robot
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.world.pose import Pose
-from tests.databases import in_a_loop_of_its_own
+from tests.databases import run_in_own_loop
 from tests.projections.event_script import MOVE, NAVIGATE, PICK_UP, T0_NS, Script, declarations, name_of, pose, row
 from tests.projections.sql_queries import stored_and_folded
 
@@ -194,7 +194,7 @@ def recorded(module_database_url: str) -> DatabaseAddress:
         finally:
             await log.close()
 
-    in_a_loop_of_its_own(record())
+    run_in_own_loop(record())
     return address
 
 

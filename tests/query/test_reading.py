@@ -26,7 +26,7 @@ from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.enums import Arms, Grasp, ObjectType
-from tests.databases import ask, in_a_loop_of_its_own
+from tests.databases import ask, run_in_own_loop
 from tests.projections.event_script import NAVIGATE, PICK_UP, SAYING, Script, declarations, name_of, pose, row
 from tests.projections.sql_queries import stored_and_folded
 
@@ -68,7 +68,7 @@ def recorded(module_database_url: str) -> DatabaseAddress:
         finally:
             await log.close()
 
-    in_a_loop_of_its_own(record())
+    run_in_own_loop(record())
     return address
 
 

@@ -1,4 +1,4 @@
-"""The tools that are shipped for tests find what they are there to find."""
+"""The shipped tools for tests accept correct classes and report each kind of defect."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class WeighActionPerformable(ActionAbstract):
     note: str | None = None
 
     async def perform(self) -> None:
-        """Done."""
+        """Succeed without doing anything."""
 
 
 class Weighed(Projection):
@@ -68,12 +68,12 @@ async def test_a_projection_that_holds_its_contract_returns_its_rows(tmp_path: P
     assert [(row["what"], row["grams"]) for row in rows["weighing"]] == [("milk", 1.5), ("water", 1.5)]
 
 
-async def test_a_projection_that_is_not_pure_is_found(tmp_path: Path) -> None:
+async def test_a_projection_that_is_not_pure_is_reported(tmp_path: Path) -> None:
     with pytest.raises(AssertionError, match=r"a second fold of weighed differs, so it is not pure: .*grams"):
         await check_projection(Impure(), plan, tmp_path)
 
 
-async def test_a_projection_that_stops_is_found_with_its_reason(tmp_path: Path) -> None:
+async def test_a_projection_that_stops_is_reported_with_its_reason(tmp_path: Path) -> None:
     with pytest.raises(AssertionError, match=r"weighed stopped: .*no milk"):
         await check_projection(Picky(), plan, tmp_path)
 
@@ -83,14 +83,14 @@ async def test_a_designator_returns_its_row_with_every_value(tmp_path: Path) -> 
     assert (row.what, row.grams, row.note) == ("milk", 1.5, None)
 
 
-async def test_a_designator_with_a_value_that_cannot_be_recorded_is_found(tmp_path: Path) -> None:
+async def test_a_designator_with_an_unrecordable_value_is_reported(tmp_path: Path) -> None:
     with pytest.raises(Unrecordable, match=r"grams"):
         await check_designator(WeighActionPerformable("milk", float("nan")), tmp_path)
 
 
 class Bare(ActionAbstract):
     async def perform(self) -> None:
-        """Done."""
+        """Succeed without doing anything."""
 
 
 async def test_a_designator_that_is_no_dataclass_is_refused(tmp_path: Path) -> None:
@@ -98,7 +98,7 @@ async def test_a_designator_that_is_no_dataclass_is_refused(tmp_path: Path) -> N
         await check_designator(Bare(), tmp_path)
 
 
-async def test_the_memory_of_a_test_records_and_refuses(memory: Memory) -> None:
+async def test_the_memory_of_a_test_records_events_and_refuses_invalid_values(memory: Memory) -> None:
     await WeighActionPerformable("milk").perform()
     await memory.flush()
     assert memory.opened_count == 1

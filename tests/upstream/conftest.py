@@ -1,4 +1,4 @@
-"""The scene and the plan that the tests of PyCRAM share, with our names: robot, kitchen, milk and cereal."""
+"""The common scene and plan of PyCRAM's tests, with the names of this package: robot, kitchen, milk and cereal."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ async def common_plan() -> None:
     await PlaceAction(milk, [Pose([1.3, 1, 0.9])], [Arms.LEFT]).resolve().perform()
 
 
-class Remembered:
-    """A memory that is closed, and asked."""
+class Recorded:
+    """A closed memory, opened for queries."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -48,9 +48,9 @@ class Remembered:
 
 
 @pytest.fixture
-async def planned(tmp_path: Path) -> Remembered:
-    """The common plan was performed in an episode of a new memory."""
+async def planned(tmp_path: Path) -> Recorded:
+    """Perform the common plan in an episode of a new memory."""
     async with Memory.open(url_of(tmp_path)) as memory, memory.episode(description=DESCRIPTION):
         with kitchen():
             await common_plan()
-    return Remembered(tmp_path)
+    return Recorded(tmp_path)

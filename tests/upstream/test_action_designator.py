@@ -1,7 +1,7 @@
-"""PyCRAM's tests of its action designators (July 2024), by name: what a description resolves to, its SOMA concept, and
-what it does in the world.
+"""PyCRAM's tests of its action designators (July 2024), by name: the result of resolving a description, its SOMA
+concept, and its effect on the world.
 
-Where theirs ends with resolving (gripping, releasing: not implemented there) ours is performed as well.
+Where theirs end with resolving (gripping, releasing: not implemented there) these perform the action as well.
 """
 
 from __future__ import annotations
@@ -140,7 +140,7 @@ async def test_open(scene: Scene) -> None:
     await NavigateActionPerformable(Pose([0.1, 1.1, 0])).perform()
     await MoveTorsoActionPerformable(0.1).perform()
     await action.perform()
-    # the drawer's limit is 0.35 m, and 0.05 m are left
+    # the drawer's limit is 0.35 m, and 0.05 m remain
     assert scene.kitchen.joint_limits("sink_area_drawer_joint") == (0.0, 0.35)
     assert scene.kitchen.joint_position("sink_area_drawer_joint") == pytest.approx(0.3)
 

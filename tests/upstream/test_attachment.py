@@ -24,7 +24,7 @@ def test_attachment_behavior(scene: Scene) -> None:
     scene.robot.attach(scene.milk)
     before = scene.milk.pose
     scene.robot.set_pose(Pose([1, 0, 0]))
-    # the robot stood at the origin
+    # the robot was at the origin
     assert scene.milk.pose.position == (before.position.x + 1, before.position.y, before.position.z)
 
 

@@ -1,8 +1,9 @@
-"""PyCRAM's tests of its merging of databases (July 2024), by name; what each was to assert is asserted here of ours.
+"""PyCRAM's tests of its merging of databases (July 2024), by name; the assertions are those that theirs were meant to
+make.
 
-There, three runs of a pick-and-place plan were stored in SQLite and moved to PostgreSQL: the primary keys of the one
-that was there were shifted until none collided, then every row was inserted. Here nothing that is there is touched, and
-moving twice is as good as once.
+There, three runs of a pick-and-place plan were stored in SQLite and moved to PostgreSQL: the primary keys of the
+existing run were shifted until none collided, then every row was inserted. Here no existing row is changed, and copying
+twice has the same result as once.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ async def source(tmp_path: Path) -> str:
 
 @pytest.fixture
 async def destination(server: Server, tmp_path: Path) -> str:
-    """With a run of its own, whose rows have the ids that those of the first run in the source have."""
+    """A memory with a run of its own, whose rows have the ids of the first run in the source."""
     url = server.new_database()
     opened = Memory.open(url, spool=tmp_path / "spool")
     async with opened as memory, memory.episode(description="was here before"):
@@ -48,7 +49,7 @@ async def destination(server: Server, tmp_path: Path) -> str:
 
 
 def assert_holds(destination: str, source: Tables, before: Tables) -> None:
-    """For every table, all rows of the source, and all that were there."""
+    """Assert that every table has all rows of the source, and all that it had before."""
     there = tables_of(destination)
     for table, rows in source.items():
         assert rows.items() <= there[table].items(), table

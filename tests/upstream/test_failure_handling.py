@@ -14,7 +14,7 @@ from pycrorm_async.plan.failures import GripperClosedCompletely
 from pycrorm_async.world import Arms, Grasp, Pose
 from tests.plan.conftest import Scene, kitchen
 from tests.promises.lab import statuses, url_of
-from tests.upstream.conftest import Remembered
+from tests.upstream.conftest import Recorded
 
 pytestmark = pytest.mark.slow
 
@@ -27,7 +27,7 @@ async def test_retry_with_success(tmp_path: Path) -> None:
             scene.robot.set_pose(Pose([0.6, 0.4, 0]))
             await Retry(PickUpAction(scene.milk, [Arms.RIGHT, Arms.LEFT], [Grasp.FRONT])).perform()
             assert scene.robot.attachments == {scene.milk: "l_gripper_tool_frame"}
-    nodes = await Remembered(tmp_path).all(select(TaskTreeNode).order_by(TaskTreeNode.id))
+    nodes = await Recorded(tmp_path).all(select(TaskTreeNode).order_by(TaskTreeNode.id))
     assert statuses(nodes) == [
         (None, "SUCCEEDED"),
         ("Retry", "SUCCEEDED"),
@@ -47,7 +47,7 @@ async def test_retry_with_success(tmp_path: Path) -> None:
 
 async def test_retry_with_failure(scene: Scene) -> None:
     with collected_tree() as tree, pytest.raises(PlanFailure) as caught:
-        # From the origin nothing of it can be reached.
+        # From the origin no alternative can be reached.
         await Retry(PickUpAction(scene.milk, [Arms.LEFT, Arms.RIGHT], [Grasp.FRONT, Grasp.TOP]), max_tries=3).perform()
     assert isinstance(caught.value, IKError)
     assert not isinstance(caught.value, GripperClosedCompletely)

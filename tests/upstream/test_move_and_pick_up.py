@@ -1,4 +1,4 @@
-"""PyCRAM's tests of moving and picking up (July 2024), by name, and what they assert."""
+"""PyCRAM's tests of moving and picking up (July 2024), by name, with their assertions."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ pytestmark = pytest.mark.slow
 
 
 def test_create_model() -> None:
-    """Nothing is where the object stands; four variables."""
+    """No base pose is inside the object; there are four variables."""
     centre = Region((Rectangle(-0.2, 0.2, -0.2, 0.2),))
     assert default_policy().probability(Evidence(region=centre)) == 0
     assert PickUpChoice._fields == ("arm", "grasp", "relative_x", "relative_y")
 
 
 def test_grounding(scene: Scene) -> None:
-    """What is free and sees the object is in disjoint pieces, and a policy for it there is."""
+    """The places that are free and see the object are disjoint pieces, and there is a policy for it in the scene."""
     grounded = MoveAndPickUp(scene.milk).grounded()
     region = grounded.evidence.region
     assert region is not None
@@ -35,7 +35,7 @@ def test_grounding(scene: Scene) -> None:
 
 @pytest.mark.parametrize("seed", [69, 420])
 async def test_move_and_pick_up(scene: Scene, seed: int) -> None:
-    """Of twenty samples that fit the scene one at least will do."""
+    """At least one of twenty samples for the scene succeeds."""
     rng = np.random.default_rng(seed)
     tries = iter(MoveAndPickUp(scene.milk, samples=20, rng=rng))
     for each in tries:

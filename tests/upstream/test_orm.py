@@ -1,7 +1,7 @@
-"""PyCRAM's tests of its ORM (July 2024), by name; what each was to assert is asserted here of our tables.
+"""PyCRAM's tests of its ORM (July 2024), by name; the assertions are those that theirs were meant to make.
 
-Names and the common plan are facts of that system, the bodies are ours. Where ours differs by design, our own number is
-asserted, reckoned beside it.
+Names and the common plan are facts of that system, the bodies are new. Where this package differs by design, its own
+number is asserted, and computed in a comment.
 """
 # ruff: noqa: N802  the names are theirs
 
@@ -58,13 +58,13 @@ from pycrorm_async.world import Arms, Grasp, GripperState, ObjectType, Pose
 from pycrorm_async.world.pose import yaw_quaternion
 from tests.plan.conftest import kitchen
 from tests.promises.lab import at, url_of
-from tests.upstream.conftest import DESCRIPTION, Remembered, common_plan
+from tests.upstream.conftest import DESCRIPTION, Recorded, common_plan
 
 pytestmark = pytest.mark.slow
 
 
 async def test_schema_creation(tmp_path: Path) -> None:
-    """All tables are there before anything was performed, under their lower-case names."""
+    """All tables exist before the first perform, under their lower-case names."""
     async with Memory.open(url_of(tmp_path)):
         pass
     with sqlite3.connect(tmp_path / "memory.db") as file:
@@ -91,7 +91,7 @@ async def test_schema_creation(tmp_path: Path) -> None:
     } <= present
 
 
-async def test_node(planned: Remembered) -> None:
+async def test_node(planned: Recorded) -> None:
     # the root, 4 actions; 1 motion of the drive, 1 of the torso, 5 of the pick-up, 3 of the placing
     assert len(await planned.all(select(TaskTreeNode))) == 1 + 4 + 10
     # 4 objects when they were added; the robot's at each of 14 designators; targets: of 2 actions, of 1 drive, of
@@ -111,13 +111,13 @@ async def test_node(planned: Remembered) -> None:
     }
 
 
-async def test_metadata_existence(planned: Remembered) -> None:
+async def test_metadata_existence(planned: Recorded) -> None:
     poses = await planned.all(select(PoseRow))
     assert poses
     assert {each.process_metadata.description for each in poses} == {DESCRIPTION}
 
 
-async def test_task_tree_node_parents(planned: Remembered) -> None:
+async def test_task_tree_node_parents(planned: Recorded) -> None:
     nodes = {each.id: each for each in await planned.all(select(TaskTreeNode))}
     roots = [each for each in nodes.values() if each.parent is None]
     assert [each.parent_id for each in roots] == [None]
@@ -135,7 +135,7 @@ async def test_task_tree_node_parents(planned: Remembered) -> None:
     ]
 
 
-async def test_meta_data(planned: Remembered) -> None:
+async def test_meta_data(planned: Recorded) -> None:
     metadata = await planned.one(select(ProcessMetaData))
     assert metadata.status == "SUCCEEDED"
     for mapped in (Action, Motion, Object, RobotState, TaskTreeNode):
@@ -146,17 +146,17 @@ async def test_meta_data(planned: Remembered) -> None:
 
 
 async def test_meta_data_alternation(tmp_path: Path) -> None:
-    """The description one gives is stored, and belongs to that episode alone."""
+    """The given description is stored, and belongs to that episode alone."""
     async with Memory.open(url_of(tmp_path)) as memory:
         with kitchen():
             for description in ("meta_data_alternation_test", "and another"):
                 async with memory.episode(description=description):
                     await ParkArmsActionPerformable(Arms.LEFT).perform()
-    parked = await Remembered(tmp_path).all(select(ParkArmsAction).order_by(ParkArmsAction.id))
+    parked = await Recorded(tmp_path).all(select(ParkArmsAction).order_by(ParkArmsAction.id))
     assert [each.process_metadata.description for each in parked] == ["meta_data_alternation_test", "and another"]
 
 
-async def test_pose(planned: Remembered) -> None:
+async def test_pose(planned: Recorded) -> None:
     for pose in await planned.all(select(PoseRow)):
         assert (pose.position.x, pose.position.y, pose.position.z) == (pose.x, pose.y, pose.z)
         turn = pose.orientation
@@ -164,14 +164,14 @@ async def test_pose(planned: Remembered) -> None:
         assert math.hypot(turn.x, turn.y, turn.z, turn.w) == pytest.approx(1)
 
 
-async def test_pose_mixin(planned: Remembered) -> None:
+async def test_pose_mixin(planned: Recorded) -> None:
     states = await planned.all(select(RobotState))
     assert len(states) == 14
     for state in states:
         assert state.pose_id == state.pose.id
     assert [(at(each.pose), each.torso_height) for each in states] == [
-        *[((0, 0, 0), 0.0)] * 2,  # the drive begins where the robot was put
-        *[((0.6, 0.4, 0), 0.0)] * 2,  # so does the torso
+        *[((0, 0, 0), 0.0)] * 2,  # the drive begins at the robot's first pose
+        *[((0.6, 0.4, 0), 0.0)] * 2,  # and so does the torso
         *[((0.6, 0.4, 0), 0.3)] * 10,
     ]
 
@@ -180,12 +180,12 @@ async def test_plan_serialization(tmp_path: Path) -> None:
     async with Memory.open(url_of(tmp_path)) as memory, memory.episode():
         with kitchen(), collected_tree() as tree:
             await common_plan()
-    remembered = Remembered(tmp_path)
+    remembered = Recorded(tmp_path)
     performed = len(await remembered.all(select(Action))) + len(await remembered.all(select(Motion)))
     assert len(tree) == performed == 14
 
 
-async def test_code_designator_type(planned: Remembered) -> None:
+async def test_code_designator_type(planned: Recorded) -> None:
     first, second, *_ = await planned.all(
         select(TaskTreeNode).where(TaskTreeNode.action_id.is_not(None)).order_by(TaskTreeNode.start_ns)
     )
@@ -199,7 +199,7 @@ async def test_parkArmsAction(tmp_path: Path) -> None:
     async with Memory.open(url_of(tmp_path)) as memory, memory.episode():
         with kitchen():
             await ParkArmsActionPerformable(Arms.BOTH).perform()
-    park = await Remembered(tmp_path).one(select(ParkArmsAction))
+    park = await Recorded(tmp_path).one(select(ParkArmsAction))
     assert (park.dtype, park.arm) == ("ParkArmsAction", Arms.BOTH)
 
 
@@ -210,7 +210,7 @@ async def test_transportAction(tmp_path: Path) -> None:
             island = Pose([-1.35, 0.78, 0.95], yaw_quaternion(math.pi))
             await TransportActionPerformable(scene.milk, Arms.LEFT, island).perform()
             resting = scene.milk.pose
-    remembered = Remembered(tmp_path)
+    remembered = Recorded(tmp_path)
     transport = await remembered.one(select(TransportAction))
     milk = await remembered.all(select(Object).where(Object.name == "milk").order_by(Object.id))
     assert transport.object.id == milk[0].id
@@ -227,7 +227,7 @@ async def test_lookAt_and_detectAction(tmp_path: Path) -> None:
             await LookAtActionPerformable(scene.milk.pose).perform()
             found = await DetectActionPerformable(scene.milk).perform()
             assert found.world_object is scene.milk
-    remembered = Remembered(tmp_path)
+    remembered = Recorded(tmp_path)
     assert at((await remembered.one(select(LookAtAction))).pose) == (1.3, 1, 0.9)
     detect = await remembered.one(select(DetectAction))
     assert (detect.object.name, detect.object.obj_type) == ("milk", ObjectType.MILK)
@@ -237,7 +237,7 @@ async def test_setGripperAction(tmp_path: Path) -> None:
     async with Memory.open(url_of(tmp_path)) as memory, memory.episode():
         with kitchen():
             await SetGripperActionPerformable(Arms.LEFT, GripperState.OPEN).perform()
-    gripper = await Remembered(tmp_path).one(select(SetGripperAction))
+    gripper = await Recorded(tmp_path).one(select(SetGripperAction))
     assert (gripper.gripper, gripper.motion) == (Arms.LEFT, GripperState.OPEN)
 
 
@@ -249,7 +249,7 @@ async def test_open_and_closeAction(tmp_path: Path) -> None:
             await MoveTorsoActionPerformable(0.1).perform()
             await OpenActionPerformable(handle, Arms.LEFT).perform()
             await Close(handle, [Arms.LEFT]).resolve().perform()
-    remembered = Remembered(tmp_path)
+    remembered = Recorded(tmp_path)
     opened, closed = await remembered.one(select(OpenAction)), await remembered.one(select(CloseAction))
     for action in (opened, closed):
         assert isinstance(action.object, ObjectPart)
@@ -257,11 +257,11 @@ async def test_open_and_closeAction(tmp_path: Path) -> None:
         assert action.object.part_of is not None
         assert action.object.part_of.name == "kitchen"
         assert action.arm is Arms.LEFT
-    # The drawer slides along -x: its handle was 0.3 m further out when it was to be closed.
+    # The drawer slides along -x: its handle was 0.3 m further out at the start of closing.
     assert opened.object.pose.x - closed.object.pose.x == pytest.approx(0.3)
 
 
-async def test_view_creation(planned: Remembered) -> None:
+async def test_view_creation(planned: Recorded) -> None:
     with sqlite3.connect(planned.folder / "memory.db") as file:
         kinds = file.execute("SELECT type FROM sqlite_schema WHERE name = 'PickUpWithContextView'").fetchall()
         columns = [name for _, name, *_ in file.execute("PRAGMA table_info('PickUpWithContextView')")]
@@ -283,7 +283,7 @@ async def test_view_creation(planned: Remembered) -> None:
     ]
 
 
-async def test_pickUpWithContextView(planned: Remembered) -> None:
+async def test_pickUpWithContextView(planned: Recorded) -> None:
     row = await planned.one(select(PickUpWithContextView))
     assert (row.arm, row.grasp, row.torso_height) == (Arms.LEFT, Grasp.FRONT, 0.3)
     assert (row.relative_x, row.relative_y) == (pytest.approx(-0.7, abs=1e-6), pytest.approx(-0.6, abs=1e-6))
@@ -291,7 +291,7 @@ async def test_pickUpWithContextView(planned: Remembered) -> None:
     assert (row.obj_type, row.status) == (ObjectType.MILK, TaskStatus.SUCCEEDED)
 
 
-async def test_pickUpWithContextView_conditions(planned: Remembered) -> None:
+async def test_pickUpWithContextView_conditions(planned: Recorded) -> None:
     assert await planned.all(select(PickUpWithContextView).where(PickUpWithContextView.arm == Arms.RIGHT)) == []
     left = select(func.count()).where(PickUpWithContextView.arm == Arms.LEFT)
     assert await planned.all(left) == [1]

@@ -1,4 +1,4 @@
-"""PyCRAM's tests of its task tree (July 2024), by name; trees are collected, and remembered, and must agree."""
+"""PyCRAM's tests of its task tree (July 2024), by name; the collected tree and the recorded one must agree."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pycrorm_async.plan.task_tree import CollectedTree
 from pycrorm_async.world import Pose
 from tests.plan.conftest import Scene, kitchen
 from tests.promises.lab import url_of
-from tests.upstream.conftest import Remembered, common_plan
+from tests.upstream.conftest import Recorded, common_plan
 
 
 @dataclass
@@ -45,7 +45,7 @@ async def test_exception(tmp_path: Path) -> None:
                 await FailingActionPerformable().perform()
     (node,) = tree
     assert (node.status, type(node.failure)) == (TaskStatus.FAILED, PlanFailure)
-    rows = await Remembered(tmp_path).all(select(TaskTreeNode).order_by(TaskTreeNode.id))
+    rows = await Recorded(tmp_path).all(select(TaskTreeNode).order_by(TaskTreeNode.id))
     assert [(row.dtype, row.status, row.reason, row.failure_message) for row in rows] == [
         (None, TaskStatus.FAILED, "PlanFailure", "as it should"),
         ("FailingAction", TaskStatus.FAILED, "PlanFailure", "as it should"),
@@ -60,7 +60,7 @@ async def test_execution(scene: Scene) -> None:
     for node in tree:
         if not tree.children(node) and node.designator is not None:
             await node.designator.perform()
-    # The same motions bring the robot to the same place; the milk is taken along by actions alone.
+    # The same motions bring the robot to the same place; only actions move the milk with it.
     assert scene.robot.pose == Pose([0.6, 0.4, 0])
     assert scene.robot.joint_position("torso_lift_joint") == 0.3
     assert scene.robot.link_pose("l_gripper_tool_frame").distance(hand) < 1e-6
@@ -79,11 +79,11 @@ async def test_simulated_tree(scene: Scene) -> None:
 
 @pytest.mark.slow
 async def test_to_sql(tmp_path: Path) -> None:
-    """Every node of the tree has its row, which says the same of it."""
+    """Every node of the tree has its row, with the same values."""
     async with Memory.open(url_of(tmp_path)) as memory, memory.episode():
         with kitchen(), collected_tree() as tree:
             await common_plan()
-    root, *rows = await Remembered(tmp_path).all(select(TaskTreeNode).order_by(TaskTreeNode.id))
+    root, *rows = await Recorded(tmp_path).all(select(TaskTreeNode).order_by(TaskTreeNode.id))
     assert (root.kind, root.action) == ("root", None)
     assert [(row.dtype, row.kind, row.status, row.reason) for row in rows] == [
         (node.designator.dtype, node.kind, node.status, None) for node in tree if node.designator is not None
