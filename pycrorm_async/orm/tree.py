@@ -115,7 +115,7 @@ class LocationCandidate(Base):
     @property
     def reachable_arms(self) -> list[Arms]:
         """The arms that reach the target from this place."""
-        return [Arms[name] for name in self.arms.split(",") if name]
+        return [Arms.named(name) for name in self.arms.split(",") if name]
 
 
 class LocationRefusal(Base):

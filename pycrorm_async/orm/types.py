@@ -17,6 +17,8 @@ import msgspec
 from sqlalchemy import BigInteger, Dialect, String, Text
 from sqlalchemy.types import TypeDecorator
 
+from pycrorm_async.world.enums import Arms
+
 __all__ = ["Moment", "EnumName", "JsonText"]
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
@@ -62,8 +64,11 @@ class EnumName(TypeDecorator[Any]):
         return value if value is None or not dialect.is_async else self.member(value)
 
     def member(self, name: str) -> Enum | str:
-        """Return the member of this name, or the name if the enum lacks it."""
-        return self._members.get(name, name)
+        """Return the member of this name, or the name if the enum lacks it; a further arm of a robot is one too."""
+        member = self._members.get(name)
+        if member is None and self.enum is Arms and name.isidentifier():
+            return Arms.named(name)
+        return name if member is None else member
 
 
 class JsonText(TypeDecorator[Any]):

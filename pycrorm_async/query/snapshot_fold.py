@@ -292,9 +292,8 @@ class MomentFold:
 
 def _robot(robot: ObjectThen) -> RobotThen:
     description = robot_description(robot.name)
-    return RobotThen(
-        robot.name, robot.pose, robot.joints.get(description.torso_joint) if description is not None else None
-    )
+    torso = description.torso_joint if description is not None else None
+    return RobotThen(robot.name, robot.pose, robot.joints.get(torso) if torso is not None else None)
 
 
 def _moment(wall_ns: int) -> datetime:

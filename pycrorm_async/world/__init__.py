@@ -29,7 +29,19 @@ if TYPE_CHECKING:
         VisibilityCostmap,
     )
     from pycrorm_async.world.robots.acting_robot import acting_robot, robot_acting
-    from pycrorm_async.world.robots.robot_description import Limits, RobotDescription, robot_description
+    from pycrorm_async.world.robots.robot_description import (
+        COURIER,
+        PR2,
+        ArmDescription,
+        Bounds,
+        Drive,
+        FieldOfView,
+        Limits,
+        RobotDescription,
+        register_robot,
+        robot_description,
+    )
+    from pycrorm_async.world.robots.urdf_description import describe_arm, describe_robot
     from pycrorm_async.world.state import WorldState
     from pycrorm_async.world.world_copy import copied
 
@@ -50,7 +62,16 @@ __all__ = [
     "BoundingBox",
     "Limits",
     "RobotDescription",
+    "ArmDescription",
+    "Bounds",
+    "Drive",
+    "FieldOfView",
+    "PR2",
+    "COURIER",
+    "register_robot",
     "robot_description",
+    "describe_arm",
+    "describe_robot",
     "robot_acting",
     "acting_robot",
     "Costmap",
@@ -72,7 +93,19 @@ _NAMES_BY_MODULE = {
     "enums": ("Arms", "Grasp", "GripperState", "JointType", "ObjectType", "WorldMode"),
     "objects": ("Object",),
     "pose": ("Pose", "Quaternion", "Vector"),
-    "robots.robot_description": ("Limits", "RobotDescription", "robot_description"),
+    "robots.robot_description": (
+        "COURIER",
+        "PR2",
+        "ArmDescription",
+        "Bounds",
+        "Drive",
+        "FieldOfView",
+        "Limits",
+        "RobotDescription",
+        "register_robot",
+        "robot_description",
+    ),
+    "robots.urdf_description": ("describe_arm", "describe_robot"),
     "robots.acting_robot": ("acting_robot", "robot_acting"),
     "state": ("WorldState",),
     "observers": ("WorldObserver", "WorldWatcher", "current_world", "watcher"),

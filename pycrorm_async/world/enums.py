@@ -3,16 +3,44 @@
 from __future__ import annotations
 
 from enum import Enum, IntEnum
+from typing import Any, cast
 
 __all__ = ["Arms", "Grasp", "GripperState", "ObjectType", "JointType", "WorldMode"]
 
 
 class Arms(IntEnum):
-    """An arm of the robot; BOTH for actions that move both."""
+    """An arm of the robot; BOTH for actions that move the left and the right one.
+
+    A robot's description says which of these it has; the only arm of a robot may be LEFT or RIGHT. Further arms have a
+    name of their own (`named`), with which they are recorded.
+    """
 
     LEFT = 1
     RIGHT = 2
     BOTH = 3
+
+    @classmethod
+    def named(cls, name: str) -> Arms:
+        """Return the arm of that name, the same object at each call; it may be one that no member of the class has.
+
+        >>> Arms.named("CENTRE").name, Arms.named("LEFT") is Arms.LEFT
+        ('CENTRE', True)
+
+        Raises `ValueError` for a text that is not an identifier.
+        """
+        if name in cls.__members__:
+            return cls.__members__[name]
+        if not name.isidentifier():
+            raise ValueError(f"the name of an arm must be an identifier, got {name!r:.100}")
+        number = int.from_bytes(name.encode(), "big")  # the same in every process, and of no other name
+        arm = int.__new__(cls, number)
+        arm._name_, arm._value_ = name, number
+        # The enum's own table of values gives each name one object, whichever thread makes it first.
+        known: Any = cls._value2member_map_
+        return cast("Arms", known.setdefault(number, arm))
+
+    def __reduce_ex__(self, protocol: Any) -> tuple[Any, ...]:
+        return Arms.named, (self._name_,)
 
 
 class Grasp(IntEnum):

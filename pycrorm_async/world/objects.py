@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pycrorm_async.world.bullet_body import Body, Color
-from pycrorm_async.world.enums import JointType, ObjectType
+from pycrorm_async.world.enums import Arms, JointType, ObjectType
 from pycrorm_async.world.errors import (
     AttachmentRefused,
     DuplicateName,
@@ -35,6 +35,7 @@ from pycrorm_async.world.urdf_checks import urdf_text
 
 if TYPE_CHECKING:
     from pycrorm_async.world.bullet import BulletWorld
+    from pycrorm_async.world.robots.chain_ik import Chain
 
 __all__ = ["Object"]
 
@@ -51,8 +52,8 @@ class Object:
         pose: pose of the root link's frame, in "map"; None means the origin. `reset` restores it.
         world: the world to add it to; None means the current world of this context.
         color: red, green, blue, opacity, 0 to 1.
-        robot: the description of a robot; None means the one with the object's name. It has the built-in shape of its
-            name too.
+        robot: the description of a robot; None means the built-in or registered one with the object's name. Without
+            `description` the model is that of the robot's description, or the built-in one of its name.
 
     Raises:
         ObjectRefused, NoWorld, WorldClosed, DuplicateName, DescriptionNotLoadable, PoseRefused.
@@ -65,6 +66,8 @@ class Object:
     description_text: str
     color: Color | None
     robot_description: RobotDescription | None
+    chains: dict[Arms, Chain]
+    """The chains of a robot's arms that were needed so far, for `robots.kinematics`."""
     body: Body
     """The body in Bullet, for this package only: moving it notifies no observer."""
     copy_of: Object | None
@@ -93,13 +96,16 @@ class Object:
         self.world = world
         self.copy_of = None
         self.original_pose = _check_pose(name, pose if pose is not None else Pose())
+        if robot is None and object_type is ObjectType.ROBOT:
+            robot = robot_description(name)
+        if description is None and robot is not None:
+            description = robot.urdf
         if description is None:
             description = built_in_urdf(name if robot is None else robot.name, object_type)
         self.description_text = urdf_text(name, description)
-        if robot is None and object_type is ObjectType.ROBOT:
-            robot = robot_description(name)
         self.robot_description = robot
         self.color = color
+        self.chains = {}
         self.body = Body(name, self.description_text, client, self.original_pose, color)
         world.add(self)
 

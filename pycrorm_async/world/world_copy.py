@@ -70,6 +70,7 @@ def _copy_object(obj: Object, copy: BulletWorld) -> Object:
     )
     object_copy.copy_of = obj
     object_copy.robot_description = obj.robot_description
+    object_copy.chains = obj.chains
     object_copy.body.place(obj.pose)
     object_copy.body.turn(obj.joint_positions())
     return object_copy

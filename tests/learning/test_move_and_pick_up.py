@@ -21,6 +21,7 @@ from pycrorm_async.plan.errors import NoRobotHere
 from pycrorm_async.plan.failures import ManipulationGoalInCollision, ObjectUnreachable
 from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose
 from pycrorm_async.world.bullet_loader import engine
+from pycrorm_async.world.robots.robot_description import PR2
 
 IN_KITCHEN = Scene(kitchen=True, torso_height=0.3)
 
@@ -151,9 +152,7 @@ def test_experience_with_other_heights_does_not_apply_to_this_one(stage: Stage) 
     policy = at(-0.6, 0.0, height=(0.55, 0.65))
     with pytest.raises(ObjectUnreachable, match="no way to pick up milk at this height"):
         list(MoveAndPickUp(stage.target, policy=policy).plain())
-    torso = stage.robot.robot_description
-    assert torso is not None
-    stage.robot.set_joint_position(torso.torso_joint, 0.3)  # the milk is 0.6 m over it now
+    stage.robot.set_joint_position(PR2.torso_joint, 0.3)  # the milk is 0.6 m over it now
     assert len(list(MoveAndPickUp(stage.target, policy=policy).plain())) == 20
 
 

@@ -36,7 +36,7 @@ def free_and_visible(robot: CurrentRobot, target: Object) -> Region:
     """
     world, ignored = target.world, robot.with_load()
     ground = Pose((target.pose.position.x, target.pose.position.y, 0.0))
-    low, high = robot.description.camera_height_m
+    low, high = robot.camera_heights_m()
     # The maps are not turned with the object, so the square in its frame needs up to √2 times the side: 1.5 is enough.
     size = {"size_cells": 2 * round(0.75 * _CELLS), "resolution_m": _RESOLUTION_M}
     clearance = base_clearance([robot])

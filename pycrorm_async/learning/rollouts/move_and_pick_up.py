@@ -103,7 +103,7 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
     def height(self) -> float:
         """Height of the object over the lifted torso at this moment, m. Raises `NoWorld`, `NoRobotHere`."""
         robot = require_robot()
-        torso = robot.body.joint_position(robot.description.torso_joint)
+        torso = robot.body.joint_position(robot.torso_joint())
         return self.target.pose.position.z - robot.body.pose.position.z - torso
 
     def policy_here(self) -> Policy:

@@ -81,8 +81,9 @@ class Stage:
         """Restore the start of a rollout. Moves only what has changed: a fifth of the time of Bullet's own reset."""
         self.world.reset()
         description = self.robot.robot_description
-        if self.scene.torso_height and description is not None:
-            self.robot.set_joint_position(description.torso_joint, self.scene.torso_height)
+        torso = description.torso_joint if description is not None else None
+        if self.scene.torso_height and torso is not None:
+            self.robot.set_joint_position(torso, self.scene.torso_height)
 
 
 def _digits(number: float) -> str:

@@ -56,7 +56,7 @@ class CheckedAction(ActionAbstract):
 
 @dataclass
 class MoveTorsoActionPerformable(CheckedAction):
-    """Lift or lower the torso to `position` (m). Raises `TorsoGoalUnreachable`."""
+    """Lift or lower the torso to `position` (m). Raises `TorsoGoalUnreachable`, `CapabilityAbsenceFailure`."""
 
     concept: ClassVar[str | None] = "MoveTorso"
 
@@ -66,7 +66,7 @@ class MoveTorsoActionPerformable(CheckedAction):
         return frozenset({Resource.TORSO})
 
     async def perform(self) -> None:
-        await MoveJointsMotion([require_robot().description.torso_joint], [self.position]).perform()
+        await MoveJointsMotion([require_robot().torso_joint()], [self.position]).perform()
 
 
 @dataclass
@@ -87,7 +87,7 @@ class SetGripperActionPerformable(CheckedAction):
 
 @dataclass
 class ParkArmsActionPerformable(CheckedAction):
-    """Move an arm, or both, to the folded park posture."""
+    """Move an arm, or both, to the folded park posture. Raises `CapabilityAbsenceFailure` for an arm without one."""
 
     concept: ClassVar[str | None] = "ParkingArms"
 
@@ -97,7 +97,12 @@ class ParkArmsActionPerformable(CheckedAction):
         return arms(self.arm)
 
     async def perform(self) -> None:
-        parked = {arm: dict(each.park) for arm, each in require_robot().each_arm(self.arm).items()}
+        robot = require_robot()
+        parked = {arm: robot.parked(arm) for arm in robot.each_arm(self.arm)}
+        if self.arm not in (Arms.LEFT, Arms.RIGHT, Arms.BOTH):
+            joints = parked[self.arm]
+            await MoveJointsMotion([*joints], [*joints.values()]).perform()
+            return
         await MoveArmJointsMotion(parked.get(Arms.LEFT), parked.get(Arms.RIGHT)).perform()
 
 
@@ -160,10 +165,9 @@ class PickUpActionPerformable(CheckedAction):
         robot = require_robot()
         target = in_world(self.object_designator)
         check_takable(robot, self.arm, target)
-        tool_frame = robot.one_arm(self.arm).tool_frame
         if collisions_count():
             check_fits(robot, self.arm, target, grasp_orientation(target.pose, self.grasp))
-        before, at, above = pick_up_poses(target.pose, self.grasp, robot.body.link_pose(tool_frame))
+        before, at, above = pick_up_poses(target.pose, self.grasp, robot.tool_pose(self.arm))
         await MoveTCPMotion(before, self.arm, allow_gripper_collision=True, _object_name=target.name).perform()
         await MoveGripperMotion(GripperState.OPEN, self.arm).perform()
         await MoveTCPMotion(at, self.arm, allow_gripper_collision=True, _object_name=target.name).perform()
@@ -197,7 +201,7 @@ class PlaceActionPerformable(CheckedAction):
         tool_frame = robot.one_arm(self.arm).tool_frame
         if body.attachments.get(held) != tool_frame:
             raise ObjectLost(f"the {self.arm.name} gripper does not hold {held.name}", held.name)
-        goal = place_pose(self.target_location, held.pose, body.link_pose(tool_frame))
+        goal = place_pose(self.target_location, held.pose, robot.tool_pose(self.arm))
         await MoveTCPMotion(goal, self.arm, _object_name=held.name).perform()
         await MoveGripperMotion(GripperState.OPEN, self.arm).perform()
         body.detach(held)

@@ -59,12 +59,11 @@ class GripActionPerformable(CheckedAction):
 
     async def perform(self) -> None:
         robot = require_robot()
-        tool_frame = robot.one_arm(self.gripper).tool_frame
         target = in_world(self.object_designator)
         if not self.effort >= 0:
             raise IllPosedGoalFailure(f"effort must be >= 0 N, got {self.effort} N", self.effort)
         check_takable(robot, self.gripper, target)
-        tool = robot.body.link_pose(tool_frame)
+        tool = robot.tool_pose(self.gripper)
         distance = min(distance_to_box(tool, target.bounding_box(link)) for link in target.links)
         if distance > HOLD_DISTANCE_M_MAX:
             message = (

@@ -28,6 +28,7 @@ from pycrorm_async.plan.object_designators import ObjectDesignator, in_world
 from pycrorm_async.world.enums import Arms, Grasp
 from pycrorm_async.world.objects import Object
 from pycrorm_async.world.pose import Pose
+from pycrorm_async.world.robots.robot_description import Drive
 
 __all__ = ["DetectActionPerformable", "TransportActionPerformable"]
 
@@ -86,17 +87,27 @@ class TransportActionPerformable(CheckedAction):
             check_fits(robot, self.arm, target, grasp_orientation(target.pose, Grasp.FRONT))
         await self._park_arms()
         if not is_held:
-            await NavigateActionPerformable(self._fetching_pose(robot.body)).perform()
+            await self._drive(self._fetching_pose(robot.body))
             await PickUpActionPerformable(self.object_designator, self.arm, Grasp.FRONT).perform()
             await self._park_arms()
         place = CostmapLocation(self.target_location, reachable_for=robot.body, reachable_arm=self.arm).resolve()
-        await NavigateActionPerformable(place.pose).perform()
+        await self._drive(place.pose)
         await PlaceActionPerformable(self.object_designator, self.arm, self.target_location).perform()
         await self._park_arms()
 
     async def _park_arms(self) -> None:
-        arms = require_robot().description.arms
-        await ParkArmsActionPerformable(Arms.BOTH if len(arms) > 1 else self.arm).perform()
+        """Park every arm that has a park posture."""
+        foldable = [arm for arm, each in require_robot().description.arms.items() if each.park]
+        both = {Arms.LEFT, Arms.RIGHT}
+        if both <= {*foldable}:
+            foldable = [Arms.BOTH, *(arm for arm in foldable if arm not in both)]
+        for arm in foldable:
+            await ParkArmsActionPerformable(arm).perform()
+
+    async def _drive(self, place: Pose) -> None:
+        """Drive to a place; a robot with a fixed base is offered no other place than its own."""
+        if require_robot().description.drive is not Drive.FIXED:
+            await NavigateActionPerformable(place).perform()
 
     def _fetching_pose(self, body: Object) -> Pose:
         try:

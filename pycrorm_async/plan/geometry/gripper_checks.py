@@ -9,7 +9,7 @@ from pycrorm_async.plan.failures import (
     IllPosedGoalFailure,
     PerceptionObjectNotInWorld,
 )
-from pycrorm_async.world.enums import Arms, ObjectType
+from pycrorm_async.world.enums import Arms, GripperState, ObjectType
 from pycrorm_async.world.objects import Object
 from pycrorm_async.world.pose import Pose, Quaternion
 from pycrorm_async.world.queries.bounding_boxes import box_around
@@ -24,7 +24,7 @@ def check_takable(robot: CurrentRobot, arm: Arms, target: Object) -> None:
         IllPosedGoalFailure: the object is furniture or a robot, or `arm` is not a single arm.
         EndEffectorFailure: the gripper holds another object.
         PerceptionObjectNotInWorld: the object is in another world than the robot.
-        CapabilityAbsenceFailure: the robot has no such arm.
+        CapabilityAbsenceFailure: the robot has no such arm, or the arm no gripper.
     """
     check_same_world(robot, target)
     if target.object_type in (ObjectType.ROBOT, ObjectType.ENVIRONMENT):
@@ -39,7 +39,11 @@ def check_same_world(robot: CurrentRobot, obj: Object) -> None:
 
 
 def check_free(robot: CurrentRobot, arm: Arms, *but: Object) -> None:
-    """Raise `EndEffectorFailure` if the gripper holds an object other than `but`."""
+    """Raise `EndEffectorFailure` if the gripper holds an object other than `but`.
+
+    Raises `CapabilityAbsenceFailure` if there is no such gripper.
+    """
+    robot.gripper_joints(arm, GripperState.CLOSE)
     tool_frame = robot.one_arm(arm).tool_frame
     for obj, link in robot.body.attachments.items():
         if link == tool_frame and obj not in but:
@@ -55,7 +59,7 @@ def check_fits(robot: CurrentRobot, arm: Arms, target: Object, tool: Quaternion)
     frames = [(across @ target.link_pose(link), target.body.solids[link]) for link in target.links]
     box = box_around([((frame.position, frame.orientation), solids) for frame, solids in frames])
     width, opening = box.size.y if box is not None else 0.0, robot.one_arm(arm).opening_m
-    if width > opening:
+    if opening is not None and width > opening:
         message = f"{target.name} is {width:.3f} m wide between the fingers, the {arm.name} gripper opens {opening:g} m"
         raise CapabilityAbsenceFailure(message, target.name, width, opening)
 

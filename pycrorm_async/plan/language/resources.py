@@ -28,6 +28,8 @@ class Resource(Enum):
     LEFT_ARM = "LEFT_ARM"
     RIGHT_ARM = "RIGHT_ARM"
     BASE = "BASE"
+    OTHER_ARM = "OTHER_ARM"
+    """Any arm but the left and the right one: the further arms of a robot take turns."""
     TORSO = "TORSO"
     HEAD = "HEAD"
 
@@ -38,25 +40,27 @@ _ARMS = {
     Arms.RIGHT: frozenset({Resource.RIGHT_ARM}),
     Arms.BOTH: frozenset({Resource.LEFT_ARM, Resource.RIGHT_ARM}),
 }
+_OTHER_ARM = frozenset({Resource.OTHER_ARM})
 _STANDING = frozenset({Resource.BASE, Resource.TORSO})
 
 
 def arms(arm: Arms) -> frozenset[Resource]:
     """Return the arm, or both, with its gripper."""
-    return _ARMS[arm]
+    return _ARMS.get(arm, _OTHER_ARM)
 
 
 def reaching(arm: Arms) -> frozenset[Resource]:
     """Return the parts for reaching a place in the map: the arm, and base and torso, which must not move."""
-    return _ARMS[arm] | _STANDING
+    return arms(arm) | _STANDING
 
 
 def moving(joints: Iterable[str], robot: RobotDescription) -> frozenset[Resource]:
     """Return the parts that these joints belong to; a joint of no part is ignored."""
-    parts = {robot.torso_joint: Resource.TORSO}
-    parts |= dict.fromkeys((robot.head_pan_joint, robot.head_tilt_joint), Resource.HEAD)
+    parts = dict.fromkeys(robot.head_joints, Resource.HEAD)
+    if robot.torso_joint is not None:
+        parts[robot.torso_joint] = Resource.TORSO
     for arm, description in robot.arms.items():
-        (part,) = _ARMS[arm]
+        (part,) = arms(arm)
         parts |= dict.fromkeys(description.joints, part)
         for positions in description.gripper_joints.values():
             parts |= dict.fromkeys(positions, part)

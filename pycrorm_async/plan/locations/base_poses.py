@@ -21,6 +21,7 @@ from pycrorm_async.world.enums import Arms, Grasp
 from pycrorm_async.world.pose import Pose, yaw_quaternion
 from pycrorm_async.world.queries.costmaps import Costmap, GaussianCostmap, OccupancyCostmap, VisibilityCostmap
 from pycrorm_async.world.robots.kinematics import Unreachable, solve
+from pycrorm_async.world.robots.robot_description import Drive, PR2Description
 
 __all__ = ["Reach", "face", "reaching_arms", "resolve_robot", "base_poses"]
 
@@ -44,38 +45,61 @@ def base_poses(
     visible_for: ObjectLike | None,
     reachable_arm: Arms | None,
 ) -> Iterator[tuple[Pose, Reach]]:
-    """Yield base poses that face the target, best first, suitable or not."""
+    """Yield base poses that face the target, best first, suitable or not; for a fixed base only its own pose."""
     reacher = resolve_robot(reachable_for) if reachable_for is not None else None
     viewer = resolve_robot(visible_for) if visible_for is not None else None
     goal = target if isinstance(target, Pose) else pose_of(target)
     check_in_map(goal)
+    if reacher is not None and reacher.description.drive is Drive.FIXED:
+        yield _checked(reacher.body.pose, target, goal, reacher, viewer, reachable_arm)
+        return
     robots = [each for each in (reacher, viewer) if each is not None]
     clearance = base_clearance(robots)
     costmap = _costmap(target, goal, robots, viewer, clearance)
     clear = 0
-    for cell in costmap.best(costmap.map.size if clearance is not None else CELLS_MAX):
+    for cell in _cells(costmap, robots, every=clearance is not None):
         base_pose = face(cell, goal)
         if clearance is not None and (collision := clearance.refusal(base_pose)) is not None:
             yield base_pose, Reach(refusal=collision)
             continue
         if (clear := clear + 1) > CELLS_MAX:
             return
-        if viewer is not None and not _sees(viewer, base_pose, target, goal):
-            yield base_pose, Reach(refusal="the target is not visible from here")
-        elif reacher is not None:
-            yield (
-                base_pose,
-                reaching_arms(reacher, reachable_arm, base_pose, partial(_goals, reacher, base_pose, target, goal)),
-            )
-        else:
-            yield base_pose, Reach()
+        yield _checked(base_pose, target, goal, reacher, viewer, reachable_arm)
+
+
+def _cells(costmap: Costmap, robots: list[CurrentRobot], *, every: bool) -> list[Pose]:
+    """Return the middles of the cells to search: the best ones, or with `every` all of them.
+
+    The best cells are as near to the target as a PR2 stands. For other robots, whose arms reach from other distances,
+    they are spread over the whole map, best first.
+    """
+    if all(isinstance(robot.description, PR2Description) for robot in robots):
+        return costmap.best(costmap.map.size if every else CELLS_MAX)
+    cells = costmap.best(costmap.map.size)
+    return cells[:: max(1, len(cells) // CELLS_MAX)]
+
+
+def _checked(
+    base_pose: Pose,
+    target: Pose | ObjectLike,
+    goal: Pose,
+    reacher: CurrentRobot | None,
+    viewer: CurrentRobot | None,
+    arm: Arms | None,
+) -> tuple[Pose, Reach]:
+    """Return the base pose with the arms that reach the target from there, or with the reason why none does."""
+    if viewer is not None and not _sees(viewer, base_pose, target, goal):
+        return base_pose, Reach(refusal="the target is not visible from here")
+    if reacher is None:
+        return base_pose, Reach()
+    return base_pose, reaching_arms(reacher, arm, base_pose, partial(_goals, reacher, base_pose, target, goal))
 
 
 def resolve_robot(meant: ObjectLike) -> CurrentRobot:
     """Return the robot that the argument refers to. Raises `NoRobotHere` if it has no robot description."""
     body = in_world(meant)
     if body.robot_description is None:
-        raise NoRobotHere(f"{body.name!r} is not a robot with a robot description; the built-in one is 'pr2'")
+        raise NoRobotHere(f"{body.name!r} is not a robot with a robot description")
     return CurrentRobot(body, body.robot_description)
 
 
@@ -132,7 +156,7 @@ def _costmap(
     costmap = free * GaussianCostmap(origin)
     if viewer is None:
         return costmap
-    low, high = viewer.description.camera_height_m
+    low, high = viewer.camera_heights_m()
     viewed = goal if isinstance(target, Pose) else in_world(target)
     return costmap * VisibilityCostmap(
         world, viewed, min_height_m=low, max_height_m=high, origin=origin, ignore=ignored
@@ -142,7 +166,7 @@ def _costmap(
 def _goals(robot: CurrentRobot, base_pose: Pose, target: Pose | ObjectLike, goal: Pose, arm: Arms) -> tuple[Pose, ...]:
     body, description = robot
     tool_frame = description.arms[arm].tool_frame
-    tool = body.link_pose(tool_frame)
+    tool = robot.tool_pose(arm)
     if not isinstance(target, Pose):
         return pick_up_poses(goal, Grasp.FRONT, base_pose @ tool.relative_to(body.pose))
     held = next((each for each, link in body.attachments.items() if link == tool_frame), None)
@@ -152,8 +176,7 @@ def _goals(robot: CurrentRobot, base_pose: Pose, target: Pose | ObjectLike, goal
 
 def _sees(robot: CurrentRobot, base_pose: Pose, target: Pose | ObjectLike, goal: Pose) -> bool:
     """Return whether the target is visible from the camera's position at this base pose."""
-    body, description = robot
-    eye = (base_pose @ body.link_pose(description.camera_link).relative_to(body.pose)).position
+    eye = (base_pose @ robot.camera_pose().relative_to(robot.body.pose)).position
     if isinstance(target, Pose):
         return require_world().ray_test([eye], [goal.position], ignore=robot.with_load()) == [None]
     return require_world().visible(in_world(target), eye, ignore=robot.with_load()) >= VISIBLE_SHARE_MIN

@@ -166,12 +166,14 @@ def _reach(robot: CurrentRobot, base_pose: Pose, target_pose: Pose, past: PastSu
     if past.arm not in description.arms:
         return Reach(refusal=f"the robot has no {past.arm.name} arm")
     if past.torso_height is not None:
+        if description.torso_joint is None:
+            return Reach(refusal="the robot has no torso to lift")
         lower, upper = body.joint_limits(description.torso_joint)
         if not lower <= past.torso_height <= upper:
             return Reach(refusal=f"the torso cannot be lifted to {past.torso_height:g} m")
 
     def goals(arm: Arms) -> tuple[Pose, ...]:
-        tool = body.link_pose(description.arms[arm].tool_frame)
+        tool = robot.tool_pose(arm)
         return pick_up_poses(target_pose, past.grasp, base_pose @ tool.relative_to(body.pose))
 
     return reaching_arms(robot, past.arm, base_pose, goals, torso_height=past.torso_height)

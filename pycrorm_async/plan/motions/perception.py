@@ -61,7 +61,7 @@ def seen_by_camera(robot: CurrentRobot, object_type: ObjectType) -> tuple[Seen, 
     Raises:
         PerceptionObjectNotFound: no object is visible; its data are the type and the reason for each object by name.
     """
-    camera = robot.body.link_pose(robot.description.camera_link)
+    camera = robot.camera_pose()
     seen: list[Seen] = []
     unseen: dict[str, str] = {}
     for obj in require_world().objects:

@@ -6,7 +6,6 @@ none.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING
 
@@ -31,6 +30,7 @@ from pycrorm_async.plan.geometry.articulation import (
 )
 from pycrorm_async.plan.geometry.grasp_poses import HOLD_DISTANCE_M_MAX, distance_to_box
 from pycrorm_async.plan.geometry.gripper_checks import check_same_world
+from pycrorm_async.plan.motions.looking import head_joints
 from pycrorm_async.plan.motions.perception import objects_in_world, seen_by_camera
 from pycrorm_async.plan.object_designators import ObjectPart
 from pycrorm_async.world.enums import Arms
@@ -38,6 +38,7 @@ from pycrorm_async.world.errors import JointLimitExceeded, UnknownJoint
 from pycrorm_async.world.pose import Pose
 from pycrorm_async.world.queries.collision_queries import collisions_at
 from pycrorm_async.world.robots.kinematics import Limits, Unreachable, solve
+from pycrorm_async.world.robots.robot_description import Drive
 
 if TYPE_CHECKING:
     from pycrorm_async.plan.motions.motions import (
@@ -71,6 +72,8 @@ class SimulatedModules:
 
     async def navigate(self, motion: MoveMotion) -> None:
         robot = require_robot()
+        if robot.description.drive is Drive.FIXED:
+            raise robot.absence("drive: its base is fixed")
         if self._collisions:
             _check_base_clear(robot, motion.target)
         robot.body.set_pose(motion.target)
@@ -90,8 +93,8 @@ class SimulatedModules:
     async def move_gripper(self, motion: MoveGripperMotion) -> None:
         robot = require_robot()
         joints: dict[str, float] = {}
-        for arm in robot.each_arm(motion.gripper).values():
-            joints |= arm.gripper_joints[motion.motion]
+        for arm in robot.each_arm(motion.gripper):
+            joints |= robot.gripper_joints(arm, motion.motion)
         robot.body.set_joint_positions(joints)
 
     async def move_arm_joints(self, motion: MoveArmJointsMotion) -> None:
@@ -134,7 +137,7 @@ class SimulatedModules:
         """Move the handle's joint to `goal` together with the hand, which keeps its pose relative to the handle."""
         check_same_world(robot, handle.whole)
         tool_frame = robot.one_arm(arm).tool_frame
-        tool = robot.body.link_pose(tool_frame)
+        tool = robot.tool_pose(arm)
         distance = distance_to_box(tool, handle.whole.bounding_box(handle.link))
         if distance > HOLD_DISTANCE_M_MAX:
             message = f"{tool_frame} is not on {handle.link} but {distance:.3f} m away: grasp it first"
@@ -181,35 +184,11 @@ def _check_base_clear(robot: CurrentRobot, goal: Pose) -> None:
         raise NavigationGoalInCollision(message, part, obj.name)
 
 
-def head_joints(robot: CurrentRobot, target: Pose) -> dict[str, float]:
-    """Return pan and tilt (rad) that point the camera's axis at the target, clamped to the joints' limits.
-
-    Pan rotates about z of the pan link. Tilt rotates about y of the tilt link, whose origin moves with pan, so tilt is
-    computed for the head after panning.
-    """
-    body, description = robot
-    pan_pose = body.link_pose(description.head_pan_link)
-    tilt_origin = body.link_pose(description.head_tilt_link).relative_to(pan_pose).position
-    point = target.relative_to(pan_pose).position
-    turn = math.atan2(point.y, point.x)
-    pan = math.remainder(body.joint_position(description.head_pan_joint) + turn, math.tau)
-    ahead = math.hypot(point.x, point.y) - tilt_origin.x
-    tilt = -math.atan2(point.z - tilt_origin.z, ahead)
-    return {
-        description.head_pan_joint: _clamp(pan, body.joint_limits(description.head_pan_joint)),
-        description.head_tilt_joint: _clamp(tilt, body.joint_limits(description.head_tilt_joint)),
-    }
-
-
-def _clamp(value: float, limits: tuple[float, float]) -> float:
-    return max(limits[0], min(limits[1], value))
-
-
 def _set_joints(robot: CurrentRobot, positions: Mapping[str, float]) -> None:
     body, description = robot
     try:
         body.set_joint_positions(positions)
     except JointLimitExceeded as exceeded:
-        if description.torso_joint in positions and len(positions) == 1:
+        if description.torso_joint is not None and [*positions] == [description.torso_joint]:
             raise TorsoGoalUnreachable(str(exceeded), positions[description.torso_joint]) from exceeded
         raise ConfigurationNotReached(str(exceeded), dict(positions)) from exceeded

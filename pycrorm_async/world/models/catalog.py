@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 from pycrorm_async.world.enums import ObjectType
 from pycrorm_async.world.errors import DescriptionNotLoadable
+from pycrorm_async.world.models.courier import courier_urdf
 from pycrorm_async.world.models.kitchen import kitchen_urdf
 from pycrorm_async.world.models.pr2 import pr2_urdf
 from pycrorm_async.world.models.primitives import Range, box_urdf, cylinder_urdf
@@ -60,10 +61,12 @@ def built_in_urdf(name: str, object_type: ObjectType) -> str:
 def _by_name(name: str, object_type: ObjectType) -> str:
     if (name, object_type) == ("pr2", ObjectType.ROBOT):
         return pr2_urdf()
+    if (name, object_type) == ("courier", ObjectType.ROBOT):
+        return courier_urdf()
     if (name, object_type) == ("kitchen", ObjectType.ENVIRONMENT):
         return kitchen_urdf()
     raise DescriptionNotLoadable(
         name,
-        f"no {object_type.name} of that name is built in ('pr2' is the robot, 'kitchen' the environment); "
+        f"no {object_type.name} of that name is built in ('pr2', 'courier' are robots, 'kitchen' the environment); "
         "pass a description: URDF text or the path of a .urdf file",
     )

@@ -10,21 +10,17 @@ model's. The shapes are about as large as the robot's: precise enough for boundi
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
-from xml.etree.ElementTree import Element, SubElement, fromstring, indent, tostring
+from xml.etree.ElementTree import Element, indent, tostring
 
 from pycrorm_async.errors import MissingExtra
-from pycrorm_async.world.models.primitives import INERTIA, numbers
-from pycrorm_async.world.robots.robot_description import FINGER_OPEN_RAD, PR2, ArmDescription, Bounds
+from pycrorm_async.world.models.urdf_elements import DARK, GREY, OPTICAL, WHITE, fixed, link, moving
+from pycrorm_async.world.robots.robot_description import FINGER_OPEN_RAD, PR2, Bounds, PR2Arm
 
 __all__ = ["pr2_urdf", "pr2_mesh_urdf_path"]
 
 _X, _Y, _Z = (1, 0, 0), (0, 1, 0), (0, 0, 1)
-_WHITE, _GREY, _DARK = "0.93 0.93 0.95 1", "0.6 0.6 0.65 1", "0.2 0.2 0.22 1"
-_OPTICAL = (-math.pi / 2, 0.0, -math.pi / 2)
 _MESH_MODEL = "cmeel.prefix/share/example-robot-data/robots/pr2_description/urdf/pr2.urdf"
 
 
@@ -34,11 +30,11 @@ def pr2_urdf() -> str:
     It declares the hard limits; the rolls of forearm and wrist are continuous.
     """
     robot = Element("robot", name=PR2.name)
-    _link(robot, "base_footprint")
-    _fixed(robot, "base_footprint_joint", "base_footprint", "base_link", (0, 0, 0.051))
-    _link(robot, "base_link", (0.65, 0.65, 0.28), (0, 0, 0.14), _WHITE)
+    link(robot, "base_footprint")
+    fixed(robot, "base_footprint_joint", "base_footprint", "base_link", (0, 0, 0.051))
+    link(robot, "base_link", (0.65, 0.65, 0.28), (0, 0, 0.14), WHITE)
     torso = PR2.torso_origin
-    _moving(
+    moving(
         robot,
         PR2.torso_joint,
         "base_link",
@@ -46,8 +42,9 @@ def pr2_urdf() -> str:
         (torso.x, torso.y, torso.z - 0.051),
         _Z,
         PR2.torso_limits,
+        prismatic=True,
     )
-    _link(robot, "torso_lift_link", (0.24, 0.44, 0.95), (-0.1, 0, -0.235), _WHITE)
+    link(robot, "torso_lift_link", (0.24, 0.44, 0.95), (-0.1, 0, -0.235), WHITE)
     _head(robot)
     for arm in PR2.arms.values():
         _arm(robot, arm)
@@ -76,7 +73,7 @@ def pr2_mesh_urdf_path() -> Path:
 
 def _head(robot: Element) -> None:
     """Add pan, tilt and the stereo camera on top, which is 1.27 m above the floor at torso height 0."""
-    _moving(
+    moving(
         robot,
         PR2.head_pan_joint,
         "torso_lift_link",
@@ -85,8 +82,8 @@ def _head(robot: Element) -> None:
         _Z,
         Bounds(-3.007, 3.007),
     )
-    _link(robot, PR2.head_pan_link, (0.16, 0.2, 0.2), (0.02, 0, -0.06), _DARK)
-    _moving(
+    link(robot, PR2.head_pan_link, (0.16, 0.2, 0.2), (0.02, 0, -0.06), DARK)
+    moving(
         robot,
         PR2.head_tilt_joint,
         PR2.head_pan_link,
@@ -95,27 +92,27 @@ def _head(robot: Element) -> None:
         _Y,
         Bounds(-0.471238, 1.39626),
     )
-    _link(robot, PR2.head_tilt_link, (0.22, 0.3, 0.11), (-0.05, 0, 0.1), _WHITE)
+    link(robot, PR2.head_tilt_link, (0.22, 0.3, 0.11), (-0.05, 0, 0.1), WHITE)
     for joint, parent, child, origin in (
         ("head_plate_frame_joint", PR2.head_tilt_link, "head_plate_frame", (0.0232, 0, 0.0645)),
         ("sensor_mount_frame_joint", "head_plate_frame", "sensor_mount_link", (0, 0, 0)),
         ("double_stereo_frame_joint", "sensor_mount_link", "double_stereo_link", (0, 0, 0.003)),
         ("wide_stereo_frame_joint", "double_stereo_link", "wide_stereo_link", (0, 0.03, 0.0305)),
     ):
-        _fixed(robot, joint, parent, child, origin)
-        _link(robot, child)
-    _fixed(
+        fixed(robot, joint, parent, child, origin)
+        link(robot, child)
+    fixed(
         robot,
         "wide_stereo_optical_frame_joint",
         "wide_stereo_link",
         PR2.camera_link,
         (0, 0, 0),
-        rotation=_OPTICAL,
+        rotation=OPTICAL,
     )
-    _link(robot, PR2.camera_link)
+    link(robot, PR2.camera_link)
 
 
-def _arm(robot: Element, arm: ArmDescription) -> None:
+def _arm(robot: Element, arm: PR2Arm) -> None:
     """Add the seven joints from the torso to the wrist, and the gripper."""
     prefix = arm.tool_frame[0]
     pan, lift, roll, elbow, forearm_roll, wrist, wrist_roll = (
@@ -136,111 +133,39 @@ def _arm(robot: Element, arm: ArmDescription) -> None:
         (wrist, wrist_roll, origin_of_parent, _X),
     )
     for joint, (parent, child, origin, axis) in zip(arm.joints, chain, strict=True):
-        _moving(robot, joint, parent, child, origin, axis, arm.hard_limits[joint])
-    _fixed(robot, f"{prefix}_upper_arm_joint", roll, upper_arm, origin_of_parent)
-    _fixed(robot, f"{prefix}_forearm_joint", forearm_roll, forearm, origin_of_parent)
+        moving(robot, joint, parent, child, origin, axis, arm.hard_limits[joint])
+    fixed(robot, f"{prefix}_upper_arm_joint", roll, upper_arm, origin_of_parent)
+    fixed(robot, f"{prefix}_forearm_joint", forearm_roll, forearm, origin_of_parent)
 
-    _link(robot, pan, (0.2, 0.2, 0.5), (0.02, 0, -0.2), _WHITE)
-    _link(robot, lift, (0.22, 0.16, 0.22), origin_of_parent, _GREY)
-    _link(robot, roll)
-    _link(robot, upper_arm, (0.3, 0.14, 0.14), (0.22, 0, 0), _WHITE)
-    _link(robot, elbow, (0.14, 0.1, 0.14), origin_of_parent, _GREY)
-    _link(robot, forearm_roll)
-    _link(robot, forearm, (0.22, 0.11, 0.11), (0.18, 0, 0), _WHITE)
-    _link(robot, wrist, (0.07, 0.05, 0.08), origin_of_parent, _GREY)
-    _link(robot, wrist_roll)
+    link(robot, pan, (0.2, 0.2, 0.5), (0.02, 0, -0.2), WHITE)
+    link(robot, lift, (0.22, 0.16, 0.22), origin_of_parent, GREY)
+    link(robot, roll)
+    link(robot, upper_arm, (0.3, 0.14, 0.14), (0.22, 0, 0), WHITE)
+    link(robot, elbow, (0.14, 0.1, 0.14), origin_of_parent, GREY)
+    link(robot, forearm_roll)
+    link(robot, forearm, (0.22, 0.11, 0.11), (0.18, 0, 0), WHITE)
+    link(robot, wrist, (0.07, 0.05, 0.08), origin_of_parent, GREY)
+    link(robot, wrist_roll)
     _gripper(robot, arm, prefix, wrist_roll)
 
 
-def _gripper(robot: Element, arm: ArmDescription, prefix: str, wrist_roll: str) -> None:
+def _gripper(robot: Element, arm: PR2Arm, prefix: str, wrist_roll: str) -> None:
     """Add the palm, two fingers that swing outwards, and the tool frame between their tips."""
     palm = f"{prefix}_gripper_palm_link"
-    _fixed(robot, f"{prefix}_gripper_palm_joint", wrist_roll, palm, (0, 0, 0))
-    _link(robot, palm, (0.1, 0.1, 0.05), (0.07, 0, 0), _DARK)
-    _fixed(robot, f"{prefix}_gripper_tool_joint", palm, arm.tool_frame, (arm.tool_m, 0, 0))
-    _link(robot, arm.tool_frame)
+    fixed(robot, f"{prefix}_gripper_palm_joint", wrist_roll, palm, (0, 0, 0))
+    link(robot, palm, (0.1, 0.1, 0.05), (0.07, 0, 0), DARK)
+    fixed(robot, f"{prefix}_gripper_tool_joint", palm, arm.tool_frame, (arm.tool_m, 0, 0))
+    link(robot, arm.tool_frame)
     for finger, side in (("l", 1), ("r", -1)):
-        link = f"{prefix}_gripper_{finger}_finger_link"
+        finger_link = f"{prefix}_gripper_{finger}_finger_link"
         origin, axis = (0.07691, side * 0.01, 0), (0, 0, side)
-        _moving(
+        moving(
             robot,
             f"{prefix}_gripper_{finger}_finger_joint",
             palm,
-            link,
+            finger_link,
             origin,
             axis,
             Bounds(0.0, FINGER_OPEN_RAD),
         )
-        _link(robot, link, (0.12, 0.02, 0.03), (0.06, side * 0.005, 0), _GREY)
-
-
-# --- elements of a URDF -----------------------------------------------------------------------------------------
-
-
-def _link(
-    robot: Element,
-    name: str,
-    size: Sequence[float] | None = None,
-    centre: Sequence[float] = (0, 0, 0),
-    rgba: str = _GREY,
-) -> None:
-    """Add a link: a box around `centre`, or, without a size, a frame only."""
-    link = SubElement(robot, "link", name=name)
-    link.append(fromstring(INERTIA))  # noqa: S314  our own text
-    if size is None:
-        return
-    for purpose in ("visual", "collision"):
-        shape = SubElement(link, purpose)
-        SubElement(shape, "origin", xyz=numbers(centre))
-        SubElement(SubElement(shape, "geometry"), "box", size=numbers(size))
-        if purpose == "visual":
-            SubElement(SubElement(shape, "material", name=rgba), "color", rgba=rgba)
-
-
-def _fixed(
-    robot: Element,
-    name: str,
-    parent: str,
-    child: str,
-    origin: Sequence[float],
-    *,
-    rotation: Sequence[float] = (0, 0, 0),
-) -> None:
-    _joint(robot, "fixed", name, parent, child, origin, rotation)
-
-
-def _moving(
-    robot: Element,
-    name: str,
-    parent: str,
-    child: str,
-    origin: Sequence[float],
-    axis: Sequence[float],
-    bounds: Bounds,
-) -> None:
-    """Add a movable joint: continuous if the bounds are infinite, prismatic for the torso, revolute otherwise."""
-    endless = math.isinf(bounds.upper)
-    kind = "continuous" if endless else "prismatic" if name == PR2.torso_joint else "revolute"
-    joint = _joint(robot, kind, name, parent, child, origin, (0, 0, 0))
-    SubElement(joint, "axis", xyz=numbers(axis))
-    limit = SubElement(joint, "limit", effort="100", velocity="3")
-    if not endless:
-        limit.set("lower", repr(bounds.lower))
-        limit.set("upper", repr(bounds.upper))
-
-
-def _joint(
-    robot: Element,
-    kind: str,
-    name: str,
-    parent: str,
-    child: str,
-    origin: Sequence[float],
-    rotation: Sequence[float],
-) -> Element:
-    joint = SubElement(robot, "joint", name=name, type=kind)
-    SubElement(joint, "parent", link=parent)
-    SubElement(joint, "child", link=child)
-    # `numbers` rounds to 1e-6, which would turn right angles into other angles: write the rotation in full.
-    SubElement(joint, "origin", xyz=numbers(origin), rpy=" ".join(map(repr, rotation)))
-    return joint
+        link(robot, finger_link, (0.12, 0.02, 0.03), (0.06, side * 0.005, 0), GREY)

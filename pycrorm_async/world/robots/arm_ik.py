@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pycrorm_async.world.pose import Quaternion, Vector, product, rotated
-from pycrorm_async.world.robots.robot_description import ArmDescription, Bounds
+from pycrorm_async.world.robots.robot_description import Bounds, PR2Arm
 
 __all__ = ["Curve", "Floats", "Reach", "curve", "pan_windows", "stretches_m", "wrist_angles", "reach", "hand"]
 
@@ -49,14 +49,14 @@ class Curve(NamedTuple):
     """Distance of the joint nearest to a limit from that limit, rad; negative if a joint is outside its limits."""
 
 
-def reach(arm_description: ArmDescription, tool: Vector, turn: Quaternion) -> Reach:
+def reach(arm_description: PR2Arm, tool: Vector, turn: Quaternion) -> Reach:
     """Convert a tool frame at `tool` (m from the origin of the pan joint) with rotation `turn` to a `Reach`."""
     ahead = rotated(turn, (1.0, 0.0, 0.0))
     wrist = Vector(*(at - arm_description.tool_m * along for at, along in zip(tool, ahead, strict=True)))
     return Reach(wrist, turn, ahead)
 
 
-def hand(arm_description: ArmDescription, angles: Sequence[float]) -> tuple[Vector, Quaternion]:
+def hand(arm_description: PR2Arm, angles: Sequence[float]) -> tuple[Vector, Quaternion]:
     """Return the tool frame's position (m from the origin of the pan joint) and rotation at seven joint angles."""
     pan, lift, _, _, forearm_roll, flex, wrist_roll = angles
     at_pan = _about_z(pan)
@@ -74,7 +74,7 @@ def hand(arm_description: ArmDescription, angles: Sequence[float]) -> tuple[Vect
     return Vector(x, y, z), at_wrist
 
 
-def pan_windows(arm_description: ArmDescription, wrist: Vector, bounds: Sequence[Bounds]) -> list[Bounds]:
+def pan_windows(arm_description: PR2Arm, wrist: Vector, bounds: Sequence[Bounds]) -> list[Bounds]:
     """Return the ranges of pan, within its limits, at which the elbow is within its limits.
 
     The lift axis moves on a circle around the pan axis, so its distance from the wrist, and with it the elbow angle,
@@ -96,7 +96,7 @@ def pan_windows(arm_description: ArmDescription, wrist: Vector, bounds: Sequence
     return windows
 
 
-def _swing(arm_description: ArmDescription, wrist: Vector, bounds: Sequence[Bounds]) -> Bounds | None:
+def _swing(arm_description: PR2Arm, wrist: Vector, bounds: Sequence[Bounds]) -> Bounds | None:
     """Return the least and greatest angle between pan and wrist that the elbow's limits allow; None if none does."""
     folded, stretched = stretches_m(arm_description, bounds)
     across, offset = math.hypot(wrist.x, wrist.y), arm_description.shoulder_offset_m
@@ -108,14 +108,14 @@ def _swing(arm_description: ArmDescription, wrist: Vector, bounds: Sequence[Boun
     return Bounds(math.acos(max(-1.0, min(1.0, most))), math.acos(max(-1.0, min(1.0, least))))
 
 
-def stretches_m(arm_description: ArmDescription, bounds: Sequence[Bounds]) -> tuple[float, float]:
+def stretches_m(arm_description: PR2Arm, bounds: Sequence[Bounds]) -> tuple[float, float]:
     """Return the distances from shoulder to wrist with the elbow at its lower and at its upper limit, m."""
     a, b = arm_description.upper_arm_m, arm_description.forearm_m
     folded, stretched = (math.sqrt(a * a + b * b + 2 * a * b * math.cos(angle)) for angle in bounds[ELBOW])
     return folded, stretched
 
 
-def curve(arm_description: ArmDescription, reach: Reach, pan: Floats, bounds: Sequence[Bounds]) -> Curve:
+def curve(arm_description: PR2Arm, reach: Reach, pan: Floats, bounds: Sequence[Bounds]) -> Curve:
     """Return for every pan the joints up to the elbow, and the margin of these and of the wrist's flex.
 
     Where no posture exists, the nearest one is returned with a negative margin.

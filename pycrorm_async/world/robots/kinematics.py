@@ -1,20 +1,20 @@
 """Compute an arm's tool frame from joint angles (`forward`), and joint angles for a pose of the tool frame (`solve`).
 
-A reachable pose has a curve of postures over the shoulder pan (`arm_ik`). `solve` samples it, both ends included, in
-steps of at most 0.01 rad, finer where it misses narrowly, and returns the posture that stays farthest from every limit;
-continuous joints have no limits.
+For an arm of the PR2's build there is a closed form: a reachable pose has a curve of postures over the shoulder pan
+(`arm_ik`), which is sampled, both ends included, in steps of at most 0.01 rad, finer where it misses narrowly; the
+result is the posture that stays farthest from every limit. Continuous joints have no limits. A refused target is out of
+reach, except for rare ones at the rim of the workspace (about 1 in 10,000 of the reachable ones there) whose only
+postures lie in a narrow range between limits. Any other arm is solved numerically (`chain_ik`).
 
 The result is deterministic: on one machine the same arguments give the same result, to the bit. Forward kinematics has
-verified it to 1e-6 m and 1e-6 rad. Collisions, with the robot itself or with objects, are not checked. A refused target
-is out of reach, except for rare ones at the rim of the workspace (about 1 in 10,000 of the reachable ones there) whose
-only postures lie in a narrow range between limits.
+verified it to 1e-6 m and 1e-6 rad. Collisions, with the robot itself or with objects, are not checked.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
@@ -23,12 +23,22 @@ from pycrorm_async.world.enums import Arms
 from pycrorm_async.world.pose import Pose, Quaternion, Vector, product, rotated
 from pycrorm_async.world.robots import arm_ik
 from pycrorm_async.world.robots.arm_ik import Floats, Reach
-from pycrorm_async.world.robots.robot_description import ArmDescription, Bounds, Limits, RobotDescription
+from pycrorm_async.world.robots.chain_ik import Chain
+from pycrorm_async.world.robots.robot_description import (
+    ArmDescription,
+    Bounds,
+    Limits,
+    PR2Arm,
+    PR2Description,
+    RobotDescription,
+)
 
 if TYPE_CHECKING:
     from pycrorm_async.world.objects import Object
 
-__all__ = ["Limits", "Unreachable", "forward", "solve", "solve_from"]
+__all__ = ["Limits", "Unreachable", "chain_of", "forward", "solve", "solve_from"]
+
+A = TypeVar("A")
 
 PAN_STEP_RAD = 0.01
 """Largest step between two sampled pans."""
@@ -52,7 +62,7 @@ class Unreachable(Exception):
 
 
 def forward(
-    description: RobotDescription, arm: Arms, joints: Mapping[str, float], *, torso_height: float, base: Pose
+    description: PR2Description, arm: Arms, joints: Mapping[str, float], *, torso_height: float, base: Pose
 ) -> Pose:
     """Return the pose of the arm's tool frame, in the frame of `base`.
 
@@ -61,7 +71,7 @@ def forward(
         torso_height: the torso joint's position, m.
         base: pose of the robot's root link.
     """
-    arm_description = _one_arm(description, arm)
+    arm_description = _one_arm(description.arms, description, arm)
     tool, turn = arm_ik.hand(arm_description, [joints[name] for name in arm_description.joints])
     shoulder = _shoulder(description, arm_description, torso_height)
     return base @ Pose([a + b for a, b in zip(shoulder, tool, strict=True)], turn, base.frame)
@@ -89,19 +99,22 @@ def solve(
     description = robot.robot_description
     if description is None:
         raise CallerError(f"{robot.name!r} has no robot description, so its arms are unknown")
-    arm_description = _one_arm(description, arm)
+    base = robot.pose if base is None else base
+    if not isinstance(description, PR2Description):
+        return _solve_chain(robot, description, arm, target, base, torso_height, limits)
+    arm_description = _one_arm(description.arms, description, arm)
     bounds = _bounds(arm_description, limits)
     if limits is Limits.HARD:
         bounds = [
             _narrow(bound, robot.joint_limits(name)) for name, bound in zip(arm_description.joints, bounds, strict=True)
         ]
     height = robot.joint_position(description.torso_joint) if torso_height is None else torso_height
-    reach = _reach(description, arm_description, target, base=robot.pose if base is None else base, torso_height=height)
+    reach = _reach(description, arm_description, target, base=base, torso_height=height)
     return _solve(arm_description, arm, target, reach, bounds, limits)
 
 
 def solve_from(
-    description: RobotDescription,
+    description: PR2Description,
     arm: Arms,
     target: Pose,
     *,
@@ -119,13 +132,72 @@ def solve_from(
     >>> forward(PR2, Arms.LEFT, joints, torso_height=0.0, base=Pose()).distance(target) < 1e-9
     True
     """
-    arm_description = _one_arm(description, arm)
+    arm_description = _one_arm(description.arms, description, arm)
     reach = _reach(description, arm_description, target, base=base, torso_height=torso_height)
     return _solve(arm_description, arm, target, reach, _bounds(arm_description, limits), limits)
 
 
+def _solve_chain(
+    robot: Object,
+    description: RobotDescription,
+    arm: Arms,
+    target: Pose,
+    base: Pose,
+    torso_height: float | None,
+    limits: Limits,
+) -> dict[str, float]:
+    """Solve for a robot without a closed form."""
+    arm_description = _one_arm(description.arms, description, arm)
+    _check(target, base)
+    chain = chain_of(robot, arm)
+    positions = robot.joint_positions()
+    if torso_height is not None and description.torso_joint is not None:
+        positions[description.torso_joint] = torso_height
+    goal = target.relative_to(base)
+    distance = chain.distance_m(goal, positions)
+    if distance > chain.reach_m:
+        raise Unreachable(
+            target, arm, f"too far: {distance:.3f} m from its first joint, it reaches {chain.reach_m:.3f} m"
+        )
+    joints = chain.solve(goal, positions, _chain_bounds(chain, arm_description, limits))
+    if joints is not None:
+        reached = chain.forward(positions | joints)
+        if reached.distance(goal) <= EXACT_M and _angle_between(reached.orientation, goal.orientation) <= EXACT_RAD:
+            return joints
+    raise Unreachable(target, arm, f"no posture within its {limits.name.lower()} limits was found")
+
+
+def chain_of(robot: Object, arm: Arms) -> Chain:
+    """Return the chain of one of the robot's arms, read from its model at the first call.
+
+    Raises `CallerError` if the description does not fit the model.
+    """
+    chain = robot.chains.get(arm)
+    if chain is None:
+        assert robot.robot_description is not None
+        described = robot.robot_description.arms[arm]
+        robot.chains[arm] = chain = Chain(
+            robot.description_text,
+            base_link=described.base_link,
+            tool_link=described.tool_frame,
+            tool_in_link=described.tool_in_link,
+        )
+    return chain
+
+
+def _chain_bounds(chain: Chain, described: ArmDescription, limits: Limits) -> dict[str, Bounds]:
+    """Return the model's limits, narrowed by the described ones."""
+    bounds = dict(chain.bounds)
+    for ranges in (described.hard_limits, described.soft_limits if limits is Limits.SOFT else {}):
+        for name, narrower in ranges.items():
+            if name in bounds:
+                lower, upper = bounds[name]
+                bounds[name] = Bounds(max(lower, narrower.lower), min(upper, narrower.upper))
+    return bounds
+
+
 def _solve(
-    arm_description: ArmDescription, arm: Arms, target: Pose, reach: Reach, bounds: Sequence[Bounds], limits: Limits
+    arm_description: PR2Arm, arm: Arms, target: Pose, reach: Reach, bounds: Sequence[Bounds], limits: Limits
 ) -> dict[str, float]:
     windows = arm_ik.pan_windows(arm_description, reach.wrist, bounds)
     if not windows:
@@ -144,9 +216,7 @@ def _solve(
     return dict(zip(arm_description.joints, angles, strict=True))
 
 
-def _best(
-    arm_description: ArmDescription, reach: Reach, pans: Floats, bounds: Sequence[Bounds]
-) -> tuple[list[float], float]:
+def _best(arm_description: PR2Arm, reach: Reach, pans: Floats, bounds: Sequence[Bounds]) -> tuple[list[float], float]:
     """Return pan, lift, roll and elbow of the posture with the largest margin, and that margin."""
     curve = arm_ik.curve(arm_description, reach, pans, bounds)
     row, column = divmod(int(curve.margin.argmax()), len(pans))
@@ -159,20 +229,17 @@ def _steps(window: Bounds, step: float) -> Floats:
     return np.linspace(*window, max(2, 1 + math.ceil((window.upper - window.lower) / step)))
 
 
-def _leads_to(arm_description: ArmDescription, angles: Sequence[float], reach: Reach) -> bool:
+def _leads_to(arm_description: PR2Arm, angles: Sequence[float], reach: Reach) -> bool:
     tool, turn = arm_ik.hand(arm_description, angles)
     expected = [at + arm_description.tool_m * along for at, along in zip(reach.wrist, reach.ahead, strict=True)]
     return math.dist(tool, expected) <= EXACT_M and _angle_between(turn, reach.turn) <= EXACT_RAD
 
 
 def _reach(
-    description: RobotDescription, arm_description: ArmDescription, target: Pose, *, base: Pose, torso_height: float
+    description: PR2Description, arm_description: PR2Arm, target: Pose, *, base: Pose, torso_height: float
 ) -> Reach:
     """Convert the target to the axes of the torso."""
-    if target.frame != base.frame:
-        raise CallerError(f"the target is in frame {target.frame!r}, the robot in {base.frame!r}")
-    if not math.isfinite(sum(target.position) + sum(target.orientation)):
-        raise CallerError(f"the target is not finite: {target!r}")
+    _check(target, base)
     x, y, z, w = base.orientation
     back = Quaternion(-x, -y, -z, w)
     from_base = rotated(back, [a - b for a, b in zip(target.position, base.position, strict=True)])
@@ -181,13 +248,13 @@ def _reach(
     return arm_ik.reach(arm_description, tool, product(back, target.orientation))
 
 
-def _shoulder(description: RobotDescription, arm_description: ArmDescription, torso_height: float) -> Vector:
+def _shoulder(description: PR2Description, arm_description: PR2Arm, torso_height: float) -> Vector:
     """Return the origin of the pan joint in the root link's frame."""
     torso, shoulder = description.torso_origin, arm_description.shoulder
     return Vector(torso.x + shoulder.x, torso.y + shoulder.y, torso.z + torso_height + shoulder.z)
 
 
-def _why_no_pan(arm_description: ArmDescription, wrist: Vector, bounds: Sequence[Bounds], limits: Limits) -> str:
+def _why_no_pan(arm_description: PR2Arm, wrist: Vector, bounds: Sequence[Bounds], limits: Limits) -> str:
     folded, stretched = arm_ik.stretches_m(arm_description, bounds)
     across, offset = math.hypot(wrist.x, wrist.y), arm_description.shoulder_offset_m
     nearest, farthest = math.hypot(across - offset, wrist.z), math.hypot(across + offset, wrist.z)
@@ -198,9 +265,7 @@ def _why_no_pan(arm_description: ArmDescription, wrist: Vector, bounds: Sequence
     return f"its wrist would reach the target only with {_outside(arm_description, arm_ik.PAN, bounds, limits)}"
 
 
-def _why_no_posture(
-    arm_description: ArmDescription, angles: Sequence[float], bounds: Sequence[Bounds], limits: Limits
-) -> str:
+def _why_no_posture(arm_description: PR2Arm, angles: Sequence[float], bounds: Sequence[Bounds], limits: Limits) -> str:
     """Name the joint that is farthest outside its limits in the best posture."""
     beyond = [max(lower - angle, angle - upper) for angle, (lower, upper) in zip(angles, bounds, strict=True)]
     worst = beyond.index(max(beyond))
@@ -209,7 +274,7 @@ def _why_no_posture(
     return f"the best posture has {_outside(arm_description, worst, bounds, limits)}, at {angles[worst]:.3f}"
 
 
-def _outside(arm_description: ArmDescription, joint: int, bounds: Sequence[Bounds], limits: Limits) -> str:
+def _outside(arm_description: PR2Arm, joint: int, bounds: Sequence[Bounds], limits: Limits) -> str:
     lower, upper = bounds[joint]
     return f"{arm_description.joints[joint]} outside its {limits.name.lower()} limits {lower:.3f}..{upper:.3f} rad"
 
@@ -219,14 +284,21 @@ def _angle_between(a: Quaternion, b: Quaternion) -> float:
     return 2 * math.atan2(math.hypot(x, y, z), abs(w))
 
 
-def _one_arm(description: RobotDescription, arm: Arms) -> ArmDescription:
-    arm_description = description.arms.get(arm)
+def _one_arm(arms: Mapping[Arms, A], description: RobotDescription, arm: Arms) -> A:
+    arm_description = arms.get(arm)
     if arm_description is None:
         raise CallerError(f"{description.name} has no single arm {arm.name}: pass one arm at a time")
     return arm_description
 
 
-def _bounds(arm_description: ArmDescription, limits: Limits) -> list[Bounds]:
+def _check(target: Pose, base: Pose) -> None:
+    if target.frame != base.frame:
+        raise CallerError(f"the target is in frame {target.frame!r}, the robot in {base.frame!r}")
+    if not math.isfinite(sum(target.position) + sum(target.orientation)):
+        raise CallerError(f"the target is not finite: {target!r}")
+
+
+def _bounds(arm_description: PR2Arm, limits: Limits) -> list[Bounds]:
     """Return the limits in the order of the joints."""
     by_name = arm_description.limits(limits)
     return [by_name[name] for name in arm_description.joints]

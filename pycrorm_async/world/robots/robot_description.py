@@ -1,8 +1,8 @@
-"""Describe robots for plans: joints and frames by name, dimensions, limits, named postures.
+"""Describe robots for plans: arms, grippers, torso, head, camera, limits and named postures.
 
 A `RobotDescription` is a constant; the robot's current pose and joint positions are in the world. Lengths are in
-metres, angles in rad. The PR2's dimensions are those of its public model, so that plans run on the built-in shape and
-on the mesh model alike (`world.models.pr2`).
+metres, angles in rad, poses of links those of the loaded model (URDF), whose root link is the base. What a robot lacks
+is None or empty in its description, and an action that needs it fails with `CapabilityAbsenceFailure`.
 
 >>> PR2.arms[Arms.LEFT].tool_frame
 'l_gripper_tool_frame'
@@ -12,23 +12,29 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import Enum
+from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
 
 from pycrorm_async.world.enums import Arms, Grasp, GripperState
-from pycrorm_async.world.pose import Quaternion, Vector
+from pycrorm_async.world.pose import Pose, Quaternion, Vector
 
 __all__ = [
     "RobotDescription",
     "ArmDescription",
     "Bounds",
+    "Drive",
     "FieldOfView",
     "Limits",
+    "PR2Arm",
+    "PR2Description",
     "GRASP_ORIENTATIONS",
     "FINGER_OPEN_RAD",
+    "COURIER",
     "PR2",
+    "register_robot",
     "robot_description",
 ]
 
@@ -49,17 +55,56 @@ class Bounds(NamedTuple):
     upper: float
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class ArmDescription:
-    """An arm of seven joints: pan, lift, roll at the shoulder, flex, roll at the elbow, flex, roll at the wrist.
+class Drive(Enum):
+    """How the base moves. A fixed base cannot navigate."""
 
-    Pan rotates about z, lift and both flexes about y, the rolls about x; with all joints 0 the arm points along x.
+    OMNIDIRECTIONAL = "OMNIDIRECTIONAL"
+    DIFFERENTIAL = "DIFFERENTIAL"
+    FIXED = "FIXED"
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class ArmDescription:
+    """An arm: a chain of joints from `base_link` to the tool, and its gripper, if it has one.
+
+    >>> ArmDescription(base_link="panda_link0", joints=("panda_joint1", ...), tool_frame="panda_hand_tcp")
     """
 
-    joints: tuple[str, str, str, str, str, str, str]
-    """Ordered from the shoulder to the wrist."""
+    joints: tuple[str, ...]
+    """All movable joints between `base_link` and `tool_frame`, ordered from the base to the tool."""
     tool_frame: str
-    """The link that inverse kinematics brings to the target: between the finger tips, x along the fingers."""
+    """The link that carries the tool; held objects are attached to it."""
+    base_link: str = ""
+    """The link at which the chain begins, such as the torso; empty for the model's root link."""
+    tool_in_link: Pose | None = None
+    """The frame that inverse kinematics brings to the target, in the link `tool_frame`; None: the link's own frame.
+
+    Its origin is between the finger tips; x points along the fingers, which close along y.
+    """
+    soft_limits: Mapping[str, Bounds] = field(default_factory=dict)
+    """The range of each joint inside its hard limits; of a joint that is not in it, the hard limits."""
+    hard_limits: Mapping[str, Bounds] = field(default_factory=dict)
+    """Hard limits that are narrower than those of the loaded model."""
+    gripper_joints: Mapping[GripperState, Mapping[str, float]] = field(default_factory=dict)
+    """Positions of the fingers' joints; empty for an arm without a gripper."""
+    opening_m: float | None = None
+    """Distance between the fingers of the open gripper; they close along y of the tool frame. None: not known."""
+    park: Mapping[str, float] = field(default_factory=dict)
+    """Posture with the arm folded; empty if there is none. Continuous joints may be several turns from zero."""
+
+    def limits(self, limits: Limits) -> Mapping[str, Bounds]:
+        """Return the described range of each joint by name."""
+        return self.soft_limits if limits is Limits.SOFT else self.hard_limits
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class PR2Arm(ArmDescription):
+    """An arm of the PR2's build: pan, lift, roll at the shoulder, flex, roll at the elbow, flex, roll at the wrist.
+
+    Pan rotates about z, lift and both flexes about y, the rolls about x; with all joints 0 the arm points along x. Its
+    inverse kinematics has a closed form (`arm_ik`).
+    """
+
     shoulder: Vector
     """Origin of the pan joint in the torso link."""
     shoulder_offset_m: float
@@ -68,17 +113,6 @@ class ArmDescription:
     forearm_m: float
     tool_m: float
     """Distance from the wrist to the tool frame."""
-    soft_limits: Mapping[str, Bounds]
-    hard_limits: Mapping[str, Bounds]
-    gripper_joints: Mapping[GripperState, Mapping[str, float]]
-    opening_m: float
-    """Distance between the fingers of the open gripper; they close along y of the tool frame."""
-    park: Mapping[str, float]
-    """Posture with the arm folded. Continuous joints may be several turns from zero."""
-
-    def limits(self, limits: Limits) -> Mapping[str, Bounds]:
-        """Return the range of each joint by name."""
-        return self.soft_limits if limits is Limits.SOFT else self.hard_limits
 
 
 class FieldOfView(NamedTuple):
@@ -88,26 +122,59 @@ class FieldOfView(NamedTuple):
     vertical: float
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+_VIEW = FieldOfView(1.0, 0.75)  # about that of an ordinary colour camera
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class RobotDescription:
-    """A mobile robot with a lifting torso, arms and a head that pans and tilts; root link on the floor."""
+    """A robot: its base, which is the root link of its model, and what is mounted on it.
+
+    >>> PANDA = RobotDescription(name="panda", drive=Drive.FIXED, arms={Arms.RIGHT: arm}, urdf=Path("panda.urdf"))
+    >>> robot = Object("panda", ObjectType.ROBOT, robot=PANDA)
+
+    `describe_robot` makes one from a URDF.
+    """
 
     name: str
+    """The model, the same for all robots of this kind."""
+    serial: str | None = None
+    """Distinguishes robots of one model; None if there is no need."""
+    urdf: str | Path | None = None
+    """The model that an `Object` of this robot loads; None for a built-in one. See `Object`."""
+    drive: Drive = Drive.OMNIDIRECTIONAL
+    arms: Mapping[Arms, ArmDescription] = field(default_factory=dict)
+    torso_joint: str | None = None
+    """A prismatic joint that lifts the arms; its limits are those of the model."""
+    head_joints: tuple[str, ...] = ()
+    """The joints that turn the camera, the first one nearest to the base."""
+    camera_link: str | None = None
+    camera_in_link: Pose | None = None
+    """The camera's optical frame in `camera_link`: z points ahead, x to the right, y down. None: the link's own."""
+    camera_view_rad: FieldOfView = _VIEW
+    camera_height_m: Bounds | None = None
+    """Camera height above the floor with the torso at its lowest and highest; None: as high as it is when it looks."""
+    postures: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    """Joint positions by the name of the posture, for `MoveJointsMotion`, such as "carry"."""
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class PR2Description(RobotDescription):
+    """A robot of the PR2's build, whose arms and head have closed forms: a lifting torso, and a head on its top.
+
+    Plans may use the whole range of the torso, also outside its soft limits.
+    """
+
+    arms: Mapping[Arms, PR2Arm]
     torso_joint: str
     torso_origin: Vector
     """Origin of the torso link in the root link, at torso height 0."""
     torso_limits: Bounds
-    """Hard limits; plans may use the whole range, also outside the torso's soft limits."""
-    arms: Mapping[Arms, ArmDescription]
     head_pan_joint: str
     head_pan_link: str
     head_tilt_joint: str
     head_tilt_link: str
     camera_link: str
-    """Optical frame: z points ahead, x to the right, y down."""
-    camera_view_rad: FieldOfView
     camera_height_m: Bounds
-    """Camera height above the floor with the torso at its lowest and at its highest position, m."""
 
 
 FINGER_OPEN_RAD = 0.548
@@ -133,7 +200,7 @@ The order matters: only in this order does TOP approach from above for every hea
 """
 
 
-def _pr2_arm(prefix: str, side: float, park: tuple[float, ...]) -> ArmDescription:
+def _pr2_arm(prefix: str, side: float, park: tuple[float, ...]) -> PR2Arm:
     """Describe the left arm (side 1) or its mirror image, the right one (side -1)."""
     joints = (
         f"{prefix}_shoulder_pan_joint",
@@ -167,7 +234,8 @@ def _pr2_arm(prefix: str, side: float, park: tuple[float, ...]) -> ArmDescriptio
         _TURN_FREE,
     )
     fingers = (f"{prefix}_gripper_l_finger_joint", f"{prefix}_gripper_r_finger_joint")
-    return ArmDescription(
+    return PR2Arm(
+        base_link="torso_lift_link",
         joints=joints,
         tool_frame=f"{prefix}_gripper_tool_frame",
         shoulder=Vector(0.0, side * 0.188, 0.0),
@@ -188,7 +256,7 @@ def _pr2_arm(prefix: str, side: float, park: tuple[float, ...]) -> ArmDescriptio
     )
 
 
-PR2 = RobotDescription(
+PR2 = PR2Description(
     name="pr2",
     torso_joint="torso_lift_joint",
     torso_origin=Vector(-0.05, 0.0, 0.051 + 0.739675),
@@ -199,6 +267,7 @@ PR2 = RobotDescription(
             Arms.RIGHT: _pr2_arm("r", -1.0, (-1.712, -0.256, -1.463, -2.12, 1.766, -0.07, 0.051)),
         }
     ),
+    head_joints=("head_pan_joint", "head_tilt_joint"),
     head_pan_joint="head_pan_joint",
     head_pan_link="head_pan_link",
     head_tilt_joint="head_tilt_joint",
@@ -209,6 +278,53 @@ PR2 = RobotDescription(
 )
 
 
+_COURIER_JOINTS = tuple(
+    f"arm_{name}_joint" for name in ("yaw", "shoulder", "elbow", "forearm_roll", "wrist", "wrist_roll")
+)
+_COURIER_FINGERS = ("left_finger_joint", "right_finger_joint")
+
+COURIER = RobotDescription(
+    name="courier",
+    drive=Drive.DIFFERENTIAL,
+    arms=MappingProxyType(
+        {
+            Arms.RIGHT: ArmDescription(
+                joints=_COURIER_JOINTS,
+                base_link="column_link",
+                tool_frame="tool_frame",
+                gripper_joints=MappingProxyType(
+                    {
+                        GripperState.OPEN: MappingProxyType(dict.fromkeys(_COURIER_FINGERS, 0.045)),
+                        GripperState.CLOSE: MappingProxyType(dict.fromkeys(_COURIER_FINGERS, 0.0)),
+                    }
+                ),
+                opening_m=0.09,
+                park=MappingProxyType(dict(zip(_COURIER_JOINTS, (0.0, -1.9, 2.5, 0.0, 0.9, 0.0), strict=True))),
+            )
+        }
+    ),
+    head_joints=("camera_pan_joint", "camera_tilt_joint"),
+    camera_link="camera_optical_frame",
+    camera_view_rad=FieldOfView(1.05, 0.80),
+    camera_height_m=Bounds(1.3, 1.3),
+)
+"""A robot of another build than the PR2: one arm of six joints, no torso, a differential base."""
+
+
+_registered: dict[str, RobotDescription] = {each.name: each for each in (PR2, COURIER)}
+"""Descriptions by model, for the process: module state, because a plan's file registers its robots when it is loaded,
+before any world is entered, and also in each process that loads it for rollouts."""
+
+
+def register_robot(description: RobotDescription) -> RobotDescription:
+    """Make this the description of every later `Object` of type ROBOT with its name; return it.
+
+    A description of the same name is replaced, so that a notebook's cell can run again.
+    """
+    _registered[description.name] = description
+    return description
+
+
 def robot_description(name: str) -> RobotDescription | None:
-    """Return the description of the robot of that name; None if there is no built-in description."""
-    return PR2 if name == PR2.name else None
+    """Return the built-in or registered description of that name; None if there is none."""
+    return _registered.get(name)

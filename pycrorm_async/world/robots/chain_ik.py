@@ -1,0 +1,341 @@
+"""Solve the inverse kinematics of any chain of revolute, continuous and prismatic joints, numerically.
+
+`Chain` reads the joints between a robot's root link and an arm's tool from the URDF. The library optik minimises the
+distance between the tool and the target from up to `STARTS_MAX` starts; here only the chain is prepared for it, and its
+answer is checked by its caller. One thread and a fixed order of starts make the answer the same for the same arguments.
+The library ends the process when a joint of the chain is prismatic, so such chains are solved here, by damped least
+squares, ten times as slowly.
+
+Of 2,000 random reachable poses it refused none, for the arm of a Panda and for that of a TIAGo (with 20 starts 1 and
+2), in 0.3 ms each; a refusal takes some 10 ms. Bullet's solver, with 10 starts, reached two thirds of the Panda's poses
+to 1 mm, in 5 ms.
+"""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+from xml.etree.ElementTree import Element, SubElement, fromstring, tostring
+
+import numpy as np
+import optik
+from numpy.typing import NDArray
+
+from pycrorm_async.errors import CallerError
+from pycrorm_async.world.enums import JointType
+from pycrorm_async.world.pose import Pose, Quaternion, Vector, product, rotated
+from pycrorm_async.world.robots.robot_description import Bounds
+
+__all__ = ["Chain", "Joint", "joints_between"]
+
+STARTS_MAX = 100
+"""Bounds the starts of a search: with 20, one of a thousand reachable poses was refused, with 100 none of 4,000."""
+TIME_MAX_S = 1.0
+"""Bounds a search, because the library never ends one whose first step is not a number. That happens at postures where
+joints are in line with each other and with the target, which `_start` avoids; a search takes some milliseconds."""
+_ERROR_MAX = 1e-14
+"""Square of the distance, m² and rad², at which a search ends; the answer is checked by its caller."""
+DESCENTS_MAX, STEPS_MAX = 20, 60
+"""Bound the damped least squares: 20 starts of 60 steps take half a second when the target is out of reach."""
+_EXACT, _DAMPING_MAX = 1e-9, 1e6
+_PARALLEL = 1e-9
+_GOLDEN = (math.sqrt(5) - 1) / 2
+_ENDLESS = Bounds(-math.inf, math.inf)
+_MOVABLE = {"revolute": JointType.REVOLUTE, "continuous": JointType.CONTINUOUS, "prismatic": JointType.PRISMATIC}
+
+
+class Joint(NamedTuple):
+    """One joint of a chain; `kind` is FIXED if it cannot move."""
+
+    name: str
+    kind: JointType
+    child: str
+    origin: Pose
+    rpy: tuple[float, float, float]
+    """The rotation of `origin` as the model has it, which no conversion rounds."""
+    axis: Vector
+    bounds: Bounds
+
+
+class Chain:
+    """The joints from a robot's root link to the tool of one arm.
+
+    Args:
+        urdf: the robot's model.
+        base_link: the link at which the arm begins; empty for the root link.
+        tool_link: the link that carries the tool.
+        tool_in_link: the tool's frame in that link; None: the link's own.
+
+    Raises `CallerError` if the model has no such links, or the tool does not hang on the base link.
+    """
+
+    def __init__(self, urdf: str, *, base_link: str, tool_link: str, tool_in_link: Pose | None) -> None:
+        self._above, self._arm = _divided(urdf, base_link, tool_link)
+        self._tool = tool_in_link
+        self._solvers: dict[tuple[Bounds, ...], optik.Robot] = {}
+        self.joints = tuple(each.name for each in self._arm if each.kind is not JointType.FIXED)
+        """The movable joints of the arm, from the base to the tool."""
+        self.bounds = {each.name: each.bounds for each in self._arm if each.kind is not JointType.FIXED}
+        """The limits of the model."""
+        last = max((number for number, each in enumerate(self._arm) if each.kind is not JointType.FIXED), default=-1)
+        self._fixed_behind = len(self._arm) - last - 1
+        behind = _along(self._arm[last + 1 :], {})
+        self._behind = behind if tool_in_link is None else behind @ tool_in_link
+        """The tool's frame in the link that the last joint moves."""
+        first = next((number for number, each in enumerate(self._arm) if each.kind is not JointType.FIXED), 0)
+        self._to_first = self._arm[: first + 1]
+        lengths = [_norm(each.origin) for each in self._arm[first + 1 :]]
+        slides = [max(map(abs, each.bounds)) for each in self._arm if each.kind is JointType.PRISMATIC]
+        self.reach_m = sum(lengths) + sum(slides) + (_norm(tool_in_link) if tool_in_link else 0.0)
+        """No posture brings the tool farther from the first joint than this."""
+
+    def forward(self, positions: Mapping[str, float]) -> Pose:
+        """Return the tool's frame in the root link at these joint positions; joints that are left out are at 0."""
+        tool = _along((*self._above, *self._arm), positions)
+        return tool if self._tool is None else tool @ self._tool
+
+    def axes(self, positions: Mapping[str, float]) -> dict[str, Vector]:
+        """Return the axis of each revolute joint of the arm, in the root link, at these joint positions."""
+        return {
+            each.name: rotated(_along((*self._above, *self._arm[: number + 1]), positions).orientation, each.axis)
+            for number, each in enumerate(self._arm)
+            if each.kind in (JointType.REVOLUTE, JointType.CONTINUOUS)
+        }
+
+    def distance_m(self, target: Pose, positions: Mapping[str, float]) -> float:
+        """Return the distance of a target in the root link from the first joint of the arm, with that joint at 0."""
+        first = _along((*self._above, *self._to_first), {**positions, **dict.fromkeys(self.joints, 0.0)})
+        return math.dist(first.position, target.position)
+
+    def solve(
+        self, target: Pose, positions: Mapping[str, float], bounds: Mapping[str, Bounds]
+    ) -> dict[str, float] | None:
+        """Return positions of the arm's joints for a target in the root link; None if no start led to it.
+
+        Args:
+            positions: of the joints above the arm; those of the arm have no effect.
+            bounds: the range of each joint of the arm; a joint that is endless stays within half a turn of 0.
+        """
+        ranges = tuple(_within_a_turn(bounds[name]) for name in self.joints)
+        if any(lower > upper for lower, upper in ranges):
+            return None
+        # The last link that a joint moves, in the link at which the arm begins.
+        goal = (target @ self._behind.inverse()).relative_to(_along(self._above, positions))
+        moving = self._arm[: len(self._arm) - self._fixed_behind]
+        if any(each.kind is JointType.PRISMATIC for each in moving):
+            angles = _descend(moving, ranges, goal)
+        else:
+            solver = self._solvers.get(ranges)
+            if solver is None:
+                self._solvers[ranges] = solver = _solver(moving, ranges)
+            config = optik.SolverConfig(max_time=TIME_MAX_S, max_restarts=STARTS_MAX, tol_f=_ERROR_MAX)
+            answer = solver.ik(config, _matrix(goal), _start(ranges, 0))
+            angles = None if answer is None else answer[0]
+        if angles is None:
+            return None
+        return {
+            name: min(max(angle, lower), upper)
+            for name, angle, (lower, upper) in zip(self.joints, angles, ranges, strict=True)
+        }
+
+
+def joints_between(urdf: str, base_link: str, tool_link: str) -> tuple[str, ...]:
+    """Return the movable joints between two links, from the base to the tool. Raises `CallerError` as `Chain` does."""
+    return tuple(each.name for each in _divided(urdf, base_link, tool_link)[1] if each.kind is not JointType.FIXED)
+
+
+def _divided(urdf: str, base_link: str, tool_link: str) -> tuple[tuple[Joint, ...], tuple[Joint, ...]]:
+    """Return the joints from the root to the base link, and those from there to the tool."""
+    robot = fromstring(urdf)  # noqa: S314  loaded by the caller's own process, and checked before
+    links = {each.get("name", "") for each in robot.findall("link")}
+    for link in (base_link, tool_link):
+        if link and link not in links:
+            raise CallerError(f"the model {robot.get('name')!r} has no link {link!r}: correct the robot's description")
+    above = {_end(each, "child"): each for each in robot.findall("joint")}
+    path: list[Joint] = []
+    link = tool_link
+    while link in above:
+        path.insert(0, _joint(above[link]))
+        link = _end(above[link], "parent")
+    passed = [link, *(each.child for each in path)]  # from the root to the tool
+    if base_link and base_link not in passed:
+        raise CallerError(f"{tool_link!r} does not hang on {base_link!r}: correct the robot's description")
+    begin = passed.index(base_link) if base_link else 0
+    return tuple(path[:begin]), tuple(path[begin:])
+
+
+def _joint(element: Element) -> Joint:
+    kind = _MOVABLE.get(element.get("type", ""), JointType.FIXED)
+    axis, limit = element.find("axis"), element.find("limit")
+    x, y, z = _numbers(None if axis is None else axis.get("xyz"), (1.0, 0.0, 0.0))
+    length = math.hypot(x, y, z) or 1.0
+    bounds = _ENDLESS
+    if kind is not JointType.CONTINUOUS and limit is not None:
+        bounds = Bounds(float(limit.get("lower", 0.0)), float(limit.get("upper", 0.0)))
+    origin = element.find("origin")
+    at, rpy = (None, None) if origin is None else (origin.get("xyz"), origin.get("rpy"))
+    roll, pitch, yaw = _numbers(rpy, (0.0, 0.0, 0.0))
+    turn = product(product(_about((0, 0, 1), yaw), _about((0, 1, 0), pitch)), _about((1, 0, 0), roll))
+    return Joint(
+        element.get("name", ""),
+        kind,
+        _end(element, "child"),
+        Pose(_numbers(at, (0.0, 0.0, 0.0)), turn),
+        (roll, pitch, yaw),
+        Vector(x / length, y / length, z / length),
+        bounds,
+    )
+
+
+def _end(joint: Element, end: str) -> str:
+    element = joint.find(end)
+    return "" if element is None else element.get("link", "")
+
+
+def _numbers(text: str | None, default: tuple[float, float, float]) -> tuple[float, float, float]:
+    if text is None:
+        return default
+    x, y, z = map(float, text.split())
+    return x, y, z
+
+
+def _along(joints: Sequence[Joint], positions: Mapping[str, float]) -> Pose:
+    """Return the frame of the last joint's child in the parent of the first, without drift: only products."""
+    x = y = z = 0.0
+    turn = Quaternion(0.0, 0.0, 0.0, 1.0)
+    for each in joints:
+        step = rotated(turn, each.origin.position)
+        x, y, z, turn = x + step.x, y + step.y, z + step.z, product(turn, each.origin.orientation)
+        position = 0.0 if each.kind is JointType.FIXED else positions.get(each.name, 0.0)
+        if each.kind is JointType.PRISMATIC:
+            step = rotated(turn, [position * along for along in each.axis])
+            x, y, z = x + step.x, y + step.y, z + step.z
+        elif position:
+            turn = product(turn, _about(each.axis, position))
+    return Pose((x, y, z), turn)
+
+
+def _about(axis: Sequence[float], angle: float) -> Quaternion:
+    x, y, z = axis
+    sine = math.sin(angle / 2)
+    return Quaternion(x * sine, y * sine, z * sine, math.cos(angle / 2))
+
+
+def _norm(pose: Pose) -> float:
+    return math.hypot(*pose.position)
+
+
+def _start(ranges: Sequence[Bounds], start: int) -> list[float]:
+    """Return a posture without symmetry: in the middle of the ranges an arm is often straight, and its axes in line."""
+    return [
+        lower + (upper - lower) * (0.1 + 0.8 * math.modf((number + start * len(ranges)) * _GOLDEN)[0])
+        for number, (lower, upper) in enumerate(ranges, 1)
+    ]
+
+
+def _descend(joints: Sequence[Joint], ranges: Sequence[Bounds], goal: Pose) -> list[float] | None:
+    """Solve by damped least squares from `DESCENTS_MAX` starts."""
+    lower, upper = np.array(ranges).T
+    for start in range(DESCENTS_MAX):
+        angles = np.array(_start(ranges, start))
+        miss, jacobian = _miss(joints, angles, goal)
+        damping = 1e-2
+        for _ in range(STEPS_MAX):
+            if np.abs(miss).max() < _EXACT:
+                return [float(angle) for angle in angles]
+            step = jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + damping * np.eye(6), miss)
+            tried = np.clip(angles + step, lower, upper)
+            tried_miss, tried_jacobian = _miss(joints, tried, goal)
+            if tried_miss @ tried_miss < miss @ miss:
+                angles, miss, jacobian, damping = tried, tried_miss, tried_jacobian, damping / 4
+            elif (damping := damping * 4) > _DAMPING_MAX:
+                break
+    return None
+
+
+def _miss(
+    joints: Sequence[Joint], angles: NDArray[np.float64], goal: Pose
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the way from the last joint's frame to the goal (m and rad), and its derivative by the joints."""
+    frames: list[tuple[Joint, Pose]] = []
+    frame, left = Pose(), iter(angles)
+    for each in joints:
+        position = 0.0 if each.kind is JointType.FIXED else float(next(left))
+        frame = frame @ _along([each], {each.name: position})
+        if each.kind is not JointType.FIXED:
+            frames.append((each, frame))
+    (x, y, z), turn = frame.position, frame.orientation
+    qx, qy, qz, qw = product(goal.orientation, (-turn.x, -turn.y, -turn.z, turn.w))
+    sine = math.copysign(math.hypot(qx, qy, qz), qw)
+    scale = 2 * math.atan2(abs(sine), abs(qw)) / sine if sine else 0.0
+    miss = [*(to - at for to, at in zip(goal.position, (x, y, z), strict=True)), qx * scale, qy * scale, qz * scale]
+    columns = []
+    for each, at in frames:
+        axis = rotated(at.orientation, each.axis)
+        if each.kind is JointType.PRISMATIC:
+            columns.append([*axis, 0.0, 0.0, 0.0])
+        else:
+            arm = [to - start for to, start in zip((x, y, z), at.position, strict=True)]
+            columns.append([*np.cross(axis, arm), *axis])
+    return np.array(miss), np.array(columns).T
+
+
+def _within_a_turn(bounds: Bounds) -> Bounds:
+    return Bounds(-math.pi, math.pi) if math.isinf(bounds.upper - bounds.lower) else bounds
+
+
+def _matrix(pose: Pose) -> list[list[float]]:
+    axes = [rotated(pose.orientation, axis) for axis in ((1, 0, 0), (0, 1, 0), (0, 0, 1))]
+    rows = [[axis[row] for axis in axes] + [pose.position[row]] for row in range(3)]
+    return [*rows, [0.0, 0.0, 0.0, 1.0]]
+
+
+def _solver(joints: Sequence[Joint], ranges: Sequence[Bounds]) -> optik.Robot:
+    """Load a model of this chain alone, whose last joint is movable, with these ranges.
+
+    The library knows no continuous joint, and leaves out fixed ones, so they are made part of the next joint.
+    """
+    robot = Element("robot", name="chain")
+    SubElement(robot, "link", name="link 0")
+    fixed: list[Joint] = []
+    number = 0
+    for each in joints:
+        if each.kind is JointType.FIXED:
+            fixed.append(each)
+            continue
+        origin, rpy = each.origin, each.rpy
+        if fixed:
+            origin = _along(fixed, {}) @ each.origin
+            rpy = _rpy(origin)
+            fixed.clear()
+        lower, upper = ranges[number]
+        number += 1
+        SubElement(robot, "link", name=f"link {number}")
+        kind = "prismatic" if each.kind is JointType.PRISMATIC else "revolute"
+        joint = SubElement(robot, "joint", name=f"joint {number}", type=kind)
+        SubElement(joint, "parent", link=f"link {number - 1}")
+        SubElement(joint, "child", link=f"link {number}")
+        SubElement(joint, "origin", xyz=_text(origin.position), rpy=_text(rpy))
+        SubElement(joint, "axis", xyz=_text(each.axis))
+        SubElement(joint, "limit", lower=repr(lower), upper=repr(upper), effort="1", velocity="1")
+    with tempfile.NamedTemporaryFile("w", suffix=".urdf", encoding="utf-8") as file:
+        file.write(tostring(robot, encoding="unicode"))
+        file.flush()
+        solver = optik.Robot.from_urdf_file(file.name, "link 0", f"link {number}")
+    solver.set_parallelism(1)
+    return solver
+
+
+def _rpy(pose: Pose) -> tuple[float, float, float]:
+    """Return roll, pitch and yaw of an orientation."""
+    (xx, xy, _, _), (yx, yy, _, _), (zx, zy, zz, _), _ = _matrix(pose)
+    flat = math.hypot(xx, yx)
+    if flat < _PARALLEL:  # roll and yaw turn about one axis: let roll be 0
+        return 0.0, math.atan2(-zx, flat), math.atan2(-xy, yy)
+    return math.atan2(zy, zz), math.atan2(-zx, flat), math.atan2(yx, xx)
+
+
+def _text(numbers: Sequence[float]) -> str:
+    return " ".join(map(repr, map(float, numbers)))

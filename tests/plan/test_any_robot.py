@@ -1,0 +1,234 @@
+"""Robots of other builds than the PR2's perform every action that their parts allow, and fail at the others by name."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from importlib.metadata import distribution
+from pathlib import Path
+
+import pytest
+
+from pycrorm_async.errors import CallerError
+from pycrorm_async.plan import (
+    ActionAbstract,
+    CostmapLocation,
+    DetectActionPerformable,
+    FaceAtPerformable,
+    GripActionPerformable,
+    LookAtActionPerformable,
+    MoveTorsoActionPerformable,
+    NavigateActionPerformable,
+    Parallel,
+    ParkArmsActionPerformable,
+    PickUpActionPerformable,
+    PlaceActionPerformable,
+    Resource,
+    SetGripperActionPerformable,
+    TransportActionPerformable,
+    simulated_robot,
+)
+from pycrorm_async.plan.current_robot import require_robot
+from pycrorm_async.plan.failures import CapabilityAbsenceFailure, ReachabilityFailure
+from pycrorm_async.world import (
+    COURIER,
+    Arms,
+    BulletWorld,
+    Drive,
+    Grasp,
+    GripperState,
+    Object,
+    ObjectType,
+    Pose,
+    RobotDescription,
+    describe_arm,
+    describe_robot,
+    register_robot,
+)
+from pycrorm_async.world.models.courier import courier_urdf
+from pycrorm_async.world.pose import rotated
+
+MODELS = Path(str(distribution("example-robot-data").locate_file("cmeel.prefix/share/example-robot-data/robots")))
+PANDA_URDF = MODELS / "panda_description/urdf/panda.urdf"
+PANDA_SRDF = MODELS / "panda_description/srdf/panda.srdf"
+TIAGO_URDF = MODELS / "tiago_description/robots/tiago_no_hand.urdf"
+TABLE = """<robot name="table"><link name="top"><inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1"
+iyz="0" izz="1"/></inertial><collision><origin xyz="0 0 0.375"/><geometry><box size="0.6 1.2 0.75"/></geometry>
+</collision></link></robot>"""
+
+
+@pytest.fixture
+def courier() -> Iterator[Object]:
+    with BulletWorld(), simulated_robot:
+        yield Object("courier", ObjectType.ROBOT)
+
+
+async def test_the_courier_detects_and_transports_an_object(courier: Object) -> None:
+    table = Object("table", ObjectType.ENVIRONMENT, TABLE, pose=Pose([2, 0, 0]))
+    milk = Object("milk", ObjectType.MILK, pose=Pose([1.85, 0.3, 0.84]))
+    await NavigateActionPerformable(Pose([0.9, 0.3, 0])).perform()
+    await LookAtActionPerformable(milk.pose).perform()
+    found = await DetectActionPerformable(milk).perform()
+    assert found.name == "milk"
+    goal = Pose([1.85, -0.3, 0.84])
+    await TransportActionPerformable(milk, Arms.RIGHT, goal).perform()
+    assert milk.pose.distance(goal) < 1e-5
+    assert milk.attached_to is None
+    park = COURIER.arms[Arms.RIGHT].park
+    assert {joint: courier.joint_position(joint) for joint in park} == dict(park)
+    assert courier.bounding_box("base_link").min.x < table.pose.position.x
+
+
+async def test_the_courier_fails_at_what_its_build_lacks(courier: Object) -> None:
+    milk = Object("milk", ObjectType.MILK, pose=Pose([0.7, 0, 0.9]))
+    for action, part in (
+        (MoveTorsoActionPerformable(0.1), "courier has no torso to lift"),
+        (ParkArmsActionPerformable(Arms.LEFT), "courier has no LEFT arm"),
+        (ParkArmsActionPerformable(Arms.BOTH), "courier has no LEFT arm"),
+        (SetGripperActionPerformable(Arms.LEFT, GripperState.OPEN), "courier has no LEFT arm"),
+        (PickUpActionPerformable(milk, Arms.LEFT, Grasp.FRONT), "courier has no LEFT arm"),
+        (PickUpActionPerformable(milk, Arms.named("CENTRE"), Grasp.FRONT), "courier has no CENTRE arm"),
+        (TransportActionPerformable(milk, Arms.LEFT, milk.pose), "courier has no LEFT arm"),
+    ):
+        await fails(action, part)
+    assert courier.pose == courier.original_pose
+
+
+@pytest.mark.parametrize("model", ["courier", "tiago"])
+async def test_a_head_without_a_closed_form_points_its_camera_at_the_target(model: str) -> None:
+    with BulletWorld(), simulated_robot:
+        Object(model, ObjectType.ROBOT, robot=COURIER if model == "courier" else tiago(), pose=Pose([0.3, 0, 0]))
+        for target in ((2, 0.5, 0.9), (1, -2, 0.8), (1.5, 1, 1.3)):
+            await LookAtActionPerformable(Pose(target)).perform()
+            x, y, z = Pose(target).relative_to(require_robot().camera_pose()).position
+            assert math.hypot(x, y) / z < 1e-6
+        await LookAtActionPerformable(Pose([-3, 0.1, 1])).perform()  # behind it: as far as the joints go
+
+
+def tiago() -> RobotDescription:
+    return describe_robot(
+        "tiago",
+        TIAGO_URDF,
+        arms={Arms.LEFT: describe_arm(TIAGO_URDF, "torso_lift_link", "arm_tool_link")},
+        drive=Drive.DIFFERENTIAL,
+        torso_joint="torso_lift_joint",
+        head_joints=("head_1_joint", "head_2_joint"),
+        camera_link="xtion_rgb_optical_frame",
+    )
+
+
+def panda() -> RobotDescription:
+    return describe_robot("panda", PANDA_URDF, srdf=PANDA_SRDF, park="default", drive=Drive.FIXED)
+
+
+async def test_a_tiago_without_a_hand_moves_what_it_has() -> None:
+    with BulletWorld(), simulated_robot:
+        robot = Object("tiago", ObjectType.ROBOT, robot=tiago())
+        milk = Object("milk", ObjectType.MILK, pose=Pose([2, 0, 1.0]))
+        await NavigateActionPerformable(Pose([0.5, 0, 0])).perform()
+        await MoveTorsoActionPerformable(0.3).perform()
+        assert robot.joint_position("torso_lift_joint") == 0.3
+        await FaceAtPerformable(milk.pose).perform()
+        assert (await DetectActionPerformable(milk).perform()).name == "milk"
+        place = CostmapLocation(Pose([3, 1, 0.9]), reachable_for=robot).resolve()
+        assert place.reachable_arms == (Arms.LEFT,)
+        await fails(SetGripperActionPerformable(Arms.LEFT, GripperState.OPEN), "no gripper at its LEFT arm")
+        await fails(PickUpActionPerformable(milk, Arms.LEFT, Grasp.FRONT), "no gripper at its LEFT arm")
+        await fails(GripActionPerformable(Arms.LEFT, milk, 1.0), "no gripper at its LEFT arm")
+        await fails(ParkArmsActionPerformable(Arms.LEFT), "no park posture of its LEFT arm")
+
+
+async def test_a_panda_on_a_fixed_base_picks_and_places_and_cannot_drive() -> None:
+    description = panda()
+    [arm] = description.arms.values()
+    assert (arm.joints, arm.tool_frame) == (tuple(f"panda_joint{n}" for n in range(1, 8)), "panda_hand_tcp")
+    assert arm.gripper_joints[GripperState.OPEN] == {"panda_finger_joint1": 0.04, "panda_finger_joint2": 0.04}
+    assert arm.opening_m == pytest.approx(0.08)
+    assert description.postures["default"]["panda_joint4"] == -2.35619
+    with BulletWorld(), simulated_robot:
+        robot = Object("panda", ObjectType.ROBOT, robot=with_fingers_along_x(description))
+        spoon = Object("spoon", ObjectType.SPOON, pose=Pose([0.45, 0.2, 0.1]))
+        await fails(NavigateActionPerformable(Pose([1, 0, 0])), "no drive: its base is fixed")
+        await fails(LookAtActionPerformable(spoon.pose), "no head to turn")
+        await fails(DetectActionPerformable(spoon), "no camera")
+        await fails(MoveTorsoActionPerformable(0.1), "no torso to lift")
+        await ParkArmsActionPerformable(Arms.RIGHT).perform()
+        await PickUpActionPerformable(spoon, Arms.RIGHT, Grasp.TOP).perform()
+        assert spoon.attached_to is robot
+        ahead = rotated(require_robot().tool_pose(Arms.RIGHT).orientation, (1.0, 0.0, 0.0))
+        assert ahead == pytest.approx((0, 0, -1), abs=1e-5)
+        await PlaceActionPerformable(spoon, Arms.RIGHT, Pose([0.45, -0.2, 0.1])).perform()
+        assert spoon.pose.distance(Pose([0.45, -0.2, 0.1])) < 1e-5
+        near = CostmapLocation(Pose([0.45, 0, 0.4]), reachable_for=robot).resolve()
+        assert near.pose == robot.pose
+        with pytest.raises(ReachabilityFailure):
+            CostmapLocation(Pose([3, 0, 0.4]), reachable_for=robot).resolve()
+
+
+def with_fingers_along_x(description: RobotDescription) -> RobotDescription:
+    """The Panda's tool link has z along its fingers."""
+    arm = replace(description.arms[Arms.RIGHT], tool_in_link=Pose(orientation=(0, -1, 0, 1)))
+    return replace(description, arms={Arms.RIGHT: arm})
+
+
+async def test_a_third_arm_has_a_name_of_its_own_and_parts_of_its_own() -> None:
+    arm = COURIER.arms[Arms.RIGHT]
+    centre = Arms.named("CENTRE")
+    three = RobotDescription(name="three", urdf=courier_urdf(), arms={centre: arm})
+    with BulletWorld(), simulated_robot:
+        robot = Object("three", ObjectType.ROBOT, robot=three)
+        park = ParkArmsActionPerformable(centre)
+        assert park.resources() == {Resource.OTHER_ARM}
+        await Parallel(park, NavigateActionPerformable(Pose([1, 0, 0]))).perform()
+        assert {joint: robot.joint_position(joint) for joint in arm.park} == dict(arm.park)
+        milk = Object("milk", ObjectType.MILK, pose=Pose([1.65, 0, 0.9]))
+        await PickUpActionPerformable(milk, centre, Grasp.FRONT).perform()
+        assert robot.attachments == {milk: "tool_frame"}
+
+
+def test_an_srdf_names_arms_grippers_and_postures() -> None:
+    joint = '<joint name="{0}_slide" type="prismatic"><parent link="{1}"/><child link="{0}"/><axis xyz="{2}"/>'
+    limit = '<limit lower="0" upper="{}" effort="1" velocity="1"/></joint>'
+    links, joints = ["base"], []
+    for side in ("left", "right", "spare"):
+        for number, (name, parent, axis, upper) in enumerate(
+            ((f"{side}_arm", "base", "1 0 0", 1), (f"{side}_a", f"{side}_arm", "0 1 0", 0.03),
+             (f"{side}_b", f"{side}_arm", "0 -1 0", 0.02))
+        ):  # fmt: skip
+            assert number < 3
+            links.append(name)
+            joints.append(joint.format(name, parent, axis) + limit.format(upper))
+    urdf = f'<robot name="trio">{"".join(f"<link name={name!r}/>" for name in links)}{"".join(joints)}</robot>'
+    srdf = "".join(
+        f'<group name="{side}_arm"><chain base_link="base" tip_link="{side}_arm"/></group>'
+        f'<end_effector name="{side}" parent_link="{side}_arm" group="{side}_hand" parent_group="{side}_arm"/>'
+        f'<group_state name="home" group="{side}_arm"><joint name="{side}_arm_slide" value="0.5"/></group_state>'
+        for side in ("left", "right", "spare")
+    )
+    trio = describe_robot("trio", urdf, srdf=f'<robot name="trio">{srdf}</robot>', park="home", serial="7")
+    assert [each.name for each in trio.arms] == ["LEFT", "RIGHT", "SPARE_ARM"]
+    left = trio.arms[Arms.LEFT]
+    assert (left.joints, left.base_link, left.tool_frame) == (("left_arm_slide",), "base", "left_arm")
+    assert left.gripper_joints[GripperState.OPEN] == {"left_a_slide": 0.03, "left_b_slide": 0.02}
+    assert (left.opening_m, left.park, trio.serial) == (0.05, {"left_arm_slide": 0.5}, "7")
+    with pytest.raises(CallerError, match="of a group without a chain"):
+        describe_robot("trio", urdf, srdf='<robot><end_effector parent_link="left_arm" group="none"/></robot>')
+    with pytest.raises(CallerError, match="cannot be read"):
+        describe_robot("trio", urdf, srdf="<robot><group>")
+
+
+def test_a_registered_robot_needs_its_name_only(request: pytest.FixtureRequest) -> None:
+    model = f"model of {request.node.name}"
+    description = RobotDescription(name=model, urdf=courier_urdf(), drive=Drive.FIXED)
+    assert register_robot(description) is description
+    with BulletWorld():
+        robot = Object(model, ObjectType.ROBOT)
+        assert robot.robot_description is description
+        assert "tool_frame" in robot.links
+
+
+async def fails(action: ActionAbstract, part: str) -> None:
+    with pytest.raises(CapabilityAbsenceFailure) as failure:
+        await action.perform()
+    assert part in failure.value.message
