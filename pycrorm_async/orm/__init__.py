@@ -61,7 +61,7 @@ from pycrorm_async.orm.objects import (
 )
 from pycrorm_async.orm.perception import Detection, Observation, ObservationValue, StateSample
 from pycrorm_async.orm.tree import LocationCandidate, LocationRefusal, LocationResolution, TaskTreeNode
-from pycrorm_async.orm.views import PickUpWithContextView, RootFailure
+from pycrorm_async.orm.views import PickUpWithContextView, RootFailure, SpatialRelation
 
 __all__ = [
     "Base",
@@ -133,4 +133,5 @@ __all__ = [
     "Retry",
     "PickUpWithContextView",
     "RootFailure",
+    "SpatialRelation",
 ]

@@ -8,10 +8,11 @@ from sqlalchemy import ForeignKey
 from sqlalchemy.orm import Mapped, mapped_column, relationship, synonym
 
 from pycrorm_async.orm.base import Base, ProcessMetaData, RowOfEvent, on_request
+from pycrorm_async.orm.tree import TaskTreeNode
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.enums import Arms, Grasp, ObjectType
 
-__all__ = ["PickUpWithContextView", "RootFailure"]
+__all__ = ["PickUpWithContextView", "RootFailure", "SpatialRelation"]
 
 
 class PickUpWithContextView(Base):
@@ -112,3 +113,33 @@ class RootFailure(RowOfEvent, Base):
     def episode(self) -> ProcessMetaData:
         """The episode in which it failed."""
         return self.process_metadata
+
+
+class SpatialRelation(Base):
+    """What an object was on, in or next to when it was picked up, or after it was placed.
+
+    `projections.schema.views.spatial_relation_view` defines the relations.
+
+    Attributes:
+        node_id: of the pick-up or the placing.
+        object, object_id: the picked up or placed object: its name, and its row at that moment.
+        relation: `on`, `in` or `next to`.
+        other, other_id: the other object: its name, and its row at that moment.
+        link: of the other object, such as `sink_area_surface`; an object of one link has its name.
+        node: the pick-up or the placing. Loaded on request.
+    """
+
+    __tablename__ = "spatial_relation"
+
+    node_id: Mapped[int] = mapped_column(ForeignKey("task_tree_node.id"), primary_key=True)
+    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"))
+    object_id: Mapped[int] = mapped_column(ForeignKey("object.id"))
+    object: Mapped[str]
+    relation: Mapped[str]
+    other_id: Mapped[int] = mapped_column(ForeignKey("object.id"), primary_key=True)
+    other: Mapped[str]
+    link: Mapped[str] = mapped_column(primary_key=True)
+
+    _node: Mapped[TaskTreeNode] = relationship(viewonly=True, lazy="select")
+    node: Mapped[TaskTreeNode] = synonym("_node", descriptor=on_request("node"))
+    process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True, lazy="selectin")

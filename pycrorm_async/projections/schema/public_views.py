@@ -20,6 +20,7 @@ from sqlalchemy import (
     Select,
     Table,
     Text,
+    TextualSelect,
     case,
     cast,
     column,
@@ -42,10 +43,11 @@ from pycrorm_async.projections.schema.pick_up_view import pick_ups_with_context
 from pycrorm_async.projections.schema.root_failure_view import root_failures
 from pycrorm_async.projections.schema.tables import CORE, OWN, column_type, make_table
 from pycrorm_async.projections.schema.views.concept_views import concept_views
+from pycrorm_async.projections.schema.views.spatial_relation_view import SpatialTables, spatial_relations
 
 __all__ = ["public_views", "projection_views", "View"]
 
-View: TypeAlias = Select[Any] | CompoundSelect[Any]
+View: TypeAlias = Select[Any] | CompoundSelect[Any] | TextualSelect
 _Cut: TypeAlias = Callable[[dict[str, Table], Layout], Select[Any]]
 
 _NUMBER_BITS = SEQUENCE_MAX.bit_length() + SLOT_MAX.bit_length()
@@ -55,8 +57,10 @@ _UNITED_MAX = 400
 """Bounds the selects in one UNION, because SQLite allows 500. More are united in groups."""
 
 _PICKED = "pick_up_action"
+_PLACED = "place_action"
 _OF_PICK_UPS = ("task_tree_node", "object", "pose", "process_metadata")
-"""The tables of `PickUpWithContextView`."""
+_OF_RELATIONS = ("task_tree_node", "object", "object_removal", "pose", "joint_change")
+"""The tables of `PickUpWithContextView` and of `spatial_relation`."""
 
 _event = table("event", column("episode"), column("sequence"), column("payload"))
 _episode = table("episode", column("number"), column("id"))
@@ -143,6 +147,10 @@ def public_views(
         picked = _leaf(_PICKED, layout, leaves, lambda view, _: view).subquery("picked")
         view = pick_ups_with_context(picked, node, object_, pose, episode, layout.dtypes(_PICKED))
         views["PickUpWithContextView"] = shown(view, node)
+        if _PLACED in layout.leaves:
+            placed = _leaf(_PLACED, layout, leaves, lambda view, _: view).subquery("placed")
+            tables = SpatialTables(*(core[name] for name in _OF_RELATIONS))
+            views["spatial_relation"] = spatial_relations(tables, picked, placed, simulated=simulated)
     views["designator_type"] = _designator_type(layout)
     views["object_description"] = select(_declaration).where(_declaration.c.fingerprint >= DESCRIPTIONS_FROM)
     return {**views, **concept_views()}

@@ -6,38 +6,22 @@ table, fold or rebuild.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import Any
-
-from sqlalchemy import CompoundSelect, Text, cast, literal, null, select, union_all
+from sqlalchemy import Text, TextualSelect
 
 from pycrorm_async.events.concepts import CONCEPT_OF_OBJECT_TYPE, CONCEPTS, ancestors
+from pycrorm_async.projections.schema.views.constants import constants
 
 __all__ = ["concept_views"]
 
 
-def concept_views() -> dict[str, CompoundSelect[Any]]:
+def concept_views() -> dict[str, TextualSelect]:
     """Return name and select of each view."""
     parents = (
         (name, parent, each.source) for name, each in sorted(CONCEPTS.items()) for parent in each.parents or (None,)
     )
     pairs = ((name, ancestor) for name in sorted(CONCEPTS) for ancestor in ancestors(name))
     return {
-        "concept": _rows(("name", "parent", "source"), parents),
-        "concept_ancestor": _rows(("concept", "ancestor"), pairs),
-        "object_concept": _rows(("obj_type", "concept"), sorted(CONCEPT_OF_OBJECT_TYPE.items())),
+        "concept": constants({"name": Text(), "parent": Text(), "source": Text()}, parents),
+        "concept_ancestor": constants({"concept": Text(), "ancestor": Text()}, pairs),
+        "object_concept": constants({"obj_type": Text(), "concept": Text()}, sorted(CONCEPT_OF_OBJECT_TYPE.items())),
     }
-
-
-def _rows(columns: tuple[str, ...], rows: Iterable[tuple[str | None, ...]]) -> CompoundSelect[Any]:
-    return union_all(
-        *(
-            select(
-                *(
-                    cast(literal(value) if value is not None else null(), Text()).label(name)
-                    for name, value in zip(columns, row, strict=True)
-                )
-            )
-            for row in rows
-        )
-    )

@@ -1,0 +1,208 @@
+"""Define `spatial_relation`: what each picked up or placed object was on, in or next to.
+
+The moment is the start of a pick-up, and the end of a placing. A relation is computed from the poses at that moment and
+from the boxes of the built-in models: of small objects by type, of the environment by name, link by link. A drawer is
+where its joint had it; links that turn, such as doors, have no box. A box is turned with its object and then replaced
+by the box along the axes of the map around it. With the picked up or placed object's box A and another one B:
+
+    on       the bottom of A is within `ON_M` of the top of B, and the centre of A is above B
+    in       the centre of A is in B
+    next to  neither, their horizontal gap is at most `NEXT_TO_M`, and their heights overlap; not for environments
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+from sqlalchemy import (
+    ColumnElement,
+    Double,
+    FromClause,
+    Select,
+    Subquery,
+    Table,
+    Text,
+    TextualSelect,
+    and_,
+    case,
+    cast,
+    exists,
+    func,
+    literal,
+    or_,
+    select,
+    union_all,
+)
+
+from pycrorm_async.events.ids import SEQUENCE_MAX, SLOT_MAX
+from pycrorm_async.projections.schema.views.constants import constants
+from pycrorm_async.world.enums import ObjectType
+from pycrorm_async.world.models.catalog import built_in_urdf
+from pycrorm_async.world.models.kitchen import kitchen_urdf
+from pycrorm_async.world.models.link_boxes import link_boxes
+
+__all__ = ["SpatialTables", "spatial_relations", "ON_M", "NEXT_TO_M"]
+
+ON_M = 0.02
+"""The largest distance between a bottom and a top that counts as contact, m: poses of placings differ by less."""
+NEXT_TO_M = 0.1
+"""The largest horizontal gap between neighbours, m: about as wide as a hand between them."""
+
+_ENVIRONMENT = ObjectType.ENVIRONMENT.name
+_AXES = ("x", "y", "z")
+_TEXTS = ("obj_type", "model", "link", "joint")
+_SLOT_BITS = SLOT_MAX.bit_length()
+_NUMBER_BITS = SEQUENCE_MAX.bit_length() + _SLOT_BITS
+
+
+class SpatialTables(NamedTuple):
+    """The tables that the view reads."""
+
+    node: Table
+    object: Table
+    removal: Table
+    pose: Table
+    joint_change: Table
+
+
+def spatial_relations(tables: SpatialTables, picked: FromClause, placed: FromClause, *, simulated: bool) -> Select[Any]:
+    """Return the view's query; `picked` and `placed` are the rows of pick-ups and placings."""
+    moments = _moments(tables, picked, placed, simulated=simulated)
+    boxes = _boxes().subquery("box")
+    one = _placed_boxes(tables, moments, boxes, same=True)
+    other = _placed_boxes(tables, moments, boxes, same=False)
+    gaps = [func.abs(one.c[f"c{axis}"] - other.c[f"c{axis}"]) - other.c[f"h{axis}"] for axis in _AXES]
+    within = [gap <= 0 for gap in gaps]
+    bottom, top = one.c.cz - one.c.hz, other.c.cz + other.c.hz
+    apart = [
+        case((gap > one.c[f"h{axis}"], gap - one.c[f"h{axis}"]), else_=0.0)
+        for gap, axis in zip(gaps, _AXES, strict=True)
+    ]
+    gap_squared = apart[0] * apart[0] + apart[1] * apart[1]
+    near = and_(gap_squared <= NEXT_TO_M**2, apart[2] <= 0, other.c.obj_type != _ENVIRONMENT)
+    relation = case(
+        (and_(func.abs(bottom - top) <= ON_M, within[0], within[1]), "on"),
+        (and_(*within), "in"),
+        (near, "next to"),
+    )
+    found = (
+        select(
+            one.c.node_id,
+            one.c.process_metadata_id,
+            one.c.row_id.label("object_id"),
+            one.c.name.label("object"),
+            cast(relation, Text()).label("relation"),
+            other.c.row_id.label("other_id"),
+            other.c.name.label("other"),
+            other.c.link,
+        )
+        .join_from(one, other, one.c.node_id == other.c.node_id)
+        .subquery("related")
+    )
+    return select(*found.c).where(found.c.relation.is_not(None))
+
+
+def _moments(tables: SpatialTables, picked: FromClause, placed: FromClause, *, simulated: bool) -> Subquery:
+    """Return the nodes with their object's identity, and the id that a row of their moment's event would have."""
+    node, target = tables.node, tables.object.alias("target")
+    first_id = node.c.id.bitwise_rshift(_NUMBER_BITS).bitwise_lshift(_NUMBER_BITS)
+    ended = first_id + node.c.end_sequence.bitwise_lshift(_SLOT_BITS)
+    return union_all(
+        *(
+            select(
+                node.c.id.label("node_id"),
+                node.c.process_metadata_id,
+                target.c.identity_id,
+                moment.label("moment"),
+            )
+            .join_from(rows, node, node.c.id == rows.c.id)
+            .join(target, target.c.id == rows.c.object_designator_id)
+            .where(target.c.identity_id.is_not(None), moment.is_not(None))
+            .where(*(() if simulated else (~node.c.simulated,)))
+            for rows, moment in ((picked, node.c.id), (placed, ended))
+        )
+    ).subquery("moment")
+
+
+def _placed_boxes(tables: SpatialTables, moments: Subquery, boxes: Subquery, *, same: bool) -> Subquery:
+    """Return for each moment the boxes in the map: of the picked up or placed object itself, or of all others."""
+    name = "one" if same else "another"
+    added, then = tables.object.alias(f"{name}_added"), tables.object.alias(f"{name}_then")
+    later, removal, pose = tables.object.alias(f"{name}_later"), tables.removal.alias(), tables.pose.alias()
+    box = boxes.alias(f"{name}_box")
+    last = (
+        select(func.max(later.c.id))
+        .where(later.c.identity_id == added.c.id, later.c.dtype == "Object", later.c.id <= moments.c.moment)
+        .scalar_subquery()
+    )
+    removed = exists(select(literal(1)).where(removal.c.identity_id == added.c.id, removal.c.id <= moments.c.moment))
+    # Joined, because SQLite would compute a subquery in the columns once for each use of a column.
+    slid = tables.joint_change.alias(f"{name}_slid")
+    last_change = _last_change(tables, added, box, moments)
+    centre = [box.c[f"c{axis}"] + box.c[f"a{axis}"] * func.coalesce(slid.c.position, 0.0) for axis in _AXES]
+    rotation = _rotation(pose)
+    columns: list[ColumnElement[Any]] = []
+    for axis, row in zip(_AXES, rotation, strict=True):
+        along = row[0] * centre[0] + row[1] * centre[1] + row[2] * centre[2]
+        half = sum((func.abs(row[each]) * box.c[f"h{_AXES[each]}"] for each in (1, 2)), func.abs(row[0]) * box.c.hx)
+        columns += [(pose.c[axis] + along).label(f"c{axis}"), half.label(f"h{axis}")]
+    named = or_(box.c.model.is_(None), box.c.model == added.c.name)
+    is_one = added.c.id == moments.c.identity_id
+    return (
+        select(
+            moments.c.node_id,
+            moments.c.process_metadata_id,
+            then.c.id.label("row_id"),
+            then.c.name,
+            then.c.obj_type,
+            func.coalesce(box.c.link, then.c.name).label("link"),
+            *columns,
+        )
+        .select_from(moments)
+        .join(added, is_one if same else and_(added.c.process_metadata_id == moments.c.process_metadata_id, ~is_one))
+        .join(then, then.c.id == last)
+        .join(pose, pose.c.id == then.c.pose_id)
+        .join(box, and_(box.c.obj_type == added.c.obj_type, named))
+        .outerjoin(slid, and_(slid.c.joint == box.c.joint, slid.c.id == last_change))
+        .where(added.c.id == added.c.identity_id, added.c.id <= moments.c.moment, ~removed)
+        .subquery(name)
+    )
+
+
+def _last_change(tables: SpatialTables, added: FromClause, box: FromClause, moments: Subquery) -> ColumnElement[int]:
+    """Return the id of the last change of the joint that slides a box."""
+    change, moved = tables.joint_change.alias(), tables.object.alias()
+    return (
+        select(func.max(change.c.id))
+        .join_from(change, moved, moved.c.id == change.c.object_id)
+        .where(moved.c.identity_id == added.c.id, change.c.joint == box.c.joint, change.c.id <= moments.c.moment)
+        .scalar_subquery()
+    )
+
+
+def _rotation(pose: FromClause) -> list[list[ColumnElement[float]]]:
+    x, y, z, w = (pose.c[f"q{axis}"] for axis in "xyzw")
+    return [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+
+
+@lru_cache(maxsize=1)
+def _boxes() -> TextualSelect:
+    """Return the boxes of the built-in models: type, name of the model, link, joint, centre, half edges, direction."""
+    names = [f"{letter}{axis}" for letter in "cha" for axis in _AXES]
+    return constants({name: Text() for name in _TEXTS} | {name: Double() for name in names}, _built_in())
+
+
+def _built_in() -> Iterator[tuple[str | float | None, ...]]:
+    for kind in ObjectType:
+        if kind not in (ObjectType.ROBOT, ObjectType.ENVIRONMENT):
+            for box in link_boxes(built_in_urdf("any", kind)):
+                yield kind.name, None, None, None, *box.centre, *box.half, *box.axis
+    for box in link_boxes(kitchen_urdf()):
+        if not box.link.endswith("_handle"):
+            yield _ENVIRONMENT, "kitchen", box.link, box.joint, *box.centre, *box.half, *box.axis

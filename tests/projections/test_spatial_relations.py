@@ -1,0 +1,150 @@
+"""The view of what an object was on, in or next to when it was picked up, and after it was placed."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pytest
+from sqlalchemy import select
+from sqlalchemy.ext.asyncio import AsyncSession
+
+from pycrorm_async.errors import CallerError
+from pycrorm_async.events.types import JointsMoved, NodeEnded, NodeStarted, ObjectAdded, ObjectMoved, ObjectRemoved
+from pycrorm_async.events.values import ObjectReference
+from pycrorm_async.orm import SpatialRelation
+from pycrorm_async.query.reading import Reading
+from pycrorm_async.store.log import EventLog
+from pycrorm_async.world.models.kitchen import kitchen_urdf
+from pycrorm_async.world.models.link_boxes import link_boxes
+from tests.projections.event_script import PICK_UP, Script, declarations, declared, field, name_of, pose, row
+from tests.projections.sql_queries import stored_and_folded
+
+PLACE = declared(
+    "PlaceAction",
+    "place_action",
+    field("object_designator", "object", 2),
+    field("arm", "enum", 3),
+    field("target_location", "pose", 4),
+)
+DRAWER = "kitchen_counter_upper_drawer"
+
+
+class Tidying:
+    """A script of an episode in the built-in kitchen."""
+
+    def __init__(self) -> None:
+        self.script = Script()
+        self.rows: dict[str, tuple[int, int]] = {}
+        self.add("kitchen", "ENVIRONMENT", 0, 0, 0)
+
+    def add(self, name: str, kind: str, *at: float, turned: float = 0.0) -> None:
+        sequence = self.script.put(ObjectAdded(name, kind, pose(*at, turned=turned)))
+        self.rows[name] = sequence, sequence
+
+    def move(self, name: str, kind: str, *at: float) -> None:
+        identity = self.rows[name][0]
+        self.rows[name] = identity, self.script.put(ObjectMoved(identity, name, kind, pose(*at)))
+
+    def reference(self, name: str) -> ObjectReference:
+        return ObjectReference(*self.rows[name])
+
+    def pick_up(self, name: str, *, simulated: bool = False) -> int:
+        parameters: dict[str, Any] = {"object_designator": self.reference(name), "arm": "LEFT", "grasp": "TOP"}
+        node = self.script.put(NodeStarted("action", None, name_of(PICK_UP), parameters, simulated=simulated))
+        self.script.put(NodeEnded(node, "SUCCEEDED"))
+        return row(node)
+
+    def start_placing(self, name: str) -> int:
+        parameters = {"object_designator": self.reference(name), "arm": "LEFT", "target_location": pose()}
+        return self.script.put(NodeStarted("action", None, name_of(PLACE), parameters))
+
+
+async def relations(log: EventLog, tidying: Tidying) -> dict[int, set[tuple[str, str, str]]]:
+    """Store the script; return relation, other object and link by node."""
+    await stored_and_folded(log, [*declarations(PICK_UP, PLACE), *tidying.script.records])
+    found: dict[int, set[tuple[str, str, str]]] = {}
+    async with AsyncSession(log.engine) as session:
+        for each in await session.scalars(select(SpatialRelation)):
+            found.setdefault(each.node_id, set()).add((each.relation, each.other, each.link))
+    return found
+
+
+@pytest.mark.slow
+async def test_a_picked_up_object_is_related_as_it_was_before(log: EventLog) -> None:
+    tidying = Tidying()
+    tidying.add("milk", "MILK", 1.3, 1.0, 0.9)
+    tidying.add("cup", "JEROEN_CUP", 1.3, 1.12, 0.862)
+    tidying.add("spoon", "SPOON", 1.3, 0.9, 0.83)
+    tidying.script.put(ObjectRemoved(tidying.reference("spoon")))
+    tidying.add("cereal", "BREAKFAST_CEREAL", 1.3, 0.8, 0.95, turned=math.sqrt(0.5))
+    tidying.add("bowl", "BOWL", 1.3, 0.2, 0.88)
+    picked = tidying.pick_up("milk")
+    tidying.move("cup", "JEROEN_CUP", 0, 0, 0)
+    assert await relations(log, tidying) == {
+        picked: {
+            ("on", "kitchen", "sink_area_surface"),
+            ("next to", "cup", "cup"),
+            ("next to", "cereal", "cereal"),  # turned by a quarter, its wide side is along y
+        }
+    }
+
+
+@pytest.mark.slow
+async def test_a_placed_object_is_related_as_it_is_at_the_end(log: EventLog) -> None:
+    tidying = Tidying()
+    tidying.add("milk", "MILK", 1.3, 1.0, 0.9)
+    tidying.add("bowl", "BOWL", 1.3, 0.2, 0.88)
+    placed = tidying.start_placing("milk")
+    tidying.move("milk", "MILK", 1.3, 0.39, 0.936 + 0.01)
+    tidying.script.put(NodeEnded(placed, "SUCCEEDED"))
+    tidying.move("milk", "MILK", 5, 5, 5)
+    tidying.start_placing("milk")
+    assert await relations(log, tidying) == {
+        row(placed): {("on", "kitchen", "kitchen_counter_surface"), ("next to", "bowl", "bowl")}
+    }
+
+
+@pytest.mark.slow
+async def test_an_object_is_in_a_drawer_where_its_joint_has_it(log: EventLog) -> None:
+    tidying = Tidying()
+    tidying.add("cup", "JEROEN_CUP", 0.85, 0.35, 0.67)
+    outside = tidying.pick_up("cup")
+    tidying.script.put(JointsMoved(tidying.reference("kitchen"), {f"{DRAWER}_joint": 0.35}))
+    inside = tidying.pick_up("cup")
+    tidying.script.put(JointsMoved(tidying.reference("kitchen"), {f"{DRAWER}_joint": 0.0}))
+    tidying.pick_up("cup", simulated=True)
+    found = await relations(log, tidying)
+    assert found == {inside: {("in", "kitchen", DRAWER)}}
+    assert outside not in found
+
+
+@pytest.mark.slow
+async def test_a_relation_leads_to_its_node_and_names_both_rows(log: EventLog) -> None:
+    tidying = Tidying()
+    tidying.add("bowl", "BOWL", 1.3, 0.2, 0.88)
+    tidying.add("spoon", "SPOON", 1.3, 0.2, 0.9255)
+    picked = tidying.pick_up("spoon")
+    await relations(log, tidying)
+    reading = Reading(log)
+    async with reading.session() as session:
+        query = select(SpatialRelation).where(SpatialRelation.other == "bowl", SpatialRelation.process_metadata_id == 1)
+        (on_bowl,) = await session.scalars(query)
+        assert (on_bowl.object, on_bowl.relation) == ("spoon", "on")
+        assert (on_bowl.object_id, on_bowl.other_id) == (row(tidying.rows["spoon"][1]), row(tidying.rows["bowl"][1]))
+        with pytest.raises(CallerError, match="node of SpatialRelation"):
+            _ = on_bowl.node
+        assert (await on_bowl.awaitable_attrs.node).id == picked
+    frame = await reading.dataframe(select(SpatialRelation.object, SpatialRelation.relation, SpatialRelation.other))
+    assert sorted(frame.itertuples(index=False)) == [
+        ("spoon", "on", "bowl"),
+    ]
+
+
+def test_the_boxes_of_the_kitchen_are_those_of_its_links() -> None:
+    boxes = {each.link: each for each in link_boxes(kitchen_urdf())}
+    surface, drawer = boxes["kitchen_counter_surface"], boxes["kitchen_island_upper_drawer"]
+    assert (surface.centre, surface.half) == ((1.35, 0.15, 0.828), (0.3, 0.7, 0.02))
+    assert (drawer.centre, drawer.half) == ((-1.315, 1.0, 0.74), (0.235, 0.3, 0.1))
+    assert (drawer.joint, drawer.axis) == ("kitchen_island_upper_drawer_joint", (1.0, 0.0, 0.0))
+    assert "fridge_door" not in boxes
