@@ -49,16 +49,16 @@ def pycrorm(*arguments: str | Path, cwd: Path, timeout_s: float = 300) -> subpro
     there are hundreds of calls. Calls that start `COMMAND` show that the result is the same.
     """
     with tempfile.TemporaryDirectory() as folder:
-        told = [Path(folder) / name for name in ("out", "err")]
+        outputs = [Path(folder) / name for name in ("out", "err")]
         words = [str(each) for each in arguments]
-        process = FORKED.Process(target=_run, args=(words, str(cwd), *map(str, told)))
+        process = FORKED.Process(target=_run, args=(words, str(cwd), *map(str, outputs)))
         fork(process)
         process.join(timeout_s)
         if process.exitcode is None:
             process.kill()
             process.join()
             raise subprocess.TimeoutExpired(words, timeout_s)
-        return subprocess.CompletedProcess(words, process.exitcode, *(each.read_text() for each in told))
+        return subprocess.CompletedProcess(words, process.exitcode, *(each.read_text() for each in outputs))
 
 
 def _run(arguments: list[str], cwd: str, out: str, err: str) -> NoReturn:

@@ -60,11 +60,11 @@ def tables_of(place: str | Path) -> Tables:
         name, mark, number = physical.rpartition("__")
         if mark and number == str(generation) and not name.startswith("pycrorm_"):
             columns.setdefault(name, []).append(column)
-    found = {
+    result = {
         name: _rows(place, name, f'{schema}"{name}__{generation}"', each, leaves.get(name), episodes)
         for name, each in columns.items()
     }
-    return {name: rows for name, rows in found.items() if rows}
+    return {name: rows for name, rows in result.items() if rows}
 
 
 def _rows(
@@ -102,14 +102,14 @@ def _portable(name: str, column: str, leaf: Mapping[str, str] | None, value: Any
 
 def logs_of(place: str | Path) -> Logs:
     """Return every event of every episode, in the order of its episode."""
-    found: Logs = {}
+    result: Logs = {}
     for identity, *event in ask(
         place,
         "SELECT id, sequence, type, version, wall_ns, monotonic_ns, payload FROM episode JOIN event ON episode = number"
         " ORDER BY number, sequence",
     ):
-        found.setdefault(identity, []).append(tuple(event))
-    return found
+        result.setdefault(identity, []).append(tuple(event))
+    return result
 
 
 def declarations_of(place: str | Path) -> set[tuple[str, str]]:

@@ -200,9 +200,9 @@ def test_a_plan_that_exits_the_program_has_failed_and_keeps_its_record(folder: P
     assert [node["status"] for node in shown["tree"]] == ["ERROR", "SUCCEEDED"]
 
 
-@pytest.mark.parametrize("told", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("signal_number", [signal.SIGINT, signal.SIGTERM])
 def test_ctrl_c_in_a_plan_that_never_suspends_ends_the_episode_as_interrupted(
-    folder: Path, told: signal.Signals
+    folder: Path, signal_number: signal.Signals
 ) -> None:
     process = subprocess.Popen(
         [*COMMAND, "run", "plans.py:endless"],
@@ -216,7 +216,7 @@ def test_ctrl_c_in_a_plan_that_never_suspends_ends_the_episode_as_interrupted(
     assert process.stderr is not None
     assert process.stdout.read(1) == b"."
     time.sleep(0.05)
-    process.send_signal(told)
+    process.send_signal(signal_number)
     dots = 1
     while chunk := process.stdout.read(1 << 16):
         dots += chunk.count(b".")

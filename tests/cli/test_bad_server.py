@@ -45,10 +45,10 @@ def folder(tmp_path: Path) -> Path:
 def refused(url: str, folder: Path, ending: str) -> None:
     for verb in VERBS:
         done = pycrorm(*verb, "--url", url, "--spool", "spool", cwd=folder)
-        said = one_line_of(done)
-        assert said.startswith("pycrorm: postgresql://")
-        assert said.endswith(ending)
-        assert "s3cr" not in said
+        message = one_line_of(done)
+        assert message.startswith("pycrorm: postgresql://")
+        assert message.endswith(ending)
+        assert "s3cr" not in message
         assert (done.returncode, done.stdout) == (3, "")
 
 

@@ -99,11 +99,11 @@ class Disk:
 
 @pytest.fixture(params=["mounted", "simulated"])
 def disk(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Disk]:
-    made = Disk(tmp_path / "disk", "1m" if "full" in request.node.name else "40m")
+    small_disk = Disk(tmp_path / "disk", "1m" if "full" in request.node.name else "40m")
     if request.param == "mounted":
-        made.mount()
-    yield made
-    made.release()
+        small_disk.mount()
+    yield small_disk
+    small_disk.release()
 
 
 def test_a_spool_on_a_read_only_disk_is_reported_in_one_line_and_loses_nothing(folder: Path, disk: Disk) -> None:
@@ -115,9 +115,9 @@ def test_a_spool_on_a_read_only_disk_is_reported_in_one_line_and_loses_nothing(f
         calls += [["writer", "--once", "--spool", spool], ["writer", "--spool", spool]]
     for call in calls:
         done = disk.pycrorm("EROFS", *call, cwd=folder)
-        said = one_line_of(done)
-        assert said.startswith(f"pycrorm: spool {spool}")
-        assert said.endswith("Read-only file system")
+        message = one_line_of(done)
+        assert message.startswith(f"pycrorm: spool {spool}")
+        assert message.endswith("Read-only file system")
         assert (done.returncode, done.stdout) == (3, "")
     assert answer("spool", "inspect", spool, cwd=folder)["recorders"][0]["records"] == EVENTS
     disk.make_read_only("rw")
@@ -159,10 +159,10 @@ def test_a_folder_of_a_newer_version_is_named_and_kept_and_the_others_are_draine
     content = segment.read_bytes()
     segment.write_bytes(content[:8] + (99).to_bytes(4, "little") + content[12:])
     done = pycrorm("writer", "--once", cwd=folder)
-    said = one_line_of(done)
+    message = one_line_of(done)
     assert done.returncode == 3
-    assert str(segment) in said
-    assert "format 99" in said
+    assert str(segment) in message
+    assert "format 99" in message
     assert pycrorm("run", "notes.py", cwd=folder).returncode == 0
     assert notes(folder) == ["a", "b", "c"]
     assert recorder_in(spool) == newer

@@ -49,17 +49,19 @@ def ids(number: int) -> str:
 
 
 def test_a_copy_reports_what_it_did_and_the_copy_of_the_copy_is_the_same(folder: Path, server: Server) -> None:
-    there = server.new_database()
-    document = answer("copy", "--from", "sqlite:///a.db", "--to", there, cwd=folder)
+    server_url = server.new_database()
+    document = answer("copy", "--from", "sqlite:///a.db", "--to", server_url, cwd=folder)
     assert document == {
         "source": "sqlite:///a.db",
-        "target": there.replace(str(server.folder), quote(str(server.folder), safe="")),
+        "target": server_url.replace(str(server.folder), quote(str(server.folder), safe="")),
         "episodes": [
             {"id": ids(n), "number": n, "were_there": 0, "copied": 12, "head": 12, "damage": None, "stopped": None}
             for n in (1, 2)
         ],
     }
-    done = pycrorm("copy", "--from", there, "--to", "sqlite:///b.db", "--episode", "1", "--episode", ids(2), cwd=folder)
+    done = pycrorm(
+        "copy", "--from", server_url, "--to", "sqlite:///b.db", "--episode", "1", "--episode", ids(2), cwd=folder
+    )
     assert (done.returncode, done.stderr) == (0, "")
     rows = [line.split("│")[1:-1] for line in done.stdout.splitlines() if ids(0)[:20] in line]
     assert [[cell.strip() for cell in row] for row in rows] == [[f"{n}", ids(n), "0", "12", "12"] for n in (1, 2)]

@@ -75,16 +75,16 @@ def lab(tmp_path: Path) -> Path:
 
 def ask(folder: Path, question: str) -> list[Any]:
     with sqlite3.connect(folder / "pycrorm.db") as connection:
-        found = connection.execute(question).fetchall()
+        result = connection.execute(question).fetchall()
     connection.close()
-    return found
+    return result
 
 
 def weighed(folder: Path) -> list[Any]:
     return ask(folder, "SELECT what, grams, status FROM weighing ORDER BY id")
 
 
-def offered(folder: Path, **entries: str) -> None:
+def write_entry_points(folder: Path, **entries: str) -> None:
     """Write what an installation leaves: a folder beside the modules that names its entry points."""
     place = folder / "site" / "lab-1.0.dist-info"
     place.mkdir(parents=True)
@@ -114,13 +114,13 @@ def test_a_named_projection_is_folded_by_the_run_rebuilt_and_verified(lab: Path)
     assert weighed(lab) == WEIGHED
     assert answer("verify", "--projection", "lab:Weighed", cwd=lab)["drift"] == 0
     ask(lab, "UPDATE pycrorm_own_weighing__2 SET grams = 3 WHERE what = 'milk'")
-    found = answer("verify", "--projection", "lab:Weighed", cwd=lab, code=1)
-    assert [(each["table"], each["column"], each["stored"]) for each in found["differences"]] == [
+    result = answer("verify", "--projection", "lab:Weighed", cwd=lab, code=1)
+    assert [(each["table"], each["column"], each["stored"]) for each in result["differences"]] == [
         ("weighing", "grams", 3)
     ]
-    told = pycrorm("rebuild", "--projection", "lab:Weighed", cwd=lab)
-    assert (told.returncode, told.stderr) == (0, "")
-    assert [line.split(":")[0] for line in told.stdout.splitlines()] == ["generation 2", "weighed, generation 3"]
+    rebuild = pycrorm("rebuild", "--projection", "lab:Weighed", cwd=lab)
+    assert (rebuild.returncode, rebuild.stderr) == (0, "")
+    assert [line.split(":")[0] for line in rebuild.stdout.splitlines()] == ["generation 2", "weighed, generation 3"]
     assert weighed(lab) == WEIGHED
 
 
@@ -132,18 +132,18 @@ def test_a_writer_with_the_projection_catches_up(lab: Path) -> None:
 
 
 def test_the_projection_of_an_installed_package_is_folded_without_an_option(lab: Path) -> None:
-    offered(lab, weighed="lab:Weighed")
+    write_entry_points(lab, weighed="lab:Weighed")
     with_site("run", "weighing.py", cwd=lab)
     assert weighed(lab) == WEIGHED
-    told = with_site("rebuild", "--json", cwd=lab)
-    assert json.loads(told.stdout)["projections"]["weighed"]["generation"] == 2
+    rebuild = with_site("rebuild", "--json", cwd=lab)
+    assert json.loads(rebuild.stdout)["projections"]["weighed"]["generation"] == 2
     assert weighed(lab) == WEIGHED
     state = json.loads(with_site("status", "--json", cwd=lab).stdout)
     assert state["projections"] == [{"name": "weighed", "version": 1, "behind": 0, "parked": {}, "fault": None}]
 
 
 def test_a_package_with_an_invalid_projection_is_reported_in_a_line_and_the_others_continue(lab: Path) -> None:
-    offered(lab, a="lab:Strange", b="nowhere:At", c="lab:Weighed", d="lab:NoTables")
+    write_entry_points(lab, a="lab:Strange", b="nowhere:At", c="lab:Weighed", d="lab:NoTables")
     done = with_site("writer", "--once", "--url", f"sqlite:///{lab}/pycrorm.db", cwd=lab)
     assert done.returncode == 0
     said = [line.partition("the projection ")[2].strip() for line in done.stderr.splitlines()]
@@ -157,16 +157,16 @@ def test_a_package_with_an_invalid_projection_is_reported_in_a_line_and_the_othe
 
 def test_a_projection_whose_code_is_missing_is_left_unchanged_and_reported(lab: Path) -> None:
     pycrorm("run", "weighing.py", "--projection", "lab:Weighed", cwd=lab)
-    told = pycrorm("rebuild", cwd=lab)
-    assert told.returncode == 0
-    assert one_line_of(told) == "the projection weighed is not rebuilt, because its code is not available"
+    rebuild = pycrorm("rebuild", cwd=lab)
+    assert rebuild.returncode == 0
+    assert one_line_of(rebuild) == "the projection weighed is not rebuilt, because its code is not available"
     assert weighed(lab) == WEIGHED
-    told = pycrorm("rebuild", "weighed", cwd=lab)
-    assert told.returncode == 2
-    assert "the code of the projection weighed is not available: add --projection module:Class" in one_line_of(told)
-    told = pycrorm("verify", cwd=lab)
-    assert told.returncode == 0
-    assert one_line_of(told) == "the projection weighed was not verified: its code is not installed here"
+    rebuild = pycrorm("rebuild", "weighed", cwd=lab)
+    assert rebuild.returncode == 2
+    assert "the code of the projection weighed is not available: add --projection module:Class" in one_line_of(rebuild)
+    rebuild = pycrorm("verify", cwd=lab)
+    assert rebuild.returncode == 0
+    assert one_line_of(rebuild) == "the projection weighed was not verified: its code is not installed here"
 
 
 def test_status_reports_what_a_projection_cannot_fold_and_which_version_is_not_folded(lab: Path) -> None:
@@ -175,8 +175,8 @@ def test_status_reports_what_a_projection_cannot_fold_and_which_version_is_not_f
     state = answer("status", cwd=lab, code=1)
     assert state["episodes"] == []
     assert [each["parked"] for each in state["projections"]] == [{"1": "event 5: weighed raised ValueError: no water"}]
-    told = pycrorm("status", cwd=lab)
-    assert "episode 1 is stopped in the projection weighed: event 5: weighed raised ValueError" in one_line_of(told)
+    rebuild = pycrorm("status", cwd=lab)
+    assert "episode 1 is stopped in the projection weighed: event 5: weighed raised ValueError" in one_line_of(rebuild)
     ran = pycrorm("writer", "--once", "--projection", "lab:Next", cwd=lab)
     assert ran.returncode == 0
     said = "have version 1, its code has version 2: run `pycrorm rebuild weighed`"

@@ -92,11 +92,11 @@ def test_a_plan_whose_database_is_unavailable_at_its_end_is_interrupted_by_ctrl_
             assert _appears(tmp_path / "done")
             time.sleep(1)  # the plan waits for the database
             running.send_signal(signal.SIGINT)
-            _, told = running.communicate(timeout=60)  # and not after the five minutes that closing would wait
+            _, errors = running.communicate(timeout=60)  # and not after the five minutes that closing would wait
     finally:
         running.kill()
     assert running.returncode == 130
-    assert "events not stored yet are safe in the spool" in told
+    assert "events not stored yet are safe in the spool" in errors
     assert pycrorm("writer", "--once", cwd=tmp_path).returncode == 0
     (episode,) = answer("episodes", cwd=tmp_path)
     assert episode["nodes"] == 2

@@ -83,8 +83,8 @@ def test_an_interrupt_is_one_line_and_resume_continues(tmp_path: Path) -> None:
     process.send_signal(signal.SIGINT)
     _, said = process.communicate(timeout=120)
     assert process.returncode == 130, said
-    *note, told = said.strip().splitlines()
-    assert told == "pycrorm: interrupted; all events recorded so far are kept"
+    *note, message = said.strip().splitlines()
+    assert message == "pycrorm: interrupted; all events recorded so far are kept"
     assert note in ([], ["recorded events are being stored; Ctrl-C again exits at once without losing any"])
     document = answer(*BY_ONE, *longer, "--resume", cwd=tmp_path)
     assert [each["rollouts"] for each in document["phases"]] == [1_500, 150, 150]
@@ -104,10 +104,12 @@ def test_a_second_interrupt_ends_at_once_and_resume_continues(tmp_path: Path) ->
         process.send_signal(signal.SIGINT)
         note = process.stderr.readline()
         process.send_signal(signal.SIGINT)
-        printed, told = process.communicate(timeout=120)
+        printed, message = process.communicate(timeout=120)
     assert note == "recorded events are being stored; Ctrl-C again exits at once without losing any\n"
     assert (process.returncode, printed) == (130, "")
-    assert told == "pycrorm: interrupted; events not stored yet are safe in the spool, and the next start stores them\n"
+    assert (
+        message == "pycrorm: interrupted; events not stored yet are safe in the spool, and the next start stores them\n"
+    )
     phase = answer(*BY_ONE, "--resume", cwd=tmp_path)["phases"][0]
     assert (phase["rollouts"], phase["done_now"] < 400) == (400, True)
 

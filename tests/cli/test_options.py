@@ -22,8 +22,8 @@ def test_every_verb_that_opens_a_database_accepts_its_spool_too() -> None:
     group = typer.main.get_command(app())
     assert isinstance(group, TyperGroup)
     options = {name: {option for each in verb.params for option in each.opts} for name, verb in group.commands.items()}
-    assert {name for name, known in options.items() if "--url" in known and "--spool" not in known} == set()
-    assert {"verify", "rebuild", "episodes"} <= {name for name, known in options.items() if "--url" in known}
+    assert {name for name, accepted in options.items() if "--url" in accepted and "--spool" not in accepted} == set()
+    assert {"verify", "rebuild", "episodes"} <= {name for name, accepted in options.items() if "--url" in accepted}
 
 
 def test_the_command_prints_its_version(tmp_path: Path) -> None:

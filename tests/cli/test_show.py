@@ -150,10 +150,10 @@ def test_the_running_nodes_of_a_killed_robot_are_shown(tmp_path: Path) -> None:
         (["7", "--at", "1"], "there is no episode '7' (`pycrorm episodes` lists the 1 there are)"),
     ],
 )
-def test_an_invalid_moment_of_an_episode_is_one_line(ridden: Path, arguments: list[str], said: str) -> None:
+def test_an_invalid_moment_of_an_episode_is_one_line(ridden: Path, arguments: list[str], message: str) -> None:
     done = pycrorm("show", *arguments, cwd=ridden)
     assert (done.returncode, done.stdout) == (2, "")
-    assert one_line_of(done) == f"pycrorm: {said}"
+    assert one_line_of(done) == f"pycrorm: {message}"
 
 
 LONG = """

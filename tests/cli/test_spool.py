@@ -79,9 +79,9 @@ def test_a_damaged_spool_is_repaired_and_its_whole_records_are_stored(left: Path
     content = path.read_bytes()
     at = content.index(b'"index":150') if b'"index":150' in content else content.index(b"150", 20_000)
     overwrite(path, at, b"#")
-    said = pycrorm("spool", "inspect", left, cwd=left.parent)
-    assert said.returncode == 4
-    line = one_line_of(said)
+    inspected_text = pycrorm("spool", "inspect", left, cwd=left.parent)
+    assert inspected_text.returncode == 4
+    line = one_line_of(inspected_text)
     assert f"{path} is damaged at byte" in line
     assert f"repair it with: pycrorm spool repair {left}" in line
     refused = pycrorm("writer", "--once", cwd=left.parent)
@@ -91,12 +91,12 @@ def test_a_damaged_spool_is_repaired_and_its_whole_records_are_stored(left: Path
     assert line.endswith(f"; repair it with: pycrorm spool repair {left}")
 
     document = answer("spool", "repair", left, cwd=left.parent, code=1)
-    [mended] = document["mended"]
-    assert Path(mended["set_aside"], path.name).read_bytes()[at : at + 1] == b"#"
-    assert len(mended["unreadable"]) == 1
-    [[first, last]] = mended["unreadable"]
+    [repaired] = document["mended"]
+    assert Path(repaired["set_aside"], path.name).read_bytes()[at : at + 1] == b"#"
+    assert len(repaired["unreadable"]) == 1
+    [[first, last]] = repaired["unreadable"]
     assert first == last
-    assert (mended["kept"], mended["complete"], len(mended["given_up"])) == (first - 1, False, 1)
+    assert (repaired["kept"], repaired["complete"], len(repaired["given_up"])) == (first - 1, False, 1)
 
     report = answer("writer", "--once", cwd=left.parent)
     assert len(report["lost"]) == 1
@@ -105,7 +105,7 @@ def test_a_damaged_spool_is_repaired_and_its_whole_records_are_stored(left: Path
     assert indices == list(range(len(indices)))
     assert len(indices) >= 140  # more, if the plan's own writer had stored what comes after the damage
     after = answer("spool", "inspect", left, cwd=left.parent)
-    assert (after["recorders"], after["set_aside"]) == ([], [Path(mended["set_aside"]).name])
+    assert (after["recorders"], after["set_aside"]) == ([], [Path(repaired["set_aside"]).name])
 
 
 def test_a_repaired_spool_names_the_next_command(left: Path) -> None:
@@ -177,8 +177,8 @@ def test_dead_letters_are_reported_with_their_place_by_status_and_inspect(tmp_pa
         {"episode": identity, "folder": str(place), "bytes": (place / "00000001.segment").stat().st_size}
     ]
     assert document["recorders"] == []
-    told = pycrorm("status", cwd=folder)
-    assert (told.returncode, one_line_of(told)) == (
+    status = pycrorm("status", cwd=folder)
+    assert (status.returncode, one_line_of(status)) == (
         1,
         f"pycrorm: the database refused events of episode {identity}; they are kept in {place}",
     )

@@ -28,8 +28,8 @@ def test_an_unreachable_server_is_one_line_without_a_password(tmp_path: Path, ve
     (tmp_path / "plan.py").write_text(PLAN)
     done = pycrorm(*verb, "--url", "postgresql://ada:s3cr@127.0.0.1:1/memory", cwd=tmp_path)
     assert (done.returncode, done.stdout) == (3, "")
-    said = one_line_of(done)
-    assert said == "pycrorm: postgresql://ada:***@127.0.0.1:1/memory: cannot be reached: Connection refused"
+    message = one_line_of(done)
+    assert message == "pycrorm: postgresql://ada:***@127.0.0.1:1/memory: cannot be reached: Connection refused"
 
 
 @pytest.mark.parametrize(
@@ -44,7 +44,7 @@ def test_an_unreachable_server_is_one_line_without_a_password(tmp_path: Path, ve
 def test_an_invalid_url_is_one_line_without_a_password(tmp_path: Path, url: str, reason: str) -> None:
     done = pycrorm("episodes", "--url", url, cwd=tmp_path)
     assert (done.returncode, done.stdout) == (2, "")
-    said = one_line_of(done)
-    assert said.startswith(f"pycrorm: {reason}")
-    assert "s3" not in said
-    assert "cr@" not in said
+    message = one_line_of(done)
+    assert message.startswith(f"pycrorm: {reason}")
+    assert "s3" not in message
+    assert "cr@" not in message

@@ -110,12 +110,12 @@ def test_an_impossible_verification_is_one_line(folder: Path) -> None:
 
 
 def test_a_log_without_tables_and_a_database_without_a_memory_are_one_line_each(tmp_path: Path) -> None:
-    async def made() -> None:
+    async def record_plan() -> None:
         log = await EventLog.open(DatabaseAddress.parse(f"sqlite:///{tmp_path}/bare.db"), create=True)
         await log.append(full(1).records)
         await log.close()
 
-    asyncio.run(made())
+    asyncio.run(record_plan())
     other = sqlite3.connect(tmp_path / "other.db")
     other.execute("CREATE TABLE cake (a)")
     other.commit()

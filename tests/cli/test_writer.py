@@ -128,9 +128,9 @@ def until(folder: Path, wanted: Any) -> Any:
     deadline = time.monotonic() + 60
     while True:
         done = pycrorm("status", "--json", cwd=folder)
-        found = wanted(json.loads(done.stdout))
-        if found:
-            return found
+        result = wanted(json.loads(done.stdout))
+        if result:
+            return result
         assert time.monotonic() < deadline, done.stdout
 
 

@@ -165,8 +165,8 @@ async def test_a_running_episode_is_copied_as_far_as_it_is_and_later_completed(n
 async def test_copies_run_beside_a_recorder_of_the_source_and_one_of_the_target(
     new_url: New, new_file: New, tmp_path: Path
 ) -> None:
-    source, target, alone = new_file(), new_url(), new_file()
-    await notes(alone, *map(str, range(200)))
+    source, target, separate = new_file(), new_url(), new_file()
+    await notes(separate, *map(str, range(200)))
     await notes(source, "before")
 
     async def record(url: str, name: str) -> None:
@@ -184,15 +184,15 @@ async def test_copies_run_beside_a_recorder_of_the_source_and_one_of_the_target(
 
     recording = True
     async with asyncio.TaskGroup() as group:
-        copies = [group.create_task(copy(each)) for each in (source, alone)]
+        copies = [group.create_task(copy(each)) for each in (source, separate)]
         await asyncio.gather(record(source, "here"), record(target, "there"))
         recording = False
         await asyncio.wait(copies)
     await copy_episodes(source, target)
-    there = logs_of(target)
-    expected = logs_of(source) | logs_of(alone)
-    assert {episode: there[episode] for episode in expected} == expected
-    assert len(there) == 4
+    copied_logs = logs_of(target)
+    expected = logs_of(source) | logs_of(separate)
+    assert {episode: copied_logs[episode] for episode in expected} == expected
+    assert len(copied_logs) == 4
     async with Reading.open(target) as reading:
         assert sorted(await texts(reading)) == sorted(
             [
@@ -220,19 +220,19 @@ async def test_a_copy_that_is_killed_and_repeated_is_complete(new_url: New, new_
     count = sum(map(len, expected.values()))
     seed = random.randrange(2**32)
     dice = random.Random(seed)
-    there: Logs = {}
+    copied_logs: Logs = {}
     kills = 0
     for _ in range(rounds):
         copying = ForkedProcess(copy_and_print, source, target)
         copying.wait_for_first_output()
-        until = sum(map(len, there.values())) + dice.randrange(2 * count // rounds)
+        until = sum(map(len, copied_logs.values())) + dice.randrange(2 * count // rounds)
         while copying.process.is_alive() and int(copying.lines[-1] if copying.lines else 0) < until:  # noqa: ASYNC110
             await asyncio.sleep(0.001)
         await asyncio.sleep(dice.random() * 0.02)
         kills += copying.process.is_alive()
         copying.kill()
-        there = logs_of(target)
-        for name, events in there.items():
+        copied_logs = logs_of(target)
+        for name, events in copied_logs.items():
             assert events == expected[name][: len(events)], f"seed {seed}"
     assert kills > rounds // 3, f"seed {seed}"
     await copy_episodes(source, target)
@@ -274,9 +274,9 @@ async def test_other_bytes_under_one_key_are_reported_and_the_other_episodes_are
     assert [(each.copied, each.damage) for each in done.episodes if each is not bad] == [(12, None)] * 2
     after = logs_of(target)
     assert after.pop(identity) == before[identity]
-    there = logs_of(source)
-    del there[identity]
-    assert after == there
+    copied_logs = logs_of(source)
+    del copied_logs[identity]
+    assert after == copied_logs
 
 
 async def test_other_bytes_that_arrive_during_the_copy_are_reported_and_the_other_episodes_are_copied(
@@ -285,22 +285,22 @@ async def test_other_bytes_that_arrive_during_the_copy_are_reported_and_the_othe
     source, target = new_file(), new_url()
     await fill(source, [hand_written(number) for number in (1, 2, 3)])
     other = [each._replace(monotonic_ns=4) for each in hand_written(2).records]
-    told = 0
+    progress_calls = 0
 
     def append_other_bytes(_done: int, _of: int) -> None:  # events were read and are not appended yet
-        nonlocal told
-        if told == 0:
+        nonlocal progress_calls
+        if progress_calls == 0:
             append_in_own_thread(target, other)
-        told += 1
+        progress_calls += 1
 
     done = await copy_episodes(source, target, watch=append_other_bytes)
     assert [each.damage is None for each in done.episodes] == [True, False, True]
     assert done.episodes[1].damage is not None
     assert "another event is stored under this number" in done.episodes[1].damage
     assert [each.head for each in done.episodes] == [12, 12, 12]
-    there = logs_of(target)
-    assert {event[4] for event in there.pop("00000000-0000-7000-8000-000000000002")} == {4}
-    assert there == {each: events for each, events in logs_of(source).items() if each in there}
+    copied_logs = logs_of(target)
+    assert {event[4] for event in copied_logs.pop("00000000-0000-7000-8000-000000000002")} == {4}
+    assert copied_logs == {each: events for each, events in logs_of(source).items() if each in copied_logs}
 
 
 @pytest.mark.parametrize("sequence", [1, 7, 12])
@@ -314,9 +314,9 @@ async def test_of_an_episode_with_a_gap_the_events_before_it_are_copied(new_file
         (bad, good) = done.episodes
         assert bad.damage == (f"episode 00000000-0000-7000-8000-000000000001, event {sequence}: is missing in {source}")
         assert (bad.head, good.head, good.damage) == (sequence - 1, 12, None)
-    there = logs_of(target)
-    assert [event[0] for event in there.get(bad.id, [])] == list(range(1, sequence))
-    assert there[good.id] == logs_of(source)[good.id]
+    copied_logs = logs_of(target)
+    assert [event[0] for event in copied_logs.get(bad.id, [])] == list(range(1, sequence))
+    assert copied_logs[good.id] == logs_of(source)[good.id]
 
 
 @pytest.mark.parametrize("damaged", [0, 1])

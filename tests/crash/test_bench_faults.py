@@ -118,8 +118,8 @@ def test_the_quick_run_makes_every_fault_and_loses_no_event(names: list[str]) ->
     bad = [each for each in outcomes if any(each[name] for name in COST)]
     assert (code, bad) == (0, []), lines
     assert [each["fault"] for each in outcomes] == names
-    made = [each for each in outcomes if not each["note"].startswith("skipped: no permission to mount")]
-    assert all(each["rounds"] >= 2 and each["events"] >= 20 for each in made)
+    performed = [each for each in outcomes if not each["note"].startswith("skipped: no permission to mount")]
+    assert all(each["rounds"] >= 2 and each["events"] >= 20 for each in performed)
     assert all(each["told"] > 0 for each in outcomes if each["fault"] == "flipped bit")
 
 
@@ -135,8 +135,8 @@ def test_a_run_continues_from_its_report_and_a_recorded_loss_is_a_problem(tmp_pa
     assert "| clock jumps | 20 |" in (tmp_path / "faults.md").read_text()
 
     (tmp_path / "faults.md.jsonl").write_text(lines.replace('"lost": 0', '"lost": 3'))
-    code, [known], _ = faults(*arguments)
-    assert (code, known["lost"]) == (1, 3)
+    code, [mounted_fault], _ = faults(*arguments)
+    assert (code, mounted_fault["lost"]) == (1, 3)
     code, [other], _ = faults(*arguments, "--seed", "8")
     assert (code, other["lost"], other["seed"]) == (0, 0, 8)
 

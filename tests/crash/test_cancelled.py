@@ -89,7 +89,7 @@ def _sending(work: Coroutine[Any, Any, Any], value: object) -> Callable[[], Any]
     return lambda: work.send(value)
 
 
-async def cancelled_at(at: int, work: Coroutine[Any, Any, None], *, alone: bool = True) -> bool:
+async def cancelled_at(at: int, work: Coroutine[Any, Any, None], *, no_other_tasks: bool = True) -> bool:
     """Run the work to its end or to its n-th await, and return whether it was cancelled; no task of it still runs."""
     loop, steps = asyncio.get_running_loop(), Steps(at)
     before = asyncio.all_tasks()
@@ -100,7 +100,7 @@ async def cancelled_at(at: int, work: Coroutine[Any, Any, None], *, alone: bool 
             await asyncio.wait([steps.work])
     finally:
         loop.set_task_factory(None)
-    left = asyncio.all_tasks() - before if alone else set()
+    left = asyncio.all_tasks() - before if no_other_tasks else set()
     assert {steps.names[task] for task in left} <= CLOSING
     for task in left:  # as `asyncio.run` does when it ends
         task.cancel()
@@ -222,7 +222,7 @@ async def test_a_flush_cancelled_at_any_await_leaves_the_writer_able_to_store_th
             source = kept_source(script)
             writer = writer_of(source, destination)
             running = asyncio.create_task(writer.run())
-            was_cancelled = await cancelled_at(at, writer.flush(15), alone=False)
+            was_cancelled = await cancelled_at(at, writer.flush(15), no_other_tasks=False)
             await running
             assert source.kept == []
             verify_stored_in_order(database_url, script)

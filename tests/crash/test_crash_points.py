@@ -58,10 +58,10 @@ def dying_at(step: int, *, after: bool) -> None:
             return answer
 
         async def finished(answer: Awaitable[Any], mine: int) -> Any:
-            given = await answer
+            result = await answer
             if mine == step:
                 os._exit(9)  # committed, but the caller never learns it
-            return given
+            return result
 
         return last
 

@@ -310,7 +310,7 @@ def compare_rows(robot: RobotProcess, stored: StoredMemory) -> None:
         if line is not None:
             assert dtype == {"step": "StepAction", "carry": "CarryAction"}[line["what"]]
             values = {"weight": weight, "hand": hand, "there": [x, y, z], "words": stored.words.get(node, [])}
-            assert values == line.get("told", {"weight": None, "hand": None, "there": [None] * 3, "words": []})
+            assert values == line.get("values", {"weight": None, "hand": None, "there": [None] * 3, "words": []})
 
 
 def compare_all(robots: list[RobotProcess], stored: StoredMemory) -> None:

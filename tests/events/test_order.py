@@ -22,7 +22,7 @@ DONE = EpisodeEnded("SUCCEEDED")
 
 def findings(*events: tuple[int, Happening]) -> list[Finding]:
     check = OrderCheck()
-    return [found for sequence, event in events for found in check.read(sequence, event)]
+    return [violation for sequence, event in events for violation in check.read(sequence, event)]
 
 
 def test_an_ordinary_episode_has_no_findings() -> None:

@@ -126,7 +126,7 @@ def recorder_case(settings: Settings | None = None) -> Iterator[RecorderCase]:
 
 def findings(events: list[tuple[int, Happening]]) -> list[Any]:
     check = OrderCheck()
-    return [found for sequence, event in events for found in check.read(sequence, event)]
+    return [finding for sequence, event in events for finding in check.read(sequence, event)]
 
 
 @dataclass

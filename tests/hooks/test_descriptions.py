@@ -96,17 +96,17 @@ async def test_a_mesh_becomes_a_blob_unless_the_spool_is_full(tmp_path: Path, fu
         Object("wedge", ObjectType.GENERIC_OBJECT, text)
         Object("wedge 2", ObjectType.GENERIC_OBJECT, text)
     (event,) = declared(case)
-    (found,) = event.meshes
+    (stored_mesh,) = event.meshes
     size = mesh.stat().st_size
-    assert (found.name, found.size) == ("wedge.OBJ", size)
+    assert (stored_mesh.name, stored_mesh.size) == ("wedge.OBJ", size)
     assert event.boxes["w"].max == pytest.approx((1, 2, 3), abs=1e-6)
     assert str(tmp_path) not in event.text
     if full:
-        assert (found.content, found.missing, case.sink.blobs) == (None, "full", {})
+        assert (stored_mesh.content, stored_mesh.missing, case.sink.blobs) == (None, "full", {})
         assert case.emitter.missing.count == (1, "DescriptionDeclared.meshes: wedge.OBJ: full")
     else:
-        assert found.content is not None
-        assert (found.content.hash, found.content.media_type) == (found.sha256, "model/obj")
-        assert case.sink.blobs == {found.sha256: mesh.read_bytes()}
+        assert stored_mesh.content is not None
+        assert (stored_mesh.content.hash, stored_mesh.content.media_type) == (stored_mesh.sha256, "model/obj")
+        assert case.sink.blobs == {stored_mesh.sha256: mesh.read_bytes()}
         assert case.sink.released == []  # a declaration is repeated for the life of the queue
         assert case.emitter.missing.count.total == 0

@@ -168,14 +168,14 @@ async def test_the_world_is_announced_again_in_its_state_and_later_events_name_i
         robot.attach(milk)
         while len(case.sink.sequences) == 1:
             bowl.set_pose(Pose([2, bowl.pose.position.y + 0.01, 1]))  # of no node: the world itself announces it
-        there = bowl.pose.position
+        bowl_position = bowl.pose.position
         bowl.set_pose(Pose([3, 3, 1]))
         await CarryActionPerformable(ObjectDesignator("bowl", ObjectType.BOWL, bowl)).perform()
         milk.remove()
     assert assert_no_faults(case)
     _, second = parts_of(case.sink)
     assert [(event.name, event.pose.position) for _, event in second[2:5] if isinstance(event, ObjectAdded)] == [
-        ("pr2", (0, 0, 0)), ("milk", (1, 0, 1)), ("bowl", tuple(there)),
+        ("pr2", (0, 0, 0)), ("milk", (1, 0, 1)), ("bowl", tuple(bowl_position)),
     ]  # fmt: skip
     assert second[5][1] == ObjectAttached(ObjectReference(3, 3), ObjectReference(4, 4))
     (moved,) = only(second, ObjectMoved)

@@ -54,7 +54,7 @@ class Robot:
 
 def samples(case: RecorderCase) -> list[StateSampled]:
     """Return all samples in the order of writing, and assert that each is inside its motion."""
-    found = []
+    result = []
     for name in case.sink.sequences:
         events = case.sink.of(name)
         assert findings(events) == []
@@ -65,8 +65,8 @@ def samples(case: RecorderCase) -> list[StateSampled]:
                 assert event.node is not None
                 assert started[event.node].kind == "motion"
                 assert event.node < sequence < ended.get(event.node, sequence + 1)
-                found.append(event)
-    return found
+                result.append(event)
+    return result
 
 
 def values(case: RecorderCase, channel: str) -> list[float]:
@@ -88,9 +88,9 @@ async def seen(case: RecorderCase, channel: str, value: float) -> None:
 
 @pytest.fixture
 def case() -> Iterator[RecorderCase]:
-    with recorder_case(SAMPLED) as made, BulletWorld(), simulated_robot:
+    with recorder_case(SAMPLED) as sampled_case, BulletWorld(), simulated_robot:
         Object("pr2", ObjectType.ROBOT)
-        yield made
+        yield sampled_case
 
 
 async def test_the_first_sample_of_an_episode_has_every_channel_and_the_next_one_only_changes(
@@ -286,11 +286,11 @@ async def test_another_robot_begins_with_every_channel(case: RecorderCase) -> No
 
     with case.episode(), ChosenRobot("mine", Robot(drive)):
         await NavigateActionPerformable(Pose([1, 0, 0])).perform()
-    found = samples(case)
-    objects = [each.object.object for each in found]
-    assert [len(each.channels) > len(BASE) for each in found] == [True, False, True, False]
+    result = samples(case)
+    objects = [each.object.object for each in result]
+    assert [len(each.channels) > len(BASE) for each in result] == [True, False, True, False]
     assert objects[0] == objects[1] != objects[2] == objects[3]
-    assert found[3].channels == {"base.x": 9.0}
+    assert result[3].channels == {"base.x": 9.0}
 
 
 @dataclass
@@ -305,9 +305,9 @@ async def test_the_robot_of_a_simulation_is_sampled_in_the_simulation(case: Reco
         await NavigateActionPerformable(Pose([1, 0, 0])).perform()
         await ThinkActionPerformable().perform()
         await NavigateActionPerformable(Pose([2, 0, 0])).perform()
-    (thought,) = (name for name in case.sink.sequences if name != episode.id)
+    (simulated,) = (name for name in case.sink.sequences if name != episode.id)
     real = [event for _, event in case.sink.of(episode) if isinstance(event, StateSampled)]
-    only_thought = [event for _, event in case.sink.of(thought) if isinstance(event, StateSampled)]
+    only_thought = [event for _, event in case.sink.of(simulated) if isinstance(event, StateSampled)]
     assert [each.channels["base.x"] for each in real] == [0.0, 1.0, 2.0]
     assert [each.channels["base.x"] for each in only_thought] == [1.0, 3.0]
     assert len(samples(case)) == 5

@@ -57,7 +57,7 @@ class ThinkActionPerformable(ActionAbstract):
 
 def simulated_episodes(case: RecorderCase) -> list[EpisodeId]:
     """Return the simulated episodes in order; every event of every episode is in its legal place."""
-    found = []
+    result = []
     for name in case.sink.sequences:
         events = case.sink.of(name)
         assert findings(events) == []
@@ -66,8 +66,8 @@ def simulated_episodes(case: RecorderCase) -> list[EpisodeId]:
         marks = {event.simulated for _, event in events if isinstance(event, NodeStarted)}
         assert marks == {started.simulated}
         if started.simulated:
-            found.append(name)
-    return found
+            result.append(name)
+    return result
 
 
 def only(events: list[tuple[int, Happening]], kind: type) -> list[Any]:
@@ -84,7 +84,7 @@ async def test_a_simulation_is_an_episode_that_names_the_node_that_simulates() -
     with recorder_case() as case, case.episode() as real:
         await ThinkActionPerformable("thought").perform()
         assert current_episode.get() is real
-    (thought,) = simulated_episodes(case)
+    (simulation,) = simulated_episodes(case)
     assert kinds(case.sink.of(real)) == [
         "EpisodeStarted", "NodeStarted", "NodeStarted", "NodeStarted", "NodeEnded", "NodeEnded", "NodeEnded",
         "EpisodeEnded",
@@ -93,11 +93,11 @@ async def test_a_simulation_is_an_episode_that_names_the_node_that_simulates() -
         {"text": "thought"},
         {"text": "real", "weight": 0.0, "ran": False},
     ]
-    beginning = started(case, thought)
+    beginning = started(case, simulation)
     assert beginning.thought_by == NodeReference(episode_text(real.id), 3)
     assert beginning.description == "simulation in ThinkAction"
-    assert [each.parameters.get("text") for each in only(case.sink.of(thought), NodeStarted)] == [None, "thought"]
-    assert only(case.sink.of(thought), EpisodeEnded)[0].status == "SUCCEEDED"
+    assert [each.parameters.get("text") for each in only(case.sink.of(simulation), NodeStarted)] == [None, "thought"]
+    assert only(case.sink.of(simulation), EpisodeEnded)[0].status == "SUCCEEDED"
 
 
 async def test_a_simulation_outside_any_node_is_caused_by_the_root_and_without_an_episode_by_none() -> None:
@@ -117,9 +117,9 @@ async def test_a_simulation_outside_any_node_is_caused_by_the_root_and_without_a
 async def test_a_simulation_in_an_implicit_episode_is_caused_by_that_episode() -> None:
     with recorder_case() as case:
         await ThinkActionPerformable("t").perform()
-    (thought,) = simulated_episodes(case)
-    real = next(name for name in case.sink.sequences if name != thought)
-    assert started(case, thought).thought_by == NodeReference(episode_text(real), 3)
+    (simulation,) = simulated_episodes(case)
+    real = next(name for name in case.sink.sequences if name != simulation)
+    assert started(case, simulation).thought_by == NodeReference(episode_text(real), 3)
     assert [each.parameters.get("text") for each in only(case.sink.of(real), NodeStarted)] == [None, "t", "real"]
 
 
@@ -132,8 +132,8 @@ async def test_a_simulation_has_the_copy_as_its_world_and_the_episode_the_real_o
             with SimulatedTaskTree():
                 await NavigateActionPerformable(THERE).perform()
             robot.set_pose(Pose([0, 1, 0]))
-    (thought,) = simulated_episodes(case)
-    events = case.sink.of(thought)
+    (simulation,) = simulated_episodes(case)
+    events = case.sink.of(simulation)
     assert [(each.name, each.pose.position) for each in only(events, ObjectAdded)] == [
         ("pr2", (0.0, 0.0, 0.0)), ("milk", (1.0, 0.0, 1.0)),
     ]  # fmt: skip
@@ -162,14 +162,14 @@ async def test_objects_belong_to_the_episode_that_names_them_in_both_directions(
                 spoon = designator_of(Object("spoon", ObjectType.SPOON, pose=Pose([2, 0, 0])))
             await CarryActionPerformable(inside[0]).perform()
             await CarryActionPerformable(spoon).perform()
-    (thought,) = simulated_episodes(case)
+    (simulation,) = simulated_episodes(case)
 
     def named(name: EpisodeId) -> list[Any]:
         return [each.parameters["what"] for each in only(case.sink.of(name), NodeStarted) if each.parameters]
 
-    added = {event.name: sequence for sequence, event in case.sink.of(thought) if isinstance(event, ObjectAdded)}
-    row = next(sequence for sequence, event in case.sink.of(thought) if isinstance(event, ObjectMoved))
-    assert named(thought) == [{"object": added["milk"], "row": row}]
+    added = {event.name: sequence for sequence, event in case.sink.of(simulation) if isinstance(event, ObjectAdded)}
+    row = next(sequence for sequence, event in case.sink.of(simulation) if isinstance(event, ObjectMoved))
+    assert named(simulation) == [{"object": added["milk"], "row": row}]
     really = next(sequence for sequence, event in case.sink.of(real.id) if isinstance(event, ObjectAdded))
     first, second = named(real.id)
     assert first == {"object": really, "row": really}
@@ -194,8 +194,8 @@ async def test_a_simulation_ends_with_the_outcome_of_its_block_and_the_episode_c
             if raised is not None:
                 raise raised
         await NoteActionPerformable("a").perform()
-    (thought,) = simulated_episodes(case)
-    assert only(case.sink.of(thought), EpisodeEnded)[0].status == status
+    (simulation,) = simulated_episodes(case)
+    assert only(case.sink.of(simulation), EpisodeEnded)[0].status == status
     assert only(case.sink.of(real), EpisodeEnded)[0].status == "SUCCEEDED"
     assert len(only(case.sink.of(real), NodeStarted)) == 2
 
@@ -280,8 +280,8 @@ async def test_an_episode_opened_in_a_simulation_is_a_simulation_too() -> None:
 async def test_a_world_entered_in_a_simulation_without_one_belongs_to_it() -> None:
     with recorder_case() as case, case.episode() as real, SimulatedTaskTree(), BulletWorld():
         Object("milk", ObjectType.MILK)
-    (thought,) = simulated_episodes(case)
-    assert [each.name for each in only(case.sink.of(thought), ObjectAdded)] == ["milk"]
+    (simulation,) = simulated_episodes(case)
+    assert [each.name for each in only(case.sink.of(simulation), ObjectAdded)] == ["milk"]
     assert only(case.sink.of(real), ObjectAdded) == []
 
 
@@ -289,18 +289,18 @@ async def test_a_simulation_whose_start_fails_by_a_fault_of_the_recorder_leaves_
     with recorder_case() as case, BulletWorld(), simulated_robot:
         Object("pr2", ObjectType.ROBOT)
         with case.episode() as real:
-            thought = SimulatedTaskTree()
+            simulation = SimulatedTaskTree()
             case.sink.broken = True
-            with thought:
+            with simulation:
                 case.sink.broken = False
                 await NavigateActionPerformable(THERE).perform()
                 assert current_episode.get() is None
             assert current_episode.get() is real
             await NoteActionPerformable("real").perform()
     assert case.emitter.faults.total == 1
-    (alone,) = simulated_episodes(case)
-    assert started(case, alone).thought_by == NodeReference(episode_text(real.id), 2)
-    assert [each.kind for each in only(case.sink.of(alone), NodeStarted)] == ["root", "action", "motion"]
+    (simulated_alone,) = simulated_episodes(case)
+    assert started(case, simulated_alone).thought_by == NodeReference(episode_text(real.id), 2)
+    assert [each.kind for each in only(case.sink.of(simulated_alone), NodeStarted)] == ["root", "action", "motion"]
     assert [each.parameters.get("text") for each in only(case.sink.of(real), NodeStarted)] == [None, "real"]
     assert only(case.sink.of(real), ObjectMoved) == []
 
@@ -327,5 +327,5 @@ async def test_simulations_are_not_among_the_recent_episodes() -> None:
 async def test_a_description_that_is_too_long_is_cut() -> None:
     with recorder_case() as case, SimulatedTaskTree("x" * 20_000):
         pass
-    (thought,) = simulated_episodes(case)
-    assert started(case, thought).description == "x" * 10_000
+    (simulation,) = simulated_episodes(case)
+    assert started(case, simulation).description == "x" * 10_000

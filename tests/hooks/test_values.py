@@ -195,11 +195,11 @@ def test_a_group_deeper_than_the_limit_is_cut() -> None:
 
 
 def group_at(group: ExceptionGroup[Exception], depth: int) -> BaseException:
-    found: Any = group
+    innermost: Any = group
     for _ in range(depth):
-        found = found.exceptions[0]
-    assert isinstance(found, BaseException)
-    return found
+        innermost = innermost.exceptions[0]
+    assert isinstance(innermost, BaseException)
+    return innermost
 
 
 def test_an_outcome_of_the_plan_language_is_a_small_dict() -> None:

@@ -43,8 +43,8 @@ def test_the_density_is_that_of_two_normal_distributions_and_an_eighth_for_each_
 
 @pytest.mark.parametrize("corner", [(0.5, 1.0, -0.3, 0.4), (-2.0, -0.5, -2.0, 2.0), (0.0, 0.3, 0.0, 0.3)])
 def test_probabilities_of_rectangles_are_the_integrals_of_the_density(corner: tuple[float, ...]) -> None:
-    there = Evidence(arms=frozenset({Arms.LEFT}), region=Region((Rectangle(*corner),)))
-    assert default_policy().probability(there) == pytest.approx(integral(*corner) / 2, rel=1e-3)
+    in_corner = Evidence(arms=frozenset({Arms.LEFT}), region=Region((Rectangle(*corner),)))
+    assert default_policy().probability(in_corner) == pytest.approx(integral(*corner) / 2, rel=1e-3)
 
 
 def test_samples_are_distributed_as_the_density() -> None:

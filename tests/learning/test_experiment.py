@@ -62,8 +62,8 @@ def after(rollouts: int, act: Callable[[], None]) -> Callable[[str, int, int, Ta
 
 @pytest.mark.soak_on("postgresql")
 async def test_a_policy_learned_from_the_memory_succeeds_several_times_as_often(place: MemoryLocation) -> None:
-    told: dict[str, tuple[int, int]] = {}
-    learned = await run(SMALL, place, lambda name, done, total, _: told.update({name: (done, total)}))
+    reports: dict[str, tuple[int, int]] = {}
+    learned = await run(SMALL, place, lambda name, done, total, _: reports.update({name: (done, total)}))
     assert [(each.name, each.tally.rollouts) for each in learned.phases] == [
         ("default policy", 700), ("learned policy", 200), ("default policy, held out", 200),
     ]  # fmt: skip
@@ -76,7 +76,7 @@ async def test_a_policy_learned_from_the_memory_succeeds_several_times_as_often(
     assert learned.default.grasps["TOP"].successes == 0
     assert sum(learned.default.stages.values()) == 700 - learned.default.tally.successes
     assert sum((learned.default.arms | {}).values(), Tally()) == learned.default.tally
-    assert told["learned policy"][1] == 200
+    assert reports["learned policy"][1] == 200
     assert not workers_running()
     everything = sum(each.tally.rollouts for each in learned.phases)
     assert ask(place.url, f"SELECT count(*) FROM {MoveAndPickUpAction.__tablename__}") == [(everything,)]
@@ -87,8 +87,8 @@ async def test_a_policy_learned_from_the_memory_succeeds_several_times_as_often(
     assert [each.done_now for each in again.phases] == [0, 0, 0]
     assert [each.tally for each in again.phases] == [each.tally for each in learned.phases]
 
-    asked = replace(SMALL, resume=True, workers=1)
-    studied = await study(asked, learned, place, rollouts=60, report_progress=lambda *_: None)
+    resumed_settings = replace(SMALL, resume=True, workers=1)
+    studied = await study(resumed_settings, learned, place, rollouts=60, report_progress=lambda *_: None)
     assert [each.rollouts for each in studied.curve] == [500]
     assert {each.rollouts for each in studied.costs} == {240, 200}
     turned = [each for each in studied.scenes if each.scene.yaw]
@@ -307,9 +307,9 @@ async def test_rollouts_without_recording_leave_no_trace_beside_recorded_ones(tm
 async def test_an_exception_of_a_worker_is_reported_in_one_line(tmp_path: Path) -> None:
     job = Job(Scene(position=(float("nan"), 0.0, 0.0)), default_policy(), 1)
     async with Workers(1, MemoryLocation(f"sqlite:///{tmp_path}/memory.db")) as workers:
-        with pytest.raises(WorkerLost, match="a rollout worker failed: PoseRefused") as told:
+        with pytest.raises(WorkerLost, match="a rollout worker failed: PoseRefused") as reports:
             await workers.roll_out(job, [(0, 5)])
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(reports.value)
 
 
 def test_an_impossible_experiment_is_refused() -> None:

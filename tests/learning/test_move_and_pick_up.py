@@ -41,8 +41,8 @@ def kitchen() -> Iterator[Stage]:
 def at(x: float, y: float, *, height: tuple[float, float] | None = None) -> Policy:
     """A policy whose samples are all within one square millimetre."""
     here, there = (Linear((each - 5e-4, each + 5e-4), (0.0, 1.0)) for each in (x, y))
-    known = None if height is None else Linear(height, (0.0, 1.0))
-    return Policy((Leaf(1.0, (0.5, 0.5), (0.25,) * len(GRASPS), here, there, known),))
+    torso_range = None if height is None else Linear(height, (0.0, 1.0))
+    return Policy((Leaf(1.0, (0.5, 0.5), (0.25,) * len(GRASPS), here, there, torso_range),))
 
 
 def seen_from_object(target: Pose, base: Pose) -> tuple[float, float]:
@@ -188,12 +188,12 @@ async def test_a_held_object_counts_as_the_arm_does() -> None:
 
 def test_cells_become_rectangles_that_cover_them_once() -> None:
     cells = np.random.default_rng(1).random((80, 80)) < 0.7
-    found = list(rectangles(cells))
-    Region(tuple(found))  # refuses rectangles that overlap
+    result = list(rectangles(cells))
+    Region(tuple(result))  # refuses rectangles that overlap
     middles = (np.arange(80) + 0.5) * 0.05 - 2.0
     x, y = np.meshgrid(middles, middles, indexing="ij")
     covered = np.zeros((80, 80), dtype=int)
-    for each in found:
+    for each in result:
         covered += (x > each.x_min) & (x < each.x_max) & (y > each.y_min) & (y < each.y_max)
     assert (covered == cells).all()
     whole = np.zeros((80, 80), dtype=bool)

@@ -190,8 +190,8 @@ def test_a_window_holds_as_much_as_any_of_its_width_can() -> None:
         ([Rectangle(0, math.nan, 0, 1)], "finite limits, the smaller first"),
     ],
 )
-def test_a_region_consists_of_rectangles_that_do_not_overlap(rectangles: list[Rectangle], said: str) -> None:
-    with pytest.raises(CallerError, match=said):
+def test_a_region_consists_of_rectangles_that_do_not_overlap(rectangles: list[Rectangle], message: str) -> None:
+    with pytest.raises(CallerError, match=message):
         Region(tuple(rectangles))
 
 

@@ -55,10 +55,10 @@ def test_a_policy_is_the_same_in_another_process_without_the_libraries_for_learn
     save_policy(policy, path)
     assert load_policy(path) == policy
     here = policy.likelihood(policy.sample(np.random.default_rng(8), 500)).tolist()
-    there = subprocess.run(
+    other_process = subprocess.run(
         [sys.executable, "-c", ELSEWHERE, str(path)], check=True, capture_output=True, text=True
     ).stdout
-    assert json.loads(there) == here
+    assert json.loads(other_process) == here
 
 
 def test_a_saved_policy_replaces_the_one_before_and_leaves_no_other_file(tmp_path: Path) -> None:
@@ -146,9 +146,9 @@ def test_a_file_that_cannot_be_read_or_written_is_reported_in_one_line(tmp_path:
     ],
 )
 def test_a_crafted_file_is_checked_although_its_checksum_matches(
-    change: dict[str, object], said: str, tmp_path: Path
+    change: dict[str, object], message: str, tmp_path: Path
 ) -> None:
-    _refused(change, said, tmp_path)
+    _refused(change, message, tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -168,17 +168,17 @@ def test_a_crafted_file_is_checked_although_its_checksum_matches(
         ({"x": {"type": "uniform"}}, "uniform"),
     ],
 )
-def test_a_crafted_leaf_is_checked(change: dict[str, object], said: str, tmp_path: Path) -> None:
+def test_a_crafted_leaf_is_checked(change: dict[str, object], message: str, tmp_path: Path) -> None:
     save_policy(default_policy(), tmp_path / "policy.json")
     leaf = json.loads((tmp_path / "policy.json").read_text().splitlines()[1])["leaves"][0]
-    _refused({"leaves": [leaf | change]}, said, tmp_path)
+    _refused({"leaves": [leaf | change]}, message, tmp_path)
 
 
-def _refused(change: dict[str, object], said: str, tmp_path: Path) -> None:
+def _refused(change: dict[str, object], message: str, tmp_path: Path) -> None:
     path = tmp_path / "policy.json"
     save_policy(default_policy(), path)
     heading, content = (json.loads(line) for line in path.read_text().splitlines())
     line = json.dumps(content | change)
     path.write_text(json.dumps(heading | {"crc32": zlib.crc32(line.encode())}) + "\n" + line + "\n")
-    with pytest.raises(PolicyDamaged, match=f"its checksum matches, but it holds no policy: .*{said}"):
+    with pytest.raises(PolicyDamaged, match=f"its checksum matches, but it holds no policy: .*{message}"):
         load_policy(path)

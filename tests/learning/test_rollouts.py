@@ -124,8 +124,8 @@ async def test_records_and_counts_agree_on_the_stage_at_which_each_rollout_faile
         assert stages == await by_node_arithmetic(memory, frame)
         assert sum(stages.values()) == sum(frame.status == "FAILED")
         async with memory.session() as session:
-            asked = (await session.execute(MoveAndPickUp.query_for_database())).all()
-        assert len(asked) == sum(frame.status == "SUCCEEDED") + await won(memory, 1)
+            query_rows = (await session.execute(MoveAndPickUp.query_for_database())).all()
+        assert len(query_rows) == sum(frame.status == "SUCCEEDED") + await won(memory, 1)
 
 
 def again(first: int, count: int) -> Tally:
@@ -149,7 +149,7 @@ async def by_node_arithmetic(memory: Memory, frame: Any) -> dict[str, int]:
     async with memory.session() as session:
         node = TaskTreeNode
         children = select(node.parent_id, func.count().label("count")).group_by(node.parent_id).subquery()
-        asked = (
+        query_rows = (
             select(children.c.count, func.count())
             .join(PickUpAction, PickUpAction.id == children.c.parent_id)
             .join(node, node.id == PickUpAction.id)
@@ -157,7 +157,7 @@ async def by_node_arithmetic(memory: Memory, frame: Any) -> dict[str, int]:
             .where(node.status == "FAILED", ProcessMetaData.id <= 2)
             .group_by(children.c.count)
         )
-        found: dict[int, int] = {row[0]: row[1] for row in await session.execute(asked)}
+        found: dict[int, int] = {row[0]: row[1] for row in await session.execute(query_rows)}
     assert len(frame) == 200
     names = {1: "pre-pose", 3: "grasp", 5: "lift"}
     return {names[count]: found[count] for count in sorted(found)}

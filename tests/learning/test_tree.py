@@ -120,15 +120,15 @@ def test_probabilities_and_conditioned_ones_equal_those_of_pyjpt(learned: Policy
     from jpt.base.intervals import ContinuousSet
 
     for x_min, x_max, y_min, y_max in [(-0.8, 0.0, -0.5, 0.5), (0.3, 0.7, 0.0, 1.0), (-1.0, 1.0, -0.8, -0.3)]:
-        there = Evidence(region=Region((Rectangle(x_min, x_max, y_min, y_max),)))
+        in_region = Evidence(region=Region((Rectangle(x_min, x_max, y_min, y_max),)))
         query = {"object_x": ContinuousSet(x_min, x_max), "object_y": ContinuousSet(y_min, y_max)}
-        assert learned.probability(there) == pytest.approx(oracle.infer(query), rel=1e-6)
+        assert learned.probability(in_region) == pytest.approx(oracle.infer(query), rel=1e-6)
         conditioned = oracle.conditional_jpt(query)
-        ours = learned.condition(there)
+        ours = learned.condition(in_region)
         for grasp in (Grasp.FRONT, Grasp.LEFT, Grasp.RIGHT):
             expected = conditioned.infer({"arm": "LEFT", "grasp": grasp.name})
-            known = Evidence(arms=frozenset({Arms.LEFT}), grasps=frozenset({grasp}))
-            assert ours.probability(known) == pytest.approx(expected, rel=1e-6, abs=1e-12)
+            conditions = Evidence(arms=frozenset({Arms.LEFT}), grasps=frozenset({grasp}))
+            assert ours.probability(conditions) == pytest.approx(expected, rel=1e-6, abs=1e-12)
 
 
 def test_a_hundred_generators_never_fail_and_repeat_themselves(learned: Policy) -> None:
@@ -328,10 +328,10 @@ def test_the_mode_for_every_arm_and_grasp_succeeds_nearly_always() -> None:
     policy = learn(frame_of(successes_of(10_000, 69)))
     for arm in (Arms.LEFT, Arms.RIGHT):
         for grasp in (Grasp.FRONT, Grasp.LEFT, Grasp.RIGHT):
-            known = Evidence(arms=frozenset({arm}), grasps=frozenset({grasp}))
-            tries = policy.condition(known).mode().sample(np.random.default_rng(1), 100)
+            conditions = Evidence(arms=frozenset({arm}), grasps=frozenset({grasp}))
+            tries = policy.condition(conditions).mode().sample(np.random.default_rng(1), 100)
             assert {each[:2] for each in tries} == {(arm, grasp)}
-            assert np.mean([succeeds(each) for each in tries]) >= 0.95, known
+            assert np.mean([succeeds(each) for each in tries]) >= 0.95, conditions
 
 
 def rng() -> np.random.Generator:

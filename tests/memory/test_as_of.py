@@ -109,11 +109,11 @@ def state_at(then: Moment) -> tuple[list[tuple[str | None, str, str | None]], di
     dtypes = {each.id: each.dtype for each in then.tree}
     nodes = sorted(then.tree, key=lambda each: each.sequence)[1:]
     tree = [(each.dtype, each.status, dtypes[each.parent_id or 0]) for each in nodes]
-    things = {
+    objects_by_name = {
         each.name: {"pose": numbers(each.pose), "joints": each.joints, "on": each.attached_to}
         for each in then.world.objects
     }
-    return tree, things
+    return tree, objects_by_name
 
 
 @contextmanager
@@ -279,8 +279,8 @@ async def test_a_simulation_has_moments_of_its_own_and_its_episode_has_none_of_t
                     await SavingActionPerformable(saved).perform()
                 await SavingActionPerformable(saved).perform()
         await memory.flush()
-        thought = await memory.as_of(2, time=1e9)
-        (during,) = [each.sequence for each in thought.tree if each.dtype == "SavingAction"]
+        simulation = await memory.as_of(2, time=1e9)
+        (during,) = [each.sequence for each in simulation.tree if each.dtype == "SavingAction"]
         then = await memory.as_of(2, sequence=during)
         assert then.simulated
         assert then.world.state == saved[0][1]

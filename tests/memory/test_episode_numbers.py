@@ -31,14 +31,14 @@ def take_numbers_up_to(url: str, last: int) -> None:
         ask_to_change(url, f"SELECT setval('pycrorm.episode_number', {last})")
 
 
-async def made(url: str) -> None:
+async def record_one(url: str) -> None:
     await (await EventLog.open(DatabaseAddress.parse(url), create=True)).close()
 
 
 async def test_the_last_number_is_used_and_further_episodes_are_kept_in_the_spool_and_tried_again(
     database_url: str, tmp_path: Path
 ) -> None:
-    await made(database_url)
+    await record_one(database_url)
     take_numbers_up_to(database_url, EPISODE_NUMBER_MAX - 1)
     spool = tmp_path / "spool"
     async with Memory.open(database_url, spool=spool) as memory:
@@ -56,9 +56,9 @@ async def test_the_last_number_is_used_and_further_episodes_are_kept_in_the_spoo
     (kept,) = [each for each in Spool(spool).recorders() if each.refused is not None]
     assert kept.refused == beyond
 
-    offered = await recover(database_url, spool=spool)  # as the next start does
-    assert offered.dead_letters.keys() == {beyond}
-    assert "all 4,194,303 episode numbers" in offered.drained.stopped[beyond]
+    recovered = await recover(database_url, spool=spool)  # as the next start does
+    assert recovered.dead_letters.keys() == {beyond}
+    assert "all 4,194,303 episode numbers" in recovered.drained.stopped[beyond]
     assert [each.refused for each in Spool(spool).recorders() if each.refused is not None] == [beyond]
     other = f"sqlite:///{tmp_path}/other.db"
     await copy_episodes(database_url, other)
@@ -74,7 +74,7 @@ async def test_the_last_number_is_used_and_further_episodes_are_kept_in_the_spoo
 async def test_status_and_log_warn_once_nine_tenths_of_the_episode_numbers_are_used(
     database_url: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    await made(database_url)
+    await record_one(database_url)
     take_numbers_up_to(database_url, 3_774_871)
     log = await EventLog.open(DatabaseAddress.parse(database_url), create=True)
     with caplog.at_level(logging.WARNING, logger="pycrorm_async"):
@@ -86,9 +86,9 @@ async def test_status_and_log_warn_once_nine_tenths_of_the_episode_numbers_are_u
     assert await log.limits_near() == [warning.format("3,774,874")]
     assert [each[-len(warning) - 7 :].strip() for each in caplog.messages] == [warning.format("3,774,873")]
     await log.close()
-    asked = ("--url", database_url, "--spool", tmp_path / "spool")
-    assert answer("status", *asked, cwd=tmp_path)["warnings"] == [warning.format("3,774,874")]
-    assert f"warning: {warning.format('3,774,874')}" in pycrorm("status", *asked, cwd=tmp_path).stderr
+    options = ("--url", database_url, "--spool", tmp_path / "spool")
+    assert answer("status", *options, cwd=tmp_path)["warnings"] == [warning.format("3,774,874")]
+    assert f"warning: {warning.format('3,774,874')}" in pycrorm("status", *options, cwd=tmp_path).stderr
 
 
 async def test_status_and_log_warn_once_nine_tenths_of_an_episodes_sequences_are_used(

@@ -31,7 +31,7 @@ async def pick_up(stand: Pose = STAND, *, torso: float = TORSO) -> None:
         await PickUpActionPerformable(here.milk, Arms.LEFT, Grasp.FRONT).perform()
 
 
-async def asked(experience: PickUpExperience | None = None) -> Location | None:
+async def resolved_location(experience: PickUpExperience | None = None) -> Location | None:
     with BulletWorld():
         milk = Object("milk", ObjectType.MILK, pose=Pose([1.3, 1, 0.9]))
         return await DatabaseCostmapLocation(milk, experience=experience).resolve()
@@ -44,19 +44,19 @@ def place_of(location: Location | None) -> tuple[float, float]:
 
 async def test_experience_is_visible_after_a_flush_even_in_the_same_episode(tmp_path: Path) -> None:
     async with Memory.open(f"sqlite:///{tmp_path}/memory.db") as memory, memory.episode(description="trying"):
-        assert await asked() is None
+        assert await resolved_location() is None
         await pick_up()
         await memory.flush()
-        assert place_of(await asked()) == pytest.approx((0.6, 0.9))
+        assert place_of(await resolved_location()) == pytest.approx((0.6, 0.9))
 
 
 async def test_experience_outlives_the_process_that_recorded_it(tmp_path: Path) -> None:
     async with Memory.open(f"sqlite:///{tmp_path}/memory.db"):
         await pick_up()
     async with Memory.open(f"sqlite:///{tmp_path}/memory.db"):
-        assert place_of(await asked()) == pytest.approx((0.6, 0.9))
+        assert place_of(await resolved_location()) == pytest.approx((0.6, 0.9))
     async with Reading.open(f"sqlite:///{tmp_path}/memory.db") as reading:
-        assert place_of(await asked(PickUpExperience(reading))) == pytest.approx((0.6, 0.9))
+        assert place_of(await resolved_location(PickUpExperience(reading))) == pytest.approx((0.6, 0.9))
 
 
 async def test_of_two_memories_the_one_with_an_open_episode_is_queried_or_else_the_one_opened_last(
@@ -66,11 +66,11 @@ async def test_of_two_memories_the_one_with_an_open_episode_is_queried_or_else_t
         await pick_up()
         await old.flush()
         async with Memory.open(f"sqlite:///{tmp_path}/new.db"):
-            assert await asked() is None
+            assert await resolved_location() is None
             async with old.episode(description="remembering"):
-                assert place_of(await asked()) == pytest.approx((0.6, 0.9))
-            assert await asked() is None
-        assert place_of(await asked()) == pytest.approx((0.6, 0.9))
+                assert place_of(await resolved_location()) == pytest.approx((0.6, 0.9))
+            assert await resolved_location() is None
+        assert place_of(await resolved_location()) == pytest.approx((0.6, 0.9))
     assert experience.get() is None
 
 
@@ -79,7 +79,7 @@ async def test_a_closed_memory_is_no_longer_queried(tmp_path: Path) -> None:
 
     async def later() -> Location | None:
         await closed.wait()
-        return await asked()
+        return await resolved_location()
 
     async with Memory.open(f"sqlite:///{tmp_path}/memory.db"):
         task = asyncio.create_task(later())
@@ -88,7 +88,7 @@ async def test_a_closed_memory_is_no_longer_queried(tmp_path: Path) -> None:
     with pytest.raises(CallerError, match="the memory is closed, so its experience cannot be read"):
         await task
     with pytest.raises(CallerError, match="queried from a memory"):
-        await asked()
+        await resolved_location()
 
 
 async def test_the_location_with_the_better_success_rate_comes_first(tmp_path: Path) -> None:
@@ -98,4 +98,4 @@ async def test_the_location_with_the_better_success_rate_comes_first(tmp_path: P
             for _ in range(2):
                 await pick_up(Pose([0.5, 0.8, 0]))
         await memory.flush()
-        assert place_of(await asked()) == pytest.approx((0.5, 0.8))
+        assert place_of(await resolved_location()) == pytest.approx((0.5, 0.8))

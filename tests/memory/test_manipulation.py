@@ -163,8 +163,8 @@ async def test_detections_and_failed_searches_are_recorded(recorded: Recorded) -
     ]
     motions = await recorded.rows(select(orm.DetectingMotion).order_by(orm.DetectingMotion.id))
     assert [each.object_type for each in motions] == [ObjectType.MILK, ObjectType.SPOON]
-    asked = await recorded.only(select(orm.WorldStateDetectingMotion))
-    assert asked.object_type is ObjectType.MILK
+    motion_row = await recorded.only(select(orm.WorldStateDetectingMotion))
+    assert motion_row.object_type is ObjectType.MILK
 
     rows = await recorded.rows(select(orm.Detection).order_by(orm.Detection.id, orm.Detection.position))
     camera = [each for each in rows if each.source == "camera"]
@@ -177,8 +177,8 @@ async def test_detections_and_failed_searches_are_recorded(recorded: Recorded) -
         assert (each.x, each.y, each.z, each.obj_type) == (*expected_object.pose.position, ObjectType.MILK)
     in_world_state = [each for each in rows if each.source == "world_state"]
     assert [(each.name, each.visible, each.node_id) for each in in_world_state] == [
-        ("milk", None, asked.id),
-        ("second", None, asked.id),
+        ("milk", None, motion_row.id),
+        ("second", None, motion_row.id),
     ]
     async with recorded.memory.session() as session:
         failed = await session.get(orm.TaskTreeNode, motions[1].id)

@@ -242,5 +242,5 @@ async def test_records_that_are_no_longer_kept_are_refused_with_their_gap_and_no
         await memory.flush()
         assert await texts(memory) == ["kept", "afterwards"]
     assert "went back" not in caplog.text
-    [said] = await incarnations(database_url)
-    assert "1 of 1 episodes stay incomplete" in said
+    [note_text] = await incarnations(database_url)
+    assert "1 of 1 episodes stay incomplete" in note_text

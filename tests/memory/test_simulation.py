@@ -207,10 +207,14 @@ async def test_the_command_leaves_simulations_out_and_shows_them_on_request(tmp_
     assert [(each["number"], each["simulated"]) for each in listed] == [(1, False), (2, True), (3, True)]
     assert [listed[2]["thought_by"][name] for name in ("episode", "dtype")] == [1, "FetchFromAnywhereAction"]
     assert answer("show", "last", *url, cwd=tmp_path)["episode"]["number"] == 1
-    thought = answer("show", "2", *url, cwd=tmp_path)
-    assert thought["episode"]["simulated"] is True
-    assert {each["simulated"] for each in thought["tree"]} == {True}
-    assert [each["dtype"] for each in thought["tree"]][:3] == [None, "MoveAndPickUpAction", "NavigateAction"]
+    simulation_document = answer("show", "2", *url, cwd=tmp_path)
+    assert simulation_document["episode"]["simulated"] is True
+    assert {each["simulated"] for each in simulation_document["tree"]} == {True}
+    assert [each["dtype"] for each in simulation_document["tree"]][:3] == [
+        None,
+        "MoveAndPickUpAction",
+        "NavigateAction",
+    ]
 
     table = pycrorm("episodes", "--simulated", *url, cwd=tmp_path).stdout
     assert table.count("by FetchFromAnywhereAction of episode 1") == 2

@@ -58,8 +58,8 @@ def noted(folder: Path) -> int:
 
 
 def workers(folder: Path) -> list[dict[str, Any]]:
-    found: list[dict[str, Any]] = answer("status", cwd=folder)["fold_workers"]
-    return found
+    entries: list[dict[str, Any]] = answer("status", cwd=folder)["fold_workers"]
+    return entries
 
 
 def wait_for_workers(folder: Path, count: int) -> list[int]:
@@ -92,10 +92,10 @@ def test_a_worker_folds_and_its_death_is_reported_and_shown_and_it_is_restarted(
     assert "Fold workers of the daemon" in shown
     assert "exited with signal 9" in shown
     daemon.send_signal(signal.SIGTERM)
-    _, said = daemon.communicate(timeout=15)
+    _, output = daemon.communicate(timeout=15)
     assert daemon.returncode == 0
-    assert said.count(f"fold worker 1 (pid {first}) exited with signal 9; restarting it in 1 s\n") == 1
-    assert "Traceback" not in said
+    assert output.count(f"fold worker 1 (pid {first}) exited with signal 9; restarting it in 1 s\n") == 1
+    assert "Traceback" not in output
     assert is_gone(second)
     assert is_gone(other)
     assert workers(folder) == []
@@ -123,10 +123,10 @@ def test_a_terminal_signal_to_both_ends_a_worker_with_the_daemon_and_no_sooner(
     for each in pids:
         os.kill(each, end)
     daemon.send_signal(end)
-    _, said = daemon.communicate(timeout=15)
+    _, output = daemon.communicate(timeout=15)
     assert daemon.returncode == 0
-    assert "exited" not in said
-    assert "Traceback" not in said
+    assert "exited" not in output
+    assert "Traceback" not in output
     assert all(map(is_gone, pids))
 
 
@@ -135,16 +135,16 @@ def test_the_reason_why_a_worker_cannot_fold_is_reported(folder: Path, daemon: s
     ask_to_change(f"sqlite:///{folder}/pycrorm.db", "DROP TABLE task_tree_node__1")
     plan = subprocess.Popen([*COMMAND, "run", "notes.py", "--writer", "daemon"], cwd=folder, env=environment())
     assert daemon.stderr is not None
-    said = ""
-    while "cannot be brought" not in said:
-        said = daemon.stderr.readline()
-        assert said, "the daemon has ended"
+    output = ""
+    while "cannot be brought" not in output:
+        output = daemon.stderr.readline()
+        assert output, "the daemon has ended"
     ended = "SELECT count(*) FROM event WHERE type = 'NodeEnded'"
     while ask(f"sqlite:///{folder}/pycrorm.db", ended) != [(8,)]:  # appending continues
         time.sleep(0.01)
     plan.kill()
     plan.wait()
-    assert "no such table: task_tree_node__1" in said
+    assert "no such table: task_tree_node__1" in output
 
 
 MANY = 12_000
@@ -192,9 +192,9 @@ def test_a_daemon_whose_workers_are_both_killed_continues_to_fold(folder: Path) 
             time.sleep(0.05)
         wait_for(url, ALL)
         process.send_signal(signal.SIGTERM)
-        _, said = process.communicate(timeout=15)
+        _, output = process.communicate(timeout=15)
     assert process.returncode == 0
-    lines = [line for line in said.splitlines() if not line.startswith(("recorder ", "stopped after"))]
+    lines = [line for line in output.splitlines() if not line.startswith(("recorder ", "stopped after"))]
     assert sorted(lines) == [
         f"fold worker {number} (pid {pid}) exited with signal 9; restarting it in 1 s"
         for number, pid in enumerate(pids, start=1)

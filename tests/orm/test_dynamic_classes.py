@@ -73,8 +73,8 @@ async def every(log: EventLog, question: Any) -> list[Any]:
         return list((await session.scalars(question)).all())
 
 
-def names(found: list[Any]) -> list[str]:
-    return [type(each).__name__ for each in found]
+def names(only_row: list[Any]) -> list[str]:
+    return [type(each).__name__ for each in only_row]
 
 
 async def accepted(log: EventLog) -> list[DesignatorTypeDeclared]:
@@ -150,12 +150,12 @@ async def test_lists_dicts_and_poses_are_attributes_of_a_made_class_whatever_the
     script.put(NodeStarted("action", None, name_of(trip), parameters))
     await stored_and_folded(log, [*declarations(trip), *script.records])
     async with classes_of(log):
-        (found,) = await every(log, select(Action))
-        assert (found.start.position.x, found.end.position.x) == (3.0, 4.0)
-        assert (found.pose is found.start, found.pose_id, found.end_id) == (True, row(1, 5), row(1, 6))
-        assert found.entries == "x"
-        assert [(each.x, each.frame) for each in found.stops] == [(1.0, "map"), (2.0, "map")]
-        assert found.loads == {"milk": 2, "cup": 1}
+        (only_row,) = await every(log, select(Action))
+        assert (only_row.start.position.x, only_row.end.position.x) == (3.0, 4.0)
+        assert (only_row.pose is only_row.start, only_row.pose_id, only_row.end_id) == (True, row(1, 5), row(1, 6))
+        assert only_row.entries == "x"
+        assert [(each.x, each.frame) for each in only_row.stops] == [(1.0, "map"), (2.0, "map")]
+        assert only_row.loads == {"milk": 2, "cup": 1}
 
 
 async def test_a_field_of_a_made_class_hides_an_attribute_that_every_action_has(log: EventLog) -> None:
@@ -166,10 +166,15 @@ async def test_a_field_of_a_made_class_hides_an_attribute_that_every_action_has(
     script.put(NodeStarted("action", None, name_of(wait), parameters))
     await stored_and_folded(log, [*declarations(wait), *script.records])
     async with classes_of(log) as classes:
-        (found,) = await every(log, select(Action))
-        assert (found.duration, found.reason, found.episode, found.status) == (60.0, "rain", 7, TaskStatus.RUNNING)
-        made = classes.of("WaitAction")
-        assert await every(log, select(made.duration).where(made.duration > 50)) == [60.0]
+        (only_row,) = await every(log, select(Action))
+        assert (only_row.duration, only_row.reason, only_row.episode, only_row.status) == (
+            60.0,
+            "rain",
+            7,
+            TaskStatus.RUNNING,
+        )
+        mapped_class = classes.of("WaitAction")
+        assert await every(log, select(mapped_class.duration).where(mapped_class.duration > 50)) == [60.0]
 
 
 async def test_a_class_can_be_requested_by_type_table_or_designator(log: EventLog) -> None:
@@ -214,8 +219,8 @@ async def test_a_field_that_appears_later_is_an_attribute_of_the_existing_class(
         classes.learn(await accepted(log))
         grown: Any = classes.of("SayingAction")
         assert grown is saying
-        said = await every(log, select(grown).order_by(grown.id))
-        assert [(each.text, each.volume) for each in said] == [("hi", None), ("HI", 0.5)]
+        rows = await every(log, select(grown).order_by(grown.id))
+        assert [(each.text, each.volume) for each in rows] == [("hi", None), ("HI", 0.5)]
         assert [each.text for each in await every(log, select(grown).where(grown.volume > 0.1))] == ["HI"]
 
 
@@ -243,16 +248,16 @@ async def test_two_memories_with_types_of_one_name_do_not_share_classes(log: Eve
 async def test_disposed_classes_leave_no_references(log: EventLog) -> None:
     await stored_and_folded(log, [*KINDS, *all_kinds().records])
     identities = dict(Designator.__mapper__.polymorphic_map)
-    made: list[weakref.ref[type]] = []
+    mapped_class: list[weakref.ref[type]] = []
     async with classes_of(log) as classes:
         await every(log, select(Action))
         await every(log, select(TaskTreeNode))
         await every(log, select(classes.of("SayingAction")))
-        made += [weakref.ref(classes.of(name)) for name in ("SayingAction", "CarefulPickUpAction", "Loop")]
+        mapped_class += [weakref.ref(classes.of(name)) for name in ("SayingAction", "CarefulPickUpAction", "Loop")]
     assert dict(Designator.__mapper__.polymorphic_map) == identities
     del classes
     gc.collect()
-    assert [each() for each in made] == [None, None, None]
+    assert [each() for each in mapped_class] == [None, None, None]
     assert names(await every(log, select(Action).order_by(Action.id))) == ["PickUpAction", "Action"]
 
 
@@ -261,9 +266,9 @@ async def test_an_authors_class_is_the_class_of_its_rows(log: EventLog) -> None:
     script = Script()
     script.put(NodeStarted("action", None, name_of(remark), {"text": "Where is my Patchie?"}, STATE))
     await stored_and_folded(log, [*declarations(remark), *script.records])
-    (found,) = await every(log, select(ORMRemark))
-    assert (type(found), found.dtype, found.text) == (ORMRemark, "RemarkAction", "Where is my Patchie?")
-    assert found.robot_state.pose.position.x == 0.5
+    (only_row,) = await every(log, select(ORMRemark))
+    assert (type(only_row), only_row.dtype, only_row.text) == (ORMRemark, "RemarkAction", "Where is my Patchie?")
+    assert only_row.robot_state.pose.position.x == 0.5
     assert names(await every(log, select(Action))) == ["ORMRemark"]
     assert names([each.action for each in await every(log, select(TaskTreeNode))]) == ["ORMRemark"]
     async with classes_of(log) as classes:
@@ -301,8 +306,8 @@ async def test_a_type_can_be_queried_while_its_base_is_unknown(
     expected = {"SayingAction": "Action", "CarefulPickUpAction": "Action"}[declaration.dtype]
     assert names(await every(log, select(Action))) == [expected]
     async with classes_of(log):
-        (found,) = await every(log, select(Action))
-        assert (type(found).__name__, found.n) == ("OrphanAction", 1)
+        (only_row,) = await every(log, select(Action))
+        assert (type(only_row).__name__, only_row.n) == ("OrphanAction", 1)
 
 
 IN_A_NEW_PROCESS = """

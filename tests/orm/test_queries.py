@@ -336,8 +336,8 @@ async def test_a_resolved_location_has_its_candidates(log: EventLog, script: Scr
 async def test_the_recorded_parameters_are_loaded_on_request(log: EventLog, script: Script) -> None:
     async with AsyncSession(log.engine) as session:
         pick = (await session.scalars(select(PickUpAction))).one()
-        asked = await pick.awaitable_attrs.parameters
-        assert asked == {"object_designator": {"object": 4, "row": 4}, "arm": "LEFT", "grasp": "TOP"}
+        awaited_parameters = await pick.awaitable_attrs.parameters
+        assert awaited_parameters == {"object_designator": {"object": 4, "row": 4}, "arm": "LEFT", "grasp": "TOP"}
     (joints,) = await every(log, select(MoveJointsMotion).options(undefer(MoveJointsMotion.parameters)))
     assert joints.parameters == {"names": ["a", "b"], "positions": [0.5, -1.0]}
 

@@ -9,9 +9,9 @@ from pycrorm_async.world import Object
 from tests.world.fakes import Matrix
 
 
-def bullet_frame(thing: Object, link: str) -> Matrix:
+def bullet_frame(target: Object, link: str) -> Matrix:
     """Return the link's frame in the map as a 4 by 4 matrix."""
-    number, client = thing.body.number, thing.world.client
+    number, client = target.body.number, target.world.client
     names = [
         pybullet.getJointInfo(number, joint, physicsClientId=client)[12].decode()
         for joint in range(pybullet.getNumJoints(number, physicsClientId=client))

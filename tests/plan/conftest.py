@@ -38,8 +38,8 @@ def kitchen() -> Iterator[Scene]:
 @pytest.fixture
 def scene() -> Iterator[Scene]:
     """The kitchen, for the whole of a test."""
-    with kitchen() as there:
-        yield there
+    with kitchen() as kitchen_scene:
+        yield kitchen_scene
 
 
 @pytest.fixture

@@ -85,17 +85,21 @@ class Recording:
     ) -> None:
         self.notes.append(f"saw {' '.join(each.thing.name for each in seen)}".strip())
 
-    def simulation_started(self, thought: Simulation) -> None:
-        if thought.record is not None or current_simulation.get() is not thought or current_node.get() is not None:
-            raise OrderBroken(f"{thought} begins, and is not what is thought")
-        thought.record = self
-        self.thoughts.append(thought)
-        self.notes.append(f"think {thought.description}")
+    def simulation_started(self, simulation: Simulation) -> None:
+        if (
+            simulation.record is not None
+            or current_simulation.get() is not simulation
+            or current_node.get() is not None
+        ):
+            raise OrderBroken(f"{simulation} begins, and is not what is thought")
+        simulation.record = self
+        self.thoughts.append(simulation)
+        self.notes.append(f"think {simulation.description}")
 
-    def simulation_ended(self, thought: Simulation, failure: BaseException | None) -> None:
-        if not self.thoughts or self.thoughts.pop() is not thought:
-            raise OrderBroken(f"{thought} ends, and is not the innermost")
-        if thought.world is not None and not thought.world.entered:
+    def simulation_ended(self, simulation: Simulation, failure: BaseException | None) -> None:
+        if not self.thoughts or self.thoughts.pop() is not simulation:
+            raise OrderBroken(f"{simulation} ends, and is not the innermost")
+        if simulation.world is not None and not simulation.world.entered:
             raise OrderBroken("the copy is closed before the thought is over")
         self.notes.append(f"thought {type(failure).__name__ if failure is not None else 'through'}")
 

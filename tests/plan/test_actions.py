@@ -191,14 +191,14 @@ async def test_furniture_and_robots_are_not_picked_up_however_near_they_are(scen
     scene.robot.set_pose(Pose([-0.6, -0.188, 0]))
     stool = Object("stool", ObjectType.ENVIRONMENT, scene.milk.description_text, Pose([0.05, 0, 0.8]))
     before = scene.world.save_state()
-    for thing in (stool, scene.robot):
+    for held in (stool, scene.robot):
         for action in (
-            PickUpActionPerformable(thing, Arms.LEFT, Grasp.FRONT),
-            TransportActionPerformable(thing, Arms.LEFT, Pose([-1.3, 1, 0.95])),
+            PickUpActionPerformable(held, Arms.LEFT, Grasp.FRONT),
+            TransportActionPerformable(held, Arms.LEFT, Pose([-1.3, 1, 0.95])),
         ):
-            with pytest.raises(IllPosedGoalFailure, match=f"{thing.name} cannot be held by a gripper") as caught:
+            with pytest.raises(IllPosedGoalFailure, match=f"{held.name} cannot be held by a gripper") as caught:
                 await action.perform()
-            assert (caught.value.data, scene.world.save_state()) == ((thing.name,), before)
+            assert (caught.value.data, scene.world.save_state()) == ((held.name,), before)
 
 
 async def test_a_picked_up_object_is_detached_from_its_former_parent(scene: Scene) -> None:

@@ -259,7 +259,7 @@ async def test_an_impossible_access_gives_the_reason_and_moves_nothing(
     part = await SINK.base_placed_by(scene)
     await GraspingActionPerformable(SINK.arm, part).perform()
     before = scene.world.save_state()
-    given: dict[str, object] = {
+    arguments: dict[str, object] = {
         "part_of": scene.kitchen,
         "arm": Arms.LEFT,
         "gripper": TOOL[Arms.LEFT],
@@ -268,7 +268,7 @@ async def test_an_impossible_access_gives_the_reason_and_moves_nothing(
         "distance": 0.1,
     }
     with pytest.raises(failure, match=message):
-        await AccessingMotion(**given | changed).perform()  # type: ignore[arg-type]  # by name
+        await AccessingMotion(**arguments | changed).perform()  # type: ignore[arg-type]  # by name
     assert scene.world.save_state() == before
 
 

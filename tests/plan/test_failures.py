@@ -80,23 +80,23 @@ PlanFailure
 def parents() -> dict[str, str]:
     """Return class name → name of its base, read off the indentation above."""
     above: list[str] = ["Exception"]
-    found = {}
+    classes = {}
     for line in TREE.strip().splitlines():
         depth = (len(line) - len(line.lstrip())) // 2
         del above[depth + 1 :]
-        found[line.strip()] = above[-1]
+        classes[line.strip()] = above[-1]
         above.append(line.strip())
-    return found
+    return classes
 
 
 def test_the_tree_of_classes_is_the_documented_one() -> None:
-    found = {
+    classes = {
         name: kind.__bases__[0].__name__
         for name, kind in vars(failures).items()
         if isinstance(kind, type) and issubclass(kind, PlanFailure)
     }
-    assert found == parents()
-    assert sorted(failures.__all__) == sorted(found)
+    assert classes == parents()
+    assert sorted(failures.__all__) == sorted(classes)
 
 
 @pytest.mark.parametrize("name", sorted(set(parents()) - {"IKError", "PlanFailures", "ResourceDeadlock"}))

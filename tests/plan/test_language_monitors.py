@@ -48,12 +48,12 @@ class Waiting(ActionAbstract):
 
 def after(count: int) -> Callable[[], bool]:
     """Return a condition that holds after this many checks."""
-    asked = 0
+    checks = 0
 
     def holds() -> bool:
-        nonlocal asked
-        asked += 1
-        return asked > count
+        nonlocal checks
+        checks += 1
+        return checks > count
 
     return holds
 
@@ -209,12 +209,12 @@ async def test_an_exception_of_a_condition_interrupts_the_plan_and_is_raised(
     between_nodes: bool, asks_later: bool
 ) -> None:
     bug = ZeroDivisionError("bug")
-    asked = 0
+    checks = 0
 
     def holds() -> bool:
-        nonlocal asked
-        asked += 1
-        if asked > 4:
+        nonlocal checks
+        checks += 1
+        if checks > 4:
             raise bug
         return False
 
@@ -286,13 +286,13 @@ async def test_a_failing_cleanup_of_an_interrupted_plan_is_raised() -> None:
 
 
 async def test_nodes_of_a_condition_belong_to_the_monitor_and_are_not_checked() -> None:
-    asked = 0
+    checks = 0
 
     async def looks() -> bool:
-        nonlocal asked
-        asked += 1
+        nonlocal checks
+        checks += 1
         await Around(Step("look")).perform()
-        return asked > 2
+        return checks > 2
 
     with collected_tree() as tree:
         assert await (Around(Around(Step("a"))) >> Monitor(looks, interval_s=60)).perform() == INTERRUPTED

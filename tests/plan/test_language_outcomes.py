@@ -71,10 +71,10 @@ async def test_a_repetition_continues_after_failed_rounds_and_returns_them() -> 
         await (Code(fails_in_two_and_four) * 5).perform()
     assert rounds == 5
     assert str(caught.value) == "2 of 5 rounds failed (2, 4): ObjectLost: gone in 2; ObjectLost: gone in 4"
-    with pytest.raises(ObjectLost, match="gone in 2") as alone:
+    with pytest.raises(ObjectLost, match="gone in 2") as single_failure:
         rounds = 0
         await (Code(fails_in_two_and_four) * 3).perform()
-    assert alone.value.__notes__ == ["this was round 2 of 3; the others succeeded"]
+    assert single_failure.value.__notes__ == ["this was round 2 of 3; the others succeeded"]
     assert await (Code(int) * 0).perform() == Outcome(rounds=0)
 
 

@@ -100,8 +100,8 @@ def test_candidates_are_on_the_floor_face_the_target_and_are_clear_of_furniture(
 @pytest.mark.slow
 def test_the_requested_arms_reach(scene: Scene) -> None:
     def reaching(arm: Arms | None) -> set[tuple[Arms, ...]]:
-        found = CostmapLocation(scene.milk, reachable_for=scene.robot, reachable_arm=arm)
-        return {each.reachable_arms for each in found}
+        resolved_location = CostmapLocation(scene.milk, reachable_for=scene.robot, reachable_arm=arm)
+        return {each.reachable_arms for each in resolved_location}
 
     scene.milk.set_pose(Pose([1.3, 1, 0.9], yaw_quaternion(1.0)))
     assert reaching(Arms.RIGHT) == {(Arms.RIGHT,)}
@@ -188,9 +188,9 @@ def test_a_removed_target_or_a_missing_robot_is_reported(scene: Scene) -> None:
     ],
 )
 def test_a_target_without_possible_locations_is_refused_by_name(
-    scene: Scene, kind: Any, arguments: Callable[[Scene], tuple[object, ...]], said: str
+    scene: Scene, kind: Any, arguments: Callable[[Scene], tuple[object, ...]], message: str
 ) -> None:
-    with pytest.raises(ResolutionError, match=re.escape(said)):
+    with pytest.raises(ResolutionError, match=re.escape(message)):
         kind(*arguments(scene))
 
 
@@ -209,9 +209,9 @@ def test_a_pose_in_another_frame_is_refused(scene: Scene, role: str) -> None:
 def test_a_resolution_is_recorded_with_the_chosen_candidate(scene: Scene) -> None:
     with Recording().listening() as recording:
         stand = CostmapLocation(scene.milk, reachable_for=scene.robot, reachable_arm=Arms.RIGHT).resolve()
-    offered = (Candidate(stand.pose, (Arms.RIGHT,)),)
+    candidates = (Candidate(stand.pose, (Arms.RIGHT,)),)
     ((name, notes, taken, considered, node),) = recording.places
-    assert (name, notes, taken, node) == ("CostmapLocation", offered, 0, None)
+    assert (name, notes, taken, node) == ("CostmapLocation", candidates, 0, None)
     first = next(iter(CostmapLocation(scene.milk, reachable_for=scene.robot, reachable_arm=Arms.RIGHT)))
     assert first == stand
     assert 1 <= considered <= 600
@@ -223,10 +223,10 @@ def test_a_loop_over_candidates_is_recorded_at_its_end_with_the_last_one_as_chos
         for place in location:
             if place.pose.position.x < -1.5:
                 break
-        ((_, offered, taken, considered, _),) = recording.places
-        assert offered[-1] == Candidate(place.pose)
-        assert taken == len(offered) - 1 == considered - 1
-        assert all(each.pose.position.x >= -1.5 for each in offered[:-1])
+        ((_, candidates, taken, considered, _),) = recording.places
+        assert candidates[-1] == Candidate(place.pose)
+        assert taken == len(candidates) - 1 == considered - 1
+        assert all(each.pose.position.x >= -1.5 for each in candidates[:-1])
 
 
 def test_a_loop_that_runs_to_its_end_chose_none(scene: Scene) -> None:
@@ -242,10 +242,10 @@ def test_a_loop_that_runs_to_its_end_chose_none(scene: Scene) -> None:
 def test_of_thousands_of_candidates_the_first_and_the_chosen_one_are_recorded(scene: Scene) -> None:
     with Recording().listening() as recording:
         places = list(itertools.islice(iter(SemanticCostmapLocation("kitchen_island_surface", scene.kitchen)), 1_500))
-    ((_, offered, taken, _, _),) = recording.places
-    assert (len(offered), taken, recording.offered_beyond) == (CANDIDATES_MAX, CANDIDATES_MAX - 1, [500])
-    assert [each.pose for each in offered[:-1]] == [each.pose for each in places[: CANDIDATES_MAX - 1]]
-    assert offered[-1].pose == places[-1].pose
+    ((_, candidates, taken, _, _),) = recording.places
+    assert (len(candidates), taken, recording.offered_beyond) == (CANDIDATES_MAX, CANDIDATES_MAX - 1, [500])
+    assert [each.pose for each in candidates[:-1]] == [each.pose for each in places[: CANDIDATES_MAX - 1]]
+    assert candidates[-1].pose == places[-1].pose
 
 
 def test_an_unused_location_is_not_recorded(scene: Scene) -> None:
@@ -261,8 +261,8 @@ def test_an_abandoned_search_is_recorded_by_the_recorder_with_which_it_began(sce
         next(places)
     assert recording.places == []
     del places
-    ((_, offered, taken, _, _),) = recording.places
-    assert (len(offered), taken) == (2, 1)
+    ((_, candidates, taken, _, _),) = recording.places
+    assert (len(candidates), taken) == (2, 1)
 
 
 async def test_the_node_that_resolves_is_recorded(scene: Scene) -> None:
@@ -272,8 +272,8 @@ async def test_the_node_that_resolves_is_recorded(scene: Scene) -> None:
 
     with Recording().listening() as recording:
         assert await Asking().perform() == Pose([1, 2, 0])
-    ((name, offered, taken, considered, node),) = recording.places
-    assert (name, offered, taken, considered) == ("Location", (Candidate(Pose([1, 2, 0])),), 0, 1)
+    ((name, candidates, taken, considered, node),) = recording.places
+    assert (name, candidates, taken, considered) == ("Location", (Candidate(Pose([1, 2, 0])),), 0, 1)
     assert node is recording.ended[0]
 
 

@@ -288,9 +288,9 @@ async def test_an_object_of_several_links_is_held_only_at_its_nearest_link(scene
 
 async def test_neither_furniture_nor_the_robot_is_held(scene: Scene) -> None:
     before = scene.world.save_state()
-    for thing in (scene.kitchen, scene.robot):
-        with pytest.raises(IllPosedGoalFailure, match=f"{thing.name} cannot be held by a gripper"):
-            await GripActionPerformable(Arms.LEFT, thing, 1.0).perform()
+    for forbidden in (scene.kitchen, scene.robot):
+        with pytest.raises(IllPosedGoalFailure, match=f"{forbidden.name} cannot be held by a gripper"):
+            await GripActionPerformable(Arms.LEFT, forbidden, 1.0).perform()
     assert scene.world.save_state() == before
 
 

@@ -68,11 +68,11 @@ async def test_a_simulation_does_not_interrupt_a_plan(scene: Scene, asks_later: 
 async def test_a_condition_performs_its_nodes_in_the_real_world_while_the_plan_simulates(
     scene: Scene, asks_later: bool
 ) -> None:
-    thought: list[bool] = []
+    simulated: list[bool] = []
 
     class Looking(ActionAbstract):
         async def perform(self) -> None:
-            thought.append(current_simulation.get() is not None)
+            simulated.append(current_simulation.get() is not None)
 
     async def looks() -> bool:
         await Looking().perform()
@@ -82,22 +82,22 @@ async def test_a_condition_performs_its_nodes_in_the_real_world_while_the_plan_s
     with collected_tree() as tree:
         await (ThinkOfDrivingActionPerformable(THERE) >> Monitor(condition, interval_s=60)).perform()
     # Checked once by the clock, and before each node: the simulating one, the drive, its motion, and the look.
-    assert thought == [False] * 5
+    assert simulated == [False] * 5
     below = [type(node.designator).__name__ for node in tree.children(tree.roots[0])]
     assert sorted(below) == ["Looking"] * 5 + ["ThinkOfDrivingActionPerformable"]
 
 
 async def test_a_condition_that_ignores_its_cancellation_does_not_outlive_the_plan() -> None:
-    begun, asked = asyncio.Event(), asyncio.Event()
+    begun, checks = asyncio.Event(), asyncio.Event()
 
     class Waiting(ActionAbstract):
         async def perform(self) -> None:
             begun.set()
-            await asked.wait()
+            await checks.wait()
 
     async def stubborn() -> bool:
         if begun.is_set():
-            asked.set()
+            checks.set()
             with suppress(asyncio.CancelledError):
                 await asyncio.Event().wait()
         return False
@@ -108,12 +108,12 @@ async def test_a_condition_that_ignores_its_cancellation_does_not_outlive_the_pl
 
 @pytest.mark.parametrize("asks_later", [True, False])
 async def test_a_cancelled_condition_interrupts_like_one_that_raises(asks_later: bool) -> None:
-    asked = 0
+    checks = 0
 
     def broken() -> bool:
-        nonlocal asked
-        asked += 1
-        if asked > 2:
+        nonlocal checks
+        checks += 1
+        if checks > 2:
             raise asyncio.CancelledError("the camera is gone")
         return False
 

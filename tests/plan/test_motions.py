@@ -184,9 +184,9 @@ async def test_the_neck_turns_as_far_as_it_can_to_a_point_behind(scene: Scene, w
     [(Pose([1, 0, 0], frame="base_link"), "in frame 'base_link'"), (Pose([math.nan, 0, 0]), "not finite")],
 )
 async def test_the_head_does_not_turn_to_a_point_outside_the_map(
-    scene: Scene, watching: Watching, target: Pose, said: str
+    scene: Scene, watching: Watching, target: Pose, message: str
 ) -> None:
-    with pytest.raises(CallerError, match=said):
+    with pytest.raises(CallerError, match=message):
         await LookingMotion(target).perform()
     assert watching.seen == []
 

@@ -39,8 +39,8 @@ def test_a_description_matches_by_name_by_type_and_by_both(scene: Scene) -> None
     assert names(ObjectDesignatorDescription(types=both[::-1])) == ["milk", "cereal"]
     assert names(ObjectDesignatorDescription(names=["pr2", "cereal"], types=both)) == ["cereal"]
     assert names(ObjectDesignatorDescription(names=[])) == []
-    found = ObjectDesignatorDescription(names=["milk"]).resolve()
-    assert (found.name, found.object_type, found.world_object) == ("milk", ObjectType.MILK, scene.milk)
+    designator = ObjectDesignatorDescription(names=["milk"]).resolve()
+    assert (designator.name, designator.object_type, designator.world_object) == ("milk", ObjectType.MILK, scene.milk)
 
 
 def test_a_description_without_a_match_lists_the_objects_of_the_world(scene: Scene) -> None:
@@ -152,17 +152,17 @@ def test_an_object_that_is_only_located_is_not_in_the_world(scene: Scene) -> Non
 def test_objects_are_located_relative_to_each_of_the_others(scene: Scene) -> None:
     scene.cereal.set_pose(Pose([1.3, 0.7, 0.95], yaw_quaternion(math.pi / 2)))
     food = [ObjectType.MILK, ObjectType.BREAKFAST_CEREAL]
-    found = list(LocatedObjectDescription([scene.cereal, scene.kitchen], types=food))
-    assert [(each.name, each.reference.name) for each in found] == [
+    designator = list(LocatedObjectDescription([scene.cereal, scene.kitchen], types=food))
+    assert [(each.name, each.reference.name) for each in designator] == [
         ("milk", "cereal"),
         ("milk", "kitchen"),
         ("cereal", "kitchen"),
     ]
     # The milk is 0.3 m along map's y from the cereal, whose x points along y: straight ahead of it.
-    assert found[0].relative_pose.position == pytest.approx((0.3, 0, -0.05))
-    for each in found:
+    assert designator[0].relative_pose.position == pytest.approx((0.3, 0, -0.05))
+    for each in designator:
         assert each.pose.position == pytest.approx(in_world(each).pose.position)
-    assert in_world(found[0]) is scene.milk
+    assert in_world(designator[0]) is scene.milk
     milk = LocatedObjectDescription([scene.cereal], names=["milk"]).resolve()
     assert (milk.name, milk.reference.name) == ("milk", "cereal")
     with pytest.raises(ObjectNotFound, match="no object is named milk, beside milk; in the world: pr2, kitchen"):
@@ -194,7 +194,7 @@ def test_one_name_or_type_needs_no_list_and_a_name_is_not_split(scene: Scene) ->
     ],
 )
 def test_an_invalid_object_name_type_or_location_is_refused_by_name(
-    scene: Scene, kind: Any, arguments: Callable[[Scene], tuple[object, ...]], said: str
+    scene: Scene, kind: Any, arguments: Callable[[Scene], tuple[object, ...]], message: str
 ) -> None:
-    with pytest.raises(ResolutionError, match=re.escape(said)):
+    with pytest.raises(ResolutionError, match=re.escape(message)):
         kind(*arguments(scene))

@@ -137,9 +137,9 @@ def test_resolving_moves_nothing_and_is_recorded_once(scene: Scene) -> None:
     with Recording().listening() as recording:
         first, second = itertools.islice(AccessingLocation(handle, scene.robot), 2)
     assert scene.world.save_state() == before
-    ((name, offered, taken, considered, node),) = recording.places
+    ((name, candidates, taken, considered, node),) = recording.places
     assert (name, taken, node) == ("AccessingLocation", 1, None)
-    assert offered == tuple(Candidate(each.pose, each.reachable_arms) for each in (first, second))
+    assert candidates == tuple(Candidate(each.pose, each.reachable_arms) for each in (first, second))
     assert considered >= 2
 
 
@@ -148,22 +148,22 @@ def test_an_unreachable_handle_is_a_failure_and_is_recorded(scene: Scene) -> Non
     with Recording().listening() as recording, pytest.raises(EnvironmentUnreachable, match="no place") as caught:
         AccessingLocation(ObjectPart("sink_area_drawer_handle", scene.kitchen), scene.robot).resolve()
     assert caught.value.data == ("sink_area_drawer_handle",)
-    ((name, offered, taken, considered, _),) = recording.places
-    assert (name, offered, taken) == ("AccessingLocation", (), None)
+    ((name, candidates, taken, considered, _),) = recording.places
+    assert (name, candidates, taken) == ("AccessingLocation", (), None)
     assert considered > REFUSALS_MAX == len(recording.refused[0])
     assert all(re.fullmatch("LEFT: .+; RIGHT: .+", each.reason) for each in recording.refused[0])
 
 
 def test_an_object_that_cannot_be_opened_is_refused_with_the_reason(scene: Scene) -> None:
-    def asked(part: ObjectPart) -> None:
+    def request(part: ObjectPart) -> None:
         AccessingLocation(part, scene.robot).resolve()
 
     with pytest.raises(EnvironmentManipulationImpossible, match="no joint of kitchen moves sink_area_surface"):
-        asked(ObjectPart("sink_area_surface", scene.kitchen))
+        request(ObjectPart("sink_area_surface", scene.kitchen))
     with pytest.raises(UnknownLink, match="attic_handle"):
-        asked(ObjectPart("attic_handle", scene.kitchen))
+        request(ObjectPart("attic_handle", scene.kitchen))
     with pytest.raises(NoRobotHere, match="'milk' is not a robot"):
         AccessingLocation(ObjectPart("sink_area_drawer_handle", scene.kitchen), scene.milk).resolve()
     scene.world.remove(scene.kitchen)
     with pytest.raises(PerceptionObjectNotInWorld, match="kitchen"):
-        asked(ObjectPart("sink_area_drawer_handle", scene.kitchen))
+        request(ObjectPart("sink_area_drawer_handle", scene.kitchen))

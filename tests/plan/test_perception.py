@@ -66,29 +66,29 @@ def listening() -> Iterator[Listening]:
         yield recording
 
 
-async def facing(scene: Scene, thing: Object) -> None:
+async def facing(scene: Scene, target: Object) -> None:
     """The robot stands 1 m before the counter and looks at the object."""
-    await MoveMotion(Pose([0.2, thing.pose.position.y, 0])).perform()
-    await LookAtActionPerformable(thing.pose).perform()
+    await MoveMotion(Pose([0.2, target.pose.position.y, 0])).perform()
+    await LookAtActionPerformable(target.pose).perform()
 
 
 async def test_an_object_in_view_is_seen(scene: Scene, listening: Listening) -> None:
     await facing(scene, scene.milk)
     with collected_tree() as tree:
-        found = await DetectActionPerformable(scene.milk).perform()
-    assert found == ObjectDesignator("milk", ObjectType.MILK, scene.milk)
-    assert found.pose == Pose([1.3, 1, 0.9])
+        detected = await DetectActionPerformable(scene.milk).perform()
+    assert detected == ObjectDesignator("milk", ObjectType.MILK, scene.milk)
+    assert detected.pose == Pose([1.3, 1, 0.9])
     assert shape(tree) == ["DetectActionPerformable", "  DetectingMotion"]
     motion = list(tree)[1]
     assert listening.detections == [("camera", ObjectType.MILK, (Seen(scene.milk, 1.0),), motion)]
-    assert motion.result == found
+    assert motion.result == detected
 
 
 async def test_a_believed_object_is_searched_at_its_believed_pose(scene: Scene) -> None:
     await facing(scene, scene.milk)
     believed = BelieveObject("some milk", ObjectType.MILK, Pose([1.3, 0.8, 0.9]))
-    found = await DetectAction(believed).resolve().perform()
-    assert (found.name, found.pose) == ("milk", Pose([1.3, 1, 0.9]))
+    detected = await DetectAction(believed).resolve().perform()
+    assert (detected.name, detected.pose) == ("milk", Pose([1.3, 1, 0.9]))
     described = DetectAction(ObjectDesignatorDescription(types=[ObjectType.MILK])).resolve()
     assert (await described.perform()).world_object is scene.milk
 
@@ -117,8 +117,8 @@ def angles(scene: Scene, point: Sequence[float]) -> tuple[float, float]:
 )
 async def test_the_field_of_view_is_that_of_the_camera(scene: Scene, right: float, down: float, inside: bool) -> None:
     """Half of 0.99483 rad to either side, half of 0.75049 rad up and down."""
-    for thing in (scene.kitchen, scene.milk, scene.cereal):
-        scene.world.remove(thing)
+    for target in (scene.kitchen, scene.milk, scene.cereal):
+        scene.world.remove(target)
     scene.robot.set_joint_position("head_tilt_joint", 0.1)
     camera = bullet_frame(scene.robot, "wide_stereo_optical_frame")
     x, y, z = (camera @ [2 * math.tan(right), 2 * math.tan(down), 2.0, 1.0])[:3].tolist()
@@ -183,9 +183,9 @@ async def test_the_most_visible_object_comes_first_and_all_are_recorded(scene: S
     half = Object("half hidden", ObjectType.MILK, pose=Pose([1.5, 1.03, 0.9]))
     away = Object("away", ObjectType.MILK, pose=Pose([-1.4, 1, 1.0]))
     clear = Object("clear", ObjectType.MILK, pose=Pose([1.5, 1.25, 0.9]))
-    found = await DetectingMotion(ObjectType.MILK).perform()
+    detected = await DetectingMotion(ObjectType.MILK).perform()
     ((_, _, seen, _),) = listening.detections
-    assert found.world_object is seen[0].thing
+    assert detected.world_object is seen[0].thing
     assert {each.thing for each in seen} == {scene.milk, clear}
     assert [each.visible for each in seen] == sorted((each.visible for each in seen), reverse=True)  # type: ignore[type-var]  # the camera tells shares
     assert half not in {each.thing for each in seen}
@@ -202,8 +202,8 @@ async def test_the_robot_hides_neither_its_target_nor_what_it_carries(scene: Sce
     way = np.array(scene.milk.pose.position) - eye
     cereal.set_pose(Pose((eye + way * 1.4).tolist()))
     assert scene.world.visible(cereal, eye.tolist()) < 0.8
-    for thing in (scene.milk, cereal):
-        assert (await DetectActionPerformable(thing).perform()).world_object is thing
+    for target in (scene.milk, cereal):
+        assert (await DetectActionPerformable(target).perform()).world_object is target
 
 
 async def test_the_robot_does_not_see_itself(scene: Scene) -> None:
@@ -229,8 +229,8 @@ async def test_world_state_detection_returns_the_first_of_a_type_seen_or_not(
     second = Object("second", ObjectType.MILK, pose=Pose([1.3, 1.2, 0.9]))
     scene.milk.set_pose(Pose([-3, 0, 0.2]))
     with collected_tree() as tree:
-        found = await WorldStateDetectingMotion(ObjectType.MILK).perform()
-    assert found.world_object is scene.milk
+        detected = await WorldStateDetectingMotion(ObjectType.MILK).perform()
+    assert detected.world_object is scene.milk
     assert listening.detections == [
         ("world_state", ObjectType.MILK, (Seen(scene.milk), Seen(second)), next(iter(tree)))
     ]

@@ -37,8 +37,8 @@ def past(
 class Known:
     """An experience with a few successes."""
 
-    def __init__(self, *known: PastSuccess) -> None:
-        self.known = known
+    def __init__(self, *known_poses: PastSuccess) -> None:
+        self.known = known_poses
         self.asked: list[tuple[ObjectType, Arms | None]] = []
 
     async def successes(self, object_type: ObjectType, *, arm: Arms | None) -> Sequence[PastSuccess]:
@@ -46,14 +46,14 @@ class Known:
         return self.known
 
 
-def remembered(scene: Scene, known: Known, *, arm: Arms | None = None) -> DatabaseCostmapLocation:
-    return DatabaseCostmapLocation(scene.milk, scene.robot, arm, experience=known)
+def location_from(scene: Scene, known_poses: Known, *, arm: Arms | None = None) -> DatabaseCostmapLocation:
+    return DatabaseCostmapLocation(scene.milk, scene.robot, arm, experience=known_poses)
 
 
 async def test_a_past_pose_is_carried_over_to_an_object_that_moved_and_rotated(scene: Scene) -> None:
     scene.world.remove(scene.kitchen)
     scene.milk.set_pose(Pose([2.0, 3.0, 0.9], yaw_quaternion(math.pi / 2)))
-    place = await remembered(scene, Known(past(ASIDE))).resolve()
+    place = await location_from(scene, Known(past(ASIDE))).resolve()
     assert place is not None
     # 0.6 m behind it and 0.4 m to its right, where its x points along map's y
     assert place.pose.position == pytest.approx((2.0 + 0.4, 3.0 - 0.6, 0.0))
@@ -63,7 +63,7 @@ async def test_a_past_pose_is_carried_over_to_an_object_that_moved_and_rotated(s
 
 async def test_from_a_candidate_it_can_be_picked_up_as_suggested(scene: Scene) -> None:
     stands = [Pose([x / 10, y / 10, -0.9], yaw_quaternion(-y / 8)) for x in range(-9, -4) for y in range(-3, 4)]
-    known = Known(
+    known_poses = Known(
         *(
             past(stand, arm=arm, grasp=grasp, torso=torso)
             for stand in stands
@@ -73,10 +73,10 @@ async def test_from_a_candidate_it_can_be_picked_up_as_suggested(scene: Scene) -
         )
     )
     before = scene.world.save_state()
-    places = [place async for place in remembered(scene, known)]
+    places = [place async for place in location_from(scene, known_poses)]
     assert scene.world.save_state() == before
     assert {place.grasp for place in places} == set(Grasp)
-    assert 20 < len(places) < len(known.known)
+    assert 20 < len(places) < len(known_poses.known)
     for place in places:
         assert place.grasp is not None
         assert place.torso_height is not None
@@ -88,13 +88,13 @@ async def test_from_a_candidate_it_can_be_picked_up_as_suggested(scene: Scene) -
 
 async def test_an_occupied_past_pose_is_no_candidate(scene: Scene) -> None:
     stand = BEFORE_IT
-    assert await remembered(scene, Known(past(stand))).resolve() is not None
+    assert await location_from(scene, Known(past(stand))).resolve() is not None
     # The base is at (0.6, 1.0): 0.25 m clear of the crate, then 0.35 m.
     crate = Object("crate", ObjectType.GENERIC_OBJECT, box_urdf("crate", x=(-0.1, 0.1), y=(-0.1, 0.1), z=(0, 0.5)),
                    Pose([0.25, 1.0, 0]))  # fmt: skip
-    assert await remembered(scene, Known(past(stand))).resolve() is None
+    assert await location_from(scene, Known(past(stand))).resolve() is None
     crate.set_pose(Pose([0.15, 1.0, 0]))
-    assert await remembered(scene, Known(past(stand))).resolve() is not None
+    assert await location_from(scene, Known(past(stand))).resolve() is not None
 
 
 async def test_the_robot_and_its_load_do_not_occupy_a_past_pose(scene: Scene) -> None:
@@ -107,13 +107,13 @@ async def test_the_robot_and_its_load_do_not_occupy_a_past_pose(scene: Scene) ->
 
 
 async def test_an_unreachable_past_pose_is_a_candidate_only_if_no_reach_is_requested(scene: Scene) -> None:
-    known = Known(past(torso=0.3), past(torso=0.0, grasp=Grasp.TOP), past(torso=0.9))
-    places = [place.torso_height async for place in remembered(scene, known)]
+    known_poses = Known(past(torso=0.3), past(torso=0.0, grasp=Grasp.TOP), past(torso=0.9))
+    places = [place.torso_height async for place in location_from(scene, known_poses)]
     assert places == [0.3]
-    everywhere = DatabaseCostmapLocation(scene.milk, experience=known)
+    everywhere = DatabaseCostmapLocation(scene.milk, experience=known_poses)
     assert [place.torso_height async for place in everywhere] == [0.3, 0.0, 0.9]
     scene.milk.set_pose(Pose([1.3, 1, 1.9]))
-    assert await remembered(scene, known).resolve() is None
+    assert await location_from(scene, known_poses).resolve() is None
 
 
 async def test_experience_with_upright_objects_is_not_carried_over_to_a_lying_one(scene: Scene) -> None:
@@ -129,10 +129,10 @@ async def test_experience_with_upright_objects_is_not_carried_over_to_a_lying_on
 
 
 async def test_the_requested_arm_is_queried(scene: Scene) -> None:
-    known = Known(past())
-    await remembered(scene, known, arm=Arms.RIGHT).resolve()
-    await remembered(scene, known).resolve()
-    assert known.asked == [(ObjectType.MILK, Arms.RIGHT), (ObjectType.MILK, None)]
+    known_poses = Known(past())
+    await location_from(scene, known_poses, arm=Arms.RIGHT).resolve()
+    await location_from(scene, known_poses).resolve()
+    assert known_poses.asked == [(ObjectType.MILK, Arms.RIGHT), (ObjectType.MILK, None)]
 
 
 async def test_the_experience_of_the_context_is_queried_and_without_one_an_error_is_raised(scene: Scene) -> None:
@@ -155,10 +155,10 @@ async def test_an_invalid_request_is_refused(scene: Scene) -> None:
     with pytest.raises(CallerError, match="pass an object as target, not a place"):
         DatabaseCostmapLocation(Pose())  # type: ignore[arg-type]  # the fault this test is about
     with pytest.raises(CallerError, match="uses one arm: reachable_arm must be LEFT, RIGHT, or None"):
-        remembered(scene, Known(), arm=Arms.BOTH)
+        location_from(scene, Known(), arm=Arms.BOTH)
     scene.world.remove(scene.robot)
     with pytest.raises(PerceptionObjectNotInWorld, match="pr2"):
-        await remembered(scene, Known(past())).resolve()
+        await location_from(scene, Known(past())).resolve()
 
 
 # --- notifications of a recorder --------------------------------------------------------------------------------------
@@ -172,7 +172,7 @@ def candidate(place: Location) -> Candidate:
 
 async def test_candidates_and_choice_are_recorded_with_grasp_and_torso_height(scene: Scene) -> None:
     with Recording().listening() as recording:
-        place = await remembered(scene, Known(HIDDEN, GOOD, OTHER)).resolve()
+        place = await location_from(scene, Known(HIDDEN, GOOD, OTHER)).resolve()
     assert place is not None
     assert candidate(place) == Candidate(place.pose, (Arms.LEFT,), Grasp.FRONT, 0.3)
     assert recording.places == [("DatabaseCostmapLocation", (candidate(place),), 0, 2, None)]
@@ -180,8 +180,8 @@ async def test_candidates_and_choice_are_recorded_with_grasp_and_torso_height(sc
 
 async def test_a_search_without_usable_experience_is_recorded_too(scene: Scene) -> None:
     with Recording().listening() as recording:
-        assert await remembered(scene, Known()).resolve() is None
-        assert await remembered(scene, Known(HIDDEN)).resolve() is None
+        assert await location_from(scene, Known()).resolve() is None
+        assert await location_from(scene, Known(HIDDEN)).resolve() is None
     assert recording.places == [
         ("DatabaseCostmapLocation", (), None, 0, None),
         ("DatabaseCostmapLocation", (), None, 1, None),
@@ -193,7 +193,7 @@ async def test_a_search_without_usable_experience_is_recorded_too(scene: Scene) 
 
 
 async def test_a_loop_over_candidates_is_recorded_once_at_its_end(scene: Scene) -> None:
-    location = remembered(scene, Known(HIDDEN, GOOD, OTHER))
+    location = location_from(scene, Known(HIDDEN, GOOD, OTHER))
     with Recording().listening() as recording:
         places = [place async for place in location]
         async for place in location:

@@ -179,8 +179,8 @@ async def test_a_hand_that_checks_collisions_fails_where_its_arm_would_collide_a
         assert repr(robot) == "<simulated (soft limits, minding collisions) robot>"
         with pytest.raises(ManipulationGoalInCollision, match="LEFT arm would be in kitchen") as failed:
             await MoveTCPMotion(goal, Arms.LEFT).perform()
-    part, thing = failed.value.data
-    assert thing == "kitchen"
+    part, obstacle = failed.value.data
+    assert obstacle == "kitchen"
     assert part in scene.robot.links
     assert scene.robot.joint_positions() == before
     await MoveTCPMotion(goal, Arms.LEFT).perform()  # the others do not check

@@ -94,11 +94,11 @@ async def test_the_result_of_a_simulation_comes_true_to_the_last_bit(scene: Scen
     await MoveTorsoActionPerformable(0.3).perform()
     with SimulatedTaskTree() as tree:
         await plan()
-        thought = current_world.get().save_state()  # type: ignore[union-attr]
+        simulated = current_world.get().save_state()  # type: ignore[union-attr]
     assert scene.cereal.pose == Pose([1.3, 0.7, 0.95])
     with collected_tree() as real:
         await plan()
-    assert scene.world.save_state() == thought
+    assert scene.world.save_state() == simulated
     assert [str(node) for node in tree] == [str(node) for node in real]
     assert scene.cereal.pose.distance(target) < 0.01
 
@@ -110,19 +110,19 @@ async def test_designators_refer_to_the_copy_inside_and_to_the_real_object_outsi
     with SimulatedTaskTree():
         copy = current_world.get()
         assert copy is not None
-        there = copy.object("milk")
-        assert in_world(milk) is in_world(scene.milk) is there
-        there.set_pose(Pose([5, 5, 5]))
+        copied_milk = copy.object("milk")
+        assert in_world(milk) is in_world(scene.milk) is copied_milk
+        copied_milk.set_pose(Pose([5, 5, 5]))
         assert milk.pose == designator_of(scene.milk).pose == Pose([5, 5, 5])
         assert milk.frozen_copy().pose == Pose([5, 5, 5])
         copy.object("pr2").set_pose(Pose([7, 0, 0]))
         assert part.pose.position.x == pytest.approx(real_part.position.x + 7, abs=1e-6)
         inside = ObjectDesignatorDescription(names=["milk"]).resolve()
-        assert inside.world_object is there
+        assert inside.world_object is copied_milk
     assert milk.pose == Pose([1.3, 1, 0.9])
     assert part.pose == real_part
     assert inside.pose == Pose([1.3, 1, 0.9])
-    assert in_world(inside) is in_world(there) is scene.milk
+    assert in_world(inside) is in_world(copied_milk) is scene.milk
 
 
 async def test_a_world_object_as_an_argument_refers_to_the_copy_too(scene: Scene) -> None:
@@ -295,21 +295,21 @@ async def test_simulations_nest(scene: Scene) -> None:
             assert in_world(scene.robot).pose == THERE
             await NavigateActionPerformable(Pose([2, 2, 0])).perform()
             assert in_world(scene.robot).pose == Pose([2, 2, 0])
-            found = designator_of(in_world(scene.milk))
+            resolved = designator_of(in_world(scene.milk))
         assert in_world(scene.robot).pose == THERE
-        assert in_world(found).world is current_world.get()
+        assert in_world(resolved).world is current_world.get()
     assert (len(outer), len(inner)) == (2, 2)
-    assert in_world(found) is scene.milk
+    assert in_world(resolved) is scene.milk
     assert scene.robot.pose == Pose()
 
 
 async def test_a_designator_resolved_in_one_simulation_refers_to_the_copy_in_the_next(scene: Scene) -> None:
     with SimulatedTaskTree():
-        found = ObjectDesignatorDescription(names=["milk"]).resolve()
-        in_world(found).set_pose(Pose([9, 9, 9]))
+        resolved = ObjectDesignatorDescription(names=["milk"]).resolve()
+        in_world(resolved).set_pose(Pose([9, 9, 9]))
     with SimulatedTaskTree():
-        assert found.pose == Pose([1.3, 1, 0.9])
-        assert in_world(found).world is current_world.get()
+        assert resolved.pose == Pose([1.3, 1, 0.9])
+        assert in_world(resolved).world is current_world.get()
 
 
 async def test_two_tasks_simulate_concurrently_while_a_third_acts(scene: Scene) -> None:
@@ -378,10 +378,10 @@ async def test_a_robot_chosen_inside_a_simulation_is_not_chosen_outside() -> Non
 
 
 def test_a_simulation_is_entered_once_and_described_in_words() -> None:
-    thought = SimulatedTaskTree()
-    with thought:
+    simulated = SimulatedTaskTree()
+    with simulated:
         pass
-    with pytest.raises(CallerError, match="entered once; make a new SimulatedTaskTree"), thought:
+    with pytest.raises(CallerError, match="entered once; make a new SimulatedTaskTree"), simulated:
         pass
     with pytest.raises(CallerError, match="a str, not 3"):
         SimulatedTaskTree(description=3)  # type: ignore[arg-type]

@@ -100,7 +100,7 @@ async def test_a_recorder_is_notified_of_the_whole_thesis_plan(scene: Scene) -> 
         "place SemanticCostmapLocation",
         "place CostmapLocation",
     ]
-    assert all((taken, len(offered)) == (0, 1) for _, offered, taken, _, _ in recording.places)
+    assert all((taken, len(candidates)) == (0, 1) for _, candidates, taken, _, _ in recording.places)
 
 
 class Alternating(Recording):
@@ -111,7 +111,7 @@ class Alternating(Recording):
 
 
 async def test_three_concurrent_plans_in_three_worlds_do_not_mix() -> None:
-    async def alone() -> tuple[float, str]:
+    async def run_once() -> tuple[float, str]:
         with BulletWorld(mode=WorldMode.DIRECT), simulated_robot, collected_tree() as tree:
             Object("pr2", ObjectType.ROBOT)
             Object("kitchen", ObjectType.ENVIRONMENT)
@@ -122,7 +122,7 @@ async def test_three_concurrent_plans_in_three_worlds_do_not_mix() -> None:
 
     all_ready = asyncio.Barrier(3)
     with Alternating().listening() as recording:
-        for distance, tree in await asyncio.gather(alone(), alone(), alone()):
+        for distance, tree in await asyncio.gather(run_once(), run_once(), run_once()):
             assert distance < 0.01
             assert tree == TREE
     assert recording.notes[:3] == ["start ParkArmsActionPerformable"] * 3

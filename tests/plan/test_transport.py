@@ -55,9 +55,9 @@ async def test_a_transported_object_is_at_its_target_and_the_arms_are_parked(sce
     assert len(tree) == 1 + 2 + 2 + 6 + 2 + 2 + 4 + 2
     assert [place[0] for place in recording.places] == ["CostmapLocation"] * 2
     transport = next(iter(tree))
-    for _, offered, taken, _, node in recording.places:
+    for _, candidates, taken, _, node in recording.places:
         assert (taken, node) == (0, transport)
-        assert arm in offered[0].arms
+        assert arm in candidates[0].arms
     assert scene.robot.pose == recording.places[1][1][0].pose
 
 

@@ -35,8 +35,8 @@ _NAMED = {
 async def names(log: EventLog, *kinds: str) -> list[str]:
     """Return the names of the tables, or of the views, or of both in the database."""
     database = log.engine.dialect.name
-    asked = _NAMED[database].format(", ".join(_KINDS[database][each] for each in kinds))
-    return [name for (name,) in await ask(log, asked)]
+    statement = _NAMED[database].format(", ".join(_KINDS[database][each] for each in kinds))
+    return [name for (name,) in await ask(log, statement)]
 
 
 async def all_rows(log: EventLog) -> dict[str, list[tuple[Any, ...]]]:

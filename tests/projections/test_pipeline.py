@@ -51,17 +51,17 @@ class LosesAnswers(WorkerInLoop):
 class LosesBatches(WorkerInLoop):
     """Lose every third batch before writing it."""
 
-    asked = 0
+    requests = 0
 
     async def write(self) -> int:
-        self.asked += 1
-        return 0 if self.asked % 3 == 0 else await super().write()
+        self.requests += 1
+        return 0 if self.requests % 3 == 0 else await super().write()
 
 
 class DiesOften(WorkerInLoop):
     """Die at every third request, so that another worker replaces it."""
 
-    asked = 0
+    requests = 0
 
     async def prepare(self, spans: Sequence[Span]) -> BatchPreview:
         self._live()
@@ -72,8 +72,8 @@ class DiesOften(WorkerInLoop):
         return await super().write()
 
     def _live(self) -> None:
-        self.asked += 1
-        if self.asked % 3 == 0:
+        self.requests += 1
+        if self.requests % 3 == 0:
             raise Died
 
 

@@ -102,9 +102,9 @@ LIFT = msgspec.structs.replace(declared("LiftAction", "lift_action", *CAREFUL.fi
         (PICK_UP, CAREFUL, msgspec.structs.replace(LIFT, bases=("PickUpAction",)), WARY),
     ],
 )
-@pytest.mark.parametrize("in_own_loop", [True, False])
+@pytest.mark.parametrize("declared_together", [True, False])
 async def test_the_pick_up_view_includes_descendants_and_former_names_in_any_order(
-    log: EventLog, types: tuple[DesignatorTypeDeclared, ...], in_own_loop: bool
+    log: EventLog, types: tuple[DesignatorTypeDeclared, ...], declared_together: bool
 ) -> None:
     script = Script()
     milk = script.put(ObjectAdded("milk", "MILK", pose(1, 2, 0.9)))
@@ -115,7 +115,7 @@ async def test_the_pick_up_view_includes_descendants_and_former_names_in_any_ord
         parameters = {"object_designator": ObjectReference(milk, milk), "arm": "LEFT", "grasp": "TOP"}
         robot = RobotValue(pose(0.25, 2.5), "ROBOT", 0.3)
         rows.append(row(script.put(NodeStarted("action", None, name_of(each), parameters, robot))))
-        if not in_own_loop:
+        if not declared_together:
             await log.append([*declarations(each), *script.records])
             await projector.catch_up()
     await log.append([*declarations(*types), *script.records])
@@ -208,8 +208,8 @@ async def test_a_user_view_is_made_beside_the_tables_and_changed_with_its_query(
     await Projector(log, views=[reasons]).open()
     assert await ask(log, "SELECT * FROM reasons") == [("IKError", 1)]
     async with AsyncSession(log.engine) as session:
-        asked = await session.execute(select(reasons.table.c.times).where(reasons.table.c.reason == "IKError"))
-        assert asked.scalars().all() == [1]
+        counts = await session.execute(select(reasons.table.c.times).where(reasons.table.c.reason == "IKError"))
+        assert counts.scalars().all() == [1]
     await Projector(log, views=[UserView("reasons", select(node.reason).where(node.reason.is_not(None)))]).open()
     assert await ask(log, "SELECT * FROM reasons") == [("IKError",)]
 

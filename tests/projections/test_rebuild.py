@@ -92,8 +92,8 @@ async def test_rebuilt_tables_equal_row_for_row_those_folded_live(database_url: 
 @pytest.mark.soak_on("postgresql")
 async def test_a_view_of_the_package_that_was_noted_as_a_users_one_is_rebuilt_too(database_url: str) -> None:
     await store(database_url, [*TYPES, *picking(1).records])
-    asked = 'SELECT id, arm, status FROM "PickUpWithContextView" ORDER BY id'
-    before = ask(database_url, asked)
+    query = 'SELECT id, arm, status FROM "PickUpWithContextView" ORDER BY id'
+    before = ask(database_url, query)
     assert before
     notes = "memory_tables.pycrorm_generation" if database_url.startswith("postgresql:") else "pycrorm_generation"
     [(noted,)] = ask(database_url, f"SELECT layout FROM {notes} WHERE projection = 'tables'")
@@ -102,7 +102,7 @@ async def test_a_view_of_the_package_that_was_noted_as_a_users_one_is_rebuilt_to
     changed = msgspec.json.encode(layout).decode()
     ask_to_change(database_url, f"UPDATE {notes} SET layout = '{changed}' WHERE projection = 'tables'")
     await rebuild_memory(database_url)
-    assert ask(database_url, asked) == before
+    assert ask(database_url, query) == before
 
 
 FAILED = 'SELECT * FROM "Failed" ORDER BY id'
@@ -210,13 +210,13 @@ async def fold_beside(database_url: str, tmp_path: Path, *, rebuilds: int) -> No
         await log.close()
 
     async def read() -> None:
-        asked = [
+        query = [
             select(func.count()).select_from(each) for each in (TaskTreeNode, PickUpAction, TaskTreeNode.__table__)
         ]
         async with Reading.open(database_url) as reading:
             while not over.is_set():
                 async with reading.session() as session:
-                    counts = [(await session.scalars(each)).one() for each in asked]
+                    counts = [(await session.scalars(each)).one() for each in query]
                     counts.append(len((await session.scalars(select(Action.id))).all()))
                 seen.append((len(await reading.episodes()), *counts))
                 await asyncio.sleep(0)

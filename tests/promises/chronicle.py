@@ -41,9 +41,9 @@ class Chronicle:
         self._known: dict[str, tuple[tuple[float, ...], dict[str, float]]] = {}
         """Pose and joints of every object, as last reported."""
 
-    def begin_with(self, things: Iterable[Object]) -> None:
+    def begin_with(self, present: Iterable[Object]) -> None:
         """Take over the objects that were in the world before the observer."""
-        self._known |= {each.name: (numbers(each.pose), each.joint_positions()) for each in things}
+        self._known |= {each.name: (numbers(each.pose), each.joint_positions()) for each in present}
 
     def known_pose(self, name: str) -> tuple[float, ...]:
         """Return the last reported pose of the object."""
@@ -74,9 +74,9 @@ class Chronicle:
     def object_detached(self, parent: Object, child: Object, link: str | None) -> None:
         self._note("detached", parent.name, child.name, link, *self._poses(parent, child))
 
-    def _poses(self, *things: Object) -> list[tuple[float, ...]]:
+    def _poses(self, *present: Object) -> list[tuple[float, ...]]:
         """Return the last reported poses."""
-        return [self.known_pose(each.name) for each in things]
+        return [self.known_pose(each.name) for each in present]
 
     def assert_no_unreported_change(self, world: BulletWorld) -> None:
         """Assert that every object is in Bullet as last reported."""
@@ -150,9 +150,9 @@ def numbers(pose: Pose) -> tuple[float, ...]:
     return (*pose.position, *pose.orientation)
 
 
-def assert_pose_in_bullet(thing: Object, pose: Pose) -> None:
+def assert_pose_in_bullet(world_object: Object, pose: Pose) -> None:
     """Assert the pose of the root link in Bullet, which itself gives the centre of mass."""
-    body, client = thing.body.number, thing.world.client
+    body, client = world_object.body.number, world_object.world.client
     facts = pybullet.getDynamicsInfo(body, -1, physicsClientId=client)
     to_root = pybullet.invertTransform(facts[3], facts[4])
     centre = pybullet.getBasePositionAndOrientation(body, physicsClientId=client)
@@ -162,9 +162,9 @@ def assert_pose_in_bullet(thing: Object, pose: Pose) -> None:
     assert [each if same_sign else -each for each in orientation] == pytest.approx(list(pose.orientation), abs=1e-5)
 
 
-def joints_of_bullet(thing: Object) -> dict[str, float]:
+def joints_of_bullet(world_object: Object) -> dict[str, float]:
     """Return every joint's position in Bullet."""
-    body, client = thing.body.number, thing.world.client
+    body, client = world_object.body.number, world_object.world.client
     return {
         pybullet.getJointInfo(body, index, physicsClientId=client)[1].decode(): pybullet.getJointState(
             body, index, physicsClientId=client

@@ -76,7 +76,7 @@ async def every(memory: Memory | Reading, statement: Select[Any], *, simulated: 
         return list(await session.scalars(statement))
 
 
-async def asked(folder: Path, statement: Select[Any]) -> list[Any]:
+async def results_of(folder: Path, statement: Select[Any]) -> list[Any]:
     """Return the same of a closed memory."""
     async with Reading.open(url_of(folder)) as reading:
         return await every(reading, statement)
@@ -84,7 +84,7 @@ async def asked(folder: Path, statement: Select[Any]) -> list[Any]:
 
 async def nodes_of(folder: Path) -> list[TaskTreeNode]:
     """Return every node of the memory, roots included, in the order of their starts."""
-    return await asked(folder, select(TaskTreeNode).order_by(TaskTreeNode.id))
+    return await results_of(folder, select(TaskTreeNode).order_by(TaskTreeNode.id))
 
 
 def statuses(nodes: list[TaskTreeNode]) -> list[tuple[str | None, str]]:

@@ -68,9 +68,9 @@ WRONG: dict[str, tuple[Callable[[], Any], str]] = {
 
 @pytest.mark.parametrize("name", WRONG)
 async def test_an_expression_that_was_built_wrongly_fails_with_the_reason(tmp_path: Path, name: str) -> None:
-    made, why = WRONG[name]
+    wrong_expression, why = WRONG[name]
     async with recorded(tmp_path):
-        await (PlanningActionPerformable(made) - NoteActionPerformable("went on")).perform()
+        await (PlanningActionPerformable(wrong_expression) - NoteActionPerformable("went on")).perform()
     _, expression, planning, note = await nodes_of(tmp_path)
     assert statuses([expression, planning, note]) == [
         ("TryInOrder", "SUCCEEDED"),

@@ -36,7 +36,7 @@ from pycrorm_async.plan.task_tree import TaskStatus
 from pycrorm_async.world import Arms, BulletWorld, Grasp, GripperState, ObjectType, Pose
 from pycrorm_async.world.robots.robot_description import PR2
 from tests.memory.note_actions import NoteActionPerformable
-from tests.promises.lab import Lab, asked, lab, nodes_of, recorded, statuses, url_of, written
+from tests.promises.lab import Lab, lab, nodes_of, recorded, results_of, statuses, url_of, written
 
 pytestmark = pytest.mark.slow
 
@@ -309,7 +309,7 @@ async def test_an_uncaught_failure_is_recorded_up_to_the_episode(tmp_path: Path)
             "milk is not an object of the world",
         )
         assert node.failure_arguments == ["milk is not an object of the world", "milk"]
-    (episode,) = await asked(tmp_path, select(ProcessMetaData))
+    (episode,) = await results_of(tmp_path, select(ProcessMetaData))
     assert (episode.status, episode.failure_message) == ("FAILED", "milk is not an object of the world")
     assert episode.failure_type == "pycrorm_async.plan.failures.PerceptionObjectNotInWorld"
 
@@ -320,8 +320,8 @@ async def test_a_failed_search_is_recorded_as_a_node_of_its_own(tmp_path: Path) 
             for name in ("perception of what there is not", "a pose no place reaches"):
                 attempt = AttemptActionPerformable(lambda name=name: CASES[name].attempt(scene))  # type: ignore[misc]  # bound now
                 await ServingActionPerformable(attempt).perform()
-    assert await asked(tmp_path, select(Detection)) == []
-    (search,) = await asked(tmp_path, select(LocationResolution))
+    assert await results_of(tmp_path, select(Detection)) == []
+    (search,) = await results_of(tmp_path, select(LocationResolution))
     assert (search.location, search.offered, search.taken, search.pose) == ("CostmapLocation", 0, None, None)
     assert search.considered == 600
     assert search.node.dtype == "AttemptAction"
@@ -376,7 +376,7 @@ async def test_a_plan_without_world_or_robot_fails_with_the_next_step_and_is_rec
             await resolved(MoveTorsoAction([0.1]))
         with BulletWorld(), pytest.raises(CallerError, match="add one"):
             await resolved(MoveTorsoAction([0.1]))
-    actions = await asked(tmp_path, select(Action).order_by(Action.id))
+    actions = await results_of(tmp_path, select(Action).order_by(Action.id))
     assert [each.dtype for each in actions] == ["NavigateAction", "MoveTorsoAction", "MoveTorsoAction"]
     reasons = select(TaskTreeNode.reason).where(TaskTreeNode.kind == "action").order_by(TaskTreeNode.id)
-    assert await asked(tmp_path, reasons) == ["NoRobotChosen", "NoWorld", "NoRobotHere"]
+    assert await results_of(tmp_path, reasons) == ["NoRobotChosen", "NoWorld", "NoRobotHere"]

@@ -31,8 +31,8 @@ def test_every_defect_has_a_test_and_a_line_in_the_readme() -> None:
     assert len(files) == 4
     tested: dict[str, str] = {}
     for path in files:
-        declared, there = declared_and_tested(path)
-        assert set(declared.values()) <= there, path.name
+        declared, existing = declared_and_tested(path)
+        assert set(declared.values()) <= existing, path.name
         assert not tested.keys() & declared.keys(), path.name
         tested |= declared
     numbers = [*map(str, range(1, 21)), *"abcde", *(f"s{number}" for number in range(1, 9))]

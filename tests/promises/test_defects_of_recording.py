@@ -71,12 +71,12 @@ from tests.promises.lab import (
     MILK_AT,
     WITHIN_REACH,
     FailingActionPerformable,
-    asked,
     at,
     every,
     lab,
     nodes_of,
     recorded,
+    results_of,
     statuses,
     turned,
     url_of,
@@ -142,7 +142,7 @@ async def test_an_action_on_a_believed_object_is_stored_with_its_believed_pose(t
             with pytest.raises(PerceptionObjectNotInWorld):
                 await PickUpActionPerformable(cup, Arms.LEFT, Grasp.TOP).perform()
             await NavigateActionPerformable(cup.pose).perform()
-    (pick,) = await asked(tmp_path, select(PickUpAction))
+    (pick,) = await results_of(tmp_path, select(PickUpAction))
     assert isinstance(pick.object, BelieveObject)
     assert (pick.object.name, pick.object.obj_type, pick.object.identity_id) == ("cup", ObjectType.JEROEN_CUP, None)
     assert at(pick.object.pose) == (2, 3, 0.5)
@@ -174,7 +174,7 @@ async def test_an_error_in_an_action_differs_from_a_plan_failure_and_from_an_act
     assert crashed.failure_message == "('division by zero', 7)"
     assert crashed.failure_arguments == ["division by zero", 7]
     assert all(node.end_time is not None and node.end_time >= node.start_time for node in (root, failed, crashed))
-    (episode,) = await asked(tmp_path, select(ProcessMetaData))
+    (episode,) = await results_of(tmp_path, select(ProcessMetaData))
     assert (episode.status, episode.failure_type) == ("ERROR", "builtins.ZeroDivisionError")
 
 
@@ -324,13 +324,13 @@ async def test_all_times_are_moments_in_utc_whatever_the_local_time_is(
             await PickUpActionPerformable(scene.milk, Arms.LEFT, Grasp.FRONT).perform()
     ended = datetime.now(UTC)
     moments = [
-        *await asked(tmp_path, select(ProcessMetaData.created_at)),
-        *await asked(tmp_path, select(ProcessMetaData.ended_at)),
-        *await asked(tmp_path, select(TaskTreeNode.start_time)),
-        *await asked(tmp_path, select(TaskTreeNode.end_time)),
-        *await asked(tmp_path, select(PoseRow.time)),
-        *await asked(tmp_path, select(Object.time)),
-        *await asked(tmp_path, select(Attachment.time)),
+        *await results_of(tmp_path, select(ProcessMetaData.created_at)),
+        *await results_of(tmp_path, select(ProcessMetaData.ended_at)),
+        *await results_of(tmp_path, select(TaskTreeNode.start_time)),
+        *await results_of(tmp_path, select(TaskTreeNode.end_time)),
+        *await results_of(tmp_path, select(PoseRow.time)),
+        *await results_of(tmp_path, select(Object.time)),
+        *await results_of(tmp_path, select(Attachment.time)),
     ]
     assert len(moments) > 30
     assert {moment.utcoffset() for moment in moments} == {timedelta(0)}
@@ -354,7 +354,7 @@ async def test_joint_targets_places_detections_and_attachments_are_recorded(tmp_
             await LookAtActionPerformable(scene.cereal.pose).perform()
             await DetectingMotion(ObjectType.BREAKFAST_CEREAL).perform()
             parked = {name: scene.robot.robot_description.arms[Arms.LEFT].park[name] for name in LEFT_ARM}  # type: ignore[union-attr]  # it is a PR2
-    rows = {row.dtype: row for row in await asked(tmp_path, select(Designator).order_by(Designator.id))}
+    rows = {row.dtype: row for row in await results_of(tmp_path, select(Designator).order_by(Designator.id))}
     arm = rows["MoveArmJointsMotion"]
     assert isinstance(arm, MoveArmJointsMotion)
     assert (arm.left_arm_poses, arm.right_arm_poses) == (parked, {})
@@ -369,11 +369,11 @@ async def test_joint_targets_places_detections_and_attachments_are_recorded(tmp_
         Arms.LEFT,
         Grasp.FRONT,
     )
-    resolved, failed = await asked(tmp_path, select(LocationResolution).order_by(LocationResolution.id))
+    resolved, failed = await results_of(tmp_path, select(LocationResolution).order_by(LocationResolution.id))
     assert (resolved.location, resolved.offered, resolved.taken) == ("CostmapLocation", 1, 0)
     assert resolved.considered >= 1
     assert (failed.offered, failed.taken, failed.considered) == (0, None, 600)
-    refused = await asked(tmp_path, select(LocationRefusal).order_by(LocationRefusal.position))
+    refused = await results_of(tmp_path, select(LocationRefusal).order_by(LocationRefusal.position))
     refused = [each for each in refused if each.resolution_id == failed.id]
     assert [each.position for each in refused] == list(range(600))
     assert len({(each.x, each.y) for each in refused}) == 600
@@ -385,12 +385,12 @@ async def test_joint_targets_places_detections_and_attachments_are_recorded(tmp_
         await MoveTorsoActionPerformable(0.3).perform()
         await MoveTCPMotion(TOO_HIGH, Arms.LEFT).perform()
     assert refused[0].reason.removeprefix("LEFT: ") in str(unreachable.value)
-    (candidate,) = await asked(tmp_path, select(LocationCandidate))
+    (candidate,) = await results_of(tmp_path, select(LocationCandidate))
     assert ((candidate.x, candidate.y, candidate.z), candidate.arms) == (stand.pose.position, "LEFT")
-    (seen,) = await asked(tmp_path, select(Detection))
+    (seen,) = await results_of(tmp_path, select(Detection))
     assert (seen.source, seen.looked_for, seen.name) == ("camera", ObjectType.BREAKFAST_CEREAL, "cereal")
     assert ((seen.x, seen.y, seen.z), seen.visible, seen.node.dtype) == ((1.3, 0.7, 0.95), 1.0, "DetectingMotion")
-    held = await asked(tmp_path, select(Attachment).order_by(Attachment.id))
+    held = await results_of(tmp_path, select(Attachment).order_by(Attachment.id))
     assert [(each.kind, each.parent.name, each.child.name, each.link) for each in held] == [
         ("attached", "pr2", "milk", "l_gripper_tool_frame"),
         ("detached", "pr2", "milk", "l_gripper_tool_frame"),
@@ -443,12 +443,12 @@ async def test_opening_and_closing_keep_their_object(tmp_path: Path) -> None:
             await OpenActionPerformable(handle, Arms.LEFT).perform()
             await CloseActionPerformable(handle, Arms.LEFT).perform()
     for mapped, x in ((OpeningMotion, 1.0), (ClosingMotion, 0.7)):
-        (motion,) = await asked(tmp_path, select(mapped))
+        (motion,) = await results_of(tmp_path, select(mapped))
         assert isinstance(motion.object, ObjectPart)
         assert motion.object.part_of is not None
         assert (motion.object.name, motion.object.part_of.name) == ("sink_area_drawer_handle", "kitchen")
         assert motion.object.pose is not None
         assert motion.object.pose.x == pytest.approx(x)  # the drawing of the kitchen; 0.3 m further out when open
         assert motion.arm is Arms.LEFT
-    turns = await asked(tmp_path, select(JointChange).where(JointChange.joint == "sink_area_drawer_joint"))
+    turns = await results_of(tmp_path, select(JointChange).where(JointChange.joint == "sink_area_drawer_joint"))
     assert [each.position for each in turns] == [pytest.approx(0.3), 0.0]

@@ -48,12 +48,12 @@ from tests.promises.lab import (
     MILK_AT,
     WITHIN_REACH,
     FailingActionPerformable,
-    asked,
     at,
     every,
     lab,
     nodes_of,
     recorded,
+    results_of,
     statuses,
     turned,
     url_of,
@@ -118,7 +118,7 @@ async def test_an_episode_without_a_description_is_stored(tmp_path: Path) -> Non
         async with memory.episode(plan="breakfast"):
             await NoteActionPerformable("in a plan").perform()
         await NoteActionPerformable("in no episode").perform()
-    found = await asked(tmp_path, select(ProcessMetaData).order_by(ProcessMetaData.id))
+    found = await results_of(tmp_path, select(ProcessMetaData).order_by(ProcessMetaData.id))
     assert [(each.description, each.plan, each.status) for each in found] == [
         ("an episode", None, "SUCCEEDED"),
         ("breakfast", "breakfast", "SUCCEEDED"),
@@ -171,9 +171,9 @@ async def test_everything_done_before_a_kill_is_stored(tmp_path: Path) -> None:
     root, *nodes = await nodes_of(tmp_path)
     assert (root.status, root.end_time) == (TaskStatus.LOST, None)
     assert statuses(nodes) == [("NavigateAction", "SUCCEEDED"), ("MoveMotion", "SUCCEEDED")] * 200
-    drives = await asked(tmp_path, select(Action).order_by(Action.id))
+    drives = await results_of(tmp_path, select(Action).order_by(Action.id))
     assert [each.target_location.x for each in drives] == [index / 100 for index in range(200)]
-    last = (await asked(tmp_path, select(Object).order_by(Object.id.desc()).limit(1)))[0]
+    last = (await results_of(tmp_path, select(Object).order_by(Object.id.desc()).limit(1)))[0]
     assert (last.name, at(last.pose)) == ("pr2", (1.99, 0, 0))
 
 
@@ -231,7 +231,7 @@ async def test_a_long_plan_costs_less_than_a_hundred_bytes_of_memory_a_node(tmp_
     # The median of all slopes: a buffer that grows once more on a busy machine is no slope.
     slope = median((later - earlier) / (last - first) / WINDOW_NODES for (first, earlier), (last, later) in windows)
     assert slope < 100, sizes  # the reference system: 33,000
-    assert len(await asked(tmp_path, select(TaskTreeNode.id))) == 7 * WINDOW_NODES + 1
+    assert len(await results_of(tmp_path, select(TaskTreeNode.id))) == 7 * WINDOW_NODES + 1
 
 
 IMPORTING = """
@@ -288,8 +288,8 @@ async def test_long_texts_and_small_differences_are_kept_exactly(tmp_path: Path)
                     await FailingActionPerformable(PlanFailure(long[:1_999])).perform()
                 turn = scene.world.object("w" * 300).pose.orientation
         await memory.flush()
-        (said,) = await every(memory, select(memory.mapped("NoteAction")))
-        assert said.text == long
+        (note,) = await every(memory, select(memory.mapped("NoteAction")))
+        assert note.text == long
         (drive,) = await every(memory, select(Action).where(Action.dtype == "NavigateAction"))
         assert at(drive.pose) == numbers
         (bowl,) = await every(memory, select(Object).where(Object.obj_type == ObjectType.BOWL))

@@ -41,11 +41,11 @@ from tests.promises.chronicle import joints_of_bullet, numbers
 from tests.promises.lab import (
     WITHIN_REACH,
     FailingActionPerformable,
-    asked,
     at,
     lab,
     nodes_of,
     recorded,
+    results_of,
     statuses,
     url_of,
 )
@@ -96,14 +96,14 @@ async def test_the_state_after_an_action_is_not_the_state_before_it(tmp_path: Pa
             await NavigateActionPerformable(WITHIN_REACH).perform()
             await PickUpActionPerformable(scene.milk, Arms.LEFT, Grasp.FRONT).perform()
             lifted = scene.milk.pose
-    first, second = await asked(tmp_path, select(NavigateAction).order_by(NavigateAction.id))
+    first, second = await results_of(tmp_path, select(NavigateAction).order_by(NavigateAction.id))
     assert [(at(each.robot_state.pose), each.robot_state.torso_height) for each in (first, second)] == [
         ((0, 0, 0), 0.0),
         ((0.6, 0.4, 0), 0.3),
     ]
-    robot = await asked(tmp_path, select(ObjectRow).where(ObjectRow.name == "pr2").order_by(ObjectRow.id))
+    robot = await results_of(tmp_path, select(ObjectRow).where(ObjectRow.name == "pr2").order_by(ObjectRow.id))
     assert [at(each.pose) for each in robot] == [(0, 0, 0), (0.6, 0.4, 0), (0.6, 0.9, 0)]
-    before, after = await asked(tmp_path, select(ObjectRow).where(ObjectRow.name == "milk").order_by(ObjectRow.id))
+    before, after = await results_of(tmp_path, select(ObjectRow).where(ObjectRow.name == "milk").order_by(ObjectRow.id))
     assert (at(before.pose), at(after.pose)) == ((1.3, 1, 0.9), lifted.position)
     assert at(before.pose) != at(after.pose)
 
@@ -181,7 +181,7 @@ async def test_every_stored_node_can_be_turned_back_into_its_designator(tmp_path
             for each in performed:
                 await each.perform()
             resting, joints = scene.milk.pose, scene.robot.joint_positions()
-    rows = await asked(tmp_path, select(Designator).where(Designator.kind == "action").order_by(Designator.id))
+    rows = await results_of(tmp_path, select(Designator).where(Designator.kind == "action").order_by(Designator.id))
     assert [type(row).__name__ for row in rows] == [type(each).dtype for each in performed]
     assert len(await nodes_of(tmp_path)) == 1 + 5 + 1 + 1 + 1 + 5 + 3
     # From the rows alone the same plan runs again, in a new world, with the same outcome.
@@ -269,10 +269,10 @@ def canonical(requirement: str) -> str:
 
 def imports(tree: ast.AST) -> set[str]:
     """Return the top-level names of the imported modules."""
-    found = set()
+    modules = set()
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
-            found |= {each.name.partition(".")[0] for each in node.names}
+            modules |= {each.name.partition(".")[0] for each in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module is not None and node.level == 0:
-            found.add(node.module.partition(".")[0])
-    return found
+            modules.add(node.module.partition(".")[0])
+    return modules

@@ -16,7 +16,7 @@ from pycrorm_async.plan import Code, Designator, NavigateAction, ParkArmsAction,
 from pycrorm_async.plan.failures import ObjectLost
 from pycrorm_async.world import Arms, Pose
 from tests.memory.note_actions import NoteActionPerformable
-from tests.promises.lab import FailingActionPerformable, asked, lab, nodes_of, recorded, statuses
+from tests.promises.lab import FailingActionPerformable, lab, nodes_of, recorded, results_of, statuses
 
 pytestmark = pytest.mark.slow
 
@@ -62,7 +62,7 @@ async def test_a_sequence_runs_in_the_order_in_which_it_is_written_however_it_is
         await ((succeeding("4") + succeeding("5")) + (succeeding("6") + (succeeding("7") + succeeding("8")))).perform()
         await memory.flush()
         notes = memory.mapped(NoteActionPerformable)
-        assert list(await asked(tmp_path, select(notes.text).order_by(notes.id))) == list("12345678")
+        assert list(await results_of(tmp_path, select(notes.text).order_by(notes.id))) == list("12345678")
     assert [dtype for dtype, _ in statuses(await nodes_of(tmp_path)) if dtype != "NoteAction"] == [
         None,
         "Sequential",
@@ -90,11 +90,11 @@ async def test_a_repetition_returns_its_rounds_and_failures(tmp_path: Path) -> N
 
 
 async def test_every_branch_performs_its_own_operand(tmp_path: Path) -> None:
-    async def said(number: int) -> int:
+    async def note_number(number: int) -> int:
         await asyncio.sleep(0)
         return number
 
-    branches: list[Designator] = [Code(said, number=number) for number in range(40)]
+    branches: list[Designator] = [Code(note_number, number=number) for number in range(40)]
     plan = branches[0] | branches[1]
     for each in branches[2:]:
         plan = plan | each
@@ -102,7 +102,7 @@ async def test_every_branch_performs_its_own_operand(tmp_path: Path) -> None:
         outcome = await plan.perform()
     assert outcome.results == tuple(range(40))
     calls = select(TaskTreeNode).where(TaskTreeNode.dtype == "Code").order_by(TaskTreeNode.id)
-    assert sorted(node.result for node in await asked(tmp_path, calls)) == list(range(40))
+    assert sorted(node.result for node in await results_of(tmp_path, calls)) == list(range(40))
 
 
 async def test_expressions_are_nodes_of_the_recorded_tree(tmp_path: Path) -> None:
@@ -111,10 +111,10 @@ async def test_expressions_are_nodes_of_the_recorded_tree(tmp_path: Path) -> Non
             plan = NavigateAction([Pose([1, 0, 0])]) + (failing() - ParkArmsAction([Arms.LEFT]))
             await plan.perform()
     nodes = await nodes_of(tmp_path)
-    found = {node.id: node for node in nodes}
+    nodes_by_id = {node.id: node for node in nodes}
 
     def depth(node: TaskTreeNode) -> int:
-        return 0 if node.parent_id is None else 1 + depth(found[node.parent_id])
+        return 0 if node.parent_id is None else 1 + depth(nodes_by_id[node.parent_id])
 
     assert [(depth(node), node.kind, node.dtype, node.status.name) for node in nodes] == [
         (0, "root", None, "SUCCEEDED"),

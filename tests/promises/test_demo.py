@@ -110,11 +110,11 @@ class WorldObserver:
     def object_detected(self, **arguments: Any) -> None:
         self.memory.object_detected(**arguments)
 
-    def simulation_started(self, thought: Simulation) -> None:
-        self.memory.simulation_started(thought)
+    def simulation_started(self, simulation: Simulation) -> None:
+        self.memory.simulation_started(simulation)
 
-    def simulation_ended(self, thought: Simulation, failure: BaseException | None) -> None:
-        self.memory.simulation_ended(thought, failure)
+    def simulation_ended(self, simulation: Simulation, failure: BaseException | None) -> None:
+        self.memory.simulation_ended(simulation, failure)
 
 
 def tree_text(nodes: list[Any]) -> str:

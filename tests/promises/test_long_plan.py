@@ -64,9 +64,9 @@ def test_a_long_plan_is_stored_whole_and_its_process_does_not_grow(tmp_path: Pat
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    found = json.loads(done.stdout)
-    assert found["rows"] == [total, 0, total - 1, total]
-    assert found["done"] == total + 1  # the root of the episode as well
+    figures = json.loads(done.stdout)
+    assert figures["rows"] == [total, 0, total - 1, total]
+    assert figures["done"] == total + 1  # the root of the episode as well
     # In KiB, over the second half: the flush before it has seen the largest batch of the writer, which may come late on
     # a busy machine. 32 kB a node, as in the reference system, would be 960 MB for the smaller plan.
-    assert found["sizes"][-1] - found["sizes"][4] < 12_000, found["sizes"]
+    assert figures["sizes"][-1] - figures["sizes"][4] < 12_000, figures["sizes"]

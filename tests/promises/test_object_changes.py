@@ -215,9 +215,9 @@ async def test_a_simulation_changes_nothing_that_is_recorded_as_real(tmp_path: P
         await memory.flush()
         assert real.short()[3:] == [("moved", "pr2", "MoveMotion"), ("joints", "pr2", "MoveJointsMotion")]
         assert_same((await read_from_memory(memory))[: len(real.entries)], real.entries)
-        there, _, _, *thought = await read_from_memory(memory, 2, simulated=True)
-        assert (there.what[1], there.what[2][:3]) == ("pr2", (0.6, 0.9, 0))  # it begins with the objects of the world
-        assert_same(thought[: len(imagined.entries)], imagined.entries)
+        entry, _, _, *simulation_entries = await read_from_memory(memory, 2, simulated=True)
+        assert (entry.what[1], entry.what[2][:3]) == ("pr2", (0.6, 0.9, 0))  # it begins with the objects of the world
+        assert_same(simulation_entries[: len(imagined.entries)], imagined.entries)
         assert ("attached", "pr2", "PickUpAction") in imagined.short()
         assert await read_from_memory(memory, 2) == []
         episodes = await every(memory, select(ProcessMetaData).order_by(ProcessMetaData.id), simulated=True)

@@ -61,13 +61,13 @@ def names_of(paths: list[Path]) -> list[str]:
 
 def replaced_in(paths: list[Path]) -> list[str]:
     """Return the places at which prose has a word that the glossary replaces."""
-    found = {
+    violations = {
         f"{path.relative_to(ROOT)}:{line}: {match.group()}"
         for path in paths
         for line, text in texts_of(ast.parse(path.read_text()))
         for match in REPLACED.finditer(without_code(text))
     }
-    return sorted(found)
+    return sorted(violations)
 
 
 def test_no_file_is_longer_than_four_hundred_lines() -> None:

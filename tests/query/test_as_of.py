@@ -341,10 +341,10 @@ async def test_a_snapshot_can_be_printed(reading: Reading) -> None:
 
 
 async def test_an_episode_can_be_named_by_number_id_or_last(log: EventLog) -> None:
-    thought = Script(3)
-    thought.put(EpisodeStarted("a thought", "me", "h", "1", "3.11", simulated=True, thought_by=NodeReference(ID, 5)))
-    thought.put(NodeStarted("root", simulated=True))
-    await stored_and_folded(log, [*declarations(*TYPES), *story().records, *story(2).records, *thought.records])
+    simulation = Script(3)
+    simulation.put(EpisodeStarted("a thought", "me", "h", "1", "3.11", simulated=True, thought_by=NodeReference(ID, 5)))
+    simulation.put(NodeStarted("root", simulated=True))
+    await stored_and_folded(log, [*declarations(*TYPES), *story().records, *story(2).records, *simulation.records])
     async with Reading.open_address(log.address) as reading:
         second = await reading.episode("2")
         for name, number in ((1, 1), ("1", 1), (ID, 1), ("last", 2), (second, 2), (second.id, 2), (3, 3)):

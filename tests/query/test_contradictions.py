@@ -38,7 +38,7 @@ class ORMBow(Action):
     id: Mapped[int] = mapped_column(ForeignKey(f"{Action.__tablename__}.id"), primary_key=True, init=False)
 
 
-async def asked(reading: Reading, question: Any) -> list[tuple[str, str]]:
+async def answer_to(reading: Reading, question: Any) -> list[tuple[str, str]]:
     """Return class and dtype of every designator in the answer."""
     async with reading.session() as session:
         return [(type(each).__name__, each.dtype) for each in await session.scalars(question.order_by("id"))]
@@ -87,9 +87,9 @@ async def test_the_refused_declaration_parks_its_episode_and_every_query_has_an_
     kept = second if parked == 2 else first
     expected = [("SayingAction", "SayingAction"), ("Wave", "Wave")]
     async with Reading.open_address(log.address) as reading:
-        assert await asked(reading, select(Designator)) == expected
-        assert await asked(reading, select(Action)) == (expected if kept.kind == "action" else expected[:1])
-        assert await asked(reading, select(Motion)) == (expected[1:] if kept.kind == "motion" else [])
+        assert await answer_to(reading, select(Designator)) == expected
+        assert await answer_to(reading, select(Action)) == (expected if kept.kind == "action" else expected[:1])
+        assert await answer_to(reading, select(Motion)) == (expected[1:] if kept.kind == "motion" else [])
         wave: Any = reading.mapped("Wave")
         async with reading.session() as session:
             assert [each.times for each in await session.scalars(select(wave))] == [
@@ -100,7 +100,7 @@ async def test_the_refused_declaration_parks_its_episode_and_every_query_has_an_
 async def test_a_type_without_an_accepted_declaration_has_no_class(log: EventLog) -> None:
     await perform_each(log, WAVE_AS_POSE)
     async with Reading.open_address(log.address) as reading:
-        assert await asked(reading, select(Designator)) == [("SayingAction", "SayingAction")]
+        assert await answer_to(reading, select(Designator)) == [("SayingAction", "SayingAction")]
         with pytest.raises(CallerError, match=r"this memory has no type 'Wave' \(its types: SayingAction\)"):
             reading.mapped("Wave")
 
@@ -136,9 +136,9 @@ async def test_bases_and_classes_of_another_kind_are_ignored(
             (select(Action), ("action",)),
             (select(Motion), ("motion",)),
         ):
-            found = await asked(reading, question)
-            assert [dtype for _, dtype in found] == [dtype for dtype, kind in everything if kind in kinds]
-        assert await asked(reading, select(ORMBow)) == []
+            answer = await answer_to(reading, question)
+            assert [dtype for _, dtype in answer] == [dtype for dtype, kind in everything if kind in kinds]
+        assert await answer_to(reading, select(ORMBow)) == []
         async with reading.session() as session:
             nodes = (await session.scalars(select(TaskTreeNode).order_by(TaskTreeNode.id))).all()
             assert [each.action and each.action.dtype for each in nodes] == [dtype for dtype, _ in everything]

@@ -32,8 +32,8 @@ def tried(
     return Attempt(arm, Grasp.FRONT, torso, Pose([x, y, z]), succeeded)
 
 
-def ways(found: list[PastSuccess]) -> list[tuple[Arms, float, float, float, int]]:
-    return [(each.arm, *each.stand.position[:2], round(each.score, 9), each.times) for each in found]
+def ways(result: list[PastSuccess]) -> list[tuple[Arms, float, float, float, int]]:
+    return [(each.arm, *each.stand.position[:2], round(each.score, 9), each.times) for each in result]
 
 
 def test_the_rate_of_a_pose_is_the_share_of_successes_near_it() -> None:
@@ -65,8 +65,8 @@ def test_equal_rates_are_ordered_by_successes_and_then_by_position_in_the_list()
 
 def test_without_a_torso_height_the_pose_alone_counts_and_without_attempts_there_is_no_experience() -> None:
     attempts = [tried(-0.7, 0, succeeded=True, torso=None), tried(-0.7, 0.05, succeeded=False, torso=None)]
-    (found,) = best_first(attempts)
-    assert (found.torso_height, found.score) == (None, 0.5)
+    (result,) = best_first(attempts)
+    assert (result.torso_height, result.score) == (None, 0.5)
     assert best_first([]) == []
     assert best_first([tried(-0.7, 0, succeeded=False)]) == []
 
@@ -75,11 +75,11 @@ def test_without_a_torso_height_the_pose_alone_counts_and_without_attempts_there
 
 
 def picked(
-    script: Script, thing: int, *, arm: str = "LEFT", status: NodeStatus = "SUCCEEDED", at: tuple[float, float],
+    script: Script, object_number: int, *, arm: str = "LEFT", status: NodeStatus = "SUCCEEDED", at: tuple[float, float],
     heading: float = 0.0,
 ) -> None:  # fmt: skip
     stand = PoseValue((*at, 0.0), yaw_quaternion(heading), "map", T0_NS)
-    parameters = {"object_designator": ObjectReference(thing, thing), "arm": arm, "grasp": "FRONT"}
+    parameters = {"object_designator": ObjectReference(object_number, object_number), "arm": arm, "grasp": "FRONT"}
     node = script.put(NodeStarted("action", None, name_of(PICK_UP), parameters, RobotValue(stand, "ROBOT", 0.3)))
     script.put(NodeEnded(node, status, None if status == "SUCCEEDED" else FailureValue("a.IKError", "far")))
 
@@ -97,12 +97,12 @@ async def test_poses_are_relative_to_the_object_whatever_its_orientation(log: Ev
     script = Script()
     milk = added(script, "milk", "MILK", (1.0, 2.0, 0.9), heading=math.pi / 2)
     picked(script, milk, at=(1.0, 1.3), heading=math.pi / 2)
-    (found,) = await experience_of(log, script)
+    (result,) = await experience_of(log, script)
     # 0.7 m behind it, where "behind" is against its own x, which points along map's y
-    assert found.stand.position == pytest.approx((-0.7, 0.0, -0.9))
-    assert found.stand.orientation == pytest.approx((0, 0, 0, 1))
-    assert (found.arm, found.grasp, found.torso_height, found.times) == (Arms.LEFT, Grasp.FRONT, 0.3, 1)
-    assert found.score == pytest.approx(2 / 3)
+    assert result.stand.position == pytest.approx((-0.7, 0.0, -0.9))
+    assert result.stand.orientation == pytest.approx((0, 0, 0, 1))
+    assert (result.arm, result.grasp, result.torso_height, result.times) == (Arms.LEFT, Grasp.FRONT, 0.3, 1)
+    assert result.score == pytest.approx(2 / 3)
 
 
 async def test_other_types_other_arms_and_pick_ups_without_an_outcome_do_not_count(log: EventLog) -> None:
@@ -114,27 +114,27 @@ async def test_other_types_other_arms_and_pick_ups_without_an_outcome_do_not_cou
     picked(script, bowl, at=(0.3, 0.0), status="FAILED")
     for status in ("CANCELLED", "INTERRUPTED", "ERROR", "LOST"):
         picked(script, milk, at=(0.3, 0.0), status=status)
-    found = await experience_of(log, script)
-    assert [(each.arm, round(each.score, 6)) for each in found] == [(Arms.RIGHT, 0.666667), (Arms.LEFT, 0.666667)]
+    result = await experience_of(log, script)
+    assert [(each.arm, round(each.score, 6)) for each in result] == [(Arms.RIGHT, 0.666667), (Arms.LEFT, 0.666667)]
     asked = PickUpExperience(Reading(log))
     assert [each.arm for each in await asked.successes(ObjectType.MILK, arm=Arms.LEFT)] == [Arms.LEFT]
     assert await asked.successes(ObjectType.SPOON, arm=None) == []
 
 
 async def test_simulated_pick_ups_do_not_count(log: EventLog) -> None:
-    thought = Script(1)
-    thought.put(EpisodeStarted("thinking", "me", "host", "1.0", "3.11", simulated=True))
-    milk = added(thought, "milk", "MILK", (1.0, 0.0, 0.9))
+    simulation = Script(1)
+    simulation.put(EpisodeStarted("thinking", "me", "host", "1.0", "3.11", simulated=True))
+    milk = added(simulation, "milk", "MILK", (1.0, 0.0, 0.9))
     parameters = {"object_designator": ObjectReference(milk, milk), "arm": "LEFT", "grasp": "FRONT"}
     stand = PoseValue((0.3, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), "map", T0_NS)
-    node = thought.put(
+    node = simulation.put(
         NodeStarted("action", None, name_of(PICK_UP), parameters, RobotValue(stand, "ROBOT", 0.3), simulated=True)
     )
-    thought.put(NodeEnded(node, "SUCCEEDED"))
+    simulation.put(NodeEnded(node, "SUCCEEDED"))
     done = Script(2)
     done.put(EpisodeStarted("doing", "me", "host", "1.0", "3.11"))
     picked(done, added(done, "milk", "MILK", (1.0, 0.0, 0.9)), at=(0.2, 0.0))
-    assert [each.stand.position.x for each in await experience_of(log, thought, done)] == pytest.approx([-0.8])
+    assert [each.stand.position.x for each in await experience_of(log, simulation, done)] == pytest.approx([-0.8])
 
 
 async def test_only_the_latest_pick_ups_are_read(log: EventLog) -> None:

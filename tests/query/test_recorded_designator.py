@@ -31,7 +31,7 @@ from pycrorm_async.query.recorded_designator import NotPerformable
 from pycrorm_async.world import Arms, Object, ObjectType, Pose
 from pycrorm_async.world.errors import NoWorld, ObjectNotInWorld
 from tests.memory.note_actions import NoteActionPerformable
-from tests.promises.lab import CEREAL_AT, Lab, asked, lab, recorded, url_of
+from tests.promises.lab import CEREAL_AT, Lab, lab, recorded, results_of, url_of
 
 pytestmark = pytest.mark.slow
 
@@ -125,29 +125,32 @@ async def test_every_kind_of_parameter_is_restored(tmp_path: Path, options: tupl
             cooked = cooking(scene)
             await cooked.perform()
             scene.milk.set_pose(Pose([9, 9, 9]))
-    (row,) = await asked(tmp_path, select(Action).options(*options))
+    (row,) = await results_of(tmp_path, select(Action).options(*options))
     with lab() as again:
         again.cereal.set_pose(Pose([7, 7, 7]))
-        made = performable_of(row)
-        assert type(made) is CookActionPerformable
+        designator = performable_of(row)
+        assert type(designator) is CookActionPerformable
         same = "text count weight_kg hot start arm taste place recipe words poses tastes note other_recipe maybe empty"
-        assert [getattr(made, name) for name in same.split()] == [getattr(cooked, name) for name in same.split()]
-        assert (made.nothing, made._cache, made.place.time_ns) == (
+        assert [getattr(designator, name) for name in same.split()] == [getattr(cooked, name) for name in same.split()]
+        assert (designator.nothing, designator._cache, designator.place.time_ns) == (
             None,
             "not recorded",
             cooked.place.time_ns // 1000 * 1000,
         )
-        assert made.milk is again.milk
-        assert made.cereal == designator_of(again.cereal)
-        assert made.objects == [designator_of(again.cereal), designator_of(again.milk)]
-        assert (made.finger, made.believed) == (ObjectPart("l_gripper_tool_frame", again.robot), cooked.believed)
-        assert made.frozen == cooked.frozen
-        assert made.frozen.pose.position == (1.3, 1.0, 0.9)
-        assert type(made.located) is LocatedObject
-        assert (made.located.name, made.located.reference) == ("cup", designator_of(again.cereal))
-        assert made.located.relative_pose.position == pytest.approx((0, 0.2, 0))
-        assert abs(made.located.timestamp - cooked.located.timestamp).total_seconds() < 1e-5
-        assert made.located.pose.position == pytest.approx((7, 7.2, 7))
+        assert designator.milk is again.milk
+        assert designator.cereal == designator_of(again.cereal)
+        assert designator.objects == [designator_of(again.cereal), designator_of(again.milk)]
+        assert (designator.finger, designator.believed) == (
+            ObjectPart("l_gripper_tool_frame", again.robot),
+            cooked.believed,
+        )
+        assert designator.frozen == cooked.frozen
+        assert designator.frozen.pose.position == (1.3, 1.0, 0.9)
+        assert type(designator.located) is LocatedObject
+        assert (designator.located.name, designator.located.reference) == ("cup", designator_of(again.cereal))
+        assert designator.located.relative_pose.position == pytest.approx((0, 0.2, 0))
+        assert abs(designator.located.timestamp - cooked.located.timestamp).total_seconds() < 1e-5
+        assert designator.located.pose.position == pytest.approx((7, 7.2, 7))
     assert CEREAL_AT != (7, 7, 7)
 
 
@@ -158,7 +161,7 @@ async def test_arguments_of_a_class_that_is_no_dataclass_are_restored_and_may_be
             MixActionPerformable("b"),
         ):
             await mixed.perform()
-    first, second = await asked(tmp_path, select(Action).order_by(Action.id))
+    first, second = await results_of(tmp_path, select(Action).order_by(Action.id))
     assert performable_of(first).everything == ("a", (1, 2), 0.5, {"sugar": "much"})  # type: ignore[attr-defined]
     assert performable_of(second).everything == ("b", (), 1.0, {})  # type: ignore[attr-defined]
     assert performable_of(second, first="c", speed=2.0).everything == ("c", (), 2.0, {})  # type: ignore[attr-defined]
@@ -172,7 +175,7 @@ async def test_a_motion_is_restored_with_its_joints(tmp_path: Path) -> None:
     async with recorded(tmp_path):
         with lab():
             await MoveArmJointsMotion(targets).perform()
-    (row,) = await asked(tmp_path, select(Designator))
+    (row,) = await results_of(tmp_path, select(Designator))
     assert performable_of(row) == MoveArmJointsMotion(targets, None)
 
 
@@ -193,7 +196,7 @@ async def strange_row(folder: Path, *options: Any) -> Any:
         async with memory.episode():
             await StrangeActionPerformable("odd", [float("nan")], float("inf"), object()).perform()
         await memory.flush()
-    (row,) = await asked(folder, select(Action).options(*options))
+    (row,) = await results_of(folder, select(Action).options(*options))
     return row
 
 
@@ -218,7 +221,7 @@ async def test_objects_and_places_that_the_current_world_lacks_are_named(tmp_pat
     async with recorded(tmp_path):
         with lab() as scene:
             await cooking(scene).perform()
-    (row,) = await asked(tmp_path, select(Action))
+    (row,) = await results_of(tmp_path, select(Action))
     with pytest.raises(NoWorld):
         performable_of(row)
     with lab() as again:
@@ -232,7 +235,7 @@ async def test_a_class_that_is_not_imported_and_one_that_is_defined_twice_are_na
     async with recorded(tmp_path):
         await NoteActionPerformable("once").perform()
         await (NoteActionPerformable("a") + NoteActionPerformable("b")).perform()
-    row, sequence, *_ = await asked(tmp_path, select(Designator).order_by(Designator.id))
+    row, sequence, *_ = await results_of(tmp_path, select(Designator).order_by(Designator.id))
     with pytest.raises(NotPerformable) as refused:
         performable_of(sequence)
     assert str(refused.value) == (
@@ -262,7 +265,7 @@ async def test_values_that_no_longer_fit_the_class_are_refused(tmp_path: Path) -
         with lab() as scene:
             await cooking(scene).perform()
             await NavigateActionPerformable(Pose([1, 0, 0])).perform()
-    cooked, drove = await asked(tmp_path, select(Action).order_by(Action.id))
+    cooked, drove = await results_of(tmp_path, select(Action).order_by(Action.id))
     with pytest.raises(ResolutionError, match=r"target_location: expected Pose"):
         performable_of(drove, target_location="the kitchen")
     cooked.taste = "BITTER"

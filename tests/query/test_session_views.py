@@ -107,7 +107,7 @@ REAL, THINKING = Script(1).episode, 8
 THOUGHT = NodeReference(episode_text(REAL), THINKING)
 
 
-async def remembered(log: EventLog, *scripts: Script) -> None:
+async def store_and_fold(log: EventLog, *scripts: Script) -> None:
     projector = Projector(log, views=[REACHED])
     await projector.open()
     await log.append([*declarations(*TYPES), *(record for script in scripts for record in script.records)])
@@ -124,19 +124,19 @@ async def rows_by_view(log: EventLog) -> dict[str, list[Any]]:
 
 
 async def test_every_view_shows_the_same_rows_whether_or_not_simulations_were_recorded(log: EventLog) -> None:
-    await remembered(log, everything(1))
+    await store_and_fold(log, everything(1))
     before = await rows_by_view(log)
     leaves = {each.table for each in TYPES}
     own = set(COLUMNS) - {"simulated_episode"} | {"designator", "action", "motion", "language", "robot_state"}
     own |= {"position", "quaternion", "designator_type", "PickUpWithContextView", "reached", *leaves}
     assert [name for name in own if not before[name]] == []
-    await remembered(log, everything(2, THOUGHT), everything(3, NodeReference(episode_text(Script(2).episode), 2)))
+    await store_and_fold(log, everything(2, THOUGHT), everything(3, NodeReference(episode_text(Script(2).episode), 2)))
     assert await rows_by_view(log) == before
 
 
 async def test_a_session_that_asks_for_simulations_sees_them_in_every_view(log: EventLog) -> None:
     """As many rows again as the real episode has, in each of the views."""
-    await remembered(log, everything(1), everything(2, THOUGHT))
+    await store_and_fold(log, everything(1), everything(2, THOUGHT))
     once = {name: len(rows) for name, rows in (await rows_by_view(log)).items()}
     async with Reading.open_address(log.address) as reading, reading.session(simulated=True) as session:
         connection = await session.connection()
@@ -146,14 +146,16 @@ async def test_a_session_that_asks_for_simulations_sees_them_in_every_view(log: 
 
 
 async def test_the_same_queries_return_simulations_on_request(log: EventLog) -> None:
-    await remembered(log, everything(1), everything(2, THOUGHT))
-    asked = select(TaskTreeNode.process_metadata_id, TaskTreeNode.simulated).distinct().order_by("process_metadata_id")
+    await store_and_fold(log, everything(1), everything(2, THOUGHT))
+    statement = (
+        select(TaskTreeNode.process_metadata_id, TaskTreeNode.simulated).distinct().order_by("process_metadata_id")
+    )
     async with Reading.open_address(log.address) as reading:
         async with reading.session() as session:
             assert [each.dtype for each in await session.scalars(select(Action).order_by(Action.id))] == [
                 "NavigateAction", "PickUpAction", "CarefulPickUpAction",
             ]  # fmt: skip
-            assert (await session.execute(asked)).all() == [(1, False)]
+            assert (await session.execute(statement)).all() == [(1, False)]
         async with reading.session(simulated=True) as session:
             actions = (await session.scalars(select(Action).order_by(Action.id))).all()
             assert [(each.id >> 31, each.dtype) for each in actions] == [
@@ -165,7 +167,7 @@ async def test_the_same_queries_return_simulations_on_request(log: EventLog) -> 
             careful: Any = actions[-1]
             assert (careful.object.pose.x, careful.speed) == (2.0, 0.5)
             assert [each.x for each in actions[-1].entries("via")] == [3.0, 4.0]
-            assert (await session.execute(asked)).all() == [(1, False), (2, True)]
+            assert (await session.execute(statement)).all() == [(1, False), (2, True)]
             metadata = (await session.scalars(select(ProcessMetaData).order_by(ProcessMetaData.id))).all()
             assert [(each.simulated, each.thought_by, each.thought_by_node) for each in metadata] == [
                 (False, None, None),
@@ -180,7 +182,7 @@ async def test_the_same_queries_return_simulations_on_request(log: EventLog) -> 
 
 
 async def test_other_sessions_do_not_see_the_simulations_that_one_session_asked_for(log: EventLog) -> None:
-    await remembered(log, everything(1), everything(2, THOUGHT))
+    await store_and_fold(log, everything(1), everything(2, THOUGHT))
     count = select(func.count()).select_from(TaskTreeNode)
     async with Reading.open_address(log.address) as reading:
         async with reading.session(simulated=True) as with_thoughts, reading.session() as without:
@@ -198,12 +200,12 @@ async def test_other_sessions_do_not_see_the_simulations_that_one_session_asked_
 async def test_later_simulations_are_visible_too(log: EventLog) -> None:
     """Including those of a type that was declared since, in the same session."""
     new = declared("WaveAction", "wave_action", field("times", "integer", 2))
-    await remembered(log, everything(1))
+    await store_and_fold(log, everything(1))
     async with Reading.open_address(log.address) as reading:
         async with reading.session(simulated=True) as session:
             assert await session.scalar(select(func.count()).select_from(Motion)) == 1
             await session.commit()
-            await remembered(log, everything(2, THOUGHT))
+            await store_and_fold(log, everything(2, THOUGHT))
             assert await session.scalar(select(func.count()).select_from(Motion)) == 2
         script = Script(3)
         script.put(EpisodeStarted("e", "me", "host", "1.0", "3.11", simulated=True))
@@ -220,7 +222,7 @@ async def test_later_simulations_are_visible_too(log: EventLog) -> None:
 
 
 async def test_a_session_with_simulations_cannot_write(log: EventLog) -> None:
-    await remembered(log, everything(1))
+    await store_and_fold(log, everything(1))
     before = await names(log, "table", "view")
     async with Reading.open_address(log.address) as reading, reading.session(simulated=True) as session:
         with pytest.raises(DBAPIError):
@@ -231,7 +233,7 @@ async def test_a_session_with_simulations_cannot_write(log: EventLog) -> None:
 async def test_the_overview_leaves_simulations_out_unless_asked(log: EventLog) -> None:
     deeper = NodeReference(episode_text(Script(2).episode), 2)
     elsewhere = NodeReference("018bcfe5-6800-7000-8000-000000000001", 12)
-    await remembered(log, everything(1), everything(2, THOUGHT), everything(3, deeper), everything(4, elsewhere))
+    await store_and_fold(log, everything(1), everything(2, THOUGHT), everything(3, deeper), everything(4, elsewhere))
     async with Reading.open_address(log.address) as reading:
         assert [(each.number, each.simulated, each.thought_by) for each in await reading.episodes()] == [
             (1, False, None)
@@ -247,7 +249,7 @@ async def test_the_overview_leaves_simulations_out_unless_asked(log: EventLog) -
 
 
 async def test_a_simulated_episode_is_found_by_name_and_the_last_episode_is_a_real_one(log: EventLog) -> None:
-    await remembered(log, everything(1), everything(2, THOUGHT))
+    await store_and_fold(log, everything(1), everything(2, THOUGHT))
     async with Reading.open_address(log.address) as reading:
         assert (await reading.episode("2")).simulated
         assert (await reading.episode(episode_text(Script(2).episode))).number == 2
@@ -258,9 +260,9 @@ async def test_a_simulated_episode_is_found_by_name_and_the_last_episode_is_a_re
 
 async def test_a_tree_names_the_simulations_of_its_nodes_and_a_simulations_own_tree_is_printed(log: EventLog) -> None:
     root = NodeReference(episode_text(REAL), 2)
-    await remembered(log, everything(1), everything(2, THOUGHT), everything(3, THOUGHT), everything(4, root))
+    await store_and_fold(log, everything(1), everything(2, THOUGHT), everything(3, THOUGHT), everything(4, root))
     async with Reading.open_address(log.address) as reading:
-        tree, thought = await reading.tree(1), await reading.tree(2)
+        tree, simulation_tree = await reading.tree(1), await reading.tree(2)
     assert [(each.dtype, each.simulated, each.thoughts) for each in tree] == [
         (None, False, (4,)),
         ("Either", False, ()),
@@ -269,13 +271,13 @@ async def test_a_tree_names_the_simulations_of_its_nodes_and_a_simulations_own_t
         ("PickUpAction", False, ()),
         ("CarefulPickUpAction", False, ()),
     ]
-    assert [(each.dtype, each.simulated) for each in thought] == [(each.dtype, True) for each in tree]
-    assert thought[4].parameters["object_designator"]["name"] == "milk"
-    assert thought[4].failure_message == "too far"
+    assert [(each.dtype, each.simulated) for each in simulation_tree] == [(each.dtype, True) for each in tree]
+    assert simulation_tree[4].parameters["object_designator"]["name"] == "milk"
+    assert simulation_tree[4].failure_message == "too far"
 
 
 async def test_a_memory_of_simulations_alone_has_no_last_episode(log: EventLog) -> None:
-    await remembered(log, everything(1, THOUGHT))
+    await store_and_fold(log, everything(1, THOUGHT))
     async with Reading.open_address(log.address) as reading:
         assert await reading.episodes() == []
         with pytest.raises(UnknownEpisode, match="lists the 0 there are"):

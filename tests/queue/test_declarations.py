@@ -22,14 +22,14 @@ def description(number: int, size: int = 400) -> bytes:
 def declared_in_segments(writer: FolderWriter) -> list[list[bytes]]:
     """The payloads of the declarations in each segment."""
     segments: dict[int, list[bytes]] = {}
-    found = survey(
+    survey_result = survey(
         writer.folder,
         RECORDER,
         on_frame=lambda number, frame: segments.setdefault(number, []).append(
             frame.payload if frame.kind == DECLARATION else b""
         ),
     )
-    assert found.damage is None
+    assert survey_result.damage is None
     return [[each for each in payloads if each] for payloads in segments.values()]
 
 

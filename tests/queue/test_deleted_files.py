@@ -108,16 +108,16 @@ def suppress_all_but_losses() -> Iterator[None]:
 
 
 @pytest.mark.parametrize("displace", DELETIONS)
-@pytest.mark.parametrize("asked", ["with news", "without news"])
+@pytest.mark.parametrize("answer", ["with news", "without news"])
 async def test_a_sync_is_refused_once_and_a_kill_leaves_all_that_was_mapped(
-    tmp_path: Path, displace: Callable[[RecorderQueue], None], asked: str, caplog: pytest.LogCaptureFixture
+    tmp_path: Path, displace: Callable[[RecorderQueue], None], answer: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     queue = make(tmp_path / "spool", settings=SLOW)
     queue.put_nowait(started(), b"{}")
     await queue.synced_to()
     before = queue.folder
     displace(queue)
-    if asked == "with news":
+    if answer == "with news":
         put(queue, 3)
     count = queue.written
     with pytest.raises(SpoolUnavailable, match=GONE):

@@ -83,8 +83,8 @@ async def test_a_large_blob_is_stored_in_parts_and_continued_where_a_writer_was_
     log.blobs.source = Files(log, other)
     await log.append([observed(1, other)])
     assert log.writes == writes + 3 + 1, "each part has a transaction of its own"
-    found = await log.blobs.read(sha256(other).hexdigest())
-    assert found == Blob(other, "image/png")
+    content = await log.blobs.read(sha256(other).hexdigest())
+    assert content == Blob(other, "image/png")
 
 
 async def test_an_event_whose_blob_is_nowhere_is_stored_and_the_fault_names_the_blob(

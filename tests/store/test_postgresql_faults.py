@@ -235,10 +235,10 @@ async def test_a_silent_connection_is_closed_and_the_batch_is_sent_through_anoth
 async def test_the_server_probes_a_machine_that_goes_silent_in_the_middle_of_a_statement(
     direct_url: str,
 ) -> None:
-    asked = "SELECT name, reset_val::int FROM pg_settings WHERE source = 'client' AND name LIKE 'tcp%' ORDER BY name"
+    query = "SELECT name, reset_val::int FROM pg_settings WHERE source = 'client' AND name LIKE 'tcp%' ORDER BY name"
     log = await EventLog.open(DatabaseAddress.parse(direct_url), create=True)
     async with log.engine.connect() as connection:
-        answer = {row.name: row.reset_val for row in await connection.execute(text(asked))}
+        answer = {row.name: row.reset_val for row in await connection.execute(text(query))}
     await log.close()
     idle, interval, count = (answer[f"tcp_keepalives_{each}"] for each in ("idle", "interval", "count"))
     assert (

@@ -140,12 +140,12 @@ async def test_a_log_opened_for_reading_takes_no_lock(file_log: EventLog) -> Non
 
 async def test_streamed_rows_are_whole_and_in_order(file_log: EventLog) -> None:
     await file_log.append(run_of(episode(1), 1, 200))
-    asked = text("SELECT sequence FROM event ORDER BY sequence")
+    query = text("SELECT sequence FROM event ORDER BY sequence")
     async with file_log.reading() as connection:
-        assert list((await connection.execute(asked)).scalars()) == list(range(1, 201))
-        streamed = await connection.stream(asked)
+        assert list((await connection.execute(query)).scalars()) == list(range(1, 201))
+        streamed = await connection.stream(query)
         assert [row.sequence async for row in streamed] == list(range(1, 201))
-        streamed = await connection.stream(asked)
+        streamed = await connection.stream(query)
         assert [row[0] for row in await streamed.fetchmany(70)] == list(range(1, 71))
         assert (await streamed.fetchone()) == (71,)
         await streamed.close()

@@ -47,8 +47,8 @@ async def test_a_log_opened_twice_in_one_process_stays_locked_against_others(add
     log = await EventLog.open(address, create=True)
     await log.append(run_of(episode(1), 1, 2))
     await (await EventLog.open(address, create=True)).close()
-    asked = "import sqlite3; c = sqlite3.connect({!r}); print(*c.execute('SELECT count(*) FROM event')); c.close()"
-    subprocess.run([sys.executable, "-c", asked.format(str(address.path))], check=True)  # noqa: ASYNC221
+    program = "import sqlite3; c = sqlite3.connect({!r}); print(*c.execute('SELECT count(*) FROM event')); c.close()"
+    subprocess.run([sys.executable, "-c", program.format(str(address.path))], check=True)  # noqa: ASYNC221
     assert address.path.with_name("memory.db-wal").exists()
     await log.append(run_of(episode(1), 3, 4))
     assert ask(address.path, "SELECT count(*) FROM event") == [(4,)]

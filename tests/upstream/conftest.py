@@ -13,15 +13,15 @@ from pycrorm_async import Memory
 from pycrorm_async.plan import MoveTorsoAction, NavigateAction, ObjectDesignatorDescription, PickUpAction, PlaceAction
 from pycrorm_async.world import Arms, Grasp, Pose
 from tests.plan.conftest import Scene, kitchen
-from tests.promises.lab import asked, url_of
+from tests.promises.lab import results_of, url_of
 
 DESCRIPTION = "the common plan"
 
 
 @pytest.fixture
 def scene() -> Iterator[Scene]:
-    with kitchen() as there:
-        yield there
+    with kitchen() as kitchen_scene:
+        yield kitchen_scene
 
 
 async def common_plan() -> None:
@@ -40,11 +40,11 @@ class Recorded:
         self.folder = folder
 
     async def all(self, statement: Select[Any]) -> list[Any]:
-        return await asked(self.folder, statement)
+        return await results_of(self.folder, statement)
 
     async def one(self, statement: Select[Any]) -> Any:
-        (found,) = await self.all(statement)
-        return found
+        (row,) = await self.all(statement)
+        return row
 
 
 @pytest.fixture

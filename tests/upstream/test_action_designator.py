@@ -129,8 +129,8 @@ async def test_detect(scene: Scene) -> None:
     scene.milk.set_pose(Pose([1.5, 0, 1.2]))
     action = DetectAction(MILK).resolve()
     assert (action.object_designator.name, action.concept) == ("milk", "LookingFor")
-    found = await action.perform()
-    assert (found.name, found.object_type, found.pose) == ("milk", ObjectType.MILK, Pose([1.5, 0, 1.2]))
+    result = await action.perform()
+    assert (result.name, result.object_type, result.pose) == ("milk", ObjectType.MILK, Pose([1.5, 0, 1.2]))
 
 
 async def test_open(scene: Scene) -> None:

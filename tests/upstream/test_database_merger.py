@@ -50,10 +50,10 @@ async def destination(server: Server, tmp_path: Path) -> str:
 
 def assert_holds(destination: str, source: Tables, before: Tables) -> None:
     """Assert that every table has all rows of the source, and all that it had before."""
-    there = tables_of(destination)
+    tables_before = tables_of(destination)
     for table, rows in source.items():
-        assert rows.items() <= there[table].items(), table
-    assert differences(there, united(source, before)) == []
+        assert rows.items() <= tables_before[table].items(), table
+    assert differences(tables_before, united(source, before)) == []
 
 
 async def test_merge_databases(source: str, destination: str) -> None:

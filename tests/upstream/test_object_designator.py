@@ -12,14 +12,14 @@ pytestmark = pytest.mark.slow
 
 
 def test_object_grounding(scene: Scene) -> None:
-    found = ObjectDesignatorDescription(["milk"], [ObjectType.MILK]).resolve()
-    assert (found.name, found.object_type) == ("milk", ObjectType.MILK)
-    assert found.world_object is scene.milk
+    designator = ObjectDesignatorDescription(["milk"], [ObjectType.MILK]).resolve()
+    assert (designator.name, designator.object_type) == ("milk", ObjectType.MILK)
+    assert designator.world_object is scene.milk
 
 
 def test_frozen_copy(scene: Scene) -> None:
-    found = ObjectDesignatorDescription(["milk"], [ObjectType.MILK]).resolve()
-    frozen = found.frozen_copy()
-    assert frozen.pose == found.pose == Pose([1.3, 1, 0.9])
+    designator = ObjectDesignatorDescription(["milk"], [ObjectType.MILK]).resolve()
+    frozen = designator.frozen_copy()
+    assert frozen.pose == designator.pose == Pose([1.3, 1, 0.9])
     scene.milk.set_pose(Pose([2, 2, 2]))
-    assert (frozen.pose, found.pose) == (Pose([1.3, 1, 0.9]), Pose([2, 2, 2]))
+    assert (frozen.pose, designator.pose) == (Pose([1.3, 1, 0.9]), Pose([2, 2, 2]))

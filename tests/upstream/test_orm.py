@@ -180,8 +180,8 @@ async def test_plan_serialization(tmp_path: Path) -> None:
     async with Memory.open(url_of(tmp_path)) as memory, memory.episode():
         with kitchen(), collected_tree() as tree:
             await common_plan()
-    remembered = Recorded(tmp_path)
-    performed = len(await remembered.all(select(Action))) + len(await remembered.all(select(Motion)))
+    recorded = Recorded(tmp_path)
+    performed = len(await recorded.all(select(Action))) + len(await recorded.all(select(Motion)))
     assert len(tree) == performed == 14
 
 
@@ -210,9 +210,9 @@ async def test_transportAction(tmp_path: Path) -> None:
             island = Pose([-1.35, 0.78, 0.95], yaw_quaternion(math.pi))
             await TransportActionPerformable(scene.milk, Arms.LEFT, island).perform()
             resting = scene.milk.pose
-    remembered = Recorded(tmp_path)
-    transport = await remembered.one(select(TransportAction))
-    milk = await remembered.all(select(Object).where(Object.name == "milk").order_by(Object.id))
+    recorded = Recorded(tmp_path)
+    transport = await recorded.one(select(TransportAction))
+    milk = await recorded.all(select(Object).where(Object.name == "milk").order_by(Object.id))
     assert transport.object.id == milk[0].id
     assert at(transport.object.pose) == at(milk[0].pose) == (1.3, 1, 0.9)
     assert at(transport.pose) == (-1.35, 0.78, 0.95)
@@ -225,11 +225,11 @@ async def test_lookAt_and_detectAction(tmp_path: Path) -> None:
             await ParkArmsActionPerformable(Arms.BOTH).perform()
             await NavigateActionPerformable(Pose([0, 1, 0])).perform()
             await LookAtActionPerformable(scene.milk.pose).perform()
-            found = await DetectActionPerformable(scene.milk).perform()
-            assert found.world_object is scene.milk
-    remembered = Recorded(tmp_path)
-    assert at((await remembered.one(select(LookAtAction))).pose) == (1.3, 1, 0.9)
-    detect = await remembered.one(select(DetectAction))
+            detected = await DetectActionPerformable(scene.milk).perform()
+            assert detected.world_object is scene.milk
+    recorded = Recorded(tmp_path)
+    assert at((await recorded.one(select(LookAtAction))).pose) == (1.3, 1, 0.9)
+    detect = await recorded.one(select(DetectAction))
     assert (detect.object.name, detect.object.obj_type) == ("milk", ObjectType.MILK)
 
 
@@ -249,8 +249,8 @@ async def test_open_and_closeAction(tmp_path: Path) -> None:
             await MoveTorsoActionPerformable(0.1).perform()
             await OpenActionPerformable(handle, Arms.LEFT).perform()
             await Close(handle, [Arms.LEFT]).resolve().perform()
-    remembered = Recorded(tmp_path)
-    opened, closed = await remembered.one(select(OpenAction)), await remembered.one(select(CloseAction))
+    recorded = Recorded(tmp_path)
+    opened, closed = await recorded.one(select(OpenAction)), await recorded.one(select(CloseAction))
     for action in (opened, closed):
         assert isinstance(action.object, ObjectPart)
         assert action.object.name == "sink_area_drawer_handle"

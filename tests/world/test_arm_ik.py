@@ -59,9 +59,9 @@ def test_a_target_that_a_posture_within_limits_reaches_is_solved_exactly_within_
         base, torso_height = random_base_pose(rng)
         target = reached(arm, joints, base=base, torso_height=torso_height)
         answer = solve_from(PR2, arm, target, base=base, torso_height=torso_height, limits=limits)
-        there = reached(arm, answer, base=base, torso_height=torso_height)
-        assert there.distance(target) < EXACT
-        assert angle_between(there.orientation, target.orientation) < EXACT
+        reached_pose = reached(arm, answer, base=base, torso_height=torso_height)
+        assert reached_pose.distance(target) < EXACT
+        assert angle_between(reached_pose.orientation, target.orientation) < EXACT
         assert least_margin(arm, answer, limits) >= 0
         assert tuple(answer) == PR2.arms[arm].joints
 
@@ -130,8 +130,8 @@ def test_only_the_target_relative_to_the_torso_matters() -> None:
 def test_a_torso_outside_its_soft_range_is_accepted_as_it_is() -> None:
     for torso_height in (0.0, 0.33):
         answer = solve_from(PR2, Arms.LEFT, AHEAD, base=Pose(), torso_height=torso_height)
-        there = reached(Arms.LEFT, answer, base=Pose(), torso_height=torso_height)
-        assert there.distance(AHEAD) < EXACT
+        reached_pose = reached(Arms.LEFT, answer, base=Pose(), torso_height=torso_height)
+        assert reached_pose.distance(AHEAD) < EXACT
 
 
 def test_the_hand_has_the_requested_orientation_or_the_target_is_refused() -> None:
@@ -139,8 +139,8 @@ def test_the_hand_has_the_requested_orientation_or_the_target_is_refused() -> No
     for turn in turns:
         target = Pose(AHEAD.position, turn)
         answer = solve_from(PR2, Arms.LEFT, target, base=Pose(), torso_height=0.0)
-        there = reached(Arms.LEFT, answer, base=Pose(), torso_height=0.0)
-        assert angle_between(there.orientation, turn) < EXACT
+        reached_pose = reached(Arms.LEFT, answer, base=Pose(), torso_height=0.0)
+        assert angle_between(reached_pose.orientation, turn) < EXACT
     towards_the_robot = Pose([0.75, 0.2, 0.9], yaw_quaternion(math.pi))
     with pytest.raises(Unreachable):
         solve_from(PR2, Arms.LEFT, towards_the_robot, base=Pose(), torso_height=0.0)

@@ -41,11 +41,11 @@ def robots(tmp_path_factory: pytest.TempPathFactory) -> dict[Arms, optik.Robot]:
             limit.set("upper", str(min(bounds.upper, math.pi)))
     path: Path = tmp_path_factory.mktemp("model") / "pr2.urdf"
     ET.ElementTree(model).write(path)
-    found = {}
+    solutions = {}
     for arm, description in PR2.arms.items():
-        found[arm] = optik.Robot.from_urdf_file(str(path), "torso_lift_link", description.tool_frame)
-        found[arm].set_parallelism(1)
-    return found
+        solutions[arm] = optik.Robot.from_urdf_file(str(path), "torso_lift_link", description.tool_frame)
+        solutions[arm].set_parallelism(1)
+    return solutions
 
 
 def goals_of(choice: PickUpChoice) -> tuple[PickUpPoses, Pose]:

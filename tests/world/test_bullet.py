@@ -96,13 +96,13 @@ def test_a_watcher_can_refuse_the_entering() -> None:
 
 
 def test_a_world_that_was_left_can_be_read_and_not_changed() -> None:
-    there = Pose([1, 2, 3])
+    target = Pose([1, 2, 3])
     with BulletWorld() as world:
-        crane = Object("crane", ObjectType.GENERIC_OBJECT, CRANE, there)
+        crane = Object("crane", ObjectType.GENERIC_OBJECT, CRANE, target)
         cup = Object("cup", ObjectType.JEROEN_CUP)
         crane.set_joint_position("turning", 0.4)
-    assert [thing.name for thing in world.objects] == ["crane", "cup"]
-    assert (crane.pose, crane.object_type) == (there, ObjectType.GENERIC_OBJECT)
+    assert [cube_object.name for cube_object in world.objects] == ["crane", "cup"]
+    assert (crane.pose, crane.object_type) == (target, ObjectType.GENERIC_OBJECT)
     assert crane.joint_position("turning") == 0.4
     state = world.save_state()
     for call in (
@@ -123,7 +123,7 @@ def test_a_world_that_was_left_can_be_read_and_not_changed() -> None:
     ):
         with pytest.raises(WorldClosed):
             call()
-    assert crane.pose is there
+    assert crane.pose is target
 
 
 def test_a_world_must_be_entered_before_objects_are_added() -> None:
@@ -151,15 +151,15 @@ async def test_two_tasks_with_a_world_each_never_mix() -> None:
         with BulletWorld() as world:
             change_log = ChangeLog()
             world.observe(change_log)
-            thing = Object("crane", ObjectType.GENERIC_OBJECT, CRANE)
+            cube_object = Object("crane", ObjectType.GENERIC_OBJECT, CRANE)
             for step in range(20):
                 await asyncio.sleep(0)
                 assert current_world.get() is world
-                thing.set_pose(Pose([number, step, 0]))
+                cube_object.set_pose(Pose([number, step, 0]))
                 await asyncio.sleep(0)
                 # Bullet itself does not see the other world's objects either.
-                assert thing.link_pose("mast").position == pytest.approx((number + 0.1, step, 0.5), abs=1e-9)
-                assert world.ray_test([(number, step, 5)], [(number, step, 0.1)]) == [thing]
+                assert cube_object.link_pose("mast").position == pytest.approx((number + 0.1, step, 0.5), abs=1e-9)
+                assert world.ray_test([(number, step, 5)], [(number, step, 0.1)]) == [cube_object]
                 assert world.ray_test([(1 - number, step, 5)], [(1 - number, step, 0.1)]) == [None]
             return [entry for entry in change_log.notes if entry[0] == "moved"]
 
@@ -172,14 +172,14 @@ def test_threads_have_worlds_of_their_own() -> None:
     def act(number: int) -> tuple[float, ...]:
         with BulletWorld() as world:
             assert current_world.get() is world
-            things = [Object(f"crane {k}", ObjectType.GENERIC_OBJECT, CRANE) for k in range(5)]
+            cranes = [Object(f"crane {k}", ObjectType.GENERIC_OBJECT, CRANE) for k in range(5)]
             for step in range(100):
-                things[0].set_pose(Pose([number, step, 0]))
-            return things[0].link_pose("mast").position
+                cranes[0].set_pose(Pose([number, step, 0]))
+            return cranes[0].link_pose("mast").position
 
     with ThreadPoolExecutor(4) as pool:
-        found = list(pool.map(act, range(8)))
-    assert found == [pytest.approx((number + 0.1, 99.0, 0.5), abs=1e-9) for number in range(8)]
+        worlds = list(pool.map(act, range(8)))
+    assert worlds == [pytest.approx((number + 0.1, 99.0, 0.5), abs=1e-9) for number in range(8)]
 
 
 # --- objects and observers --------------------------------------------------------------------------------------------
@@ -351,9 +351,9 @@ def test_a_ray_hits_the_first_object_in_its_way(world: BulletWorld) -> None:
 
 
 def test_rays_follow_objects_that_moved(world: BulletWorld) -> None:
-    thing = cube("thing", (1, 0, 1))
-    thing.set_pose(Pose([1, 5, 1]))
-    assert world.ray_test([(0, 0, 1), (0, 5, 1)], [(3, 0, 1), (3, 5, 1)]) == [None, thing]
+    cube_object = cube("thing", (1, 0, 1))
+    cube_object.set_pose(Pose([1, 5, 1]))
+    assert world.ray_test([(0, 0, 1), (0, 5, 1)], [(3, 0, 1), (3, 5, 1)]) == [None, cube_object]
     crane = Object("crane", ObjectType.GENERIC_OBJECT, CRANE, Pose([0, -5, 0]))
     x, y, z = crane.link_pose("hook").position
     assert world.ray_test([(x, y, z + 1)], [(x, y, z - 0.09)]) == [crane]
@@ -364,9 +364,9 @@ def test_rays_follow_objects_that_moved(world: BulletWorld) -> None:
 
 
 def test_more_rays_than_bullet_accepts_at_once_are_cast(world: BulletWorld) -> None:
-    thing = cube("thing", (0, 0, 1))
+    cube_object = cube("thing", (0, 0, 1))
     starts = [(0, 0, 2 + ray / 40_000) for ray in range(20_000)]
-    assert world.ray_test(starts, [(0, 0, 0.5)] * 20_000) == [thing] * 20_000
+    assert world.ray_test(starts, [(0, 0, 0.5)] * 20_000) == [cube_object] * 20_000
 
 
 def test_unequal_numbers_of_starts_and_ends_are_refused(world: BulletWorld) -> None:
@@ -375,17 +375,17 @@ def test_unequal_numbers_of_starts_and_ends_are_refused(world: BulletWorld) -> N
 
 
 def test_visibility_is_the_share_that_is_not_hidden(world: BulletWorld) -> None:
-    thing, eye = cube("thing", (2, 0, 1)), (0.0, 0.0, 1.0)
-    assert world.visible(thing, eye) == 1.0
+    cube_object, eye = cube("thing", (2, 0, 1)), (0.0, 0.0, 1.0)
+    assert world.visible(cube_object, eye) == 1.0
     whole = Object("wall", ObjectType.GENERIC_OBJECT, wall(0.4), Pose([1, 0, 1]))
-    assert world.visible(thing, eye) == 0.0
-    assert world.visible(thing, eye, ignore=[whole]) == 1.0
+    assert world.visible(cube_object, eye) == 0.0
+    assert world.visible(cube_object, eye, ignore=[whole]) == 1.0
     assert world.visible(whole, eye) == 1.0
     whole.set_pose(Pose([1, 0.2, 1]))
-    assert world.visible(thing, eye) == 0.5
+    assert world.visible(cube_object, eye) == 0.5
     whole.set_pose(Pose([3, 0, 1]))
-    assert world.visible(thing, eye) == 1.0
-    assert world.visible(thing, (2, 0, -1)) == 0.0
+    assert world.visible(cube_object, eye) == 1.0
+    assert world.visible(cube_object, (2, 0, -1)) == 0.0
 
 
 SHAPES = {
@@ -402,9 +402,9 @@ def test_an_object_without_obstacles_is_wholly_visible_from_everywhere(world: Bu
         '<robot name="a"><link name="l"><collision><origin xyz="0.1 0 0" rpy="0.3 0.2 0"/><geometry>'
         f"{SHAPES[shape]}</geometry></collision></link></robot>"
     )
-    thing = Object("thing", ObjectType.GENERIC_OBJECT, description, Pose([0, 0, 2], [0.1, 0.5, -0.2, 0.7]))
+    cube_object = Object("thing", ObjectType.GENERIC_OBJECT, description, Pose([0, 0, 2], [0.1, 0.5, -0.2, 0.7]))
     eyes = [(2, 0, 2), (-2, 0.1, 3), (0, 2, 1), (0.3, -2, 2), (0, 0, 4), (0.1, 0, 0.5)]
-    assert [world.visible(thing, eye) for eye in eyes] == [1.0] * 6
+    assert [world.visible(cube_object, eye) for eye in eyes] == [1.0] * 6
 
 
 def wall(width: float) -> str:

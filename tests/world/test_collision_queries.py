@@ -38,7 +38,7 @@ def test_an_arm_collides_with_a_box_on_its_line_and_not_with_one_beside_it(world
     box = box_at(world, along.x + 0.1, along.y, along.z)
     met = collisions_at(robot, STRAIGHT, links=links(robot))
     assert (FOREARM, box) in met
-    assert {thing for _, thing in met} == {box}
+    assert {obstacle for _, obstacle in met} == {box}
     assert collisions_at(robot, ASIDE, links=links(robot)) == []
     box.set_pose(Pose([along.x + 0.1, along.y + 0.3, along.z]))
     assert collisions_at(robot, STRAIGHT, links=links(robot)) == []

@@ -149,7 +149,7 @@ def test_visibility_agrees_with_rays_through_bullet(world: BulletWorld) -> None:
     cells = middles(costmap)
     for height in (1.0, 1.1, 1.2, 1.3, 1.4):
         met = world.ray_test([(x, y, height) for *_, x, y in cells], [centre] * len(cells))
-        agreed += sum(thing is milk for thing in met)
+        agreed += sum(hit is milk for hit in met)
     # A ray that begins inside a shape does not hit it, so that the two may differ in the cells of furniture.
     assert agreed / 5 == pytest.approx(costmap.map.sum(), rel=0.04)
     assert 0.2 < costmap.map.mean() < 0.95

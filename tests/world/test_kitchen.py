@@ -62,8 +62,8 @@ def test_surfaces_are_where_the_drawing_has_them_with_their_frame_on_top(
 
 def test_cereal_and_milk_of_the_thesis_are_on_the_worktops(kitchen: Object) -> None:
     cereal, milk = cereal_and_milk()
-    for thing, surface in ((cereal, "kitchen_counter_surface"), (milk, "sink_area_surface")):
-        box, top = thing.bounding_box(), kitchen.bounding_box(surface)
+    for packet, surface in ((cereal, "kitchen_counter_surface"), (milk, "sink_area_surface")):
+        box, top = packet.bounding_box(), kitchen.bounding_box(surface)
         assert box.min.z == pytest.approx(top.max.z, abs=1e-9)
         assert top.min[:2] < box.min[:2]
         assert box.max[:2] < top.max[:2]
@@ -151,8 +151,8 @@ def robot(world: BulletWorld, kitchen: Object) -> Object:
 
 
 def test_cereal_and_milk_can_be_picked_up_from_free_floor(world: BulletWorld, robot: Object) -> None:
-    for thing in cereal_and_milk():
-        x, y, z = thing.pose.position
+    for packet in cereal_and_milk():
+        x, y, z = packet.pose.position
         assert reachable_from(world, robot, [Pose([x, y, z]), Pose([x - 0.07, y, z]), Pose([x, y, z + 0.03])])
 
 

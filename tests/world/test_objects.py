@@ -49,85 +49,85 @@ def test_without_a_pose_an_object_is_at_the_origin(world: BulletWorld) -> None:
 def test_every_link_is_where_the_description_has_it(
     world: BulletWorld, base: Pose, turning: float, lifting: float, reaching: float
 ) -> None:
-    thing = crane(base)
-    thing.set_joint_positions({"turning": turning, "lifting": lifting, "reaching": reaching})
+    placed_crane = crane(base)
+    placed_crane.set_joint_positions({"turning": turning, "lifting": lifting, "reaching": reaching})
     expected = crane_links(base, turning=turning, lifting=lifting, reaching=reaching)
-    assert set(thing.links) == set(expected)
+    assert set(placed_crane.links) == set(expected)
     for link, where in expected.items():
-        np.testing.assert_allclose(matrix(thing.link_pose(link)), where, atol=1e-9)
+        np.testing.assert_allclose(matrix(placed_crane.link_pose(link)), where, atol=1e-9)
 
 
 @pytest.mark.parametrize("base", [Pose(), LEANING])
 def test_a_link_pose_at_other_joint_positions_moves_nothing_and_notifies_no_observer(
     world: BulletWorld, base: Pose
 ) -> None:
-    thing = crane(base)
-    thing.set_joint_positions({"turning": 0.4, "lifting": -0.5, "reaching": 0.1})
+    placed_crane = crane(base)
+    placed_crane.set_joint_positions({"turning": 0.4, "lifting": -0.5, "reaching": 0.1})
     change_log = ChangeLog()
     world.observe(change_log)
-    before = {link: thing.link_pose(link) for link in thing.links}
+    before = {link: placed_crane.link_pose(link) for link in placed_crane.links}
     expected = crane_links(base, turning=2.5, lifting=-0.5, reaching=0.25)
     for link, where in expected.items():
-        there = thing.link_pose_at(link, {"turning": 2.5, "reaching": 0.25})
+        there = placed_crane.link_pose_at(link, {"turning": 2.5, "reaching": 0.25})
         np.testing.assert_allclose(matrix(there), where, atol=1e-9)
-    assert {link: thing.link_pose(link) for link in thing.links} == before
-    assert thing.joint_positions() == {"turning": 0.4, "lifting": -0.5, "reaching": 0.1}
+    assert {link: placed_crane.link_pose(link) for link in placed_crane.links} == before
+    assert placed_crane.joint_positions() == {"turning": 0.4, "lifting": -0.5, "reaching": 0.1}
     assert change_log.notes == []
     with pytest.raises(UnknownJoint):
-        thing.link_pose_at("hook", {"rowing": 1.0})
+        placed_crane.link_pose_at("hook", {"rowing": 1.0})
 
 
 def test_links_follow_a_base_that_is_set_after_the_joints(world: BulletWorld) -> None:
-    thing = crane()
-    thing.set_joint_positions({"turning": 0.4, "reaching": 0.6})
-    thing.set_pose(LEANING)
+    placed_crane = crane()
+    placed_crane.set_joint_positions({"turning": 0.4, "reaching": 0.6})
+    placed_crane.set_pose(LEANING)
     expected = crane_links(LEANING, turning=0.4, lifting=0, reaching=0.6)
-    np.testing.assert_allclose(matrix(thing.link_pose("hook")), expected["hook"], atol=1e-9)
+    np.testing.assert_allclose(matrix(placed_crane.link_pose("hook")), expected["hook"], atol=1e-9)
 
 
 def test_joints_and_links_have_the_names_kinds_and_limits_of_the_description(world: BulletWorld) -> None:
-    thing = crane()
-    assert thing.links[0] == "foot"
-    assert set(thing.joints) == {"turning", "lifting", "reaching"}
-    assert thing.joint_positions() == {"turning": 0.0, "lifting": 0.0, "reaching": 0.0}
-    assert thing.joint_limits("lifting") == (-0.5, 1.2)
-    assert thing.joint_limits("reaching") == (0.0, 0.6)
-    assert thing.joint_limits("turning") == (-math.inf, math.inf)
-    assert [thing.joint_type(joint) for joint in ("turning", "lifting", "reaching", "pole")] == [
+    placed_crane = crane()
+    assert placed_crane.links[0] == "foot"
+    assert set(placed_crane.joints) == {"turning", "lifting", "reaching"}
+    assert placed_crane.joint_positions() == {"turning": 0.0, "lifting": 0.0, "reaching": 0.0}
+    assert placed_crane.joint_limits("lifting") == (-0.5, 1.2)
+    assert placed_crane.joint_limits("reaching") == (0.0, 0.6)
+    assert placed_crane.joint_limits("turning") == (-math.inf, math.inf)
+    assert [placed_crane.joint_type(joint) for joint in ("turning", "lifting", "reaching", "pole")] == [
         JointType.CONTINUOUS,
         JointType.REVOLUTE,
         JointType.PRISMATIC,
         JointType.FIXED,
     ]
-    assert thing.joints_above("hook") == ("reaching", "lifting", "turning")
-    assert thing.joints_above("flag") == ("turning",)
-    assert thing.joints_above("foot") == ()
+    assert placed_crane.joints_above("hook") == ("reaching", "lifting", "turning")
+    assert placed_crane.joints_above("flag") == ("turning",)
+    assert placed_crane.joints_above("foot") == ()
 
 
 def test_one_motion_of_joints_is_reported_once_with_all_of_them(world: BulletWorld, change_log: ChangeLog) -> None:
-    thing = crane()
+    placed_crane = crane()
     change_log.notes.clear()
-    thing.set_joint_positions({"turning": 1.5, "reaching": 0.1})
-    thing.set_joint_position("reaching", 0.1)
+    placed_crane.set_joint_positions({"turning": 1.5, "reaching": 0.1})
+    placed_crane.set_joint_position("reaching", 0.1)
     assert change_log.notes == [
         ("joints", "crane", {"turning": 1.5, "reaching": 0.1}),
         ("joints", "crane", {"reaching": 0.1}),
     ]
-    assert thing.joint_positions() == {"turning": 1.5, "lifting": 0.0, "reaching": 0.1}
+    assert placed_crane.joint_positions() == {"turning": 1.5, "lifting": 0.0, "reaching": 0.1}
 
 
 def test_a_motion_of_no_joints_is_ignored(world: BulletWorld, change_log: ChangeLog) -> None:
-    thing = crane()
+    placed_crane = crane()
     change_log.notes.clear()
-    thing.set_joint_positions({})
+    placed_crane.set_joint_positions({})
     assert change_log.notes == []
 
 
 def test_a_base_motion_is_reported_once_even_without_a_change(world: BulletWorld, change_log: ChangeLog) -> None:
-    thing = crane()
+    placed_crane = crane()
     change_log.notes.clear()
-    thing.set_pose(LEANING)
-    thing.set_pose(LEANING)
+    placed_crane.set_pose(LEANING)
+    placed_crane.set_pose(LEANING)
     assert change_log.notes == [("moved", "crane", LEANING)] * 2
 
 
@@ -145,13 +145,13 @@ def test_a_base_motion_is_reported_once_even_without_a_change(world: BulletWorld
 def test_a_joint_outside_its_limits_is_refused_and_nothing_moves(
     world: BulletWorld, change_log: ChangeLog, joint: str, value: float, limits: tuple[float, float]
 ) -> None:
-    thing = crane()
+    placed_crane = crane()
     change_log.notes.clear()
     with pytest.raises(JointLimitExceeded) as refused:
-        thing.set_joint_positions({"turning": 0.5, "lifting": 0.5, joint: value})
+        placed_crane.set_joint_positions({"turning": 0.5, "lifting": 0.5, joint: value})
     assert (refused.value.object_name, refused.value.joint, refused.value.limits) == ("crane", joint, limits)
     assert refused.value.value == value or math.isnan(value)
-    assert thing.joint_positions() == {"turning": 0.0, "lifting": 0.0, "reaching": 0.0}
+    assert placed_crane.joint_positions() == {"turning": 0.0, "lifting": 0.0, "reaching": 0.0}
     assert change_log.notes == []
 
 
@@ -162,22 +162,22 @@ def test_a_joint_without_limits_is_refused_with_a_clear_message(world: BulletWor
 
 
 def test_rounding_past_a_limit_is_accepted_and_never_clamped(world: BulletWorld) -> None:
-    thing = crane()
-    thing.set_joint_position("lifting", 1.2 + 9e-7)
-    assert thing.joint_position("lifting") == 1.2 + 9e-7
+    placed_crane = crane()
+    placed_crane.set_joint_position("lifting", 1.2 + 9e-7)
+    assert placed_crane.joint_position("lifting") == 1.2 + 9e-7
 
 
 def test_unknown_names_are_refused_with_those_that_exist(world: BulletWorld) -> None:
-    thing = crane()
+    placed_crane = crane()
     for call in (
-        lambda: thing.set_joint_position("elbow", 0.0),
-        lambda: thing.joint_position("elbow"),
-        lambda: thing.joint_limits("elbow"),
-        lambda: thing.joint_type("elbow"),
+        lambda: placed_crane.set_joint_position("elbow", 0.0),
+        lambda: placed_crane.joint_position("elbow"),
+        lambda: placed_crane.joint_limits("elbow"),
+        lambda: placed_crane.joint_type("elbow"),
     ):
         with pytest.raises(UnknownJoint, match=r"'crane' has no movable joint 'elbow'.*turning"):
             call()
-    for look in (thing.link_pose, thing.bounding_box, thing.joints_above):
+    for look in (placed_crane.link_pose, placed_crane.bounding_box, placed_crane.joints_above):
         with pytest.raises(UnknownLink, match=r"'crane' has no link 'claw'.*hook"):
             look("claw")
 
@@ -196,17 +196,17 @@ def test_unknown_names_are_refused_with_those_that_exist(world: BulletWorld) -> 
 def test_an_invalid_pose_is_refused_and_nothing_moves(
     world: BulletWorld, change_log: ChangeLog, pose: Pose, reason: str
 ) -> None:
-    thing, milk = crane(LEANING), Object("milk", ObjectType.MILK)
-    thing.attach(milk, "hook")
+    placed_crane, milk = crane(LEANING), Object("milk", ObjectType.MILK)
+    placed_crane.attach(milk, "hook")
     change_log.notes.clear()
     with pytest.raises(PoseRefused, match=re.escape(reason)) as refused:
-        thing.set_pose(pose)
+        placed_crane.set_pose(pose)
     assert refused.value.object_name == "crane"
     assert refused.value.pose is pose
     assert str(refused.value).startswith(f"'crane' cannot be moved to {pose!r}: ")
-    assert (thing.pose, milk.pose) == (LEANING, Pose())
+    assert (placed_crane.pose, milk.pose) == (LEANING, Pose())
     with pytest.raises(PoseRefused, match=r"'crane' cannot be moved to \[1, 2, 3\]: it is not a Pose"):
-        thing.set_pose([1, 2, 3])  # type: ignore[arg-type]  # the fault this test is about
+        placed_crane.set_pose([1, 2, 3])  # type: ignore[arg-type]  # the fault this test is about
     with pytest.raises(PoseRefused, match="'cup'"):
         Object("cup", ObjectType.JEROEN_CUP, pose=pose)
     assert [present.name for present in world.objects] == ["crane", "milk"]
@@ -214,11 +214,11 @@ def test_an_invalid_pose_is_refused_and_nothing_moves(
 
 
 def test_the_pose_of_an_object_carried_to_the_farthest_place_is_finite(world: BulletWorld) -> None:
-    thing, milk = crane(), Object("milk", ObjectType.MILK, pose=Pose([-1e9, -1e9, -1e9]))
-    thing.attach(milk, "hook")
+    placed_crane, milk = crane(), Object("milk", ObjectType.MILK, pose=Pose([-1e9, -1e9, -1e9]))
+    placed_crane.attach(milk, "hook")
     for place in (Pose([1e9, 1e9, 1e9], [0.2, -0.4, 0.1, 0.8]), Pose([-1e9, 0, 1e9], [0.2, 0.4, 0.1, -0.8])):
-        thing.set_pose(place)
-        thing.set_joint_position("turning", 1e9)
+        placed_crane.set_pose(place)
+        placed_crane.set_joint_position("turning", 1e9)
         assert all(map(math.isfinite, (*milk.pose.position, *milk.pose.orientation)))
 
 
@@ -254,34 +254,34 @@ def test_an_object_needs_a_world() -> None:
 
 
 def test_reset_of_an_object_reports_only_its_changes(world: BulletWorld, change_log: ChangeLog) -> None:
-    thing, cup = crane(LEANING), Object("cup", ObjectType.JEROEN_CUP, pose=Pose([1, 0, 0]))
-    thing.attach(cup, "hook")
-    thing.set_joint_positions({"turning": 0.4, "lifting": 0.0})
+    placed_crane, cup = crane(LEANING), Object("cup", ObjectType.JEROEN_CUP, pose=Pose([1, 0, 0]))
+    placed_crane.attach(cup, "hook")
+    placed_crane.set_joint_positions({"turning": 0.4, "lifting": 0.0})
     kept = cup.pose
     change_log.notes.clear()
-    thing.reset()
+    placed_crane.reset()
     assert change_log.notes == [("detached", "crane", "cup", "hook"), ("joints", "crane", {"turning": 0.0})]
-    assert thing.pose is LEANING
+    assert placed_crane.pose is LEANING
     assert cup.pose is kept
     change_log.notes.clear()
-    thing.reset()
+    placed_crane.reset()
     assert change_log.notes == []
 
 
 def test_a_removed_object_can_be_read_but_not_moved(world: BulletWorld, change_log: ChangeLog) -> None:
-    thing = crane(LEANING)
-    thing.set_joint_position("turning", 0.4)
-    thing.remove()
+    placed_crane = crane(LEANING)
+    placed_crane.set_joint_position("turning", 0.4)
+    placed_crane.remove()
     assert change_log.notes[-1] == ("removed", "crane", LEANING)
-    assert (thing.name, thing.pose, thing.joint_position("turning")) == ("crane", LEANING, 0.4)
+    assert (placed_crane.name, placed_crane.pose, placed_crane.joint_position("turning")) == ("crane", LEANING, 0.4)
     assert world.objects == ()
     for call in (
-        lambda: thing.set_pose(Pose()),
-        lambda: thing.set_joint_position("turning", 0.0),
-        lambda: thing.link_pose("hook"),
-        thing.bounding_box,
-        thing.reset,
-        thing.remove,
+        lambda: placed_crane.set_pose(Pose()),
+        lambda: placed_crane.set_joint_position("turning", 0.0),
+        lambda: placed_crane.link_pose("hook"),
+        placed_crane.bounding_box,
+        placed_crane.reset,
+        placed_crane.remove,
     ):
         with pytest.raises(ObjectNotInWorld, match="'crane'"):
             call()

@@ -144,6 +144,6 @@ def test_small_things_have_the_extents_of_the_thesis_scene(world: BulletWorld, o
 def test_every_type_but_robots_and_environments_has_a_shape(world: BulletWorld) -> None:
     for object_type in ObjectType:
         if object_type not in (ObjectType.ROBOT, ObjectType.ENVIRONMENT):
-            thing = Object(f'a "{object_type.name}" <&>', object_type)
-            assert thing.links == (f'a "{object_type.name}" <&>',)
-            assert min(thing.bounding_box().size) > 0.01
+            shaped = Object(f'a "{object_type.name}" <&>', object_type)
+            assert shaped.links == (f'a "{object_type.name}" <&>',)
+            assert min(shaped.bounding_box().size) > 0.01

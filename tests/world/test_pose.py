@@ -44,8 +44,8 @@ def test_a_quaternion_without_a_direction_is_refused(number: float) -> None:
         ({"time_ns": 2**63}, "whole number of ns since 1970 of at most 64 bits, got 9223372036854775808"),
     ],
 )
-def test_an_invalid_pose_is_refused_in_a_line_with_the_reason(arguments: dict[str, Any], said: str) -> None:
-    with pytest.raises(MalformedPose, match=said) as caught:
+def test_an_invalid_pose_is_refused_in_a_line_with_the_reason(arguments: dict[str, Any], message: str) -> None:
+    with pytest.raises(MalformedPose, match=message) as caught:
         Pose(**arguments)
     assert isinstance(caught.value, CallerError)
 

@@ -76,8 +76,8 @@ def test_an_attached_object_in_a_copy_moves_by_geometry_and_not_in_the_world(yar
         on_hook = np.linalg.inv(hook) @ matrix(label.pose)
         crane.set_joint_positions({"turning": -1.0, "reaching": 0.1})
         crane.set_pose(Pose([-2, 0, 1]))
-        there = crane_links(Pose([-2, 0, 1]), turning=-1.0, lifting=0.8, reaching=0.1)["hook"] @ on_hook
-        assert np.allclose(matrix(label.pose), there, atol=1e-6)
+        hook_frame = crane_links(Pose([-2, 0, 1]), turning=-1.0, lifting=0.8, reaching=0.1)["hook"] @ on_hook
+        assert np.allclose(matrix(label.pose), hook_frame, atol=1e-6)
         copy.object("milk").remove()
         Object("spoon", ObjectType.SPOON)
         crane.detach_all()

@@ -130,11 +130,11 @@ async def test_a_database_that_stays_locked_during_the_fold_is_raised_and_stored
 
 async def test_a_query_for_stopped_episodes_on_an_unavailable_database_is_retried(log: EventLog) -> None:
     class UnavailableTwice(ForwardingDestination):
-        asked = 0
+        requests = 0
 
         async def stopped(self) -> Mapping[str, str]:
-            self.asked += 1
-            if self.asked < 3:
+            self.requests += 1
+            if self.requests < 3:
                 raise DatabaseUnavailable("the connection was closed")
             return await super().stopped()
 

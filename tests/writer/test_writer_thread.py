@@ -342,17 +342,17 @@ async def test_a_fold_that_fails_is_raised_at_flush(address: DatabaseAddress) ->
 
 async def test_a_fold_on_an_unavailable_database_is_retried(address: DatabaseAddress) -> None:
     class OftenUnavailable(ForwardingDestination):
-        asked = 0
+        requests = 0
 
         async def fold(self) -> int:
-            self.asked += 1
-            if self.asked % 3:
+            self.requests += 1
+            if self.requests % 3:
                 raise DatabaseUnavailable("the database is locked")
             return await super().fold()
 
         async def stopped(self) -> Mapping[str, str]:
-            self.asked += 1
-            if self.asked % 3:
+            self.requests += 1
+            if self.requests % 3:
                 raise DatabaseUnavailable("the database is locked")
             return await super().stopped()
 
