@@ -32,7 +32,10 @@ def parse_moment(text: str) -> tuple[float | None, int | None]:
 
 
 def print_snapshot(snapshot: Moment, requested: str, *, events: bool = False, full: bool = False) -> None:
-    """Print the episode's facts, its task tree, and a table of the objects in the world; with `full`, uncut."""
+    """Print the episode's facts, its task tree, and a table of the objects in the world.
+
+    With `full` no text is cut, and the objects have their colours and the fingerprints of their descriptions.
+    """
     robot = snapshot.world.robot
     print_facts(
         f"Episode {snapshot.number}: {snapshot.description}",
@@ -53,6 +56,8 @@ def print_snapshot(snapshot: Moment, requested: str, *, events: bool = False, fu
     if snapshot.world.objects:
         columns = ("object", "type", "x", "y", "z", "heading", "attached to", "joints")
         print_table("World", columns, [_row(each, full=full) for each in snapshot.world.objects])
+        if full:
+            print_table("Shapes", ("object", "color", "description"), map(_shape_row, snapshot.world.objects))
     if snapshot.observations:
         observed = [_observed_row(name, each, full=full) for name, each in snapshot.observations.items()]
         print_table("Observations", ("name", "at", "event", "values"), observed)
@@ -86,6 +91,11 @@ def _row(each: ObjectThen, *, full: bool) -> tuple[object, ...]:
     attached = " ".join(filter(None, parent)) if parent is not None else ""
     joints = _joints_text(each, full=full)
     return each.name, each.object_type, *each.pose.position, _degrees(each.pose.yaw), attached, joints
+
+
+def _shape_row(each: ObjectThen) -> tuple[object, ...]:
+    color = " ".join(f"{part:g}" for part in each.color) if each.color is not None else ""
+    return each.name, color, each.description_fingerprint or "not recorded"
 
 
 def _degrees(angle: float) -> str:

@@ -26,7 +26,7 @@ __all__ = [
     "encoded_bytes",
     "decode",
     "DECLARATION_TYPES",
-    "DESCRIPTIONS_FROM",
+    "DESCRIPTION_PREFIX",
     "fingerprint",
     "declaration_type",
     "declaration_of",
@@ -35,11 +35,10 @@ __all__ = [
 ]
 
 
-_DESCRIPTION = "urdf-"
-DESCRIPTIONS_FROM: Final = "g"
-"""Divides the fingerprints of designator types, which are hexadecimal digits, from those of descriptions."""
+DESCRIPTION_PREFIX: Final = "urdf-"
+"""The prefix of the fingerprints of descriptions; those of designator types are hexadecimal digits alone."""
 
-DECLARATION_TYPES: Final[Mapping[str, str]] = {"DesignatorTypeDeclared": "", "DescriptionDeclared": _DESCRIPTION}
+DECLARATION_TYPES: Final[Mapping[str, str]] = {"DesignatorTypeDeclared": "", "DescriptionDeclared": DESCRIPTION_PREFIX}
 """The event types that belong to a recorder and not to an episode, with the prefix of their fingerprints."""
 
 
@@ -165,14 +164,14 @@ def encoded_bytes(value: Any) -> int:
 def fingerprint(declaration: bytes, type_name: str = "DesignatorTypeDeclared") -> str:
     """Compute the content address of a declaration: 128 bits of BLAKE2b over its payload, as 32 hexadecimal digits.
 
-    That of a description follows a prefix, so that the log can read the declarations of either type by their index.
+    That of a description follows a prefix, by which the log distinguishes the two types.
     """
     return DECLARATION_TYPES[type_name] + hashlib.blake2b(declaration, digest_size=16).hexdigest()
 
 
 def declaration_type(fingerprint: str) -> str:
     """Return the event type of the declaration that has this fingerprint."""
-    return "DescriptionDeclared" if fingerprint.startswith(_DESCRIPTION) else "DesignatorTypeDeclared"
+    return "DescriptionDeclared" if fingerprint.startswith(DESCRIPTION_PREFIX) else "DesignatorTypeDeclared"
 
 
 def unwritable(value: Any) -> str | None:

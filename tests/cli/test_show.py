@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 
 from tests.commands import answer, one_line_of, pycrorm
+from tests.databases import ask
 
 pytestmark = pytest.mark.slow
 
@@ -91,6 +92,10 @@ def test_a_moment_is_drawn_with_its_tree_and_its_world(ridden: Path) -> None:
     assert "  running   HoldAction > MoveTorsoAction > MoveJointsMotion\n" in later
     assert "torso at 0.200 m" in later
     assert "torso_lift_joint 0.200" in later
+    full = pycrorm("show", "1", "--at", "#9", "--full", cwd=ridden).stdout
+    rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in full.splitlines() if "│" in line]
+    fingerprints = ask(ridden / "pycrorm.db", "SELECT description_fingerprint FROM object WHERE id = identity_id")
+    assert rows[-2:] == [["pr2", "", fingerprints[0][0]], ["milk", "", fingerprints[1][0]]]
 
 
 def test_a_moment_is_one_document(ridden: Path) -> None:

@@ -25,6 +25,7 @@ from pycrorm_async.orm import ObjectDescription
 from pycrorm_async.query.recorded_world import RecordedWorld
 from pycrorm_async.settings import Settings
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose, copied
+from pycrorm_async.world.robots.robot_description import PR2
 from tests.commands import environment
 
 ROBOTS = "cmeel.prefix/share/example-robot-data/robots"
@@ -241,6 +242,19 @@ async def test_a_robot_of_a_plan_that_was_killed_before_anything_was_stored_is_s
             assert dict(world.assumed) == {}
             assert arm.color == (0.0, 0.0, 1.0, 1.0)
             assert arm.link_pose("tip").position == pytest.approx(tip, abs=1e-6)
+
+
+async def test_a_robot_under_another_name_keeps_its_description(database_url: str) -> None:
+    async with Memory.open(database_url) as memory:
+        async with memory.episode(description="two robots"):
+            with BulletWorld():
+                for name in ("ada", "bob"):
+                    Object(name, ObjectType.ROBOT, robot=PR2)
+        await memory.flush()
+        then = await memory.as_of("last", sequence=4)
+    assert len(then.world.descriptions) == 1
+    with world_of(then) as world:
+        assert [(each.name, each.robot_description) for each in world.objects] == [("ada", PR2), ("bob", PR2)]
 
 
 async def test_objects_of_an_older_version_have_assumed_shapes_and_say_so(tmp_path: Path) -> None:

@@ -67,6 +67,16 @@ def test_a_description_larger_than_an_eighth_is_not_repeated_and_counted() -> No
     assert (declarations.bytes, declarations.unrepeated) == (64 + len(payload), 1)
 
 
+def test_a_description_that_is_put_again_is_dropped_later() -> None:
+    size = 64 + len(b"DescriptionDeclared") + len(description(1))
+    declarations = Declarations(3 * size)
+    for number in (1, 2, 3, 1, 4):
+        body = b"DescriptionDeclared" + description(number)
+        declarations.add(body, name=b"DescriptionDeclared", version=1, payload=description(number), room=10 * size)
+    in_use = {each.payload for each in declarations._frames.values()}
+    assert in_use == {description(number) for number in (3, 1, 4)}
+
+
 def test_the_bytes_of_the_descriptions_are_counted_exactly() -> None:
     declarations = Declarations(1_000)
     for number in range(50):

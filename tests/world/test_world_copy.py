@@ -65,6 +65,14 @@ def test_a_copy_has_everything_of_the_world(yard: BulletWorld) -> None:
     assert yard.save_state() == before
 
 
+def test_a_copy_has_the_colors_of_its_world(world: BulletWorld) -> None:
+    Object("milk", ObjectType.MILK, color=(1.0, 0.0, 0.0, 0.5))
+    Object("bowl", ObjectType.BOWL)
+    with copied(world) as copy, copied(copy) as second:
+        for each in (copy, second):
+            assert [obj.color for obj in each.objects] == [(1.0, 0.0, 0.0, 0.5), None]
+
+
 def test_an_attached_object_in_a_copy_moves_by_geometry_and_not_in_the_world(yard: BulletWorld) -> None:
     """The expected pose of the label: on the hook, by matrices from the crane's drawing."""
     change_log = ChangeLog()

@@ -35,7 +35,7 @@ from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.sql.functions import FunctionElement
 from sqlalchemy.sql.selectable import CompoundSelect
 
-from pycrorm_async.events.codec import DESCRIPTIONS_FROM
+from pycrorm_async.events.codec import DESCRIPTION_PREFIX
 from pycrorm_async.events.fields import table_name
 from pycrorm_async.events.ids import SEQUENCE_MAX, SLOT_MAX
 from pycrorm_async.projections.schema.layout import Layout
@@ -65,6 +65,7 @@ _OF_RELATIONS = ("task_tree_node", "object", "object_removal", "pose", "joint_ch
 _event = table("event", column("episode"), column("sequence"), column("payload"))
 _episode = table("episode", column("number"), column("id"))
 _declaration = table("pycrorm_declaration", column("fingerprint"), column("payload"))
+_is_description = func.substr(_declaration.c.fingerprint, 1, len(DESCRIPTION_PREFIX)) == DESCRIPTION_PREFIX
 
 
 class _Member(FunctionElement[str]):
@@ -152,7 +153,7 @@ def public_views(
             tables = SpatialTables(*(core[name] for name in _OF_RELATIONS))
             views["spatial_relation"] = spatial_relations(tables, picked, placed, simulated=simulated)
     views["designator_type"] = _designator_type(layout)
-    views["object_description"] = select(_declaration).where(_declaration.c.fingerprint >= DESCRIPTIONS_FROM)
+    views["object_description"] = select(_declaration).where(_is_description)
     return {**views, **concept_views()}
 
 
@@ -207,7 +208,7 @@ def _designator_type(layout: Layout) -> View:
         member("concept").label("concept"),
         func.coalesce(member("fields"), "[]").label("fields"),
     )
-    view = view.where(_declaration.c.fingerprint < DESCRIPTIONS_FROM)
+    view = view.where(~_is_description)
     return view.where(~unreadable) if layout.unreadable else view
 
 

@@ -14,7 +14,7 @@ from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.errors import DamageError, DatabaseUnavailable, TablesOutdated
 from pycrorm_async.events.blobs import references_in
-from pycrorm_async.events.codec import fingerprint
+from pycrorm_async.events.codec import DESCRIPTION_PREFIX, fingerprint
 from pycrorm_async.projections.custom.projection import Projection
 from pycrorm_async.projections.fold.parameters import Designators
 from pycrorm_async.projections.fold.row_batch import Rows
@@ -32,8 +32,9 @@ from pycrorm_async.store.stored import EpisodeRow, Span, StoredEvent
 
 __all__ = ["VerifyResult", "Damage", "StoppedEpisode", "verify"]
 
-_FINGERPRINTS = text("SELECT fingerprint FROM pycrorm_declaration WHERE fingerprint < 'g' ORDER BY ordinal")
-_DESCRIPTIONS = text("SELECT fingerprint FROM pycrorm_declaration WHERE fingerprint >= 'g'")
+_BY_PREFIX = "SELECT fingerprint FROM pycrorm_declaration WHERE substr(fingerprint, 1, 5)"
+_FINGERPRINTS = text(f"{_BY_PREFIX} <> '{DESCRIPTION_PREFIX}' ORDER BY ordinal")
+_DESCRIPTIONS = text(f"{_BY_PREFIX} = '{DESCRIPTION_PREFIX}'")
 _DESCRIPTIONS_READ = 100
 """Bounds the descriptions read at once: each takes up to `record_bytes_max`."""
 _TOTAL = text("SELECT coalesce(sum(head), 0) FROM episode WHERE number >= :first AND number < :end")

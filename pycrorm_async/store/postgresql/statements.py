@@ -113,10 +113,9 @@ WITH ORDINALITY AS span (number, after, last, place) CROSS JOIN LATERAL (
     WHERE episode = span.number AND sequence > span.after AND sequence <= span.last ORDER BY sequence
 ) AS event ORDER BY span.place, event.sequence"""
 
-# The fingerprint of a description begins with a letter behind the hexadecimal digits, so the index on fingerprints
-# leads to the designator types alone, however many descriptions there are.
 _PAYLOADS = "SELECT pg_catalog.convert_to(payload, 'UTF8') FROM pycrorm.pycrorm_declaration"
-SELECT_DECLARATIONS = f"{_PAYLOADS} WHERE fingerprint < 'g' ORDER BY ordinal"
+# By equality, because the order of letters and digits depends on the database's collation.
+SELECT_DECLARATIONS = f"{_PAYLOADS} WHERE pg_catalog.substr(fingerprint, 1, 5) <> 'urdf-' ORDER BY ordinal"
 SELECT_DESCRIPTIONS = f"{_PAYLOADS} WHERE fingerprint = ANY ($1::text[])"
 
 # Locks the rows by number first, as elsewhere. An UPDATE alone locks them in any order, so that two processes that fold

@@ -80,8 +80,8 @@ SELECT json_group_array(json_array(sequence, type, version, wall_ns, monotonic_n
        CAST(group_concat(payload, '') AS BLOB)
 FROM event WHERE episode = ? AND sequence > ? AND sequence <= ?"""
 
-# The fingerprint of a description begins with a letter behind the hexadecimal digits, so the index on fingerprints
-# leads to the designator types alone, however many descriptions there are; `+` keeps SQLite from a scan in rowid order.
+# The prefix of a description's fingerprint is behind the hexadecimal digits, so the index on fingerprints leads to the
+# designator types alone, however many descriptions there are; `+` keeps SQLite from a scan in rowid order.
 SELECT_DECLARATIONS = "SELECT CAST(payload AS BLOB) FROM pycrorm_declaration WHERE fingerprint < 'g' ORDER BY +ordinal"
 SELECT_DESCRIPTIONS = (
     "SELECT CAST(payload AS BLOB) FROM pycrorm_declaration WHERE fingerprint IN (SELECT value FROM json_each(?))"
