@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import datetime
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, TypeVar, dataclass_transform
 
 from sqlalchemy import (
     BigInteger,
@@ -18,6 +18,7 @@ from sqlalchemy import (
     Double,
     ForeignKey,
     Text,
+    and_,
     event,
     inspect,
     literal_column,
@@ -27,7 +28,20 @@ from sqlalchemy import (
 from sqlalchemy.exc import MissingGreenlet, StatementError
 from sqlalchemy.ext.asyncio import AsyncAttrs
 from sqlalchemy.ext.hybrid import hybrid_property
-from sqlalchemy.orm import DeclarativeBase, Mapped, MappedAsDataclass, Mapper, mapped_column, relationship, synonym
+from sqlalchemy.orm import (
+    DeclarativeBase,
+    Mapped,
+    MappedAsDataclass,
+    MappedColumn,
+    Mapper,
+    RelationshipProperty,
+    Synonym,
+    foreign,
+    mapped_column,
+    relationship,
+    remote,
+    synonym,
+)
 from sqlalchemy.orm.exc import DetachedInstanceError
 
 from pycrorm_async.errors import CallerError
@@ -45,6 +59,11 @@ __all__ = [
     "Concept",
     "ConceptAncestor",
     "is_concept",
+    "one_of",
+    "many_of",
+    "inherited_from",
+    "same_row",
+    "EPISODE",
     "ProcessMetaData",
     "Position",
     "Quaternion",
@@ -55,6 +74,71 @@ __all__ = [
 _Value = TypeVar("_Value")
 
 
+EPISODE = "process_metadata_id"
+"""The column of every table that names the episode of a row."""
+
+
+def one_of(
+    reference: Callable[[], Any], table: str, class_: Any = None, *, lazy: Any = "selectin", **options: Any
+) -> Any:
+    """Return a read-only relationship to the row of `table` whose id the attribute `reference()` contains.
+
+    It joins by id and episode, so that a database whose tables are divided by episode reads one part of them. `class_`
+    is the class of these rows, where no annotation names it.
+    """
+
+    def joined() -> Any:
+        attribute = reference()
+        others, own_episode = Base.metadata.tables[table].c, attribute.class_.process_metadata_id
+        return and_(foreign(attribute) == remote(others.id), own_episode == remote(others.process_metadata_id))
+
+    return _by_id(relationship(class_, primaryjoin=joined, viewonly=True, lazy=lazy, **options))
+
+
+def many_of(reference: Callable[[], Any], table: str, *, lazy: Any = "selectin", **options: Any) -> Any:
+    """Return a read-only relationship to the rows whose attribute `reference()` contains the id of a row of `table`."""
+
+    def joined() -> Any:
+        attribute = reference()
+        own, episode = Base.metadata.tables[table].c, attribute.class_.process_metadata_id
+        return and_(own.id == remote(foreign(attribute)), own.process_metadata_id == remote(episode))
+
+    return _by_id(relationship(primaryjoin=joined, viewonly=True, lazy=lazy, **options))
+
+
+def inherited_from(base: Any, table: Any) -> dict[str, Any]:
+    """Return the arguments of a mapper that joins the rows of `table` with those of `base` by id and episode."""
+    repeated = [each.local_table.c[EPISODE] for each in (*base.__mapper__.iterate_to_root(),)][:-1]
+    return {"inherit_condition": same_row(table, base.__table__), "exclude_properties": [table.c[EPISODE], *repeated]}
+
+
+def same_row(one: Any, other: Any) -> Any:
+    """Return the condition that rows of two tables have the same id and episode."""
+    return and_(one.c.id == other.c.id, one.c[EPISODE] == other.c[EPISODE])
+
+
+def _by_id(related: Any) -> Any:
+    """Let `selectinload` read related rows by their ids, which are unique in the memory.
+
+    SQLAlchemy does so by itself only where the join is by the mapped key alone, which is the id. Otherwise it would
+    join the rows of the parent again for every load. `EpisodeSession` adds the episode to such a load.
+    """
+    related.omit_join = True
+    return related
+
+
+@dataclass_transform(
+    field_specifiers=(
+        MappedColumn,
+        RelationshipProperty,
+        Synonym,
+        mapped_column,
+        relationship,
+        synonym,
+        one_of,
+        many_of,
+    )
+)
 class Base(MappedAsDataclass, AsyncAttrs, DeclarativeBase, init=False, repr=False, eq=False):
     """The root of the mapped classes. Its repr shows loaded attributes only and never queries the database."""
 
@@ -292,8 +376,8 @@ class Pose(RowOfEvent, Base):
     qz: Mapped[float]
     qw: Mapped[float]
 
-    position: Mapped[Position] = relationship(viewonly=True, lazy="joined", innerjoin=True)
-    orientation: Mapped[Quaternion] = relationship(viewonly=True, lazy="joined", innerjoin=True)
+    position: Mapped[Position] = one_of(lambda: Pose.position_id, "position", lazy="joined", innerjoin=True)
+    orientation: Mapped[Quaternion] = one_of(lambda: Pose.orientation_id, "quaternion", lazy="joined", innerjoin=True)
     process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True, lazy="selectin")
 
 
@@ -308,5 +392,5 @@ class RobotState(RowOfEvent, Base):
     type: Mapped[ObjectType]
     pose_id: Mapped[int] = mapped_column(ForeignKey("pose.id"))
 
-    pose: Mapped[Pose] = relationship(viewonly=True, lazy="joined", innerjoin=True)
+    pose: Mapped[Pose] = one_of(lambda: RobotState.pose_id, "pose", lazy="joined", innerjoin=True)
     process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True, lazy="selectin")

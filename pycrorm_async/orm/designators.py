@@ -21,12 +21,24 @@ from __future__ import annotations
 from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
-from sqlalchemy import ColumnElement, Dialect, ForeignKey, String, select
+from sqlalchemy import BigInteger, Column, ColumnElement, Dialect, ForeignKey, String, Table, select
 from sqlalchemy.ext.hybrid import hybrid_property
 from sqlalchemy.orm import Mapped, MappedAsDataclass, declared_attr, mapped_column, relationship, synonym
 from sqlalchemy.types import TypeDecorator
 
-from pycrorm_async.orm.base import Base, HybridOnRequest, Pose, ProcessMetaData, RobotState, RowOfEvent, is_concept
+from pycrorm_async.orm.base import (
+    EPISODE,
+    Base,
+    HybridOnRequest,
+    Pose,
+    ProcessMetaData,
+    RobotState,
+    RowOfEvent,
+    inherited_from,
+    is_concept,
+    many_of,
+    one_of,
+)
 from pycrorm_async.orm.known_classes import known_classes
 from pycrorm_async.orm.objects import Object
 from pycrorm_async.orm.types import JsonText
@@ -105,7 +117,7 @@ class ParameterItem(Base):
     object_name: Mapped[str | None]
     obj_type: Mapped[str | None]
 
-    object: Mapped[Object | None] = relationship(viewonly=True, lazy="selectin")
+    object: Mapped[Object | None] = one_of(lambda: ParameterItem.object_id, "object")
 
     @property
     def value(self) -> Any:
@@ -157,15 +169,23 @@ class Designator(RowOfEvent, Base):
             if "__tablename__" not in vars(cls):
                 cls.__tablename__ = cls.__name__
             if "id" not in vars(cls):
-                base = next(each for each in cls.__mro__[1:] if issubclass(each, Base) and "__table__" in vars(each))
+                base = _mapped_base(cls)
                 cls.id = mapped_column(ForeignKey(f"{base.__tablename__}.id"), primary_key=True, sort_order=-2)
         super().__init_subclass__(**arguments)
+
+    @classmethod
+    def __table_cls__(cls, *arguments: Any, **options: Any) -> Table:
+        # Every leaf's view also has the episode, which joins use. Queries read it from `designator` alone.
+        episode = () if cls.__name__ == "Designator" else (Column(EPISODE, BigInteger()),)
+        return Table(*arguments, *episode, **options)
 
     @declared_attr.directive
     def __mapper_args__(cls) -> dict[str, Any]:
         # "selectin" at every level: a query for a base loads the columns of all leaves without a join for each.
         arguments = {"polymorphic_identity": cls.__name__, "polymorphic_load": "selectin"}
-        return {"polymorphic_on": "_lineage", **arguments} if cls.__name__ == "Designator" else arguments
+        if cls.__name__ == "Designator":
+            return {"polymorphic_on": "_lineage", **arguments}
+        return {**arguments, **inherited_from(_mapped_base(cls), cls.__table__)}
 
     id: Mapped[int] = mapped_column(primary_key=True)
     process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"))
@@ -182,14 +202,12 @@ class Designator(RowOfEvent, Base):
     _end_sequence: Mapped[int | None] = mapped_column("end_sequence")
     _robot: Mapped[str | None] = mapped_column("robot")
 
-    robot_state: Mapped[RobotState | None] = relationship(viewonly=True, lazy="selectin")
-    items: Mapped[list[ParameterItem]] = relationship(
-        viewonly=True, lazy="selectin", order_by=(ParameterItem.field, ParameterItem.position)
+    robot_state: Mapped[RobotState | None] = one_of(lambda: Designator.robot_state_id, "robot_state")
+    items: Mapped[list[ParameterItem]] = many_of(
+        lambda: ParameterItem.node_id, "designator", order_by=(ParameterItem.field, ParameterItem.position)
     )
     process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True, lazy="selectin")
-    _node: Mapped[TaskTreeNode] = relationship(
-        primaryjoin="foreign(Designator.id) == TaskTreeNode.id", viewonly=True, lazy="select"
-    )
+    _node: Mapped[TaskTreeNode] = one_of(lambda: Designator.id, "task_tree_node", lazy="select")
 
     # Hybrids, because a subclass may map a field of such a name, which a column of the same name would collide with.
 
@@ -261,6 +279,11 @@ class Designator(RowOfEvent, Base):
         return {item.key: item.value for item in self.items if item.field == field and item.key is not None}
 
 
+def _mapped_base(class_: Any) -> Any:
+    """Return the nearest mapped class that this class derives from."""
+    return next(each for each in class_.__mro__[1:] if issubclass(each, Base) and "__table__" in vars(each))
+
+
 class Action(Designator):
     """A performed action: a task that a plan requests."""
 
@@ -286,8 +309,9 @@ class PoseParameter(MappedAsDataclass, init=False, repr=False, eq=False):
     """A pose; the class or a mixin declares `pose_id`."""
 
     @declared_attr
-    def pose(cls) -> Mapped[Pose]:
-        return relationship(viewonly=True, lazy="selectin")
+    def pose(cls: Any) -> Mapped[Pose]:
+        related: Mapped[Pose] = one_of(lambda: cls.pose_id, "pose")
+        return related
 
 
 class TargetLocationParameter(PoseParameter):
@@ -322,8 +346,9 @@ class ObjectParameter(MappedAsDataclass, init=False, repr=False, eq=False):
     """An object, as its row from before the node started; the class or a mixin declares `object_id`."""
 
     @declared_attr
-    def object(cls) -> Mapped[Object]:
-        return relationship(viewonly=True, lazy="selectin")
+    def object(cls: Any) -> Mapped[Object]:
+        related: Mapped[Object] = one_of(lambda: cls.object_id, "object")
+        return related
 
 
 class ObjectDesignatorParameter(ObjectParameter):

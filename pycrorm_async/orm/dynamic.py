@@ -20,13 +20,13 @@ from typing import Any
 
 from sqlalchemy import BigInteger, Boolean, Column, Double, ForeignKey, MetaData, Table, Text
 from sqlalchemy.ext.asyncio import AsyncEngine
-from sqlalchemy.orm import registry, relationship, synonym
+from sqlalchemy.orm import registry, synonym
 from sqlalchemy.types import TypeEngine
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.types import DesignatorTypeDeclared
 from pycrorm_async.events.values import FieldDeclared, FieldType
-from pycrorm_async.orm.base import Base, Pose
+from pycrorm_async.orm.base import EPISODE, Base, Pose, inherited_from, one_of
 from pycrorm_async.orm.designators import Action, Designator, Language, Motion
 from pycrorm_async.orm.known_classes import known_classes
 from pycrorm_async.orm.objects import Object
@@ -153,13 +153,19 @@ class DynamicClasses:
             return self._add_fields(dtype, existing, fields)
         declared = self._declared[dtype][-1]
         base = self._base(declared, (*descendants, dtype))
-        table = Table(declared.table, self._metadata, Column("id", ForeignKey(base.__table__.c.id), primary_key=True))
+        table = Table(
+            declared.table,
+            self._metadata,
+            Column("id", ForeignKey(base.__table__.c.id), primary_key=True),
+            Column(EPISODE, BigInteger()),
+        )
         class_ = type(dtype, (base,), {"__abstract__": True, "__doc__": f"{dtype}, as it was declared."})
         identity = f"{dtype}@{id(self):x}"
         self._registry.map_imperatively(
             class_,
             table,
             inherits=base.__mapper__,
+            **inherited_from(base, table),
             polymorphic_identity=identity,
             polymorphic_load="selectin",
         )
@@ -212,16 +218,8 @@ class DynamicClasses:
         column = Column(field.column, BigInteger(), ForeignKey(target.__table__.c.id))
         table.append_column(column)
         mapper.add_property(f"{field.name}_id", column)
-        mapper.add_property(
-            field.name,
-            relationship(
-                target,
-                primaryjoin=column == target.__table__.c.id,
-                foreign_keys=column,
-                viewonly=True,
-                lazy="selectin",
-            ),
-        )
+        reference = f"{field.name}_id"
+        mapper.add_property(field.name, one_of(lambda: getattr(class_, reference), target.__tablename__, target))
         if not mapper.has_property(field.type):  # the first pose is also `pose`, the first object also `object`
             mapper.add_property(field.type, synonym(field.name))
             mapper.add_property(f"{field.type}_id", synonym(f"{field.name}_id"))

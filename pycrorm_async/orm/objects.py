@@ -11,13 +11,13 @@ from datetime import datetime
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-from sqlalchemy import ColumnElement, ForeignKey, FromClause, select
+from sqlalchemy import ColumnElement, ForeignKey, FromClause, and_, select
 from sqlalchemy.orm import Mapped, mapped_column, relationship, synonym
 
 from pycrorm_async.events.codec import description_of
 from pycrorm_async.events.types import DescriptionDeclared
 from pycrorm_async.events.values import BoxValue, MeshValue
-from pycrorm_async.orm.base import Base, Pose, ProcessMetaData, RowOfEvent, is_concept, on_request
+from pycrorm_async.orm.base import Base, Pose, ProcessMetaData, RowOfEvent, is_concept, on_request, one_of
 from pycrorm_async.orm.types import JsonText
 from pycrorm_async.world.enums import ObjectType
 
@@ -118,16 +118,18 @@ class Object(RowOfEvent, Base):
     description_fingerprint: Mapped[str | None] = mapped_column(ForeignKey("object_description.fingerprint"))
     color: Mapped[list[float] | None] = mapped_column(JsonText())
 
-    pose: Mapped[Pose | None] = relationship(viewonly=True, lazy="selectin")
+    pose: Mapped[Pose | None] = one_of(lambda: Object.pose_id, "pose")
     _description: Mapped[ObjectDescription | None] = relationship(
         secondary=lambda: _ADDED,
-        primaryjoin=lambda: Object.identity_id == _ADDED.c.id,
+        primaryjoin=lambda: and_(
+            Object.identity_id == _ADDED.c.id, Object.process_metadata_id == _ADDED.c.process_metadata_id
+        ),
         secondaryjoin=lambda: _ADDED.c.description_fingerprint == ObjectDescription.fingerprint,
         viewonly=True,
         lazy="select",
         uselist=False,
     )
-    _node: Mapped[TaskTreeNode | None] = relationship(foreign_keys=node_id, viewonly=True, lazy="select")
+    _node: Mapped[TaskTreeNode | None] = one_of(lambda: Object.node_id, "task_tree_node", lazy="select")
     process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True, lazy="selectin")
 
     __mapper_args__ = {"polymorphic_on": "dtype", "polymorphic_identity": "Object"}  # noqa: RUF012  SQLAlchemy's form
@@ -154,9 +156,7 @@ class ObjectPart(Object):
 
     part_of_id: Mapped[int | None] = mapped_column(ForeignKey("object.id"))
 
-    part_of: Mapped[Object | None] = relationship(
-        foreign_keys=part_of_id, remote_side=Object.id, viewonly=True, lazy="selectin", join_depth=_STEPS_MAX
-    )
+    part_of: Mapped[Object | None] = one_of(lambda: ObjectPart.part_of_id, "object", join_depth=_STEPS_MAX)
 
     __mapper_args__ = {"polymorphic_identity": "ObjectPart", "polymorphic_load": "inline"}  # noqa: RUF012
 
@@ -166,9 +166,7 @@ class LocatedObject(Object):
 
     reference_id: Mapped[int | None] = mapped_column("part_of_id", ForeignKey("object.id"), use_existing_column=True)
 
-    reference: Mapped[Object | None] = relationship(
-        foreign_keys=reference_id, remote_side=Object.id, viewonly=True, lazy="selectin", join_depth=_STEPS_MAX
-    )
+    reference: Mapped[Object | None] = one_of(lambda: LocatedObject.reference_id, "object", join_depth=_STEPS_MAX)
 
     __mapper_args__ = {"polymorphic_identity": "LocatedObject", "polymorphic_load": "inline"}  # noqa: RUF012
 
@@ -191,7 +189,7 @@ class ObjectRemoval(RowOfEvent, Base):
     time: Mapped[datetime]
     node_id: Mapped[int | None] = mapped_column(ForeignKey("task_tree_node.id"))
 
-    object: Mapped[Object] = relationship(foreign_keys=object_id, viewonly=True, lazy="selectin")
+    object: Mapped[Object] = one_of(lambda: ObjectRemoval.object_id, "object")
     process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True, lazy="selectin")
 
 
@@ -209,8 +207,8 @@ class Attachment(RowOfEvent, Base):
     time: Mapped[datetime]
     node_id: Mapped[int | None] = mapped_column(ForeignKey("task_tree_node.id"))
 
-    parent: Mapped[Object] = relationship(foreign_keys=parent_id, viewonly=True, lazy="selectin")
-    child: Mapped[Object] = relationship(foreign_keys=child_id, viewonly=True, lazy="selectin")
+    parent: Mapped[Object] = one_of(lambda: Attachment.parent_id, "object")
+    child: Mapped[Object] = one_of(lambda: Attachment.child_id, "object")
     process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True, lazy="selectin")
 
 
@@ -227,5 +225,5 @@ class JointChange(RowOfEvent, Base):
     time: Mapped[datetime]
     node_id: Mapped[int | None] = mapped_column(ForeignKey("task_tree_node.id"))
 
-    object: Mapped[Object] = relationship(viewonly=True, lazy="selectin")
+    object: Mapped[Object] = one_of(lambda: JointChange.object_id, "object")
     process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True, lazy="selectin")

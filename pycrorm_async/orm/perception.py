@@ -7,7 +7,7 @@ from datetime import datetime
 from sqlalchemy import ForeignKey
 from sqlalchemy.orm import Mapped, mapped_column, relationship
 
-from pycrorm_async.orm.base import Base, ProcessMetaData, RowOfEvent
+from pycrorm_async.orm.base import Base, ProcessMetaData, RowOfEvent, many_of, one_of
 from pycrorm_async.orm.objects import Object
 from pycrorm_async.orm.tree import TaskTreeNode
 from pycrorm_async.world.enums import ObjectType
@@ -53,8 +53,8 @@ class Detection(RowOfEvent, Base):
     confidence: Mapped[float | None]
     time: Mapped[datetime]
 
-    node: Mapped[TaskTreeNode | None] = relationship(viewonly=True, lazy="selectin")
-    object: Mapped[Object | None] = relationship(viewonly=True, lazy="selectin")
+    node: Mapped[TaskTreeNode | None] = one_of(lambda: Detection.node_id, "task_tree_node")
+    object: Mapped[Object | None] = one_of(lambda: Detection.object_id, "object")
     process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True, lazy="selectin")
 
 
@@ -99,9 +99,9 @@ class Observation(RowOfEvent, Base):
     time: Mapped[datetime]
     ns: Mapped[int]
 
-    node: Mapped[TaskTreeNode | None] = relationship(viewonly=True, lazy="selectin")
-    items: Mapped[list[ObservationValue]] = relationship(
-        viewonly=True, lazy="selectin", order_by="ObservationValue.position"
+    node: Mapped[TaskTreeNode | None] = one_of(lambda: Observation.node_id, "task_tree_node")
+    items: Mapped[list[ObservationValue]] = many_of(
+        lambda: ObservationValue.id, "observation", order_by=lambda: ObservationValue.position
     )
     process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True, lazy="selectin")
 

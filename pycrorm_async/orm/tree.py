@@ -8,7 +8,16 @@ from typing import Any
 from sqlalchemy import ForeignKey
 from sqlalchemy.orm import Mapped, mapped_column, relationship, synonym
 
-from pycrorm_async.orm.base import Base, Pose, ProcessMetaData, RowOfEvent, named_if_unloaded, on_request
+from pycrorm_async.orm.base import (
+    Base,
+    Pose,
+    ProcessMetaData,
+    RowOfEvent,
+    many_of,
+    named_if_unloaded,
+    on_request,
+    one_of,
+)
 from pycrorm_async.orm.designators import Designator
 from pycrorm_async.orm.types import JsonText
 from pycrorm_async.task_status import TaskStatus
@@ -63,11 +72,11 @@ class TaskTreeNode(RowOfEvent, Base):
     simulated: Mapped[bool]
     duration: Mapped[float | None]
 
-    action: Mapped[Designator | None] = relationship(viewonly=True, lazy="selectin")
-    _parent: Mapped[TaskTreeNode | None] = relationship(
-        remote_side="TaskTreeNode.id", viewonly=True, lazy="selectin", join_depth=1
+    action: Mapped[Designator | None] = one_of(lambda: TaskTreeNode.action_id, "designator")
+    _parent: Mapped[TaskTreeNode | None] = one_of(lambda: TaskTreeNode.parent_id, "task_tree_node", join_depth=1)
+    _children: Mapped[list[TaskTreeNode]] = many_of(
+        lambda: TaskTreeNode.parent_id, "task_tree_node", lazy="select", order_by=lambda: TaskTreeNode.id
     )
-    _children: Mapped[list[TaskTreeNode]] = relationship(viewonly=True, lazy="select", order_by="TaskTreeNode.id")
     process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True, lazy="selectin")
 
     parent: Mapped[TaskTreeNode | None] = synonym("_parent", descriptor=on_request("parent"))
@@ -97,6 +106,7 @@ class LocationCandidate(Base):
 
     resolution_id: Mapped[int] = mapped_column(ForeignKey("location_resolution.id"), primary_key=True)
     position: Mapped[int] = mapped_column(primary_key=True)
+    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"))
     x: Mapped[float]
     y: Mapped[float]
     z: Mapped[float]
@@ -125,6 +135,7 @@ class LocationRefusal(Base):
 
     resolution_id: Mapped[int] = mapped_column(ForeignKey("location_resolution.id"), primary_key=True)
     position: Mapped[int] = mapped_column(primary_key=True)
+    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"))
     x: Mapped[float]
     y: Mapped[float]
     z: Mapped[float]
@@ -161,13 +172,16 @@ class LocationResolution(RowOfEvent, Base):
     pose_id: Mapped[int | None] = mapped_column(ForeignKey("pose.id"))
     time: Mapped[datetime]
 
-    node: Mapped[TaskTreeNode | None] = relationship(viewonly=True, lazy="selectin")
-    pose: Mapped[Pose | None] = relationship(viewonly=True, lazy="selectin")
-    candidates: Mapped[list[LocationCandidate]] = relationship(
-        viewonly=True, lazy="selectin", order_by=LocationCandidate.position
+    node: Mapped[TaskTreeNode | None] = one_of(lambda: LocationResolution.node_id, "task_tree_node")
+    pose: Mapped[Pose | None] = one_of(lambda: LocationResolution.pose_id, "pose")
+    candidates: Mapped[list[LocationCandidate]] = many_of(
+        lambda: LocationCandidate.resolution_id, "location_resolution", order_by=LocationCandidate.position
     )
-    _refusals: Mapped[list[LocationRefusal]] = relationship(
-        viewonly=True, lazy="select", order_by=LocationRefusal.position
+    _refusals: Mapped[list[LocationRefusal]] = many_of(
+        lambda: LocationRefusal.resolution_id,
+        "location_resolution",
+        lazy="select",
+        order_by=LocationRefusal.position,
     )
     process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True, lazy="selectin")
 

@@ -7,12 +7,13 @@ from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 from typing import Any
 
-from sqlalchemy import Select, func, select
+from sqlalchemy import Select, and_, func, select
 from sqlalchemy.ext.asyncio import AsyncConnection
 from sqlalchemy.orm import aliased
 
 from pycrorm_async.events.ids import SLOT_NODE, row_id, row_key
 from pycrorm_async.orm import Designator, Object, Observation, ProcessMetaData, TaskTreeNode
+from pycrorm_async.orm.base import same_row
 from pycrorm_async.store.episode_lookup import number_named
 from pycrorm_async.task_status import TaskStatus
 
@@ -173,7 +174,12 @@ def _overview() -> Select[*tuple[Any, ...]]:
             simulating_node.dtype.label("simulating_dtype"),
         )
         .outerjoin(simulating_episode, simulating_episode.uuid == episode.thought_by)
-        .outerjoin(simulating_node, simulating_node.id == simulating_node_id)
+        .outerjoin(
+            simulating_node,
+            and_(
+                simulating_node.id == simulating_node_id, simulating_node.process_metadata_id == simulating_episode.id
+            ),
+        )
         .order_by(episode.id)
     )
 
@@ -196,7 +202,7 @@ async def task_tree(connection: AsyncConnection, number: int) -> list[NodeSummar
     table, designator, objects = TaskTreeNode.__table__, Designator.__table__, Object.__table__
     query = (
         select(table, designator.c.parameters)
-        .outerjoin(designator, designator.c.id == table.c.id)
+        .outerjoin(designator, same_row(designator, table))
         .where(table.c.process_metadata_id == number)
         .order_by(table.c.id)
     )

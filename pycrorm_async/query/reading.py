@@ -28,6 +28,7 @@ from pycrorm_async.projections.schema.session_views import all_views, with_views
 from pycrorm_async.query import named_queries
 from pycrorm_async.query.as_of import AnyEpisode, as_of
 from pycrorm_async.query.dataframes import dataframe
+from pycrorm_async.query.episode_session import EpisodeSession
 from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary
 from pycrorm_async.query.snapshot import Moment
 from pycrorm_async.store.address import DatabaseAddress
@@ -113,7 +114,7 @@ class Reading:
             return
         async with (
             self._connection(simulated=True) as connection,
-            AsyncSession(connection, expire_on_commit=False) as session,
+            AsyncSession(connection, expire_on_commit=False, sync_session_class=EpisodeSession) as session,
         ):
             yield session
 
@@ -214,7 +215,7 @@ class Reading:
     def _use(self, log: EventLog) -> None:
         self._opened = log
         self._classes.use_in(log.engine)
-        self._sessions = async_sessionmaker(log.engine, expire_on_commit=False)
+        self._sessions = async_sessionmaker(log.engine, expire_on_commit=False, sync_session_class=EpisodeSession)
 
     @property
     def _log(self) -> EventLog:

@@ -26,7 +26,11 @@ def test_every_action_and_motion_has_a_mapped_class(designator: type) -> None:
     table = inspect(mapped).local_table
     assert isinstance(table, Table)
     columned = [each for each in declaration.fields if each.type not in ("list", "dict")]
-    assert {each.name for each in table.columns} == {"id", *(each.column for each in columned)}
+    assert {each.name for each in table.columns} == {
+        "id",
+        "process_metadata_id",
+        *(each.column for each in columned),
+    }
     for field in declaration.fields:
         assert hasattr(mapped, field.name), field.name
     for kind in ("pose", "object"):

@@ -35,7 +35,11 @@ def test_every_expression_has_a_mapped_class(expression: type) -> None:
     assert (declaration.kind, declaration.dtype, declaration.bases) == ("language", expression.__name__, ())
     assert issubclass(mapped, Language)
     assert mapped.__tablename__ == declaration.table
-    assert {each.name for each in table.columns} == {"id", *COLUMNS.get(expression.__name__, ())}
+    assert {each.name for each in table.columns} == {
+        "id",
+        "process_metadata_id",
+        *COLUMNS.get(expression.__name__, ()),
+    }
     for field in declaration.fields:
         assert hasattr(mapped, field.name), field.name
     layout = Layout().with_leaves(mapped_leaves())

@@ -34,6 +34,7 @@ from pycrorm_async.events.values import (
     RobotValue,
     SeenValue,
 )
+from pycrorm_async.projections.fold.column_values import json_text
 from pycrorm_async.projections.fold.fold import CannotFold, fold
 from pycrorm_async.projections.fold.parameters import Designators
 from pycrorm_async.projections.fold.row_batch import Rows
@@ -111,6 +112,7 @@ def test_an_episode_is_one_row_from_its_start_to_its_end() -> None:
 
 def test_a_node_with_a_robot_is_a_node_a_pose_and_a_leaf() -> None:
     script = Script()
+    parameters = {"target_location": pose(3, 4, 5)}
     robot_row = script.put(
         ObjectAdded(
             "pr2", "ROBOT", pose(), {"torso_lift_joint": 0.25, "wheel": -1.5}, None, "urdf-1", (1.0, 0.0, 0.5, 1.0)
@@ -118,9 +120,7 @@ def test_a_node_with_a_robot_is_a_node_a_pose_and_a_leaf() -> None:
     )
     root = script.put(NodeStarted("root"))
     robot = RobotValue(pose(1.5, -2.0, 0.0, turned=0.6), "ROBOT", 0.25, ObjectReference(robot_row, robot_row), "pr2")
-    node = script.put(
-        NodeStarted("action", root, name_of(NAVIGATE), {"target_location": pose(3, 4, 5)}, robot, simulated=True)
-    )
+    node = script.put(NodeStarted("action", root, name_of(NAVIGATE), parameters, robot, simulated=True))
     assert (robot_row, root, node) == (1, 2, 3)
     assert rows_of(script, NAVIGATE) == {
         "object": [
@@ -134,15 +134,15 @@ def test_a_node_with_a_robot_is_a_node_a_pose_and_a_leaf() -> None:
             (row(3, 1), 1, 1.5, -2.0, 0.0, 0.0, 0.0, 0.6, 0.8, "map", POSE_US),
             (row(3, 2), 1, 3.0, 4.0, 5.0, 0.0, 0.0, 0.0, 1.0, "map", POSE_US),
         ],
-        "navigate_action(id,target_location_id)": [(row(3), row(3, 2))],
+        "navigate_action(id,process_metadata_id,target_location_id)": [(row(3), 1, row(3, 2))],
         "task_tree_node": [
             (
                 row(2), 1, None, "root", None, "RUNNING", time_us(2), None, 2_000_000_005, None, None,
-                None, None, None, None, None, None, None, None, None, False,
+                None, None, None, None, None, None, None, None, None, False, None,
             ),
             (
                 row(3), 1, row(2), "action", "NavigateAction", "RUNNING", time_us(3), None, 3_000_000_005, None, None,
-                None, None, None, None, row(3, 1), 0.25, "ROBOT", row(1), "pr2", True,
+                None, None, None, None, row(3, 1), 0.25, "ROBOT", row(1), "pr2", True, json_text(parameters),
             ),
         ],
     }  # fmt: skip
@@ -159,6 +159,7 @@ def test_a_node_that_ends_in_the_batch_in_which_it_started_is_one_insert() -> No
         [
             row(1), 1, None, "action", "SayingAction", "FAILED", time_us(1), time_us(2), 1_000_000_005, 2_000_000_005,
             2, "IKError", "no way", '["left",1]', '{"said":[1,null]}', None, None, None, None, None, False,
+            '{"text":"hi"}',
         ]
     ]  # fmt: skip
 
@@ -220,9 +221,9 @@ def test_every_type_of_field_has_its_column_and_its_rows() -> None:
     )
     assert (milk, node) == (1, 2)
     rows_by_table = rows_of(script, EVERYTHING)
-    leaf = "everything_action(id,count,speed,text,flag,due,arm,there_id,thing_id)"
+    leaf = "everything_action(id,process_metadata_id,count,speed,text,flag,due,arm,there_id,thing_id)"
     # 2026-01-02 03:04:05.000006 UTC
-    assert rows_by_table[leaf] == [(row(2), 3, 0.1, "Käse", True, 1_767_323_045_000_006, "LEFT", row(2, 8), row(1))]
+    assert rows_by_table[leaf] == [(row(2), 1, 3, 0.1, "Käse", True, 1_767_323_045_000_006, "LEFT", row(2, 8), row(1))]
     assert rows_by_table["pose"][1:] == [(row(2, 8), 1, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, "map", POSE_US)]
     nothing = (None,) * 5
     nowhere = (None,) * 8
@@ -257,13 +258,17 @@ def test_a_part_and_a_believed_object_have_rows_of_their_own() -> None:
         (row(2, 3), 1, "BelieveObject", "cup", None, None, None, None, time_us(2), row(2), *[None] * 3),
     ]  # fmt: skip
     assert rows_by_table["pose"][1:] == [(row(2, 2), 1, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 1.0, "map", POSE_US)]
-    assert rows_by_table["open_action(id,object_designator_id,cup_id)"] == [(row(2), row(2, 2), row(2, 3))]
+    assert rows_by_table["open_action(id,process_metadata_id,object_designator_id,cup_id)"] == [
+        (row(2), 1, row(2, 2), row(2, 3))
+    ]
 
 
 def test_a_value_recorded_as_missing_or_left_out_is_null() -> None:
     script = Script()
     script.put(NodeStarted("action", None, name_of(PICK_UP), {"arm": MissingValue("no member", "<x>")}))
-    assert rows_of(script, PICK_UP)["pick_up_action(id,object_designator_id,arm,grasp)"] == [(row(1), None, None, None)]
+    assert rows_of(script, PICK_UP)["pick_up_action(id,process_metadata_id,object_designator_id,arm,grasp)"] == [
+        (row(1), 1, None, None, None)
+    ]
 
 
 def test_each_change_of_the_world_is_one_row() -> None:
@@ -355,7 +360,7 @@ def test_nodes_of_the_language_have_a_table_too() -> None:
     script = Script()
     script.put(NodeStarted("language", None, name_of(repeat), {"times": 3}))
     rows_by_table = rows_of(script, repeat)
-    assert rows_by_table["repeat(id,times)"] == [(row(1), 3)]
+    assert rows_by_table["repeat(id,process_metadata_id,times)"] == [(row(1), 1, 3)]
     assert rows_by_table["task_tree_node"][0][3:5] == ("language", "Repeat")
 
 

@@ -42,6 +42,7 @@ from pycrorm_async.projections.fold.node_row import (
     DTYPE,
     ID,
     KIND,
+    PARAMETERS,
     PARENT_ID,
     PROCESS_METADATA_ID,
     ROBOT,
@@ -159,6 +160,7 @@ def _node_started(event: StoredEvent, started: NodeStarted, designators: Designa
     parameter_rows: ParameterRows = []
     designator = designators.of(started)
     leaf = designator.rows(event, node, started.parameters, parameter_rows) if designator is not None else ()
+    parameters = json_text(started.parameters) if started.parameters else None
     parent = row(number, started.parent) if started.parent is not None else None
     robot = started.robot
     robot_object = row(number, robot.object.row) if robot is not None and robot.object is not None else None
@@ -181,6 +183,7 @@ def _node_started(event: StoredEvent, started: NodeStarted, designators: Designa
         columns[ROBOT] = robot.name
     if designator is not None:
         columns[DTYPE] = designator.dtype
+        columns[PARAMETERS] = parameters
         rows.leaves.setdefault(designator.leaf, []).append(leaf)
         for table, each in parameter_rows:
             rows.inserts[table].append(each)

@@ -32,11 +32,12 @@ from pycrorm_async.projections.schema import tables
     ROBOT_OBJECT_ID,
     ROBOT,
     SIMULATED,
-) = range(21)
+    PARAMETERS,
+) = range(22)
 assert [each.lower() for each in globals() if each.isupper()] == [*tables.CORE["task_tree_node"]], "the order differs"
 
 OUTCOME: Final = slice(REASON, RESULT + 1)
 """The columns reason to result."""
-RUNNING: Final[list[Any]] = [None] * (SIMULATED + 1)
+RUNNING: Final[list[Any]] = [None] * (PARAMETERS + 1)
 """The row of a node that has started, to be copied and filled."""
 RUNNING[STATUS], RUNNING[SIMULATED] = "RUNNING", False

@@ -21,6 +21,7 @@ from pycrorm_async.projections.fold.column_values import (
     scalar,
 )
 from pycrorm_async.projections.fold.row_batch import Row
+from pycrorm_async.projections.schema.tables import EPISODE
 from pycrorm_async.store.stored import StoredEvent
 
 __all__ = ["Designators", "DesignatorFold", "ParameterRows"]
@@ -42,13 +43,13 @@ class DesignatorFold:
     def __init__(self, declared: DesignatorTypeDeclared) -> None:
         columned = [each for each in declared.fields if each.type not in ("list", "dict")]
         self.dtype = declared.dtype
-        self.leaf = (declared.table, ("id", *(each.column for each in columned)))
+        self.leaf = (declared.table, ("id", EPISODE, *(each.column for each in columned)))
         self._columned = [(f.name, AS_IT_IS.get(f.type), _CONVERTED.get(f.type, _scalar), f) for f in columned]
         self._listed = [each for each in declared.fields if each.type in ("list", "dict")]
 
     def rows(self, event: StoredEvent, node: int, parameters: Mapping[str, Any], others: ParameterRows) -> Row:
         """Return the node's row in the leaf table and add rows of other tables to `others`. Raises `CannotFold`."""
-        leaf: list[Any] = [node]
+        leaf: list[Any] = [node, event.number]
         for name, as_it_is, converted, field in self._columned:
             value = parameters.get(name)
             if value is None or type(value) is as_it_is:

@@ -44,6 +44,7 @@ from pycrorm_async.projections.schema.tables import (
     expected,
     index_name,
     indexed,
+    leaf_columns,
     make_table,
     physical_name,
 )
@@ -210,7 +211,7 @@ async def make_generation(connection: AsyncConnection, number: int) -> Generatio
 async def grow_tables(connection: AsyncConnection, generation: Generation, layout: Layout) -> Generation:
     """Create the tables and columns of this layout that the generation lacks; its views stay as they are."""
     present = generation.layout.leaves
-    new = {name: {"id": "key", **columns} for name, columns in layout.leaves.items() if name not in present}
+    new = {name: leaf_columns(each) for name, each in layout.leaves.items() if name not in present}
     await make_empty(connection, new, generation.number)
     for name in layout.leaves.keys() & present.keys():
         await _add_columns(connection, name, layout.leaves[name], present[name], generation.number)
@@ -362,7 +363,7 @@ async def _add_columns(
     present: dict[str, Storage],
     generation: int,
 ) -> None:
-    table = make_table(name, {"id": "key", **columns}, generation, dialect_of(connection).stored_column)
+    table = make_table(name, leaf_columns(columns), generation, dialect_of(connection).stored_column)
     for new in [each for each in columns if each not in present]:
         definition = CreateColumn(table.c[new]).compile(dialect=connection.dialect)
         await dialect_of(connection).add_column(connection, physical_name(name, generation), str(definition))

@@ -16,7 +16,7 @@ from sqlalchemy.types import TypeEngine
 from pycrorm_async.orm import Action, Designator, Language, Motion
 from pycrorm_async.orm.types import Moment
 from pycrorm_async.projections.schema.layout import Leaf
-from pycrorm_async.projections.schema.tables import Storage
+from pycrorm_async.projections.schema.tables import EPISODE, Storage
 
 __all__ = ["mapped_leaves", "storage_of"]
 
@@ -36,7 +36,7 @@ def _leaves(root: Mapper[Designator]) -> Iterator[Leaf]:
             continue
         if table.metadata is not Designator.metadata:
             continue
-        columns = {str(each.name): _storage(each) for each in table.columns if each.name != "id"}
+        columns = {str(each.name): _storage(each) for each in table.columns if each.name not in ("id", EPISODE)}
         built_in = mapper.class_.__module__.startswith("pycrorm_async.orm.")
         kind = next((kind for root, kind in _KINDS.items() if issubclass(mapper.class_, root)), None)
         yield Leaf(str(table.name), columns, mapper.class_.__name__ if built_in else None, kind if built_in else None)

@@ -15,12 +15,11 @@ from sqlalchemy.schema import CreateIndex, CreateTable
 
 from pycrorm_async.errors import DatabaseError
 from pycrorm_async.projections.schema.layout import Layout, MaterialisedView
-from pycrorm_async.projections.schema.tables import Storage, index_name, make_table, physical_name
+from pycrorm_async.projections.schema.tables import EPISODE, Storage, index_name, make_table, physical_name
 from pycrorm_async.store.dialects import dialect_of
 
-__all__ = ["EPISODE", "ViewRefused", "make_materialised", "refresh_some", "shown_texts", "materialised_tables"]
+__all__ = ["ViewRefused", "make_materialised", "refresh_some", "shown_texts", "materialised_tables"]
 
-EPISODE = "process_metadata_id"
 _EPISODES = 200
 """Bounds the episodes refreshed in one transaction, and so the time for which it locks out other writers."""
 _PROGRESS: dict[str, Storage] = {"id": "key", "folded": "integer"}

@@ -10,8 +10,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Any, Self
 
-from sqlalchemy import Boolean, ColumnElement, FromClause, ScalarSelect, Select, Table, select
+from sqlalchemy import Boolean, ColumnElement, FromClause, ScalarSelect, Select, Table, and_, select
 from sqlalchemy.ext.compiler import compiles
+
+from pycrorm_async.projections.schema.tables import EPISODE
 
 __all__ = ["pick_ups_with_context"]
 
@@ -79,12 +81,17 @@ def pick_ups_with_context(
             of_episode("world").label("scene"),
         )
         .select_from(picked)
-        .join(node, node.c.id == picked.c.id)
-        .join(robot, robot.c.id == node.c.robot_pose_id)
-        .join(object_, object_.c.id == picked.c.object_designator_id)
-        .join(place, place.c.id == object_.c.pose_id)
+        .join(node, _same(node, picked, node.c.id == picked.c.id))
+        .join(robot, _same(robot, node, robot.c.id == node.c.robot_pose_id))
+        .join(object_, _same(object_, picked, object_.c.id == picked.c.object_designator_id))
+        .join(place, _same(place, object_, place.c.id == object_.c.pose_id))
         .where(_PlannerHint(node.c.dtype.in_(dtypes)))
     )
+
+
+def _same(one: FromClause, other: FromClause, by_id: ColumnElement[bool]) -> ColumnElement[bool]:
+    """Return the condition of a join within an episode."""
+    return and_(by_id, one.c[EPISODE] == other.c[EPISODE])
 
 
 def _seen_from(place: Any, robot: Any) -> Iterator[ColumnElement[Any]]:

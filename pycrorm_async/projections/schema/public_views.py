@@ -41,7 +41,7 @@ from pycrorm_async.events.ids import SEQUENCE_MAX, SLOT_MAX
 from pycrorm_async.projections.schema.layout import Layout
 from pycrorm_async.projections.schema.pick_up_view import pick_ups_with_context
 from pycrorm_async.projections.schema.root_failure_view import root_failures
-from pycrorm_async.projections.schema.tables import CORE, OWN, column_type, make_table
+from pycrorm_async.projections.schema.tables import CORE, EPISODE, OWN, column_type, leaf_columns, make_table
 from pycrorm_async.projections.schema.views.concept_views import concept_views
 from pycrorm_async.projections.schema.views.spatial_relation_view import SpatialTables, spatial_relations
 
@@ -49,9 +49,6 @@ __all__ = ["public_views", "projection_views", "View"]
 
 View: TypeAlias = Select[Any] | CompoundSelect[Any] | TextualSelect
 _Cut: TypeAlias = Callable[[dict[str, Table], Layout], Select[Any]]
-
-_NUMBER_BITS = SEQUENCE_MAX.bit_length() + SLOT_MAX.bit_length()
-"""The bits of a row's id below the episode's number."""
 
 _UNITED_MAX = 400
 """Bounds the selects in one UNION, because SQLite allows 500. More are united in groups."""
@@ -62,7 +59,6 @@ _OF_PICK_UPS = ("task_tree_node", "object", "pose", "process_metadata")
 _OF_RELATIONS = ("task_tree_node", "object", "object_removal", "pose", "joint_change")
 """The tables of `PickUpWithContextView` and of `spatial_relation`."""
 
-_event = table("event", column("episode"), column("sequence"), column("payload"))
 _episode = table("episode", column("number"), column("id"))
 _declaration = table("pycrorm_declaration", column("fingerprint"), column("payload"))
 _is_description = func.substr(_declaration.c.fingerprint, 1, len(DESCRIPTION_PREFIX)) == DESCRIPTION_PREFIX
@@ -140,7 +136,7 @@ def public_views(
     views: dict[str, View] = {name: shown(select(*each.c, *_sequence(each)), each) for name, each in core.items()}
     views |= {name: shown(make(core, layout), core[home]) for name, (home, make) in _CUT.items()}
     leaves = {
-        name: make_table(name, {"id": "key", **columns}, generation, stored) for name, columns in layout.leaves.items()
+        name: make_table(name, leaf_columns(columns), generation, stored) for name, columns in layout.leaves.items()
     }
     views |= {name: _leaf(name, layout, leaves, shown) for name in layout.leaves}
     if _PICKED in layout.leaves:
@@ -167,7 +163,7 @@ def projection_views(
     simulations = make_table("simulated_episode", CORE["simulated_episode"], generation, stored)
     views: dict[str, View] = {}
     for name, columns in layout.leaves.items():
-        rows = make_table(name, {"id": "key", **columns}, number, stored)
+        rows = make_table(name, leaf_columns(columns), number, stored)
         view = select(*map(_labelled, rows.c))
         views[name.removeprefix(OWN)] = view if simulated else view.where(_happened(rows, simulations))
     return views
@@ -177,8 +173,7 @@ def _happened(rows: Table, simulations: Table) -> ColumnElement[bool]:
     """Return the condition that a row does not belong to a simulation."""
     if "simulated" in rows.c:
         return ~rows.c.simulated
-    number = rows.c.process_metadata_id if "process_metadata_id" in rows.c else rows.c.id.bitwise_rshift(_NUMBER_BITS)
-    return _Absent(number, simulations.c.id)
+    return _Absent(rows.c[EPISODE], simulations.c.id)
 
 
 def _process_metadata(core: dict[str, Table], _layout: Layout) -> Select[Any]:
@@ -215,7 +210,8 @@ def _designator_type(layout: Layout) -> View:
 def _task_tree_node(core: dict[str, Table], _layout: Layout) -> Select[Any]:
     nodes = core["task_tree_node"]
     action_id = case((nodes.c.dtype.is_not(None), nodes.c.id), else_=null())
-    return select(*nodes.c, *_sequence(nodes), action_id.label("action_id"), _duration(nodes))
+    columns = (each for each in nodes.c if each.key != "parameters")
+    return select(*columns, *_sequence(nodes), action_id.label("action_id"), _duration(nodes))
 
 
 def _sequence(rows: Table) -> tuple[ColumnElement[Any], ...]:
@@ -240,12 +236,6 @@ def _course(nodes: Table) -> tuple[ColumnElement[Any], ...]:
 
 def _designator(core: dict[str, Table], layout: Layout) -> Select[Any]:
     nodes = core["task_tree_node"]
-    started = (
-        select(_member(_event.c.payload, "parameters"))
-        .where(_event.c.episode == nodes.c.process_metadata_id)
-        .where(_event.c.sequence == _event_of(nodes))
-        .scalar_subquery()
-    )
     robot_state_id = case((nodes.c.robot_pose_id.is_not(None), nodes.c.id), else_=null())
     return select(
         nodes.c.id,
@@ -253,7 +243,7 @@ def _designator(core: dict[str, Table], layout: Layout) -> Select[Any]:
         nodes.c.dtype,
         nodes.c.kind,
         robot_state_id.label("robot_state_id"),
-        func.coalesce(started, "{}").label("parameters"),
+        func.coalesce(nodes.c.parameters, "{}").label("parameters"),
         _lineage(nodes, layout).label("lineage"),
         *_course(nodes),
     ).where(nodes.c.dtype.is_not(None))
@@ -343,7 +333,7 @@ def _leaf(
         for each, storage in united_columns.items():
             same = layout.leaves[member].get(each) == storage
             columns.append(_labelled(rows.c[each]) if same else cast(null(), column_type(storage)).label(each))
-        parts.append(shown(select(*columns), rows))
+        parts.append(shown(select(*columns, rows.c[EPISODE]), rows))
     return _united(parts)
 
 

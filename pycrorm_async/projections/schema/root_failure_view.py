@@ -3,8 +3,8 @@
 Path, object, arm and `recovered` are found by climbing from the failed node to the root, one lookup by primary key for
 each ancestor. A query that does not select them does not climb: both databases compute only the columns they need. The
 object and the arm are those of the nearest node that has such a parameter, because a motion that failed often has
-neither while the action around it has both. They are read from the events of these nodes, since a lookup in the leaf
-tables would need one subquery for every type of a memory.
+neither while the action around it has both. They are read from the recorded parameters of these nodes, since a lookup
+in the leaf tables would need one subquery for every type of a memory.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from sqlalchemy import Boolean, ColumnElement, Select, Table, Text, exists, lite
 from sqlalchemy.ext.compiler import compiles
 
 from pycrorm_async.events.ids import SEQUENCE_MAX, SLOT_MAX
+from pycrorm_async.projections.schema.tables import EPISODE
 from pycrorm_async.task_status import TaskStatus
 
 __all__ = ["root_failures"]
@@ -23,32 +24,31 @@ _FAILED = (TaskStatus.FAILED.name, TaskStatus.ERROR.name)
 _SLOT_BITS = SLOT_MAX.bit_length()
 _NUMBER_BITS = SEQUENCE_MAX.bit_length() + _SLOT_BITS
 
-_CLIMB = """WITH RECURSIVE up(id, parent_id, path, status, depth) AS (
- SELECT {node}.id, {node}.parent_id, coalesce({node}.dtype, {node}.kind), {node}.status, 0
+_CLIMB = f"""WITH RECURSIVE up(id, parent_id, path, status, depth) AS (
+ SELECT {{node}}.id, {{node}}.parent_id, coalesce({{node}}.dtype, {{node}}.kind), {{node}}.status, 0
  UNION ALL
  SELECT above.id, above.parent_id, coalesce(above.dtype, above.kind) || ' > ' || up.path, above.status, up.depth + 1
- FROM up JOIN {node} AS above ON above.id = up.parent_id)"""
+ FROM up JOIN {{node}} AS above ON above.id = up.parent_id AND above.{EPISODE} = {{node}}.{EPISODE})"""  # noqa: S608
 _PATH = f"({_CLIMB} SELECT path FROM up ORDER BY depth DESC LIMIT 1)"  # noqa: S608  constants only, also below
 _RECOVERED = f"EXISTS ({_CLIMB} SELECT 1 FROM up WHERE status = '{TaskStatus.SUCCEEDED.name}')"  # noqa: S608
-_STARTED = f"""{_CLIMB} SELECT {{value}} FROM up JOIN event
- ON event.episode = up.id >> {_NUMBER_BITS} AND event.sequence = (up.id >> {_SLOT_BITS}) & {SEQUENCE_MAX}"""  # noqa: S608
+_STARTED = f"""{_CLIMB} SELECT {{value}} FROM up JOIN {{node}} AS started
+ ON started.id = up.id AND started.{EPISODE} = {{node}}.{EPISODE}"""  # noqa: S608
 _NEAREST = "ORDER BY up.depth LIMIT 1"
 _FIRST_ID = f"((up.id >> {_NUMBER_BITS}) << {_NUMBER_BITS})"
 """The id of the episode's row 0; an object's row has this id plus its sequence in the place of a sequence."""
-_OBJECT_ROW = f"SELECT name FROM {{object}} AS moved WHERE moved.id = {_FIRST_ID}"  # noqa: S608
+_OBJECT_ROW = f"""SELECT name FROM {{object}} AS moved
+ WHERE moved.{EPISODE} = {{node}}.{EPISODE} AND moved.id = {_FIRST_ID}"""  # noqa: S608
 
-_ARM_SQLITE = "coalesce(json_extract(payload, '$.parameters.arm'), json_extract(payload, '$.parameters.gripper'))"
-_ARM_POSTGRESQL = (
-    "coalesce(CAST(payload AS json) -> 'parameters' ->> 'arm', CAST(payload AS json) -> 'parameters' ->> 'gripper')"
-)
+_ARM_SQLITE = "coalesce(json_extract(started.parameters, '$.arm'), json_extract(started.parameters, '$.gripper'))"
+_ARM_POSTGRESQL = "coalesce(CAST(started.parameters AS json) ->> 'arm', CAST(started.parameters AS json) ->> 'gripper')"
 _OBJECT_SQLITE = f"""CASE WHEN json_extract(field.value, '$.object') IS NULL THEN json_extract(field.value, '$.name')
  ELSE ({_OBJECT_ROW} + (json_extract(field.value, '$.row') << {_SLOT_BITS})) END"""
 _OBJECT_POSTGRESQL = f"""CASE WHEN field.value ->> 'object' IS NULL THEN field.value ->> 'name'
  ELSE ({_OBJECT_ROW} + (CAST(field.value ->> 'row' AS bigint) << {_SLOT_BITS})) END"""
-_FIELDS_SQLITE = """, json_each(payload, '$.parameters') AS field WHERE field.type = 'object' AND (
+_FIELDS_SQLITE = """, json_each(started.parameters) AS field WHERE field.type = 'object' AND (
  (json_extract(field.value, '$.object') IS NOT NULL AND json_type(field.value, '$.row') = 'integer')
  OR (json_extract(field.value, '$.dtype') IS NOT NULL AND json_extract(field.value, '$.name') IS NOT NULL))"""
-_FIELDS_POSTGRESQL = """, json_each(CAST(payload AS json) -> 'parameters') AS field WHERE
+_FIELDS_POSTGRESQL = """, json_each(CAST(started.parameters AS json)) AS field WHERE
  json_typeof(field.value) = 'object' AND (
  (field.value ->> 'object' IS NOT NULL AND field.value ->> 'row' ~ '^[0-9]+$')
  OR (field.value ->> 'dtype' IS NOT NULL AND field.value ->> 'name' IS NOT NULL))"""
@@ -82,7 +82,11 @@ def root_failures(nodes: Table, objects: Table) -> Select[*tuple[Any, ...]]:
     """Return the view's query."""
     child = nodes.alias("child")
     failed_child = exists(
-        select(literal_column("1")).where(child.c.parent_id == nodes.c.id, child.c.status.in_(_FAILED))
+        select(literal_column("1")).where(
+            child.c.parent_id == nodes.c.id,
+            child.c[EPISODE] == nodes.c[EPISODE],
+            child.c.status.in_(_FAILED),
+        )
     )
 
     def sql(text: str, **named: str) -> str:

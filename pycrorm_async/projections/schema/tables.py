@@ -3,6 +3,10 @@
 Every row names its episode (`process_metadata_id`). Row ids are computed from (episode number, sequence, slot), see
 `pycrorm_async.events.ids`: a node, its designator and its leaf row have one id, and so have an object's row and its
 pose. Foreign keys are not enforced, because that would cost a third of the write rate; `verify` checks integrity.
+
+The tables can be divided by episode. No row refers to a row of another episode, views and relationships join by id and
+episode, and on PostgreSQL the episode is part of every primary key, as a table partitioned by it requires. The id comes
+first in the key, so that a lookup by id alone, which is unique in the memory, finds its row as well.
 """
 
 from __future__ import annotations
@@ -11,7 +15,8 @@ from collections.abc import Callable
 from functools import lru_cache
 from typing import Any, Literal, TypeAlias
 
-from sqlalchemy import BigInteger, Boolean, Column, Double, Index, Integer, MetaData, Table, Text
+from sqlalchemy import BigInteger, Boolean, Column, Double, Index, Integer, MetaData, PrimaryKeyConstraint, Table, Text
+from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.types import TypeEngine
 
 from pycrorm_async.events.fields import bounded
@@ -19,9 +24,11 @@ from pycrorm_async.store.dialect import Expected
 
 __all__ = [
     "Storage",
+    "EPISODE",
     "OWN",
     "CORE",
     "COLUMNS",
+    "leaf_columns",
     "make_table",
     "physical_name",
     "column_type",
@@ -35,6 +42,9 @@ Storage: TypeAlias = Literal["key", "row", "pose", "object", "integer", "real", 
 
 OWN = "pycrorm_own_"
 """The prefix of the tables of custom projections, so that they never collide with the table of a designator."""
+
+EPISODE = "process_metadata_id"
+"""The column that names the episode of a row. In `process_metadata` and `simulated_episode` it is `id`."""
 
 _POSE: dict[str, Storage] = {
     "x": "real",
@@ -101,6 +111,7 @@ CORE: dict[str, dict[str, Storage]] = {
         "robot_object_id": "object",
         "robot": "text",
         "simulated": "boolean",
+        "parameters": "json",
     },
     "pose": {"id": "key", "process_metadata_id": "row", **_POSE, "time": "time"},
     "object": {
@@ -295,7 +306,7 @@ def physical_name(table: str, generation: int) -> str:
 
 
 def make_table(name: str, columns: dict[str, Storage], generation: int, stored: Callable[[str], str]) -> Table:
-    """Return the table with its indexes, in one generation.
+    """Return the table with its key and its indexes, in one generation.
 
     `stored` maps a column of the layout to its name in this database; the table's column keys are those of the layout.
     The latest tables are kept, because the views of all tables are made again whenever one is added.
@@ -315,13 +326,15 @@ def _make_table(
             Column(
                 stored(column),
                 Text() if (name, column) in _TEXT_KEYS else column_type(storage),
-                primary_key=storage == "key",
+                nullable=storage != "key",
                 autoincrement=False,
                 key=column,
             )
             for column, storage in columns.items()
         ),
     )
+    if keys := [table.c[column] for column, storage in columns.items() if storage == "key"]:
+        table.append_constraint(_Key(*keys))
     for column in indexed(name, columns):
         Index(
             index_name(name, column, generation),
@@ -329,6 +342,22 @@ def _make_table(
             postgresql_include=_INCLUDES.get((name, column), ()),
         )
     return table
+
+
+class _Key(PrimaryKeyConstraint):
+    """A primary key that on PostgreSQL also has the episode, behind the id. On SQLite a single key is the rowid."""
+
+
+@compiles(_Key, "postgresql")
+def _with_episode(key: _Key, compiler: Any, **_options: Any) -> str:
+    first, *others = key.columns
+    episode = [first.table.c[EPISODE]] if EPISODE in first.table.c else []
+    return f"PRIMARY KEY ({', '.join(compiler.preparer.format_column(each) for each in (first, *episode, *others))})"
+
+
+def leaf_columns(columns: dict[str, Storage]) -> dict[str, Storage]:
+    """Return the columns of a leaf table: its key, its episode and those of the layout."""
+    return {"id": "key", EPISODE: "row", **columns}
 
 
 def indexed(name: str, columns: dict[str, Storage]) -> tuple[str, ...]:

@@ -15,7 +15,7 @@ from sqlalchemy.ext.asyncio import AsyncConnection
 from pycrorm_async.events.ids import row_key
 from pycrorm_async.projections.fold.row_batch import Row
 from pycrorm_async.projections.schema.generations import Generation
-from pycrorm_async.projections.schema.tables import CORE, Storage, make_table
+from pycrorm_async.projections.schema.tables import CORE, Storage, leaf_columns, make_table
 
 __all__ = ["Comparison", "Difference", "Range"]
 
@@ -81,7 +81,7 @@ class Comparison:
         self.count = 0
         self._tables: dict[str, Table] = {}
         leaves: dict[str, dict[str, Storage]] = {
-            name: {"id": "key", **columns} for name, columns in generation.layout.leaves.items()
+            name: leaf_columns(columns) for name, columns in generation.layout.leaves.items()
         }
         for name, columns in (dict(core) | leaves).items():
             self._tables[name] = make_table(name, columns, generation.number, stored)

@@ -1,0 +1,241 @@
+"""Queries for one episode, on a copy of the tables on PostgreSQL that is partitioned by episode."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Coroutine, Iterator
+from contextlib import contextmanager
+from typing import Any, NamedTuple
+
+import pytest
+from sqlalchemy import Engine, Select, event, select
+from sqlalchemy.ext.asyncio import AsyncConnection
+from sqlalchemy.orm import selectinload, undefer
+
+from pycrorm_async import Reading
+from pycrorm_async.events.types import (
+    EpisodeEnded,
+    EpisodeStarted,
+    LocationResolved,
+    NodeEnded,
+    NodeStarted,
+    ObjectAdded,
+    ObjectMoved,
+)
+from pycrorm_async.events.values import (
+    CandidateValue,
+    FailureValue,
+    ObjectReference,
+    ObjectValue,
+    RefusalValue,
+    RobotValue,
+)
+from pycrorm_async.orm import (
+    Action,
+    LocationResolution,
+    NavigateAction,
+    Object,
+    PickUpAction,
+    PickUpWithContextView,
+    RootFailure,
+    TaskTreeNode,
+)
+from pycrorm_async.projections.schema.generations import current_generation
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.log import EventLog
+from tests.databases import Server, ask, run_in_own_loop
+from tests.projections.event_script import (
+    MOVE,
+    NAVIGATE,
+    PICK_UP,
+    Script,
+    declarations,
+    declared,
+    field,
+    name_of,
+    pose,
+)
+from tests.projections.sql_queries import stored_and_folded
+
+pytestmark = pytest.mark.slow
+
+EPISODES, PARTITIONS, ASKED = 12, 4, 7
+EPISODE = "process_metadata_id"
+OF_DIVIDED = f"""SELECT relname FROM pg_class JOIN pg_attribute ON attrelid = pg_class.oid
+WHERE relnamespace = 'memory_tables'::regnamespace AND relkind = 'r' AND attname = '{EPISODE}' ORDER BY relname"""
+SETS = declared("SetAction", "set_action", field("things", "list", 2, item="object"))
+
+
+def episode(number: int) -> Script:
+    """An episode in which a robot navigates, fails to pick the milk up, and handles a list of objects."""
+    script = Script(number)
+    put = script.put
+    put(EpisodeStarted("Tutorial", "me", "host", "1.0", "3.11", plan="breakfast"))
+    root = put(NodeStarted("root"))
+    robot = put(ObjectAdded("pr2", "ROBOT", pose(0.5), {"torso": 0.25}))
+    milk = put(ObjectAdded("milk", "MILK", pose(1, 2, 3)))
+    state = RobotValue(pose(0.5, turned=0.6), "ROBOT", 0.25, ObjectReference(robot, robot))
+    drive = put(NodeStarted("action", root, name_of(NAVIGATE), {"target_location": pose(7, 8)}, state))
+    offered, refused = (CandidateValue(pose(7, 8), ("LEFT",)),), (RefusalValue(pose(8, 8), "too far"),)
+    put(LocationResolved("CostmapLocation", offered, 0, 9, drive, refused))
+    move = put(NodeStarted("motion", drive, name_of(MOVE), {"target": pose(7, 8)}, state))
+    put(NodeEnded(move, "SUCCEEDED"))
+    put(NodeEnded(drive, "SUCCEEDED"))
+    seen = ObjectReference(milk, milk)
+    put(NodeStarted("action", root, name_of(SETS), {"things": [seen, ObjectValue("BelieveObject", "cup")]}, state))
+    pick = put(
+        NodeStarted("action", root, name_of(PICK_UP), {"object_designator": seen, "arm": "LEFT", "grasp": "TOP"}, state)
+    )
+    put(ObjectMoved(milk, "milk", "MILK", pose(9, 9, 9), pick))
+    put(NodeEnded(pick, "FAILED", FailureValue("plan.failures.IKError", "too far", ["LEFT"])))
+    put(EpisodeEnded("FAILED"))
+    return script
+
+
+@pytest.fixture(scope="module")
+def divided(server: Server) -> Iterator[str]:
+    """The URL of a memory whose tables and events are partitioned by episode."""
+    url = server.new_database()
+    run_in_own_loop(fill_and_divide(url))
+    yield url
+    server.drop(url)
+
+
+async def fill_and_divide(url: str) -> None:
+    log = await EventLog.open(DatabaseAddress.parse(url), create=True)
+    records = [record for number in range(1, EPISODES + 1) for record in episode(number).records]
+    await stored_and_folded(log, [*declarations(NAVIGATE, MOVE, PICK_UP, SETS), *records])
+    async with log.engine.begin() as connection:
+        for (table,) in (await connection.exec_driver_sql(OF_DIVIDED)).all():
+            await divide(connection, "memory_tables", table, EPISODE)
+        await divide(connection, "pycrorm", "event", "episode")
+        generation = await current_generation(connection)
+        assert generation is not None
+        for name, text in generation.views.items():
+            await connection.exec_driver_sql(f'CREATE OR REPLACE VIEW memory."{name}" AS {text}')
+    await log.close()
+
+
+async def divide(connection: AsyncConnection, schema: str, table: str, by: str) -> None:
+    """Replace a table by a copy that is hash-partitioned by this column, with the same keys and indexes."""
+    parts = [
+        f'CREATE TABLE {schema}."{table}_part{part}" PARTITION OF {schema}."{table}"'
+        f" FOR VALUES WITH (MODULUS {PARTITIONS}, REMAINDER {part})"
+        for part in range(PARTITIONS)
+    ]
+    for statement in (
+        f'ALTER TABLE {schema}."{table}" RENAME TO "{table}_whole"',
+        f'CREATE TABLE {schema}."{table}" (LIKE {schema}."{table}_whole" INCLUDING ALL) PARTITION BY HASH ({by})',
+        *parts,
+        f'INSERT INTO {schema}."{table}" SELECT * FROM {schema}."{table}_whole"',
+    ):
+        await connection.exec_driver_sql(statement)
+
+
+class Statement(NamedTuple):
+    text: str
+    parameters: tuple[Any, ...]
+
+
+@contextmanager
+def executed() -> Iterator[list[Statement]]:
+    """Collect the queries that any engine executes."""
+    statements: list[Statement] = []
+
+    def note(_connection: Any, _cursor: Any, text: str, parameters: Any, _context: Any, _many: bool) -> None:
+        if re.match(r"\s*(SELECT|WITH)", text) and "set_config" not in text:
+            statements.append(Statement(text, tuple(parameters)))
+
+    event.listen(Engine, "before_cursor_execute", note)
+    try:
+        yield statements
+    finally:
+        event.remove(Engine, "before_cursor_execute", note)
+
+
+async def parts_read(log: EventLog, statement: Statement) -> set[tuple[str, str]]:
+    """Return table and number of each partition that the server reads for a statement."""
+    async with log.engine.connect() as connection:
+        explain = f"EXPLAIN (ANALYZE, FORMAT JSON) {statement.text}"
+        plan: Any = (await connection.exec_driver_sql(explain, statement.parameters)).scalar_one()
+    parts = set()
+    pending = [(json.loads(plan) if isinstance(plan, str) else plan)[0]["Plan"]]
+    while pending:
+        step = pending.pop()
+        pending += step.get("Plans", [])
+        table, _, part = step.get("Relation Name", "").rpartition("_part")
+        if table and step["Actual Loops"]:
+            parts.add((table, part))
+    return parts
+
+
+async def rows_of(reading: Reading, statement: Select[Any]) -> None:
+    async with reading.session() as session:
+        assert (await session.scalars(statement)).all()
+
+
+def of_episode(class_: Any, *options: Any) -> Callable[[Reading], Coroutine[Any, Any, None]]:
+    return lambda reading: rows_of(reading, select(class_).where(class_.process_metadata_id == ASKED).options(*options))
+
+
+async def a_frame_of_pick_ups(reading: Reading) -> None:
+    view = PickUpWithContextView
+    frame = await reading.dataframe(select(view, view.object_z).where(view.process_metadata_id == ASKED))
+    assert len(frame) == 1
+
+
+async def a_joined_question(reading: Reading) -> None:
+    question = select(PickUpAction).join(PickUpAction.object).join(Object.pose).join(PickUpAction.node)
+    await rows_of(reading, question.where(PickUpAction.process_metadata_id == ASKED, Object.name == "milk"))
+
+
+async def the_tree(reading: Reading) -> None:
+    assert len(await reading.tree(ASKED)) == 5
+
+
+async def a_snapshot(reading: Reading) -> None:
+    assert (await reading.as_of(ASKED, sequence=8)).world.objects
+
+
+@pytest.mark.parametrize(
+    "question",
+    [
+        pytest.param(of_episode(Action), id="actions"),
+        pytest.param(of_episode(Action, undefer(Action.parameters)), id="actions with parameters"),
+        pytest.param(of_episode(NavigateAction), id="actions of a type"),
+        pytest.param(of_episode(TaskTreeNode, selectinload(TaskTreeNode.children)), id="nodes with children"),
+        pytest.param(of_episode(Object, selectinload(Object.node)), id="objects with nodes"),
+        pytest.param(of_episode(LocationResolution, selectinload(LocationResolution.refusals)), id="places"),
+        pytest.param(of_episode(PickUpWithContextView), id="pick-ups"),
+        pytest.param(a_frame_of_pick_ups, id="a data frame of pick-ups"),
+        pytest.param(of_episode(RootFailure), id="where failures began"),
+        pytest.param(a_joined_question, id="a join"),
+        pytest.param(the_tree, id="the task tree"),
+        pytest.param(a_snapshot, id="a snapshot"),
+    ],
+)
+async def test_a_question_for_one_episode_reads_one_partition(
+    divided: str, question: Callable[[Reading], Coroutine[Any, Any, None]]
+) -> None:
+    async with Reading.open(divided) as reading:
+        with executed() as statements:
+            await question(reading)
+    log = await EventLog.open(DatabaseAddress.parse(divided), create=False)
+    read = {part: statement for statement in statements for part in await parts_read(log, statement)}
+    await log.close()
+    assert read
+    numbers = {number for _, number in read}
+    assert len(numbers) == 1, {part: statement.text for part, statement in read.items()}
+
+
+def test_the_episode_is_part_of_every_primary_key(divided: str) -> None:
+    tables = [name for (name,) in ask(divided, OF_DIVIDED.replace("'r'", "'p'"))]
+    assert len(tables) > 40
+    for table in tables:
+        keys = ask(
+            divided,
+            f"SELECT attname FROM pg_index JOIN pg_attribute ON attrelid = indrelid AND attnum = ANY (indkey)"
+            f""" WHERE indisprimary AND indrelid = 'memory_tables."{table}"'::regclass""",
+        )
+        assert (EPISODE,) in keys, table
