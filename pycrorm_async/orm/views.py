@@ -7,7 +7,7 @@ from datetime import datetime
 from sqlalchemy import ForeignKey
 from sqlalchemy.orm import Mapped, mapped_column, relationship, synonym
 
-from pycrorm_async.orm.base import Base, ProcessMetaData, RowOfEvent, on_request
+from pycrorm_async.orm.base import Base, ProcessMetaData, RowOfEvent, on_request, one_of
 from pycrorm_async.orm.tree import TaskTreeNode
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.enums import Arms, Grasp, ObjectType
@@ -140,6 +140,6 @@ class SpatialRelation(Base):
     other: Mapped[str]
     link: Mapped[str] = mapped_column(primary_key=True)
 
-    _node: Mapped[TaskTreeNode] = relationship(viewonly=True, lazy="select")
+    _node: Mapped[TaskTreeNode] = one_of(lambda: SpatialRelation.node_id, "task_tree_node", lazy="select")
     node: Mapped[TaskTreeNode] = synonym("_node", descriptor=on_request("node"))
     process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True, lazy="selectin")

@@ -39,6 +39,7 @@ from pycrorm_async.orm import (
     PickUpAction,
     PickUpWithContextView,
     RootFailure,
+    SpatialRelation,
     TaskTreeNode,
 )
 from pycrorm_async.projections.schema.generations import current_generation
@@ -190,6 +191,11 @@ async def a_joined_question(reading: Reading) -> None:
     await rows_of(reading, question.where(PickUpAction.process_metadata_id == ASKED, Object.name == "milk"))
 
 
+async def spatial_relations(reading: Reading) -> None:
+    async with reading.session() as session:
+        await session.scalars(select(SpatialRelation).where(SpatialRelation.process_metadata_id == ASKED))
+
+
 async def the_tree(reading: Reading) -> None:
     assert len(await reading.tree(ASKED)) == 5
 
@@ -211,6 +217,7 @@ async def a_snapshot(reading: Reading) -> None:
         pytest.param(a_frame_of_pick_ups, id="a data frame of pick-ups"),
         pytest.param(of_episode(RootFailure), id="where failures began"),
         pytest.param(a_joined_question, id="a join"),
+        pytest.param(spatial_relations, id="spatial relations"),
         pytest.param(the_tree, id="the task tree"),
         pytest.param(a_snapshot, id="a snapshot"),
     ],

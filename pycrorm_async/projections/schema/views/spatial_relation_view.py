@@ -37,6 +37,7 @@ from sqlalchemy import (
 )
 
 from pycrorm_async.events.ids import SEQUENCE_MAX, SLOT_MAX
+from pycrorm_async.projections.schema.tables import EPISODE
 from pycrorm_async.projections.schema.views.constants import constants
 from pycrorm_async.world.enums import ObjectType
 from pycrorm_async.world.models.catalog import built_in_urdf
@@ -98,7 +99,7 @@ def spatial_relations(tables: SpatialTables, picked: FromClause, placed: FromCla
             other.c.name.label("other"),
             other.c.link,
         )
-        .join_from(one, other, one.c.node_id == other.c.node_id)
+        .join_from(one, other, _same(one, other, one.c.node_id == other.c.node_id))
         .subquery("related")
     )
     return select(*found.c).where(found.c.relation.is_not(None))
@@ -117,8 +118,8 @@ def _moments(tables: SpatialTables, picked: FromClause, placed: FromClause, *, s
                 target.c.identity_id,
                 moment.label("moment"),
             )
-            .join_from(rows, node, node.c.id == rows.c.id)
-            .join(target, target.c.id == rows.c.object_designator_id)
+            .join_from(rows, node, _same(node, rows, node.c.id == rows.c.id))
+            .join(target, _same(target, rows, target.c.id == rows.c.object_designator_id))
             .where(target.c.identity_id.is_not(None), moment.is_not(None))
             .where(*(() if simulated else (~node.c.simulated,)))
             for rows, moment in ((picked, node.c.id), (placed, ended))
@@ -134,10 +135,15 @@ def _placed_boxes(tables: SpatialTables, moments: Subquery, boxes: Subquery, *, 
     box = boxes.alias(f"{name}_box")
     last = (
         select(func.max(later.c.id))
-        .where(later.c.identity_id == added.c.id, later.c.dtype == "Object", later.c.id <= moments.c.moment)
+        .where(_same(later, added, later.c.identity_id == added.c.id))
+        .where(later.c.dtype == "Object", later.c.id <= moments.c.moment)
         .scalar_subquery()
     )
-    removed = exists(select(literal(1)).where(removal.c.identity_id == added.c.id, removal.c.id <= moments.c.moment))
+    removed = exists(
+        select(literal(1))
+        .where(_same(removal, added, removal.c.identity_id == added.c.id))
+        .where(removal.c.id <= moments.c.moment)
+    )
     # Joined, because SQLite would compute a subquery in the columns once for each use of a column.
     slid = tables.joint_change.alias(f"{name}_slid")
     last_change = _last_change(tables, added, box, moments)
@@ -161,11 +167,11 @@ def _placed_boxes(tables: SpatialTables, moments: Subquery, boxes: Subquery, *, 
             *columns,
         )
         .select_from(moments)
-        .join(added, is_one if same else and_(added.c.process_metadata_id == moments.c.process_metadata_id, ~is_one))
-        .join(then, then.c.id == last)
-        .join(pose, pose.c.id == then.c.pose_id)
+        .join(added, _same(added, moments, is_one if same else ~is_one))
+        .join(then, _same(then, moments, then.c.id == last))
+        .join(pose, _same(pose, then, pose.c.id == then.c.pose_id))
         .join(box, and_(box.c.obj_type == added.c.obj_type, named))
-        .outerjoin(slid, and_(slid.c.joint == box.c.joint, slid.c.id == last_change))
+        .outerjoin(slid, _same(slid, moments, and_(slid.c.joint == box.c.joint, slid.c.id == last_change)))
         .where(added.c.id == added.c.identity_id, added.c.id <= moments.c.moment, ~removed)
         .subquery(name)
     )
@@ -176,10 +182,16 @@ def _last_change(tables: SpatialTables, added: FromClause, box: FromClause, mome
     change, moved = tables.joint_change.alias(), tables.object.alias()
     return (
         select(func.max(change.c.id))
-        .join_from(change, moved, moved.c.id == change.c.object_id)
-        .where(moved.c.identity_id == added.c.id, change.c.joint == box.c.joint, change.c.id <= moments.c.moment)
+        .join_from(change, moved, _same(moved, change, moved.c.id == change.c.object_id))
+        .where(_same(moved, added, moved.c.identity_id == added.c.id))
+        .where(change.c.joint == box.c.joint, change.c.id <= moments.c.moment)
         .scalar_subquery()
     )
+
+
+def _same(one: FromClause, other: FromClause, condition: ColumnElement[bool]) -> ColumnElement[bool]:
+    """Return the condition of a join within an episode."""
+    return and_(condition, one.c[EPISODE] == other.c[EPISODE])
 
 
 def _rotation(pose: FromClause) -> list[list[ColumnElement[float]]]:
