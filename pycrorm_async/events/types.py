@@ -168,6 +168,8 @@ class ObjectAdded(Happening, frozen=True):
         node: added the object; None if none did, or if it was in the world before the episode.
         description: fingerprint of the `DescriptionDeclared`; None in events of older versions.
         color: red, green, blue, opacity, 0 to 1; None if the description alone says it.
+        model, serial: of a robot with a `RobotDescription`: the model's name, and what distinguishes robots of one
+            model, if it is known.
     """
 
     name: str
@@ -177,6 +179,8 @@ class ObjectAdded(Happening, frozen=True):
     node: int | None = None
     description: str | None = None
     color: tuple[float, float, float, float] | None = None
+    model: str | None = None
+    serial: str | None = None
 
 
 class ObjectRemoved(Happening, frozen=True):

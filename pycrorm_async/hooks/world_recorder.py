@@ -126,6 +126,7 @@ class WorldRecorder:
                 self._causing_node(),
                 self._emitter.descriptions.declare(added),
                 self._color(added),
+                *_model(added),
             ),
             row_of=added,
         )
@@ -214,3 +215,11 @@ class WorldRecorder:
             self._references[row_of] = ObjectReference(sequence if identity is None else identity, sequence)
         if sequence >= self.continue_at:
             self.continue_()
+
+
+def _model(added: Object) -> tuple[str | None, str | None]:
+    """Return model and serial of a robot; None for other objects, and for what its description does not have."""
+    described = added.robot_description
+    if described is None:
+        return None, None
+    return clean(described.name), clean(described.serial) if described.serial is not None else None

@@ -96,6 +96,7 @@ class Object(RowOfEvent, Base):
         color: red, green, blue, opacity, 0 to 1, when it was added; None in later rows, and if its description alone
             says it.
         description_fingerprint: fingerprint of its description when it was added; None in later rows.
+        model, serial: of a robot with a `RobotDescription`, when it was added; None in later rows.
         description: its description, in every row; None in episodes of older versions. Not loaded by default: use
             `selectinload(Object.description)` or `await row.awaitable_attrs.description`.
         node_id: the node that moved or added it; None if no node did.
@@ -117,6 +118,8 @@ class Object(RowOfEvent, Base):
     joints: Mapped[dict[str, Any] | None] = mapped_column(JsonText())
     description_fingerprint: Mapped[str | None] = mapped_column(ForeignKey("object_description.fingerprint"))
     color: Mapped[list[float] | None] = mapped_column(JsonText())
+    model: Mapped[str | None]
+    serial: Mapped[str | None]
 
     pose: Mapped[Pose | None] = one_of(lambda: Object.pose_id, "pose")
     _description: Mapped[ObjectDescription | None] = relationship(

@@ -16,8 +16,9 @@ from pycrorm_async.orm import Designator, Object, Observation, ProcessMetaData, 
 from pycrorm_async.orm.base import same_row
 from pycrorm_async.store.episode_lookup import number_named
 from pycrorm_async.task_status import TaskStatus
+from pycrorm_async.world.enums import ObjectType
 
-__all__ = ["EpisodeSummary", "NodeSummary", "SimulatingNode", "episodes", "episode_named", "task_tree"]
+__all__ = ["EpisodeSummary", "NodeSummary", "RobotSummary", "SimulatingNode", "episodes", "episode_named", "task_tree"]
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,22 @@ class SimulatingNode:
     episode: int | None
     node: int | None
     dtype: str | None
+
+
+@dataclass(frozen=True)
+class RobotSummary:
+    """A robot that took part in an episode.
+
+    Attributes:
+        name: of its object in the world.
+        model, serial: of its `RobotDescription`; None without one, and in episodes of version 0.1.0.
+        description: fingerprint of its recorded description; None likewise.
+    """
+
+    name: str
+    model: str | None
+    serial: str | None
+    description: str | None
 
 
 @dataclass(frozen=True)
@@ -55,6 +72,7 @@ class EpisodeSummary:
         world: the world in one line.
         libraries, settings: version by package; the settings that differ from their defaults.
         clock_synchronized, clock_error_us: whether a time service kept the clock, and its estimated error.
+        robots: the robots that took part, in the order in which they were added.
     """
 
     number: int
@@ -81,6 +99,7 @@ class EpisodeSummary:
     settings: dict[str, Any] | None = None
     clock_synchronized: bool | None = None
     clock_error_us: int | None = None
+    robots: tuple[RobotSummary, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -122,6 +141,7 @@ async def episodes(connection: AsyncConnection, number: int | None = None) -> li
     query = _overview()
     if number is not None:
         query = query.where(ProcessMetaData.id == number)
+    robots = await _robots(connection, number)
     return [
         EpisodeSummary(
             number=row.id,
@@ -150,9 +170,28 @@ async def episodes(connection: AsyncConnection, number: int | None = None) -> li
             settings=row.settings,
             clock_synchronized=row.clock_synchronized,
             clock_error_us=row.clock_error_us,
+            robots=tuple(robots.get(row.id, ())),
         )
         for row in await connection.execute(query)
     ]
+
+
+async def _robots(connection: AsyncConnection, number: int | None) -> dict[int, list[RobotSummary]]:
+    """Return the robots of every episode, or of the one with this number, by episode."""
+    added = Object.__table__
+    query = (
+        select(
+            added.c.process_metadata_id, added.c.name, added.c.model, added.c.serial, added.c.description_fingerprint
+        )
+        .where(added.c.obj_type == ObjectType.ROBOT.name, added.c.id == added.c.identity_id)
+        .order_by(added.c.id)
+    )
+    if number is not None:
+        query = query.where(added.c.process_metadata_id == number)
+    robots: dict[int, list[RobotSummary]] = {}
+    for episode, *facts in await connection.execute(query):
+        robots.setdefault(episode, []).append(RobotSummary(*facts))
+    return robots
 
 
 def _overview() -> Select[*tuple[Any, ...]]:

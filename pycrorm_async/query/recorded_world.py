@@ -30,7 +30,7 @@ from pycrorm_async.world.models.primitives import point_urdf
 from pycrorm_async.world.objects import Object
 from pycrorm_async.world.pose import Vector
 from pycrorm_async.world.queries.bounding_boxes import BoundingBox
-from pycrorm_async.world.robots.robot_description import RobotDescription, robot_description
+from pycrorm_async.world.robots.robot_description import robot_description
 
 __all__ = ["world_of", "RecordedWorld"]
 
@@ -120,7 +120,7 @@ def world_of(
             if folder is not None and isinstance(urdf, str):
                 urdf = with_mesh_files(urdf, {name: str(folder / file) for name, file in meshes.items()})
             kind = _object_type(each)
-            robot = _robot_of(each.name, urdf) if kind is ObjectType.ROBOT else None
+            robot = robot_description(each.model) if each.model is not None else None
             added = Object(each.name, kind, urdf, each.pose, world=world, color=each.color, robot=robot)
             if is_point:
                 added.label(each.name)
@@ -137,16 +137,6 @@ def _object_type(then: ObjectThen) -> ObjectType:
             f"object {then.name!r} was recorded with the type {then.object_type!r}, which ObjectType lacks here"
         )
     return ObjectType[then.object_type]
-
-
-def _robot_of(name: str, urdf: str | Path) -> RobotDescription | None:
-    """Return the description of a robot that was added under another name than its own, which is in its URDF."""
-    if robot_description(name) is not None or isinstance(urdf, Path) or not urdf.lstrip().startswith("<"):
-        return None
-    try:
-        return robot_description(fromstring(urdf).get("name", ""))  # noqa: S314  checked when the object is made
-    except ParseError:
-        return None
 
 
 def _shape(then: ObjectThen, world: WorldThen) -> _Shape:

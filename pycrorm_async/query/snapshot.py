@@ -49,6 +49,7 @@ class ObjectThen:
         attached_to: name and link of the object that it moves with; the link is None for the root link.
         description_fingerprint: of its description in `WorldThen.descriptions`; None in episodes of older versions.
         color: red, green, blue, opacity, 0 to 1; None if the description alone says it.
+        model, serial: of a robot with a `RobotDescription`; None in episodes of older versions.
     """
 
     id: int
@@ -60,6 +61,8 @@ class ObjectThen:
     attached_to: tuple[str, str | None] | None
     description_fingerprint: str | None = None
     color: tuple[float, float, float, float] | None = None
+    model: str | None = None
+    serial: str | None = None
 
 
 @dataclass(frozen=True)

@@ -69,6 +69,8 @@ class _WorldObject:
     joints: dict[str, float] = field(default_factory=dict)
     description: str | None = None
     color: tuple[float, float, float, float] | None = None
+    model: str | None = None
+    serial: str | None = None
     attached_to: tuple[int, str | None] | None = None
 
 
@@ -151,6 +153,8 @@ class MomentFold:
                     dict(happening.joints),
                     happening.description,
                     happening.color,
+                    happening.model,
+                    happening.serial,
                 )
                 self._names[sequence] = name
             case ObjectMoved():
@@ -287,11 +291,13 @@ class MomentFold:
             else None,
             description_fingerprint=value.description,
             color=value.color,
+            model=value.model,
+            serial=value.serial,
         )
 
 
 def _robot(robot: ObjectThen) -> RobotThen:
-    description = robot_description(robot.name)
+    description = robot_description(robot.model or robot.name)
     torso = description.torso_joint if description is not None else None
     return RobotThen(robot.name, robot.pose, robot.joints.get(torso) if torso is not None else None)
 

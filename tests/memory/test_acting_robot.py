@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
@@ -12,20 +12,41 @@ from sqlalchemy import select, text
 
 from pycrorm_async import Memory
 from pycrorm_async.errors import CallerError
-from pycrorm_async.orm import Action, NavigateAction, PickUpWithContextView, TaskTreeNode
+from pycrorm_async.orm import (
+    Action,
+    NavigateAction,
+    ParkArmsAction,
+    PickUpWithContextView,
+    TaskTreeNode,
+)
+from pycrorm_async.orm import Object as RecordedObject
 from pycrorm_async.plan import (
     Code,
     MoveTorsoActionPerformable,
     NavigateActionPerformable,
     NoRobotHere,
+    ParkArmsActionPerformable,
     PickUpActionPerformable,
     SimulatedTaskTree,
     simulated_robot,
 )
 from pycrorm_async.plan.current_robot import require_robot
+from pycrorm_async.query.recorded_world import world_of
 from pycrorm_async.settings import Settings
-from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose, robot_acting
-from pycrorm_async.world.robots.robot_description import PR2
+from pycrorm_async.world import (
+    COURIER,
+    PR2,
+    Arms,
+    BulletWorld,
+    Grasp,
+    Object,
+    ObjectType,
+    Pose,
+    register_robot,
+    robot_acting,
+)
+from pycrorm_async.world.models.courier import courier_urdf
+from tests.commands import answer, pycrorm
 
 pytestmark = pytest.mark.slow
 
@@ -68,6 +89,52 @@ async def test_two_tasks_move_their_own_robots_and_each_node_has_the_state_of_it
             assert (await session.scalars(select(Action).where(Action.robot.is_(None)))).all() == []
             sampled = "SELECT DISTINCT name FROM state_sample JOIN object ON object.id = state_sample.object_id"
             assert sorted(await session.scalars(text(sampled))) == ["ada", "bob"]
+
+
+async def test_every_episode_names_its_robots_with_model_serial_and_description(
+    database_url: str, tmp_path: Path
+) -> None:
+    third = replace(COURIER, serial="C-03")
+    arm = Arms.named("CENTRE")
+    many = replace(third, name="many", urdf=courier_urdf(), arms={arm: COURIER.arms[Arms.RIGHT]}, serial=None)
+    register_robot(many)
+    async with Memory.open(database_url, spool=tmp_path / "spool") as memory:
+        async with memory.episode(description="nobody"):
+            await asyncio.sleep(0)
+        with BulletWorld(), simulated_robot:
+            async with memory.episode(description="two"):
+                eve = Object("eve", ObjectType.ROBOT, robot=third)
+                Object("many", ObjectType.ROBOT)
+                with robot_acting(eve):
+                    await NavigateActionPerformable(Pose([1, 0, 0])).perform()
+                with robot_acting(eve.world.object("many")):
+                    await ParkArmsActionPerformable(arm).perform()
+        await memory.flush()
+        alone, two = await memory.reading.episodes()
+        assert alone.robots == ()
+        assert [(each.name, each.model, each.serial) for each in two.robots] == [
+            ("eve", "courier", "C-03"),
+            ("many", "many", None),
+        ]
+        assert all(each.description for each in two.robots)
+        async with memory.session() as session:
+            query = select(RecordedObject).where(RecordedObject.model.is_not(None)).order_by(RecordedObject.id)
+            robots = (await session.scalars(query)).all()
+            assert {each.process_metadata_id for each in robots} == {two.number}
+            assert [(each.name, each.model, each.serial) for each in robots] == [
+                ("eve", "courier", "C-03"),
+                ("many", "many", None),
+            ]
+            parked = (await session.scalars(select(ParkArmsAction).where(ParkArmsAction.arm == arm))).one()
+            assert (parked.arm, parked.robot) == (arm, "many")
+        then = await memory.as_of(str(two.number), sequence=two.end_sequence)
+        assert [(each.model, each.serial) for each in then.world.objects] == [("courier", "C-03"), ("many", None)]
+        with world_of(then) as again:
+            assert again.object("eve").robot_description is COURIER
+    shown = answer("episodes", "--url", database_url, cwd=tmp_path)
+    assert [each["model"] for each in shown[1]["robots"]] == ["courier", "many"]
+    lines = pycrorm("show", "2", "--url", database_url, cwd=tmp_path).stdout
+    assert "eve (courier C-03), many" in lines
 
 
 async def test_a_pick_up_names_its_robot_in_the_view_for_learning(

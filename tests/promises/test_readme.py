@@ -32,7 +32,7 @@ def python_of(page: str) -> list[str]:
 
 
 PLAN, QUESTIONS, CELLS = python_of("README.md")
-TIDY, STEREO = python_of("pycrorm_async/plan/README.md")
+TIDY, LIFTER, STEREO = python_of("pycrorm_async/plan/README.md")
 COURSE, AROUND, BEGAN, SEEN, THEN, AGAIN, RATE = python_of("pycrorm_async/query/README.md")
 [BETTER] = python_of("pycrorm_async/learning/README.md")
 
@@ -84,6 +84,26 @@ def test_the_plan_with_every_expression_runs_and_the_milk_is_at_its_goal(tmp_pat
         question = "SELECT x, y, z FROM object JOIN pose ON pose.id = pose_id WHERE name = 'milk' ORDER BY object.id"
         *_, resting = plain.execute(question).fetchall()
     assert resting == pytest.approx((1.3, 0.45, 0.95), abs=1e-6)
+
+
+def test_a_users_robot_acts_beside_another_and_each_node_names_its_robot(tmp_path: Path) -> None:
+    (tmp_path / "lifter.py").write_text(LIFTER)
+    done = pycrorm("run", "lifter.py", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "courier has no torso to lift" in done.stdout
+    robots = answer("episodes", cwd=tmp_path)[0]["robots"]
+    assert [(each["name"], each["model"], each["serial"]) for each in robots] == [
+        ("lifter 1", "lifter", "L-17"),
+        ("courier", "courier", None),
+    ]
+    with contextlib.closing(sqlite3.connect(tmp_path / "pycrorm.db")) as plain:
+        question = "SELECT dtype, robot, status FROM action WHERE dtype <> 'NavigateAction' ORDER BY dtype"
+        assert plain.execute(question).fetchall() == [
+            ("MoveTorsoAction", "courier", "FAILED"),
+            ("ParkArmsAction", "lifter 1", "SUCCEEDED"),
+            ("PickUpAction", "courier", "SUCCEEDED"),
+        ]
+        assert plain.execute('SELECT robot FROM "PickUpWithContextView"').fetchall() == [("courier",)]
 
 
 def test_the_percepts_of_a_users_robot_are_in_the_table(tmp_path: Path) -> None:

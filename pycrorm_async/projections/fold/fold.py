@@ -64,6 +64,8 @@ __all__ = ["fold", "fold_happening", "happening_of", "CannotFold", "UndecodableP
 
 
 _NO_OUTCOME: Row = (None, None, None, None)
+_UNCHANGED: Row = (None, None, None, None, None)
+"""The columns of an object that only its first row has: joints, description, colour, model, serial."""
 
 
 class UndecodablePayload(CannotFold):
@@ -219,14 +221,15 @@ def _object_added(event: StoredEvent, added: ObjectAdded, _designators: Designat
     joints = json_text(added.joints) if added.joints else None
     color = json_text(added.color) if added.color is not None else None
     rows.inserts["pose"].append(pose_row(own, number, added.pose))
-    rows.inserts["object"].append((*_object_row(event, added, own, own, node), joints, added.description, color))
+    details = joints, added.description, color, added.model, added.serial
+    rows.inserts["object"].append((*_object_row(event, added, own, own, node), *details))
 
 
 def _object_moved(event: StoredEvent, moved: ObjectMoved, _designators: Designators, rows: Rows) -> None:
     identity, node = row(event.number, moved.object), _node(event, moved.node)
     own, number = _own(event)
     rows.inserts["pose"].append(pose_row(own, number, moved.pose))
-    rows.inserts["object"].append((*_object_row(event, moved, own, identity, node), None, None, None))
+    rows.inserts["object"].append((*_object_row(event, moved, own, identity, node), *_UNCHANGED))
 
 
 def _object_row(event: StoredEvent, value: ObjectAdded | ObjectMoved, own: int, identity: int, node: int | None) -> Row:

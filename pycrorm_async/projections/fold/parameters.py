@@ -114,7 +114,7 @@ def _object(event: StoredEvent, node: int, field: FieldDeclared, recorded: Any, 
     part_of = row(event.number, value.part_of.row) if value.part_of is not None else None
     number, time = event.number, microseconds(event.wall_ns)
     columns = own, number, value.dtype, value.name, value.object_type, pose_id, part_of, None, time, node
-    others.append(("object", (*columns, None, None, None)))
+    others.append(("object", (*columns, None, None, None, None, None)))
     return own
 
 

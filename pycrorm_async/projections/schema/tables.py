@@ -128,6 +128,8 @@ CORE: dict[str, dict[str, Storage]] = {
         "joints": "json",
         "description_fingerprint": "text",
         "color": "json",
+        "model": "text",
+        "serial": "text",
     },
     "object_removal": {
         "id": "key",
