@@ -112,11 +112,12 @@ async def test_an_object_is_in_a_drawer_where_its_joint_has_it(log: EventLog) ->
     outside = tidying.pick_up("cup")
     tidying.script.put(JointsMoved(tidying.reference("kitchen"), {f"{DRAWER}_joint": 0.35}))
     inside = tidying.pick_up("cup")
-    tidying.script.put(JointsMoved(tidying.reference("kitchen"), {f"{DRAWER}_joint": 0.0}))
     tidying.pick_up("cup", simulated=True)
+    tidying.script.put(JointsMoved(tidying.reference("kitchen"), {f"{DRAWER}_joint": 0.0}))
+    closed = tidying.pick_up("cup")
     found = await relations(log, tidying)
     assert found == {inside: {("in", "kitchen", DRAWER)}}
-    assert outside not in found
+    assert not {outside, closed} & found.keys()
 
 
 @pytest.mark.slow
