@@ -24,9 +24,9 @@ CLASSES = [
     for each in sorted(Base.registry.mappers, key=str)
     if each.class_.__module__.startswith("pycrorm_async.orm")
 ]
-ON_REQUEST = {"parent", "children", "ancestors", "node", "parameters", "refusals"}
+ON_REQUEST = {"parent", "children", "ancestors", "node", "parameters", "refusals", "description"}
 ON_REQUEST_OF_PICK_UPS = {"object_z", "object_qx", "object_qy", "object_qz", "object_qw", "height_over_torso"}
-ON_REQUEST_OF_PICK_UPS |= {"robot", "description", "scene"}
+ON_REQUEST_OF_PICK_UPS |= {"robot", "scene"}
 
 
 def attributes(row: Base) -> set[str]:

@@ -186,6 +186,13 @@ async def a_frame_of_pick_ups(reading: Reading) -> None:
     assert len(frame) == 1
 
 
+async def the_scenes_of_pick_ups(reading: Reading) -> None:
+    view = PickUpWithContextView
+    assert (
+        len(await reading.dataframe(select(view.scene, view.description).where(view.process_metadata_id == ASKED))) == 1
+    )
+
+
 async def a_joined_question(reading: Reading) -> None:
     question = select(PickUpAction).join(PickUpAction.object).join(Object.pose).join(PickUpAction.node)
     await rows_of(reading, question.where(PickUpAction.process_metadata_id == ASKED, Object.name == "milk"))
@@ -216,6 +223,7 @@ async def a_snapshot(reading: Reading) -> None:
         pytest.param(of_episode(PickUpWithContextView), id="pick-ups"),
         pytest.param(a_frame_of_pick_ups, id="a data frame of pick-ups"),
         pytest.param(of_episode(RootFailure), id="where failures began"),
+        pytest.param(the_scenes_of_pick_ups, id="scenes of pick-ups"),
         pytest.param(a_joined_question, id="a join"),
         pytest.param(spatial_relations, id="spatial relations"),
         pytest.param(the_tree, id="the task tree"),

@@ -229,9 +229,11 @@ def _duration(nodes: Table) -> ColumnElement[Any]:
 
 
 def _course(nodes: Table) -> tuple[ColumnElement[Any], ...]:
-    """Return the columns that say when a node was performed, by time and by event, by which robot, and how it ended."""
+    """Return the columns that say when a node was performed, by time and by event, by which robot, for which node, and
+    how it ended."""
     times = nodes.c.start_time, nodes.c.end_time, _duration(nodes)
-    return nodes.c.status, *times, nodes.c.reason, *_sequence(nodes), nodes.c.end_sequence, nodes.c.robot
+    ended = nodes.c.reason, nodes.c.failure_message, nodes.c.result
+    return nodes.c.status, *times, *ended, *_sequence(nodes), nodes.c.end_sequence, nodes.c.robot, nodes.c.parent_id
 
 
 def _designator(core: dict[str, Table], layout: Layout) -> Select[Any]:
@@ -264,7 +266,8 @@ def _lineage(nodes: Table, layout: Layout) -> ColumnElement[str]:
 def _of_kind(kind: str) -> _Cut:
     def view(core: dict[str, Table], _layout: Layout) -> Select[Any]:
         nodes = core["task_tree_node"]
-        columns = nodes.c.id, nodes.c.process_metadata_id, nodes.c.dtype, *_course(nodes)
+        parameters = func.coalesce(nodes.c.parameters, "{}").label("parameters")
+        columns = nodes.c.id, nodes.c.process_metadata_id, nodes.c.dtype, *_course(nodes), parameters
         return select(*columns).where(nodes.c.kind == kind, nodes.c.dtype.is_not(None))
 
     return view
