@@ -55,7 +55,7 @@ def learn(
         Limits, typer.Option(help="Ranges of the arms' joints to use.", case_sensitive=False)
     ] = Limits.SOFT,
     collisions: Annotated[
-        bool, typer.Option("--collisions", help="Count an arm that collides with an object as a failure.")
+        bool, typer.Option("--collisions", help="Count a base or an arm that collides with an object as a failure.")
     ] = False,
     episode_each: Annotated[
         bool, typer.Option("--episode-each", help="Record one episode per rollout instead of one per some hundred.")

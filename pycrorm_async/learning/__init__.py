@@ -9,6 +9,7 @@ from pycrorm_async.learning.policies.evidence import Evidence, Rectangle, Region
 from pycrorm_async.learning.policies.policy import PickUpChoice, Policy
 from pycrorm_async.learning.policies.policy_file import load_policy, name_of, save_policy
 from pycrorm_async.learning.policies.policy_plot import draw_policies
+from pycrorm_async.learning.policies.recorded_policy import read_policy, record_policy
 from pycrorm_async.learning.policies.tree import learn
 from pycrorm_async.learning.rollouts.move_and_pick_up import MoveAndPickUp
 from pycrorm_async.learning.rollouts.recorded_rollouts import rollouts_question
@@ -26,6 +27,8 @@ __all__ = [
     "Rectangle",
     "save_policy",
     "load_policy",
+    "record_policy",
+    "read_policy",
     "name_of",
     "draw_policies",
     "Scene",

@@ -16,12 +16,14 @@ from pycrorm_async.errors import CallerError, InternalError
 from pycrorm_async.learning.policies.default_policy import default_policy
 from pycrorm_async.learning.policies.policy import PickUpChoice, Policy
 from pycrorm_async.learning.policies.policy_file import name_of
+from pycrorm_async.learning.policies.recorded_policy import policy_contents, record_policy
 from pycrorm_async.learning.policies.tree import check_leaf, learn
 from pycrorm_async.learning.rollouts import recorded_rollouts
 from pycrorm_async.learning.rollouts.recorded_rollouts import tally_of
-from pycrorm_async.learning.rollouts.rollout_pool import ROLLOUTS_PER_RUN, Job, MemoryLocation, Workers
+from pycrorm_async.learning.rollouts.rollout_pool import ROLLOUTS_PER_RUN, SETTINGS, Job, MemoryLocation, Workers
 from pycrorm_async.learning.rollouts.rollouts import Tally
 from pycrorm_async.learning.rollouts.scene import Scene
+from pycrorm_async.memory import Memory
 from pycrorm_async.operations.recovery import recover
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.world.enums import Arms, Grasp
@@ -147,12 +149,18 @@ class _PhaseRunner:
     """Run the phases of one experiment with workers, and query each phase's results from the memory."""
 
     def __init__(
-        self, experiment: Experiment, workers: Workers, reading: Reading, report_progress: ReportProgress
+        self,
+        experiment: Experiment,
+        place: MemoryLocation,
+        workers: Workers,
+        reading: Reading,
+        report_progress: ReportProgress,
     ) -> None:
         self._experiment = experiment
         self._workers = workers
         self._reading = reading
         self._report_progress = report_progress
+        self._place = place
         self.phases: list[Phase] = []
 
     async def phase(self, name: str, policy: Policy, seed: int, count: int) -> pd.DataFrame:
@@ -200,6 +208,31 @@ class _PhaseRunner:
         )
         return frame
 
+    async def record(self, policy: Policy, *, rounds: int, successes: int) -> None:
+        """Record the policy learned after that many rounds, with its training episodes, unless it is recorded."""
+        experiment, name = self._experiment, name_of(policy)
+        seeds = [experiment.seed + number for number in range(rounds)]
+        scene, policies = str(experiment.scene), [each.policy for each in self.phases[:rounds]]
+        async with self._reading.session() as session:
+            if await session.scalar(policy_contents(name).limit(1)) is not None:
+                return
+            training = recorded_rollouts.episodes_question(scene=scene, seeds=seeds, policies=policies)
+            episodes = list(await session.scalars(training))
+        # The daemon that drains the workers' recorders drains this one too.
+        async with Memory.open(self._place.url, spool=self._place.spool, writer="daemon", settings=SETTINGS) as memory:
+            async with memory.episode(description=f"learned policy {name}", plan="learn", seed=experiment.seed):
+                await record_policy(
+                    memory,
+                    policy,
+                    episodes=episodes,
+                    successes=successes,
+                    min_samples_leaf=experiment.min_samples_leaf,
+                    rollouts=rounds * experiment.rollouts,
+                    scene=scene,
+                    seeds=seeds,
+                )
+            await memory.flush()
+
 
 async def run(
     experiment: Experiment, place: MemoryLocation, report_progress: ReportProgress = lambda *_: None
@@ -219,6 +252,7 @@ async def run(
             frame = await runner.phase(name, policy, experiment.seed + number, experiment.rollouts)
             frames.append(recorded_rollouts.successes(frame))
             policy = _learn_from(frames, experiment)
+            await runner.record(policy, rounds=number + 1, successes=sum(map(len, frames)))
         await runner.phase("learned policy", policy, experiment.seed + experiment.rounds, experiment.evaluate)
         held_out_seed = experiment.seed + HELD_OUT_SEED
         held_out = await runner.phase("default policy, held out", default_policy(), held_out_seed, experiment.held_out)
@@ -237,7 +271,7 @@ async def _open_runner(
     # Killed workers may have left records in the spool; `recover` stores them and creates the tables.
     await recover(place.url, spool=place.spool)
     async with Workers(experiment.workers, place) as workers, Reading.open(place.url) as reading:
-        yield _PhaseRunner(experiment, workers, reading, report_progress)
+        yield _PhaseRunner(experiment, place, workers, reading, report_progress)
 
 
 def _learn_from(frames: Sequence[pd.DataFrame], experiment: Experiment) -> Policy:

@@ -39,6 +39,7 @@ __all__ = [
     "FaceAtAction",
     "MoveAndPickUpAction",
     "BatchRolloutAction",
+    "LearnPolicyAction",
 ]
 
 
@@ -194,3 +195,34 @@ class BatchRolloutAction(Action):
     seed: Mapped[int]
     first: Mapped[int]
     count: Mapped[int]
+
+
+class LearnPolicyAction(Action):
+    """A policy was learned (`pycrorm_async.learning.record_policy`); `read_policy` returns it by its name.
+
+    Attributes:
+        policy: its name, the hash of its content, which rollouts under it repeat.
+        successes: number of samples from which it was learned.
+        min_samples_leaf: the setting of `learn`.
+        rollouts, scene: of the rollouts that gave the samples; None if others did.
+        episode_count: number of the episodes that hold the samples.
+    """
+
+    __tablename__ = "learn_policy_action"
+
+    policy: Mapped[str]
+    successes: Mapped[int]
+    min_samples_leaf: Mapped[int]
+    rollouts: Mapped[int | None]
+    scene: Mapped[str | None]
+    episode_count: Mapped[int]
+
+    @property
+    def seeds(self) -> list[int]:
+        """The seeds of the rollouts that gave the samples, one for each round."""
+        return self.entries("seeds")
+
+    @property
+    def training_episodes(self) -> list[str]:
+        """The ids of the first 10,000 episodes that hold the samples."""
+        return self.entries("episodes")

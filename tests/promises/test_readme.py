@@ -12,8 +12,9 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
+from pycrorm_async import Memory
 from pycrorm_async.cli.main import app
-from pycrorm_async.learning import load_policy
+from pycrorm_async.learning import load_policy, name_of
 from tests.commands import answer, pycrorm
 
 pytestmark = pytest.mark.slow
@@ -34,7 +35,7 @@ def python_of(page: str) -> list[str]:
 PLAN, QUESTIONS, CELLS = python_of("README.md")
 TIDY, LIFTER, STEREO = python_of("pycrorm_async/plan/README.md")
 COURSE, AROUND, BEGAN, SEEN, THEN, AGAIN, RATE = python_of("pycrorm_async/query/README.md")
-[BETTER] = python_of("pycrorm_async/learning/README.md")
+BETTER, ORIGINS = python_of("pycrorm_async/learning/README.md")
 
 
 def test_the_readme_is_short_and_every_link_of_a_page_leads_to_a_file() -> None:
@@ -283,6 +284,13 @@ async def test_a_policy_is_learned_from_the_recorded_rollouts_and_used(
     with contextlib.closing(sqlite3.connect(tmp_path / "tries.db")) as plain:
         statuses = [status for (status,) in plain.execute("SELECT status FROM task_tree_node WHERE dtype = 'Retry'")]
     assert statuses == ["SUCCEEDED"]
+    exec(ORIGINS, names)
+    async with Memory.open("sqlite:///tries.db") as memory:
+        [learned], used = await names["origins"](memory)
+        [training] = [each for each in await memory.reading.episodes() if each.id in learned.training_episodes]
+    assert (learned.policy, learned.successes) == (name_of(policy), tally.successes)
+    assert training.nodes > 1000
+    assert used == []
 
 
 def test_every_verb_in_the_readme_exists(tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ from pycrorm_async.learning.policies.evidence import Evidence, Rectangle, Region
 from pycrorm_async.learning.policies.policy import ARMS, GRASPS, Leaf, Policy
 from pycrorm_async.world.enums import Arms, Grasp
 
-__all__ = ["load_policy", "name_of", "save_policy"]
+__all__ = ["decode_policy", "encode_policy", "load_policy", "name_of", "save_policy"]
 
 FORMAT = "pycrorm policy"
 VERSION = 1
@@ -58,7 +58,7 @@ def save_policy(policy: Policy, path: Path | str) -> None:
 
     Raises `PolicyFileRefused` if the file cannot be written.
     """
-    path, content = Path(path), _encode(policy)
+    path, content = Path(path), encode_policy(policy)
     heading = msgspec.json.encode(_Heading(FORMAT, VERSION, zlib.crc32(content)))
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
@@ -71,10 +71,11 @@ def save_policy(policy: Policy, path: Path | str) -> None:
 
 def name_of(policy: Policy) -> str:
     """Return the policy's name, 12 hexadecimal digits: a hash of its content, the same in every process."""
-    return hashlib.blake2b(_encode(policy), digest_size=6).hexdigest()
+    return hashlib.blake2b(encode_policy(policy), digest_size=6).hexdigest()
 
 
-def _encode(policy: Policy) -> bytes:
+def encode_policy(policy: Policy) -> bytes:
+    """Return the policy as JSON; equal policies give equal bytes in every process."""
     return msgspec.json.encode(
         _Policy(
             [each.name for each in ARMS],
@@ -110,12 +111,14 @@ def load_policy(path: Path | str) -> Policy:
     if zlib.crc32(content) != heading.crc32:
         raise PolicyDamaged(path, "its checksum does not match its content")
     try:
-        return _decode(msgspec.json.decode(content, type=_Policy))
+        return decode_policy(content)
     except (msgspec.DecodeError, CallerError, ImpossibleCondition, KeyError, ValueError) as error:
         raise PolicyDamaged(path, f"its checksum matches, but it holds no policy: {error}") from None
 
 
-def _decode(content: _Policy) -> Policy:
+def decode_policy(encoded: bytes) -> Policy:
+    """Return the policy that `encode_policy` wrote. Raises `msgspec.DecodeError` or another `ValueError`."""
+    content = msgspec.json.decode(encoded, type=_Policy)
     if (content.arms, content.grasps) != ([each.name for each in ARMS], [each.name for each in GRASPS]):
         raise ValueError(f"unexpected members: probabilities of arms {content.arms} and grasps {content.grasps}")
     if not math.isclose(sum(leaf.weight for leaf in content.leaves), 1, rel_tol=1e-6):

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
-from sqlalchemy import Select, func, select
+from sqlalchemy import Select, and_, func, or_, select
 from sqlalchemy.orm import aliased
 
 from pycrorm_async.learning.rollouts.rollouts import Tally
-from pycrorm_async.orm import BatchRolloutAction, PickUpWithContextView, TaskTreeNode
+from pycrorm_async.orm import BatchRolloutAction, PickUpWithContextView, ProcessMetaData, TaskTreeNode
 from pycrorm_async.task_status import TaskStatus
 
 if TYPE_CHECKING:
@@ -67,6 +67,20 @@ def rollouts_question(*, scene: str, seed: int, policy: str | None = None) -> Se
         .join(picked, picked.parent_id == rollout.c.id)
         .join(view, view.id == picked.id)
         .order_by(rollout.c.index, rollout.c.id)
+    )
+
+
+def episodes_question(*, scene: str, seeds: Sequence[int], policies: Sequence[str]) -> Select[str]:
+    """Select the ids of the episodes that hold the rollouts in this scene under these policies, each with its seed."""
+    batch, node, episode = BatchRolloutAction, TaskTreeNode, ProcessMetaData
+    rounds = [and_(batch.seed == seed, batch.policy == policy) for seed, policy in zip(seeds, policies, strict=True)]
+    return (
+        select(episode.uuid)
+        .join(node, node.process_metadata_id == episode.id)
+        .join(batch, batch.id == node.id)
+        .where(batch.scene == scene, or_(*rounds))
+        .group_by(episode.id, episode.uuid)
+        .order_by(episode.id)
     )
 
 

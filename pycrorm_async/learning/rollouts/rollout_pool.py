@@ -54,7 +54,7 @@ from pycrorm_async.operations.daemon import serve
 from pycrorm_async.operations.processes import ChildProcess
 from pycrorm_async.settings import Settings
 
-__all__ = ["Workers", "WorkerLost", "MemoryLocation", "Job", "ROLLOUTS_PER_RUN"]
+__all__ = ["Workers", "WorkerLost", "MemoryLocation", "Job", "ROLLOUTS_PER_RUN", "SETTINGS"]
 
 ROLLOUTS_PER_RUN = 500
 """Rollouts in one run of a worker, which is one episode: enough to make the cost of building the world negligible."""
@@ -62,7 +62,7 @@ _PROGRESS_INTERVAL_S = 0.2
 _POLL_INTERVAL_S = 0.02
 _TAKEOVER_INTERVAL_S = 1.0
 """Time between attempts to drain the spool while another daemon drains it."""
-_SETTINGS = Settings(flush_timeout_s=120)
+SETTINGS = Settings(flush_timeout_s=120)
 """Workers wait longer than usual in `flush`, because one daemon drains and folds the records of all of them."""
 _log = logging.getLogger(__name__)
 
@@ -296,7 +296,7 @@ async def _serve_jobs(pipe: Connection, place: MemoryLocation | None) -> None:
     async with AsyncExitStack() as stack:
         memory = None
         if place is not None:
-            opened = Memory.open(place.url, spool=place.spool, writer="daemon", settings=_SETTINGS)
+            opened = Memory.open(place.url, spool=place.spool, writer="daemon", settings=SETTINGS)
             memory = await stack.enter_async_context(opened)
         job: Job | None = None
         with suppress(EOFError):

@@ -27,7 +27,7 @@ class Scene:
         yaw: rotation of the object about the vertical, rad.
         torso_height: torso height at the start of every rollout, m. The thesis' rollouts have 0.
         limits: joint limits of the arms. Within soft limits and with the torso at 0 no grasp from above is reachable.
-        collisions: whether an arm in collision is a failure; if False, collisions are not checked.
+        collisions: whether a base or an arm in collision is a failure; if False, collisions are not checked.
         kitchen: whether the world contains the kitchen.
     """
 

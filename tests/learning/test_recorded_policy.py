@@ -1,0 +1,68 @@
+"""A learned policy is in the memory with its content, its training episodes and its settings."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from sqlalchemy import select
+
+from pycrorm_async import Memory, Reading
+from pycrorm_async.errors import CallerError
+from pycrorm_async.learning import default_policy, name_of, read_policy, record_policy, save_policy
+from pycrorm_async.learning.experiment import Experiment, run
+from pycrorm_async.learning.rollouts.rollout_pool import MemoryLocation
+from pycrorm_async.orm import BatchRolloutAction, LearnPolicyAction, ProcessMetaData
+
+SMALL = Experiment(rollouts=700, evaluate=60, held_out=60, workers=2, rounds=2)
+
+
+async def test_a_recorded_policy_is_read_back_by_its_name(database_url: str, tmp_path: Path) -> None:
+    policy = default_policy()
+    async with Memory.open(database_url, spool=tmp_path / "spool") as memory:
+        async with memory.episode(description="training") as training:
+            pass
+        name = await record_policy(memory, policy, episodes=[str(training)], successes=7, min_samples_leaf=3)
+        await memory.flush()
+        read = await read_policy(memory.reading, name)
+        async with memory.session() as session:
+            (learned,) = (await session.scalars(select(LearnPolicyAction))).all()
+    assert name == name_of(policy) == name_of(read) == learned.policy
+    assert read.sample(np.random.default_rng(1), 5) == policy.sample(np.random.default_rng(1), 5)
+    assert (learned.successes, learned.min_samples_leaf, learned.rollouts, learned.scene) == (7, 3, None, None)
+    assert (learned.training_episodes, learned.episode_count, learned.seeds) == ([str(training)], 1, [])
+
+
+async def test_a_policy_that_is_not_recorded_is_named(database_url: str, tmp_path: Path) -> None:
+    async with Memory.open(database_url, spool=tmp_path / "spool") as memory:
+        with pytest.raises(CallerError, match="the memory holds no policy '0123456789ab'"):
+            await read_policy(memory.reading, "0123456789ab")
+
+
+@pytest.mark.slow
+async def test_the_rollouts_of_an_experiment_lead_to_their_policy_and_its_training_episodes(
+    database_url: str, tmp_path: Path
+) -> None:
+    place = MemoryLocation(database_url, tmp_path / "spool")
+    learned = await run(SMALL, place)
+    save_policy(default_policy(), tmp_path / "policy.json")  # what the file holds does not matter
+    async with Reading.open(place.url) as reading:
+        evaluation = learned.evaluation
+        assert name_of(await read_policy(reading, evaluation.policy)) == name_of(learned.policy) == evaluation.policy
+        async with reading.session() as session:
+            first, last = (await session.scalars(select(LearnPolicyAction).order_by(LearnPolicyAction.id))).all()
+            batches = (await session.scalars(select(BatchRolloutAction))).all()
+            uuids = {each.id: each.uuid for each in await session.scalars(select(ProcessMetaData))}
+    assert (first.policy, last.policy) == (learned.phases[1].policy, evaluation.policy)
+    assert (first.rollouts, last.rollouts, first.seeds, last.seeds) == (700, 1_400, [69], [69, 70])
+    assert last.successes == len(learned.successes)
+    assert (last.min_samples_leaf, last.scene) == (25, str(SMALL.scene))
+    for each, seeds in ((first, {69}), (last, {69, 70})):
+        training = {uuids[batch.process_metadata_id] for batch in batches if batch.seed in seeds}
+        assert training == set(each.training_episodes)
+        assert each.episode_count == len(training) > 1
+    again = await run(Experiment(**{**vars(SMALL), "resume": True}), place)
+    assert again.policy.leaves == learned.policy.leaves
+    async with Reading.open(place.url) as reading, reading.session() as session:
+        assert len((await session.scalars(select(LearnPolicyAction))).all()) == 2
