@@ -13,10 +13,11 @@ from sqlalchemy import select
 from pycrorm_async import Memory
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock, clock_quality
 from pycrorm_async.hooks.provenance import PlanSource
-from pycrorm_async.orm import ProcessMetaData
-from pycrorm_async.plan import ParkArmsActionPerformable, simulated_robot
+from pycrorm_async.orm import PickUpWithContextView, ProcessMetaData
+from pycrorm_async.plan import ParkArmsActionPerformable, PickUpActionPerformable, simulated_robot
+from pycrorm_async.plan.failures import PlanFailure
 from pycrorm_async.settings import Settings
-from pycrorm_async.world import Arms, BulletWorld, Object, ObjectType
+from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose
 
 SOURCE = PlanSource("ab" * 32, "cd" * 20, git_dirty=True)
 
@@ -54,6 +55,20 @@ async def test_what_is_not_known_is_null(database_url: str, tmp_path: Path) -> N
         (episode,) = await episodes_of(memory)
     assert (episode.plan_sha256, episode.git_commit, episode.git_dirty, episode.settings) == (None,) * 4
     assert (episode.clock_synchronized, episode.clock_error_us, episode.world) == (None,) * 3
+
+
+async def test_the_scene_of_a_pick_up_is_the_world_that_its_episode_entered(database_url: str, tmp_path: Path) -> None:
+    async with Memory.open(database_url, spool=tmp_path / "spool") as memory:
+        async with memory.episode(description="a pick-up"):
+            with BulletWorld(), simulated_robot:
+                Object("pr2", ObjectType.ROBOT)
+                milk = Object("milk", ObjectType.MILK, pose=Pose([0.6, 0.2, 0.9]))
+                with pytest.raises(PlanFailure):
+                    await PickUpActionPerformable(milk, Arms.LEFT, Grasp.TOP).perform()
+        await memory.flush()
+        async with memory.session() as session:
+            scenes = (await session.scalars(select(PickUpWithContextView.scene))).all()
+    assert scenes == ["BulletWorld (DIRECT): pr2 (ROBOT), milk (MILK)"]
 
 
 async def test_a_world_that_is_entered_inside_an_episode_is_described(database_url: str, tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Any, Self
 
-from sqlalchemy import Boolean, ColumnElement, FromClause, ScalarSelect, Select, Table, and_, select
+from sqlalchemy import Boolean, ColumnElement, FromClause, ScalarSelect, Select, Table, and_, func, select
 from sqlalchemy.ext.compiler import compiles
 
 from pycrorm_async.projections.schema.tables import EPISODE
@@ -54,9 +54,11 @@ def pick_ups_with_context(
     column. `dtypes` are all dtypes that a node with a row in `picked` may have."""
     robot, place = pose.alias("robot"), pose.alias("there")
 
-    def of_episode(column: str) -> ScalarSelect[Any]:
+    def of_episode(value: ColumnElement[Any]) -> ScalarSelect[Any]:
         # A subquery, which costs nothing where the column is not selected.
-        return select(episode.c[column]).where(episode.c.id == node.c.process_metadata_id).scalar_subquery()
+        return select(value).where(episode.c.id == node.c.process_metadata_id).scalar_subquery()
+
+    world = func.coalesce(episode.c.world, episode.c.entered_world)
 
     return (
         select(
@@ -77,8 +79,8 @@ def pick_ups_with_context(
             *_seen_from(place.c, robot.c),
             (place.c.z - robot.c.z - node.c.torso_height).label("height_over_torso"),
             node.c.robot,
-            of_episode("description").label("description"),
-            of_episode("world").label("scene"),
+            of_episode(episode.c.description).label("description"),
+            of_episode(world).label("scene"),
         )
         .select_from(picked)
         .join(node, _same(node, picked, node.c.id == picked.c.id))
