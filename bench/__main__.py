@@ -53,6 +53,7 @@ RUNS = (
     Run("others"),
     Run("daemon"),
     Run("daemon postgresql", ("--postgresql",)),
+    Run("digests"),
     Run("thesis"),
     Run("thesis postgresql", ("--postgresql",), quick=False),
     Run("questions"),

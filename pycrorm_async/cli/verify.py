@@ -3,19 +3,24 @@
 from __future__ import annotations
 
 import asyncio
+import sys
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Annotated, Any
 
+import msgspec
 import typer
 
 from pycrorm_async.bulk_records import collect_seldom
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, ProjectionOption, SpoolOption, UrlOption
 from pycrorm_async.cli.output import note, print_json, stdout
 from pycrorm_async.cli.pending_events import note_pending_events
+from pycrorm_async.errors import CallerError
 from pycrorm_async.operations.destination import shared_address
 from pycrorm_async.progress_bar import watched
 from pycrorm_async.projections.custom.discovery import installed_projections, load_projections
 from pycrorm_async.projections.custom.projection import Projection
+from pycrorm_async.projections.verify.digest_check import OutsideDigest
 from pycrorm_async.projections.verify.verify import VerifyResult
 from pycrorm_async.projections.verify.verify import verify as verify_log
 from pycrorm_async.store.episode_lookup import episode_named
@@ -32,6 +37,15 @@ def verify(
         str | None, typer.Option("--episode", help="Verify only this episode: its number, its id, or `last`.")
     ] = None,
     url: UrlOption = DEFAULT_URL,
+    digests: Annotated[
+        Path | None,
+        typer.Option(
+            "--digests",
+            help="Compare also with these digests: a file from `pycrorm episodes --simulated --json`, or - for stdin.",
+            allow_dash=True,
+            dir_okay=False,
+        ),
+    ] = None,
     spool: SpoolOption = None,
     projection: ProjectionOption = None,
     as_json: JsonOption = False,
@@ -40,12 +54,14 @@ def verify(
 
     Changes nothing; recording and folding may continue. Exit code 0 if no problem is result; 1 if tables differ from
     the log or are of an older version (`pycrorm rebuild` replaces them), if an episode is parked or refused, or if a
-    designator type has no tables or a view is left out; 4 if the log is damaged.
+    designator type has no tables or a view is left out; 4 if the log is damaged, or differs from its digests or from
+    those of --digests.
     """
+    outside = () if digests is None else _read_digests(digests)
     given_projections = load_projections(projection or ())
     projections = [*given_projections, *installed_projections(given_projections)]
     collect_seldom()
-    result, ids = asyncio.run(_verify(url, episode, projections))
+    result, ids = asyncio.run(_verify(url, episode, projections, outside))
     note_pending_events(url, spool)
     for name, reason in result.not_compared.items():
         note(f"the projection {name} was not verified: {reason}")
@@ -58,14 +74,40 @@ def verify(
     return 1 if result.drift or result.stopped or result.unmade or result.failed_views or result.outdated else 0
 
 
+class _EpisodeDigest(msgspec.Struct):
+    """The fields of `pycrorm episodes --json` that name an episode and its last digest."""
+
+    id: str
+    digest_sequence: int | None = None
+    digest: str | None = None
+
+
+def _read_digests(path: Path) -> list[OutsideDigest]:
+    """Read a document of `pycrorm episodes --json`; episodes without a digest are left out. Raises `CallerError`."""
+    try:
+        document = sys.stdin.buffer.read() if str(path) == "-" else path.read_bytes()
+        episodes = msgspec.json.decode(document, type=list[_EpisodeDigest])
+    except OSError as error:
+        raise CallerError(f"{path} cannot be read: {error.strerror}") from error
+    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+        raise CallerError(f"{path} holds no digests: {error}; write them with `pycrorm episodes --json`") from error
+    return [
+        OutsideDigest(each.id, each.digest_sequence, each.digest)
+        for each in episodes
+        if each.digest is not None and each.digest_sequence is not None
+    ]
+
+
 async def _verify(
-    url: str, episode: str | None, projections: Sequence[Projection]
+    url: str, episode: str | None, projections: Sequence[Projection], digests: Sequence[OutsideDigest]
 ) -> tuple[VerifyResult, dict[int, str]]:
     log = await EventLog.open(shared_address(url), create=False)
     try:
         only = None if episode is None else await episode_named(log, episode)
         with watched("verifying") as report_progress:
-            result = await verify_log(log, episode=only, projections=projections, report_progress=report_progress)
+            result = await verify_log(
+                log, episode=only, projections=projections, digests=digests, report_progress=report_progress
+            )
         return result, {each.number: each.id for each in await log.episodes()}
     finally:
         await log.close()
@@ -90,6 +132,12 @@ def _print(result: VerifyResult) -> None:
         stdout.print(f"and {count - shown} more")
     if result.behind:
         stdout.print(f"{result.behind} events are not in the tables yet")
+    if result.without_digest:
+        stdout.print(
+            f"{result.without_digest} episodes are without a digest, because an earlier version stored them;"
+            " in a copy made with `pycrorm copy` they have one",
+            soft_wrap=True,
+        )
     checked = f"{result.events} events of {result.episodes} episodes and {result.rows} rows: "
     if result.damage:
         stdout.print(f"{checked}the log is damaged; copy its intact events to another memory with `pycrorm copy`")

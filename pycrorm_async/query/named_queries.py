@@ -73,6 +73,8 @@ class EpisodeSummary:
         libraries, settings: version by package; the settings that differ from their defaults.
         clock_synchronized, clock_error_us: whether a time service kept the clock, and its estimated error.
         robots: the robots that took part, in the order in which they were added.
+        digest_sequence, digest: the last digest that the log keeps of this episode, and the event up to which it covers
+            the episode; None without one.
     """
 
     number: int
@@ -100,6 +102,8 @@ class EpisodeSummary:
     clock_synchronized: bool | None = None
     clock_error_us: int | None = None
     robots: tuple[RobotSummary, ...] = ()
+    digest_sequence: int | None = None
+    digest: str | None = None
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from dataclasses import replace
 from datetime import datetime
 from typing import TYPE_CHECKING, Any, Self
 
@@ -138,8 +139,15 @@ class Reading:
         """Return every episode, the oldest first."""
         await self._ready()
         with self._log.translated():
+            digests = await self._log.last_digests()
             async with self._connection(simulated=simulated) as connection:
-                return await named_queries.episodes(connection)
+                summaries = await named_queries.episodes(connection)
+        return [
+            replace(each, digest_sequence=digest.sequence, digest=digest.digest)
+            if (digest := digests.get(each.number)) is not None
+            else each
+            for each in summaries
+        ]
 
     async def episode(self, name: str) -> EpisodeSummary:
         """Return the episode with this number, id, or first digits of its id, simulations included.

@@ -40,6 +40,7 @@ from pycrorm_async.store.append_rules import (
     step,
 )
 from pycrorm_async.store.dialect import Dialect, Insertion
+from pycrorm_async.store.digests.digest_table import Extension, RunningDigests
 from pycrorm_async.store.limits import warnings_of
 from pycrorm_async.store.stored import NOTHING_KNOWN, Basis, EpisodeRow, Stored, StoredEvent
 
@@ -52,22 +53,32 @@ class _Plan(NamedTuple):
     known_rows: Mapping[EpisodeId, EpisodeRow]
     steps: Mapping[EpisodeId, EpisodeStep]
     insertion: Insertion
+    digests: Extension | None
 
 
 class Appending:
-    """One batch and its append; use it once."""
+    """One batch and its append; use it once. Without `digests` it stores none."""
 
-    def __init__(self, dialect: Dialect, records: Sequence[Record], basis: Basis = NOTHING_KNOWN) -> None:
+    def __init__(
+        self,
+        dialect: Dialect,
+        records: Sequence[Record],
+        basis: Basis = NOTHING_KNOWN,
+        digests: RunningDigests | None = None,
+    ) -> None:
         self._dialect = dialect
         self._basis = basis
+        self._digests = digests
         self._batch = sort(records)
         self._plan: _Plan | None = None
         self.warnings: dict[str, str] = {}
         """Warnings of limits that the batch came near, by "numbers" or an episode's id."""
+        self.extension: Extension | None = None
+        """The digests that `write` inserted, to be kept after the commit."""
 
     async def prepare(self, connection: AsyncConnection) -> None:
         """Read the episodes in a reading transaction and build the statements for them. Optional."""
-        self._plan = await self._make_plan(await self._read_rows(connection))
+        self._plan = await self._make_plan(connection, await self._read_rows(connection))
 
     async def write(self, connection: AsyncConnection) -> Stored:
         """Append the batch in the caller's transaction.
@@ -85,13 +96,16 @@ class Appending:
         known_rows, refusals = await self._read_or_create_rows(connection)
         plan = self._plan
         if plan is None or plan.known_rows != known_rows:
-            plan = await self._make_plan(known_rows)
+            plan = await self._make_plan(connection, known_rows)
         changed = [each.after for identity, each in plan.steps.items() if each.after != known_rows[identity]]
         if changed:
             await dialect.upsert_episodes(connection, changed)
             self.warnings = warnings_of(changed)
         if any(each.fresh for each in plan.steps.values()):
             await dialect.insert_events(connection, plan.insertion)
+            if self._digests is not None and plan.digests is not None:
+                await self._digests.insert(connection, plan.digests)
+                self.extension = plan.digests
         else:
             await dialect.force_durable_commit(connection)
         await _compare(dialect, connection, [each for each in plan.steps.values() if each.again])
@@ -101,10 +115,13 @@ class Appending:
         refusals |= {each: reason for each, reason in stopped.items() if reason is not None}
         return Stored(refusals, {each: change.after for each, change in plan.steps.items()})
 
-    async def _make_plan(self, known_rows: Mapping[EpisodeId, EpisodeRow]) -> _Plan:
+    async def _make_plan(self, connection: AsyncConnection, known_rows: Mapping[EpisodeId, EpisodeRow]) -> _Plan:
         steps = {each: step(self._batch.episodes[each], row) for each, row in known_rows.items()}
+        digests: Extension | None = None
+        if self._digests is not None:
+            digests = await self._digests.extend(connection, ((known_rows[each], steps[each]) for each in steps))
         rows = [row for each in steps.values() for row in _rows(each)]
-        return _Plan(known_rows, steps, await self._dialect.event_insertion(rows))
+        return _Plan(known_rows, steps, await self._dialect.event_insertion(rows), digests)
 
     async def _read_rows(self, connection: AsyncConnection) -> dict[EpisodeId, EpisodeRow]:
         """Read the rows of the batch's episodes, without `folded` and `parked`, which folding changes meanwhile."""

@@ -14,6 +14,7 @@ from pycrorm_async.store.stored import EpisodeRow, Incarnation, Span, StoredEven
 __all__ = [
     "Dialect",
     "Birth",
+    "DigestStatements",
     "Expected",
     "LogIdentity",
     "Insertion",
@@ -51,6 +52,22 @@ class LogIdentity(NamedTuple):
     format: int
 
 
+class DigestStatements(NamedTuple):
+    """The SQL of the table of digests, for the driver.
+
+    Attributes:
+        table: creates the table and its triggers.
+        creatable: selects whether the table is missing and this login may create it.
+        usable: selects whether this login may read it, and whether it may insert into it.
+        insert: inserts rows, given as a JSON array of arrays, and skips keys that exist.
+    """
+
+    table: Sequence[str]
+    creatable: str
+    usable: str
+    insert: str
+
+
 class StoredOn(NamedTuple):
     """The number of machines that hold a committed event, and the known standbys that confirm each COMMIT."""
 
@@ -77,6 +94,7 @@ class Dialect(Protocol):
     # --- finding and creating a log -------------------------------------------------------------------------
 
     migrations: Migrations
+    digest_statements: DigestStatements
     blob_table: Sequence[str]
     """Statements that create the table of the blobs unless it exists."""
 

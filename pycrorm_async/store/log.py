@@ -30,6 +30,8 @@ from pycrorm_async.store.append import Appending
 from pycrorm_async.store.blobs import Blobs
 from pycrorm_async.store.dialect import Dialect, Progress, StoredOn
 from pycrorm_async.store.dialects import dialect_of
+from pycrorm_async.store.digests.digest_table import RunningDigests, last_digests
+from pycrorm_async.store.digests.episode_digest import DigestRow
 from pycrorm_async.store.limits import EVENTS_MANY, events_warning, number_warning
 from pycrorm_async.store.schema import Birth, make_file, make_or_migrate, must_exist, recognise
 from pycrorm_async.store.sqlite.engine import BEGIN
@@ -76,6 +78,8 @@ class EventLog:
         self._write_turn = asyncio.Lock() if address.is_sqlite else None
         self._warned: set[str] = set()
         self.blobs = Blobs(self._dialect, self.reading, self.writing)
+        self.digests: RunningDigests | None = RunningDigests(self._dialect)
+        """The digests of the episodes that this process appends to; None, for a benchmark, stores none."""
 
     @classmethod
     async def open(
@@ -144,12 +148,19 @@ class EventLog:
             return Stored({}, {})
         with self.translated():
             await self.blobs.store_for(records)  # again, because the log may have lost them since
-            appending = Appending(self._dialect, records, basis)
-            if self._write_turn is not None and len(records) >= _MANY_EVENTS:
-                async with self.reading() as connection:
-                    await appending.prepare(connection)
-            async with self.writing() as connection:
-                stored = await appending.write(connection)
+            appending = Appending(self._dialect, records, basis, self.digests)
+            try:
+                if self._write_turn is not None and len(records) >= _MANY_EVENTS:
+                    async with self.reading() as connection:
+                        await appending.prepare(connection)
+                async with self.writing() as connection:
+                    stored = await appending.write(connection)
+            except BaseException:
+                if self.digests is not None:
+                    self.digests.forget()
+                raise
+            if self.digests is not None and appending.extension is not None:
+                self.digests.keep(appending.extension)
         for what, warning in appending.warnings.items():
             if what not in self._warned:
                 self._warned.add(what)
@@ -210,6 +221,11 @@ class EventLog:
         """Read an episode's row; None if no event of it is stored."""
         async with self.reading() as connection:
             return await self._dialect.episode(connection, episode_text(episode))
+
+    async def last_digests(self) -> dict[int, DigestRow]:
+        """Read the last kept digest of each episode that has one, by number."""
+        async with self.reading() as connection:
+            return await last_digests(self._dialect, connection)
 
     async def episode_number(self, episode: EpisodeId) -> int | None:
         """Return an episode's number; None if no event of it is stored."""

@@ -17,6 +17,7 @@ from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable
 from pycrorm_async.settings import FILE_MODES, FileAccess
 from pycrorm_async.store.dialect import Birth, Dialect, LogIdentity, Migrations
 from pycrorm_async.store.dialects import dialect_of
+from pycrorm_async.store.digests.digest_table import create_digest_table
 from pycrorm_async.store.sqlite.leftovers import move_leftovers
 
 __all__ = ["Birth", "make_or_migrate", "recognise", "make_file", "must_exist"]
@@ -58,6 +59,7 @@ async def make_or_migrate(
             raise DatabaseUnavailable(f"{name} {_missing_log(belongs_to)}")
         for statements in migrations[identity.format if identity else 0 :]:
             await dialect.execute_all(connection, statements)
+        await create_digest_table(dialect, connection)
         if identity is None:
             await dialect.insert_log(connection, birth, len(migrations))
             return birth.log_id

@@ -6,6 +6,7 @@ import builtins
 import contextlib
 import sqlite3
 from collections.abc import AsyncIterator, Iterator
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
@@ -88,7 +89,9 @@ async def test_the_overview_has_a_line_for_every_episode(reading: Reading) -> No
         duration_ns=10_000_000_000, status="SUCCEEDED", description="episode 2", created_by="me", nodes=4, failed=1,
         end_sequence=11,
     )  # fmt: skip
-    assert await reading.episodes() == [first, second]
+    summaries = await reading.episodes()
+    assert [replace(each, digest_sequence=None, digest=None) for each in summaries] == [first, second]
+    assert [(each.digest_sequence, each.digest is None) for each in summaries] == [(None, True), (11, False)]
 
 
 @pytest.mark.slow

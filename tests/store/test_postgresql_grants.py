@@ -90,3 +90,24 @@ async def test_an_owner_is_shown_the_missing_statements_has_another_login_run_th
     grant(url)
     tables_owner = "SELECT nspowner::regrole::text FROM pg_namespace WHERE nspname = 'memory_tables'"
     assert ask(url, tables_owner) == [("pycrorm_folder",)]
+
+
+async def test_a_recorder_inserts_digests_and_appends_without_them_where_it_may_not(server: Server) -> None:
+    url = server.new_database()
+    database = urlsplit(url).path.removeprefix("/")
+    await (await make_log(url)).close()
+    grant(url)
+    ask(url, f"CREATE ROLE recorder_of_{database} LOGIN IN ROLE pycrorm_recorder")
+    address = DatabaseAddress.parse(server.url(database, user=f"recorder_of_{database}"))
+    log = await EventLog.open(address, create=True)
+    assert await log.append(run_of(episode(2), 1, 300)) == {}
+    for change in ("UPDATE pycrorm.pycrorm_digest SET digest = ''", "DELETE FROM pycrorm.pycrorm_digest"):
+        with pytest.raises(asyncpg.InsufficientPrivilegeError):
+            ask(server.url(database, user=f"recorder_of_{database}"), change)
+    await log.close()
+    ask(url, "REVOKE ALL ON pycrorm.pycrorm_digest FROM pycrorm_recorder")
+    log = await EventLog.open(address, create=True)
+    assert await log.append(run_of(episode(3), 1, 300)) == {}
+    assert await log.last_digests() == {}
+    await log.close()
+    assert [tuple(each) for each in ask(url, "SELECT episode, sequence FROM pycrorm.pycrorm_digest")] == [(2, 256)]

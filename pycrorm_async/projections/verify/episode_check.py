@@ -19,6 +19,7 @@ from pycrorm_async.projections.fold.parameters import Designators
 from pycrorm_async.projections.fold.row_batch import Rows
 from pycrorm_async.projections.verify.findings import VerifyResult
 from pycrorm_async.projections.verify.row_comparison import Difference
+from pycrorm_async.store.digests.episode_digest import BLOCK_EVENTS
 from pycrorm_async.store.stored import Span, StoredEvent
 
 __all__ = ["EpisodeCheck"]
@@ -31,6 +32,7 @@ class EpisodeCheck:
         compared: whether the rows are compared completely, because the tables ended before the last part did.
         carried: ids of the running nodes, which a later part compares.
         descriptions: fingerprints of the stored descriptions.
+        damaged_blocks: indexes of the blocks (`store.digests`) with an event for which damage was reported.
     """
 
     def __init__(self, number: int, result: VerifyResult) -> None:
@@ -39,6 +41,7 @@ class EpisodeCheck:
         self.compared = False
         self.carried: frozenset[int] = frozenset()
         self.descriptions: frozenset[str] = frozenset()
+        self.damaged_blocks: set[int] = set()
         self._nodes: dict[int, list[Any]] = {}
         self._row: dict[str, Any] | None = None
         self._order: OrderCheck | None = OrderCheck()
@@ -132,4 +135,5 @@ class EpisodeCheck:
             self._open_when_lost = {key.sequence for key in keys if key.number == self.number}
 
     def _damaged(self, sequence: int, reason: str) -> None:
+        self.damaged_blocks.add((sequence - 1) // BLOCK_EVENTS)
         self._result.add_damage(self.number, sequence, reason)

@@ -50,6 +50,7 @@ class VerifyResult:
         unmade: by dtype, the reason why a designator type has no tables.
         failed_views: by name, the reason why a user's view is left out.
         blobs: by hash, the first event that refers to this blob; the content of each is compared with its hash.
+        without_digest: the number of episodes without a digest, which an earlier version stored.
         outdated: the reason why no table was compared: an older fold made them. None for tables of this version.
     """
 
@@ -67,6 +68,7 @@ class VerifyResult:
     unmade: Mapping[str, str] = field(default_factory=dict)
     failed_views: Mapping[str, str] = field(default_factory=dict)
     blobs: dict[str, tuple[int | None, int | None]] = field(default_factory=dict)
+    without_digest: int = 0
     outdated: str | None = None
 
     def add_damage(self, number: int | None, sequence: int | None, reason: str) -> None:

@@ -5,7 +5,7 @@ Writes nothing. Each part is read in one snapshot, so that recording and folding
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from itertools import groupby
 from operator import attrgetter
 
@@ -21,6 +21,13 @@ from pycrorm_async.projections.fold.row_batch import Rows
 from pycrorm_async.projections.schema.generations import Generation, current_generation
 from pycrorm_async.projections.schema.layout import unite
 from pycrorm_async.projections.schema.unmade_types import failed_views, unmade_types
+from pycrorm_async.projections.verify.digest_check import (
+    DigestCheck,
+    OutsideDigest,
+    check_outside,
+    check_places,
+    read_kept,
+)
 from pycrorm_async.projections.verify.episode_check import EpisodeCheck
 from pycrorm_async.projections.verify.findings import Damage, StoppedEpisode, VerifyResult
 from pycrorm_async.projections.verify.parts import EpisodeRange, Place, Unreadable
@@ -60,6 +67,7 @@ async def verify(
     *,
     episode: EpisodeRow | None = None,
     projections: Sequence[Projection] = (),
+    digests: Iterable[OutsideDigest] = (),
     report_progress: Callable[[int, int], None] = lambda _done, _total: None,
 ) -> VerifyResult:
     """Verify a whole memory, or one episode.
@@ -68,6 +76,7 @@ async def verify(
         log: may be open for reading only.
         episode: to verify; all of them if None.
         projections: custom projections whose tables are compared too.
+        digests: kept outside of the memory, with which those in the log are compared.
         report_progress: called with the number of events checked and their total.
 
     Raises `DatabaseForeign` for tables of a newer version, `DatabaseUnavailable` for a memory without tables.
@@ -81,6 +90,7 @@ async def verify(
             result.failed_views = await failed_views(log)
         result.stopped = await _stopped(log, episode)
         try:
+            await check_outside(log, digests, result, episode)
             total = await _check_heads(log, within, result)
             await within.check(log, _TablesCheck(log, result, total, report_progress))
         except TablesOutdated as fault:
@@ -164,6 +174,7 @@ async def _check_heads(log: EventLog, within: EpisodeRange, result: VerifyResult
             for sequence in sorted({lowest, highest}):
                 if not 1 <= sequence <= head:
                     result.add_damage(number, sequence, f"exists, but the episode must end with event {head}")
+        await check_places(connection, within.limits, result)
         return int((await connection.execute(_TOTAL, within.limits)).scalar_one())
 
 
@@ -181,6 +192,7 @@ class _TablesCheck:
         self._total = total
         self._report_progress = report_progress
         self._unfinished = EpisodeCheck(0, result)
+        self._digests: DigestCheck | None = None
         self._comparison: Comparison | None = None
 
     async def comparison(self, connection: AsyncConnection) -> Comparison:
@@ -197,9 +209,11 @@ class _TablesCheck:
         episodes = await _episodes(connection, within._replace(first=at.number), limit)
         spans, place = _cut(episodes, at, limit)
         events = await self._events_of(connection, spans)
+        kept = await read_kept(connection, spans)
         designators = await _designators(connection, comparison.generation)
         descriptions = frozenset((await connection.execute(_DESCRIPTIONS)).scalars())
         folded = {each.number: each.folded for each in episodes}
+        by_number = {each.number: each for each in episodes}
         rows = Rows()
         low, high = at, place or (None if within.end is None else Place(within.end))
         settled: frozenset[int] = frozenset()
@@ -212,10 +226,19 @@ class _TablesCheck:
         for span in spans:
             if span.after == 0:
                 self._unfinished = EpisodeCheck(span.number, self.result)
+                self._digests = DigestCheck(by_number[span.number], self.result)
                 self.result.episodes += 1
             read[span.number] = self._unfinished
             self._unfinished.descriptions = descriptions
             self._unfinished.read(span, events.get(span.number, {}), folded[span.number], designators, rows)
+            if self._digests is not None:
+                self._digests.read(
+                    span,
+                    by_number[span.number].head,
+                    events.get(span.number, {}),
+                    kept.get(span.number, {}),
+                    self._unfinished.damaged_blocks,
+                )
         carried: frozenset[int] = frozenset()
         if place is not None and place.after:
             self._unfinished.leave(rows, place.after, folded[place.number])

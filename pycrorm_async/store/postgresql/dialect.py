@@ -38,6 +38,7 @@ class PostgreSQL:
     """Implements `Dialect`. Events are inserted by COPY; an append locks its episodes' rows until COMMIT."""
 
     migrations: Migrations = tables.MIGRATIONS
+    digest_statements = sql.DIGEST_STATEMENTS
     blob_table: Sequence[str] = tables.BLOB
     faults: tuple[type[Exception], ...] = errors.FAULTS
 

@@ -32,7 +32,7 @@ from __future__ import annotations
 from pycrorm_async.store.postgresql.search_path import LOG_SCHEMA as LOG
 from pycrorm_async.store.postgresql.search_path import TABLES_SCHEMA as TABLES
 from pycrorm_async.store.postgresql.search_path import VIEWS_SCHEMA as VIEWS
-from pycrorm_async.store.postgresql.tables import BLOB, INCARNATION
+from pycrorm_async.store.postgresql.tables import BLOB, DIGEST, INCARNATION
 
 __all__ = ["GRANTS"]
 
@@ -86,11 +86,12 @@ GRANTS: tuple[str, ...] = (
     _TRANSFER,
     INCARNATION,
     *BLOB,
+    *DIGEST,
     f"REVOKE ALL ON SCHEMA {LOG}, {TABLES}, {VIEWS} FROM PUBLIC",
     f"GRANT USAGE ON SCHEMA {LOG} TO {_READING}",
     f"GRANT SELECT ON ALL TABLES IN SCHEMA {LOG} TO {_READING}",
     f"GRANT INSERT ON {LOG}.event, {LOG}.episode, {LOG}.pycrorm_declaration TO {_APPENDING}",
-    f"GRANT INSERT ON {LOG}.pycrorm_incarnation, {LOG}.pycrorm_blob TO {_APPENDING}",
+    f"GRANT INSERT ON {LOG}.pycrorm_incarnation, {LOG}.pycrorm_blob, {LOG}.pycrorm_digest TO {_APPENDING}",
     f"GRANT UPDATE (head, ended_wall_ns, refused) ON {LOG}.episode TO {_APPENDING}",
     f"GRANT USAGE ON SEQUENCE {LOG}.episode_number TO {_APPENDING}",
     f"GRANT UPDATE (folded, parked) ON {LOG}.episode TO pycrorm_folder",

@@ -8,7 +8,11 @@ Every function is qualified with its schema, so that no function of another role
 
 from __future__ import annotations
 
+from pycrorm_async.store.dialect import DigestStatements
+from pycrorm_async.store.postgresql.tables import DIGEST
+
 __all__ = [
+    "DIGEST_STATEMENTS",
     "INSERT_DECLARATIONS",
     "SELECT_EPISODES_BY_ID",
     "SELECT_EPISODES_AND_WITNESS",
@@ -65,6 +69,20 @@ INSERT INTO pycrorm.episode (number, id, head, started_wall_ns, ended_wall_ns, r
 SELECT * FROM unnest($1::bigint[], $2::text[], $3::bigint[], $4::bigint[], $5::bigint[], $6::text[])
 ON CONFLICT (number) DO UPDATE
 SET head = excluded.head, ended_wall_ns = excluded.ended_wall_ns, refused = excluded.refused"""
+
+_DIGEST = "pg_catalog.to_regclass('pycrorm.pycrorm_digest')"
+DIGEST_STATEMENTS = DigestStatements(
+    table=DIGEST,
+    creatable=f"SELECT {_DIGEST} IS NULL AND pg_catalog.has_schema_privilege('pycrorm', 'CREATE')",
+    usable=f"""
+SELECT coalesce(pg_catalog.has_table_privilege({_DIGEST}::oid, 'SELECT'), false),
+coalesce(pg_catalog.has_table_privilege({_DIGEST}::oid, 'SELECT')
+    AND pg_catalog.has_table_privilege({_DIGEST}::oid, 'INSERT'), false)""",
+    insert="""
+INSERT INTO pycrorm.pycrorm_digest (episode, sequence, digest)
+SELECT (value->>0)::bigint, (value->>1)::bigint, value->>2
+FROM pg_catalog.json_array_elements($1::text::json) AS one (value) ON CONFLICT DO NOTHING""",
+)
 
 WRITE_AHEAD = "SELECT pg_catalog.pg_logical_emit_message(true, 'pycrorm', '')"
 """Writes an empty message to the server's write-ahead log. A COMMIT without any record there waits for no standby, and

@@ -13,6 +13,7 @@ __all__ = [
     "INCARNATION",
     "HAS_INCARNATION",
     "BLOB",
+    "DIGEST",
     "TABLE_NAMES",
     "HAS_TABLE",
     "READ_LOG",
@@ -177,6 +178,20 @@ CREATE TABLE IF NOT EXISTS {LOG}.pycrorm_incarnation (
     reason text NOT NULL
 )"""
 """Created when a log is first found to have gone back. Not part of the format: older programs still use the log."""
+DIGEST = (
+    f"""
+CREATE TABLE IF NOT EXISTS {LOG}.pycrorm_digest (
+    episode bigint NOT NULL,
+    sequence bigint NOT NULL,
+    digest text NOT NULL,
+    PRIMARY KEY (episode, sequence)
+)""",
+    f"""
+CREATE OR REPLACE TRIGGER digest_is_not_changed BEFORE UPDATE OR DELETE OR TRUNCATE ON {LOG}.pycrorm_digest
+FOR EACH STATEMENT EXECUTE FUNCTION {LOG}.refuse_change()""",
+)
+"""Created when a log is opened for writing. Not part of the format: older programs still use the log."""
+
 HAS_INCARNATION = f"SELECT pg_catalog.to_regclass('{LOG}.pycrorm_incarnation') IS NOT NULL"
 
 BLOB = (

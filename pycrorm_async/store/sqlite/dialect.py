@@ -42,6 +42,7 @@ class SQLite:
 
     migrations: Migrations = tables.MIGRATIONS
     blob_table: Sequence[str] = tables.BLOB
+    digest_statements = sql.DIGEST_STATEMENTS
     faults: tuple[type[Exception], ...] = (
         DBAPIError,
         sqlite3.Error,

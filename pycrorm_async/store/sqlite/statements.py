@@ -10,7 +10,11 @@ payloads keep the bytes of the queue.
 
 from __future__ import annotations
 
+from pycrorm_async.store.dialect import DigestStatements
+from pycrorm_async.store.sqlite.tables import DIGEST
+
 __all__ = [
+    "DIGEST_STATEMENTS",
     "INSERT_DECLARATIONS",
     "SELECT_EPISODES_BY_ID",
     "SELECT_NUMBER_MAX",
@@ -60,6 +64,16 @@ _EVENT = (
 
 SELECT_STORED_AGAIN = f"""
 SELECT {_EVENT} FROM json_each(?) JOIN event ON event.episode = value->>0 AND event.sequence = value->>1"""
+
+_IS_DIGEST = "FROM sqlite_master WHERE type = 'table' AND name = 'pycrorm_digest'"
+DIGEST_STATEMENTS = DigestStatements(
+    table=DIGEST,
+    creatable=f"SELECT count(*) = 0 {_IS_DIGEST}",
+    usable=f"SELECT count(*), count(*) {_IS_DIGEST}",
+    insert="""
+INSERT INTO pycrorm_digest (episode, sequence, digest)
+SELECT value->>0, value->>1, value->>2 FROM json_each(?) WHERE true ON CONFLICT DO NOTHING""",
+)
 
 # --- read -----------------------------------------------------------------------------------------------------
 

@@ -4,7 +4,17 @@ from __future__ import annotations
 
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX
 
-__all__ = ["MIGRATIONS", "INCARNATION", "BLOB", "TABLE_NAMES", "HAS_TABLE", "READ_LOG", "INSERT_LOG", "SET_FORMAT"]
+__all__ = [
+    "MIGRATIONS",
+    "INCARNATION",
+    "BLOB",
+    "DIGEST",
+    "TABLE_NAMES",
+    "HAS_TABLE",
+    "READ_LOG",
+    "INSERT_LOG",
+    "SET_FORMAT",
+]
 
 
 def _refuse(name: str, change: str, table: str) -> str:
@@ -101,6 +111,19 @@ CREATE TABLE IF NOT EXISTS pycrorm_blob (
     _refuse("IF NOT EXISTS blob_is_not_deleted", "DELETE", "pycrorm_blob"),
 )
 """Created with the first blob. Not part of the format: older programs still use the log."""
+
+DIGEST = (
+    """
+CREATE TABLE IF NOT EXISTS pycrorm_digest (
+    episode INTEGER NOT NULL,
+    sequence INTEGER NOT NULL,
+    digest TEXT NOT NULL,
+    PRIMARY KEY (episode, sequence)
+) STRICT, WITHOUT ROWID""",
+    _refuse("IF NOT EXISTS digest_is_not_updated", "UPDATE", "pycrorm_digest"),
+    _refuse("IF NOT EXISTS digest_is_not_deleted", "DELETE", "pycrorm_digest"),
+)
+"""Created when a log is opened for writing. Not part of the format: older programs still use the log."""
 
 TABLE_NAMES = (
     "SELECT name FROM sqlite_master WHERE type IN ('table', 'view') AND name NOT LIKE 'sqlite\\_%' ESCAPE '\\'"

@@ -1,0 +1,161 @@
+"""The log keeps digests of an episode's events, which depend on the events alone."""
+
+from __future__ import annotations
+
+from hashlib import blake2b
+
+import msgspec
+import pytest
+
+from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.ids import EpisodeId
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.digests.episode_digest import RunningDigest
+from pycrorm_async.store.log import EventLog
+from tests.databases import ask, ask_to_change
+from tests.store.factories import episode, record, run_of
+
+KEPT = "SELECT episode, sequence, digest FROM pycrorm_digest ORDER BY episode, sequence"
+
+
+def whole(of: EpisodeId, last: int) -> list[Record]:
+    """Return an episode that ends with event `last`."""
+    return [*run_of(of, 1, last - 1), record(of, last, kind="EpisodeEnded", payload=b'{"status":"SUCCEEDED"}')]
+
+
+def expected(of: EpisodeId, records: list[Record]) -> list[tuple[int, str]]:
+    """Compute the kept digests of a whole episode by the definition, event by event."""
+    before, rows = bytes(of), []
+    hasher = blake2b(before, digest_size=32, person=b"pycrorm episode")
+    for each in records:
+        fields = (each.sequence, each.type, each.version, each.wall_ns, each.monotonic_ns, each.payload)
+        hasher.update(msgspec.msgpack.encode(fields))
+        if each.sequence % 256 == 0 or each is records[-1]:
+            rows.append((each.sequence, hasher.hexdigest()))
+        if each.sequence % 256 == 0:
+            hasher = blake2b(hasher.digest(), digest_size=32, person=b"pycrorm episode")
+    return rows
+
+
+async def test_a_digest_is_kept_at_the_end_of_each_block_and_of_the_episode(log: EventLog, database_url: str) -> None:
+    ended, exact, still_open = whole(episode(1), 600), whole(episode(2), 512), run_of(episode(3), 1, 300)
+    await log.append([*ended, *exact, *still_open])
+    rows = ask(database_url, KEPT)
+    assert [tuple(row[1:]) for row in rows if row[0] == 1] == expected(episode(1), ended)
+    assert [tuple(row[1:]) for row in rows if row[0] == 2] == expected(episode(2), exact)
+    assert [tuple(row[:2]) for row in rows] == [(1, 256), (1, 512), (1, 600), (2, 256), (2, 512), (3, 256)]
+    assert {number: each.sequence for number, each in (await log.last_digests()).items()} == {1: 600, 2: 512, 3: 256}
+
+
+def test_the_digest_of_three_events_stays_the_same_for_ever() -> None:
+    running = RunningDigest.at_start(episode(1))
+    assert running.add(whole(episode(1), 3)) == []
+    assert running.digest() == "d0221755ecdd29b75baa8d227b83a480d80d05ccaa617d8544a398aebe55c365"
+
+
+@pytest.mark.parametrize("size", [1, 7, 255, 256, 257, 599])
+async def test_the_sizes_of_batches_make_no_difference(log: EventLog, database_url: str, size: int) -> None:
+    records = whole(episode(1), 600)
+    for start in range(0, 600, size):
+        await log.append(records[start : start + size])
+    assert [tuple(row[1:]) for row in ask(database_url, KEPT)] == expected(episode(1), records)
+
+
+def test_each_field_of_an_event_and_the_episode_change_the_digest() -> None:
+    plain = record(episode(1), 1)
+    others = [
+        plain._replace(type="NodeEnded"),
+        plain._replace(version=2),
+        plain._replace(wall_ns=plain.wall_ns + 1),
+        plain._replace(monotonic_ns=plain.monotonic_ns + 1),
+        plain._replace(payload=plain.payload + b" "),
+        plain._replace(episode=episode(2)),
+    ]
+    digests = set()
+    for each in (plain, *others):
+        assert each.episode is not None
+        running = RunningDigest.at_start(each.episode)
+        running.add([each])
+        digests.add(running.digest())
+    assert len(digests) == 1 + len(others)
+
+
+async def test_repeats_and_the_position_make_no_difference(log: EventLog, database_url: str) -> None:
+    records = whole(episode(1), 300)
+    await log.append(records[:200])
+    await log.append([each._replace(position=0) for each in records[100:]])
+    await log.append(records)
+    assert [tuple(row[1:]) for row in ask(database_url, KEPT)] == expected(episode(1), records)
+
+
+@pytest.mark.parametrize("at", [1, 255, 256, 400, 512])
+async def test_a_restarted_writer_and_another_process_continue_from_the_log(
+    address: DatabaseAddress, database_url: str, at: int
+) -> None:
+    records = whole(episode(1), 600)
+    first = await EventLog.open(address, create=True)
+    await first.append(records[:at])
+    second = await EventLog.open(address, create=True)
+    await second.append(records[at : at + 50])
+    await first.append(records[at + 50 :])
+    await first.close()
+    await second.close()
+    assert [tuple(row[1:]) for row in ask(database_url, KEPT)] == expected(episode(1), records)
+
+
+async def test_an_append_that_was_rolled_back_leaves_the_running_digest(
+    log: EventLog, database_url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    records = whole(episode(1), 600)
+    await log.append(records[:100])
+    with monkeypatch.context() as patch:
+
+        async def fail(*_: object) -> None:
+            raise RuntimeError
+
+        patch.setattr(type(log.digests), "insert", fail)
+        with pytest.raises(RuntimeError):
+            await log.append(records[100:400])
+    await log.append(records[100:])
+    assert [tuple(row[1:]) for row in ask(database_url, KEPT)] == expected(episode(1), records)
+
+
+async def test_the_database_refuses_to_change_or_delete_a_digest(log: EventLog, database_url: str) -> None:
+    await log.append(whole(episode(1), 300))
+    for change in ("UPDATE pycrorm_digest SET digest = ''", "DELETE FROM pycrorm_digest"):
+        with pytest.raises(Exception, match="the event log is append-only: pycrorm_digest refuses"):
+            ask_to_change(database_url, change)
+
+
+async def test_an_episode_of_an_earlier_version_gets_no_digest_and_later_ones_do(
+    log: EventLog, database_url: str
+) -> None:
+    digests, log.digests = log.digests, None
+    await log.append(run_of(episode(1), 1, 300))
+    log.digests = digests
+    await log.append(run_of(episode(1), 301, 600))
+    await log.append(whole(episode(2), 300))
+    assert [tuple(row[:2]) for row in ask(database_url, KEPT)] == [(2, 256), (2, 300)]
+
+
+async def test_a_log_of_an_earlier_version_gets_the_table_when_it_is_opened_for_writing(
+    address: DatabaseAddress, database_url: str
+) -> None:
+    log = await EventLog.open(address, create=True)
+    await log.close()
+    ask_to_change(database_url, "DROP TABLE pycrorm_digest")
+    reader = await EventLog.open(address, create=False)
+    assert await reader.last_digests() == {}
+    await reader.close()
+    log = await EventLog.open(address, create=True)
+    await log.append(whole(episode(1), 300))
+    assert [tuple(row[:2]) for row in ask(database_url, KEPT)] == [(1, 256), (1, 300)]
+    await log.close()
+
+
+async def test_a_table_that_vanishes_under_a_writer_does_not_stop_it(log: EventLog, database_url: str) -> None:
+    await log.append(run_of(episode(1), 1, 100))
+    ask_to_change(database_url, "DROP TABLE pycrorm_digest")
+    with pytest.raises(Exception, match="pycrorm_digest"):
+        await log.append(run_of(episode(1), 101, 300))
+    assert await log.append(run_of(episode(1), 101, 300)) == {}
