@@ -128,7 +128,7 @@ class _RowReader:
 
     def __init__(self, row: orm.Designator) -> None:
         self._row = row
-        self._parameters: Mapping[str, Any] = vars(row).get("parameters", {})  # empty unless the query loads them
+        self._parameters: Mapping[str, Any] = vars(row).get("_parameters", {})  # empty unless the query loads them
 
     def missing(self, names: tuple[str, ...], reason: str) -> NotPerformable:
         name = "_".join(names)
