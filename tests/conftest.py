@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import gc
 import signal
-from collections.abc import Iterator
+from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 
 import pytest
 
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.log import EventLog
 from tests.databases import Server, server_in_memory
 from tests.soak_turns import current_commit, place_of, turn_of
 
@@ -30,6 +32,14 @@ def database_url(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str
     url = running.new_database()
     yield url
     running.drop(url)  # several hundred files, which would be written to the disk and deleted at the end
+
+
+@pytest.fixture
+async def log(database_url: str) -> AsyncIterator[EventLog]:
+    """A new log, for each test on both kinds of database."""
+    opened = await EventLog.open(DatabaseAddress.parse(database_url), create=True)
+    yield opened
+    await opened.close()
 
 
 @pytest.fixture(scope="module", params=["sqlite", "postgresql"])

@@ -28,6 +28,7 @@ from pycrorm_async.writer.drain import Drain
 from pycrorm_async.writer.retry import Backoff
 from tests.databases import Server, ask
 from tests.store.factories import episode, run_of
+from tests.store.faults import cancel_at_await
 from tests.writer.fakes import KeptSource
 
 __all__ = [
@@ -290,14 +291,7 @@ async def _cancel_at_each_await(outcome: Outcome, url: str, step: Step) -> int:
         awaits += 1
         batch = run_of(episode(1), stored + 1, stored + _BATCH)
         appending = asyncio.create_task(log.append(batch))
-        awaited: list[object] = []
-        while len(awaited) < awaits and not appending.done():
-            waiter = getattr(appending, "_fut_waiter", None)
-            if waiter is not None and waiter not in awaited[-1:]:
-                awaited.append(waiter)
-            await asyncio.sleep(0)
-        appending.cancel()
-        await asyncio.wait([appending])
+        await cancel_at_await(appending, awaits)
         cancelled = appending.cancelled()
         head = (
             await log.append(batch[:1]) or (await log.episodes())[0].head

@@ -13,8 +13,9 @@ import asyncpg
 import pytest
 
 from tests.commands import COMMAND, answer, environment, one_line_of, pycrorm
-from tests.copying.memories import append, assert_same
+from tests.copying.memories import assert_same
 from tests.databases import Server
+from tests.projections.factories import append_and_fold
 from tests.store.factories import episode, record, run_of
 from tests.table_comparison import logs_of
 from tests.test_table_comparison import episode as hand_written
@@ -111,7 +112,7 @@ def test_a_copy_without_a_target_is_a_usage_error(folder: Path) -> None:
 
 async def test_two_memories_that_contradict_each_other_are_reported_and_the_rest_is_copied(folder: Path) -> None:
     other = f"sqlite:///{folder}/b.db"
-    await append(other, [hand_written(1).records[0]._replace(monotonic_ns=6)], folded=False)
+    await append_and_fold(other, [hand_written(1).records[0]._replace(monotonic_ns=6)], folded=False)
     done = pycrorm("copy", "--from", "sqlite:///a.db", "--to", "sqlite:///b.db", cwd=folder)
     assert done.returncode == 4
     assert one_line_of(done) == (
@@ -123,7 +124,7 @@ async def test_two_memories_that_contradict_each_other_are_reported_and_the_rest
 
 
 async def test_an_episode_that_cannot_be_folded_is_copied_and_reported(folder: Path) -> None:
-    await append(f"sqlite:///{folder}/c.db", [record(episode(9), 1, kind="HandShaken", payload=b"{}")])
+    await append_and_fold(f"sqlite:///{folder}/c.db", [record(episode(9), 1, kind="HandShaken", payload=b"{}")])
     done = pycrorm("copy", "--from", "sqlite:///c.db", "--to", "sqlite:///b.db", cwd=folder)
     assert done.returncode == 1
     name = "00000000-0000-0000-0000-000000000009"
@@ -134,8 +135,8 @@ async def test_an_episode_that_cannot_be_folded_is_copied_and_reported(folder: P
 
 def test_a_copy_is_interrupted_at_once_and_the_next_one_takes_the_rest(tmp_path: Path, server: Server) -> None:
     source, target = f"sqlite:///{tmp_path}/pycrorm.db", server.new_database()
-    asyncio.run(append(source, run_of(episode(1), 1, 2_000), folded=False))
-    asyncio.run(append(target, run_of(episode(1), 1, 500)))
+    asyncio.run(append_and_fold(source, run_of(episode(1), 1, 2_000), folded=False))
+    asyncio.run(append_and_fold(target, run_of(episode(1), 1, 500)))
     # A terminal, so that the copy shows its progress.
     ours, its = pty.openpty()
     with asyncio.Runner() as runner:

@@ -10,9 +10,9 @@ import pytest
 
 from pycrorm_async.events.envelope import Record
 from tests.commands import COMMAND, environment, one_line_of, pycrorm
-from tests.copying.memories import append
 from tests.databases import ask_to_change
 from tests.projections.event_script import Script
+from tests.projections.factories import append_and_fold
 from tests.store.factories import episode, run_of
 from tests.test_table_comparison import episode as hand_written
 
@@ -45,7 +45,7 @@ async def test_every_event_is_a_line_with_all_its_fields(database_url: str, tmp_
     script = hand_written(1)
     script.put_payload("HandShaken", '{"of": "a newer version", "ü": 1.50}'.encode(), 7)
     script.records[1] = script.records[1]._replace(wall_ns=1_700_000_000_000_000_009)
-    await append(database_url, script.records, folded=False)
+    await append_and_fold(database_url, script.records, folded=False)
     expected = [text_of(each, f"2023-11-14T22:13:{20 + each.sequence:02}.000000000Z") for each in script.records]
     expected[1]["time"] = "2023-11-14T22:13:20.000000009Z"
     assert lines_of(pycrorm("events", "1", "--url", database_url, cwd=tmp_path)) == expected
@@ -59,7 +59,7 @@ async def test_every_event_is_a_line_with_all_its_fields(database_url: str, tmp_
 def test_no_character_is_lost_on_a_terminal_with_ascii_alone(tmp_path: Path) -> None:
     script = Script(1)
     script.put_payload("NodeStarted", '{"kind":"root","text":"Grüße, 牛奶"}'.encode())
-    asyncio.run(append(f"sqlite:///{tmp_path}/pycrorm.db", script.records, folded=False))
+    asyncio.run(append_and_fold(f"sqlite:///{tmp_path}/pycrorm.db", script.records, folded=False))
     done = subprocess.run(
         [*COMMAND, "events", "1"],
         cwd=tmp_path,
@@ -71,7 +71,7 @@ def test_no_character_is_lost_on_a_terminal_with_ascii_alone(tmp_path: Path) -> 
 
 
 def test_a_reader_that_closes_the_pipe_ends_the_command_without_a_message(tmp_path: Path) -> None:
-    asyncio.run(append(f"sqlite:///{tmp_path}/pycrorm.db", run_of(episode(1), 1, 5_000), folded=False))
+    asyncio.run(append_and_fold(f"sqlite:///{tmp_path}/pycrorm.db", run_of(episode(1), 1, 5_000), folded=False))
     process = subprocess.Popen(
         [*COMMAND, "events", "1"], cwd=tmp_path, env=environment(), stdout=subprocess.PIPE, stderr=subprocess.PIPE
     )
@@ -86,7 +86,7 @@ def test_a_reader_that_closes_the_pipe_ends_the_command_without_a_message(tmp_pa
 
 async def test_of_a_damaged_log_the_events_before_the_damage_are_printed(tmp_path: Path) -> None:
     url = f"sqlite:///{tmp_path}/pycrorm.db"
-    await append(url, hand_written(1).records, folded=False)
+    await append_and_fold(url, hand_written(1).records, folded=False)
     ask_to_change(url, "DROP TRIGGER event_is_not_deleted")
     ask_to_change(url, "DROP TRIGGER event_is_not_updated")
     ask_to_change(url, "DELETE FROM event WHERE sequence = 9")
@@ -115,7 +115,7 @@ async def test_of_a_damaged_log_the_events_before_the_damage_are_printed(tmp_pat
 )
 async def test_an_impossible_request_is_one_line(tmp_path: Path, arguments: list[str], code: int, reason: str) -> None:
     url = f"sqlite:///{tmp_path}/pycrorm.db"
-    await append(url, [*hand_written(1).records, *hand_written(2).records], folded=False)
+    await append_and_fold(url, [*hand_written(1).records, *hand_written(2).records], folded=False)
     done = pycrorm("events", *arguments, cwd=tmp_path)
     assert (done.returncode, done.stdout) == (code, "")
     assert reason in one_line_of(done)

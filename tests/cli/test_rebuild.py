@@ -18,7 +18,8 @@ from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.commands import COMMAND, answer, environment, one_line_of, pycrorm
 from tests.databases import ask
-from tests.projections.rebuild_cases import TYPES, parking, picking, store, str_of, traces
+from tests.projections.factories import append_and_fold
+from tests.projections.rebuild_cases import TYPES, parking, picking, str_of, traces
 from tests.table_comparison import differences, tables_of
 
 pytestmark = pytest.mark.slow
@@ -58,7 +59,7 @@ def test_a_rebuild_needs_no_code_of_the_plan_and_reports_what_it_made(tmp_path: 
 
 
 def test_an_episode_that_cannot_be_folded_is_reported_and_is_a_problem(tmp_path: Path) -> None:
-    asyncio.run(store(f"sqlite:///{tmp_path}/pycrorm.db", [*TYPES, *picking(1).records, *parking(2).records]))
+    asyncio.run(append_and_fold(f"sqlite:///{tmp_path}/pycrorm.db", [*TYPES, *picking(1).records, *parking(2).records]))
     done = pycrorm("rebuild", cwd=tmp_path)
     assert done.returncode == 1
     assert one_line_of(done).startswith(f"episode {str_of(2)} is parked: event 3: ")
@@ -81,7 +82,7 @@ def test_bad_input_is_one_line(tmp_path: Path, arguments: Sequence[str], code: i
 
 
 async def test_a_second_rebuild_is_refused_with_one_line(database_url: str, tmp_path: Path) -> None:
-    await store(database_url, [*TYPES, *picking(1).records])
+    await append_and_fold(database_url, [*TYPES, *picking(1).records])
     log = await EventLog.open(DatabaseAddress.parse(database_url), create=True)
     async with claimed(log):
         done = await asyncio.to_thread(pycrorm, "rebuild", "--url", database_url, cwd=tmp_path)
@@ -102,7 +103,7 @@ def start_rebuild(folder: Path, workers: str) -> subprocess.Popen[str]:
 @pytest.mark.parametrize("workers", ["1", "2"])
 def test_an_interrupted_rebuild_exits_with_130_and_the_next_one_continues(tmp_path: Path, workers: str) -> None:
     url = f"sqlite:///{tmp_path}/pycrorm.db"
-    asyncio.run(store(url, [*TYPES, *(each for number in range(1, 100) for each in picking(number).records)]))
+    asyncio.run(append_and_fold(url, [*TYPES, *(each for number in range(1, 100) for each in picking(number).records)]))
     before = tables_of(url)
     blocker = sqlite3.connect(tmp_path / "pycrorm.db", isolation_level=None, timeout=60)
     making = "SELECT generation FROM pycrorm_generation WHERE projection = 'tables/making'"

@@ -10,15 +10,13 @@ from pycrorm_async import Memory
 from pycrorm_async.events.envelope import LOST, Record
 from pycrorm_async.events.types import EpisodeEnded
 from pycrorm_async.plan import NavigateAction, ParkArmsAction, SimulatedTaskTree
-from pycrorm_async.projections.projector import Projector
 from pycrorm_async.settings import Settings
-from pycrorm_async.store.address import DatabaseAddress
-from pycrorm_async.store.log import EventLog
 from pycrorm_async.world import Arms, Pose
 from tests.databases import ask
 from tests.memory.note_actions import NoteActionPerformable
 from tests.plan.conftest import kitchen
 from tests.projections.event_script import Script
+from tests.projections.factories import append_and_fold
 from tests.promises.test_random_plans import play
 from tests.table_comparison import declarations_of, differences, logs_of, tables_of, united
 from tests.test_table_comparison import episode as hand_written
@@ -63,22 +61,9 @@ async def notes(url: str, *texts: str) -> None:
             await NoteActionPerformable(text).perform()
 
 
-async def append(url: str, records: Iterable[Record], *, folded: bool = True) -> None:
-    """Append to a log that is opened for this call alone."""
-    log = await EventLog.open(DatabaseAddress.parse(url), create=True)
-    try:
-        assert await log.append(list(records)) == {}
-        if folded:
-            projector = Projector(log)
-            await projector.open()
-            await projector.catch_up()
-    finally:
-        await log.close()
-
-
 def append_in_own_thread(url: str, records: Iterable[Record]) -> None:
     """Append in the same way, for callers that cannot await."""
-    thread = threading.Thread(target=lambda: asyncio.run(append(url, records, folded=False)))
+    thread = threading.Thread(target=lambda: asyncio.run(append_and_fold(url, records, folded=False)))
     thread.start()
     thread.join()
 

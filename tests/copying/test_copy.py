@@ -18,7 +18,6 @@ from pycrorm_async.operations.copy import CopySummary, copy_episodes
 from pycrorm_async.settings import Settings
 from tests.copying.memories import (
     PATIENT,
-    append,
     append_in_own_thread,
     assert_merged,
     assert_same,
@@ -31,6 +30,7 @@ from tests.crash.forked_processes import ForkedProcess
 from tests.databases import Server, ask, ask_to_change
 from tests.memory.note_actions import NoteActionPerformable, texts
 from tests.projections.event_script import Script, declarations, declared, field, name_of
+from tests.projections.factories import append_and_fold
 from tests.store.factories import declaration, episode, record, run_of
 from tests.table_comparison import Logs, logs_of, tables_of
 from tests.test_table_comparison import episode as hand_written
@@ -105,7 +105,7 @@ async def test_an_episode_that_is_longer_in_the_target_is_not_changed(new_file: 
     source, target = new_file(), new_file()
     records = hand_written(1).records
     await fill(target, [hand_written(1)])
-    await append(source, [*declarations_as_records(target), *records[:4]])
+    await append_and_fold(source, [*declarations_as_records(target), *records[:4]])
     assert counts(await copy_episodes(source, target)) == [(1, 4, 0, len(records))]
     assert counts(await copy_episodes(target, source)) == [(1, 4, len(records) - 4, len(records))]
     assert_same(target, source)
@@ -242,7 +242,7 @@ async def test_a_copy_that_is_killed_and_repeated_is_complete(new_url: New, new_
 async def test_events_appended_but_not_folded_before_a_kill_are_folded_by_the_next_copy(new_file: New) -> None:
     source, target = new_file(), new_file()
     await fill(source, [hand_written(1)])
-    await append(target, [*declarations_as_records(source), *hand_written(1).records], folded=False)
+    await append_and_fold(target, [*declarations_as_records(source), *hand_written(1).records], folded=False)
     assert counts(await copy_episodes(source, target)) == [(1, 12, 0, 12)]
     assert_same(source, target)
 
@@ -262,7 +262,7 @@ async def test_other_bytes_under_one_key_are_reported_and_the_other_episodes_are
     scripts = [hand_written(number) for number in (1, 2, 3)]
     await fill(source, scripts)
     other = [each._replace(wall_ns=each.wall_ns + (each.sequence == 5)) for each in scripts[1].records]
-    await append(target, [*declarations_as_records(source), *other[:9]])
+    await append_and_fold(target, [*declarations_as_records(source), *other[:9]])
     before = logs_of(target)
     done = await copy_episodes(source, target)
     (bad,) = [each for each in done.episodes if each.damage]
@@ -351,7 +351,7 @@ async def test_events_of_a_newer_version_are_copied_unchanged(new_url: New, new_
     script = Script(1)
     script.put_payload("HandShaken", b'{"whom": "Ada", "firm": 1.50}')
     script.put_payload("NodeStarted", b'{"designator": ["of", "another", "shape"]}', 2)
-    await append(source, script.records)
+    await append_and_fold(source, script.records)
     (done,) = (await copy_episodes(source, target)).episodes
     assert done.damage is None
     assert done.stopped == "event 1: HandShaken is not an event this version knows"
@@ -369,7 +369,7 @@ async def test_an_episode_whose_type_contradicts_the_target_is_copied_and_parked
                 b'{"kind":"action","parent":3,"designator":"%s","parameters":{"text":5}}' % name_of(number).encode()
             )
             script.records[sequence - 1] = each._replace(payload=payload)
-    await append(source, [*declarations(number), *declarations_as_records(target), *script.records])
+    await append_and_fold(source, [*declarations(number), *declarations_as_records(target), *script.records])
     (done,) = (await copy_episodes(source, target)).episodes
     assert done.damage is None
     assert done.stopped is not None
@@ -412,7 +412,7 @@ async def test_large_events_are_copied_in_small_batches(new_file: New) -> None:
     source, target = new_file(), new_file()
     big = b'{"kind":"action","parameters":{"text":"%s"}}' % (b"x" * 100_000)
     records = [record(episode(1), sequence, payload=big) for sequence in range(1, 1001)]
-    await append(source, [*records, *run_of(episode(2), 1, 30)], folded=False)
+    await append_and_fold(source, [*records, *run_of(episode(2), 1, 30)], folded=False)
     done: list[int] = []
     await copy_episodes(
         source, target, settings=Settings(batch_bytes_max=2**20), watch=lambda count, _: done.append(count)

@@ -13,7 +13,8 @@ from pycrorm_async.operations.rebuild import rebuild_memory
 from tests.crash.forked_processes import ForkedProcess
 from tests.crash.rebuild_processes import read_until_stopped, rebuild_until, record_until_stopped
 from tests.databases import ask
-from tests.projections.rebuild_cases import TYPES, folded_elsewhere, picking, store, traces
+from tests.projections.factories import append_and_fold
+from tests.projections.rebuild_cases import TYPES, folded_elsewhere, picking, traces
 from tests.table_comparison import differences, tables_of
 
 pytestmark = [pytest.mark.soak_on("postgresql"), pytest.mark.slow]
@@ -25,7 +26,7 @@ BATCH_EVENTS = 60
 
 async def filled(url: str, episodes: int = EPISODES) -> None:
     records = (each for number in range(1, episodes + 1) for each in picking(number).records)
-    await store(url, [*TYPES, *records])
+    await append_and_fold(url, [*TYPES, *records])
 
 
 def killed_at(url: str, last: int, *, workers: int) -> None:

@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from pycrorm_async.operations.rebuild import rebuild_memory
-from tests.projections.rebuild_cases import TYPES, picking, store
+from tests.projections.factories import append_and_fold
+from tests.projections.rebuild_cases import TYPES, picking
 from tests.table_comparison import differences, tables_of
 
 pytestmark = pytest.mark.slow
@@ -21,7 +22,7 @@ def rebuild_with_two_workers(url: str) -> None:
 
 def test_a_rebuild_in_a_daemonic_process_folds_without_workers(tmp_path: Path) -> None:
     url = f"sqlite:///{tmp_path}/memory.db"
-    asyncio.run(store(url, [*TYPES, *picking(1).records]))
+    asyncio.run(append_and_fold(url, [*TYPES, *picking(1).records]))
     before = tables_of(url)
     process = multiprocessing.get_context("spawn").Process(target=rebuild_with_two_workers, args=(url,), daemon=True)
     process.start()

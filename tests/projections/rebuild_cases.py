@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from pathlib import Path
 
 from pycrorm_async.events.envelope import LOST, Record
 from pycrorm_async.events.ids import parse_episode_id
 from pycrorm_async.events.types import EpisodeEnded, EpisodeStarted, NodeEnded, NodeStarted, ObjectAdded
 from pycrorm_async.events.values import FailureValue, NodeReference, ObjectReference, RobotValue
-from pycrorm_async.projections.projector import Projector
-from pycrorm_async.store.address import DatabaseAddress
-from pycrorm_async.store.log import EventLog
 from tests.databases import ask
 from tests.projections.event_script import PICK_UP, SAYING, Script, declarations, declared, field, name_of, pose
+from tests.projections.factories import append_and_fold
 from tests.table_comparison import Tables, tables_of
 
 TYPES = declarations(PICK_UP, SAYING)
@@ -69,19 +66,6 @@ def whispering(number: int) -> list[Record]:
     return [*declarations(WHISPERING), *script.records]
 
 
-async def store(url: str, records: Iterable[Record], *, folded: bool = True) -> None:
-    """Store the scripts in the log and fold them into the tables."""
-    log = await EventLog.open(DatabaseAddress.parse(url), create=True)
-    try:
-        assert await log.append(list(records)) == {}
-        if folded:
-            projector = Projector(log)
-            await projector.open()
-            await projector.catch_up()
-    finally:
-        await log.close()
-
-
 async def folded_elsewhere(url: str, folder: Path) -> Tables:
     """Return the expected tables: the same log, folded into a new database without a rebuild."""
     other = f"sqlite:///{folder}/elsewhere.db"
@@ -97,7 +81,7 @@ async def folded_elsewhere(url: str, folder: Path) -> Tables:
         episode = parse_episode_id(identity)
         position = len(records) + 1
         records.append(Record(position, episode, sequence, kind, version, wall_ns, monotonic_ns, payload.encode()))
-    await store(other, records)
+    await append_and_fold(other, records)
     return tables_of(other)
 
 
@@ -131,7 +115,6 @@ __all__ = [
     "lost",
     "parking",
     "picking",
-    "store",
     "str_of",
     "traces",
     "whispering",

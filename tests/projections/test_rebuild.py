@@ -32,13 +32,13 @@ from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import Span, StoredEvent
 from tests.databases import Server, ask, ask_to_change
+from tests.projections.factories import append_and_fold
 from tests.projections.rebuild_cases import (
     TYPES,
     folded_elsewhere,
     lost,
     parking,
     picking,
-    store,
     str_of,
     traces,
     whispering,
@@ -60,8 +60,8 @@ async def every_kind_of_episode(url: str, spool: Path) -> None:
             await play(seed, memory)
         await memory.flush()
     scripts = [*map(picking, range(1, 8)), picking(8, simulated=True), lost(9), parking(10)]
-    await store(url, [*TYPES, *(each for script in scripts for each in script.records)])
-    await store(url, whispering(11))
+    await append_and_fold(url, [*TYPES, *(each for script in scripts for each in script.records)])
+    await append_and_fold(url, whispering(11))
 
 
 async def test_rebuilt_tables_equal_row_for_row_those_folded_live(database_url: str, tmp_path: Path) -> None:
@@ -91,7 +91,7 @@ async def test_rebuilt_tables_equal_row_for_row_those_folded_live(database_url: 
 
 @pytest.mark.soak_on("postgresql")
 async def test_a_view_of_the_package_that_was_noted_as_a_users_one_is_rebuilt_too(database_url: str) -> None:
-    await store(database_url, [*TYPES, *picking(1).records])
+    await append_and_fold(database_url, [*TYPES, *picking(1).records])
     query = 'SELECT id, arm, status FROM "PickUpWithContextView" ORDER BY id'
     before = ask(database_url, query)
     assert before
@@ -122,7 +122,7 @@ async def test_large_logs_are_rebuilt_by_two_processes_where_two_cores_are_idle(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, events: int, cores: set[int], load: float, begun: list[int]
 ) -> None:
     url = f"sqlite:///{tmp_path}/memory.db"
-    await store(url, [*TYPES, *(record for number in range(1, 8) for record in picking(number).records)])
+    await append_and_fold(url, [*TYPES, *(record for number in range(1, 8) for record in picking(number).records)])
     before, real, shared_out = tables_of(url), rebuilding._run_workers, list[int]()
     ((all_events,),) = ask(url, "SELECT sum(head) FROM episode")
 
@@ -147,7 +147,7 @@ async def test_workers_that_are_killed_are_restarted_and_the_tables_are_the_same
 ) -> None:
     url = f"sqlite:///{tmp_path}/memory.db"
     episodes = [picking(number, nodes=124).records for number in range(1, 71)]  # two batches for each of two workers
-    await store(url, [*TYPES, *(record for records in episodes for record in records)])
+    await append_and_fold(url, [*TYPES, *(record for records in episodes for record in records)])
     before, killed = tables_of(url), set[int]()
 
     def kill_once(_step: str, _done: int, _total: int) -> None:
@@ -165,7 +165,7 @@ async def test_workers_that_are_killed_are_restarted_and_the_tables_are_the_same
 
 
 async def test_missing_tables_are_made(database_url: str) -> None:
-    await store(database_url, [*TYPES, *picking(1).records, *parking(2).records], folded=False)
+    await append_and_fold(database_url, [*TYPES, *picking(1).records, *parking(2).records], folded=False)
     done = await rebuild_memory(database_url)
     assert (done.generation, done.events, done.episodes) == (1, 19, 2)
     assert [(number, folded) for number, folded, _ in ask(database_url, STOPPED)] == [(1, 15), (2, 2)]
@@ -188,7 +188,9 @@ async def test_events_folded_beside_many_rebuilds_are_in_the_tables(
 
 
 async def fold_beside(database_url: str, tmp_path: Path, *, rebuilds: int) -> None:
-    await store(database_url, [*TYPES, *(each for number in range(1, 30) for each in picking(number).records)])
+    await append_and_fold(
+        database_url, [*TYPES, *(each for number in range(1, 30) for each in picking(number).records)]
+    )
     over = asyncio.Event()
     seen: list[tuple[int, ...]] = []
 
@@ -239,7 +241,7 @@ async def fold_beside(database_url: str, tmp_path: Path, *, rebuilds: int) -> No
 async def test_events_folded_while_the_new_tables_are_published_are_in_them(
     database_url: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    await store(database_url, [*TYPES, *picking(1).records])
+    await append_and_fold(database_url, [*TYPES, *picking(1).records])
     log = await EventLog.open(DatabaseAddress.parse(database_url), create=True)
     projector = Projector(log)
     await projector.open()
@@ -277,7 +279,9 @@ class EndedError(Exception):
 
 async def test_an_interrupted_rebuild_is_continued(database_url: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(steps, "_BATCH_EVENTS", 40)
-    await store(database_url, [*TYPES, *(each for number in range(1, 21) for each in picking(number).records)])
+    await append_and_fold(
+        database_url, [*TYPES, *(each for number in range(1, 21) for each in picking(number).records)]
+    )
     before = tables_of(database_url)
 
     def interrupted(what: str, done: int, total: int) -> None:
@@ -312,7 +316,7 @@ async def test_the_size_of_batches_does_not_change_the_tables(
 async def test_no_batch_is_read_in_vain(database_url: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The next batch of an episode longer than one batch begins where the batch that is being written ends."""
     monkeypatch.setattr(steps, "_BATCH_EVENTS", 10)
-    await store(database_url, [*TYPES, *picking(1, nodes=100).records, *picking(2).records])
+    await append_and_fold(database_url, [*TYPES, *picking(1, nodes=100).records, *picking(2).records])
     log = await EventLog.open(DatabaseAddress.parse(database_url), create=True)
     async with claimed(log):
         rebuild = await Rebuild.begin(log)
@@ -357,7 +361,7 @@ async def test_a_rebuild_cancelled_at_any_moment_is_continued(
 
 
 async def test_only_one_process_rebuilds_at_a_time(database_url: str) -> None:
-    await store(database_url, [*TYPES, *picking(1).records])
+    await append_and_fold(database_url, [*TYPES, *picking(1).records])
     log = await EventLog.open(DatabaseAddress.parse(database_url), create=True)
     async with claimed(log):
         with pytest.raises(CallerError, match="another `pycrorm rebuild` is running: wait for it to end"):
@@ -367,7 +371,7 @@ async def test_only_one_process_rebuilds_at_a_time(database_url: str) -> None:
 
 
 async def test_tables_of_a_newer_version_are_refused_unchanged(database_url: str) -> None:
-    await store(database_url, [*TYPES, *picking(1).records])
+    await append_and_fold(database_url, [*TYPES, *picking(1).records])
     at = "memory_tables." if database_url.startswith("postgresql:") else ""
     ask_to_change(database_url, f"UPDATE {at}pycrorm_generation SET version = 999, layout = '[]'")
     with pytest.raises(DatabaseForeign, match=r"made by version 999 of the fold, this is version \d: use a newer"):
@@ -376,12 +380,12 @@ async def test_tables_of_a_newer_version_are_refused_unchanged(database_url: str
 
 
 async def test_tables_of_an_older_version_are_replaced(database_url: str) -> None:
-    await store(database_url, [*TYPES, *picking(1).records])
+    await append_and_fold(database_url, [*TYPES, *picking(1).records])
     before = tables_of(database_url)
     at = "memory_tables." if database_url.startswith("postgresql:") else ""
     ask_to_change(database_url, f"UPDATE {at}pycrorm_generation SET version = 1")
     with pytest.raises(DatabaseForeign, match="run `pycrorm rebuild`"):
-        await store(database_url, [])
+        await append_and_fold(database_url, [])
     assert (await rebuild_memory(database_url)).generation == 2
     assert differences(before, tables_of(database_url)) == []
     assert traces(database_url) == []
@@ -402,7 +406,7 @@ async def test_a_database_without_a_memory_is_left_unchanged(tmp_path: Path, ser
 
 async def test_an_event_missing_from_the_log_is_damage_and_ends_the_rebuild(tmp_path: Path) -> None:
     url = f"sqlite:///{tmp_path}/memory.db"
-    await store(url, [*TYPES, *picking(1).records, *picking(2).records])
+    await append_and_fold(url, [*TYPES, *picking(1).records, *picking(2).records])
     before = tables_of(url)
     ask_to_change(url, "DROP TRIGGER event_is_not_deleted")
     ask_to_change(url, "DELETE FROM event WHERE episode = 2 AND sequence IN (1, 7)")
@@ -416,7 +420,7 @@ async def test_an_event_missing_from_the_log_is_damage_and_ends_the_rebuild(tmp_
 
 async def test_a_reader_in_a_transaction_continues_and_the_next_rebuild_drops_its_tables(server: Server) -> None:
     url = server.new_database()
-    await store(url, [*TYPES, *picking(1).records])
+    await append_and_fold(url, [*TYPES, *picking(1).records])
     before = tables_of(url)
     async with Reading.open(url) as reading:
         async with reading.session() as session:
@@ -432,7 +436,7 @@ async def test_a_reader_in_a_transaction_continues_and_the_next_rebuild_drops_it
 
 async def test_a_foreign_view_on_the_tables_keeps_them_and_is_reported(server: Server) -> None:
     url = server.new_database()
-    await store(url, [*TYPES, *picking(1).records])
+    await append_and_fold(url, [*TYPES, *picking(1).records])
     ask_to_change(url, "CREATE VIEW public.mine AS SELECT id FROM memory.pick_up_action")
     done = await rebuild_memory(url)
     assert "pick_up_action__1" in done.left
@@ -444,7 +448,7 @@ async def test_a_foreign_view_on_the_tables_keeps_them_and_is_reported(server: S
 
 async def test_a_foreign_table_in_the_schema_of_the_views_is_reported_in_one_line_and_stays(server: Server) -> None:
     url = server.new_database()
-    await store(url, [*TYPES, *picking(1).records])
+    await append_and_fold(url, [*TYPES, *picking(1).records])
     ask_to_change(url, "CREATE TABLE memory.mine (a int)")
     for _ in range(2):
         with pytest.raises(DatabaseError, match=r"memory\.mine does not belong to the memory.*: move it to"):

@@ -47,6 +47,7 @@ from pycrorm_async.store.log import EventLog
 from pycrorm_async.world.pose import Pose
 from tests.databases import run_in_own_loop
 from tests.projections.event_script import MOVE, NAVIGATE, PICK_UP, T0_NS, Script, declarations, name_of, pose, row
+from tests.projections.factories import append_and_fold
 from tests.projections.sql_queries import stored_and_folded
 
 pytestmark = pytest.mark.slow
@@ -187,14 +188,7 @@ def recorded(module_database_url: str) -> DatabaseAddress:
     """A log in which episode 1 is the story."""
     address = DatabaseAddress.parse(module_database_url)
 
-    async def record() -> None:
-        log = await EventLog.open(address, create=True)
-        try:
-            await stored_and_folded(log, [*declarations(*TYPES), *story().records])
-        finally:
-            await log.close()
-
-    run_in_own_loop(record())
+    run_in_own_loop(append_and_fold(module_database_url, [*declarations(*TYPES), *story().records]))
     return address
 
 

@@ -29,7 +29,7 @@ from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.enums import Arms, Grasp, ObjectType
 from tests.databases import ask, run_in_own_loop
 from tests.projections.event_script import NAVIGATE, PICK_UP, SAYING, Script, declarations, name_of, pose, row
-from tests.projections.sql_queries import stored_and_folded
+from tests.projections.factories import append_and_fold
 
 
 def moment(sequence: int) -> datetime:
@@ -61,15 +61,8 @@ def recorded(module_database_url: str) -> DatabaseAddress:
     """A log in which episode 1 still runs and episode 2 has ended."""
     address = DatabaseAddress.parse(module_database_url)
 
-    async def record() -> None:
-        log = await EventLog.open(address, create=True)
-        try:
-            types = declarations(NAVIGATE, PICK_UP, SAYING)
-            await stored_and_folded(log, [*types, *episode(1).records, *episode(2).records])
-        finally:
-            await log.close()
-
-    run_in_own_loop(record())
+    types = declarations(NAVIGATE, PICK_UP, SAYING)
+    run_in_own_loop(append_and_fold(module_database_url, [*types, *episode(1).records, *episode(2).records]))
     return address
 
 

@@ -19,6 +19,7 @@ from pycrorm_async.store.log import EventLog
 from tests.crash.recorder_process import report
 from tests.databases import ask
 from tests.store.factories import episode, run_of
+from tests.store.faults import cancel_at_await
 
 pytestmark = pytest.mark.slow
 
@@ -116,14 +117,7 @@ def test_an_append_cancelled_at_any_await_leaves_a_whole_batch_or_nothing_and_no
     async def append_and_cancel(number: int, at: int) -> bool:
         log = await EventLog.open(address, create=True)
         appending: asyncio.Task[object] = asyncio.create_task(log.append(batch(number)))
-        awaited: list[object] = []
-        while len(awaited) < at and not appending.done():
-            waiter = getattr(appending, "_fut_waiter", None)
-            if waiter is not None and waiter not in awaited[-1:]:
-                awaited.append(waiter)
-            await asyncio.sleep(0)
-        appending.cancel()
-        await asyncio.wait([appending])
+        await cancel_at_await(appending, at)
         # A lock that only the garbage collector would release is detected here: it has not run yet.
         ask(address.path, "BEGIN IMMEDIATE")
         await log.close()

@@ -26,6 +26,7 @@ from pycrorm_async.writer.drain import Drain
 from pycrorm_async.writer.retry import Backoff
 from tests.databases import Server, ask, server_in_memory
 from tests.store.factories import declaration, episode, run_of
+from tests.store.faults import cancel_at_await
 from tests.writer.fakes import KeptSource
 
 pytestmark = pytest.mark.slow
@@ -304,14 +305,7 @@ async def test_an_append_cancelled_at_any_await_leaves_a_whole_batch_or_nothing_
         at += 1
         log = await EventLog.open(address, create=True, busy_timeout_s=2.0)
         appending = asyncio.create_task(log.append(run_of(episode(1), stored_events + 1, stored_events + 30)))
-        awaited: list[object] = []
-        while len(awaited) < at and not appending.done():
-            waiter = getattr(appending, "_fut_waiter", None)
-            if waiter is not None and waiter not in awaited[-1:]:
-                awaited.append(waiter)
-            await asyncio.sleep(0)
-        appending.cancel()
-        await asyncio.wait([appending])
+        await cancel_at_await(appending, at)
         [[head]] = ask(direct_url, "SELECT coalesce(max(head), 0) FROM episode")
         assert head in (stored_events, stored_events + 30)
         assert ask(direct_url, "SELECT count(*) FROM event") == [(head,)]
