@@ -21,9 +21,9 @@ __all__ = ["Tables", "Logs", "tables_of", "logs_of", "declarations_of", "united"
 
 Key: TypeAlias = tuple[Any, ...]
 Tables: TypeAlias = dict[str, dict[Key, dict[str, Any]]]
-"""By table and by key the values of the columns. The key of most is one (UUID, sequence, slot)."""
+"""Values of the columns by table and by key. The key of most is one (UUID, sequence, slot)."""
 Logs: TypeAlias = dict[str, list[tuple[Any, ...]]]
-"""By UUID (sequence, type, version, wall ns, monotonic ns, payload) of every event."""
+"""Lists of (sequence, type, version, wall ns, monotonic ns, payload) of every event, by the UUID of the episode."""
 
 _KEYS = {
     "parameter_item": ("node_id", "field", "position"),

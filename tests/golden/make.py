@@ -197,11 +197,11 @@ def main(archive: Path) -> None:
         asyncio.run(make(Path(folder)))
         with tarfile.open(archive, "w:gz") as packed:
             for path in sorted(Path(folder).iterdir()):
-                packed.add(path, path.name, filter=_of_nobody)
+                packed.add(path, path.name, filter=_without_owner)
     os._exit(0)  # the recorder has not closed its folder: as if it had been killed
 
 
-def _of_nobody(member: tarfile.TarInfo) -> tarfile.TarInfo:
+def _without_owner(member: tarfile.TarInfo) -> tarfile.TarInfo:
     member.uid = member.gid = member.mtime = 0
     member.uname = member.gname = ""
     return member

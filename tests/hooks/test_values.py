@@ -211,7 +211,7 @@ def test_an_outcome_of_the_plan_language_is_a_small_dict() -> None:
 
 
 def test_a_text_that_is_also_an_enum_is_written_as_its_text() -> None:
-    class Side(str, enum.Enum):  # noqa: UP042  the form people write
+    class Side(str, enum.Enum):  # noqa: UP042  a common form in user code
         LEFT = "left"
 
     class Odd(float):

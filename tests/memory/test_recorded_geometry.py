@@ -110,7 +110,7 @@ asyncio.run(see(sys.argv[1], sys.argv[2] == "files"))
 
 
 def seen_again(url: str, folder: Path, sequence: int, meshes: str = "boxes") -> dict[str, object]:
-    """What a fresh process sees, in another folder."""
+    """Return the report of a new process in another folder."""
     folder.mkdir()
     done = subprocess.run(
         [sys.executable, "-W", "error", "-c", SEE, url, meshes, str(sequence)],
@@ -216,7 +216,7 @@ asyncio.run(die(*sys.argv[1:]))
 
 
 def killed_plan(url: str, spool: Path, robot: Path) -> list[float]:
-    """Where the arm's tip was when the plan was killed."""
+    """Return the position of the arm's tip when the plan was killed."""
     words = [sys.executable, "-c", DIES, url, str(spool), str(robot)]
     died = subprocess.run(words, env=environment(), capture_output=True, text=True, check=False)
     assert died.returncode == -signal.SIGKILL, died.stderr

@@ -31,7 +31,7 @@ class Recording:
     async def wait_for_notes(self, count: int) -> None:
         """Wait until it has this many notes."""
         async with asyncio.timeout(10):
-            while len(self.notes) < count:  # noqa: ASYNC110  whoever tells does not know of this test
+            while len(self.notes) < count:  # noqa: ASYNC110  the plan layer sets no event of the test
                 await asyncio.sleep(0)
 
     def admit(self) -> Awaitable[None] | None:

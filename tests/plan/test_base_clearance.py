@@ -1,4 +1,4 @@
-"""Where collisions count, no place that is offered puts the base into anything, and driving into something fails."""
+"""Collision checks of the base: no candidate collides, and driving into an obstacle fails, where collisions count."""
 
 from __future__ import annotations
 

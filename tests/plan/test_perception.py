@@ -38,7 +38,7 @@ from tests.plan.fake_observer import Recording
 from tests.plan.test_actions import shape
 from tests.plan.test_process_modules import Noting
 
-Told = tuple[str, ObjectType | None, tuple[Seen, ...], TaskTreeNode | None]
+DetectionNote = tuple[str, ObjectType | None, tuple[Seen, ...], TaskTreeNode | None]
 
 
 class Listening(Recording):
@@ -46,7 +46,7 @@ class Listening(Recording):
 
     def __init__(self) -> None:
         super().__init__()
-        self.detections: list[Told] = []
+        self.detections: list[DetectionNote] = []
 
     def object_detected(
         self,
@@ -187,7 +187,7 @@ async def test_the_most_visible_object_comes_first_and_all_are_recorded(scene: S
     ((_, _, seen, _),) = listening.detections
     assert detected.world_object is seen[0].thing
     assert {each.thing for each in seen} == {scene.milk, clear}
-    assert [each.visible for each in seen] == sorted((each.visible for each in seen), reverse=True)  # type: ignore[type-var]  # the camera tells shares
+    assert [each.visible for each in seen] == sorted((each.visible for each in seen), reverse=True)  # type: ignore[type-var]  # the camera reports shares
     assert half not in {each.thing for each in seen}
     assert away not in {each.thing for each in seen}
 

@@ -156,7 +156,7 @@ async def test_a_held_object_is_held_in_the_copy(scene: Scene) -> None:
 
 
 async def test_locations_are_resolved_in_the_copy_to_plain_poses(scene: Scene) -> None:
-    """With the milk moved in the simulation, the base poses are beside its simulated pose."""
+    """The milk is moved in the simulation, and the base poses are beside its simulated pose."""
     with SimulatedTaskTree():
         in_world(scene.milk).set_pose(Pose([1.3, -0.5, 0.9]))
         await MoveTorsoActionPerformable(0.3).perform()

@@ -42,7 +42,7 @@ _RATE = select(_TRIES.c.arm, func.count().label("tries")).group_by(_TRIES.c.arm)
 
 class GraspRate(Projection):
     name, version = "grasp_rate", 1
-    tables = {"grasp_try": {"arm": "text", "grasp": "text", "status": "text"}}  # noqa: RUF012 - as people write it
+    tables = {"grasp_try": {"arm": "text", "grasp": "text", "status": "text"}}  # noqa: RUF012 - a common form in user code
     views = [UserView("grasp_tries_per_arm", _RATE)]  # noqa: RUF012
 
     def fold(self, event: Event, rows: Changes) -> None:
@@ -197,7 +197,7 @@ async def test_a_fold_that_raises_stops_its_episode_and_no_other(
 
 class NextGraspRate(GraspRate):
     version = 2
-    tables = {"grasp_try": {"arm": "text", "hard": "boolean"}}  # noqa: RUF012 - as people write it
+    tables = {"grasp_try": {"arm": "text", "hard": "boolean"}}  # noqa: RUF012 - a common form in user code
     views = []  # noqa: RUF012
 
     def fold(self, event: Event, rows: Changes) -> None:
@@ -282,11 +282,11 @@ async def test_an_interrupted_rebuild_is_continued(log: EventLog, monkeypatch: p
 
 class TakesAView(GraspRate):
     name = "other"
-    tables = {"other": {"n": "integer"}}  # noqa: RUF012 - as people write it
+    tables = {"other": {"n": "integer"}}  # noqa: RUF012 - a common form in user code
 
 
 class TakesALeaf(TakesAView):
-    tables = {"pick_up_action": {"n": "integer"}}  # noqa: RUF012 - as people write it
+    tables = {"pick_up_action": {"n": "integer"}}  # noqa: RUF012 - a common form in user code
     views = []  # noqa: RUF012
 
 
@@ -326,7 +326,7 @@ async def test_a_type_that_is_declared_later_still_gets_its_table(
 
 class Wrong(Projection):
     name = "wrong"
-    tables = {"wrong_row": {"n": "integer", "x": "real", "said": "text", "is_it": "boolean", "order": "json"}}  # noqa: RUF012 - as people write it
+    tables = {"wrong_row": {"n": "integer", "x": "real", "said": "text", "is_it": "boolean", "order": "json"}}  # noqa: RUF012 - a common form in user code
 
     def __init__(self, *changes: tuple[str, int, dict[str, Any]]) -> None:
         self.changes = changes

@@ -78,9 +78,9 @@ class Generator:
         self._greedy = greedy
 
     def plan(self) -> PlanPart:
-        return self._thing((), 4, "", self._dice.choice(["parallel", "all"]) if self._greedy else None)
+        return self._part((), 4, "", self._dice.choice(["parallel", "all"]) if self._greedy else None)
 
-    def _thing(self, path: Path, depth: int, above: str, kind: str | None = None) -> PlanPart:
+    def _part(self, path: Path, depth: int, above: str, kind: str | None = None) -> PlanPart:
         dice = self._dice
         if depth == 0 or (path and dice.random() < 0.2):
             does = [dice.choice(self._ends) for _ in range(3)]
@@ -94,7 +94,7 @@ class Generator:
         return PlanPart(
             kind,
             path,
-            [self._thing((*path, number), depth - 1, kind) for number in range(count)],
+            [self._part((*path, number), depth - 1, kind) for number in range(count)],
             times=dice.randint(1, 12) if kind == "monitor" else dice.randint(1, 3),
             pauses=dice.choice([0, 1, 3, 50]),
             wants=self._wants(0.3) if kind in ACTIONS else frozenset(),

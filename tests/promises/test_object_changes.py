@@ -41,7 +41,7 @@ ARM = "l_gripper_tool_frame"
 
 @dataclass
 class RearrangingActionPerformable(ActionAbstract):
-    """Change the world directly, as a simulation of people or of processes does."""
+    """Change the world directly, as a simulation of persons or of processes does."""
 
     _change: Any
 

@@ -1,26 +1,31 @@
 """Style as a test: sizes of files and folders, the first words of docstrings, and words that the glossary replaces.
 
-Sizes hold for the package; the rules for prose hold for the package and for `bench/`.
+Sizes hold for the package; the rules for prose hold for the package, for `bench/` and for `tests/`.
 """
 
 from __future__ import annotations
 
 import ast
+import io
 import re
+import tokenize
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parent.parent.parent
-PACKAGE, BENCH = ROOT / "pycrorm_async", ROOT / "bench"
+PACKAGE, BENCH, TESTS = ROOT / "pycrorm_async", ROOT / "bench", ROOT / "tests"
 MODULES = sorted(PACKAGE.rglob("*.py"))
 BENCH_MODULES = sorted(BENCH.rglob("*.py"))
+TEST_MODULES = sorted(TESTS.rglob("*.py"))
 LINES_MAX = 400
 MODULES_MAX = 12
 OPENINGS = ("What", "Who", "Where", "How", "Which", "Whether")
 BENCH_OPENINGS = (*OPENINGS, "Each", "Every", "That", "So", "By", "Of", "With", "Without", "Until", "When", "All")
 """The docstrings of `bench/` also do not open with a fragment that has no subject and no verb."""
+FRAGMENTS = (*OPENINGS, "That", "So", "By", "Of", "With", "Without", "Until", "When")
+"""Openings that docstrings of `tests/` avoid; "Each" and "Every" may open one, as the subject of a sentence."""
 REPLACED = re.compile(
     r"\b(tells?|told|telling|hears?|heard|mends?|anew|lets? go|gives? up|gave up|puts? aside|goes on|went on"
     r"|looks? round|whoever|nobody|somebody|things?)\b",
@@ -47,6 +52,25 @@ def docstrings_of(tree: ast.Module) -> Iterator[tuple[int, str]]:
         match node:
             case ast.Expr(value=ast.Constant(value=str(text))) if text.strip():
                 yield node.lineno, text
+
+
+def comments_of(source: str) -> Iterator[tuple[int, str]]:
+    """Comments, with their lines."""
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type == tokenize.COMMENT:
+            yield token.start[0], token.string
+
+
+def defined_names_of(tree: ast.Module) -> Iterator[tuple[int, str]]:
+    """Names of functions and classes with spaces between their words, and their lines."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
+            yield node.lineno, separated(node.name)
+
+
+def separated(names: str) -> str:
+    """The text with spaces between the words of its names."""
+    return re.sub(r"(?<=[a-z])(?=[A-Z])", " ", names).replace("_", " ")
 
 
 def without_code(text: str) -> str:
@@ -115,3 +139,26 @@ def test_the_prose_of_the_bench_uses_the_words_of_the_glossary() -> None:
 def test_the_page_of_the_bench_uses_the_words_of_the_glossary() -> None:
     prose = re.sub(r"`[^`]*`", "", (BENCH / "README.md").read_text())
     assert REPLACED.findall(prose) == []
+
+
+def test_every_docstring_of_the_tests_opens_with_a_sentence() -> None:
+    openings = [
+        f"{path.relative_to(ROOT)}:{line}: {text.split()[0]}"
+        for path in TEST_MODULES
+        for line, text in docstrings_of(ast.parse(path.read_text()))
+        if text.split()[0] in FRAGMENTS
+    ]
+    assert openings == []
+
+
+def test_names_docstrings_and_comments_of_the_tests_use_the_words_of_the_glossary() -> None:
+    replaced = [
+        f"{path.relative_to(ROOT)}:{line}: {match.group()}"
+        for path in TEST_MODULES
+        for source in [path.read_text()]
+        if REPLACED.search(separated(source))  # most files need no parse
+        for tree in [ast.parse(source)]
+        for line, text in [*docstrings_of(tree), *comments_of(source), *defined_names_of(tree)]
+        for match in REPLACED.finditer(without_code(text))
+    ]
+    assert replaced == []

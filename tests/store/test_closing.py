@@ -15,5 +15,5 @@ async def test_a_close_ends_although_its_thread_was_stopped_meanwhile(tmp_path: 
     closing = asyncio.create_task(connection.close())
     await asyncio.sleep(0)
     connection.stop()
-    time.sleep(0.2)  # noqa: ASYNC251  the thread does all it was told before this loop hears of any of it
+    time.sleep(0.2)  # noqa: ASYNC251  the thread ends its work before this loop is notified
     await asyncio.wait_for(closing, 10)

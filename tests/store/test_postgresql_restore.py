@@ -64,7 +64,7 @@ class Backup:
 async def until_refused_again(drain: Drain, *, times: int) -> None:
     """Wait until the drain has met this many more refusals."""
     enough = drain.state.retries + times
-    while drain.state.retries < enough:  # noqa: ASYNC110  nothing tells of it
+    while drain.state.retries < enough:  # noqa: ASYNC110  there is no event for it
         await asyncio.sleep(0.001)
 
 

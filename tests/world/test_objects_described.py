@@ -137,7 +137,7 @@ EXTENTS = {
 
 
 @pytest.mark.parametrize("object_type", EXTENTS)
-def test_small_things_have_the_extents_of_the_thesis_scene(world: BulletWorld, object_type: ObjectType) -> None:
+def test_small_objects_have_the_extents_of_the_thesis_scene(world: BulletWorld, object_type: ObjectType) -> None:
     np.testing.assert_allclose(Object("thing", object_type).bounding_box(), EXTENTS[object_type], rtol=0, atol=1e-6)
 
 
