@@ -146,7 +146,7 @@ def test_the_running_nodes_of_a_killed_robot_are_shown(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         (["1", "--at", "noon"], "--at takes seconds since the episode's start, or an event such as e300, got 'noon'"),
         (["1", "--at", "#3.5"], "--at takes seconds since the episode's start, or an event such as e300, got '#3.5'"),
