@@ -181,7 +181,7 @@ def test_a_window_holds_as_much_as_any_of_its_width_can() -> None:
 
 
 @pytest.mark.parametrize(
-    ("rectangles", "said"),
+    ("rectangles", "message"),
     [
         ([Rectangle(0, 1, 0, 1), Rectangle(2, 3, 0, 1), Rectangle(0.9, 2, 0.9, 2)], "must not overlap"),
         ([Rectangle(0, 0, 0, 1)], "finite limits, the smaller first"),

@@ -134,7 +134,7 @@ def test_a_file_that_cannot_be_read_or_written_is_reported_in_one_line(tmp_path:
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"arms": ["RIGHT", "LEFT"]}, "probabilities of arms"),
         ({"leaves": []}, "weights of the leaves"),
@@ -152,7 +152,7 @@ def test_a_crafted_file_is_checked_although_its_checksum_matches(
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "message"),
     [
         ({"weight": 0.5}, "weights of the leaves"),
         ({"weight": -1.0}, "weight"),

@@ -173,7 +173,7 @@ def test_a_removed_target_or_a_missing_robot_is_reported(scene: Scene) -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "arguments", "said"),
+    ("kind", "arguments", "message"),
     [
         (CostmapLocation, lambda _: ("milk",), "target: expected Pose | Object | ObjectDesignator, got str 'milk'"),
         (CostmapLocation, lambda s: (s.milk, "pr2"), "reachable_for: expected Object | ObjectDesignator | None, got"),

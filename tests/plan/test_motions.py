@@ -180,7 +180,7 @@ async def test_the_neck_turns_as_far_as_it_can_to_a_point_behind(scene: Scene, w
 
 
 @pytest.mark.parametrize(
-    ("target", "said"),
+    ("target", "message"),
     [(Pose([1, 0, 0], frame="base_link"), "in frame 'base_link'"), (Pose([math.nan, 0, 0]), "not finite")],
 )
 async def test_the_head_does_not_turn_to_a_point_outside_the_map(

@@ -176,7 +176,7 @@ def test_one_name_or_type_needs_no_list_and_a_name_is_not_split(scene: Scene) ->
 
 
 @pytest.mark.parametrize(
-    ("kind", "arguments", "said"),
+    ("kind", "arguments", "message"),
     [
         (ObjectDesignatorDescription, lambda _: ([ObjectType.MILK],), "names: expected each str, got <ObjectType.MILK"),
         (ObjectDesignatorDescription, lambda _: (None, ["milk"]), "types: expected each ObjectType, got 'milk'"),

@@ -28,7 +28,7 @@ def test_a_quaternion_without_a_direction_is_refused(number: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "said"),
+    ("arguments", "message"),
     [
         ({"position": [0, 0]}, r"three numbers x, y, z in metres, got \[0, 0\]"),
         ({"position": None}, "three numbers x, y, z in metres, got None"),
