@@ -173,6 +173,20 @@ async def test_driving_into_furniture_fails_where_collisions_count_and_nothing_m
     assert scene.robot.pose.position == goal.position
 
 
+async def test_another_robot_has_the_footprint_of_its_own_model() -> None:
+    """The courier's base is 0.5 m long and 0.44 m wide, so that it comes nearer to the counter than a PR2."""
+    with BulletWorld(), colliding():
+        courier = Object("courier", ObjectType.ROBOT)
+        Object("kitchen", ObjectType.ENVIRONMENT)
+        milk = Object("milk", ObjectType.MILK, pose=Pose([1.3, 1, 0.9]))
+        places = list(itertools.islice(CostmapLocation(milk, reachable_for=courier), 5))
+        assert len(places) == 5
+        for pose in (*(place.pose for place in places), Pose([0.78, -0.2, 0])):
+            await NavigateActionPerformable(pose).perform()
+        with pytest.raises(NavigationGoalInCollision):
+            await NavigateActionPerformable(Pose([1.2, 0, 0])).perform()
+
+
 async def test_a_base_that_fits_straight_may_not_fit_turned(scene: Scene) -> None:
     """The front of the counter is at x 1.03, the base reaches 0.325 m ahead and 0.46 m to its corners."""
     with colliding():
