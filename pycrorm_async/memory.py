@@ -13,7 +13,7 @@ from __future__ import annotations
 import asyncio
 import logging
 import os
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import (
     AbstractContextManager,
     AsyncExitStack,
@@ -23,30 +23,34 @@ from contextlib import (
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from types import TracebackType
-from typing import Self
+from types import MappingProxyType, TracebackType
+from typing import Any, Self
 
 from pycrorm_async import __version__
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
 from pycrorm_async.connected_var import set_inside
 from pycrorm_async.errors import CallerError, EpisodeParked, PycrormError, TablesForeign
 from pycrorm_async.events.ids import episode_id
+from pycrorm_async.events.tags import checked_tags
 from pycrorm_async.hooks.emitter import Emitter
 from pycrorm_async.hooks.episode import Episode
 from pycrorm_async.hooks.observations import Observations
 from pycrorm_async.hooks.plan_recorder import Recorder, current_episode
 from pycrorm_async.hooks.provenance import PlanSource, Provenance
-from pycrorm_async.memory_observing import ObservingMemory
+from pycrorm_async.hooks.values.episode_arguments import read_labels
 from pycrorm_async.memory_parts import Parts
-from pycrorm_async.memory_reading import ReadableMemory
+from pycrorm_async.memory_reading import ObservingMemory, ReadableMemory
 from pycrorm_async.memory_status import MemoryStatus
 from pycrorm_async.operations.destination import expected_log, open_destination
 from pycrorm_async.operations.recovery import dead_queues
+from pycrorm_async.operations.tag import tag_episode
 from pycrorm_async.plan.execution.unawaited_performs import called_performs
 from pycrorm_async.projections.custom.discovery import validate_projections
 from pycrorm_async.projections.custom.projection import Projection
 from pycrorm_async.projections.schema.user_views import UserView
+from pycrorm_async.query.as_of import AnyEpisode
 from pycrorm_async.query.experience import PickUpExperience
+from pycrorm_async.query.named_queries import EpisodeSummary
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.queue.files.locks import call_in_forked_child
 from pycrorm_async.queue.files.spool import Spool
@@ -184,7 +188,7 @@ class Memory(ReadableMemory, ObservingMemory):
         return self
 
     async def _open(self) -> Parts:
-        address = self._stack.enter_context(self._address.located())
+        address = self._located = self._stack.enter_context(self._address.located())
         by_daemon = self._settings.writer == "daemon"
         spool = Spool(self._spool or address.default_spool, self._settings.file_access)
         if not by_daemon:
@@ -276,7 +280,13 @@ class Memory(ReadableMemory, ObservingMemory):
 
     @asynccontextmanager
     async def episode(
-        self, *, description: str | None = None, plan: str | None = None, seed: int | None = None
+        self,
+        *,
+        description: str | None = None,
+        plan: str | None = None,
+        seed: int | None = None,
+        tags: Sequence[str] = (),
+        metadata: Mapping[str, Any] = MappingProxyType({}),
     ) -> AsyncIterator[Episode]:
         """Record an episode: plans performed inside, and the world that was entered before or is entered inside.
 
@@ -286,15 +296,20 @@ class Memory(ReadableMemory, ObservingMemory):
             description: the purpose; default: the plan's name.
             plan: the plan's name.
             seed: of the plan's random numbers, 64 bits, so that it can be repeated.
+            tags: short texts to find the episode by; `tag` changes them later.
+            metadata: JSON values of your own, at most 64 KiB.
 
         Raises:
             EpisodeRefused: an episode is open in this task already. A child task may open its own.
+            CallerError: for an argument of the wrong type, and a tag that is not a text of 1 to 100 characters.
         """
         parts = self._open_parts
         recorder = parts.recorder
         if (room := recorder.admit()) is not None:
             await room
-        episode = recorder.open_episode(description=description or plan or "an episode", plan=plan, seed=seed)
+        labels = read_labels(tags, metadata, parts.emitter)
+        text = description or plan or "an episode"
+        episode = recorder.open_episode(description=text, plan=plan, seed=seed, labels=labels)
         failure: BaseException | None = None
         with (
             parts.in_context(),
@@ -308,6 +323,25 @@ class Memory(ReadableMemory, ObservingMemory):
                 raise
             finally:
                 recorder.close_episode(episode, failure)
+
+    async def tag(self, episode: AnyEpisode, *tags: str, remove: Sequence[str] = ()) -> None:
+        """Add and remove tags of an episode of this database: a number, id, `last`, or object.
+
+        Tags of an episode that is open in this memory are recorded in it; those of one that has ended are written
+        directly to the log, after a flush.
+
+        Raises `CallerError` for an episode that another process still records, and for a removed tag that the episode
+        does not have; `UnknownEpisode`; `DatabaseUnavailable`, also if this login may not append.
+        """
+        parts = self._open_parts
+        added, removed = checked_tags(tags), checked_tags(remove)
+        name = str(episode.id if isinstance(episode, EpisodeSummary) else episode)
+        for each in parts.recorder.open_episodes:
+            if str(each) == name:
+                each.tag(added, removed)
+                return
+        await self.flush()
+        await tag_episode(self._located, name, added, removed, clock=self._clock)
 
     async def synced(self) -> None:
         """Wait until all events recorded so far survive a power loss.

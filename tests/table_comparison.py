@@ -32,6 +32,7 @@ _KEYS = {
     "location_refusal": ("resolution_id", "position"),
     "detection": ("id", "position"),
     "observation_value": ("id", "position"),
+    "episode_tagging": ("id", "position"),
     "state_sample": ("id", "channel"),
 }
 _OF_EPISODES = ("process_metadata", "simulated_episode")

@@ -25,6 +25,9 @@ def episodes(
     simulated: Annotated[
         bool, typer.Option("--simulated", help="Also list simulated episodes (SimulatedTaskTree).")
     ] = False,
+    tag: Annotated[
+        list[str] | None, typer.Option(metavar="TAG", help="List only episodes with this tag; repeatable: with all.")
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """List the recorded episodes."""
@@ -33,7 +36,7 @@ def episodes(
         async with Reading.open(url) as reading:
             return await reading.episodes(simulated=simulated)
 
-    summaries = asyncio.run(query())
+    summaries = [each for each in asyncio.run(query()) if set(tag or ()) <= set(each.tags)]
     note_pending_events(url, spool)
     if as_json:
         print_json(summaries)
@@ -44,6 +47,9 @@ def episodes(
         (e.number, moment(e.started_at), duration(e.duration_ns), e.status, e.nodes, e.failed, _description(e, numbers))
         for e in summaries
     ]
+    if any(each.tags for each in summaries):
+        columns = (*columns, "tags")
+        rows = [(*row, ", ".join(e.tags)) for row, e in zip(rows, summaries, strict=True)]
     if simulated:
         columns = (*columns, "simulated")
         rows = [(*row, simulated_by(e) if e.simulated else "") for row, e in zip(rows, summaries, strict=True)]

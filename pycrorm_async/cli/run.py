@@ -29,6 +29,7 @@ from pycrorm_async.cli.output import note, print_json, print_table, problem, std
 from pycrorm_async.cli.plan_loader import LoadedPlan, load_plan
 from pycrorm_async.cli.plan_source import plan_source
 from pycrorm_async.errors import CallerError, EpisodeParked
+from pycrorm_async.events.tags import checked_tags
 from pycrorm_async.hooks.values.texts import message_of
 from pycrorm_async.memory import Memory
 from pycrorm_async.projections.custom.discovery import load_projections
@@ -58,6 +59,7 @@ def run(
     seed: Annotated[
         int | None, typer.Option(help="Seed to record with the episode; the plan must use it itself.")
     ] = None,
+    tag: Annotated[list[str] | None, typer.Option(metavar="TAG", help="Tag of the episode; repeatable.")] = None,
     writer: WriterOption = "thread",
     projection: ProjectionOption = None,
     file_access: FileAccessOption = "owner",
@@ -109,7 +111,10 @@ def run(
         on_full=_choice("--on-full", on_full, get_args(OnFull)),
         record_meshes=_choice("--record-meshes", record_meshes, get_args(RecordMeshes)),
     )
+    tags = checked_tags(tag or ())
     loaded = load_plan(plan)
+    if tags and loaded.takes_memory:
+        raise CallerError(f"--tag cannot be used: {loaded.name} takes the memory and opens its own episodes")
     memory = Memory.open(
         url,
         spool=spool,
@@ -120,7 +125,7 @@ def run(
     outcome = _Outcome()
     with redirect_stdout(sys.stderr) if as_json else nullcontext():
         try:
-            asyncio.run(_run_and_record(loaded, memory, description or loaded.description, seed, outcome))
+            asyncio.run(_run_and_record(loaded, memory, description or loaded.description, seed, tags, outcome))
         except asyncio.CancelledError as cancelled:  # the plan cancelled itself; Ctrl-C is a KeyboardInterrupt here
             outcome.failure = cancelled
         except SystemExit as system_exit:  # raised in a task of the plan, where it ends the event loop
@@ -200,7 +205,12 @@ class _Outcome:
 
 
 async def _run_and_record(
-    loaded: LoadedPlan, opened: Memory, description: str, seed: int | None, outcome: _Outcome
+    loaded: LoadedPlan,
+    opened: Memory,
+    description: str,
+    seed: int | None,
+    tags: tuple[str, ...],
+    outcome: _Outcome,
 ) -> None:
     interruption = Interruption()
     with interruption.handled():
@@ -209,7 +219,7 @@ async def _run_and_record(
                 if loaded.takes_memory:
                     await loaded.function(memory)
                 else:
-                    async with memory.episode(description=description, plan=loaded.name, seed=seed):
+                    async with memory.episode(description=description, plan=loaded.name, seed=seed, tags=tags):
                         await loaded.function()
             except (KeyboardInterrupt, asyncio.CancelledError):
                 raise

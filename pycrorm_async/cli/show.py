@@ -71,6 +71,8 @@ def _show(episode: str, url: str, spool: Path | None, *, events: bool, full: boo
             "continued": f"in episode {summary.continued_in}" if summary.continued_in else None,
             "simulated": simulated_by(summary) if summary.simulated else None,
             "robot": ", ".join(map(_robot, summary.robots)) or None,
+            "tags": ", ".join(summary.tags) or None,
+            "metadata": _pairs(summary.metadata),
             **_provenance(summary, full=full),
         },
     )

@@ -9,7 +9,8 @@
 | ObjectMoved, ObjectRemoved, ObjectAttached, ObjectDetached, JointsMoved | open; the objects they name were added | |
 | LocationResolved, ObjectDetected, Observed | open; the node it names, if any, started | |
 | StateSampled | open; the object it names was added; the node it names, if any, started | |
-| EpisodeEnded | open | the episode is closed: no event follows |
+| EpisodeEnded | open | the episode is closed: no event follows but EpisodeTagged |
+| EpisodeTagged | open or closed | |
 
 A structural break (a gap, an end without a start, an unknown parent) is *damage*. An unusual order that correct plans
 do produce (a child that ends after its cancelled parent, a child started by an ended node, nodes open at the end) is a
@@ -23,6 +24,7 @@ from typing import Literal, NamedTuple
 from pycrorm_async.events.types import (
     EpisodeEnded,
     EpisodeStarted,
+    EpisodeTagged,
     Happening,
     JointsMoved,
     LocationResolved,
@@ -84,7 +86,7 @@ class OrderCheck:
             return findings
         if self._state == "before":
             findings.append(Finding("damage", sequence, "the episode has not started"))
-        elif self._state == "closed":
+        elif self._state == "closed" and not isinstance(event, EpisodeTagged):
             findings.append(Finding("damage", sequence, "the episode has ended already"))
         findings += [Finding(kind, sequence, text) for kind, text in self._faults(sequence, event)]
         return findings

@@ -33,6 +33,7 @@ __all__ = [
     "Happening",
     "EpisodeStarted",
     "EpisodeEnded",
+    "EpisodeTagged",
     "DesignatorTypeDeclared",
     "DescriptionDeclared",
     "ObjectAdded",
@@ -76,6 +77,7 @@ class EpisodeStarted(Happening, frozen=True):
         libraries: version by package.
         settings: the memory's settings that differ from their defaults, by name.
         clock_synchronized, clock_error_us: whether a time service kept the clock, and the estimated error.
+        tags, metadata: given by the program that opened the episode; `EpisodeTagged` changes the tags.
     """
 
     description: str
@@ -96,6 +98,8 @@ class EpisodeStarted(Happening, frozen=True):
     settings: dict[str, Any] = {}
     clock_synchronized: bool | None = None
     clock_error_us: int | None = None
+    tags: tuple[str, ...] = ()
+    metadata: dict[str, Any] = {}
 
 
 class EpisodeEnded(Happening, frozen=True):
@@ -109,6 +113,16 @@ class EpisodeEnded(Happening, frozen=True):
     failure: FailureValue | None = None
     continued_in: str | None = None
     world: str | None = None
+
+
+class EpisodeTagged(Happening, frozen=True):
+    """An episode got tags and lost others. The only event that may follow `EpisodeEnded`.
+
+    An episode has a tag if the last event that names it adds it.
+    """
+
+    added: tuple[str, ...] = ()
+    removed: tuple[str, ...] = ()
 
 
 class DesignatorTypeDeclared(Happening, frozen=True):
@@ -333,6 +347,7 @@ EVENT_TYPES: dict[str, type[Happening]] = {
     for kind in (
         EpisodeStarted,
         EpisodeEnded,
+        EpisodeTagged,
         DesignatorTypeDeclared,
         DescriptionDeclared,
         ObjectAdded,

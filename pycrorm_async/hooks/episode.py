@@ -29,13 +29,14 @@ again in the follow-up. `NodeRecord.episode_id` is the id under which the node's
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Final, Literal, NamedTuple
 
 from pycrorm_async.errors import Unrecordable
 from pycrorm_async.events.codec import NotEncodable
 from pycrorm_async.events.ids import EpisodeId, episode_text
-from pycrorm_async.events.types import EpisodeEnded, NodeEnded, NodeStarted
+from pycrorm_async.events.tags import changed_tags
+from pycrorm_async.events.types import EpisodeEnded, EpisodeTagged, NodeEnded, NodeStarted
 from pycrorm_async.events.values import FailureValue, NodeReference, NodeStatus, ObjectReference, RobotValue
 from pycrorm_async.hooks.declaration import DeclaredType
 from pycrorm_async.hooks.emitter import UNAWAITED_MAX, Emitter
@@ -104,7 +105,7 @@ class Episode:
         continue_at: the first sequence that triggers a follow-up episode.
         task: the asyncio task that opened the episode; None outside any task.
         closed: whether the last event has been written, or its writing has begun.
-        simulated: whether the episode is a simulation, performed in a copy of the world.
+        simulated: whether the episode is a simulation.
         world: the recorder of its world; None without a world.
         faults: faults of the plan, each type once: performs that were never awaited.
         calls: performs called in the episode's context.
@@ -256,6 +257,12 @@ class Episode:
         except NotEncodable as error:
             self._emitter.missing.note("ObjectDetected", "seen", error.reason)
             return self._emitter.put(self.id, fit_detection(detected, self._emitter.settings.record_bytes_max))
+
+    def tag(self, added: Sequence[str], removed: Sequence[str]) -> None:
+        """Write a change of the episode's tags. Raises `CallerError` for a removed tag that it does not have."""
+        tags = changed_tags(self._opening.labels.tags, added, removed)
+        self._emitter.put(self.id, EpisodeTagged(tuple(added), tuple(removed)))
+        self._opening = self._opening.with_tags(tags)
 
     def end(self, failure: BaseException | None) -> None:
         """Write the end of the episode. Nodes that are still open end LOST, because no later end can be recorded."""

@@ -19,6 +19,7 @@ from pycrorm_async.events.values import (
     SeenValue,
 )
 from pycrorm_async.hooks.provenance import Provenance
+from pycrorm_async.hooks.values.episode_arguments import NO_LABELS, Labels
 from pycrorm_async.hooks.values.texts import clean
 from pycrorm_async.hooks.values.value_snapshot import References, pose_value
 from pycrorm_async.plan.exceptions import is_plan_failure
@@ -40,6 +41,11 @@ class EpisodeOpening(NamedTuple):
     simulated: bool = False
     thought_by: NodeReference | None = None
     provenance: Provenance | None = None
+    labels: Labels = NO_LABELS
+
+    def with_tags(self, tags: tuple[str, ...]) -> EpisodeOpening:
+        """Return the arguments with these tags instead."""
+        return self._replace(labels=self.labels._replace(tags=tags))
 
 
 def episode_started(opening: EpisodeOpening, continues: EpisodeId | None) -> EpisodeStarted:
@@ -56,6 +62,8 @@ def episode_started(opening: EpisodeOpening, continues: EpisodeId | None) -> Epi
         simulated=opening.simulated,
         thought_by=opening.thought_by,
         continues=episode_text(continues) if continues is not None else None,
+        tags=opening.labels.tags,
+        metadata=dict(opening.labels.metadata),
         **(opening.provenance.fields() if opening.provenance is not None else {}),
     )
 

@@ -29,7 +29,7 @@ from contextvars import ContextVar
 from typing import Literal
 
 from pycrorm_async.clock import Clock
-from pycrorm_async.errors import CallerError, DeclarationRefused, EpisodeRefused, SpoolFull, Unrecordable
+from pycrorm_async.errors import DeclarationRefused, EpisodeRefused, SpoolFull, Unrecordable
 from pycrorm_async.events.envelope import Heading
 from pycrorm_async.events.ids import EpisodeId, episode_id, episode_text
 from pycrorm_async.events.values import NodeReference
@@ -39,6 +39,7 @@ from pycrorm_async.hooks.episode import Episode, NodeRecord
 from pycrorm_async.hooks.episode_events import EpisodeOpening, current_task
 from pycrorm_async.hooks.provenance import Provenance
 from pycrorm_async.hooks.sampler import Sampler
+from pycrorm_async.hooks.values.episode_arguments import NO_LABELS, Labels, check_arguments
 from pycrorm_async.hooks.values.event_fitting import EPISODE_TEXT_MAX
 from pycrorm_async.plan.execution.observer import Candidate, Refusal, Seen, Simulation, current_simulation
 from pycrorm_async.plan.execution.unawaited_performs import CalledPerforms
@@ -92,7 +93,9 @@ class Recorder:
 
     # --- episodes ---------------------------------------------------------------------------------------------
 
-    def open_episode(self, *, description: str, plan: str | None = None, seed: int | None = None) -> Episode:
+    def open_episode(
+        self, *, description: str, plan: str | None = None, seed: int | None = None, labels: Labels = NO_LABELS
+    ) -> Episode:
         """Open an episode in this context; `close_episode` ends it.
 
         Raises `EpisodeRefused` if this task has an open episode, `CallerError` for an argument that does not fit.
@@ -102,10 +105,12 @@ class Recorder:
             raise EpisodeRefused(
                 f"episode {open_episode} is open in this task already: end it first, or open the other in its own task"
             )
-        _check_arguments(description=description, plan=plan, seed=seed, strict=self._strict)
-        return self._start(description, plan=plan, seed=seed)
+        check_arguments(description=description, plan=plan, seed=seed, strict=self._strict)
+        return self._start(description, plan=plan, seed=seed, labels=labels)
 
-    def _start(self, description: str, *, plan: str | None = None, seed: int | None = None) -> Episode:
+    def _start(
+        self, description: str, *, plan: str | None = None, seed: int | None = None, labels: Labels = NO_LABELS
+    ) -> Episode:
         """Start an episode; a simulation if this context is in one."""
         simulation, world = current_simulation.get(), current_world.get()
         new_id = episode_id(self._clock.wall_ns(), self._randomness(10))
@@ -118,6 +123,7 @@ class Recorder:
             simulated=simulation is not None,
             thought_by=_simulating_node(simulation),
             provenance=self._provenance,
+            labels=labels,
         )
         episode = Episode(self._emitter, new_id, opening)
         self._open[new_id] = episode
@@ -382,15 +388,3 @@ def _description_of(simulation: Simulation) -> str:
     if simulation.by is not None and simulation.by.designator is not None:
         return f"simulation in {simulation.by.designator.dtype}"
     return "simulation"
-
-
-def _check_arguments(*, description: object, plan: object, seed: object, strict: bool) -> None:
-    """Check that an episode's arguments fit its columns. Raises `CallerError` naming the argument.
-
-    In strict mode a text that is too long is refused; otherwise it is cut later.
-    """
-    for name, text in (("plan", plan), ("description", description)):
-        if text is not None and not (isinstance(text, str) and (len(text) <= EPISODE_TEXT_MAX or not strict)):
-            raise CallerError(f"the {name} of an episode must be a str of at most {EPISODE_TEXT_MAX:,} characters")
-    if seed is not None and not (isinstance(seed, int) and -(2**63) <= seed < 2**63):
-        raise CallerError(f"the seed of an episode must be an int of at most 64 bits, not {seed!r:.100}")

@@ -62,11 +62,12 @@ from pycrorm_async.orm.objects import (
 )
 from pycrorm_async.orm.perception import Detection, Observation, ObservationValue, StateSample
 from pycrorm_async.orm.tree import LocationCandidate, LocationRefusal, LocationResolution, TaskTreeNode
-from pycrorm_async.orm.views import PickUpWithContextView, RootFailure, SpatialRelation
+from pycrorm_async.orm.views import EpisodeTag, PickUpWithContextView, RootFailure, SpatialRelation
 
 __all__ = [
     "Base",
     "ProcessMetaData",
+    "EpisodeTag",
     "Position",
     "Quaternion",
     "Pose",

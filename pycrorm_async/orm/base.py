@@ -328,6 +328,10 @@ class ProcessMetaData(Base):
     clock_synchronized: Mapped[bool | None]
     """Whether a time service kept the wall clock; `clock_error_us` is its estimated error, µs."""
     clock_error_us: Mapped[int | None]
+    episode_metadata: Mapped[dict[str, Any] | None] = mapped_column("metadata", JsonText())
+    """In SQL `metadata`, a name of an attribute that SQLAlchemy keeps for itself."""
+    tag_rows: Mapped[list[Any]] = relationship("EpisodeTag", viewonly=True, lazy="selectin", order_by="EpisodeTag.tag")
+    tags = property(lambda self: [each.tag for each in self.tag_rows], doc="The tags, in alphabetical order.")
 
     pycram_version: Mapped[str] = synonym("version")
 

@@ -12,7 +12,7 @@ from pycrorm_async.orm.tree import TaskTreeNode
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.enums import Arms, Grasp, ObjectType
 
-__all__ = ["PickUpWithContextView", "RootFailure", "SpatialRelation"]
+__all__ = ["EpisodeTag", "PickUpWithContextView", "RootFailure", "SpatialRelation"]
 
 
 class PickUpWithContextView(Base):
@@ -143,3 +143,13 @@ class SpatialRelation(Base):
     _node: Mapped[TaskTreeNode] = one_of(lambda: SpatialRelation.node_id, "task_tree_node", lazy="select")
     node: Mapped[TaskTreeNode] = synonym("_node", descriptor=on_request("node"))
     process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True, lazy="selectin")
+
+
+class EpisodeTag(Base):
+    """A tag that an episode has now, and when it got it. The view `episode_tagging` has all changes."""
+
+    __tablename__ = "episode_tag"
+
+    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"), primary_key=True)
+    tag: Mapped[str] = mapped_column(primary_key=True)
+    time: Mapped[datetime]

@@ -37,7 +37,7 @@ def _name_episode(state: ORMExecuteState) -> None:
     if number != row_key(max(keys)).number:
         return
     column = _loaded_by(state.statement)
-    if column is not None and EPISODE in column.table.c:
+    if column is not None and column.key != EPISODE and EPISODE in column.table.c:  # else the keys are episodes
         state.statement = state.statement.where(column.table.c[EPISODE] == number)
 
 

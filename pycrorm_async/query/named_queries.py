@@ -12,7 +12,7 @@ from sqlalchemy.ext.asyncio import AsyncConnection
 from sqlalchemy.orm import aliased
 
 from pycrorm_async.events.ids import SLOT_NODE, row_id, row_key
-from pycrorm_async.orm import Designator, Object, Observation, ProcessMetaData, TaskTreeNode
+from pycrorm_async.orm import Designator, EpisodeTag, Object, Observation, ProcessMetaData, TaskTreeNode
 from pycrorm_async.orm.base import same_row
 from pycrorm_async.store.episode_lookup import number_named
 from pycrorm_async.task_status import TaskStatus
@@ -75,6 +75,8 @@ class EpisodeSummary:
         robots: the robots that took part, in the order in which they were added.
         digest_sequence, digest: the last digest that the log keeps of this episode, and the event up to which it covers
             the episode; None without one.
+        tags: in alphabetical order.
+        metadata: given by the program that opened it.
     """
 
     number: int
@@ -104,6 +106,8 @@ class EpisodeSummary:
     robots: tuple[RobotSummary, ...] = ()
     digest_sequence: int | None = None
     digest: str | None = None
+    tags: tuple[str, ...] = ()
+    metadata: dict[str, Any] | None = None
 
 
 @dataclass(frozen=True)
@@ -146,6 +150,12 @@ async def episodes(connection: AsyncConnection, number: int | None = None) -> li
     if number is not None:
         query = query.where(ProcessMetaData.id == number)
     robots = await _robots(connection, number)
+    tags: dict[int, list[str]] = {}
+    tagged = select(EpisodeTag.process_metadata_id, EpisodeTag.tag).order_by(EpisodeTag.tag)
+    if number is not None:
+        tagged = tagged.where(EpisodeTag.process_metadata_id == number)
+    for episode, tag in await connection.execute(tagged):
+        tags.setdefault(episode, []).append(tag)
     return [
         EpisodeSummary(
             number=row.id,
@@ -175,6 +185,8 @@ async def episodes(connection: AsyncConnection, number: int | None = None) -> li
             clock_synchronized=row.clock_synchronized,
             clock_error_us=row.clock_error_us,
             robots=tuple(robots.get(row.id, ())),
+            tags=tuple(tags.get(row.id, ())),
+            metadata=row.metadata,
         )
         for row in await connection.execute(query)
     ]

@@ -150,6 +150,7 @@ class Moment:
         status: of the episode at that moment.
         tree: the nodes that had started, each before its children, children in the order they started.
         observations: by name, the latest observation of a program.
+        tags: of the episode at that moment.
     """
 
     number: int
@@ -165,6 +166,7 @@ class Moment:
     tree: tuple[NodeThen, ...]
     world: WorldThen
     observations: Mapping[str, ObservationThen] = field(default_factory=dict)
+    tags: tuple[str, ...] = ()
 
     @property
     def running(self) -> tuple[NodeThen, ...]:

@@ -17,6 +17,7 @@ from pycrorm_async.events.types import (
     DescriptionDeclared,
     EpisodeEnded,
     EpisodeStarted,
+    EpisodeTagged,
     Happening,
     JointsMoved,
     NodeEnded,
@@ -92,6 +93,7 @@ class MomentFold:
         self._objects: dict[int, _WorldObject] = {}
         self._names: dict[int, str] = {}
         """The names of all objects, removed ones included, by identity."""
+        self._tags: dict[str, None] = {}
         self._observed: dict[str, tuple[StoredEvent, Observed]] = {}
 
     def read(self, event: StoredEvent) -> None:
@@ -127,6 +129,10 @@ class MomentFold:
                 if self._started is not None:
                     raise CannotFold("the episode starts a second time")
                 self._started = happening
+                self._tags = dict.fromkeys(happening.tags)
+            case EpisodeTagged():
+                kept = {tag: None for tag in self._tags if tag not in happening.removed}
+                self._tags = kept | dict.fromkeys(happening.added)
             case EpisodeEnded():
                 self._ended(happening.status)
             case Observed():
@@ -216,6 +222,7 @@ class MomentFold:
             tree=tuple(self._tree(dtypes, first.monotonic_ns)),
             world=self._world(descriptions, meshes),
             observations={name: self._observation(*each) for name, each in self._observed.items()},
+            tags=tuple(self._tags),
         )
 
     def _observation(self, event: StoredEvent, observed: Observed) -> ObservationThen:

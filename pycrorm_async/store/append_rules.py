@@ -135,7 +135,8 @@ def _advanced(row: EpisodeRow, fresh: Sequence[Record], *, refused: str | None) 
     if not fresh:  # repeats alone do not end an earlier refusal
         return row._replace(refused=row.refused or refused)
     last = fresh[-1]
-    ended = last.wall_ns if last.type == "EpisodeEnded" else row.ended_wall_ns
+    end = next((each for each in reversed(fresh) if each.type != "EpisodeTagged"), last)  # tags may follow the end
+    ended = end.wall_ns if end.type == "EpisodeEnded" else row.ended_wall_ns
     return row._replace(head=last.sequence, ended_wall_ns=ended, refused=refused)
 
 

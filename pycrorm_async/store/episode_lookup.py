@@ -8,12 +8,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import msgspec
+from sqlalchemy import text
 
 from pycrorm_async.errors import UnknownEpisode
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import EpisodeRow
 
-__all__ = ["number_named", "episode_named"]
+__all__ = ["number_named", "episode_named", "tags_of"]
 
 
 def number_named(name: str, ids: Mapping[int, str], *, listed: int) -> int:
@@ -41,6 +42,29 @@ async def episode_named(log: EventLog, name: str) -> EpisodeRow:
             if not await _is_simulated(log, row):
                 return row
     return rows[number_named(name, {number: row.id for number, row in rows.items()}, listed=len(rows))]
+
+
+async def tags_of(log: EventLog, number: int) -> tuple[str, ...]:
+    """Return the tags of an episode according to its events. Raises `LogDamaged` for one that cannot be read."""
+    tags: tuple[str, ...] = ()
+    query = text(
+        "SELECT sequence, payload FROM event WHERE episode = :number AND type IN ('EpisodeStarted', 'EpisodeTagged')"
+        " ORDER BY sequence"
+    )
+    async with log.reading() as connection:
+        for _, payload in await connection.execute(query, {"number": number}):
+            change = msgspec.json.decode(payload, type=_Tagging)
+            left = [each for each in tags if each not in change.removed]
+            tags = tuple(dict.fromkeys([*left, *change.tags, *change.added]))
+    return tags
+
+
+class _Tagging(msgspec.Struct):
+    """The parts of `EpisodeStarted` and `EpisodeTagged` that concern tags."""
+
+    tags: tuple[str, ...] = ()
+    added: tuple[str, ...] = ()
+    removed: tuple[str, ...] = ()
 
 
 class _Started(msgspec.Struct):

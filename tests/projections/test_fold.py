@@ -10,6 +10,7 @@ from pycrorm_async.events.types import (
     DesignatorTypeDeclared,
     EpisodeEnded,
     EpisodeStarted,
+    EpisodeTagged,
     JointsMoved,
     LocationResolved,
     NodeEnded,
@@ -20,6 +21,7 @@ from pycrorm_async.events.types import (
     ObjectDetected,
     ObjectMoved,
     ObjectRemoved,
+    Observed,
     StateSampled,
 )
 from pycrorm_async.events.values import (
@@ -95,19 +97,50 @@ def test_an_episode_is_one_row_from_its_start_to_its_end() -> None:
     former, rest = "018bcfe5-6800-7000-8000-000000000002", "018bcfe5-6800-7000-8000-000000000003"
     script.put(
         EpisodeStarted("why", "me", "host", "1.2", "3.11.7", "breakfast", "a kitchen", 42, True, thinker, former,
-                       "f3d6", "702b", True, {"numpy": "2.4.6"}, {"writer": "daemon"}, True, 250)
+                       "f3d6", "702b", True, {"numpy": "2.4.6"}, {"writer": "daemon"}, True, 250,
+                       ("kitchen",), {"n": 1})
     )  # fmt: skip
     script.put(EpisodeEnded("FAILED", FailureValue("plans.IKError", "too far"), rest, "a fridge"))
+    script.put(EpisodeTagged(("late",), ("kitchen",)))
     assert rows_of(script, number=7) == {
         "process_metadata": [
             (
                 7, time_us(1), "me", "why", "1.2", "host", "3.11.7", "breakfast", "a kitchen", 42,
                 "FAILED", time_us(2), 2, "plans.IKError", "too far", True, "018bcfe5-6800-7000-8000-000000000001", 12,
                 former, rest, "f3d6", "702b", True, '{"numpy":"2.4.6"}', '{"writer":"daemon"}', True, 250, "a fridge",
+                '{"n":1}',
             )
+        ],
+        "episode_tagging": [
+            (row(1, number=7), 0, 7, "kitchen", True, time_us(1)),
+            (row(3, number=7), 0, 7, "kitchen", False, time_us(3)),
+            (row(3, number=7), 1, 7, "late", True, time_us(3)),
         ],
         "simulated_episode": [(7,)],
     }  # fmt: skip
+
+
+def test_an_observation_has_a_row_for_each_scalar_and_blob() -> None:
+    script = Script()
+    root = script.put(NodeStarted("root"))
+    cloud = {"$blob": "a" * 64, "media_type": "application/x-npy", "size": 9, "dtype": "float32", "shape": [2]}
+    values = {"x": 1, "ok": True, "at": ["map", None], "cloud": cloud, "none": {}}
+    observed = script.put(Observed("force", values, root, {"at.1": "nan is not a finite number"}))
+    alone = script.put(Observed("alone", None, None, {"": "too long"}))
+    rows = rows_of(script)
+    assert rows["observation"] == [
+        (row(observed), 1, row(root), "force", time_us(observed), script.records[observed - 1].monotonic_ns),
+        (row(alone), 1, None, "alone", time_us(alone), script.records[alone - 1].monotonic_ns),
+    ]
+    empty = (None,) * 6
+    assert rows["observation_value"] == [
+        (row(observed), 0, 1, "x", 1.0, None, None, None, None, None, None),
+        (row(observed), 1, 1, "ok", None, None, True, None, None, None, None),
+        (row(observed), 2, 1, "at.0", None, "map", None, None, None, None, None),
+        (row(observed), 3, 1, "at.1", *empty, "nan is not a finite number"),
+        (row(observed), 4, 1, "cloud", None, None, None, "a" * 64, "application/x-npy", 9, None),
+        (row(alone), 0, 1, "value", *empty, "too long"),
+    ]
 
 
 def test_a_node_with_a_robot_is_a_node_a_pose_and_a_leaf() -> None:

@@ -34,7 +34,7 @@ def python_of(page: str) -> list[str]:
 
 PLAN, QUESTIONS, CELLS = python_of("README.md")
 TIDY, LIFTER, STEREO = python_of("pycrorm_async/plan/README.md")
-COURSE, AROUND, BEGAN, SEEN, THEN, AGAIN, RATE = python_of("pycrorm_async/query/README.md")
+COURSE, AROUND, BEGAN, TAGGED, SEEN, THEN, AGAIN, RATE = python_of("pycrorm_async/query/README.md")
 BETTER, ORIGINS = python_of("pycrorm_async/learning/README.md")
 
 
@@ -223,6 +223,15 @@ async def test_failures_are_counted_where_they_began(tmp_path: Path) -> None:
         {"path": "root > Parallel > KnockAction", "reason": "PlanFailure", "times": 2}
     ]
     assert frame.object.tolist() == [None]
+
+
+async def test_tags_are_given_changed_and_queried(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    names: dict[str, Any] = {}
+    exec("from pycrorm_async import Memory", names)
+    opened = f"    async with Memory.open({f'sqlite:///{tmp_path}/pycrorm.db'!r}) as memory:\n"
+    exec(f"async def asked():\n{opened}{textwrap.indent(TAGGED, '        ')}", names)
+    await names["asked"]()
+    assert capsys.readouterr().out == "Set the table ['good', 'kitchen', 'night'] {'batch': 7}\n"
 
 
 async def test_observations_are_recorded_and_queried(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

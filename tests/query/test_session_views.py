@@ -13,6 +13,7 @@ from pycrorm_async.events.ids import episode_text
 from pycrorm_async.events.types import (
     EpisodeEnded,
     EpisodeStarted,
+    EpisodeTagged,
     JointsMoved,
     LocationResolved,
     NodeEnded,
@@ -23,6 +24,7 @@ from pycrorm_async.events.types import (
     ObjectDetected,
     ObjectMoved,
     ObjectRemoved,
+    Observed,
     StateSampled,
 )
 from pycrorm_async.events.values import (
@@ -73,7 +75,7 @@ def everything(number: int, thinker: NodeReference | None = None) -> Script:
     """Return an episode with a row in every table; a simulation if a node caused it."""
     script = Script(number)
     put, simulated = script.put, thinker is not None
-    put(EpisodeStarted("e", "me", "host", "1.0", "3.11", simulated=simulated, thought_by=thinker))  # 1
+    put(EpisodeStarted("e", "me", "host", "1.0", "3.11", simulated=simulated, thought_by=thinker, tags=("t",)))  # 1
     root = put(NodeStarted("root", simulated=simulated))  # 2
     milk, table = put(ObjectAdded("milk", "MILK", pose(1, 2, 3))), put(ObjectAdded("table", "ENVIRONMENT", pose()))
     put(ObjectAttached(ObjectReference(table, table), ObjectReference(milk, milk), "top"))  # 5
@@ -98,8 +100,10 @@ def everything(number: int, thinker: NodeReference | None = None) -> Script:
     put(NodeEnded(careful, "SUCCEEDED"))
     put(ObjectRemoved(ObjectReference(milk, moved)))
     put(NodeEnded(either, "SUCCEEDED"))
+    put(Observed("force", {"x": 1.5}, root))
     put(NodeEnded(root, "SUCCEEDED"))
     put(EpisodeEnded("SUCCEEDED"))
+    put(EpisodeTagged(("late",)))
     return script
 
 

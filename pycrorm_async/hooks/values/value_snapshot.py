@@ -37,6 +37,7 @@ __all__ = [
     "OBJECT_TYPES",
     "UnrecordableValue",
     "References",
+    "NO_REFERENCES",
     "pose_value",
     "encode_parameter",
     "encode_or_missing",
@@ -275,7 +276,7 @@ def _pose_or_none(value: Any) -> PoseValue | None:
         pose = value.pose
     except Exception:  # noqa: BLE001  the object or link was removed; `perform` reports it
         return None
-    return _encode_pose(pose, None, _NO_REFERENCES) if pose is not None else None
+    return _encode_pose(pose, None, NO_REFERENCES) if pose is not None else None
 
 
 def _type_name(value: Any) -> str | None:
@@ -300,7 +301,7 @@ class _NoReferences:
         return None
 
 
-_NO_REFERENCES = _NoReferences()
+NO_REFERENCES = _NoReferences()
 
 
 def _encode_key(key: Any) -> str:
@@ -388,7 +389,7 @@ def _as_built_in(value: str | float) -> str | int | float:
         return str.__str__(value)
     if isinstance(value, float):
         return float.__float__(value)
-    return _encode_integer(value, None, _NO_REFERENCES)
+    return _encode_integer(value, None, NO_REFERENCES)
 
 
 def _mismatch(declared: str, value: Any) -> UnrecordableValue:

@@ -16,6 +16,7 @@ from pycrorm_async.events.ids import SLOT_ROBOT_POSE
 from pycrorm_async.events.types import (
     EpisodeEnded,
     EpisodeStarted,
+    EpisodeTagged,
     Happening,
     JointsMoved,
     LocationResolved,
@@ -132,9 +133,24 @@ def _episode_started(event: StoredEvent, started: EpisodeStarted, _designators: 
         "clock_synchronized": started.clock_synchronized,
         "clock_error_us": started.clock_error_us,
         "entered_world": None,
+        "metadata": json_text(started.metadata) if started.metadata else None,
     }
+    _tagging(event, started.tags, (), rows)
     if started.simulated:
         rows.inserts["simulated_episode"].append((event.number,))
+
+
+def _episode_tagged(event: StoredEvent, tagged: EpisodeTagged, _designators: Designators, rows: Rows) -> None:
+    _tagging(event, tagged.added, tagged.removed, rows)
+
+
+def _tagging(event: StoredEvent, added: tuple[str, ...], removed: tuple[str, ...], rows: Rows) -> None:
+    own, number = _own(event)
+    time = microseconds(event.wall_ns)
+    changes = [*((tag, False) for tag in removed), *((tag, True) for tag in added)]
+    rows.inserts["episode_tagging"].extend(
+        (own, position, number, tag, is_added, time) for position, (tag, is_added) in enumerate(changes)
+    )
 
 
 def _episode_ended(event: StoredEvent, ended: EpisodeEnded, _designators: Designators, rows: Rows) -> None:
@@ -347,6 +363,7 @@ def _node(event: StoredEvent, sequence: int | None) -> int | None:
 _FOLDS: dict[str, Callable[[StoredEvent, Any, Designators, Rows], None]] = {
     "EpisodeStarted": _episode_started,
     "EpisodeEnded": _episode_ended,
+    "EpisodeTagged": _episode_tagged,
     "NodeStarted": _node_started,
     "NodeEnded": _node_ended,
     "ObjectAdded": _object_added,

@@ -21,12 +21,15 @@ from sqlalchemy import (
     Table,
     Text,
     TextualSelect,
+    and_,
     case,
     cast,
     column,
     func,
     literal_column,
+    not_,
     null,
+    or_,
     select,
     table,
     union_all,
@@ -185,6 +188,19 @@ def _process_metadata(core: dict[str, Table], _layout: Layout) -> Select[Any]:
     )
 
 
+def _episode_tag(core: dict[str, Table], _layout: Layout) -> Select[Any]:
+    """Return the tags that episodes have now: those whose last change added them."""
+    changes = core["episode_tagging"]
+    later = changes.alias("later")
+    is_later = and_(
+        later.c.process_metadata_id == changes.c.process_metadata_id,
+        later.c.tag == changes.c.tag,
+        or_(later.c.id > changes.c.id, and_(later.c.id == changes.c.id, later.c.position > changes.c.position)),
+    )
+    columns = changes.c.id, changes.c.process_metadata_id, changes.c.tag, changes.c.time
+    return select(*columns).where(changes.c.added, not_(select(later.c.id).where(is_later).exists()))
+
+
 def _designator_type(layout: Layout) -> View:
     """Return the view of declarations. It never parses one that is not JSON, whichever column a query reads."""
     payload: ColumnElement[Any] = _declaration.c.payload
@@ -307,6 +323,7 @@ def _quaternion(core: dict[str, Table], _layout: Layout) -> Select[Any]:
 
 _CUT: dict[str, tuple[str, _Cut]] = {
     "process_metadata": ("process_metadata", _process_metadata),
+    "episode_tag": ("episode_tagging", _episode_tag),
     "task_tree_node": ("task_tree_node", _task_tree_node),
     "designator": ("task_tree_node", _designator),
     "action": ("task_tree_node", _of_kind("action")),

@@ -57,6 +57,9 @@ _POSE: dict[str, Storage] = {
     "frame": "text",
 }
 
+_ROW: dict[str, Storage] = {"id": "key", "process_metadata_id": "row"}
+_ITEM: dict[str, Storage] = {"id": "key", "position": "key", "process_metadata_id": "row"}
+
 CORE: dict[str, dict[str, Storage]] = {
     "process_metadata": {
         "id": "key",
@@ -87,11 +90,17 @@ CORE: dict[str, dict[str, Storage]] = {
         "clock_synchronized": "boolean",
         "clock_error_us": "integer",
         "entered_world": "text",
+        "metadata": "json",
+    },
+    "episode_tagging": {
+        **_ITEM,
+        "tag": "text",
+        "added": "boolean",
+        "time": "time",
     },
     "simulated_episode": {"id": "key"},
     "task_tree_node": {
-        "id": "key",
-        "process_metadata_id": "row",
+        **_ROW,
         "parent_id": "row",
         "kind": "text",
         "dtype": "text",
@@ -115,8 +124,7 @@ CORE: dict[str, dict[str, Storage]] = {
     },
     "pose": {"id": "key", "process_metadata_id": "row", **_POSE, "time": "time"},
     "object": {
-        "id": "key",
-        "process_metadata_id": "row",
+        **_ROW,
         "dtype": "text",
         "name": "text",
         "obj_type": "text",
@@ -132,8 +140,7 @@ CORE: dict[str, dict[str, Storage]] = {
         "serial": "text",
     },
     "object_removal": {
-        "id": "key",
-        "process_metadata_id": "row",
+        **_ROW,
         "object_id": "object",
         "identity_id": "object",
         "time": "time",
@@ -156,8 +163,7 @@ CORE: dict[str, dict[str, Storage]] = {
         "obj_type": "text",
     },
     "attachment": {
-        "id": "key",
-        "process_metadata_id": "row",
+        **_ROW,
         "kind": "text",
         "parent_id": "object",
         "child_id": "object",
@@ -175,8 +181,7 @@ CORE: dict[str, dict[str, Storage]] = {
         "node_id": "row",
     },
     "location_resolution": {
-        "id": "key",
-        "process_metadata_id": "row",
+        **_ROW,
         "node_id": "row",
         "location": "text",
         "considered": "integer",
@@ -203,9 +208,7 @@ CORE: dict[str, dict[str, Storage]] = {
         "reason": "text",
     },
     "detection": {
-        "id": "key",
-        "position": "key",
-        "process_metadata_id": "row",
+        **_ITEM,
         "node_id": "row",
         "source": "text",
         "looked_for": "text",
@@ -228,17 +231,14 @@ CORE: dict[str, dict[str, Storage]] = {
         "ns": "integer",
     },
     "observation": {
-        "id": "key",
-        "process_metadata_id": "row",
+        **_ROW,
         "node_id": "row",
         "name": "text",
         "time": "time",
         "ns": "integer",
     },
     "observation_value": {
-        "id": "key",
-        "position": "key",
-        "process_metadata_id": "row",
+        **_ITEM,
         "key": "text",
         "number": "real",
         "text": "text",
@@ -260,6 +260,7 @@ COLUMNS = {table: tuple(columns) for table, columns in CORE.items()}
 _TEXT_KEYS = {("parameter_item", "field"), ("joint_change", "joint"), ("state_sample", "channel")}
 
 _INDEXED = {
+    "episode_tagging": ("process_metadata_id", "tag"),
     "task_tree_node": ("process_metadata_id", "parent_id", "status", "dtype"),
     "pose": ("process_metadata_id",),
     "object": ("process_metadata_id", "identity_id", "obj_type"),
@@ -283,7 +284,7 @@ _INCLUDES = {("task_tree_node", "dtype"): ("id", "robot_pose_id", "torso_height"
 """Columns stored in PostgreSQL's index without being part of its key. An index-only scan saves reading a page for each
 node, so the learning query over 50,000 pick-ups takes some 70 ms instead of 100."""
 
-_EXPECTED = {"process_metadata": 1_000, "simulated_episode": 100}
+_EXPECTED = {"process_metadata": 1_000, "episode_tagging": 1_000, "simulated_episode": 100}
 _EXPECTED_CORE, _EXPECTED_LEAF = 1_000_000, 50_000
 _ALIKE = {
     "process_metadata_id": [1_000],

@@ -1,0 +1,45 @@
+"""`pycrorm tag EPISODE TAG...` adds tags to an episode that has ended, and removes others."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Annotated
+
+import typer
+
+from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
+from pycrorm_async.cli.output import note, print_json, stdout
+from pycrorm_async.cli.pending_events import note_pending_events
+from pycrorm_async.errors import CallerError
+from pycrorm_async.events.tags import checked_tags
+from pycrorm_async.operations.destination import shared_address
+from pycrorm_async.operations.tag import tag_episode
+
+__all__ = ["tag"]
+
+
+def tag(
+    episode: Annotated[str, typer.Argument(help="The episode's number, its id or first digits of the id, or `last`.")],
+    tags: Annotated[list[str] | None, typer.Argument(metavar="TAG...", help="Tags to add.")] = None,
+    remove: Annotated[list[str] | None, typer.Option(metavar="TAG", help="Tag to remove; repeatable.")] = None,
+    url: UrlOption = DEFAULT_URL,
+    spool: SpoolOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Add tags to an episode that has ended, and remove others; `pycrorm episodes --tag TAG` finds it.
+
+    The change is an event of its own behind the episode's last one. The plan that records an episode tags it with
+    `memory.tag`.
+    """
+    added, removed = checked_tags(tags or ()), checked_tags(remove or ())
+    if not added and not removed:
+        raise CallerError("name a tag to add, or one to remove with --remove")
+    with shared_address(url).located() as address:
+        done = asyncio.run(tag_episode(address, episode, added, removed))
+    note_pending_events(url, spool)
+    if not done.visible:
+        note("the tags are stored; the tables show them after the next fold (`pycrorm writer --once`)")
+    if as_json:
+        print_json(done)
+    else:
+        stdout.print(f"episode {done.number}: {', '.join(done.tags) or 'no tags'}", markup=False, highlight=False)
