@@ -36,7 +36,6 @@ def print_snapshot(snapshot: Moment, requested: str, *, events: bool = False, fu
 
     With `full` no text is cut, and the objects have their colours and the fingerprints of their descriptions.
     """
-    robot = snapshot.world.robot
     print_facts(
         f"Episode {snapshot.number}: {snapshot.description}",
         {
@@ -49,7 +48,7 @@ def print_snapshot(snapshot: Moment, requested: str, *, events: bool = False, fu
             "status": snapshot.status,
             "simulated": "yes" if snapshot.simulated else None,
             "running": _running_text(snapshot),
-            "robot": _robot_text(robot) if robot is not None else None,
+            "robot": "; ".join(map(_robot_text, snapshot.world.robots)) or None,
         },
     )
     print_tree(snapshot.tree, events=events, full=full)

@@ -91,12 +91,14 @@ class WorldThen:
         robot: the first of type ROBOT.
         descriptions: the descriptions of the objects, by fingerprint.
         meshes: contents of their mesh files, by SHA-256: those that are recorded, if the snapshot was asked for them.
+        robots: all of type ROBOT, in the order they were added.
     """
 
     objects: tuple[ObjectThen, ...]
     robot: RobotThen | None
     descriptions: Mapping[str, DescriptionDeclared] = field(default_factory=dict)
     meshes: Mapping[str, bytes] = field(default_factory=dict, repr=False)
+    robots: tuple[RobotThen, ...] = ()
 
     def object(self, name: str) -> ObjectThen:
         """Return the object with this name. Raises `CallerError` if the world had none."""

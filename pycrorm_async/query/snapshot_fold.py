@@ -276,8 +276,8 @@ class MomentFold:
 
     def _world(self, descriptions: Mapping[str, DescriptionDeclared], meshes: Mapping[str, bytes]) -> WorldThen:
         objects = tuple(self._object(identity, each) for identity, each in self._objects.items())
-        robot = next((each for each in objects if each.object_type == "ROBOT"), None)
-        return WorldThen(objects, _robot(robot) if robot is not None else None, descriptions, meshes)
+        robots = tuple(_robot(each) for each in objects if each.object_type == "ROBOT")
+        return WorldThen(objects, robots[0] if robots else None, descriptions, meshes, robots)
 
     def _object(self, identity: int, value: _WorldObject) -> ObjectThen:
         at = value.pose

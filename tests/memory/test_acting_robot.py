@@ -129,12 +129,15 @@ async def test_every_episode_names_its_robots_with_model_serial_and_description(
             assert (parked.arm, parked.robot) == (arm, "many")
         then = await memory.as_of(str(two.number), sequence=two.end_sequence)
         assert [(each.model, each.serial) for each in then.world.objects] == [("courier", "C-03"), ("many", None)]
+        assert [(each.name, each.pose.position.x) for each in then.world.robots] == [("eve", 1), ("many", 0)]
         with world_of(then) as again:
             assert again.object("eve").robot_description is COURIER
     shown = answer("episodes", "--url", database_url, cwd=tmp_path)
     assert [each["model"] for each in shown[1]["robots"]] == ["courier", "many"]
     lines = pycrorm("show", "2", "--url", database_url, cwd=tmp_path).stdout
     assert "eve (courier C-03), many" in lines
+    moment = pycrorm("show", "2", "--at", "9", "--url", database_url, cwd=tmp_path).stdout
+    assert "eve at (1.000, 0.000), heading 0.0°; many at (0.000, 0.000), heading 0.0°" in moment
 
 
 async def test_a_pick_up_names_its_robot_in_the_view_for_learning(
