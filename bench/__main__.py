@@ -56,6 +56,7 @@ RUNS = (
     Run("digests"),
     Run("thesis"),
     Run("thesis postgresql", ("--postgresql",), quick=False),
+    Run("size"),
     Run("questions"),
     Run("questions, large", ("--pick-ups", "500000"), quick=False),
     Run("rebuild", ("--workers", "1", "2")),

@@ -60,7 +60,8 @@ def spool_tree(tree: Tree, spool: Path) -> int:
     for rollout in tree.rollouts:
         recording.put_tree(rollout, recording.root)
     recording.end()
-    return recording.leave() - len(DECLARED)
+    recording.leave()
+    return recording.events
 
 
 def spool_rollouts(count: int, spool: Path, *, seed: int, an_episode: int = 100) -> int:
@@ -76,7 +77,8 @@ def spool_rollouts(count: int, spool: Path, *, seed: int, an_episode: int = 100)
         for rollout in tree.rollouts:
             recording.put_tree(rollout, recording.root)
         recording.end()
-    return recording.leave() - len(DECLARED)
+    recording.leave()
+    return recording.events
 
 
 class Recording:
@@ -92,6 +94,8 @@ class Recording:
         self._episode = EpisodeId(b"")
         self._milk = ObjectReference(0, 0)
         self.root = 0
+        self.events = 0
+        """Counts the events of episodes, without declarations, which every segment repeats."""
 
     def declare(self) -> None:
         """Declare the types; call it once, before the first episode."""
@@ -133,15 +137,14 @@ class Recording:
         if after is not None:
             after()
 
-    def leave(self) -> int:
-        """Sync everything and close the recorder, so that its folder is dead; return the number of its records."""
+    def leave(self) -> None:
+        """Sync everything and close the recorder, so that its folder is dead."""
         asyncio.run(self.queue.synced_to(self.queue.written))
-        count = self.queue.written
         self.queue.close()
         self.queue.release()
-        return count
 
     def _put(self, event: Happening) -> int:
+        self.events += 1
         return self._emitter.put(self._episode, event)
 
     def _written(self, value: object) -> Any:

@@ -147,6 +147,19 @@ def _learning(lines: Lines) -> Verdict:
     return Verdict(text, all(each <= 100 for each in median_ms.values()))
 
 
+def _size(lines: Lines) -> Verdict:
+    line = lines["size"]
+    bytes_a_node = {database: line[database]["ours"]["bytes_a_node"] for database in _SIZES_MAX}
+    text = ", ".join(
+        f"{database} {each:,} (system of the thesis: {line[database]['thesis_bytes_a_node']})"
+        for database, each in bytes_a_node.items()
+    )
+    return Verdict(text, all(each <= _SIZES_MAX[database] for database, each in bytes_a_node.items()))
+
+
+_SIZES_MAX = {"sqlite": 800, "postgresql": 1_150}
+
+
 BUDGETS = (
     Budget("one hook, mean of start and end", "median ≤ 5 µs, p99 ≤ 50 µs", _hook),
     Budget("the fastest headless rollout with memory against without", "≤ 5 % slower", _plan),
@@ -159,5 +172,6 @@ BUDGETS = (
     Budget("rebuild", "≥ 100,000 events/s", _rebuild_rate),
     Budget("rebuild, the largest log against the smallest", "≤ 1.1 times per event, flat memory", _rebuild_growth),
     Budget("memory of a recording process", "flat (system of the thesis: 32 kB a node)", _recording),
+    Budget("disk a node, log and tables", "≤ 800 bytes SQLite, ≤ 1,150 bytes PostgreSQL", _size),
     Budget("the thesis' learning query over 50,000 pick-ups → DataFrame", "≤ 100 ms", _learning),
 )

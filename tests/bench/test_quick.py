@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[2]
 BUT = {"busy", "faults", "hook", "__main__", "concurrent_processes"}
 OTHERS = sorted({path.stem for path in (ROOT / "bench").glob("*.py")} - BUT)
 """Scripts without a test of their own."""
-HEAVY = {"growth", "questions", "rebuild", "visible"}
+HEAVY = {"growth", "questions", "rebuild", "size", "visible"}
 """Scripts that start servers and daemons; their quick version takes more than ten seconds."""
 
 

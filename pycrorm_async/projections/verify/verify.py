@@ -52,7 +52,9 @@ SELECT number, following FROM (
     FROM (SELECT number FROM episode UNION ALL SELECT :first) AS known
 ) AS gap WHERE following > number + 1
 AND EXISTS (SELECT 1 FROM event WHERE episode > number AND episode < following) ORDER BY number""")
-_FIRST_IN_GAP = text("SELECT min(episode) FROM event WHERE episode > :number AND episode < :following")
+_FIRST_IN_GAP = text(
+    "SELECT min(episode) FROM event WHERE episode > CAST(:number AS BIGINT) AND episode < CAST(:following AS BIGINT)"
+)
 _NUMBERS_END = 2**62
 _BEYOND = text("""
 SELECT number, head, first, last FROM (

@@ -122,11 +122,12 @@ CREATE TABLE {LOG}.episode (
 _BEHIND = f"CREATE INDEX episode_behind ON {LOG}.episode (number) WHERE folded < head AND parked IS NULL"
 _STOPPED = f"CREATE INDEX episode_stopped ON {LOG}.episode (number) WHERE refused IS NOT NULL OR parked IS NOT NULL"
 
+# integer holds both parts of the key (`events.ids`) in half the bytes. Logs of 0.1.0 have bigint, which reads alike.
 # text, because jsonb refuses U+0000, reorders keys and rounds numbers; text keeps the bytes of the queue.
 _EVENT = f"""
 CREATE TABLE {LOG}.event (
-    episode bigint NOT NULL,
-    sequence bigint NOT NULL,
+    episode integer NOT NULL,
+    sequence integer NOT NULL,
     type text NOT NULL,
     version integer NOT NULL,
     wall_ns bigint NOT NULL,

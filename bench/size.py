@@ -1,0 +1,104 @@
+"""Measure the bytes on disk that a node takes, in the memory of the thesis and in this one.
+
+    python -m bench.size             30,000 nodes, SQLite and PostgreSQL
+    python -m bench.size --quick     300 nodes
+
+Both sides store one tree of pick-up rollouts (`bench/material`) with the same values: the thesis' memory as rows of its
+tables, this one as events in the log and as the rows that are folded from them. In a SQLite file the pages of each
+table and index are counted (`dbstat`), on PostgreSQL the blocks (`pg_relation_size`). The tables of an empty memory are
+subtracted. The script prints one JSON line: for each database and side bytes a node, for ours also by log and tables,
+rows and indexes apart, and for each table and index that takes at least one byte a node.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import shutil
+import tempfile
+from collections.abc import Callable
+from contextlib import ExitStack
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from bench.material.rollouts import Tree, tree
+from bench.material.spool_recording import spool_tree
+from bench.reporting.figures import MISSING
+from bench.thesis import run_baseline, store_by_us
+from tests.databases import ask, server_in
+
+_SEED = 69
+_PAGES = "SELECT name, sum(pgsize) FROM dbstat GROUP BY name"
+_BLOCKS = """
+SELECT relname, pg_relation_size(pg_class.oid) FROM pg_class JOIN pg_namespace ON pg_namespace.oid = relnamespace
+WHERE relkind IN ('r', 'i', 't') AND nspname NOT IN ('pg_catalog', 'information_schema', 'pg_toast')"""
+_LOG = re.compile(r"(sqlite_autoindex_)?(event|episode)(_|$)")
+_INDEX = re.compile(r"_by_|_pkey$|_key$|^sqlite_autoindex_")
+
+
+def sizes(url: str) -> dict[str, int]:
+    """Return the bytes of each table and index of a database."""
+    return {name: int(size) for name, size in ask(url, _BLOCKS if url.startswith("postgresql:") else _PAGES)}
+
+
+def by_part(sizes_by_name: dict[str, int], nodes: int) -> dict[str, Any]:
+    """Return bytes a node: of everything, of log and tables with their indexes, and of each table and index."""
+    parts = {"log": 0, "log, indexes": 0, "tables": 0, "tables, indexes": 0}
+    for name, size in sizes_by_name.items():
+        of_log = "log" if _LOG.match(name) else "tables"
+        parts[f"{of_log}, indexes" if _INDEX.search(name) else of_log] += size
+    each = {name: round(size / nodes, 1) for name, size in sizes_by_name.items() if size >= nodes}
+    return {
+        "bytes_a_node": round(sum(sizes_by_name.values()) / nodes),
+        **{name: round(size / nodes) for name, size in parts.items()},
+        "each": dict(sorted(each.items(), key=lambda item: -item[1])),
+    }
+
+
+def measure(new_url: Callable[[str], str], task_tree: Tree, folder: Path, *, with_baseline: bool) -> dict[str, Any]:
+    """Store the tree with both sides and return their bytes a node."""
+    sizes_by_name: list[dict[str, int]] = []
+    for name, each in (("empty", Tree([], 1)), ("ours", task_tree)):
+        spool = folder / name
+        recorded = folder / f"{name}.recorded"
+        events = spool_tree(each, recorded)
+        url = new_url(name)
+        store_by_us(url, recorded, spool, events)
+        sizes_by_name.append(sizes(url))
+    empty, stored = sizes_by_name
+    ours = by_part({name: size - empty.get(name, 0) for name, size in stored.items()}, task_tree.nodes)
+    result = {"ours": ours, "thesis_bytes_a_node": MISSING}
+    if with_baseline:
+        url = new_url("thesis")
+        run_baseline(url, task_tree.nodes, _SEED)
+        result["thesis_bytes_a_node"] = round(sum(sizes(url).values()) / task_tree.nodes)
+    return result
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="300 nodes")
+    parser.add_argument("--nodes", type=int, default=30_000)
+    arguments = parser.parse_args()
+    task_tree = tree(300 if arguments.quick else arguments.nodes, _SEED)
+    result: dict[str, Any] = {"bench": "size", "nodes": task_tree.nodes}
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="b")))
+        files = folder / "sqlite"
+        files.mkdir()
+        result["sqlite"] = measure(lambda name: f"sqlite:///{files}/{name}.db", task_tree, files, with_baseline=True)
+        shutil.rmtree(files)
+        server = stack.enter_context(server_in(folder / "pg"))
+        servers = folder / "postgresql"
+        servers.mkdir()
+        has_driver = find_spec("psycopg") is not None
+        result["postgresql"] = measure(
+            lambda _name: server.new_database(), task_tree, servers, with_baseline=has_driver
+        )
+    print(json.dumps(result))
+
+
+if __name__ == "__main__":
+    main()
