@@ -149,16 +149,11 @@ class EventLog:
         with self.translated():
             await self.blobs.store_for(records)  # again, because the log may have lost them since
             appending = Appending(self._dialect, records, basis, self.digests)
-            try:
-                if self._write_turn is not None and len(records) >= _MANY_EVENTS:
-                    async with self.reading() as connection:
-                        await appending.prepare(connection)
-                async with self.writing() as connection:
-                    stored = await appending.write(connection)
-            except BaseException:
-                if self.digests is not None:
-                    self.digests.forget()
-                raise
+            if self._write_turn is not None and len(records) >= _MANY_EVENTS:
+                async with self.reading() as connection:
+                    await appending.prepare(connection)
+            async with self.writing() as connection:
+                stored = await appending.write(connection)
             if self.digests is not None and appending.extension is not None:
                 self.digests.keep(appending.extension)
         for what, warning in appending.warnings.items():

@@ -76,20 +76,20 @@ class RunningDigests:
 
     async def insert(self, connection: AsyncConnection, extension: Extension) -> None:
         """Insert the digests in the transaction that appends the events."""
-        if extension.rows:
-            rows = msgspec.json.encode(extension.rows).decode()
+        if not extension.rows:
+            return
+        rows = msgspec.json.encode(extension.rows).decode()
+        try:
             await connection.exec_driver_sql(self._dialect.digest_statements.insert, (rows,))
+        except BaseException:
+            self._insertable = None  # a database that was restored meanwhile may lack the table
+            raise
 
     def keep(self, extension: Extension) -> None:
         """Keep the running digests of an append that was committed."""
         self._running |= extension.running
         while len(self._running) > _EPISODES_MAX:
             del self._running[next(iter(self._running))]
-
-    def forget(self) -> None:
-        """Compute the running digests again after a failed append: the database may have been restored meanwhile."""
-        self._insertable = None
-        self._running.clear()
 
     async def _at_head(self, connection: AsyncConnection, row: EpisodeRow) -> RunningDigest | None:
         """Return a running digest at the episode's head, to be changed by the caller; None if it cannot continue."""
