@@ -120,11 +120,21 @@ def test_sliding_and_endless_joints_below_another_one_are_solved_where_that_one_
 
 
 def test_a_description_that_does_not_fit_the_model_is_refused_by_name() -> None:
-    for base, tool, named in (("", "hand", "'hand'"), ("no_link", "tool_frame", "'no_link'")):
+    for base, tool, named in (
+        ("", "hand", "'hand'"),
+        ("no_link", "tool_frame", "'no_link'"),
+        ("tool_frame", "camera_link", "does not hang on"),
+        ("column_link", "elbow_link", "but its description has arm_yaw_joint: correct it"),
+    ):
         wrong = ArmDescription(joints=("arm_yaw_joint",), base_link=base, tool_frame=tool)
         unfit = RobotDescription(name="unfit", urdf=courier_urdf(), arms={Arms.LEFT: wrong})
         with BulletWorld(), pytest.raises(CallerError, match=named):
             solve(Object("unfit", ObjectType.ROBOT, robot=unfit), Arms.LEFT, Pose([0.6, 0, 0.8]))
+
+
+def test_an_arm_without_a_joint_is_refused() -> None:
+    with pytest.raises(CallerError, match="'tool_frame' has none"):
+        ArmDescription(joints=(), tool_frame="tool_frame")
 
 
 def test_the_general_solver_reaches_what_the_closed_form_reaches() -> None:

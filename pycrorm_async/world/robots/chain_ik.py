@@ -4,7 +4,8 @@
 distance between the tool and the target from up to `STARTS_MAX` starts; here only the chain is prepared for it, and its
 answer is checked by its caller. One thread and a fixed order of starts make the answer the same for the same arguments.
 The library ends the process when a joint of the chain is prismatic, so such chains are solved here, by damped least
-squares, ten times as slowly.
+squares, which is slower and refuses more: of 100 reachable poses of a TIAGo whose torso counts as a joint of its arm it
+refused 8, in 0.15 s each. A torso that is the description's `torso_joint` belongs to no arm.
 
 Of 2,000 random reachable poses it refused none, for the arm of a Panda and for that of a TIAGo (with 20 starts 1 and
 2), in 0.3 ms each; a refusal takes some 10 ms. Bullet's solver, with 10 starts, reached two thirds of the Panda's poses

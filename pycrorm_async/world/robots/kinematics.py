@@ -176,12 +176,19 @@ def chain_of(robot: Object, arm: Arms) -> Chain:
     if chain is None:
         assert robot.robot_description is not None
         described = robot.robot_description.arms[arm]
-        robot.chains[arm] = chain = Chain(
+        chain = Chain(
             robot.description_text,
             base_link=described.base_link,
             tool_link=described.tool_frame,
             tool_in_link=described.tool_in_link,
         )
+        if chain.joints != described.joints:
+            between = f"between {described.base_link or 'the root link'!r} and {described.tool_frame!r}"
+            raise CallerError(
+                f"the joints of {robot.name!r} {between} are {', '.join(chain.joints) or 'none'}, but its description"
+                f" has {', '.join(described.joints) or 'none'}: correct it, or use describe_arm"
+            )
+        robot.chains[arm] = chain
     return chain
 
 

@@ -18,6 +18,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
 
+from pycrorm_async.errors import CallerError
 from pycrorm_async.world.enums import Arms, Grasp, GripperState
 from pycrorm_async.world.pose import Pose, Quaternion, Vector
 
@@ -91,6 +92,10 @@ class ArmDescription:
     """Distance between the fingers of the open gripper; they close along y of the tool frame. None: not known."""
     park: Mapping[str, float] = field(default_factory=dict)
     """Posture with the arm folded; empty if there is none. Continuous joints may be several turns from zero."""
+
+    def __post_init__(self) -> None:
+        if not self.joints:
+            raise CallerError(f"an arm needs a joint, but the one with the tool {self.tool_frame!r} has none")
 
     def limits(self, limits: Limits) -> Mapping[str, Bounds]:
         """Return the described range of each joint by name."""
