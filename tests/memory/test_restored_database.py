@@ -8,12 +8,13 @@ import shutil
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, replace
+from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from pycrorm_async import Memory, Settings, recover
+from pycrorm_async import Blob, Memory, Settings, recover
 from pycrorm_async.plan import ActionAbstract
 from pycrorm_async.projections.verify.verify import verify
 from pycrorm_async.queue import Spool
@@ -122,6 +123,28 @@ async def test_a_plan_that_continues_stores_again_all_that_was_flushed(
         assert await texts(memory) == ["before", "a", "b"]
         assert ask(database_url, "SELECT number FROM late_action ORDER BY id") == [(1,), (2,)]
     assert await is_clean(database_url)
+
+
+async def test_lost_blobs_are_stored_again_with_the_events_that_refer_to_them(
+    database_url: str, spool: Path, take_backup: TakeBackup
+) -> None:
+    kept, still_held = sha256(b"ended").hexdigest(), sha256(b"running").hexdigest()
+    async with memory_at(database_url, spool) as memory:
+        await note(memory, "before")
+        await memory.flush()
+    backup = take_backup()
+    async with memory_at(database_url, spool) as memory, memory.episode(description="seen"):
+        memory.observe("camera", Blob(b"ended", "image/png"))
+    async with memory_at(database_url, spool) as memory, memory.episode(description="seen"):
+        memory.observe("camera", Blob(b"running", "image/png"))
+        await memory.flush()
+        backup.restore()
+        await memory.flush()
+        assert await memory.blob(kept) == Blob(b"ended", "image/png")
+        assert await memory.blob(still_held) == Blob(b"running", "image/png")
+    log = await EventLog.open(DatabaseAddress.parse(database_url), create=False)
+    assert (await verify(log)).damage == 0
+    await log.close()
 
 
 async def test_lost_episodes_get_their_own_numbers_and_new_ones_get_others(
