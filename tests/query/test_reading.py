@@ -249,9 +249,8 @@ def synchronous(address: DatabaseAddress) -> Iterator[Engine]:
         engine.dispose()
 
 
+@pytest.mark.parametrize("module_database_url", ["sqlite"], indirect=True)  # PostgreSQL's drivers here are async
 async def test_objects_have_members_also_in_a_synchronous_session(recorded: DatabaseAddress) -> None:
-    if not str(recorded).startswith("sqlite"):
-        pytest.skip("no synchronous driver for PostgreSQL is installed")
     with synchronous(recorded) as engine, Session(engine) as session:
         (picked, _) = session.scalars(select(PickUpAction).order_by(PickUpAction.id))
         assert (picked.arm, picked.grasp, picked.status) == (Arms.LEFT, Grasp.TOP, TaskStatus.FAILED)

@@ -284,7 +284,7 @@ _INCLUDES = {("task_tree_node", "dtype"): ("id", "robot_pose_id", "torso_height"
 """Columns stored in PostgreSQL's index without being part of its key. An index-only scan saves reading a page for each
 node, so the learning query over 50,000 pick-ups takes some 70 ms instead of 100."""
 
-_EXPECTED = {"process_metadata": 1_000, "episode_tagging": 1_000, "simulated_episode": 100}
+_EXPECTED = {"process_metadata": 1_000, "simulated_episode": 100}
 _EXPECTED_CORE, _EXPECTED_LEAF = 1_000_000, 50_000
 _ALIKE = {
     "process_metadata_id": [1_000],
