@@ -86,8 +86,12 @@ async def test_the_same_episodes_under_other_numbers_on_another_kind_of_database
     assert logs_of(file) == logs_of(other)
     assert declarations_of(file) == declarations_of(other)
     identity = "00000000-0000-7000-8000-000000000001"
-    assert tables["counting_action"][((identity, 6, 0),)] == {"robot_id": 2**31 * 9, "milk_id": (identity, 2, 0)}
-    assert tables["navigate_action"][((identity, 4, 0),)] == {"target_location_id": (identity, 4, 2)}
+    assert tables["counting_action"][((identity, 6, 0),)] == {
+        "process_metadata_id": identity, "robot_id": 2**31 * 9, "milk_id": (identity, 2, 0)
+    }  # fmt: skip
+    assert tables["navigate_action"][((identity, 4, 0),)] == {
+        "process_metadata_id": identity, "target_location_id": (identity, 4, 2)
+    }  # fmt: skip
     assert tables["joint_change"][((identity, 2 + 8, 0), "b")]["position"] == -0.25
     assert tables["process_metadata"][(identity,)]["description"] == "e1"
     assert {len(rows) for rows in tables.values()} == {5, 10, 20}

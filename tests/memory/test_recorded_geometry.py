@@ -8,7 +8,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import tarfile
 from collections.abc import Callable
 from importlib.metadata import distribution
 from pathlib import Path
@@ -27,9 +26,9 @@ from pycrorm_async.settings import Settings
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose, copied
 from pycrorm_async.world.robots.robot_description import PR2
 from tests.commands import environment
+from tests.golden.unpacking import unpack_memory_v1
 
 ROBOTS = "cmeel.prefix/share/example-robot-data/robots"
-GOLDEN = Path(__file__).parent.parent / "golden" / "memory_v1.tar.gz"
 AT = Pose([1, -2, 0.5], [0, 0, 0.6, 0.8])
 RED = (1.0, 0.0, 0.0, 0.5)
 
@@ -258,9 +257,7 @@ async def test_a_robot_under_another_name_keeps_its_description(database_url: st
 
 
 async def test_objects_of_an_older_version_have_assumed_shapes_and_say_so(tmp_path: Path) -> None:
-    with tarfile.open(GOLDEN) as packed:
-        packed.extractall(tmp_path, filter="data")
-    url = f"sqlite:///{tmp_path}/memory.db"
+    url = unpack_memory_v1(tmp_path)
     await rebuild_memory(url)
     async with Reading.open(url) as reading:
         then = await reading.as_of("1", sequence=4)

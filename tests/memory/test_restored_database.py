@@ -168,7 +168,7 @@ async def test_lost_episodes_get_their_own_numbers_and_new_ones_get_others(
     after = everything(database_url)
     assert [row for row in after[0] if row in stored[0]] == stored[0]
     assert [row for row in after[2] if row in stored[2]] == stored[2]
-    numbers = [number for _, number, *_ in after[0]]
+    numbers = sorted(number for _, number, *_ in after[0])  # two ids of one millisecond have any order
     assert numbers[:3] == [1, 2, 3]
     reserve = 4_096 if database_url.startswith("postgresql") else 0  # for episodes that other spools had stored there
     assert numbers[3] > 3 + reserve

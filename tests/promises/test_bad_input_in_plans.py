@@ -280,13 +280,14 @@ async def test_an_unreachable_pose_is_recorded_with_the_pose_and_the_arm(tmp_pat
     for node in failed:
         assert node.reason == "IKError"
         assert node.failure_arguments is not None
-        pose, arm, tip, why = node.failure_arguments
+        pose, arm, tip, why, milk = node.failure_arguments
         # 0.1 m before the milk along the gripper, which points along x of the map, turned to point down
         assert pose["position"] == pytest.approx([8.9, 9, 1])
         assert pose["orientation"] == pytest.approx([0, 0.5**0.5, 0, 0.5**0.5])
-        assert (arm, tip) == ("RIGHT", "r_gripper_tool_frame")
+        assert (arm, tip, milk) == ("RIGHT", "r_gripper_tool_frame", "milk")
         assert why
-        assert node.failure_message == f"{tip} cannot reach (8.900, 9.000, 1.000) with the RIGHT arm: {why}"
+        reach = f"{tip} cannot reach (8.900, 9.000, 1.000) with the RIGHT arm: {why}"
+        assert node.failure_message == f"{reach}, reaching for milk"
 
 
 async def test_an_uncaught_failure_is_recorded_up_to_the_episode(tmp_path: Path) -> None:

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import tarfile
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -33,20 +32,17 @@ from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.schema import Birth, make_or_migrate
 from pycrorm_async.world import Arms
 from tests.databases import ask, ask_to_change
+from tests.golden.unpacking import unpack_memory_v1
 from tests.store.factories import declaration, episode, run_of
 from tests.table_comparison import differences, tables_of
 
 pytestmark = pytest.mark.slow
 
-GOLDEN = Path(__file__).parent.parent / "golden" / "memory_v1.tar.gz"
-
 
 @pytest.fixture
 def as_written(tmp_path: Path) -> str:
     """The URL of the golden memory, with the spool of a dead recorder beside it."""
-    with tarfile.open(GOLDEN) as packed:
-        packed.extractall(tmp_path, filter="data")
-    return f"sqlite:///{tmp_path}/memory.db"
+    return unpack_memory_v1(tmp_path)
 
 
 @pytest.fixture

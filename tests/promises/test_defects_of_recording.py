@@ -196,7 +196,8 @@ async def test_a_failure_keeps_its_message_and_its_arguments(tmp_path: Path) -> 
         assert node.failure_message.startswith(
             "l_gripper_tool_frame cannot reach (1.200, 1.000, 0.900) with the LEFT arm"
         )
-        assert node.failure_arguments == [written(goal), "LEFT", "l_gripper_tool_frame", caught.value.reason]
+        assert node.failure_message.endswith(", reaching for milk")
+        assert node.failure_arguments == [written(goal), "LEFT", "l_gripper_tool_frame", caught.value.reason, "milk"]
 
 
 async def test_every_class_of_failure_can_be_raised_and_is_recorded(tmp_path: Path) -> None:
