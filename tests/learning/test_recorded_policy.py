@@ -41,6 +41,7 @@ async def test_a_policy_that_is_not_recorded_is_named(database_url: str, tmp_pat
 
 
 @pytest.mark.slow
+@pytest.mark.soak_on("postgresql")
 async def test_the_rollouts_of_an_experiment_lead_to_their_policy_and_its_training_episodes(
     database_url: str, tmp_path: Path
 ) -> None:

@@ -110,6 +110,7 @@ class Successes:
 
 
 @pytest.mark.slow
+@pytest.mark.soak_on(1, 2, 3)
 @pytest.mark.parametrize("part", range(4))
 async def test_no_offered_place_is_in_collision_in_two_hundred_table_scenes(part: int) -> None:
     offering = dict.fromkeys(("costmap", "seeing", "experience", "policy", "surface"), 0)

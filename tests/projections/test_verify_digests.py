@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import subprocess
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 
 import pytest
@@ -15,8 +15,9 @@ from pycrorm_async.projections.verify.digest_check import OutsideDigest
 from pycrorm_async.projections.verify.verify import VerifyResult, verify
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
+from tests.backups import Backup
 from tests.commands import COMMAND, answer, one_line_of, pycrorm
-from tests.databases import ask, ask_to_change
+from tests.databases import ask, ask_to_change, run_in_own_loop
 from tests.projections.test_verify_damage import unlock
 from tests.projections.verify_cases import fold_in_batches, full, in_parts, opened
 
@@ -26,14 +27,34 @@ KEPT = "SELECT id, sequence, digest FROM pycrorm_digest JOIN episode ON number =
 ID = "00000000-0000-7000-8000-00000000000{}"
 
 
-@pytest.fixture
-async def log(database_url: str) -> AsyncIterator[EventLog]:
-    """Open for reading a log of three episodes, of which the second has several blocks, that can be changed."""
-    log = await opened(database_url)
+async def fill(url: str) -> None:
+    """Store and fold three episodes, of which the second has several blocks, and allow changes of the log."""
+    log = await opened(url)
     await fold_in_batches(log, [full(1), full(2, rounds=40), full(3)], 10_000)
     await log.close()
-    unlock(database_url)
-    reader = await EventLog.open(DatabaseAddress.parse(database_url), create=False)
+    unlock(url)
+
+
+@pytest.fixture(scope="module")
+def prepared(request: pytest.FixtureRequest, module_database_url: str) -> Iterator[Backup]:
+    run_in_own_loop(fill(module_database_url))
+    on_server = module_database_url.startswith("postgresql")
+    backup = Backup(module_database_url, request.getfixturevalue("server") if on_server else None)
+    yield backup
+    backup.drop()
+
+
+@pytest.fixture
+def filled_url(prepared: Backup, module_database_url: str) -> str:
+    """The URL of the three episodes as they were stored."""
+    prepared.restore()
+    return module_database_url
+
+
+@pytest.fixture
+async def log(filled_url: str) -> AsyncIterator[EventLog]:
+    """The log of the three episodes, open for reading."""
+    reader = await EventLog.open(DatabaseAddress.parse(filled_url), create=False)
     yield reader
     await reader.close()
 
@@ -43,7 +64,7 @@ async def findings(log: EventLog, digests: tuple[OutsideDigest, ...], monkeypatc
     result = await verify(log, digests=digests)
     lines = [str(each) for each in result.damages]
     if not digests:
-        for size in (6, 256, 300):
+        for size in (50, 256, 300):
             assert sorted(str(each) for each in (await in_parts(log, size, monkeypatch)).damages) == sorted(lines)
     return lines
 
@@ -106,11 +127,11 @@ CHANGED = "or their digest, was changed after it was stored: the digest does not
     ],
 )
 async def test_each_change_of_the_log_is_found_and_named_in_one_line(
-    log: EventLog, database_url: str, changes: list[str], lines: list[str], monkeypatch: pytest.MonkeyPatch
+    log: EventLog, filled_url: str, changes: list[str], lines: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    head = ask(database_url, "SELECT head FROM episode WHERE number = 2")[0][0]
+    head = ask(filled_url, "SELECT head FROM episode WHERE number = 2")[0][0]
     for change in changes:
-        ask_to_change(database_url, change.format(last=head))
+        ask_to_change(filled_url, change.format(last=head))
     assert await findings(log, (), monkeypatch) == [each.format(last=head) for each in lines]
 
 
@@ -129,23 +150,23 @@ async def test_each_change_of_the_log_is_found_and_named_in_one_line(
     ],
 )
 async def test_digests_kept_elsewhere_find_what_was_deleted_with_its_digests(
-    log: EventLog, database_url: str, changes: list[str], line: str, monkeypatch: pytest.MonkeyPatch
+    log: EventLog, filled_url: str, changes: list[str], line: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    digests, head = await digests_of(log), ask(database_url, "SELECT head FROM episode WHERE number = 2")[0][0]
+    digests, head = await digests_of(log), ask(filled_url, "SELECT head FROM episode WHERE number = 2")[0][0]
     assert await findings(log, digests, monkeypatch) == []
     for change in (*changes, "DELETE FROM pycrorm_digest"):
-        ask_to_change(database_url, change)
+        ask_to_change(filled_url, change)
     assert line.format(id=ID.format(3), last=head) in "\n".join(await findings(log, digests, monkeypatch))
 
 
 async def test_new_digests_over_changed_events_differ_from_those_kept_elsewhere(
-    log: EventLog, database_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    log: EventLog, filled_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     digests = await digests_of(log)
-    ask_to_change(database_url, "UPDATE event SET wall_ns = wall_ns + 1 WHERE episode = 3 AND sequence = 2")
-    ask_to_change(database_url, "DELETE FROM pycrorm_digest")
+    ask_to_change(filled_url, "UPDATE event SET wall_ns = wall_ns + 1 WHERE episode = 3 AND sequence = 2")
+    ask_to_change(filled_url, "DELETE FROM pycrorm_digest")
     forged = f"sqlite:///{tmp_path}/forged.db"
-    await copy_episodes(database_url, forged)
+    await copy_episodes(filled_url, forged)
     other = await EventLog.open(DatabaseAddress.parse(forged), create=False)
     assert (await verify(other)).damage == 0
     lines = await findings(other, digests, monkeypatch)
@@ -155,13 +176,13 @@ async def test_new_digests_over_changed_events_differ_from_those_kept_elsewhere(
 
 
 async def test_a_copy_has_the_same_digests_and_gives_them_to_episodes_without(
-    log: EventLog, database_url: str, tmp_path: Path
+    log: EventLog, filled_url: str, tmp_path: Path
 ) -> None:
-    before = ask(database_url, KEPT)
-    ask_to_change(database_url, "DELETE FROM pycrorm_digest WHERE episode < 3")
+    before = ask(filled_url, KEPT)
+    ask_to_change(filled_url, "DELETE FROM pycrorm_digest WHERE episode < 3")
     assert (await verify(log)).without_digest == 2
     copied = f"sqlite:///{tmp_path}/copy.db"
-    await copy_episodes(database_url, copied)
+    await copy_episodes(filled_url, copied)
     assert [tuple(each) for each in ask(copied, KEPT)] == [tuple(each) for each in before]
 
 
@@ -181,19 +202,17 @@ async def test_an_episode_that_is_being_recorded_is_covered_up_to_its_last_block
     await log.close()
 
 
-async def test_the_command_compares_with_a_document_of_digests(
-    log: EventLog, database_url: str, tmp_path: Path
-) -> None:
-    url = ("--url", database_url)
+async def test_the_command_compares_with_a_document_of_digests(log: EventLog, filled_url: str, tmp_path: Path) -> None:
+    url = ("--url", filled_url)
     document = answer("episodes", "--simulated", *url, cwd=tmp_path)
-    heads = dict(tuple(each) for each in ask(database_url, "SELECT number, head FROM episode"))
+    heads = dict(tuple(each) for each in ask(filled_url, "SELECT number, head FROM episode"))
     assert [(each["number"], each["digest_sequence"]) for each in document] == sorted(heads.items())
     assert {each["id"]: each["digest"] for each in document} == {each.id: each.digest for each in await digests_of(log)}
     file = tmp_path / "digests.json"
     file.write_text(json.dumps(document))
     assert pycrorm("verify", "--digests", str(file), *url, cwd=tmp_path).returncode == 0
     for table, column in (("event", "episode"), ("episode", "number"), ("pycrorm_digest", "episode")):
-        ask_to_change(database_url, f"DELETE FROM {table} WHERE {column} = 3")
+        ask_to_change(filled_url, f"DELETE FROM {table} WHERE {column} = 3")
     line = f"damage: episode {ID.format(3)} is missing: a digest at event 20 is given"
     done = pycrorm("verify", "--digests", str(file), *url, cwd=tmp_path)
     assert (done.returncode, done.stdout.splitlines()[0]) == (4, line)
