@@ -22,8 +22,8 @@ no other episode has it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any, Final, NamedTuple
 
 from sqlalchemy.ext.asyncio import AsyncConnection
 
@@ -45,6 +45,10 @@ from pycrorm_async.store.limits import warnings_of
 from pycrorm_async.store.stored import NOTHING_KNOWN, Basis, EpisodeRow, Stored, StoredEvent
 
 __all__ = ["Appending"]
+
+_PART_EVENTS: Final = 1_024
+"""Bounds the events whose digests and rows are computed at once. PostgreSQL stores the rows of one part while those of
+the next are computed."""
 
 
 class _Plan(NamedTuple):
@@ -117,11 +121,10 @@ class Appending:
 
     async def _make_plan(self, connection: AsyncConnection, known_rows: Mapping[EpisodeId, EpisodeRow]) -> _Plan:
         steps = {each: step(self._batch.episodes[each], row) for each, row in known_rows.items()}
-        digests: Extension | None = None
-        if self._digests is not None:
-            digests = await self._digests.extend(connection, ((known_rows[each], steps[each]) for each in steps))
-        rows = [row for each in steps.values() for row in _rows(each)]
-        return _Plan(known_rows, steps, await self._dialect.event_insertion(rows), digests)
+        extending = [known_rows[each] for each, change in steps.items() if change.fresh]
+        digests = None if self._digests is None else await self._digests.begin(connection, extending)
+        insertion = await self._dialect.event_insertion(_rows(steps.values(), digests))
+        return _Plan(known_rows, steps, insertion, digests)
 
     async def _read_rows(self, connection: AsyncConnection) -> dict[EpisodeId, EpisodeRow]:
         """Read the rows of the batch's episodes, without `folded` and `parked`, which folding changes meanwhile."""
@@ -162,12 +165,29 @@ class Appending:
         return numbers
 
 
-def _rows(change: EpisodeStep) -> list[tuple[Any, ...]]:
-    number = change.after.number
-    return [
-        (number, sequence, type_name, version, wall_ns, monotonic_ns, payload.decode())
-        for _, _, sequence, type_name, version, wall_ns, monotonic_ns, payload in change.fresh
-    ]
+def _rows(steps: Iterable[EpisodeStep], digests: Extension | None) -> Iterator[tuple[Any, ...]]:
+    """Yield the rows of the new events, and add these to the digests."""
+    for each in steps:
+        number = each.after.number
+        for part, last in _parts(each):
+            if digests is not None:
+                digests.add(number, part, last=last)
+            yield from [
+                (number, sequence, type_name, version, wall_ns, monotonic_ns, payload.decode())
+                for _, _, sequence, type_name, version, wall_ns, monotonic_ns, payload in part
+            ]
+
+
+def _parts(change: EpisodeStep) -> Iterator[tuple[Sequence[Record], bool]]:
+    """Split an episode's new events; yield of each part whether it is the episode's end, or a tag behind the end."""
+    events = change.fresh
+    last = len(events)
+    if change.after.ended_wall_ns is not None:
+        last = next((at for at in reversed(range(last)) if events[at].type == "EpisodeEnded"), 0)
+    for start in range(0, last, _PART_EVENTS):
+        yield events[start : min(start + _PART_EVENTS, last)], False
+    for at in range(last, len(events)):
+        yield events[at : at + 1], True
 
 
 def _has_unstored(batch: SortedBatch, episode: EpisodeId, change: EpisodeStep) -> bool:

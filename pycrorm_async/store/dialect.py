@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
@@ -162,8 +162,11 @@ class Dialect(Protocol):
         """Return the number of machines that hold an event when its COMMIT returns."""
         ...
 
-    async def event_insertion(self, rows: Sequence[tuple[Any, ...]]) -> Insertion:
-        """Prepare the insertion of these events. A row has the fields of a `StoredEvent`, with the payload as text."""
+    async def event_insertion(self, rows: Iterator[tuple[Any, ...]]) -> Insertion:
+        """Prepare the insertion of these events. A row has the fields of a `StoredEvent`, with the payload as text.
+
+        The rows are read now, or once while they are inserted.
+        """
         ...
 
     async def insert_events(self, connection: AsyncConnection, insertion: Insertion) -> None: ...

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from pycrorm_async.events.codec import encode
+from pycrorm_async.events.types import EpisodeTagged
 from pycrorm_async.operations.copy import copy_episodes
 from pycrorm_async.projections.verify.digest_check import OutsideDigest
 from pycrorm_async.projections.verify.verify import VerifyResult, verify
@@ -199,6 +201,29 @@ async def test_an_episode_that_is_being_recorded_is_covered_up_to_its_last_block
     await log.append(records[-30:])
     ask_to_change(database_url, "UPDATE event SET wall_ns = wall_ns + 1 WHERE sequence = 521")
     assert (await verify(log)).damage == 1
+    await log.close()
+
+
+@pytest.mark.parametrize(
+    ("change", "finding"),
+    [
+        ("UPDATE event SET payload = replace(payload, 'seen', 'lost') WHERE sequence = 21", CHANGED),
+        ("UPDATE event SET wall_ns = wall_ns + 1 WHERE sequence = 21", CHANGED),
+        ("DELETE FROM pycrorm_digest WHERE sequence = 21", "its digest is missing"),
+    ],
+)
+async def test_a_tag_behind_the_end_is_covered(database_url: str, change: str, finding: str) -> None:
+    log = await opened(database_url)
+    script = full(1)
+    await fold_in_batches(log, [script], 10_000)
+    last = script.records[-1]
+    tag = last._replace(sequence=last.sequence + 1, type="EpisodeTagged", payload=encode(EpisodeTagged(("seen",))))
+    await log.append([tag])
+    assert tag.sequence == 21
+    assert (await verify(log)).damage == 0
+    unlock(database_url)
+    ask_to_change(database_url, change)
+    assert [finding in str(each) for each in (await verify(log)).damages] == [True]
     await log.close()
 
 

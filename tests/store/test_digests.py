@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from hashlib import blake2b
+from hashlib import sha256
 
 import msgspec
 import pytest
@@ -26,15 +26,16 @@ def whole(of: EpisodeId, last: int) -> list[Record]:
 
 def expected(of: EpisodeId, records: list[Record]) -> list[tuple[int, str]]:
     """Compute the kept digests of a whole episode by the definition, event by event."""
-    before, rows = bytes(of), []
-    hasher = blake2b(before, digest_size=32, person=b"pycrorm episode")
+    hasher, rows = sha256(b"pycrorm episode\0" + of), []
+    ended = False
     for each in records:
         fields = (each.sequence, each.type, each.version, each.wall_ns, each.monotonic_ns, each.payload)
         hasher.update(msgspec.msgpack.encode(fields))
-        if each.sequence % 256 == 0 or each is records[-1]:
+        ended = ended or each.type == "EpisodeEnded"
+        if each.sequence % 256 == 0 or ended:
             rows.append((each.sequence, hasher.hexdigest()))
         if each.sequence % 256 == 0:
-            hasher = blake2b(hasher.digest(), digest_size=32, person=b"pycrorm episode")
+            hasher = sha256(b"pycrorm episode\0" + hasher.digest())
     return rows
 
 
@@ -48,10 +49,22 @@ async def test_a_digest_is_kept_at_the_end_of_each_block_and_of_the_episode(log:
     assert {number: each.sequence for number, each in (await log.last_digests()).items()} == {1: 600, 2: 512, 3: 256}
 
 
+@pytest.mark.parametrize("size", [1, 299, 300, 301, 400])
+async def test_each_tag_behind_the_end_has_a_digest(log: EventLog, database_url: str, size: int) -> None:
+    tagged = [record(episode(1), at, kind="EpisodeTagged", payload=b'{"added":["a"]}') for at in (7, 301, 302)]
+    records = [*whole(episode(1), 300), *tagged[1:]]
+    records[6] = tagged[0]
+    for start in range(0, len(records), size):
+        await log.append(records[start : start + size])
+    rows = [tuple(row[1:]) for row in ask(database_url, KEPT)]
+    assert rows == expected(episode(1), records)
+    assert [sequence for sequence, _ in rows] == [256, 300, 301, 302]
+
+
 def test_the_digest_of_three_events_stays_the_same_for_ever() -> None:
     running = RunningDigest.at_start(episode(1))
     assert running.add(whole(episode(1), 3)) == []
-    assert running.digest() == "d0221755ecdd29b75baa8d227b83a480d80d05ccaa617d8544a398aebe55c365"
+    assert running.digest() == "52cdb8b7daa97644e61fa44ff601794f91ce08079c2006577120d2961acbe0a3"
 
 
 @pytest.mark.parametrize("size", [1, 7, 255, 256, 257, 599])

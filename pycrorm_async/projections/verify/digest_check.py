@@ -51,6 +51,8 @@ class DigestCheck:
         self._number = episode.number
         self._result = result
         self._running: RunningDigest | None = RunningDigest.at_start(parse_episode_id(episode.id))
+        tags = () if episode.ended_wall_ns is None else ("EpisodeTagged",)  # behind the end each has a digest
+        self._last_types = ("EpisodeEnded", *tags)
         self._has_digest = False
         self._missing: int | None = None
 
@@ -78,7 +80,7 @@ class DigestCheck:
                 self._has_digest = True
                 if digest not in (None, kept[end]) and block not in damaged_blocks:
                     self._report(block * BLOCK_EVENTS + 1, end)
-            elif end % BLOCK_EVENTS == 0 or (end == head and last is not None and last.type == "EpisodeEnded"):
+            elif end % BLOCK_EVENTS == 0 or (end == head and last is not None and last.type in self._last_types):
                 self._missing = self._missing or end
             if end % BLOCK_EVENTS == 0 and end in kept:
                 self._running = _behind(kept[end], end)

@@ -1,11 +1,11 @@
 """Keep the digests of episodes in the table `pycrorm_digest`, in the transactions that append their events.
 
 Theory of operation. `RunningDigests` keeps a running digest for each episode that this process appends to. An append
-copies it, adds its new events, inserts the digests of completed blocks in the same transaction, and replaces the
-running digest by the copy after the commit. A running digest counts only if it is at the head that the transaction
-sees under its lock; otherwise, as after a restart or when another process has appended, it is computed again from the
-kept digest before the current block and the block's events in the log. So a process that restarts takes over the events
-of an incomplete block as the log holds them.
+copies it into an `Extension`, adds the events while their rows are made, inserts the digests of completed blocks in the
+same transaction, and replaces the running digest by the copy after the commit. A running digest counts only if it is at
+the head that the transaction sees under its lock; otherwise, as after a restart or when another process has appended,
+it is computed again from the kept digest before the current block and the block's events in the log. So a process that
+restarts takes over the events of an incomplete block as the log holds them.
 
 The table only grows: a digest is inserted once and never changed, like an event. It is no part of the log's format:
 older programs still use the log, and the episodes that they append get no digests. If the digest before the current
@@ -16,14 +16,14 @@ owner has not run `GRANTS` again, appends without them.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Final, NamedTuple
+from typing import Final
 
 import msgspec
 from sqlalchemy import text
 from sqlalchemy.ext.asyncio import AsyncConnection
 
+from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import parse_episode_id
-from pycrorm_async.store.append_rules import EpisodeStep
 from pycrorm_async.store.dialect import Dialect
 from pycrorm_async.store.digests.episode_digest import BLOCK_EVENTS, DigestRow, RunningDigest
 from pycrorm_async.store.stored import EpisodeRow
@@ -40,11 +40,21 @@ FROM (SELECT episode, max(sequence) AS sequence FROM pycrorm_digest GROUP BY epi
 JOIN pycrorm_digest USING (episode, sequence)""")
 
 
-class Extension(NamedTuple):
-    """The digests that an append inserts, and by number the running digests after it; None: it gets no digests."""
+class Extension:
+    """The digests after an append: rows to insert, and running digests by number; None: the episode gets no digests."""
 
-    rows: Sequence[DigestRow]
-    running: Mapping[int, RunningDigest | None]
+    def __init__(self, running: Mapping[int, RunningDigest | None]) -> None:
+        self.rows: list[DigestRow] = []
+        self.running = running
+
+    def add(self, number: int, events: Sequence[Record], *, last: bool = False) -> None:
+        """Add the next events of an episode; with `last`, keep the digest behind them also inside a block."""
+        digest = self.running[number]
+        if digest is None:
+            return
+        self.rows += [DigestRow(number, *each) for each in digest.add(events)]
+        if last and digest.sequence % BLOCK_EVENTS:
+            self.rows.append(DigestRow(number, digest.sequence, digest.digest()))
 
 
 class RunningDigests:
@@ -55,24 +65,13 @@ class RunningDigests:
         self._insertable: bool | None = None
         self._running: dict[int, RunningDigest | None] = {}
 
-    async def extend(self, connection: AsyncConnection, steps: Iterable[tuple[EpisodeRow, EpisodeStep]]) -> Extension:
-        """Compute the digests after these steps, each given with the row before it. Changes no running digest."""
+    async def begin(self, connection: AsyncConnection, rows: Iterable[EpisodeRow]) -> Extension | None:
+        """Begin an append to the episodes of these rows; None if digests cannot be stored."""
         if self._insertable is None:
             self._insertable = await has_digests(self._dialect, connection, insert=True)
         if not self._insertable:
-            return Extension((), {})
-        rows: list[DigestRow] = []
-        running: dict[int, RunningDigest | None] = {}
-        for before, step in steps:
-            if not step.fresh:
-                continue
-            number = before.number
-            running[number] = digest = await self._at_head(connection, before)
-            if digest is not None:
-                rows += [DigestRow(number, *each) for each in digest.add(step.fresh)]
-                if step.fresh[-1].type == "EpisodeEnded" and digest.sequence % BLOCK_EVENTS:
-                    rows.append(DigestRow(number, digest.sequence, digest.digest()))
-        return Extension(rows, running)
+            return None
+        return Extension({each.number: await self._at_head(connection, each) for each in rows})
 
     async def insert(self, connection: AsyncConnection, extension: Extension) -> None:
         """Insert the digests in the transaction that appends the events."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Collection, Iterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import asynccontextmanager, contextmanager
 from typing import Any, NamedTuple
 
@@ -135,8 +135,8 @@ class PostgreSQL:
         names = tuple((await connection.exec_driver_sql(sql.SELECT_SYNCHRONOUS)).scalars())
         return StoredOn(1 + max(1, _confirming(configured)), names or (configured,))
 
-    async def event_insertion(self, rows: Sequence[tuple[Any, ...]]) -> Insertion:
-        return rows
+    async def event_insertion(self, rows: Iterator[tuple[Any, ...]]) -> Insertion:
+        return rows  # read while COPY runs, so that the server stores the first rows while the last are computed
 
     async def insert_events(self, connection: AsyncConnection, insertion: Insertion) -> None:
         await _copy(connection, LOG_SCHEMA, "event", sql.EVENT_COLUMNS, insertion)
@@ -363,7 +363,7 @@ class _ReplacedSchema(NamedTuple):
 
 
 async def _copy(
-    connection: AsyncConnection, schema: str, table: str, columns: Sequence[str], rows: Sequence[tuple[Any, ...]]
+    connection: AsyncConnection, schema: str, table: str, columns: Sequence[str], rows: Iterable[tuple[Any, ...]]
 ) -> None:
     """Insert rows by COPY, in the transaction that an earlier statement through SQLAlchemy began."""
     driver = await _driver(connection)

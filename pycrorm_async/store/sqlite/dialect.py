@@ -117,8 +117,8 @@ class SQLite:
     async def stored_on(self, connection: AsyncConnection) -> StoredOn:  # noqa: ARG002
         return StoredOn(1)
 
-    async def event_insertion(self, rows: Sequence[tuple[Any, ...]]) -> Insertion:
-        return await self.insertion({("event", sql.EVENT_COLUMNS): rows})
+    async def event_insertion(self, rows: Iterator[tuple[Any, ...]]) -> Insertion:
+        return await self.insertion({("event", sql.EVENT_COLUMNS): list(rows)})
 
     async def insert_events(self, connection: AsyncConnection, insertion: Insertion) -> None:
         await (await _driver(connection)).execute_in_turn(insertion)
