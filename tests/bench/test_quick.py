@@ -14,8 +14,8 @@ ROOT = Path(__file__).parents[2]
 BUT = {"busy", "faults", "hook", "__main__", "concurrent_processes"}
 OTHERS = sorted({path.stem for path in (ROOT / "bench").glob("*.py")} - BUT)
 """Scripts without a test of their own."""
-HEAVY = {"growth", "questions", "rebuild", "size", "visible"}
-"""Scripts that start servers and daemons; their quick version takes more than ten seconds."""
+SHORT = {"digests", "plan"}
+"""Scripts that start no other process. The others run in turns, because most take ten seconds and more."""
 
 
 def measure(script: str, *options: str) -> dict[str, Any]:
@@ -47,7 +47,7 @@ def test_the_backlog_beside_a_busy_plan_is_measured(options: tuple[str, ...]) ->
 
 
 @pytest.mark.parametrize(
-    "script", [pytest.param(each, marks=pytest.mark.soak) if each in HEAVY else each for each in OTHERS]
+    "script", [each if each in SHORT else pytest.param(each, marks=pytest.mark.soak) for each in OTHERS]
 )
 def test_every_other_script_measures_something(script: str) -> None:
     assert len(measure(script)) >= 2

@@ -3,7 +3,7 @@
 `python -m bench.faults` runs more and longer rounds, some on disks of their own.
 
  1  SIGKILL at any moment
-        test_queue_kill (100 rounds, 10,000 in the soak), test_killed_plan, test_daemon_kill, test_many_machines,
+        test_queue_kill (48 rounds, 10,000 in the soak), test_killed_plan, test_daemon_kill, test_many_machines,
         store/test_crash
  2  killed at each step that touches disk or log, and once more
         test_crash_points; queue/test_dead_source (sealing, removing), queue/test_repair

@@ -35,6 +35,7 @@ def kill_again_and_again(lab: Lab, *, robots: int, kills: int) -> None:
     lab.verify_every_step_stored_once_in_order()
 
 
+@pytest.mark.soak_on("postgresql")
 def test_killed_daemons_and_plans_leave_every_step_stored_once(database_url: str, tmp_path: Path) -> None:
     lab = Lab(tmp_path, database_url, random.randrange(2**31))
     try:

@@ -69,7 +69,7 @@ def killed(folder: Path, seconds: float) -> tuple[set[int], set[int]]:
     )
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.soak)])
 def test_a_killed_plan_has_every_node_whose_hook_returned_and_its_episode_is_lost(tmp_path: Path, seed: int) -> None:
     (tmp_path / "walk.py").write_text(PLAN)
     seconds = random.Random(seed).uniform(0.0, 0.6)

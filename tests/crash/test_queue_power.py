@@ -196,7 +196,7 @@ async def live_through_cuts(machine: Machine, rng: random.Random) -> None:
     machine.cut()
 
 
-@pytest.mark.parametrize("seed", [*range(6), *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(6, 200))])
+@pytest.mark.parametrize("seed", [*range(3), *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(3, 200))])
 async def test_a_power_cut_costs_no_synced_record_and_is_never_reported_as_damage(machine: Machine, seed: int) -> None:
     rng = random.Random(seed + 1000)
     await live_through_cuts(machine, rng)
@@ -218,7 +218,7 @@ async def test_a_power_cut_costs_no_synced_record_and_is_never_reported_as_damag
                 await recover(folder)
 
 
-@pytest.mark.parametrize("seed", [*range(8), *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(8, 200))])
+@pytest.mark.parametrize("seed", [*range(4), *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(4, 200))])
 async def test_what_a_recovery_supplied_after_a_kill_is_supplied_again_after_a_power_cut(
     machine: Machine, seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:

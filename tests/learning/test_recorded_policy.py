@@ -15,7 +15,7 @@ from pycrorm_async.learning.experiment import Experiment, run
 from pycrorm_async.learning.rollouts.rollout_pool import MemoryLocation
 from pycrorm_async.orm import BatchRolloutAction, LearnPolicyAction, ProcessMetaData
 
-SMALL = Experiment(rollouts=700, evaluate=60, held_out=60, workers=2, rounds=2)
+SMALL = Experiment(rollouts=600, evaluate=30, held_out=30, rounds=2)
 
 
 async def test_a_recorded_policy_is_read_back_by_its_name(database_url: str, tmp_path: Path) -> None:
@@ -56,7 +56,7 @@ async def test_the_rollouts_of_an_experiment_lead_to_their_policy_and_its_traini
             batches = (await session.scalars(select(BatchRolloutAction))).all()
             uuids = {each.id: each.uuid for each in await session.scalars(select(ProcessMetaData))}
     assert (first.policy, last.policy) == (learned.phases[1].policy, evaluation.policy)
-    assert (first.rollouts, last.rollouts, first.seeds, last.seeds) == (700, 1_400, [69], [69, 70])
+    assert (first.rollouts, last.rollouts, first.seeds, last.seeds) == (600, 1_200, [69], [69, 70])
     assert last.successes == len(learned.successes)
     assert (last.min_samples_leaf, last.scene) == (25, str(SMALL.scene))
     for each, seeds in ((first, {69}), (last, {69, 70})):

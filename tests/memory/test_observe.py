@@ -304,6 +304,7 @@ def returncode(script: Path) -> int:
     return run([sys.executable, str(script)], env=environment(), check=False).returncode
 
 
+@pytest.mark.soak_on("postgresql")
 @pytest.mark.parametrize("kill", ["before the record", "after the record"])
 async def test_a_process_killed_between_blob_and_record_loses_no_blob_that_an_event_refers_to(
     database_url: str, tmp_path: Path, kill: str

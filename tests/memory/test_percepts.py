@@ -76,6 +76,7 @@ async def rows(memory: Memory, *, simulated: bool = False) -> list[tuple[Any, ..
 MILK, CUP = ObjectType.MILK, ObjectType.JEROEN_CUP
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_a_percept_keeps_its_pose_confidence_and_source_and_needs_no_object(
     database_url: str, tmp_path: Path, server: Server
 ) -> None:

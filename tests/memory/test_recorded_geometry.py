@@ -148,6 +148,7 @@ async def recorded(url: str, robot: Path, settings: Settings) -> tuple[dict[str,
         return poses, memory.status.missing
 
 
+@pytest.mark.soak_on("postgresql")
 @pytest.mark.slow
 @pytest.mark.parametrize(("make", "meshes"), [(made_arm, "boxes"), (made_arm, "files"), (panda, "boxes")])
 async def test_a_robot_is_seen_again_by_a_fresh_process_when_its_files_are_gone(
@@ -270,6 +271,7 @@ async def test_objects_of_an_older_version_have_assumed_shapes_and_say_so(tmp_pa
         assert world.object("pr2").joint_position("torso_lift_joint") == 0.3
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_a_mesh_that_changed_between_two_runs_has_two_hashes_and_both_are_kept(
     database_url: str, tmp_path: Path
 ) -> None:

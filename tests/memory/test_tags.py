@@ -127,6 +127,7 @@ async def test_a_tagger_that_loses_a_race_decides_again_from_the_new_tags(
     await assert_intact(database_url)
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_a_process_killed_between_event_and_tables_leaves_a_tag_that_the_next_fold_shows(
     database_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

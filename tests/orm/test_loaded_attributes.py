@@ -94,6 +94,7 @@ async def test_every_attribute_is_loaded_or_says_how_to_load_it(
     assert {"TransportAction", "Object", "LocationResolution", "Attachment", "TaskTreeNode", "MoveMotion"} <= with_rows
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_attributes_on_request_are_loaded_as_the_error_says(
     database_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import AsyncIterator
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
@@ -58,8 +59,10 @@ from pycrorm_async.orm.types import Moment
 from pycrorm_async.plan.task_tree import TaskStatus
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.query.reading import Reading
+from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.world.enums import Arms, Grasp, ObjectType
+from tests.databases import run_in_own_loop
 from tests.projections.event_script import (
     MOVE,
     NAVIGATE,
@@ -109,9 +112,8 @@ def moment(sequence: int) -> datetime:
     return datetime(2023, 11, 14, 22, 13, 20, tzinfo=UTC) + timedelta(seconds=sequence)
 
 
-@pytest.fixture
-async def script(log: EventLog) -> Script:
-    """A robot drives (with a motion inside), picks up the milk, and opens the fridge, all in one episode."""
+async def fill(url: str) -> None:
+    """Record that a robot drives (with a motion inside), picks up the milk, and opens the fridge, in one episode."""
     script = Script()
     put = script.put
     put(EpisodeStarted("Tutorial", "me", "host", "1.0", "3.11", plan="breakfast"))  # 1
@@ -138,8 +140,23 @@ async def script(log: EventLog) -> Script:
     put(JointsMoved(ObjectReference(robot, robot), {"a": 0.5}, root))  # 17
     put(ObjectRemoved(seen))  # 18
     put(EpisodeEnded("LOST"))  # 19
+    log = await EventLog.open(DatabaseAddress.parse(url), create=True)
     await stored_and_folded(log, [*declarations(NAVIGATE, PICK_UP, MOVE, OPEN, MOVE_JOINTS), *script.records])
-    return script
+    await log.close()
+
+
+@pytest.fixture(scope="module")
+def filled_url(module_database_url: str) -> str:
+    run_in_own_loop(fill(module_database_url))
+    return module_database_url
+
+
+@pytest.fixture
+async def breakfast(filled_url: str) -> AsyncIterator[EventLog]:
+    """The log of that episode, open for reading."""
+    log = await EventLog.open(DatabaseAddress.parse(filled_url), create=False)
+    yield log
+    await log.close()
 
 
 async def every(log: EventLog, question: Any) -> list[Any]:
@@ -155,8 +172,8 @@ async def test_a_fresh_memory_has_no_rows_of_any_class(log: EventLog) -> None:
     assert {each.__name__: await every(log, select(each)) for each in mapped} == {each.__name__: [] for each in mapped}
 
 
-async def test_the_episode_has_its_author_and_its_outcome(log: EventLog, script: Script) -> None:
-    (metadata,) = await every(log, select(ProcessMetaData))
+async def test_the_episode_has_its_author_and_its_outcome(breakfast: EventLog) -> None:
+    (metadata,) = await every(breakfast, select(ProcessMetaData))
     assert repr(metadata) == (
         "ProcessMetaData(id=1, uuid='00000000-0000-7000-8000-000000000001',"
         f" created_at={moment(1)!r}, created_by='me', description='Tutorial', version='1.0', host='host',"
@@ -165,16 +182,14 @@ async def test_the_episode_has_its_author_and_its_outcome(log: EventLog, script:
     )
 
 
-async def test_the_version_of_an_episode_has_the_name_from_the_thesis_as_a_synonym(
-    log: EventLog, script: Script
-) -> None:
-    (metadata,) = await every(log, select(ProcessMetaData).where(ProcessMetaData.pycram_version == "1.0"))
+async def test_the_version_of_an_episode_has_the_name_from_the_thesis_as_a_synonym(breakfast: EventLog) -> None:
+    (metadata,) = await every(breakfast, select(ProcessMetaData).where(ProcessMetaData.pycram_version == "1.0"))
     assert metadata.pycram_version == metadata.version == "1.0"
-    assert await every(log, select(ProcessMetaData.pycram_version)) == ["1.0"]
+    assert await every(breakfast, select(ProcessMetaData.pycram_version)) == ["1.0"]
 
 
-async def test_a_navigation_has_its_start_and_its_target(log: EventLog, script: Script) -> None:
-    (drive,) = await every(log, select(NavigateAction))
+async def test_a_navigation_has_its_start_and_its_target(breakfast: EventLog) -> None:
+    (drive,) = await every(breakfast, select(NavigateAction))
     assert (drive.id, drive.dtype, drive.kind) == (row(6), "NavigateAction", "action")
     state = drive.robot_state
     assert (state.torso_height, state.type, state.pose_id) == (0.25, ObjectType.ROBOT, row(6, 1))
@@ -187,8 +202,8 @@ async def test_a_navigation_has_its_start_and_its_target(log: EventLog, script: 
     assert state.pose.process_metadata is drive.process_metadata
 
 
-async def test_the_text_of_an_action_has_its_fields_and_its_robot(log: EventLog, script: Script) -> None:
-    (pick,) = await every(log, select(PickUpAction))
+async def test_the_text_of_an_action_has_its_fields_and_its_robot(breakfast: EventLog) -> None:
+    (pick,) = await every(breakfast, select(PickUpAction))
     assert repr(pick) == (
         f"PickUpAction(id={row(11)}, process_metadata_id=1, dtype='PickUpAction', kind='action',"
         f" robot_state_id={row(11)}, object_id={row(4)}, arm=<Arms.LEFT: 1>, grasp=<Grasp.TOP: 3>,"
@@ -197,32 +212,32 @@ async def test_the_text_of_an_action_has_its_fields_and_its_robot(log: EventLog,
     )
 
 
-async def test_every_action_is_an_instance_of_its_own_class(log: EventLog, script: Script) -> None:
-    actions = await every(log, select(Action).order_by(Action.id))
+async def test_every_action_is_an_instance_of_its_own_class(breakfast: EventLog) -> None:
+    actions = await every(breakfast, select(Action).order_by(Action.id))
     assert [type(each) for each in actions] == [NavigateAction, PickUpAction, OpenAction]
     assert actions[1].arm is Arms.LEFT
     assert actions[1].grasp is Grasp.TOP
     assert actions[1].object.pose.position.z == 3.0
     assert actions[2].robot_state is None
-    motions = await every(log, select(Motion).order_by(Motion.id))
+    motions = await every(breakfast, select(Motion).order_by(Motion.id))
     assert [type(each) for each in motions] == [MoveMotion, MoveJointsMotion]
     assert motions[0].robot_state.pose.position.x == 0.5
     assert (motions[1].names, motions[1].positions) == (["a", "b"], [0.5, -1.0])
-    designators = await every(log, select(Designator).order_by(Designator.id))
+    designators = await every(breakfast, select(Designator).order_by(Designator.id))
     assert [type(each).__name__ for each in designators] == [
         "NavigateAction", "MoveMotion", "PickUpAction", "OpenAction", "MoveJointsMotion",
     ]  # fmt: skip
     assert designators[0].target_location.position.x == 7.0
 
 
-async def test_the_pose_of_a_picked_up_object_is_the_one_at_execution(log: EventLog, script: Script) -> None:
+async def test_the_pose_of_a_picked_up_object_is_the_one_at_execution(breakfast: EventLog) -> None:
     for picked in (PickUpAction.object, PickUpAction.object_designator):
-        poses = await every(log, select(Pose).join(picked).join(Object.pose))
+        poses = await every(breakfast, select(Pose).join(picked).join(Object.pose))
         assert [(each.position.x, each.position.y, each.position.z) for each in poses] == [(1.0, 2.0, 3.0)]
 
 
-async def test_nodes_carry_their_action_parent_status_and_reason(log: EventLog, script: Script) -> None:
-    nodes = {each.id: each for each in await every(log, select(TaskTreeNode))}
+async def test_nodes_carry_their_action_parent_status_and_reason(breakfast: EventLog) -> None:
+    nodes = {each.id: each for each in await every(breakfast, select(TaskTreeNode))}
     assert sorted(nodes) == [row(2), row(6), row(8), row(11), row(15), row(16)]
     pick = nodes[row(11)]
     assert (pick.status, pick.reason, pick.failure_message) == (TaskStatus.FAILED, "IKError", "too far")
@@ -234,17 +249,17 @@ async def test_nodes_carry_their_action_parent_status_and_reason(log: EventLog, 
     assert nodes[row(8)].parent.action.target_location.position.x == 7.0
     assert (nodes[row(15)].status, nodes[row(15)].end_time) == (TaskStatus.LOST, None)
     lost = select(TaskTreeNode.id).where(TaskTreeNode.status == TaskStatus.LOST).order_by(TaskTreeNode.id)
-    assert await every(log, lost) == [row(2), row(15), row(16)]
+    assert await every(breakfast, lost) == [row(2), row(15), row(16)]
 
 
-async def test_one_node_alone_has_its_parent_loaded(log: EventLog, script: Script) -> None:
-    (node,) = await every(log, select(TaskTreeNode).where(TaskTreeNode.id == row(8)))
+async def test_one_node_alone_has_its_parent_loaded(breakfast: EventLog) -> None:
+    (node,) = await every(breakfast, select(TaskTreeNode).where(TaskTreeNode.id == row(8)))
     assert node.parent.id == row(6)
     assert node.parent.action.robot_state.pose.position.x == 0.5
 
 
-async def test_a_node_has_children_and_ancestors(log: EventLog, script: Script) -> None:
-    async with AsyncSession(log.engine) as session:
+async def test_a_node_has_children_and_ancestors(breakfast: EventLog) -> None:
+    async with AsyncSession(breakfast.engine) as session:
         move = (await session.scalars(select(TaskTreeNode).where(TaskTreeNode.id == row(8)))).one()
         ancestors = await move.awaitable_attrs.ancestors
         assert [each.id for each in ancestors] == [row(6), row(2)]
@@ -258,9 +273,9 @@ async def test_a_node_has_children_and_ancestors(log: EventLog, script: Script) 
         assert (await milk.awaitable_attrs.node).action.dtype == "PickUpAction"
     drive, root = row(6), row(2)
     question = select(TaskTreeNode).where(TaskTreeNode.id == root).options(selectinload(TaskTreeNode.children))
-    (node,) = await every(log, question)
+    (node,) = await every(breakfast, question)
     assert (node.children[0].id, node.children[0].action.dtype) == (drive, "NavigateAction")
-    moved = await every(log, select(Object).options(selectinload(Object.node)).order_by(Object.id))
+    moved = await every(breakfast, select(Object).options(selectinload(Object.node)).order_by(Object.id))
     assert [each.node and each.node.id for each in moved if each.name == "milk"] == [None, row(11)]
 
 
@@ -269,31 +284,31 @@ async def test_a_node_has_children_and_ancestors(log: EventLog, script: Script) 
     [(TaskTreeNode, 2, "children"), (TaskTreeNode, 8, "ancestors"), (Object, 12, "node")],
 )
 async def test_an_attribute_that_is_not_loaded_names_the_remedy(
-    log: EventLog, script: Script, class_: type[Base], sequence: int, name: str
+    breakfast: EventLog, class_: type[Base], sequence: int, name: str
 ) -> None:
     message = rf"^{name} of {class_.__name__} \(\d+,\) is not loaded: .*awaitable_attrs.{name}`"
-    async with AsyncSession(log.engine, expire_on_commit=False) as session:
+    async with AsyncSession(breakfast.engine, expire_on_commit=False) as session:
         loaded = await session.get_one(class_, row(sequence))
         with pytest.raises(CallerError, match=message):
             getattr(loaded, name)
         assert await getattr(loaded.awaitable_attrs, name)  # the session is still usable
         getattr(loaded, name)
-    (closed,) = await every(log, select(class_).where(class_.id == row(sequence)))  # type: ignore[attr-defined]
+    (closed,) = await every(breakfast, select(class_).where(class_.id == row(sequence)))  # type: ignore[attr-defined]
     with pytest.raises(CallerError, match=message):
         getattr(closed, name)
 
 
-async def test_nodes_join_their_designators(log: EventLog, script: Script) -> None:
+async def test_nodes_join_their_designators(breakfast: EventLog) -> None:
     question = (
         select(PickUpAction.arm, TaskTreeNode.status).join(PickUpAction.node).where(PickUpAction.arm == Arms.LEFT)
     )
-    async with AsyncSession(log.engine) as session:
+    async with AsyncSession(breakfast.engine) as session:
         assert (await session.execute(question)).all() == [(Arms.LEFT, TaskStatus.FAILED)]
         other = select(TaskTreeNode).join(TaskTreeNode.action.of_type(PickUpAction)).where(PickUpAction.arm == "LEFT")
         assert [each.id for each in await session.scalars(other)] == [row(11)]
 
 
-async def test_the_parts_of_a_pose_can_be_joined(log: EventLog, script: Script) -> None:
+async def test_the_parts_of_a_pose_can_be_joined(breakfast: EventLog) -> None:
     question = (
         select(Position.x, Quaternion.z)
         .select_from(NavigateAction)
@@ -302,66 +317,66 @@ async def test_the_parts_of_a_pose_can_be_joined(log: EventLog, script: Script) 
         .join(Pose.position)
         .join(Pose.orientation)
     )
-    async with AsyncSession(log.engine) as session:
+    async with AsyncSession(breakfast.engine) as session:
         assert (await session.execute(question)).all() == [(0.5, 0.6)]
 
 
-async def test_objects_are_rows_of_moments_and_parts_know_their_whole(log: EventLog, script: Script) -> None:
-    milk = await every(log, select(Object).where(Object.identity_id == row(4)).order_by(Object.id))
+async def test_objects_are_rows_of_moments_and_parts_know_their_whole(breakfast: EventLog) -> None:
+    milk = await every(breakfast, select(Object).where(Object.identity_id == row(4)).order_by(Object.id))
     assert [(each.id, each.pose.position.x, each.node_id) for each in milk] == [
         (row(4), 1.0, None),
         (row(12), 9.0, row(11)),
     ]
-    (handle,) = await every(log, select(ObjectPart))
+    (handle,) = await every(breakfast, select(ObjectPart))
     assert (handle.name, handle.part_of.name, handle.pose.position.x) == ("handle", "fridge", 1.0)
-    assert await every(log, select(BelieveObject)) == []
-    (robot,) = await every(log, select(Object).where(Object.obj_type == ObjectType.ROBOT))
+    assert await every(breakfast, select(BelieveObject)) == []
+    (robot,) = await every(breakfast, select(Object).where(Object.obj_type == ObjectType.ROBOT))
     assert robot.joints == {"torso": 0.25}
 
 
-async def test_the_changes_of_objects_can_be_queried(log: EventLog, script: Script) -> None:
-    (held,) = await every(log, select(Attachment))
+async def test_the_changes_of_objects_can_be_queried(breakfast: EventLog) -> None:
+    (held,) = await every(breakfast, select(Attachment))
     assert (held.kind, held.parent.name, held.child.name, held.link) == (
         "attached", "pr2", "milk", "l_gripper_tool_frame",
     )  # fmt: skip
-    (turned,) = await every(log, select(JointChange))
+    (turned,) = await every(breakfast, select(JointChange))
     assert (turned.joint, turned.position, turned.object.name, turned.time) == ("a", 0.5, "pr2", moment(17))
-    (gone,) = await every(log, select(ObjectRemoval))
+    (gone,) = await every(breakfast, select(ObjectRemoval))
     assert (gone.object.name, gone.identity_id, gone.node_id) == ("milk", row(4), None)
 
 
-async def test_a_resolved_location_has_its_candidates(log: EventLog, script: Script) -> None:
-    (resolved,) = await every(log, select(LocationResolution))
+async def test_a_resolved_location_has_its_candidates(breakfast: EventLog) -> None:
+    (resolved,) = await every(breakfast, select(LocationResolution))
     assert (resolved.location, resolved.considered, resolved.offered, resolved.taken) == ("CostmapLocation", 9, 1, 0)
     assert (resolved.pose.position.x, resolved.node.action.dtype) == (7.0, "NavigateAction")
     assert [(each.x, each.reachable_arms, each.taken) for each in resolved.candidates] == [(7.0, [Arms.LEFT], True)]
 
 
-async def test_the_recorded_parameters_are_loaded_on_request(log: EventLog, script: Script) -> None:
-    async with AsyncSession(log.engine) as session:
+async def test_the_recorded_parameters_are_loaded_on_request(breakfast: EventLog) -> None:
+    async with AsyncSession(breakfast.engine) as session:
         pick = (await session.scalars(select(PickUpAction))).one()
         awaited_parameters = await pick.awaitable_attrs.parameters
         assert awaited_parameters == {"object_designator": {"object": 4, "row": 4}, "arm": "LEFT", "grasp": "TOP"}
-    (joints,) = await every(log, select(MoveJointsMotion).options(undefer(MoveJointsMotion.parameters)))
+    (joints,) = await every(breakfast, select(MoveJointsMotion).options(undefer(MoveJointsMotion.parameters)))
     assert joints.parameters == {"names": ["a", "b"], "positions": [0.5, -1.0]}
 
 
-async def test_an_action_loads_its_node_on_request(log: EventLog, script: Script) -> None:
-    async with AsyncSession(log.engine) as session:
+async def test_an_action_loads_its_node_on_request(breakfast: EventLog) -> None:
+    async with AsyncSession(breakfast.engine) as session:
         pick = (await session.scalars(select(PickUpAction))).one()
         assert (await pick.awaitable_attrs.node).status == TaskStatus.FAILED
-    (pick,) = await every(log, select(PickUpAction).options(selectinload(PickUpAction.node)))
+    (pick,) = await every(breakfast, select(PickUpAction).options(selectinload(PickUpAction.node)))
     assert (pick.node.status, pick.node.reason) == (TaskStatus.FAILED, "IKError")
 
 
-async def test_an_action_has_its_times_and_its_outcome(log: EventLog, script: Script) -> None:
-    drive, pick, opening = await every(log, select(Action).order_by(Action.start_time))
+async def test_an_action_has_its_times_and_its_outcome(breakfast: EventLog) -> None:
+    drive, pick, opening = await every(breakfast, select(Action).order_by(Action.start_time))
     assert (drive.status, drive.reason, drive.duration) == (TaskStatus.SUCCEEDED, None, 4.0)
     assert (pick.status, pick.reason, pick.duration) == (TaskStatus.FAILED, "IKError", 3.0)
     assert (pick.start_time, pick.end_time) == (moment(11), moment(14))
     assert (opening.status, opening.end_time, opening.duration) == (TaskStatus.LOST, None, None)
     assert pick.episode is pick.process_metadata
-    (move,) = await every(log, select(MoveMotion))
+    (move,) = await every(breakfast, select(MoveMotion))
     assert (move.status, move.duration) == (TaskStatus.SUCCEEDED, 1.0)
 
 
@@ -377,24 +392,24 @@ async def test_an_action_has_its_times_and_its_outcome(log: EventLog, script: Sc
     ],
 )
 async def test_actions_are_filtered_and_ordered_by_times_and_outcome(
-    log: EventLog, script: Script, condition: Any, expected: list[int]
+    breakfast: EventLog, condition: Any, expected: list[int]
 ) -> None:
     slowest_last = select(Action.id).where(condition).order_by(Action.duration.is_(None), Action.start_time)
-    assert await every(log, slowest_last) == [row(each) for each in expected]
+    assert await every(breakfast, slowest_last) == [row(each) for each in expected]
 
 
-async def test_an_action_joins_its_episode(log: EventLog, script: Script) -> None:
+async def test_an_action_joins_its_episode(breakfast: EventLog) -> None:
     question = select(ProcessMetaData.description, PickUpAction.duration).join(PickUpAction.episode)
-    async with AsyncSession(log.engine) as session:
+    async with AsyncSession(breakfast.engine) as session:
         assert (await session.execute(question)).all() == [("Tutorial", 3.0)]
 
 
 @pytest.mark.parametrize("view", ["action", "motion", "designator", "task_tree_node"])
-async def test_plain_sql_reads_times_and_outcome_of_an_action_from_one_view(
-    log: EventLog, script: Script, view: str
-) -> None:
+async def test_plain_sql_reads_times_and_outcome_of_an_action_from_one_view(breakfast: EventLog, view: str) -> None:
     columns = "process_metadata_id, dtype, status, start_time, end_time, duration, reason"
-    course = await ask(log, f"SELECT {columns} FROM {view} WHERE dtype IN ('PickUpAction', 'MoveMotion') ORDER BY id")
+    course = await ask(
+        breakfast, f"SELECT {columns} FROM {view} WHERE dtype IN ('PickUpAction', 'MoveMotion') ORDER BY id"
+    )
     move = (1, "MoveMotion", "SUCCEEDED", time_us(8), time_us(9), 1.0, None)
     pick = (1, "PickUpAction", "FAILED", time_us(11), time_us(14), 3.0, "IKError")
     assert course == {"action": [pick], "motion": [move]}.get(view, [move, pick])
@@ -525,30 +540,30 @@ async def test_an_object_type_that_is_unknown_to_this_process_is_its_name_and_an
     assert (pick.arm, pick.grasp, pick.object.obj_type) == (Arms.named("THIRD"), Grasp.TOP, "OAT_MILK")
 
 
-async def test_times_can_be_compared_and_a_naive_one_is_refused(log: EventLog, script: Script) -> None:
+async def test_times_can_be_compared_and_a_naive_one_is_refused(breakfast: EventLog) -> None:
     later = select(TaskTreeNode.id).where(TaskTreeNode.start_time > moment(11)).order_by(TaskTreeNode.id)
-    assert await every(log, later) == [row(15), row(16)]
+    assert await every(breakfast, later) == [row(15), row(16)]
     with pytest.raises(ValueError, match="has no time zone"):
         Moment().process_bind_param(datetime(2026, 1, 1), None)  # type: ignore[arg-type]  # noqa: DTZ001  the point
     assert int(moment(0).timestamp()) * 10**9 == T0_NS
 
 
-async def test_a_row_knows_its_event_and_queries_filter_and_order_by_it(log: EventLog, script: Script) -> None:
-    nodes = await every(log, select(TaskTreeNode).order_by(TaskTreeNode.sequence.desc()))
+async def test_a_row_knows_its_event_and_queries_filter_and_order_by_it(breakfast: EventLog) -> None:
+    nodes = await every(breakfast, select(TaskTreeNode).order_by(TaskTreeNode.sequence.desc()))
     assert [each.sequence for each in nodes] == sorted((each.sequence for each in nodes), reverse=True)
     assert all(each.id == row(each.sequence) for each in nodes)
-    assert await every(log, select(Action.id).where(Action.sequence == 6)) == [row(6)]
+    assert await every(breakfast, select(Action.id).where(Action.sequence == 6)) == [row(6)]
     ends = {each.sequence: each.end_sequence for each in nodes}
-    assert await every(log, select(Action.end_sequence).where(Action.sequence == 6)) == [ends[6]]
+    assert await every(breakfast, select(Action.end_sequence).where(Action.sequence == 6)) == [ends[6]]
     for class_ in (Object, Pose, Attachment, JointChange, ObjectRemoval, RootFailure, PickUpAction):
-        (sequences,) = (await every(log, select(func.sum(class_.sequence)))) or [None]
-        assert sequences == sum(each.sequence for each in await every(log, select(class_))) > 0, class_
+        (sequences,) = (await every(breakfast, select(func.sum(class_.sequence)))) or [None]
+        assert sequences == sum(each.sequence for each in await every(breakfast, select(class_))) > 0, class_
 
 
-async def test_plain_sql_has_the_events_of_a_row(log: EventLog, script: Script) -> None:
-    nodes = await every(log, select(TaskTreeNode).order_by(TaskTreeNode.id))
+async def test_plain_sql_has_the_events_of_a_row(breakfast: EventLog) -> None:
+    nodes = await every(breakfast, select(TaskTreeNode).order_by(TaskTreeNode.id))
     expected = [(each.sequence, each.end_sequence) for each in nodes]
-    async with log.engine.connect() as connection:
+    async with breakfast.engine.connect() as connection:
         for view in ("task_tree_node", "designator"):
             rows = await connection.exec_driver_sql(f"SELECT id, sequence, end_sequence FROM {view} ORDER BY id")
             by_id = {row.id: (row.sequence, row.end_sequence) for row in rows}

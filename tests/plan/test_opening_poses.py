@@ -50,6 +50,7 @@ def spread_candidates(places: list[Location], about: int) -> list[Location]:
     return places[:: max(1, len(places) // about)]
 
 
+@pytest.mark.soak_on("kitchen_counter_upper_drawer", "kitchen_counter_lower_drawer", "kitchen_island_upper_drawer")
 @ABOUT
 @pytest.mark.parametrize(
     ("name", "torso"), [*((name, 0.3 if "lower" in name else 0.0) for name in TRAVEL), ("fridge_door", 0.3)]

@@ -66,6 +66,7 @@ async def test_a_process_that_does_not_register_it_keeps_it_up_to_date(log: Even
     assert len(await visible_rows(log, "said")) == 4
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_one_that_is_registered_later_shows_earlier_rows(log: EventLog) -> None:
     first = Projector(log)
     await first.open()
@@ -95,6 +96,7 @@ async def test_a_changed_query_under_the_same_name_is_shown_and_the_next_rebuild
     assert len(await kept_tables_of(log)) == 2
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_a_materialised_view_can_become_a_plain_view_and_back(log: EventLog) -> None:
     await log.append([*declarations(SAYING), *talk(1, 4).records])
     for view in (KEPT, UserView("said", MEANING), KEPT):

@@ -206,6 +206,7 @@ async def test_every_event_is_folded_once_and_in_its_place(
         )  # no batch is prepared in vain; first the tables are altered
 
 
+@pytest.mark.soak_on("postgresql")
 @pytest.mark.parametrize("bad", ["unknown", "refused by the database", "missing"])
 @pytest.mark.parametrize("place", [6, 7])
 async def test_an_episode_stops_where_it_cannot_be_folded_whichever_worker_meets_that(

@@ -91,7 +91,9 @@ async def test_every_table_has_rows_after_every_kind_of_event(log: EventLog) -> 
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("batch_events", [1, 2, 3, 7, 10_000])
+@pytest.mark.parametrize(
+    "batch_events", [1, *(pytest.param(size, marks=pytest.mark.soak) for size in (2, 3)), 7, 10_000]
+)
 async def test_batches_of_any_size_give_the_same_rows(log: EventLog, batch_events: int) -> None:
     episodes = [rich_episode(1), rich_episode(2)]
     lost = Script(3)

@@ -94,11 +94,11 @@ LIFT = msgspec.structs.replace(declared("LiftAction", "lift_action", *CAREFUL.fi
 @pytest.mark.parametrize(
     "types",
     [
-        (PICK_UP, CAREFUL, WARY),
+        pytest.param((PICK_UP, CAREFUL, WARY), marks=pytest.mark.soak),
         (WARY, CAREFUL, PICK_UP),
-        (PICK_UP, CAREFUL, GRAB),
+        pytest.param((PICK_UP, CAREFUL, GRAB), marks=pytest.mark.soak),
         (GRAB, PICK_UP),
-        (CAREFUL, PICK_UP, WARY, GRAB),
+        pytest.param((CAREFUL, PICK_UP, WARY, GRAB), marks=pytest.mark.soak),
         (PICK_UP, CAREFUL, msgspec.structs.replace(LIFT, bases=("PickUpAction",)), WARY),
     ],
 )

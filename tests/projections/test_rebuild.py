@@ -277,6 +277,7 @@ class EndedError(Exception):
     """Raised in place of whatever may end the rebuild."""
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_an_interrupted_rebuild_is_continued(database_url: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(steps, "_BATCH_EVENTS", 40)
     await append_and_fold(

@@ -66,7 +66,7 @@ async def findings_for_any_parts(log: EventLog, url: str, monkeypatch: pytest.Mo
     """Return the findings, which are the same for all sizes of parts; verify must write nothing."""
     before = everything(url)
     result = await look(log)
-    other = await in_parts(log, 6, monkeypatch)
+    other = await in_parts(log, 16, monkeypatch)
     assert sorted(map(str, other.damages)) == sorted(map(str, result.damages))
     assert sorted(other.differences, key=repr) == sorted(result.differences, key=repr)
     assert everything(url) == before

@@ -66,7 +66,7 @@ async def findings(log: EventLog, digests: tuple[OutsideDigest, ...], monkeypatc
     result = await verify(log, digests=digests)
     lines = [str(each) for each in result.damages]
     if not digests:
-        for size in (50, 256, 300):
+        for size in (200, 256):
             assert sorted(str(each) for each in (await in_parts(log, size, monkeypatch)).damages) == sorted(lines)
     return lines
 
@@ -79,6 +79,7 @@ async def digests_of(log: EventLog) -> tuple[OutsideDigest, ...]:
 CHANGED = "or their digest, was changed after it was stored: the digest does not match"
 
 
+@pytest.mark.soak_on("postgresql")
 @pytest.mark.parametrize(
     ("changes", "lines"),
     [
@@ -227,6 +228,7 @@ async def test_a_tag_behind_the_end_is_covered(database_url: str, change: str, f
     await log.close()
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_the_command_compares_with_a_document_of_digests(log: EventLog, filled_url: str, tmp_path: Path) -> None:
     url = ("--url", filled_url)
     document = answer("episodes", "--simulated", *url, cwd=tmp_path)
