@@ -59,12 +59,12 @@ def tables_of(place: str | Path) -> Tables:
     columns: dict[str, list[str]] = {}
     for physical, column in ask(place, _COLUMNS_POSTGRESQL if on_server else _COLUMNS_SQLITE):
         name, mark, number = physical.rpartition("__")
-        if mark and number == str(generation) and not name.startswith("pycrorm_"):
-            columns.setdefault(name, []).append(column)
-    result = {
-        name: _rows(place, name, f'{schema}"{name}__{generation}"', each, leaves.get(name), episodes)
-        for name, each in columns.items()
-    }
+        if mark and number == str(generation) and "pycrorm_" not in name:
+            columns.setdefault(physical, []).append(column)
+    result: Tables = {}
+    for physical, each in columns.items():
+        name = physical.removesuffix(f"__{generation}").removeprefix("zz_")
+        result[name] = _rows(place, name, f'{schema}"{physical}"', each, leaves.get(name), episodes)
     return {name: rows for name, rows in result.items() if rows}
 
 

@@ -105,13 +105,16 @@ async def test_the_same_episodes_under_other_numbers_on_another_kind_of_database
 @pytest.mark.parametrize(
     ("change", "table"),
     [
-        ("DELETE FROM pose__1 WHERE z = 3", "pose"),
-        ("UPDATE pose__1 SET x = x + 1e-12 WHERE z = 3", "pose"),
-        ("UPDATE pose__1 SET frame = NULL WHERE z = 3", "pose"),
-        ("UPDATE task_tree_node__1 SET parent_id = parent_id + 32 WHERE dtype = 'SayingAction'", "task_tree_node"),
-        ("UPDATE counting_action__1 SET milk_id = milk_id + 2147483648 WHERE id < 4294967296", "counting_action"),
-        ("UPDATE joint_change__1 SET process_metadata_id = 2 WHERE process_metadata_id = 1", "joint_change"),
-        ("UPDATE process_metadata__1 SET created_at = created_at + 1 WHERE id = 1", "process_metadata"),
+        ("DELETE FROM zz_pose__1001 WHERE z = 3", "pose"),
+        ("UPDATE zz_pose__1001 SET x = x + 1e-12 WHERE z = 3", "pose"),
+        ("UPDATE zz_pose__1001 SET frame = NULL WHERE z = 3", "pose"),
+        (
+            "UPDATE zz_task_tree_node__1001 SET parent_id = parent_id + 32 WHERE dtype = 'SayingAction'",
+            "task_tree_node",
+        ),
+        ("UPDATE zz_counting_action__1001 SET milk_id = milk_id + 2147483648 WHERE id < 4294967296", "counting_action"),
+        ("UPDATE zz_joint_change__1001 SET process_metadata_id = 2 WHERE process_metadata_id = 1", "joint_change"),
+        ("UPDATE zz_process_metadata__1001 SET created_at = created_at + 1 WHERE id = 1", "process_metadata"),
     ],
 )
 def test_every_difference_is_reported(three_episodes: Path, tmp_path: Path, change: str, table: str) -> None:

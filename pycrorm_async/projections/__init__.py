@@ -7,6 +7,6 @@ the rows of a batch together with its checkpoints, in one transaction; `projecto
 `rebuild` and `verify` fold the log again, to replace the tables or to compare them; `custom` does all of this for
 projections that users write. Every table here can be dropped and rebuilt from the log.
 
-The table `pose` is stored as `pose__1`, in generation 1, and `pose` itself is a view. A rebuild fills `pose__2` next to
-it and then replaces the views.
+The table `pose` is stored as `zz_pose__1001`, in generation 1001, and `pose` itself is a view. A rebuild fills
+`zz_pose__1002` next to it and then replaces the views. The prefix puts these tables at the end of a list of names.
 """

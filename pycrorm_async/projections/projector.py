@@ -29,6 +29,7 @@ from pycrorm_async.projections.schema.generations import (
 from pycrorm_async.projections.schema.mapped_tables import mapped_leaves
 from pycrorm_async.projections.schema.materialised_views import ViewRefused, refresh_some
 from pycrorm_async.projections.schema.user_views import UserView, with_user_views
+from pycrorm_async.projections.table_names import next_number
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import Span
@@ -80,7 +81,7 @@ class Projector:
                 current = await current_generation(connection, hold="change")
                 if current is None and (await connection.execute(_ANYTHING_FOLDED)).first() is not None:
                     raise DatabaseForeign(f"{self._log.address}: the tables are missing: run `pycrorm rebuild`")
-                generation = current or await make_generation(connection, 1)
+                generation = current or await make_generation(connection, next_number(()))
                 layout = generation.layout.with_leaves(mapped_leaves())
                 layout = with_user_views(layout, self._views, connection.dialect).with_failed_views({})
                 changed = await self._custom.set_up(connection, layout)

@@ -68,6 +68,7 @@ from pycrorm_async.projections.schema.materialised_views import refresh_some
 from pycrorm_async.projections.schema.public_views import public_views
 from pycrorm_async.projections.schema.session_views import with_views
 from pycrorm_async.projections.schema.user_views import UserView, view_text, with_user_views
+from pycrorm_async.projections.table_names import next_number
 from pycrorm_async.store.dialect import RowRefused
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
@@ -153,7 +154,7 @@ class Rebuild:
                 )
                 if making is None:
                     numbers = [each.number for key, each in generations.items() if not key.startswith(PROJECTION)]
-                    making = await make_generation(connection, 1 + max(numbers, default=0))
+                    making = await make_generation(connection, next_number(numbers))
                     await make_empty(connection, {checkpoints.TABLE: checkpoints.COLUMNS}, making.number)
                 making = await grow_tables(connection, making, making.layout.with_leaves(mapped_leaves()))
                 await write_generation(connection, MAKING, making)

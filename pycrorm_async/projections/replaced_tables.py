@@ -17,7 +17,8 @@ from pycrorm_async.projections.schema.generations import (
     read_generations,
 )
 from pycrorm_async.projections.schema.materialised_views import materialised_tables
-from pycrorm_async.projections.schema.tables import CORE, physical_name
+from pycrorm_async.projections.schema.tables import CORE
+from pycrorm_async.projections.table_names import physical_name
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 

@@ -109,18 +109,18 @@ def test_a_named_projection_is_folded_by_the_run_rebuilt_and_verified(lab: Path)
     done = answer("rebuild", "weighed", "--projection", "lab:Weighed", cwd=lab)
     assert done.keys() == {"projections"}
     assert {**done["projections"]["weighed"], "seconds": 0} == {
-        "generation": 2, "events": 8, "episodes": 1, "seconds": 0, "parked": {}, "left": []
+        "generation": 1002, "events": 8, "episodes": 1, "seconds": 0, "parked": {}, "left": []
     }  # fmt: skip
     assert weighed(lab) == WEIGHED
     assert answer("verify", "--projection", "lab:Weighed", cwd=lab)["drift"] == 0
-    ask(lab, "UPDATE pycrorm_own_weighing__2 SET grams = 3 WHERE what = 'milk'")
+    ask(lab, "UPDATE zz_pycrorm_own_weighing__1002 SET grams = 3 WHERE what = 'milk'")
     result = answer("verify", "--projection", "lab:Weighed", cwd=lab, code=1)
     assert [(each["table"], each["column"], each["stored"]) for each in result["differences"]] == [
         ("weighing", "grams", 3)
     ]
     rebuild = pycrorm("rebuild", "--projection", "lab:Weighed", cwd=lab)
     assert (rebuild.returncode, rebuild.stderr) == (0, "")
-    assert [line.split(":")[0] for line in rebuild.stdout.splitlines()] == ["generation 2", "weighed, generation 3"]
+    assert [line.split(":")[0] for line in rebuild.stdout.splitlines()] == ["generation 1002", "weighed, generation 3"]
     assert weighed(lab) == WEIGHED
 
 
@@ -136,7 +136,7 @@ def test_the_projection_of_an_installed_package_is_folded_without_an_option(lab:
     with_site("run", "weighing.py", cwd=lab)
     assert weighed(lab) == WEIGHED
     rebuild = with_site("rebuild", "--json", cwd=lab)
-    assert json.loads(rebuild.stdout)["projections"]["weighed"]["generation"] == 2
+    assert json.loads(rebuild.stdout)["projections"]["weighed"]["generation"] == 1002
     assert weighed(lab) == WEIGHED
     state = json.loads(with_site("status", "--json", cwd=lab).stdout)
     assert state["projections"] == [{"name": "weighed", "version": 1, "behind": 0, "parked": {}, "fault": None}]

@@ -49,13 +49,13 @@ def test_a_rebuild_needs_no_code_of_the_plan_and_reports_what_it_made(tmp_path: 
     assert next(iter(before["weigh_action"].values()))["grams"] == 0.1
     done = answer("rebuild", "--workers", "2", cwd=tmp_path)
     assert {**done, "seconds": 0} == {
-        "generation": 2, "events": 6, "episodes": 1, "seconds": 0, "parked": {}, "left": []
+        "generation": 1002, "events": 6, "episodes": 1, "seconds": 0, "parked": {}, "left": []
     }  # fmt: skip
     assert differences(before, tables_of(url)) == []
     assert traces(url) == []
     rebuilt = pycrorm("rebuild", cwd=tmp_path)
     assert (rebuilt.returncode, rebuilt.stderr) == (0, "")
-    assert rebuilt.stdout.startswith("generation 3: 6 events of 1 episodes in ")
+    assert rebuilt.stdout.startswith("generation 1003: 6 events of 1 episodes in ")
 
 
 def test_an_episode_that_cannot_be_folded_is_reported_and_is_a_problem(tmp_path: Path) -> None:

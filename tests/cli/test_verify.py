@@ -55,9 +55,9 @@ def test_an_intact_memory_is_reported_as_such(folder: Path) -> None:
 
 def test_differences_are_printed_with_both_values_and_exit_with_1_and_damage_with_4(folder: Path) -> None:
     file = folder / "pycrorm.db"
-    ask_to_change(file, "UPDATE detection__1 SET name = '[b]mïlk' WHERE id >> 31 = 2 AND position = 0")
-    ask_to_change(file, "DELETE FROM object_removal__1 WHERE id >> 31 = 3")
-    ask_to_change(file, "UPDATE pose__1 SET frame = x'fe00' WHERE id = (SELECT min(id) FROM pose__1)")
+    ask_to_change(file, "UPDATE zz_detection__1001 SET name = '[b]mïlk' WHERE id >> 31 = 2 AND position = 0")
+    ask_to_change(file, "DELETE FROM zz_object_removal__1001 WHERE id >> 31 = 3")
+    ask_to_change(file, "UPDATE zz_pose__1001 SET frame = x'fe00' WHERE id = (SELECT min(id) FROM zz_pose__1001)")
     done = pycrorm("verify", cwd=folder)
     assert (done.returncode, done.stderr) == (1, "")
     lines = done.stdout.splitlines()
@@ -87,11 +87,11 @@ def test_differences_are_printed_with_both_values_and_exit_with_1_and_damage_wit
 
 
 def test_of_many_findings_the_first_are_shown_and_all_are_counted(folder: Path) -> None:
-    ask_to_change(folder / "pycrorm.db", "UPDATE task_tree_node__1 SET simulated = 1 - simulated, start_ns = 0")
-    ask_to_change(folder / "pycrorm.db", "UPDATE pose__1 SET x = -x - 1, time = 0, frame = NULL")
+    ask_to_change(folder / "pycrorm.db", "UPDATE zz_task_tree_node__1001 SET simulated = 1 - simulated, start_ns = 0")
+    ask_to_change(folder / "pycrorm.db", "UPDATE zz_pose__1001 SET x = -x - 1, time = 0, frame = NULL")
     done = pycrorm("verify", cwd=folder)
     assert done.returncode == 1
-    count = 12 * 2 + 3 * ask(folder / "pycrorm.db", "SELECT count(*) FROM pose__1")[0][0]
+    count = 12 * 2 + 3 * ask(folder / "pycrorm.db", "SELECT count(*) FROM zz_pose__1001")[0][0]
     lines = done.stdout.splitlines()
     assert len(lines) == 22
     assert lines[20] == f"and {count - 20} more"
@@ -103,7 +103,7 @@ def test_an_impossible_verification_is_one_line(folder: Path) -> None:
     done = pycrorm("verify", "--episode", "7", cwd=folder)
     assert (done.returncode, done.stdout) == (2, "")
     assert "there is no episode '7'" in one_line_of(done)
-    ask_to_change(folder / "pycrorm.db", "DROP TABLE state_sample__1")
+    ask_to_change(folder / "pycrorm.db", "DROP TABLE zz_state_sample__1001")
     done = pycrorm("verify", cwd=folder)
     assert (done.returncode, done.stdout) == (3, "")
     assert "a table is missing: run `pycrorm rebuild`" in one_line_of(done)
@@ -178,7 +178,7 @@ async def test_on_postgresql_every_role_that_may_read_may_verify(server: Server,
     assert answer("verify", "--url", reader, cwd=tmp_path)["events"] == 60
     folder = server.url(database, user=f"robot_of_{database}")
     assert pycrorm("rebuild", "--url", folder, cwd=tmp_path).returncode == 0
-    ask(url, "UPDATE memory_tables.state_sample__2 SET value = 2.5 WHERE channel = 'torso' AND id >> 31 = 2")
+    ask(url, "UPDATE memory_tables.zz_state_sample__1002 SET value = 2.5 WHERE channel = 'torso' AND id >> 31 = 2")
     done = pycrorm("verify", "--url", reader, cwd=tmp_path)
     assert (done.returncode, done.stderr) == (1, "")
     assert done.stdout.splitlines()[0] == "drift: episode 2, event 12: state_sample.value is 2.5, and should be 0.2"

@@ -44,10 +44,10 @@ async def test_two_memories_merged_and_then_rebuilt_hold_row_for_row_what_both_h
     one, other, target = await merged(new_file, new_url, everything)
     assert_merged(target, one, other)
     at = "memory_tables." if target.startswith("postgresql:") else ""
-    for change in ("DELETE FROM {}pose__1", "UPDATE {}task_tree_node__1 SET status = 'RUNNING'"):
+    for change in ("DELETE FROM {}zz_pose__1001", "UPDATE {}zz_task_tree_node__1001 SET status = 'RUNNING'"):
         ask_to_change(target, change.format(at))  # the comparison below does not use the merged tables
     done = await rebuild_memory(target)
-    assert (done.generation, done.parked, done.left) == (2, {}, [])
+    assert (done.generation, done.parked, done.left) == (1002, {}, [])
     assert_merged(target, one, other)
     assert traces(target) == []
 
@@ -57,7 +57,7 @@ async def test_earlier_rebuilds_of_the_sources_make_no_difference(new_url: New, 
     one, other, target = await merged(new_file, new_url, lambda url: random_plans(url, range(6)))
     before = tables_of(target)
     for each in (one, other):
-        assert (await rebuild_memory(each)).generation == 2
+        assert (await rebuild_memory(each)).generation == 1002
     again, at_last = new_url(), new_file()
     for source in (one, other):
         await copy_episodes(source, again)

@@ -132,7 +132,7 @@ def test_a_terminal_signal_to_both_ends_a_worker_with_the_daemon_and_no_sooner(
 
 def test_the_reason_why_a_worker_cannot_fold_is_reported(folder: Path, daemon: subprocess.Popen[str]) -> None:
     assert noted(folder) == 3
-    ask_to_change(f"sqlite:///{folder}/pycrorm.db", "DROP TABLE task_tree_node__1")
+    ask_to_change(f"sqlite:///{folder}/pycrorm.db", "DROP TABLE zz_task_tree_node__1001")
     plan = subprocess.Popen([*COMMAND, "run", "notes.py", "--writer", "daemon"], cwd=folder, env=environment())
     assert daemon.stderr is not None
     output = ""
@@ -144,7 +144,7 @@ def test_the_reason_why_a_worker_cannot_fold_is_reported(folder: Path, daemon: s
         time.sleep(0.01)
     plan.kill()
     plan.wait()
-    assert "no such table: task_tree_node__1" in output
+    assert "no such table: zz_task_tree_node__1001" in output
 
 
 MANY = 12_000

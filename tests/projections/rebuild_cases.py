@@ -100,7 +100,7 @@ def traces(url: str) -> list[str]:
     tables = [name for (name,) in ask(url, listed)]
     traces_left = [each for each in notes if each != "tables"]
     traces_left += [each for each in tables if "__" in each and not each.endswith(f"__{current}")]
-    traces_left += [each for each in tables if each.startswith("pycrorm_progress")]
+    traces_left += [each for each in tables if "pycrorm_progress" in each]
     if at:
         gone = "SELECT nspname FROM pg_namespace WHERE nspname LIKE 'memory\\_gone\\_%' OR nspname = 'memory_new'"
         return traces_left + [name for (name,) in ask(url, gone)]

@@ -41,5 +41,5 @@ async def names(log: EventLog, *kinds: str) -> list[str]:
 
 async def all_rows(log: EventLog) -> dict[str, list[tuple[Any, ...]]]:
     """Return every table of the first generation, ordered."""
-    tables = [name for name in await names(log, "table") if name.endswith("__1")]
+    tables = [name for name in await names(log, "table") if name.startswith("zz_") and name.endswith("__1001")]
     return {name: sorted(await ask(log, f'SELECT * FROM "{name}"'), key=repr) for name in tables}

@@ -21,7 +21,7 @@ from pycrorm_async.events.values import FieldDeclared, FieldType
 from pycrorm_async.operations.copy import copy_episodes
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.schema import growth, layout
-from pycrorm_async.projections.schema.tables import index_name, physical_name
+from pycrorm_async.projections.table_names import index_name, physical_name
 from pycrorm_async.projections.verify.verify import VerifyResult, verify
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
@@ -231,11 +231,11 @@ async def change(log: EventLog, statement: str) -> None:
 
 async def test_a_foreign_table_with_a_used_name_parks_that_type_alone_until_it_is_renamed(log: EventLog) -> None:
     types = [with_fields(f"Kind{n}Action", "real", "size") for n in range(7)]
-    await change(log, "CREATE TABLE kind5_action__1 (mine integer)") if log.address.is_sqlite else None
+    await change(log, "CREATE TABLE zz_kind5_action__1001 (mine integer)") if log.address.is_sqlite else None
     projector = Projector(log)
     await projector.open()
     if not log.address.is_sqlite:
-        await change(log, "CREATE TABLE memory_tables.kind5_action__1 (mine integer)")
+        await change(log, "CREATE TABLE memory_tables.zz_kind5_action__1001 (mine integer)")
     records: Sequence[Record] = [each for n, type_ in enumerate(types) for each in performing(n + 1, type_, size=n)]
     await log.append([*declarations(*types), *records])
     await projector.catch_up()
@@ -248,7 +248,7 @@ async def test_a_foreign_table_with_a_used_name_parks_that_type_alone_until_it_i
     assert [*(await assert_verified(log)).unmade] == ["Kind5Action"]
     await stored_and_folded(log, [])  # the foreign table is still there
     assert await parked_reasons(log) == [(6, reason)]
-    await change(log, f"ALTER TABLE {place(log, 'kind5_action__1')} RENAME TO my_kinds")
+    await change(log, f"ALTER TABLE {place(log, 'zz_kind5_action__1001')} RENAME TO my_kinds")
     await stored_and_folded(log, [])
     assert await parked_reasons(log) == []
     assert await ask(log, "SELECT size FROM kind5_action") == [(5.0,)]

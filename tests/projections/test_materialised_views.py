@@ -40,7 +40,7 @@ async def visible_rows(log: EventLog, view: str) -> list[tuple[object, ...]]:
 
 
 async def kept_tables_of(log: EventLog) -> list[str]:
-    return [name for name in await names(log, "table") if name.startswith("pycrorm_view_")]
+    return [name for name in await names(log, "table") if name.startswith("zz_pycrorm_view_")]
 
 
 @pytest.mark.parametrize("step", [1, 3, 1000])

@@ -84,10 +84,10 @@ async def test_every_table_has_rows_after_every_kind_of_event(log: EventLog) -> 
     await stored_and_folded(log, [*declarations(NAVIGATE, PICK_UP, VIA), *rich_episode(1).records])
     filled = {name for name, rows in (await all_rows(log)).items() if rows}
     assert filled == {
-        "process_metadata__1", "task_tree_node__1", "pose__1", "object__1", "object_removal__1", "attachment__1",
-        "parameter_item__1", "joint_change__1", "location_resolution__1", "location_candidate__1",
-        "location_refusal__1",
-        "navigate_action__1", "pick_up_action__1", "via_action__1",
+        "zz_process_metadata__1001", "zz_task_tree_node__1001", "zz_pose__1001", "zz_object__1001",
+        "zz_object_removal__1001", "zz_attachment__1001", "zz_parameter_item__1001", "zz_joint_change__1001",
+        "zz_location_resolution__1001", "zz_location_candidate__1001", "zz_location_refusal__1001",
+        "zz_navigate_action__1001", "zz_pick_up_action__1001", "zz_via_action__1001",
     }  # fmt: skip
 
 
@@ -114,7 +114,11 @@ async def test_batches_of_any_size_give_the_same_rows(log: EventLog, batch_event
             (row(13, number=number), "SUCCEEDED", time_us(14)),
         ]
     assert nodes == [*expected, (row(1, number=3), "LOST", None), (row(2, number=3), "LOST", None)]
-    counts = {name.removesuffix("__1"): len(rows) for name, rows in (await all_rows(log)).items() if rows}
+    counts = {
+        name.removeprefix("zz_").removesuffix("__1001"): len(rows)
+        for name, rows in (await all_rows(log)).items()
+        if rows
+    }
     assert counts == {
         "process_metadata": 2, "task_tree_node": 10, "pose": 16, "object": 6, "object_removal": 2,
         "parameter_item": 4, "attachment": 2, "joint_change": 2, "location_resolution": 2, "location_candidate": 2,
@@ -298,7 +302,7 @@ async def test_doubles_are_stored_bit_by_bit(log: EventLog) -> None:
 
 
 async def test_text_of_any_kind_is_stored_unchanged(log: EventLog) -> None:
-    texts = ["", "Käse 🧀", "'; DROP TABLE pose__1; --", '"%s" ?1 :x', "a\nb\t\\", "\ud7ff\uffff"]
+    texts = ["", "Käse 🧀", "'; DROP TABLE zz_pose__1001; --", '"%s" ?1 :x', "a\nb\t\\", "\ud7ff\uffff"]
     script = Script()
     for text in texts:
         script.put(NodeStarted("action", None, name_of(SAYING), {"text": text}))

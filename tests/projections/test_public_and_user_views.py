@@ -233,7 +233,7 @@ async def test_every_name_in_a_fresh_memory_is_reserved_for_designators_and_for_
     await Projector(log).open()
     names_used = set(await names(log, "table", "view"))
     assert len(names_used) > 60
-    assert {"event", "pycrorm_generation", "designator", "pose", "pose__1", "PickUpWithContextView"} <= names_used
+    assert {"event", "pycrorm_generation", "designator", "pose", "zz_pose__1001", "PickUpWithContextView"} <= names_used
     async with log.engine.connect() as connection:
         generation = await current_generation(connection)
     assert generation is not None

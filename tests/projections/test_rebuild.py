@@ -71,7 +71,7 @@ async def test_rebuilt_tables_equal_row_for_row_those_folded_live(database_url: 
     assert failed
     # A rebuild uses only the log, whatever was changed in the tables.
     at = "memory_tables." if database_url.startswith("postgresql:") else ""
-    for change in ("DELETE FROM {}pose__1", "UPDATE {}task_tree_node__1 SET status = 'RUNNING'"):
+    for change in ("DELETE FROM {}zz_pose__1001", "UPDATE {}zz_task_tree_node__1001 SET status = 'RUNNING'"):
         ask_to_change(database_url, change.format(at))
     assert differences(before, tables_of(database_url)) != []
     done = await rebuild_memory(database_url)
@@ -79,11 +79,11 @@ async def test_rebuilt_tables_equal_row_for_row_those_folded_live(database_url: 
     assert differences(before, await folded_elsewhere(database_url, tmp_path)) == []
     assert ask(database_url, STOPPED) == stopped
     assert ask(database_url, FAILED) == failed
-    assert (done.generation, done.left, list(done.parked)) == (2, [], [str_of(10)])
+    assert (done.generation, done.left, list(done.parked)) == (1002, [], [str_of(10)])
     assert traces(database_url) == []
     again = await rebuild_memory(database_url, workers=2, views=[UserView("All", select(TaskTreeNode.id))])
     assert differences(before, tables_of(database_url)) == []
-    assert (again.generation, again.left) == (3, [])
+    assert (again.generation, again.left) == (1003, [])
     assert ask(database_url, 'SELECT count(*) FROM "All"') == ask(database_url, "SELECT count(*) FROM task_tree_node")
     assert ask(database_url, FAILED) == failed
     assert traces(database_url) == []
@@ -167,7 +167,7 @@ async def test_workers_that_are_killed_are_restarted_and_the_tables_are_the_same
 async def test_missing_tables_are_made(database_url: str) -> None:
     await append_and_fold(database_url, [*TYPES, *picking(1).records, *parking(2).records], folded=False)
     done = await rebuild_memory(database_url)
-    assert (done.generation, done.events, done.episodes) == (1, 19, 2)
+    assert (done.generation, done.events, done.episodes) == (1001, 19, 2)
     assert [(number, folded) for number, folded, _ in ask(database_url, STOPPED)] == [(1, 15), (2, 2)]
     assert ask(database_url, "SELECT count(*) FROM pick_up_action") == [(5,)]
     assert traces(database_url) == []
@@ -295,7 +295,7 @@ async def test_an_interrupted_rebuild_is_continued(database_url: str, monkeypatc
     progress: list[int] = []
     done = await rebuild_memory(database_url, report_progress=lambda _what, done, _total: progress.append(done))
     assert progress[0] > 150
-    assert done.generation == 2
+    assert done.generation == 1002
     assert differences(before, tables_of(database_url)) == []
     assert traces(database_url) == []
 
@@ -368,7 +368,7 @@ async def test_only_one_process_rebuilds_at_a_time(database_url: str) -> None:
         with pytest.raises(CallerError, match="another `pycrorm rebuild` is running: wait for it to end"):
             await rebuild_memory(database_url)
     await log.close()
-    assert (await rebuild_memory(database_url)).generation == 2
+    assert (await rebuild_memory(database_url)).generation == 1002
 
 
 async def test_tables_of_a_newer_version_are_refused_unchanged(database_url: str) -> None:
@@ -387,7 +387,7 @@ async def test_tables_of_an_older_version_are_replaced(database_url: str) -> Non
     ask_to_change(database_url, f"UPDATE {at}pycrorm_generation SET version = 1")
     with pytest.raises(DatabaseForeign, match="run `pycrorm rebuild`"):
         await append_and_fold(database_url, [])
-    assert (await rebuild_memory(database_url)).generation == 2
+    assert (await rebuild_memory(database_url)).generation == 1002
     assert differences(before, tables_of(database_url)) == []
     assert traces(database_url) == []
 
@@ -427,8 +427,8 @@ async def test_a_reader_in_a_transaction_continues_and_the_next_rebuild_drops_it
         async with reading.session() as session:
             assert len((await session.scalars(select(PickUpAction.id))).all()) == 5
             done = await rebuild_memory(url)
-            assert "pick_up_action__1" in done.left
-            assert "tables/gone/1" in traces(url)
+            assert "zz_pick_up_action__1001" in done.left
+            assert "tables/gone/1001" in traces(url)
             assert len((await session.scalars(select(PickUpAction.id))).all()) == 5
         assert differences(before, tables_of(url)) == []
         assert (await rebuild_memory(url)).left == []
@@ -440,7 +440,7 @@ async def test_a_foreign_view_on_the_tables_keeps_them_and_is_reported(server: S
     await append_and_fold(url, [*TYPES, *picking(1).records])
     ask_to_change(url, "CREATE VIEW public.mine AS SELECT id FROM memory.pick_up_action")
     done = await rebuild_memory(url)
-    assert "pick_up_action__1" in done.left
+    assert "zz_pick_up_action__1001" in done.left
     assert ask(url, "SELECT count(*) FROM public.mine") == [(5,)]
     ask_to_change(url, "DROP VIEW public.mine")
     assert (await rebuild_memory(url)).left == []

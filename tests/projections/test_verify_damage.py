@@ -242,7 +242,7 @@ async def test_an_overwritten_page_of_the_log_is_reported_by_episode_and_event(f
     [(payload,)] = ask(file, "SELECT payload FROM event WHERE episode = 2 AND sequence = 250")
     # Located by a text that occurs nowhere else.
     ask_to_change(file, "UPDATE event SET payload = replace(payload, 'x', 'x') WHERE episode = 2 AND sequence = 250")
-    ask_to_change(file, "UPDATE pose__1 SET y = 7.5 WHERE id = (SELECT max(id) FROM pose__1)")
+    ask_to_change(file, "UPDATE zz_pose__1001 SET y = 7.5 WHERE id = (SELECT max(id) FROM zz_pose__1001)")
     image = bytearray(file.read_bytes())
     places = [place for place in range(len(image)) if image.startswith(payload.encode(), place)]
     page = places[len(places) // 2] // 4096

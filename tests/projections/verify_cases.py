@@ -244,6 +244,7 @@ def visible_tables(url: str) -> list[VisibleTable]:
     tables: dict[str, VisibleTable] = {}
     for physical, column, kind, is_key in listed:
         name, mark, generation = physical.rpartition("__")
+        name = name.removeprefix("zz_")
         if not mark or generation != str(number) or name.startswith("pycrorm_"):
             continue
         table = tables.setdefault(name, VisibleTable(name, f'{schema}"{physical}"', [], [], {}))

@@ -153,7 +153,7 @@ async def test_a_session_cannot_write(reading: Reading) -> None:
     async with reading.session() as session:
         connection = await session.connection()
         with pytest.raises(DBAPIError, match=r"read-?only"):
-            await connection.exec_driver_sql("DELETE FROM pose__1")
+            await connection.exec_driver_sql("DELETE FROM zz_pose__1001")
 
 
 async def test_a_memory_that_is_missing_or_has_no_tables_is_unavailable(log: EventLog, tmp_path: object) -> None:

@@ -231,7 +231,7 @@ async def test_a_session_with_simulations_cannot_write(log: EventLog) -> None:
     before = await names(log, "table", "view")
     async with Reading.open_address(log.address) as reading, reading.session(simulated=True) as session:
         with pytest.raises(DBAPIError):
-            await (await session.connection()).exec_driver_sql("UPDATE pose__1 SET x = 5")
+            await (await session.connection()).exec_driver_sql("UPDATE zz_pose__1001 SET x = 5")
     assert await names(log, "table", "view") == before
 
 

@@ -79,13 +79,13 @@ ATTACKS: dict[str, Sequence[str]] = {
         "CREATE OPERATOR memory_tables.= (LEFTARG = oid, RIGHTARG = regnamespace, FUNCTION = memory_tables.same)",
     ),
     "triggers on tables that are folded into": (
-        trigger_on("process_metadata__1", "INSERT"),
+        trigger_on("zz_process_metadata__1001", "INSERT"),
         trigger_on("pycrorm_generation", "INSERT OR UPDATE"),
     ),
-    "a view in the place of a table": view_instead_of("object__1"),
+    "a view in the place of a table": view_instead_of("zz_object__1001"),
     "a view in the place of the note of the generations": view_instead_of("pycrorm_generation"),
     "a default value": (
-        "ALTER TABLE memory_tables.process_metadata__1 ADD COLUMN planted integer DEFAULT memory_tables.one()",
+        "ALTER TABLE memory_tables.zz_process_metadata__1001 ADD COLUMN planted integer DEFAULT memory_tables.one()",
     ),
 }
 

@@ -37,6 +37,7 @@ from pycrorm_async.projections.schema.generations import (
 from pycrorm_async.projections.schema.layout import Layout
 from pycrorm_async.projections.schema.tables import OWN, Storage
 from pycrorm_async.projections.schema.user_views import with_user_views
+from pycrorm_async.projections.table_names import next_number
 from pycrorm_async.store.log import EventLog
 
 __all__ = [
@@ -88,7 +89,7 @@ async def make_projection_tables(connection: AsyncConnection, projection: Projec
     generations = await read_generations(connection)
     own = f"{PROJECTION}{projection.name}"
     numbers = [each.number for name, each in generations.items() if name == own or name.startswith(f"{own}/")]
-    empty = Generation(1 + max(numbers, default=0), 0, Layout(), {}, projection.version)
+    empty = Generation(next_number(numbers), 0, Layout(), {}, projection.version)
     generation = await grow_tables(connection, empty, layout_of(projection, connection.dialect))
     await make_empty(connection, {f"{checkpoints.TABLE}_{projection.name}": checkpoints.COLUMNS}, generation.number)
     await write_generation(connection, key, generation)

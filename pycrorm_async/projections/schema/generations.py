@@ -1,11 +1,11 @@
 """Create, extend and switch generations: complete sets of tables, with views in front of the visible one.
 
-Theory of operation. A generation is one set of physical tables whose names end in its number (`pose__7`). Public views
-(`pose`) select from the tables of one generation, so replacing the views replaces all tables at once. Each generation
-has a row in `pycrorm_generation` with its number, its layout, the SQL of its views, the version of the fold that made
-it, and a revision. The key of the row is the state. For the built-in tables: `tables` is visible, `tables/making` is
-being filled by a rebuild, `tables/gone/6` is replaced and waits to be dropped. A custom projection has the same states
-under `projection/NAME`, `projection/NAME/making` and `projection/NAME/gone/6`.
+Theory of operation. A generation is one set of physical tables whose names end in its number (`zz_pose__1007`). Public
+views (`pose`) select from the tables of one generation, so replacing the views replaces all tables at once. Each
+generation has a row in `pycrorm_generation` with its number, its layout, the SQL of its views, the version of the fold
+that made it, and a revision. The key of the row is the state. For the built-in tables: `tables` is visible,
+`tables/making` is being filled by a rebuild, `tables/gone/1006` is replaced and waits to be dropped. A custom
+projection has the same states under `projection/NAME`, `projection/NAME/making` and `projection/NAME/gone/1006`.
 
 Three activities meet here: a fold writes rows, a fold or an opening process extends the tables when new designator
 types are declared, and a rebuild switches to another generation. A fold computes the rows of a batch without a lock,
@@ -42,13 +42,12 @@ from pycrorm_async.projections.schema.tables import (
     OWN,
     Storage,
     expected,
-    index_name,
     indexed,
     leaf_columns,
     make_table,
-    physical_name,
 )
 from pycrorm_async.projections.schema.user_views import view_text
+from pycrorm_async.projections.table_names import index_name, physical_name
 from pycrorm_async.store.dialects import dialect_of
 
 __all__ = [

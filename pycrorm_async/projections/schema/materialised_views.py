@@ -15,7 +15,8 @@ from sqlalchemy.schema import CreateIndex, CreateTable
 
 from pycrorm_async.errors import DatabaseError
 from pycrorm_async.projections.schema.layout import Layout, MaterialisedView
-from pycrorm_async.projections.schema.tables import EPISODE, Storage, index_name, make_table, physical_name
+from pycrorm_async.projections.schema.tables import EPISODE, Storage, make_table
+from pycrorm_async.projections.table_names import index_name, physical_name
 from pycrorm_async.store.dialects import dialect_of
 
 __all__ = ["ViewRefused", "make_materialised", "refresh_some", "shown_texts", "materialised_tables"]

@@ -19,7 +19,7 @@ from sqlalchemy import BigInteger, Boolean, Column, Double, Index, Integer, Meta
 from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.types import TypeEngine
 
-from pycrorm_async.events.fields import bounded
+from pycrorm_async.projections.table_names import index_name, physical_name
 from pycrorm_async.store.dialect import Expected
 
 __all__ = [
@@ -30,10 +30,8 @@ __all__ = [
     "COLUMNS",
     "leaf_columns",
     "make_table",
-    "physical_name",
     "column_type",
     "indexed",
-    "index_name",
     "expected",
 ]
 
@@ -298,16 +296,6 @@ _ALIKE_OTHERS = [10]
 have the same value in an index's first column and in its first two."""
 
 
-_NAME_LENGTH_MAX = 63
-"""The longest name in bytes; PostgreSQL truncates longer ones."""
-
-
-def physical_name(table: str, generation: int) -> str:
-    """Return the name of the table that contains the rows, such as `pose__1`."""
-    number = f"__{generation}"
-    return f"{bounded(table, _NAME_LENGTH_MAX - len(number))}{number}"
-
-
 def make_table(name: str, columns: dict[str, Storage], generation: int, stored: Callable[[str], str]) -> Table:
     """Return the table with its key and its indexes, in one generation.
 
@@ -377,11 +365,6 @@ def expected(name: str, columns: dict[str, Storage], generation: int) -> Expecte
         index_name(name, column, generation): _ALIKE.get(column, _ALIKE_OTHERS) for column in indexed(name, columns)
     }
     return Expected(physical_name(name, generation), rows, alike)
-
-
-def index_name(name: str, column: str, generation: int) -> str:
-    """Return the name of the index on this column."""
-    return bounded(f"{physical_name(name, generation)}_by_{column}", _NAME_LENGTH_MAX)
 
 
 def column_type(storage: Storage) -> TypeEngine[Any]:
