@@ -256,7 +256,9 @@ async def test_disposed_classes_leave_no_references(log: EventLog) -> None:
         mapped_class += [weakref.ref(classes.of(name)) for name in ("SayingAction", "CarefulPickUpAction", "Loop")]
     assert dict(Designator.__mapper__.polymorphic_map) == identities
     del classes
+    gc.unfreeze()  # tests/conftest.py froze all objects, also the loading paths that `dispose` replaced
     gc.collect()
+    gc.freeze()
     assert [each() for each in mapped_class] == [None, None, None]
     assert names(await every(log, select(Action).order_by(Action.id))) == ["PickUpAction", "Action"]
 

@@ -53,8 +53,12 @@ asyncio.run(main(sys.argv[1], int(sys.argv[2])))
 """
 
 
-@pytest.mark.parametrize("total", [60_000, pytest.param(400_000, marks=pytest.mark.soak)])
-def test_a_long_plan_is_stored_whole_and_its_process_does_not_grow(tmp_path: Path, total: int) -> None:
+@pytest.mark.parametrize(
+    ("total", "grown_kib_max"), [(60_000, 40_000), pytest.param(400_000, 20_000, marks=pytest.mark.soak)]
+)
+def test_a_long_plan_is_stored_whole_and_its_process_does_not_grow(
+    tmp_path: Path, total: int, grown_kib_max: int
+) -> None:
     done = subprocess.run(
         [sys.executable, "-c", SCRIPT, f"sqlite:///{tmp_path}/long.db", str(total)],
         env=environment(),
@@ -67,6 +71,7 @@ def test_a_long_plan_is_stored_whole_and_its_process_does_not_grow(tmp_path: Pat
     figures = json.loads(done.stdout)
     assert figures["rows"] == [total, 0, total - 1, total]
     assert figures["done"] == total + 1  # the root of the episode as well
-    # In KiB, over the second half: the flush before it has seen the largest batch of the writer, which may come late on
-    # a busy machine. 32 kB a node, as in the reference system, would be 960 MB for the smaller plan.
-    assert figures["sizes"][-1] - figures["sizes"][4] < 12_000, figures["sizes"]
+    # In KiB, over the second half. The process grows until the writer has met its largest batch and then no more (the
+    # longer plan: 100 bytes a node at most). On a busy machine that batch may come after the first 30,000 nodes, so the
+    # bound for the shorter plan is that growth; 32 kB a node, as in the reference system, would be 960,000.
+    assert figures["sizes"][-1] - figures["sizes"][4] < grown_kib_max, figures["sizes"]
