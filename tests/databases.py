@@ -13,15 +13,25 @@ import tempfile
 import threading
 import time
 import warnings
-from collections.abc import Coroutine, Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import AsyncIterator, Coroutine, Iterable, Iterator
+from contextlib import asynccontextmanager, closing, contextmanager
 from pathlib import Path
 from typing import Any, Final
 from urllib.parse import urlsplit
 
 import asyncpg
 
-__all__ = ["Server", "server_in", "server_in_memory", "ask", "ask_to_change", "await_events", "run_in_own_loop"]
+__all__ = [
+    "Server",
+    "server_in",
+    "server_in_memory",
+    "ask",
+    "ask_each",
+    "ask_to_change",
+    "change_each",
+    "await_events",
+    "run_in_own_loop",
+]
 
 _ROOM_BYTES: Final = 4 << 30
 """A server takes at most half a gigabyte, and each test process starts one or two."""
@@ -132,12 +142,18 @@ def ask(place: str | Path, statement: str, parameters: Iterable[Any] = ()) -> li
     """Return the rows of a plain query on a new connection. `place` is a URL, or the path of a SQLite file."""
     url = str(place)
     if not url.startswith("postgresql:"):
-        connection = sqlite3.connect(url.removeprefix("sqlite:///"), timeout=0.1)
-        try:
+        with closing(sqlite3.connect(url.removeprefix("sqlite:///"), timeout=0.1)) as connection:
             return connection.execute(statement, tuple(parameters)).fetchall()
-        finally:
-            connection.close()
     return [tuple(row) for row in run_in_own_loop(_run(url, statement, tuple(parameters)))]
+
+
+def ask_each(place: str | Path, statements: Iterable[str]) -> list[list[Any]]:
+    """Return the rows of each query, all on one new connection. One of SQLite first parses the schema for 4 ms."""
+    url = str(place)
+    if not url.startswith("postgresql:"):
+        with closing(sqlite3.connect(url.removeprefix("sqlite:///"), timeout=0.1)) as connection:
+            return [connection.execute(each).fetchall() for each in statements]
+    return run_in_own_loop(_run_each(url, statements))
 
 
 def await_events(file: Path, count: int) -> None:
@@ -156,20 +172,40 @@ def ask_to_change(place: str | Path, statement: str, parameters: Iterable[Any] =
     if url.startswith("postgresql:"):
         ask(url, statement, parameters)
         return
-    connection = sqlite3.connect(url.removeprefix("sqlite:///"))
-    try:
+    with closing(sqlite3.connect(url.removeprefix("sqlite:///"))) as connection:
         connection.execute(statement, tuple(parameters))
         connection.commit()
+
+
+def change_each(place: str | Path, statements: Iterable[str]) -> None:
+    """Execute and commit each of the changes, all on one new connection."""
+    url = str(place)
+    if url.startswith("postgresql:"):
+        run_in_own_loop(_run_each(url, statements))
+        return
+    with closing(sqlite3.connect(url.removeprefix("sqlite:///"))) as connection:
+        for each in statements:
+            connection.execute(each)
+        connection.commit()
+
+
+@asynccontextmanager
+async def _connection(url: str) -> AsyncIterator[Any]:
+    connection = await asyncpg.connect(url, server_settings={"search_path": "memory, pycrorm, public"})
+    try:
+        yield connection
     finally:
-        connection.close()
+        await connection.close()
 
 
 async def _run(url: str, statement: str, parameters: tuple[Any, ...]) -> list[Any]:
-    connection = await asyncpg.connect(url, server_settings={"search_path": "memory, pycrorm, public"})
-    try:
+    async with _connection(url) as connection:
         return list(await connection.fetch(statement, *parameters))
-    finally:
-        await connection.close()
+
+
+async def _run_each(url: str, statements: Iterable[str]) -> list[list[Any]]:
+    async with _connection(url) as connection:
+        return [[tuple(row) for row in await connection.fetch(each)] for each in statements]
 
 
 def run_in_own_loop(call: Coroutine[Any, Any, list[Any] | None]) -> list[Any]:

@@ -15,7 +15,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, TypeAlias
 
-from tests.databases import ask
+from tests.databases import ask, ask_each
 
 __all__ = ["Tables", "Logs", "tables_of", "logs_of", "declarations_of", "united", "differences"]
 
@@ -61,25 +61,27 @@ def tables_of(place: str | Path) -> Tables:
         name, mark, number = physical.rpartition("__")
         if mark and number == str(generation) and "pycrorm_" not in name:
             columns.setdefault(physical, []).append(column)
-    result: Tables = {}
+    queries = []
     for physical, each in columns.items():
+        listed = ", ".join(f'"{column}"' for column in each)
+        queries.append(f'SELECT {listed} FROM {schema}"{physical}"')
+    result: Tables = {}
+    for (physical, each), rows in zip(columns.items(), ask_each(place, queries), strict=True):
         name = physical.removesuffix(f"__{generation}").removeprefix("zz_")
-        result[name] = _rows(place, name, f'{schema}"{physical}"', each, leaves.get(name), episodes)
+        result[name] = _rows(name, rows, each, leaves.get(name), episodes)
     return {name: rows for name, rows in result.items() if rows}
 
 
 def _rows(
-    place: str | Path,
     name: str,
-    physical: str,
+    values_of_rows: list[Any],
     columns: list[str],
     leaf: Mapping[str, str] | None,
     episodes: Mapping[int, str],
 ) -> dict[Key, dict[str, Any]]:
     keys = _KEYS.get(name, ("id",))
-    listed = ", ".join(f'"{column}"' for column in columns)
     rows: dict[Key, dict[str, Any]] = {}
-    for values in ask(place, f"SELECT {listed} FROM {physical}"):
+    for values in values_of_rows:
         row = {
             column: _portable(name, column, leaf, value, episodes)
             for column, value in zip(columns, values, strict=True)

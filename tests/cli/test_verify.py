@@ -13,7 +13,7 @@ from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.postgresql.roles import GRANTS
 from tests.commands import answer, one_line_of, pycrorm
-from tests.databases import Server, ask, ask_to_change
+from tests.databases import Server, ask, ask_to_change, change_each
 from tests.projections.verify_cases import fold_in_batches, full, opened, visible_tables
 from tests.store.factories import declaration
 
@@ -75,8 +75,8 @@ def test_differences_are_printed_with_both_values_and_exit_with_1_and_damage_wit
         "episode": ID.format(2), "number": 2, "sequence": 9, "table": "detection", "column": "name",
         "stored": "[b]mïlk", "expected": "milk",
     }  # fmt: skip
-    for (name,) in ask(file, "SELECT name FROM sqlite_master WHERE type = 'trigger'"):
-        ask_to_change(file, f"DROP TRIGGER {name}")
+    triggers = ask(file, "SELECT name FROM sqlite_master WHERE type = 'trigger'")
+    change_each(file, [f"DROP TRIGGER {name}" for (name,) in triggers])
     ask_to_change(file, "DELETE FROM event WHERE episode = 1 AND sequence = 9")
     done = pycrorm("verify", cwd=folder)
     assert (done.returncode, done.stderr) == (4, "")

@@ -23,7 +23,7 @@ from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
-from tests.databases import ask, ask_to_change
+from tests.databases import ask, ask_to_change, change_each
 from tests.table_comparison import declarations_of, differences, tables_of
 
 RED = (1.0, 0.0, 0.0, 0.5)
@@ -136,8 +136,8 @@ async def test_verify_names_a_description_that_changed_or_is_gone_and_its_blob(f
         ask_to_change(filled, "ALTER TABLE pycrorm.pycrorm_declaration DISABLE TRIGGER ALL")
         ask_to_change(filled, "ALTER TABLE pycrorm.pycrorm_blob DISABLE TRIGGER ALL")
     else:
-        for (trigger,) in ask(filled, "SELECT name FROM sqlite_master WHERE type = 'trigger'"):
-            ask_to_change(filled, f"DROP TRIGGER {trigger}")
+        triggers = ask(filled, "SELECT name FROM sqlite_master WHERE type = 'trigger'")
+        change_each(filled, [f"DROP TRIGGER {trigger}" for (trigger,) in triggers])
     blob = "pycrorm.pycrorm_blob" if filled.startswith("postgresql:") else "pycrorm_blob"
     ask_to_change(filled, f"DELETE FROM {blob}")
     (damage,) = (await verified(filled)).damages

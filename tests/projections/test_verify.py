@@ -20,7 +20,7 @@ from pycrorm_async.projections.verify import parts
 from pycrorm_async.projections.verify.row_comparison import Difference
 from pycrorm_async.projections.verify.verify import verify
 from pycrorm_async.store.log import EventLog
-from tests.databases import ask, ask_to_change
+from tests.databases import ask, ask_to_change, change_each
 from tests.projections.event_script import Script
 from tests.projections.verify_cases import (
     TYPES,
@@ -33,7 +33,7 @@ from tests.projections.verify_cases import (
     full,
     in_own_loop,
     in_parts,
-    insert,
+    insertion,
     look,
     lost,
     named,
@@ -41,6 +41,7 @@ from tests.projections.verify_cases import (
     parked,
     rebuilt,
     rows_of,
+    rows_of_each,
     running,
     set_columns,
     visible_tables,
@@ -75,7 +76,7 @@ async def test_verify_finds_nothing_in_random_plans_with_failures(
     assert_clean(result)
     assert (result.episodes, result.behind) == (25, 0)
     assert result.events == ask(database_url, "SELECT count(*) FROM event")[0][0]
-    assert result.rows == sum(len(rows_of(database_url, table)) for table in visible_tables(database_url))
+    assert result.rows == sum(map(len, rows_of_each(database_url, visible_tables(database_url))))
     for events in (60, 400):
         assert findings(await in_parts(log, events, monkeypatch)) == findings(result)
     await log.close()
@@ -238,7 +239,7 @@ async def test_a_deleted_row_is_reported(log: EventLog, database_url: str) -> No
             number, sequence = event_of(table, row)
             whole = tuple(row[each] for each in table.columns)
             assert (await look(log)).differences == [Difference(number, sequence, table.name, None, None, whole)]
-            insert(database_url, table, row)
+            ask_to_change(database_url, insertion(table, row))
     assert_clean(await look(log))
 
 
@@ -250,7 +251,7 @@ async def test_a_deleted_row_is_reported(log: EventLog, database_url: str) -> No
 async def test_a_row_without_an_event_is_reported_in_every_table(
     log: EventLog, database_url: str, number: int, sequence: int
 ) -> None:
-    expected = []
+    expected, insertions = [], []
     for table in visible_tables(database_url):
         added: dict[str, Any] = dict.fromkeys(table.columns)
         added |= {each: "x" if "text" in table.kinds[each] else 0 for each in table.key}
@@ -258,9 +259,10 @@ async def test_a_row_without_an_event_is_reported_in_every_table(
         if of_episode and number in (1, 6):
             continue
         added["id" if "id" in table.key else table.key[0]] = number if of_episode else number * 2**31 + sequence * 32
-        insert(database_url, table, added)
+        insertions.append(insertion(table, added))
         event = (number, 1) if of_episode else (number, sequence)
         expected.append(Difference(*event, table.name, None, tuple(added[each] for each in table.columns), None))
+    change_each(database_url, insertions)
     result = await look(log)
     assert sorted(result.differences, key=repr) == sorted(expected, key=repr)
     assert result.drift == len(expected) > 30

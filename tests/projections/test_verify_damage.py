@@ -15,7 +15,7 @@ from pycrorm_async.events.codec import encode
 from pycrorm_async.projections.verify.verify import VerifyResult, verify
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from tests.databases import ask, ask_to_change
+from tests.databases import ask, ask_each, ask_to_change, change_each
 from tests.projections.event_script import NAVIGATE, PICK_UP, name_of
 from tests.projections.verify_cases import (
     assert_clean,
@@ -25,6 +25,7 @@ from tests.projections.verify_cases import (
     look,
     opened,
     rows_of,
+    rows_of_each,
     set_columns,
     visible_tables,
 )
@@ -49,17 +50,16 @@ async def log(database_url: str) -> AsyncIterator[EventLog]:
 
 def unlock(url: str) -> None:
     if url.startswith("postgresql:"):
-        for table in ("event", "episode", "pycrorm_declaration", "pycrorm_digest"):
-            ask_to_change(url, f"ALTER TABLE pycrorm.{table} DISABLE TRIGGER ALL")
+        tables = ("event", "episode", "pycrorm_declaration", "pycrorm_digest")
+        change_each(url, [f"ALTER TABLE pycrorm.{table} DISABLE TRIGGER ALL" for table in tables])
     else:
-        for (name,) in ask(url, TRIGGERS):
-            ask_to_change(url, f"DROP TRIGGER {name}")
+        change_each(url, [f"DROP TRIGGER {name}" for (name,) in ask(url, TRIGGERS)])
 
 
 def everything(url: str) -> list[Any]:
     """Return all rows of log and tables."""
-    logged = [ask(url, f"SELECT * FROM {name} ORDER BY 1, 2") for name in ("event", "episode", "pycrorm_declaration")]
-    return [*logged, *(rows_of(url, table) for table in visible_tables(url))]
+    logged = [f"SELECT * FROM {name} ORDER BY 1, 2" for name in ("event", "episode", "pycrorm_declaration")]
+    return [*ask_each(url, logged), *rows_of_each(url, visible_tables(url))]
 
 
 async def findings_for_any_parts(log: EventLog, url: str, monkeypatch: pytest.MonkeyPatch) -> VerifyResult:

@@ -44,7 +44,7 @@ from pycrorm_async.projections.verify import parts
 from pycrorm_async.projections.verify.verify import VerifyResult, verify
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from tests.databases import ask, ask_to_change
+from tests.databases import ask, ask_each, ask_to_change
 from tests.projections.event_script import NAVIGATE, PICK_UP, Script, declarations, declared, field, name_of, pose
 
 EVERY = declared(
@@ -285,10 +285,19 @@ def where(table: VisibleTable, row: dict[str, Any]) -> str:
 
 
 def rows_of(url: str, table: VisibleTable) -> list[dict[str, Any]]:
-    listed = ", ".join(f'"{each}"' for each in table.columns)
-    order = ", ".join(f'"{each}"' for each in table.key)
-    result = ask(url, f"SELECT {listed} FROM {table.physical} ORDER BY {order}")
-    return [dict(zip(table.columns, row, strict=True)) for row in result]
+    return rows_of_each(url, [table])[0]
+
+
+def rows_of_each(url: str, tables: Sequence[VisibleTable]) -> list[list[dict[str, Any]]]:
+    """Return the rows of each of the tables, in the order of their keys."""
+    queries = []
+    for table in tables:
+        listed, order = (", ".join(f'"{each}"' for each in names) for names in (table.columns, table.key))
+        queries.append(f"SELECT {listed} FROM {table.physical} ORDER BY {order}")
+    return [
+        [dict(zip(table.columns, row, strict=True)) for row in rows]
+        for table, rows in zip(tables, ask_each(url, queries), strict=True)
+    ]
 
 
 def event_of(table: VisibleTable, row: dict[str, Any]) -> tuple[int, int]:
@@ -299,10 +308,11 @@ def event_of(table: VisibleTable, row: dict[str, Any]) -> tuple[int, int]:
     return key // 2**31, key // 2**5 % 2**26
 
 
-def insert(url: str, table: VisibleTable, row: dict[str, Any]) -> None:
+def insertion(table: VisibleTable, row: dict[str, Any]) -> str:
+    """Return the statement that inserts this row."""
     names = ", ".join(f'"{each}"' for each in table.columns)
     values = ", ".join(literal(row[each], table.kinds[each]) for each in table.columns)
-    ask_to_change(url, f"INSERT INTO {table.physical} ({names}) VALUES ({values})")
+    return f"INSERT INTO {table.physical} ({names}) VALUES ({values})"
 
 
 def set_columns(url: str, table: VisibleTable, row: dict[str, Any], values: dict[str, Any]) -> None:
