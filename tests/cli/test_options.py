@@ -33,7 +33,11 @@ def test_the_command_prints_its_version(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("words", "completed"),
-    [("pycrorm reb", "rebuild"), ("pycrorm run --wr", "--writer"), ("pycrorm spool rep", "repair")],
+    [
+        pytest.param("pycrorm reb", "rebuild", marks=pytest.mark.soak),
+        ("pycrorm run --wr", "--writer"),
+        ("pycrorm spool rep", "repair"),
+    ],
 )
 def test_a_shell_completes_verbs_and_their_options(tmp_path: Path, words: str, completed: str) -> None:
     typed = {"_PYCRORM_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": str(words.count(" "))}

@@ -103,7 +103,7 @@ def start_rebuild(folder: Path, workers: str) -> subprocess.Popen[str]:
 @pytest.mark.parametrize("workers", ["1", "2"])
 def test_an_interrupted_rebuild_exits_with_130_and_the_next_one_continues(tmp_path: Path, workers: str) -> None:
     url = f"sqlite:///{tmp_path}/pycrorm.db"
-    asyncio.run(append_and_fold(url, [*TYPES, *(each for number in range(1, 100) for each in picking(number).records)]))
+    asyncio.run(append_and_fold(url, [*TYPES, *(each for number in range(1, 50) for each in picking(number).records)]))
     before = tables_of(url)
     blocker = sqlite3.connect(tmp_path / "pycrorm.db", isolation_level=None, timeout=60)
     making = "SELECT generation FROM pycrorm_generation WHERE projection = 'tables/making'"

@@ -47,6 +47,7 @@ async def assert_intact(url: str, *, behind: int = 0) -> None:
     assert (result.damage, result.drift, result.behind, list(map(str, result.damages))) == (0, 0, behind, [])
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_tags_change_during_and_after_an_episode_and_survive_copy_and_rebuild(
     database_url: str, tmp_path: Path, server: Server
 ) -> None:

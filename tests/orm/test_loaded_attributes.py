@@ -72,6 +72,7 @@ async def transport(memory: Memory) -> None:
     await memory.flush()
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_every_attribute_is_loaded_or_says_how_to_load_it(
     database_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

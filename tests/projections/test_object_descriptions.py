@@ -111,6 +111,7 @@ async def test_designator_types_are_read_without_the_descriptions(filled: str) -
     assert ask(filled, "SELECT count(*) FROM object_description") == [(3,)]
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_a_copy_and_a_rebuild_have_the_same_descriptions(filled: str, tmp_path: Path) -> None:
     target = f"sqlite:///{tmp_path / 'copy.db'}"
     await copy_episodes(filled, target)
