@@ -172,6 +172,7 @@ def words_of(number: int, words: int, *, episode: int | None = None) -> list[tup
     return expected
 
 
+@pytest.mark.soak_on("postgresql")
 @pytest.mark.parametrize(
     ("hand", "batch_events"),
     [
