@@ -67,8 +67,9 @@ from pycrorm_async.projections.schema.mapped_tables import mapped_leaves
 from pycrorm_async.projections.schema.materialised_views import refresh_some
 from pycrorm_async.projections.schema.public_views import public_views
 from pycrorm_async.projections.schema.session_views import with_views
+from pycrorm_async.projections.schema.tables import CORE
 from pycrorm_async.projections.schema.user_views import UserView, view_text, with_user_views
-from pycrorm_async.projections.table_names import next_number
+from pycrorm_async.projections.table_names import next_number, physical_name
 from pycrorm_async.store.dialect import RowRefused
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
@@ -200,9 +201,11 @@ class Rebuild:
     async def show(self) -> None:
         """Make the new tables visible, with at least the events of the old ones. `clear` drops the old ones."""
         with self._log.translated():
-            for _ in range(_SHOW_ATTEMPTS):
+            for attempt in range(_SHOW_ATTEMPTS):
                 while await self.fold_next_batch() is not None:
                     pass
+                if attempt == 0:
+                    await self._gather_statistics()
                 await self._fill_kept()
                 try:
                     if await self._show_if_complete():
@@ -213,6 +216,14 @@ class Rebuild:
         raise DatabaseUnavailable(
             f"{self._log.address}: {reason}: run `pycrorm rebuild` again when fewer robots record"
         )
+
+    async def _gather_statistics(self) -> None:
+        """Let the planner know the new tables: without statistics, questions about them may take minutes."""
+        async with self._log.engine.begin() as connection:
+            making = await self._making.generation(connection, "share")
+            names = [*(CORE if self._projection is None else ()), *making.layout.leaves]
+            tables = [physical_name(each, self.number) for each in names]
+            await dialect_of(connection).gather_statistics(connection, tables)
 
     async def _fill_kept(self) -> None:
         """Compute the rows of materialised views from the new tables."""

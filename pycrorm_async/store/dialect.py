@@ -261,6 +261,10 @@ class Dialect(Protocol):
         """Give the query planner statistics of tables that are still empty."""
         ...
 
+    async def gather_statistics(self, connection: AsyncConnection, tables: Sequence[str]) -> None:
+        """Count and sample the rows of tables that have been filled, for the query planner, if it needs that."""
+        ...
+
     def stored_column(self, name: str) -> str:
         """Return the table's column for a view's column: another name if the database reserves this one."""
         ...

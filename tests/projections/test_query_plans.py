@@ -8,6 +8,7 @@ import pytest
 
 from pycrorm_async import Memory
 from pycrorm_async.operations.rebuild import rebuild_memory
+from pycrorm_async.plan import Code
 from tests.databases import Server, ask, ask_to_change
 
 pytestmark = pytest.mark.slow
@@ -89,3 +90,17 @@ async def test_the_statistics_of_a_table_follow_it_through_a_rebuild(tmp_path: P
     assert analysed_tables() == {"zz_task_tree_node__1001"}
     await rebuild_memory(url)
     assert analysed_tables() == {"zz_task_tree_node__1002"}
+
+
+async def test_a_server_knows_the_rows_of_rebuilt_tables_before_they_are_shown(server: Server, tmp_path: Path) -> None:
+    """The server of the tests never gathers statistics by itself, and others only after a minute."""
+    url = server.new_database()
+    async with Memory.open(url, spool=tmp_path / "spool") as memory, memory.episode():
+        for _ in range(20):
+            await Code(lambda: None).perform()
+    await rebuild_memory(url)
+    counted = dict(ask(url, "SELECT relname, reltuples FROM pg_class WHERE relname LIKE 'zz_%1002' AND relkind = 'r'"))
+    assert counted["zz_task_tree_node__1002"] == 21
+    assert min(counted.values()) == 0  # -1 means that the rows were never counted
+    sampled = "SELECT attname FROM pg_stats WHERE tablename = 'zz_task_tree_node__1002' AND n_distinct = 1"
+    assert ("process_metadata_id",) in ask(url, sampled)

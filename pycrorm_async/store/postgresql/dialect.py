@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import AsyncIterator, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import asynccontextmanager, contextmanager
+from contextlib import asynccontextmanager
 from typing import Any, NamedTuple
 
-from sqlalchemy.exc import DataError, DBAPIError, IntegrityError
+from sqlalchemy.exc import DBAPIError
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.bulk_records import make
@@ -18,7 +18,6 @@ from pycrorm_async.store.dialect import (
     LogIdentity,
     Migrations,
     Progress,
-    RowRefused,
     RowsByTable,
     StoredOn,
 )
@@ -244,6 +243,10 @@ class PostgreSQL:
     async def expect(self, connection: AsyncConnection, tables: Sequence[Expected]) -> None:
         """Do nothing: the server gathers statistics itself."""
 
+    async def gather_statistics(self, connection: AsyncConnection, tables: Sequence[str]) -> None:
+        quote = connection.dialect.identifier_preparer.quote
+        await connection.exec_driver_sql(f"ANALYZE {', '.join(f'{TABLES_SCHEMA}.{quote(each)}' for each in tables)}")
+
     def stored_column(self, name: str) -> str:
         return f"_{name}" if name in tables.SYSTEM_COLUMNS else name
 
@@ -329,7 +332,7 @@ class PostgreSQL:
     ) -> None:
         arrays = ", ".join(f"${index}::{kind}[]" for index, kind in enumerate(columns.values(), 1))
         changes = ", ".join(f"{column} = change.{column}" for column in list(columns)[1:])
-        with _rows_refused():
+        with errors.rows_refused():
             await connection.exec_driver_sql(
                 f"UPDATE {table} SET {changes}"  # noqa: S608
                 f" FROM unnest({arrays}) AS change ({', '.join(columns)}) WHERE {table}.id = change.id",
@@ -367,7 +370,7 @@ async def _copy(
 ) -> None:
     """Insert rows by COPY, in the transaction that an earlier statement through SQLAlchemy began."""
     driver = await _driver(connection)
-    with _rows_refused():
+    with errors.rows_refused():
         await driver.copy_records_to_table(table, schema_name=schema, columns=columns, records=rows)
 
 
@@ -375,18 +378,6 @@ async def _driver(connection: AsyncConnection) -> Any:
     driver = (await connection.get_raw_connection()).driver_connection
     assert driver is not None
     return driver
-
-
-@contextmanager
-def _rows_refused() -> Iterator[None]:
-    try:
-        yield
-    except DBAPIError as error:
-        if isinstance(error, DataError | IntegrityError):
-            raise RowRefused(str(error.orig)) from error
-        raise
-    except errors.ROW_FAULTS as error:
-        raise RowRefused(" ".join(str(error).split())) from error
 
 
 async def _rows(kind: Any, connection: AsyncConnection, statement: str, *parameters: Any) -> list[Any]:

@@ -5,13 +5,16 @@ from __future__ import annotations
 import os
 import re
 import ssl
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import asyncpg
-from sqlalchemy.exc import DBAPIError, InterfaceError
+from sqlalchemy.exc import DataError, DBAPIError, IntegrityError, InterfaceError
 
 from pycrorm_async.errors import DamageError, DatabaseUnavailable, InternalError, PycrormError
+from pycrorm_async.store.dialect import RowRefused
 
-__all__ = ["FAULTS", "ROW_FAULTS", "CommitInDoubt", "translate_error", "refusal", "is_missing_table"]
+__all__ = ["FAULTS", "CommitInDoubt", "rows_refused", "translate_error", "refusal", "is_missing_table"]
 
 FAULTS: tuple[type[Exception], ...] = (
     DBAPIError,
@@ -22,7 +25,7 @@ FAULTS: tuple[type[Exception], ...] = (
     TimeoutError,
 )
 
-ROW_FAULTS: tuple[type[Exception], ...] = (
+_ROW_FAULTS: tuple[type[Exception], ...] = (
     asyncpg.DataError,
     asyncpg.IntegrityConstraintViolationError,
     asyncpg.exceptions._base.DataError,  # noqa: SLF001  raised by the driver before sending; the public name is another class
@@ -59,6 +62,19 @@ _DROPPED_MEANWHILE = re.compile("could not open relation with OID|cache lookup f
 
 class CommitInDoubt(ConnectionError):
     """The server committed, but warns that a synchronous standby may not have the commit."""
+
+
+@contextmanager
+def rows_refused() -> Iterator[None]:
+    """Raise `RowRefused` for an error of a row that the database cannot store."""
+    try:
+        yield
+    except DBAPIError as error:
+        if isinstance(error, DataError | IntegrityError):
+            raise RowRefused(str(error.orig)) from error
+        raise
+    except _ROW_FAULTS as error:
+        raise RowRefused(" ".join(str(error).split())) from error
 
 
 def translate_error(error: Exception, database: str) -> PycrormError:
