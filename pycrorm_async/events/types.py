@@ -184,6 +184,7 @@ class ObjectAdded(Happening, frozen=True):
         color: red, green, blue, opacity, 0 to 1; None if the description alone says it.
         model, serial: of a robot with a `RobotDescription`: the model's name, and what distinguishes robots of one
             model, if it is known.
+        mass_kg: as given, or the sum of the masses in the description; None if it is not known.
     """
 
     name: str
@@ -195,6 +196,7 @@ class ObjectAdded(Happening, frozen=True):
     color: tuple[float, float, float, float] | None = None
     model: str | None = None
     serial: str | None = None
+    mass_kg: float | None = None
 
 
 class ObjectRemoved(Happening, frozen=True):

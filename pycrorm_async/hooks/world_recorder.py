@@ -127,6 +127,7 @@ class WorldRecorder:
                 self._emitter.descriptions.declare(added),
                 self._color(added),
                 *_model(added),
+                added.mass_kg,
             ),
             row_of=added,
         )

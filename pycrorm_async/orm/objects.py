@@ -97,6 +97,7 @@ class Object(RowOfEvent, Base):
             says it.
         description_fingerprint: fingerprint of its description when it was added; None in later rows.
         model, serial: of a robot with a `RobotDescription`, when it was added; None in later rows.
+        mass_kg: when it was added; None in later rows, and if it is not known.
         description: its description, in every row; None in episodes of older versions. Not loaded by default: use
             `selectinload(Object.description)` or `await row.awaitable_attrs.description`.
         node_id: the node that moved or added it; None if no node did.
@@ -120,6 +121,7 @@ class Object(RowOfEvent, Base):
     color: Mapped[list[float] | None] = mapped_column(JsonText())
     model: Mapped[str | None]
     serial: Mapped[str | None]
+    mass_kg: Mapped[float | None]
 
     pose: Mapped[Pose | None] = one_of(lambda: Object.pose_id, "pose")
     _description: Mapped[ObjectDescription | None] = relationship(

@@ -121,7 +121,9 @@ def world_of(
                 urdf = with_mesh_files(urdf, {name: str(folder / file) for name, file in meshes.items()})
             kind = _object_type(each)
             robot = robot_description(each.model) if each.model is not None else None
-            added = Object(each.name, kind, urdf, each.pose, world=world, color=each.color, robot=robot)
+            added = Object(
+                each.name, kind, urdf, each.pose, world=world, color=each.color, mass_kg=each.mass_kg, robot=robot
+            )
             if is_point:
                 added.label(each.name)
         world.restore_state(then.state)

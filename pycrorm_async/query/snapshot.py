@@ -50,6 +50,7 @@ class ObjectThen:
         description_fingerprint: of its description in `WorldThen.descriptions`; None in episodes of older versions.
         color: red, green, blue, opacity, 0 to 1; None if the description alone says it.
         model, serial: of a robot with a `RobotDescription`; None in episodes of older versions.
+        mass_kg: None if it is not known.
     """
 
     id: int
@@ -63,6 +64,7 @@ class ObjectThen:
     color: tuple[float, float, float, float] | None = None
     model: str | None = None
     serial: str | None = None
+    mass_kg: float | None = None
 
 
 @dataclass(frozen=True)

@@ -72,6 +72,7 @@ class _WorldObject:
     color: tuple[float, float, float, float] | None = None
     model: str | None = None
     serial: str | None = None
+    mass_kg: float | None = None
     attached_to: tuple[int, str | None] | None = None
 
 
@@ -161,6 +162,7 @@ class MomentFold:
                     happening.color,
                     happening.model,
                     happening.serial,
+                    happening.mass_kg,
                 )
                 self._names[sequence] = name
             case ObjectMoved():
@@ -300,6 +302,7 @@ class MomentFold:
             color=value.color,
             model=value.model,
             serial=value.serial,
+            mass_kg=value.mass_kg,
         )
 
 

@@ -9,6 +9,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -27,6 +28,7 @@ from pycrorm_async.world.errors import (
     UnknownLink,
 )
 from pycrorm_async.world.models.catalog import built_in_urdf
+from pycrorm_async.world.models.inertia import described_mass_kg
 from pycrorm_async.world.observers import current_world
 from pycrorm_async.world.pose import COORDINATE_MAX, Pose
 from pycrorm_async.world.queries.bounding_boxes import BoundingBox
@@ -52,6 +54,7 @@ class Object:
         pose: pose of the root link's frame, in "map"; None means the origin. `reset` restores it.
         world: the world to add it to; None means the current world of this context.
         color: red, green, blue, opacity, 0 to 1.
+        mass_kg: None means the sum of the masses in the description, which may be unknown.
         robot: the description of a robot; None means the built-in or registered one with the object's name. Without
             `description` the model is that of the robot's description, or the built-in one of its name.
 
@@ -82,9 +85,11 @@ class Object:
         *,
         world: BulletWorld | None = None,
         color: Color | None = None,
+        mass_kg: float | None = None,
         robot: RobotDescription | None = None,
     ) -> None:
         _check_identity(name, object_type)
+        _check_mass(name, mass_kg)
         world = world if world is not None else current_world.get()
         if world is None:
             raise NoWorld(f"object {name!r}")
@@ -105,6 +110,7 @@ class Object:
         self.description_text = urdf_text(name, description)
         self.robot_description = robot
         self.color = color
+        self._mass_kg = mass_kg
         self.chains = {}
         self.body = Body(name, self.description_text, client, self.original_pose, color)
         world.add(self)
@@ -174,6 +180,17 @@ class Object:
         Raises `UnknownLink`.
         """
         return self.body.box_in_link(self._check_link(link))
+
+    @property
+    def mass_kg(self) -> float | None:
+        """The given mass, else that of the description; None if it is not known.
+
+        A description says it for objects that grippers lift, not for robots and environments, whose models often have
+        masses that no one has weighed.
+        """
+        if self._mass_kg is not None or self.object_type in (ObjectType.ROBOT, ObjectType.ENVIRONMENT):
+            return self._mass_kg
+        return described_mass_kg(self.description_text)
 
     def label(self, text: str) -> None:
         """Show a text at the object, if the world has a window."""
@@ -330,6 +347,12 @@ def _check_identity(name: object, object_type: object) -> None:
         raise ObjectRefused(f"an object's name must be a str, got {name!r}")
     if not isinstance(object_type, ObjectType):
         raise ObjectRefused(f"the type of object {name!r} must be an ObjectType, got {object_type!r}")
+
+
+def _check_mass(name: str, mass_kg: object) -> None:
+    """Raise `ObjectRefused` unless the mass is None or a finite number > 0."""
+    if mass_kg is not None and not (isinstance(mass_kg, int | float) and 0 < mass_kg < math.inf):
+        raise ObjectRefused(f"the mass of object {name!r} must be a number of kg > 0, got {mass_kg!r}")
 
 
 def _check_pose(name: str, pose: Pose) -> Pose:

@@ -66,7 +66,13 @@ def original(world: BulletWorld) -> BulletWorld:
 
 def _copy_object(obj: Object, copy: BulletWorld) -> Object:
     object_copy = Object(
-        obj.name, obj.object_type, obj.description_text, obj.original_pose, world=copy, color=obj.color
+        obj.name,
+        obj.object_type,
+        obj.description_text,
+        obj.original_pose,
+        world=copy,
+        color=obj.color,
+        mass_kg=obj.mass_kg,
     )
     object_copy.copy_of = obj
     object_copy.robot_description = obj.robot_description

@@ -276,7 +276,7 @@ async def test_an_object_outside_the_world_is_neither_held_nor_grasped_nor_trans
 
 async def test_an_object_of_several_links_is_held_only_at_its_nearest_link(scene: Scene) -> None:
     """The crane's whole box reaches up to its flag, its lowest link is 0.2 m high."""
-    crane = Object("crane", ObjectType.GENERIC_OBJECT, CRANE, Pose([1.3, 1, 0.6]))
+    crane = Object("crane", ObjectType.GENERIC_OBJECT, CRANE, Pose([1.3, 1, 0.6]), mass_kg=1.0)
     await reached(scene, 1.2)
     assert crane.bounding_box().min.z < 0.9 < crane.bounding_box().max.z
     with pytest.raises(GripperClosedCompletely, match=r"crane is 0\.100 m from it"):

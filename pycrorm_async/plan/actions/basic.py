@@ -148,8 +148,8 @@ class PickUpActionPerformable(CheckedAction):
         EndEffectorFailure: the gripper holds another object.
         PerceptionObjectNotInWorld: the object is not in the robot's world.
         IllPosedGoalFailure: `arm` is not a single arm, or the object is furniture or a robot.
-        CapabilityAbsenceFailure: the robot has no such arm; or collisions count, and the object is wider than the
-            gripper's opening.
+        CapabilityAbsenceFailure: the robot has no such arm; or the object is heavier than the arm's payload; or
+            collisions count, and the object is wider than the gripper's opening.
     """
 
     concept: ClassVar[str | None] = "PickingUp"

@@ -44,8 +44,8 @@ class GripActionPerformable(CheckedAction):
         PerceptionObjectNotInWorld: the object is not in the robot's world.
         IllPosedGoalFailure: `gripper` is not a single arm, the effort is below 0, or the object is furniture or a
             robot.
-        CapabilityAbsenceFailure: the robot has no such arm; or collisions count, and the object is wider than the
-            gripper's opening.
+        CapabilityAbsenceFailure: the robot has no such arm; or the object is heavier than the arm's payload; or
+            collisions count, and the object is wider than the gripper's opening.
     """
 
     concept: ClassVar[str | None] = "Holding"

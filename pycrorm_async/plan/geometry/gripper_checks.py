@@ -18,18 +18,24 @@ __all__ = ["check_fits", "check_same_world", "check_free", "check_takable", "tak
 
 
 def check_takable(robot: CurrentRobot, arm: Arms, target: Object) -> None:
-    """Check that the gripper can take the object or holds it already.
+    """Check that the gripper can take the object, and that the arm lifts it with all that is attached to it.
 
     Raises:
         IllPosedGoalFailure: the object is furniture or a robot, or `arm` is not a single arm.
         EndEffectorFailure: the gripper holds another object.
         PerceptionObjectNotInWorld: the object is in another world than the robot.
-        CapabilityAbsenceFailure: the robot has no such arm, or the arm no gripper.
+        CapabilityAbsenceFailure: the robot has no such arm, or the arm no gripper, or the object is heavier than its
+            payload. A mass that is not known counts as 0.
     """
     check_same_world(robot, target)
     if target.object_type in (ObjectType.ROBOT, ObjectType.ENVIRONMENT):
         raise IllPosedGoalFailure(f"{target.name} cannot be held by a gripper", target.name)
     check_free(robot, arm, target)
+    mass_kg = sum(each.mass_kg or 0.0 for each in (target, *target.world.attachments.below(target)))
+    payload_kg = robot.one_arm(arm).payload_kg
+    if payload_kg is not None and mass_kg > payload_kg:
+        message = f"{target.name} weighs {mass_kg:g} kg, the {arm.name} arm lifts {payload_kg:g} kg"
+        raise CapabilityAbsenceFailure(message, target.name, mass_kg, payload_kg)
 
 
 def check_same_world(robot: CurrentRobot, obj: Object) -> None:

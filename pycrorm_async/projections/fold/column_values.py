@@ -14,9 +14,11 @@ import msgspec
 from pycrorm_async.events.ids import SEQUENCE_MAX, SLOT_MAX, row_id, row_key
 from pycrorm_async.events.values import FieldDeclared, ObjectReference, ObjectValue, PoseValue
 from pycrorm_async.projections.fold.row_batch import Row
+from pycrorm_async.projections.schema.tables import COLUMNS
 
 __all__ = [
     "AS_IT_IS",
+    "UNCHANGED",
     "CannotFold",
     "row",
     "in_slot",
@@ -31,6 +33,8 @@ __all__ = [
 ]
 
 _ROWS_OF_EPISODE, _ROWS_OF_EVENT = row_id(1, 0, 0), row_id(0, 1, 0)
+UNCHANGED: Row = (None,) * (len(COLUMNS["object"]) - COLUMNS["object"].index("joints"))
+"""The columns of an object that only its first row has, from its joints on."""
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _MICROSECOND = timedelta(microseconds=1)
 _SCALARS: dict[str, tuple[type, ...]] = {

@@ -32,6 +32,7 @@ from pycrorm_async.events.types import (
     StateSampled,
 )
 from pycrorm_async.projections.fold.column_values import (
+    UNCHANGED,
     CannotFold,
     json_text,
     microseconds,
@@ -65,8 +66,6 @@ __all__ = ["fold", "fold_happening", "happening_of", "CannotFold", "UndecodableP
 
 
 _NO_OUTCOME: Row = (None, None, None, None)
-_UNCHANGED: Row = (None, None, None, None, None)
-"""The columns of an object that only its first row has: joints, description, colour, model, serial."""
 
 
 class UndecodablePayload(CannotFold):
@@ -237,7 +236,7 @@ def _object_added(event: StoredEvent, added: ObjectAdded, _designators: Designat
     joints = json_text(added.joints) if added.joints else None
     color = json_text(added.color) if added.color is not None else None
     rows.inserts["pose"].append(pose_row(own, number, added.pose))
-    details = joints, added.description, color, added.model, added.serial
+    details = joints, added.description, color, added.model, added.serial, added.mass_kg
     rows.inserts["object"].append((*_object_row(event, added, own, own, node), *details))
 
 
@@ -245,7 +244,7 @@ def _object_moved(event: StoredEvent, moved: ObjectMoved, _designators: Designat
     identity, node = row(event.number, moved.object), _node(event, moved.node)
     own, number = _own(event)
     rows.inserts["pose"].append(pose_row(own, number, moved.pose))
-    rows.inserts["object"].append((*_object_row(event, moved, own, identity, node), *_UNCHANGED))
+    rows.inserts["object"].append((*_object_row(event, moved, own, identity, node), *UNCHANGED))
 
 
 def _object_row(event: StoredEvent, value: ObjectAdded | ObjectMoved, own: int, identity: int, node: int | None) -> Row:

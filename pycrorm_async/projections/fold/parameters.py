@@ -9,6 +9,7 @@ from pycrorm_async.events.types import DesignatorTypeDeclared, NodeStarted
 from pycrorm_async.events.values import FieldDeclared, ObjectReference, ObjectValue
 from pycrorm_async.projections.fold.column_values import (
     AS_IT_IS,
+    UNCHANGED,
     CannotFold,
     in_slot,
     is_missing,
@@ -114,7 +115,7 @@ def _object(event: StoredEvent, node: int, field: FieldDeclared, recorded: Any, 
     part_of = row(event.number, value.part_of.row) if value.part_of is not None else None
     number, time = event.number, microseconds(event.wall_ns)
     columns = own, number, value.dtype, value.name, value.object_type, pose_id, part_of, None, time, node
-    others.append(("object", (*columns, None, None, None, None, None)))
+    others.append(("object", (*columns, *UNCHANGED)))
     return own
 
 

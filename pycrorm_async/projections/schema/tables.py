@@ -136,6 +136,7 @@ CORE: dict[str, dict[str, Storage]] = {
         "color": "json",
         "model": "text",
         "serial": "text",
+        "mass_kg": "real",
     },
     "object_removal": {
         **_ROW,

@@ -1,7 +1,8 @@
 """Return built-in descriptions as URDF text, so that no file has to be read, downloaded or licensed.
 
 A small object is one link, a box or an upright cylinder, with the extent of the objects in the thesis' plans (metres,
-around the object's origin). The robot and the environment are built in by name.
+around the object's origin). Masses are those of the like objects of the YCB set (chips can, cracker box, bowl, mug,
+spoon), and of a litre of milk in its carton. The robot and the environment are built in by name.
 """
 
 from __future__ import annotations
@@ -23,22 +24,24 @@ class _Box(NamedTuple):
     y: Range
     z: Range
     color: tuple[float, float, float, float]
+    mass_kg: float | None = None
 
 
 class _Cylinder(NamedTuple):
     radius: float
     z: Range
     color: tuple[float, float, float, float]
+    mass_kg: float | None = None
 
 
 _SHAPES: dict[ObjectType, _Box | _Cylinder] = {
-    ObjectType.MILK: _Box((-0.033, 0.033), (-0.033, 0.033), (-0.088, 0.106), (0.3, 0.5, 0.9, 1.0)),
-    ObjectType.BREAKFAST_CEREAL: _Box((-0.075, 0.073), (-0.03, 0.028), (-0.102, 0.122), (0.2, 0.7, 0.3, 1.0)),
-    ObjectType.SPOON: _Box((-0.108, 0.108), (-0.023, 0.023), (-0.0095, 0.0095), (0.7, 0.7, 0.75, 1.0)),
-    ObjectType.BOWL: _Cylinder(0.07, (-0.032, 0.035), (0.9, 0.8, 0.2, 1.0)),
-    ObjectType.JEROEN_CUP: _Cylinder(0.04, (-0.05, 0.05), (0.9, 0.9, 0.9, 1.0)),
-    ObjectType.METALMUG: _Cylinder(0.04, (-0.05, 0.05), (0.6, 0.6, 0.65, 1.0)),
-    ObjectType.PRINGLES: _Cylinder(0.0375, (-0.12, 0.12), (0.8, 0.2, 0.2, 1.0)),
+    ObjectType.MILK: _Box((-0.033, 0.033), (-0.033, 0.033), (-0.088, 0.106), (0.3, 0.5, 0.9, 1.0), 1.06),
+    ObjectType.BREAKFAST_CEREAL: _Box((-0.075, 0.073), (-0.03, 0.028), (-0.102, 0.122), (0.2, 0.7, 0.3, 1.0), 0.411),
+    ObjectType.SPOON: _Box((-0.108, 0.108), (-0.023, 0.023), (-0.0095, 0.0095), (0.7, 0.7, 0.75, 1.0), 0.03),
+    ObjectType.BOWL: _Cylinder(0.07, (-0.032, 0.035), (0.9, 0.8, 0.2, 1.0), 0.147),
+    ObjectType.JEROEN_CUP: _Cylinder(0.04, (-0.05, 0.05), (0.9, 0.9, 0.9, 1.0), 0.118),
+    ObjectType.METALMUG: _Cylinder(0.04, (-0.05, 0.05), (0.6, 0.6, 0.65, 1.0), 0.118),
+    ObjectType.PRINGLES: _Cylinder(0.0375, (-0.12, 0.12), (0.8, 0.2, 0.2, 1.0), 0.205),
     ObjectType.GENERIC_OBJECT: _Box((-0.05, 0.05), (-0.05, 0.05), (-0.05, 0.05), (0.6, 0.6, 0.6, 1.0)),
     ObjectType.HUMAN: _Cylinder(0.25, (0.0, 1.75), (0.8, 0.6, 0.5, 1.0)),
 }
@@ -54,8 +57,8 @@ def built_in_urdf(name: str, object_type: ObjectType) -> str:
         return _by_name(name, object_type)
     shape = _SHAPES[object_type]
     if isinstance(shape, _Box):
-        return box_urdf(name, x=shape.x, y=shape.y, z=shape.z, color=shape.color)
-    return cylinder_urdf(name, radius=shape.radius, z=shape.z, color=shape.color)
+        return box_urdf(name, x=shape.x, y=shape.y, z=shape.z, color=shape.color, mass_kg=shape.mass_kg)
+    return cylinder_urdf(name, radius=shape.radius, z=shape.z, color=shape.color, mass_kg=shape.mass_kg)
 
 
 def _by_name(name: str, object_type: ObjectType) -> str:

@@ -7,24 +7,32 @@ from xml.sax.saxutils import quoteattr
 
 __all__ = ["Range", "box_urdf", "cylinder_urdf", "point_urdf", "shape", "numbers", "INERTIA"]
 
-INERTIA = '<inertial><mass value="1"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'
-"""The inertia of every link: Bullet warns about links without one. Its values do not matter because the simulation is
-never stepped."""
+_INERTIAL = '<inertial><mass value="{:g}"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'
+INERTIA = _INERTIAL.format(1.0)
+"""The inertia of a link of a robot or an environment: Bullet warns about links without one. Its values do not matter
+because the simulation is never stepped, and because no gripper lifts such an object."""
 
 Range = tuple[float, float]
 WHITE = (1.0, 1.0, 1.0, 1.0)
 
 
-def box_urdf(name: str, *, x: Range, y: Range, z: Range, color: Sequence[float] = WHITE) -> str:
-    """Return an object of one link: the box between these bounds, m."""
+def box_urdf(
+    name: str, *, x: Range, y: Range, z: Range, color: Sequence[float] = WHITE, mass_kg: float | None = None
+) -> str:
+    """Return an object of one link: the box between these bounds, m. A mass of None is not known."""
     size, middle = zip(*((high - low, (low + high) / 2) for low, high in (x, y, z)), strict=True)
-    return _one_link(name, f'<box size="{numbers(size)}"/>', middle, color)
+    return _one_link(name, f'<box size="{numbers(size)}"/>', middle, color, mass_kg)
 
 
-def cylinder_urdf(name: str, *, radius: float, z: Range, color: Sequence[float] = WHITE) -> str:
-    """Return an object of one link: the upright cylinder around its z axis between these heights, m."""
+def cylinder_urdf(
+    name: str, *, radius: float, z: Range, color: Sequence[float] = WHITE, mass_kg: float | None = None
+) -> str:
+    """Return an object of one link: the upright cylinder around its z axis between these heights, m.
+
+    A mass of None is not known.
+    """
     geometry = f'<cylinder radius="{radius:g}" length="{numbers([z[1] - z[0]])}"/>'
-    return _one_link(name, geometry, (0.0, 0.0, (z[0] + z[1]) / 2), color)
+    return _one_link(name, geometry, (0.0, 0.0, (z[0] + z[1]) / 2), color, mass_kg)
 
 
 def point_urdf(name: str, *, joints: Iterable[str], links: Iterable[str]) -> str:
@@ -33,13 +41,13 @@ def point_urdf(name: str, *, joints: Iterable[str], links: Iterable[str]) -> str
     Its joints are continuous, so that they take every position, and move links without a shape. `links` are fixed.
     """
     visual = '<visual><geometry><sphere radius="0.01"/></geometry><material name="1 0 1"><color rgba="1 0 1 1"/>'
-    parts = [f"<link name={quoteattr(name)}>{INERTIA}{visual}</material></visual></link>"]
+    parts = [f"<link name={quoteattr(name)}>{visual}</material></visual></link>"]
     for kind, joint, link in (
         *(("continuous", each, f"{each} of {name}") for each in joints),
         *(("fixed", f"{each} fixed in {name}", each) for each in links if each != name),
     ):
         parts.append(
-            f"<link name={quoteattr(link)}>{INERTIA}</link><joint name={quoteattr(joint)} type={quoteattr(kind)}>"
+            f"<link name={quoteattr(link)}/><joint name={quoteattr(joint)} type={quoteattr(kind)}>"
             f'<parent link={quoteattr(name)}/><child link={quoteattr(link)}/><axis xyz="0 0 1"/></joint>'
         )
     lines = "\n".join(parts)  # Bullet cannot read a long file that has a single line
@@ -61,6 +69,6 @@ def numbers(values: Sequence[float]) -> str:
     return " ".join(f"{round(value, 6) + 0.0:g}" for value in values)
 
 
-def _one_link(name: str, geometry: str, middle: Sequence[float], color: Sequence[float]) -> str:
-    link = quoteattr(name)
-    return f"<robot name={link}><link name={link}>{INERTIA}{shape(geometry, middle, color)}</link></robot>\n"
+def _one_link(name: str, geometry: str, middle: Sequence[float], color: Sequence[float], mass_kg: float | None) -> str:
+    link, inertial = quoteattr(name), "" if mass_kg is None else _INERTIAL.format(mass_kg)
+    return f"<robot name={link}><link name={link}>{inertial}{shape(geometry, middle, color)}</link></robot>\n"

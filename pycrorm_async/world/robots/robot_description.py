@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from pathlib import Path
 from types import MappingProxyType
@@ -37,6 +37,7 @@ __all__ = [
     "PR2",
     "register_robot",
     "robot_description",
+    "with_payload",
 ]
 
 
@@ -90,12 +91,19 @@ class ArmDescription:
     """Positions of the fingers' joints; empty for an arm without a gripper."""
     opening_m: float | None = None
     """Distance between the fingers of the open gripper; they close along y of the tool frame. None: not known."""
+    payload_kg: float | None = None
+    """The greatest mass that the arm lifts; None: not known, and nothing is refused. A URDF does not have it."""
     park: Mapping[str, float] = field(default_factory=dict)
     """Posture with the arm folded; empty if there is none. Continuous joints may be several turns from zero."""
 
     def __post_init__(self) -> None:
         if not self.joints:
             raise CallerError(f"an arm needs a joint, but the one with the tool {self.tool_frame!r} has none")
+        if self.payload_kg is not None and not 0 < self.payload_kg < math.inf:
+            raise CallerError(
+                f"the payload of the arm with the tool {self.tool_frame!r} must be a number of kg > 0, got"
+                f" {self.payload_kg!r}; None if it is not known"
+            )
 
     def limits(self, limits: Limits) -> Mapping[str, Bounds]:
         """Return the described range of each joint by name."""
@@ -257,6 +265,7 @@ def _pr2_arm(prefix: str, side: float, park: tuple[float, ...]) -> PR2Arm:
             }
         ),
         opening_m=0.086,
+        payload_kg=1.8,  # of the manufacturer's data sheet
         park=MappingProxyType(dict(zip(joints, park, strict=True))),
     )
 
@@ -304,6 +313,7 @@ COURIER = RobotDescription(
                     }
                 ),
                 opening_m=0.09,
+                payload_kg=3.0,  # of arms of its size, such as those of TIAGo and UR3e
                 park=MappingProxyType(dict(zip(_COURIER_JOINTS, (0.0, -1.9, 2.5, 0.0, 0.9, 0.0), strict=True))),
             )
         }
@@ -321,13 +331,29 @@ _registered: dict[str, RobotDescription] = {each.name: each for each in (PR2, CO
 before any world is entered, and also in each process that loads it for rollouts."""
 
 
-def register_robot(description: RobotDescription) -> RobotDescription:
+def register_robot(
+    description: RobotDescription, *, payload_kg: float | Mapping[Arms, float] | None = None
+) -> RobotDescription:
     """Make this the description of every later `Object` of type ROBOT with its name; return it.
 
-    A description of the same name is replaced, so that a notebook's cell can run again.
+    A description of the same name is replaced, so that a notebook's cell can run again. `payload_kg`, of all arms or by
+    arm, replaces that of the description. Raises `CallerError` for an arm that the robot lacks.
     """
+    if payload_kg is not None:
+        description = replace(description, arms=with_payload(description.arms, payload_kg))
     _registered[description.name] = description
     return description
+
+
+def with_payload(
+    arms: Mapping[Arms, ArmDescription], payload_kg: float | Mapping[Arms, float]
+) -> dict[Arms, ArmDescription]:
+    """Return the arms with this payload, of all or by arm. Raises `CallerError` for an arm that is not among them."""
+    payloads = payload_kg if isinstance(payload_kg, Mapping) else dict.fromkeys(arms, payload_kg)
+    if (unknown := next((arm for arm in payloads if arm not in arms), None)) is not None:
+        names = ", ".join(each.name for each in arms) or "none"
+        raise CallerError(f"payload_kg is for the {unknown.name} arm, but the robot's arms are: {names}")
+    return {arm: replace(each, payload_kg=payloads.get(arm, each.payload_kg)) for arm, each in arms.items()}
 
 
 def robot_description(name: str) -> RobotDescription | None:

@@ -16,7 +16,7 @@ from pycrorm_async.errors import CallerError
 from pycrorm_async.world.enums import Arms, GripperState
 from pycrorm_async.world.pose import Pose
 from pycrorm_async.world.robots.chain_ik import joints_between
-from pycrorm_async.world.robots.robot_description import ArmDescription, RobotDescription
+from pycrorm_async.world.robots.robot_description import ArmDescription, RobotDescription, with_payload
 from pycrorm_async.world.urdf_checks import urdf_text
 
 __all__ = ["describe_arm", "describe_robot"]
@@ -29,6 +29,7 @@ def describe_robot(
     srdf: str | Path | None = None,
     arms: Mapping[Arms, ArmDescription] | None = None,
     park: str = "park",
+    payload_kg: float | Mapping[Arms, float] | None = None,
     **facts: Any,
 ) -> RobotDescription:
     """Return the description of a robot whose model is this URDF (text, or the path of a file).
@@ -38,6 +39,7 @@ def describe_robot(
     (`Arms.named`). The named states become `postures`, and the state `park` the arms' park posture.
 
     Args:
+        payload_kg: the greatest mass that each arm lifts, or by arm; a URDF does not have it.
         facts: further attributes of `RobotDescription`, such as `drive`, `torso_joint`, `camera_link`.
 
     Raises:
@@ -53,7 +55,8 @@ def describe_robot(
         if arms is None:
             arms = _arms(name, urdf_text(name, urdf), semantics, postures.get(park, {}))
     facts.setdefault("postures", postures)
-    return RobotDescription(name=name, urdf=urdf, arms=dict(arms or {}), **facts)
+    arms = dict(arms or {}) if payload_kg is None else with_payload(arms or {}, payload_kg)
+    return RobotDescription(name=name, urdf=urdf, arms=arms, **facts)
 
 
 def describe_arm(
@@ -63,6 +66,7 @@ def describe_arm(
     *,
     park: Mapping[str, float] | None = None,
     tool_in_link: Pose | None = None,
+    payload_kg: float | None = None,
 ) -> ArmDescription:
     """Return the arm between two links of the model, with its gripper, if that has fingers that slide.
 
@@ -87,6 +91,7 @@ def describe_arm(
         base_link=base_link,
         tool_frame=tool_frame,
         tool_in_link=tool_in_link,
+        payload_kg=payload_kg,
         gripper_joints=grip if fingers else {},
         opening_m=sum(upper - lower for lower, upper in fingers.values()) if fingers else None,
         park={joint: position for joint, position in (park or {}).items() if joint in joints},

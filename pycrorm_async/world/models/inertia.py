@@ -1,0 +1,23 @@
+"""Read the mass of an object from its description (URDF)."""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from xml.etree.ElementTree import fromstring
+
+__all__ = ["described_mass_kg"]
+
+
+@lru_cache(maxsize=256)
+def described_mass_kg(urdf: str) -> float | None:
+    """Return the sum of the masses of all links, kg; None if no link has one, or if one is not a number.
+
+    A sum of 0 is None too, because a model whose masses are 0 does not say them.
+    """
+    robot = fromstring(urdf)  # noqa: S314  loaded by the caller's own process, and checked before
+    try:
+        mass = sum(float(each.get("value", "")) for each in robot.iterfind("link/inertial/mass"))
+    except ValueError:
+        return None
+    return mass if 0 < mass < math.inf else None
