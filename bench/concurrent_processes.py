@@ -45,7 +45,7 @@ class ConcurrentProcesses:
     def rebuild_begins(self) -> None:
         """Count operations from now on as concurrent with the rebuild."""
         for each in self._all:
-            each.tell()
+            each.send_byte()
 
     def stop(self) -> dict[str, list[dict[str, object]]]:
         """Stop all processes and return their lines. Raise `AssertionError` if one of them failed."""

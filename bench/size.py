@@ -69,7 +69,7 @@ def measure(new_url: Callable[[str], str], task_tree: Tree, folder: Path, *, wit
         sizes_by_name.append(sizes(url))
     empty, stored = sizes_by_name
     ours = by_part({name: size - empty.get(name, 0) for name, size in stored.items()}, task_tree.nodes)
-    result = {"ours": ours, "thesis_bytes_a_node": MISSING}
+    result: dict[str, Any] = {"ours": ours, "thesis_bytes_a_node": MISSING}
     if with_baseline:
         url = new_url("thesis")
         run_baseline(url, task_tree.nodes, _SEED)

@@ -224,7 +224,9 @@ def test_ctrl_c_in_a_plan_that_never_suspends_ends_the_episode_as_interrupted(
     process.stdout.close()
     process.stderr.close()
     assert process.wait(30) == 130
-    assert errors.splitlines() == ["pycrorm: interrupted; all events recorded so far are kept"]
+    *note, reason = errors.splitlines()
+    assert note in ([], ["recorded events are being stored; Ctrl-C again exits at once without losing any"])  # if slow
+    assert reason == "pycrorm: interrupted; all events recorded so far are kept"
     shown = answer("show", "last", cwd=folder)
     assert shown["episode"]["status"] == "INTERRUPTED"
     notes = [node for node in shown["tree"] if node["dtype"] == "NoteAction"]

@@ -120,7 +120,10 @@ def test_a_named_projection_is_folded_by_the_run_rebuilt_and_verified(lab: Path)
     ]
     rebuild = pycrorm("rebuild", "--projection", "lab:Weighed", cwd=lab)
     assert (rebuild.returncode, rebuild.stderr) == (0, "")
-    assert [line.split(":")[0] for line in rebuild.stdout.splitlines()] == ["generation 1002", "weighed, generation 3"]
+    assert [line.split(":")[0] for line in rebuild.stdout.splitlines()] == [
+        "generation 1002",
+        "weighed, generation 1003",
+    ]
     assert weighed(lab) == WEIGHED
 
 
