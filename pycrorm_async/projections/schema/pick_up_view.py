@@ -3,6 +3,10 @@
 The view selects from the tables and not from the public views, because each of those excludes simulations separately;
 here the node is checked once. PostgreSQL cannot estimate how many rows such a check leaves, and with one for each table
 it read all pick-ups where the latest 2,000 were wanted.
+
+Poses and objects are joined as outer joins. All tables have the episode's column in common, so from inner joins
+PostgreSQL concludes that it can join a pick-up with all poses of its episode before the node that names one of them.
+Without statistics it did, and 100 pick-ups took half a minute. An outer join follows the rows that its condition names.
 """
 
 from __future__ import annotations
@@ -84,11 +88,16 @@ def pick_ups_with_context(
         )
         .select_from(picked)
         .join(node, _same(node, picked, node.c.id == picked.c.id))
-        .join(robot, _same(robot, node, robot.c.id == node.c.robot_pose_id))
-        .join(object_, _same(object_, picked, object_.c.id == picked.c.object_designator_id))
-        .join(place, _same(place, object_, place.c.id == object_.c.pose_id))
-        .where(_PlannerHint(node.c.dtype.in_(dtypes)))
+        .outerjoin(robot, _same(robot, node, robot.c.id == node.c.robot_pose_id))
+        .outerjoin(object_, _same(object_, picked, object_.c.id == picked.c.object_designator_id))
+        .outerjoin(place, _same(place, object_, place.c.id == object_.c.pose_id))
+        .where(_PlannerHint(node.c.dtype.in_(dtypes)), _present(robot), _present(place))
     )
+
+
+def _present(row: FromClause) -> ColumnElement[bool]:
+    """Return the condition that an outer join has a row. From IS NOT NULL PostgreSQL would make it an inner join."""
+    return func.coalesce(row.c.id, 0) > 0
 
 
 def _same(one: FromClause, other: FromClause, by_id: ColumnElement[bool]) -> ColumnElement[bool]:

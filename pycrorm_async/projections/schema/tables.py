@@ -17,6 +17,7 @@ from typing import Any, Literal, TypeAlias
 
 from sqlalchemy import BigInteger, Boolean, Column, Double, Index, Integer, MetaData, PrimaryKeyConstraint, Table, Text
 from sqlalchemy.ext.compiler import compiles
+from sqlalchemy.sql.functions import FunctionElement
 from sqlalchemy.types import TypeEngine
 
 from pycrorm_async.projections.table_names import index_name, physical_name
@@ -330,10 +331,26 @@ def _make_table(
     for column in indexed(name, columns):
         Index(
             index_name(name, column, generation),
-            *(table.c[each] for each in (column, *_SECOND_COLUMNS.get((name, column), ()))),
+            *(
+                [_EpisodeThenId(table.c[EPISODE], table.c.id)]
+                if (name, column) == ("task_tree_node", EPISODE)
+                else (table.c[each] for each in (column, *_SECOND_COLUMNS.get((name, column), ())))
+            ),
             postgresql_include=_INCLUDES.get((name, column), ()),
         )
     return table
+
+
+class _EpisodeThenId(FunctionElement[int]):
+    """The key of the index of nodes by episode, on PostgreSQL with the id, because plans look nodes up by it."""
+
+    inherit_cache = True
+
+
+@compiles(_EpisodeThenId)
+def _by_dialect(element: _EpisodeThenId, compiler: Any, **options: Any) -> str:
+    columns = list(element.clauses)[: None if compiler.dialect.name == "postgresql" else 1]
+    return ", ".join(compiler.process(each, **options) for each in columns)
 
 
 class _Key(PrimaryKeyConstraint):

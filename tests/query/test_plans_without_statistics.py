@@ -1,0 +1,129 @@
+"""Query plans of a PostgreSQL server that has never analysed the tables: none reads an episode once for each row."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Coroutine, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sqlalchemy import Engine, event, select
+
+from bench.material.spool_recording import spool_rollouts
+from pycrorm_async import Reading
+from pycrorm_async.operations.recovery import recover
+from pycrorm_async.orm import (
+    Object,
+    PickUpAction,
+    PickUpWithContextView,
+    Pose,
+    SpatialRelation,
+)
+from pycrorm_async.query.experience import PickUpExperience
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.log import EventLog
+from pycrorm_async.world import ObjectType
+from tests.databases import Server, ask, run_in_own_loop
+
+pytestmark = pytest.mark.slow
+
+EPISODES, PICK_UPS = 2, 60
+TURNS_A_ROW = 10
+"""Bounds the rows that one step of a plan reads: this many times all rows of the largest table. A step that reads an
+episode for each pick-up reads more."""
+
+Question = Callable[[Reading], Coroutine[Any, Any, None]]
+
+
+@pytest.fixture(scope="module")
+def unanalysed(server: Server, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """The URL of a memory of rollouts without statistics."""
+    url, spool = server.new_database(), Path(tmp_path_factory.mktemp("spool"))
+    spool_rollouts(EPISODES * PICK_UPS, spool, seed=69, an_episode=PICK_UPS)
+
+    async def store() -> None:
+        await recover(url, spool=spool)
+
+    run_in_own_loop(store())
+    assert ask(url, "SELECT count(*) FROM pg_stats WHERE schemaname = 'memory_tables'") == [(0,)]
+    yield url
+    server.drop(url)
+
+
+def rows_of(statement: Any) -> Question:
+    async def read(reading: Reading) -> None:
+        async with reading.session() as session:
+            (await session.scalars(statement)).all()
+
+    return read
+
+
+def frame_of(statement: Any) -> Question:
+    async def read(reading: Reading) -> None:
+        await reading.dataframe(statement)
+
+    return read
+
+
+async def what_went_well(reading: Reading) -> None:
+    assert await PickUpExperience(reading).successes(ObjectType.MILK, arm=None)
+
+
+async def the_tree(reading: Reading) -> None:
+    assert await reading.tree(1)
+
+
+async def rows_read(log: EventLog, statements: list[tuple[str, Any]]) -> dict[str, float]:
+    """Return the largest number of rows that a step of its plan reads, for each query."""
+    most: dict[str, float] = {}
+    async with log.engine.connect() as connection:
+        await connection.exec_driver_sql("SET LOCAL statement_timeout = '10s'")
+        for text, parameters in statements:
+            if text.startswith("SET LOCAL"):
+                await connection.exec_driver_sql(text)
+            if not text.lstrip().startswith(("SELECT", "WITH")) or "set_config" in text:
+                continue
+            explain = f"EXPLAIN (ANALYZE, FORMAT JSON) {text}"
+            plan: Any = (await connection.exec_driver_sql(explain, tuple(parameters))).scalar_one()
+            pending = [(json.loads(plan) if isinstance(plan, str) else plan)[0]["Plan"]]
+            while pending:
+                step = pending.pop()
+                pending += step.get("Plans", [])
+                rows = sum(value for name, value in step.items() if name.startswith(("Actual Rows", "Rows Removed")))
+                most[text] = max(most.get(text, 0), rows * step["Actual Loops"])
+    return most
+
+
+@pytest.mark.parametrize(
+    "question",
+    [
+        pytest.param(what_went_well, id="what went well"),
+        pytest.param(frame_of(select(PickUpWithContextView)), id="pick-ups with context"),
+        pytest.param(
+            frame_of(select(PickUpWithContextView.arm).where(PickUpWithContextView.status == "SUCCEEDED")),
+            id="the learning question",
+        ),
+        pytest.param(rows_of(select(SpatialRelation)), id="spatial relations"),
+        pytest.param(rows_of(select(Pose).join(PickUpAction.object).join(Object.pose)), id="a join"),
+        pytest.param(the_tree, id="the task tree"),
+    ],
+)
+async def test_no_query_reads_an_episode_once_for_each_row(unanalysed: str, question: Question) -> None:
+    statements: list[tuple[str, Any]] = []
+
+    def note(_connection: Any, _cursor: Any, text: str, parameters: Any, _context: Any, _many: bool) -> None:
+        statements.append((text, parameters))
+
+    event.listen(Engine, "before_cursor_execute", note)
+    try:
+        async with Reading.open(unanalysed) as reading:
+            await question(reading)
+    finally:
+        event.remove(Engine, "before_cursor_execute", note)
+    log = await EventLog.open(DatabaseAddress.parse(unanalysed), create=False)
+    read = await rows_read(log, statements)
+    await log.close()
+    [(poses,)] = ask(unanalysed, "SELECT count(*) FROM memory.pose")
+    assert {text: rows for text, rows in read.items() if rows > TURNS_A_ROW * poses} == {}
+    assert read
