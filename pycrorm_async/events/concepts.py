@@ -1,8 +1,10 @@
 """List the ontology's classes that recorded tasks and objects are instances of, with their superclasses.
 
-Facts of SOMA 2.1.0 (SOMA-ACT, SOMA-OBJ and SOMA-HOME, http://www.ease-crc.org/ont/SOMA.owl) and of DOLCE+DnS Ultralite
-3.32 (DUL), limited to what the built-in designators and object types use. Two concepts of PyCRAM's designators are not
-in SOMA 2.1.0; their superclasses here are ours.
+Facts of SOMA 2.1.0 and of DOLCE+DnS Ultralite (DUL) as published with it: owl/2.1.0/SOMA-HOME.owl, which contains the
+classes of SOMA-ACT and SOMA-OBJ, and owl/2.1.0/DUL.owl of https://github.com/ease-crc/soma. They are limited to what
+the built-in designators and object types use. The superclasses are the named ones; an intersection counts as each of
+its named classes. Classes without a superclass here have one in DUL. Two concepts of PyCRAM's designators are not in
+SOMA 2.1.0; their superclasses here are ours.
 """
 
 from __future__ import annotations
@@ -54,20 +56,21 @@ CONCEPTS: dict[str, Concept] = {
     "Transporting": Concept(("ModifyingPhysicalObject",)),
     # objects
     "PhysicalObject": Concept((), _DUL),
-    "PhysicalAgent": Concept(("PhysicalObject",), _DUL),
-    "NaturalPerson": Concept(("PhysicalAgent",), _DUL),
+    "Agent": Concept((), _DUL),
+    "Person": Concept(("Agent",), _DUL),
+    "PhysicalAgent": Concept(("Agent", "PhysicalObject"), _DUL),
+    "NaturalPerson": Concept(("Person", "PhysicalAgent"), _DUL),
     "PhysicalPlace": Concept(("PhysicalObject",), _DUL),
     "PhysicalArtifact": Concept(("PhysicalObject",), _DUL),
     "DesignedArtifact": Concept(("PhysicalArtifact",), _DUL),
     "DesignedContainer": Concept(("DesignedArtifact",)),
     "Box": Concept(("DesignedContainer",)),
     "CerealBox": Concept(("Box",)),
-    "Can": Concept(("DesignedContainer",)),
     "Pack": Concept(("DesignedContainer",)),
     "MilkPack": Concept(("Pack",)),
     "DesignedTool": Concept(("DesignedArtifact",)),
     "Tableware": Concept(("DesignedTool",)),
-    "Crockery": Concept(("Tableware",)),
+    "Crockery": Concept(("DesignedContainer", "Tableware")),
     "Bowl": Concept(("Crockery",)),
     "Cup": Concept(("Crockery",)),
     "Cutlery": Concept(("Tableware",)),
@@ -76,7 +79,7 @@ CONCEPTS: dict[str, Concept] = {
 
 CONCEPT_OF_OBJECT_TYPE = {
     "METALMUG": "Cup",
-    "PRINGLES": "Can",
+    "PRINGLES": "DesignedContainer",
     "MILK": "MilkPack",
     "SPOON": "Spoon",
     "BOWL": "Bowl",

@@ -48,11 +48,21 @@ def test_every_concept_of_the_built_in_types_has_its_superclasses() -> None:
     for each in used - {None}:
         assert [*ancestors(str(each))][-1] == "Task"
     for each in CONCEPT_OF_OBJECT_TYPE.values():
-        assert [*ancestors(each)][-1] == "PhysicalObject"
+        assert "PhysicalObject" in ancestors(each)
     assert [*ancestors("LookingFor")] == [
         "LookingFor", "Perceiving", "InformationAcquisition", "PhysicalTask", "MentalTask", "Task",
     ]  # fmt: skip
     assert [*ancestors("Greeting")] == ["Greeting"]
+
+
+def test_the_superclasses_are_those_of_soma_and_dul() -> None:
+    assert CONCEPTS["Crockery"].parents == ("DesignedContainer", "Tableware")
+    assert CONCEPTS["Tableware"].parents == ("DesignedTool",)
+    assert CONCEPTS["PhysicalPlace"].parents == ("PhysicalObject",)
+    assert CONCEPTS["PhysicalAgent"].parents == ("Agent", "PhysicalObject")
+    assert CONCEPTS["NaturalPerson"].parents == ("Person", "PhysicalAgent")
+    assert "Can" not in CONCEPTS
+    assert "DesignedContainer" in ancestors("Cup")
 
 
 @pytest.mark.slow
