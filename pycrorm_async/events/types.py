@@ -18,6 +18,7 @@ from pycrorm_async.events.values import (
     EpisodeStatus,
     FailureValue,
     FieldDeclared,
+    LinkBoxValue,
     MeshValue,
     NodeKind,
     NodeReference,
@@ -157,12 +158,14 @@ class DescriptionDeclared(Happening, frozen=True):
             content, or `missing:` and the file's name; `MeshValue.reference` is the same text.
         meshes: the mesh files, each once.
         boxes: for each link with a mesh, the box around its collision shapes, in the link's frame.
+        link_boxes: for each link that is fixed or slides; links that turn have none.
         missing: the reason if the description could not be recorded; `urdf` is empty then.
     """
 
     urdf: str = ""
     meshes: tuple[MeshValue, ...] = ()
     boxes: dict[str, BoxValue] = {}
+    link_boxes: tuple[LinkBoxValue, ...] = ()
     missing: str | None = None
 
     @property

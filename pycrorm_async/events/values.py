@@ -19,6 +19,7 @@ __all__ = [
     "BlobReference",
     "MeshValue",
     "BoxValue",
+    "LinkBoxValue",
     "CandidateValue",
     "RefusalValue",
     "SeenValue",
@@ -146,6 +147,21 @@ class BoxValue(_Value, frozen=True):
 
     min: tuple[float, float, float]
     max: tuple[float, float, float]
+
+
+class LinkBoxValue(_Value, frozen=True):
+    """The box around a link's collision shapes along the axes of the root link's frame, with every joint at 0.
+
+    Attributes:
+        center, half: its centre and half of its edges, m.
+        joint, axis: the prismatic joint that slides the link, and its direction; None for a link that is fixed.
+    """
+
+    link: str
+    center: tuple[float, float, float]
+    half: tuple[float, float, float]
+    joint: str | None = None
+    axis: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
 class CandidateValue(_Value, frozen=True):

@@ -16,12 +16,14 @@ from typing import NamedTuple, Protocol
 from pycrorm_async.events.codec import NotEncodable, encode, fingerprint
 from pycrorm_async.events.envelope import Heading
 from pycrorm_async.events.types import DescriptionDeclared
-from pycrorm_async.events.values import BlobReference, BoxValue, MeshValue
+from pycrorm_async.events.values import BlobReference, BoxValue, LinkBoxValue, MeshValue
 from pycrorm_async.hooks.values.missing_values import MissingValues
 from pycrorm_async.hooks.values.texts import clean, cut, message_of
 from pycrorm_async.settings import Settings
+from pycrorm_async.world.models.link_boxes import link_boxes
 from pycrorm_async.world.models.mesh_boxes import mesh_files, meshed_links, with_mesh_files
 from pycrorm_async.world.objects import Object
+from pycrorm_async.world.queries.bounding_boxes import BoundingBox
 
 __all__ = ["Descriptions"]
 
@@ -115,11 +117,13 @@ class Descriptions:
         text = described.description_text
         meshes = {file: self._mesh(Path(file)) for file in files}
         meshed = meshed_links(text) if files else ()
-        boxes = {link: box for link in meshed if (box := _box(described, link)) is not None}
+        solid = {link: box for link in described.links if (box := described.box_in_link(link)) is not None}
+        boxes = {link: _box_value(solid[link]) for link in meshed if link in solid}
+        placed = tuple(LinkBoxValue(*each) for each in link_boxes(text, solid))
         if meshes:
             text = with_mesh_files(text, {file: mesh.reference for file, mesh in meshes.items()})
         packed = base64.b64encode(zlib.compress(text.encode())).decode()
-        event = DescriptionDeclared(packed, tuple(dict.fromkeys(meshes.values())), boxes)
+        event = DescriptionDeclared(packed, tuple(dict.fromkeys(meshes.values())), boxes, placed)
         missing = [("meshes", f"{mesh.name}: {mesh.missing}") for mesh in event.meshes if mesh.missing is not None]
         try:
             payload = encode(event, bytes_max=self._record_bytes_max)
@@ -159,10 +163,7 @@ def _stat(file: str) -> tuple[int, int] | None:
     return status.st_mtime_ns, status.st_size
 
 
-def _box(described: Object, link: str) -> BoxValue | None:
-    box = described.box_in_link(link)
-    if box is None:
-        return None
+def _box_value(box: BoundingBox) -> BoxValue:
     low, high = (tuple(round(value, 6) for value in corner) for corner in box)
     return BoxValue((low[0], low[1], low[2]), (high[0], high[1], high[2]))
 

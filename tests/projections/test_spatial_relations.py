@@ -10,14 +10,28 @@ from sqlalchemy import select
 from sqlalchemy.ext.asyncio import AsyncSession
 
 from pycrorm_async.errors import CallerError
-from pycrorm_async.events.types import JointsMoved, NodeEnded, NodeStarted, ObjectAdded, ObjectMoved, ObjectRemoved
-from pycrorm_async.events.values import ObjectReference
+from pycrorm_async.events.codec import decode
+from pycrorm_async.events.envelope import Heading, Record
+from pycrorm_async.events.types import (
+    DescriptionDeclared,
+    JointsMoved,
+    NodeEnded,
+    NodeStarted,
+    ObjectAdded,
+    ObjectMoved,
+    ObjectRemoved,
+)
+from pycrorm_async.events.values import BlobReference, ObjectReference
+from pycrorm_async.hooks.descriptions import Descriptions
+from pycrorm_async.hooks.values.missing_values import MissingValues
 from pycrorm_async.orm import SpatialRelation
 from pycrorm_async.query.reading import Reading
+from pycrorm_async.settings import Settings
 from pycrorm_async.store.log import EventLog
+from pycrorm_async.world import BulletWorld, Object, ObjectType
 from pycrorm_async.world.models.kitchen import kitchen_urdf
 from pycrorm_async.world.models.link_boxes import link_boxes
-from tests.projections.event_script import PICK_UP, Script, declarations, declared, field, name_of, pose, row
+from tests.projections.event_script import PICK_UP, T0_NS, Script, declarations, declared, field, name_of, pose, row
 from tests.projections.sql_queries import stored_and_folded
 
 PLACE = declared(
@@ -38,8 +52,8 @@ class Tidying:
         self.rows: dict[str, tuple[int, int]] = {}
         self.add("kitchen", "ENVIRONMENT", 0, 0, 0)
 
-    def add(self, name: str, kind: str, *at: float, turned: float = 0.0) -> None:
-        sequence = self.script.put(ObjectAdded(name, kind, pose(*at, turned=turned)))
+    def add(self, name: str, kind: str, *at: float, turned: float = 0.0, description: str | None = None) -> None:
+        sequence = self.script.put(ObjectAdded(name, kind, pose(*at, turned=turned), description=description))
         self.rows[name] = sequence, sequence
 
     def move(self, name: str, kind: str, *at: float) -> None:
@@ -60,9 +74,35 @@ class Tidying:
         return self.script.put(NodeStarted("action", None, name_of(PLACE), parameters))
 
 
-async def relations(log: EventLog, tidying: Tidying) -> dict[int, set[tuple[str, str, str]]]:
+class Declared:
+    """Takes the descriptions that a recorder declares."""
+
+    def __init__(self) -> None:
+        self.records: list[Record] = []
+
+    def put_payload(self, heading: Heading, payload: bytes) -> int:
+        position = 1_000 + len(self.records)
+        self.records.append(Record(position, None, 0, heading.type, heading.version, T0_NS, 0, payload))
+        return position
+
+    def put_blob(self, content: bytes, media_type: str) -> BlobReference:
+        raise AssertionError
+
+    def description(self, urdf: str) -> str:
+        """Return the fingerprint of an object's description, made from this URDF as a plan makes it."""
+        with BulletWorld():
+            made = Object("made", ObjectType.GENERIC_OBJECT, urdf)
+            fingerprint = Descriptions(self, Settings(), MissingValues()).declare(made)
+        assert fingerprint is not None
+        return fingerprint
+
+
+async def relations(
+    log: EventLog, tidying: Tidying, declared_: Declared | None = None
+) -> dict[int, set[tuple[str, str, str]]]:
     """Store the script; return relation, other object and link by node."""
-    await stored_and_folded(log, [*declarations(PICK_UP, PLACE), *tidying.script.records])
+    described = declared_.records if declared_ is not None else []
+    await stored_and_folded(log, [*declarations(PICK_UP, PLACE), *described, *tidying.script.records])
     found: dict[int, set[tuple[str, str, str]]] = {}
     async with AsyncSession(log.engine) as session:
         for each in await session.scalars(select(SpatialRelation)):
@@ -142,10 +182,72 @@ async def test_a_relation_leads_to_its_node_and_names_both_rows(log: EventLog) -
     ]
 
 
+def box_urdf(name: str, size: str, at: str = "0 0 0", rpy: str = "0 0 0") -> str:
+    shape = f'<origin xyz="{at}" rpy="{rpy}"/><geometry><box size="{size}"/></geometry>'
+    return f'<robot name="{name}">\n<link name="{name}"><collision>{shape}</collision></link></robot>'
+
+
+@pytest.mark.slow
+async def test_an_object_has_the_size_of_its_description_and_not_of_its_type(log: EventLog) -> None:
+    declared_, tidying = Declared(), Tidying()
+    crate = declared_.description(box_urdf("crate", "0.6 0.4 0.3"))
+    big_milk = declared_.description(box_urdf("big", "0.1 0.1 0.4", at="0 0 0.2"))
+    lying = declared_.description(box_urdf("lying", "0.02 0.3 0.02", rpy="0 0 1.5707963267948966"))
+    tidying.add("crate", "MILK", 5, 5, 0.15, description=crate)
+    tidying.add("milk", "MILK", 5.2, 5.1, 0.3, description=big_milk)
+    tidying.add("bar", "SPOON", 5.49, 5.1, 0.5, description=lying)  # from 5.34 on, 0.09 beside the milk
+    tidying.add("old milk", "MILK", 5, 5.15, 0.35)  # beside the milk, but not as far as one of its type reaches
+    picked = tidying.pick_up("milk")
+    assert await relations(log, tidying, declared_) == {picked: {("on", "crate", "crate"), ("next to", "bar", "bar")}}
+
+
+@pytest.mark.slow
+async def test_an_object_is_in_a_sliding_part_of_a_recorded_description(log: EventLog) -> None:
+    declared_, tidying = Declared(), Tidying()
+    box = '<collision><geometry><box size="{}"/></geometry></collision>'
+    chest = declared_.description(
+        f"""<robot name="chest">
+<link name="frame"/>
+<link name="tray">{box.format("0.4 0.4 0.2")}</link>
+<link name="lid">{box.format("0.4 0.4 0.02")}</link>
+<joint name="slide" type="prismatic"><parent link="frame"/><child link="tray"/>
+<origin xyz="0 0 0.5" rpy="0 0 1.5707963267948966"/><axis xyz="2 0 0"/>
+<limit lower="0" upper="1" effort="1" velocity="1"/></joint>
+<joint name="hinge" type="revolute"><parent link="frame"/><child link="lid"/><axis xyz="1 0 0"/>
+<limit lower="0" upper="1" effort="1" velocity="1"/></joint></robot>"""
+    )
+    tidying.add("chest", "GENERIC_OBJECT", 5, 5, 0, turned=1.0, description=chest)  # turned half around z
+    tidying.add("cup", "JEROEN_CUP", 5, 4.4, 0.5)
+    tidying.pick_up("cup")
+    tidying.script.put(JointsMoved(tidying.reference("chest"), {"slide": 0.6}))
+    inside = tidying.pick_up("cup")
+    assert await relations(log, tidying, declared_) == {inside: {("in", "chest", "chest")}}
+
+
+@pytest.mark.slow
+async def test_the_links_of_a_recorded_kitchen_are_those_of_the_built_in_one(log: EventLog) -> None:
+    declared_ = Declared()
+    kitchen = declared_.description(kitchen_urdf())
+    event = decode("DescriptionDeclared", declared_.records[0].payload)
+    assert isinstance(event, DescriptionDeclared)
+    recorded = {each.link: each for each in event.link_boxes}
+    assert recorded.keys() == {each.link for each in link_boxes(kitchen_urdf())}
+    for each in link_boxes(kitchen_urdf()):
+        box = recorded[each.link]
+        assert (box.joint, box.axis) == (each.joint, each.axis)
+        assert [*box.center, *box.half] == pytest.approx([*each.center, *each.half], abs=1e-5)
+    tidying = Tidying()
+    tidying.script.put(ObjectRemoved(tidying.reference("kitchen")))
+    tidying.add("home", "ENVIRONMENT", 0, 0, 0, description=kitchen)
+    tidying.add("milk", "MILK", 1.3, 1.0, 0.9)
+    picked = tidying.pick_up("milk")
+    assert await relations(log, tidying, declared_) == {picked: {("on", "home", "sink_area_surface")}}
+
+
 def test_the_boxes_of_the_kitchen_are_those_of_its_links() -> None:
     boxes = {each.link: each for each in link_boxes(kitchen_urdf())}
     surface, drawer = boxes["kitchen_counter_surface"], boxes["kitchen_island_upper_drawer"]
-    assert (surface.centre, surface.half) == ((1.35, 0.15, 0.828), (0.3, 0.7, 0.02))
-    assert (drawer.centre, drawer.half) == ((-1.315, 1.0, 0.74), (0.235, 0.3, 0.1))
+    assert (surface.center, surface.half) == ((1.35, 0.15, 0.828), (0.3, 0.7, 0.02))
+    assert (drawer.center, drawer.half) == ((-1.315, 1.0, 0.74), (0.235, 0.3, 0.1))
     assert (drawer.joint, drawer.axis) == ("kitchen_island_upper_drawer_joint", (1.0, 0.0, 0.0))
     assert "fridge_door" not in boxes

@@ -1,110 +1,132 @@
-"""Compute the box around the collision shapes of each link of a built-in URDF, without Bullet.
+"""Compute the box around the collision shapes of each link of a URDF, without Bullet.
 
-Boxes are exact; cylinders have the box around them. The boxes are in the frame of the root link, with every joint at
-position 0. A link that a prismatic joint slides also has that joint and its direction. Links without such a shape and
-links that turn are left out.
+The boxes are along the axes of the root link's frame, with every joint at position 0. Boxes are exact; cylinders have
+the box around them. A caller that knows the boxes of the links gives them, and then the shapes may be any. A link that
+a prismatic joint slides also has that joint and its direction. Links without a shape and links that turn are left out.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple, TypeAlias
 from xml.etree.ElementTree import Element, fromstring
+
+from pycrorm_async.world.queries.bounding_boxes import BoundingBox
 
 __all__ = ["LinkBox", "link_boxes"]
 
 _Vector: TypeAlias = tuple[float, float, float]
+_Matrix: TypeAlias = tuple[_Vector, _Vector, _Vector]
 
 _CORNERS = list(itertools.product((-0.5, 0.5), repeat=3))
+_ZERO: _Vector = (0.0, 0.0, 0.0)
 
 
 class LinkBox(NamedTuple):
-    """The box around a link: its centre and half of its edges in the root link's frame, m.
+    """The box around a link: its center and half of its edges in the root link's frame, m.
 
     `joint` slides it along `axis`, a unit vector in the same frame; None for a link that is fixed.
     """
 
     link: str
-    centre: _Vector
+    center: _Vector
     half: _Vector
     joint: str | None = None
-    axis: _Vector = (0.0, 0.0, 0.0)
+    axis: _Vector = _ZERO
 
 
 class _Frame(NamedTuple):
-    """The pose of a link in the root's frame, and the joint that slides it. Rotations are about z only."""
+    """The pose of a link or a shape in another's frame, and the joint that slides it."""
 
-    turn: float
-    position: _Vector
-    joint: str | None
-    axis: _Vector
+    rotation: _Matrix = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    position: _Vector = _ZERO
+    joint: str | None = None
+    axis: _Vector = _ZERO
+
+    def turned(self, vector: _Vector) -> _Vector:
+        """Return a vector of this frame along the axes of the other."""
+        x, y, z = (sum(a * b for a, b in zip(row, vector, strict=True)) for row in self.rotation)
+        return x, y, z
 
     def placed(self, point: _Vector) -> _Vector:
-        """Return a point of the link in the root's frame."""
-        turned = _turned(point, self.turn)
-        return (self.position[0] + turned[0], self.position[1] + turned[1], self.position[2] + turned[2])
+        """Return a point of this frame in the other."""
+        x, y, z = (a + b for a, b in zip(self.position, self.turned(point), strict=True))
+        return x, y, z
 
 
-def link_boxes(urdf: str) -> Iterator[LinkBox]:
-    """Yield the box of each link that is fixed or slides, the root's first. Links may be rotated about z only."""
-    robot = fromstring(urdf)  # noqa: S314  a built-in description
+def link_boxes(urdf: str, boxes: Mapping[str, BoundingBox] | None = None) -> Iterator[LinkBox]:
+    """Yield the box of each link that is fixed or slides, the root's first.
+
+    With `boxes`, those around the shapes of the links in their own frames, the shapes of the URDF are not read;
+    otherwise they must be boxes and cylinders that are not rotated in their links.
+    """
+    robot = fromstring(urdf)  # noqa: S314  a built-in description, or one that was loaded into a world
     links = {link.get("name", ""): link for link in robot.findall("link")}
     joints: dict[str, list[Element]] = {}
     for joint in robot.findall("joint"):
         joints.setdefault(_name(joint, "parent"), []).append(joint)
     children = {_name(joint, "child") for each in joints.values() for joint in each}
-    pending = [(name, _Frame(0.0, (0.0, 0.0, 0.0), None, (0.0, 0.0, 0.0))) for name in links if name not in children]
+    pending = [(name, _Frame()) for name in links if name not in children]
     for name, frame in pending:
-        corners = [frame.placed(corner) for each in links[name].findall("collision") for corner in _corners(each)]
-        if corners:
+        inside = _shape_corners(links[name]) if boxes is None else _box_corners(boxes.get(name))
+        if corners := [frame.placed(corner) for corner in inside]:
             ranges = [(min(each), max(each)) for each in zip(*corners, strict=True)]
-            centre = _rounded([(low + high) / 2 for low, high in ranges])
+            center = _rounded([(low + high) / 2 for low, high in ranges])
             half = _rounded([(high - low) / 2 for low, high in ranges])
-            yield LinkBox(name, centre, half, frame.joint, _rounded(frame.axis))
+            yield LinkBox(name, center, half, frame.joint, _rounded(frame.axis))
         moving = (joint for joint in joints.get(name, ()) if joint.get("type") in ("fixed", "prismatic"))
         pending += [(_name(joint, "child"), _child(frame, joint)) for joint in moving]
 
 
 def _child(frame: _Frame, joint: Element) -> _Frame:
-    turn, offset = _origin(joint)
-    turn, position = frame.turn + turn, frame.placed(offset)
+    own = _origin(joint)
+    columns = [frame.turned((own.rotation[0][at], own.rotation[1][at], own.rotation[2][at])) for at in range(3)]
+    first, second, third = zip(*columns, strict=True)
+    placed = _Frame((first, second, third), frame.placed(own.position), frame.joint, frame.axis)
     if joint.get("type") == "fixed":
-        return _Frame(turn, position, frame.joint, frame.axis)
+        return placed
     axis = joint.find("axis")
-    assert axis is not None, joint.get("name")
-    return _Frame(turn, position, joint.get("name"), _turned(_numbers(axis.get("xyz")), turn))
+    direction = (1.0, 0.0, 0.0) if axis is None else _numbers(axis.get("xyz"))
+    length = math.hypot(*direction) or 1.0
+    unit = direction[0] / length, direction[1] / length, direction[2] / length
+    return placed._replace(joint=joint.get("name"), axis=placed.turned(unit))
 
 
-def _corners(collision: Element) -> Iterator[_Vector]:
-    """Yield the corners of the box around a shape in its link's frame."""
-    turn, offset = _origin(collision)
-    assert turn == 0, "a shape of a built-in model is not rotated in its link"
-    (shape,) = collision.iterfind("geometry/*")
-    if shape.tag == "box":
-        size = _numbers(shape.get("size"))
-    else:
-        assert shape.tag == "cylinder", shape.tag
-        diameter = 2 * float(shape.get("radius", 0))
-        size = diameter, diameter, float(shape.get("length", 0))
-    for corner in _CORNERS:
-        x, y, z = (middle + part * edge for middle, part, edge in zip(offset, corner, size, strict=True))
-        yield x, y, z
+def _box_corners(box: BoundingBox | None) -> Iterator[_Vector]:
+    if box is not None:
+        yield from itertools.product(*zip(box.min, box.max, strict=True))
 
 
-def _origin(element: Element) -> tuple[float, _Vector]:
+def _shape_corners(link: Element) -> Iterator[_Vector]:
+    """Yield the corners of the boxes around a link's shapes in its frame."""
+    for collision in link.findall("collision"):
+        placed = _origin(collision)
+        assert placed.rotation == _Frame().rotation, "a shape of a built-in model is not rotated in its link"
+        (shape,) = collision.iterfind("geometry/*")
+        if shape.tag == "box":
+            size = _numbers(shape.get("size"))
+        else:
+            assert shape.tag == "cylinder", shape.tag
+            diameter = 2 * float(shape.get("radius", 0))
+            size = diameter, diameter, float(shape.get("length", 0))
+        for x, y, z in _CORNERS:
+            yield placed.placed((x * size[0], y * size[1], z * size[2]))
+
+
+def _origin(element: Element) -> _Frame:
     origin = element.find("origin")
     if origin is None:
-        return 0.0, (0.0, 0.0, 0.0)
-    roll, pitch, yaw = _numbers(origin.get("rpy"))
-    assert roll == pitch == 0, "a link of a built-in model is rotated about z only"
-    return yaw, _numbers(origin.get("xyz"))
-
-
-def _turned(point: _Vector, angle: float) -> _Vector:
-    x, y, z = point
-    return math.cos(angle) * x - math.sin(angle) * y, math.sin(angle) * x + math.cos(angle) * y, z
+        return _Frame()
+    angles = _numbers(origin.get("rpy"))
+    (cr, cp, cy), (sr, sp, sy) = (tuple(map(each, angles)) for each in (math.cos, math.sin))
+    rotation = (
+        (cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr),
+        (sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr),
+        (-sp, cp * sr, cp * cr),
+    )
+    return _Frame(rotation, _numbers(origin.get("xyz")))
 
 
 def _numbers(text: str | None) -> _Vector:

@@ -1,9 +1,10 @@
 """Define `spatial_relation`: what each picked up or placed object was on, in or next to.
 
 The moment is the start of a pick-up, and the end of a placing. A relation is computed from the poses at that moment and
-from the boxes of the built-in models: of small objects by type, of the environment by name, link by link. A drawer is
-where its joint had it; links that turn, such as doors, have no box. A box is turned with its object and then replaced
-by the box along the axes of the map around it. With the picked up or placed object's box A and another one B:
+from the boxes of the recorded descriptions, link by link. An object of version 0.1.0 has no description; it has the
+boxes of the built-in model of its type, and an environment those of its name. A drawer is where its joint had it; links
+that turn, such as doors, have no box. A box is turned with its object and then replaced by the box along the axes of
+the map around it. With the box A around the picked up or placed object and another object's box B:
 
     on       the bottom of A is within `ON_M` of the top of B, and the centre of A is above B
     in       the centre of A is in B
@@ -24,18 +25,23 @@ from sqlalchemy import (
     Subquery,
     Table,
     Text,
+    TextClause,
     TextualSelect,
     and_,
     case,
     cast,
+    column,
     exists,
     func,
     literal,
-    or_,
+    null,
     select,
     union_all,
 )
+from sqlalchemy.ext.compiler import compiles
+from sqlalchemy.types import TypeEngine
 
+from pycrorm_async.events.codec import DESCRIPTION_PREFIX
 from pycrorm_async.events.ids import SEQUENCE_MAX, SLOT_MAX
 from pycrorm_async.projections.schema.tables import EPISODE
 from pycrorm_async.projections.schema.views.constants import constants
@@ -51,9 +57,12 @@ ON_M = 0.02
 NEXT_TO_M = 0.1
 """The largest horizontal gap between neighbours, m: about as wide as a hand between them."""
 
-_ENVIRONMENT = ObjectType.ENVIRONMENT.name
+_ENVIRONMENT, _ROBOT = ObjectType.ENVIRONMENT.name, ObjectType.ROBOT.name
 _AXES = ("x", "y", "z")
-_TEXTS = ("obj_type", "model", "link", "joint")
+_TEXTS = ("model", "link", "joint")
+_NUMBERS = [f"{letter}{axis}" for letter in "cha" for axis in _AXES]
+"""A box: its center, half of its edges, and the direction in which its joint slides it."""
+_IS_DESCRIPTION = f"substr(declaration.fingerprint, 1, {len(DESCRIPTION_PREFIX)}) = '{DESCRIPTION_PREFIX}'"
 _SLOT_BITS = SLOT_MAX.bit_length()
 _NUMBER_BITS = SEQUENCE_MAX.bit_length() + _SLOT_BITS
 
@@ -71,8 +80,8 @@ class SpatialTables(NamedTuple):
 def spatial_relations(tables: SpatialTables, picked: FromClause, placed: FromClause, *, simulated: bool) -> Select[Any]:
     """Return the view's query; `picked` and `placed` are the rows of pick-ups and placings."""
     moments = _moments(tables, picked, placed, simulated=simulated)
-    boxes = _boxes().subquery("box")
-    one = _placed_boxes(tables, moments, boxes, same=True)
+    boxes = _boxes()
+    one = _placed_boxes(tables, moments, _around(boxes), same=True)
     other = _placed_boxes(tables, moments, boxes, same=False)
     gaps = [func.abs(one.c[f"c{axis}"] - other.c[f"c{axis}"]) - other.c[f"h{axis}"] for axis in _AXES]
     within = [gap <= 0 for gap in gaps]
@@ -154,7 +163,7 @@ def _placed_boxes(tables: SpatialTables, moments: Subquery, boxes: Subquery, *, 
         along = row[0] * centre[0] + row[1] * centre[1] + row[2] * centre[2]
         half = sum((func.abs(row[each]) * box.c[f"h{_AXES[each]}"] for each in (1, 2)), func.abs(row[0]) * box.c.hx)
         columns += [(pose.c[axis] + along).label(f"c{axis}"), half.label(f"h{axis}")]
-    named = or_(box.c.model.is_(None), box.c.model == added.c.name)
+    built_in = case((added.c.obj_type == _ENVIRONMENT, added.c.name), else_=added.c.obj_type)
     is_one = added.c.id == moments.c.identity_id
     return (
         select(
@@ -170,9 +179,10 @@ def _placed_boxes(tables: SpatialTables, moments: Subquery, boxes: Subquery, *, 
         .join(added, _same(added, moments, is_one if same else ~is_one))
         .join(then, _same(then, moments, then.c.id == last))
         .join(pose, _same(pose, then, pose.c.id == then.c.pose_id))
-        .join(box, and_(box.c.obj_type == added.c.obj_type, named))
+        .join(box, box.c.model == func.coalesce(added.c.description_fingerprint, built_in))
         .outerjoin(slid, _same(slid, moments, and_(slid.c.joint == box.c.joint, slid.c.id == last_change)))
         .where(added.c.id == added.c.identity_id, added.c.id <= moments.c.moment, ~removed)
+        .where(added.c.obj_type != _ROBOT)
         .subquery(name)
     )
 
@@ -203,18 +213,86 @@ def _rotation(pose: FromClause) -> list[list[ColumnElement[float]]]:
     ]
 
 
+def _boxes() -> Subquery:
+    """Return the boxes of all links, with their model: the fingerprint of a description, or a built-in one."""
+    built_in, described = _built_in().subquery("built_in"), _described().subquery("described")
+    return union_all(select(*built_in.c), select(*described.c)).subquery("box")
+
+
+def _around(boxes: Subquery) -> Subquery:
+    """Return one box for each model, around those of its links."""
+    low = {axis: func.min(boxes.c[f"c{axis}"] - boxes.c[f"h{axis}"]) for axis in _AXES}
+    high = {axis: func.max(boxes.c[f"c{axis}"] + boxes.c[f"h{axis}"]) for axis in _AXES}
+    columns: list[ColumnElement[Any]] = [((low[axis] + high[axis]) / 2).label(f"c{axis}") for axis in _AXES]
+    columns += [((high[axis] - low[axis]) / 2).label(f"h{axis}") for axis in _AXES]
+    columns += [literal(0.0).label(f"a{axis}") for axis in _AXES]
+    nothing = cast(null(), Text())
+    around = select(boxes.c.model, nothing.label("link"), nothing.label("joint"), *columns).group_by(boxes.c.model)
+    return around.subquery("around")
+
+
 @lru_cache(maxsize=1)
-def _boxes() -> TextualSelect:
-    """Return the boxes of the built-in models: type, name of the model, link, joint, centre, half edges, direction."""
-    names = [f"{letter}{axis}" for letter in "cha" for axis in _AXES]
-    return constants({name: Text() for name in _TEXTS} | {name: Double() for name in names}, _built_in())
+def _built_in() -> TextualSelect:
+    kinds: dict[str, TypeEngine[Any]] = {name: Text() for name in _TEXTS} | {name: Double() for name in _NUMBERS}
+    return constants(kinds, _built_in_rows())
 
 
-def _built_in() -> Iterator[tuple[str | float | None, ...]]:
+def _built_in_rows() -> Iterator[tuple[str | float | None, ...]]:
     for kind in ObjectType:
         if kind not in (ObjectType.ROBOT, ObjectType.ENVIRONMENT):
             for box in link_boxes(built_in_urdf("any", kind)):
-                yield kind.name, None, None, None, *box.centre, *box.half, *box.axis
+                yield kind.name, None, None, *box.center, *box.half, *box.axis
     for box in link_boxes(kitchen_urdf()):
         if not box.link.endswith("_handle"):
-            yield _ENVIRONMENT, "kitchen", box.link, box.joint, *box.centre, *box.half, *box.axis
+            yield "kitchen", box.link, box.joint, *box.center, *box.half, *box.axis
+
+
+class _SqlText(TextClause):
+    """A select given as SQL for each database."""
+
+    inherit_cache = False
+
+    def __init__(self, sqlite: str, postgresql: str) -> None:
+        super().__init__(sqlite)
+        self.sqlite = sqlite
+        self.postgresql = postgresql
+
+
+@compiles(_SqlText)
+def _of_sqlite(element: _SqlText, _compiler: Any, **_options: Any) -> str:
+    return element.sqlite
+
+
+@compiles(_SqlText, "postgresql")
+def _of_postgresql(element: _SqlText, _compiler: Any, **_options: Any) -> str:
+    return element.postgresql
+
+
+def _described() -> TextualSelect:
+    """Return the boxes of the recorded descriptions, from `DescriptionDeclared.link_boxes`.
+
+    The only link of a description has no name here, as that of a built-in model.
+    """
+    parts = [f"{name}[{at}]" for name in ("center", "half", "axis") for at in range(3)]
+    sqlite = ", ".join(
+        f"CAST(coalesce(json_extract(each.value, '$.{part}'), 0) AS REAL) AS {column}"
+        for part, column in zip(parts, _NUMBERS, strict=True)
+    )
+    postgresql = ", ".join(
+        f"CAST(coalesce(each.value -> '{part[:-3]}' ->> {part[-2]}, '0') AS double precision) AS {column}"
+        for part, column in zip(parts, _NUMBERS, strict=True)
+    )
+    text = _SqlText(
+        f"""SELECT declaration.fingerprint AS model,
+ CASE WHEN json_array_length(declaration.payload, '$.link_boxes') > 1 THEN json_extract(each.value, '$.link') END
+ AS link, json_extract(each.value, '$.joint') AS joint, {sqlite}
+ FROM pycrorm_declaration AS declaration, json_each(declaration.payload, '$.link_boxes') AS each
+ WHERE {_IS_DESCRIPTION} AND json_extract(each.value, '$.link') NOT LIKE '%_handle'""",  # noqa: S608  constants
+        f"""SELECT declaration.fingerprint AS model,
+ CASE WHEN json_array_length(CAST(declaration.payload AS json) -> 'link_boxes') > 1 THEN each.value ->> 'link' END
+ AS link, each.value ->> 'joint' AS joint, {postgresql}
+ FROM pycrorm_declaration AS declaration,
+ json_array_elements(CAST(declaration.payload AS json) -> 'link_boxes') AS each (value)
+ WHERE {_IS_DESCRIPTION} AND each.value ->> 'link' NOT LIKE '%_handle'""",  # noqa: S608  constants
+    )
+    return text.columns(*(column(name, Text()) for name in _TEXTS), *(column(name, Double()) for name in _NUMBERS))
