@@ -74,6 +74,7 @@ def test_a_study_evaluates_the_policy_under_other_conditions(document: Any) -> N
     assert {each["default"]["rollouts"] for each in studied["elsewhere"]} == {4}
 
 
+@pytest.mark.soak
 def test_an_interrupt_is_one_line_and_resume_continues(tmp_path: Path) -> None:
     longer = ("--rollouts", "1000")
     command = [*COMMAND, *SMALL, *longer, "--workers", "2"]

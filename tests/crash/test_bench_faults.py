@@ -108,7 +108,7 @@ def test_the_list_of_faults_is_complete() -> None:
 @pytest.mark.parametrize(
     "names",
     [
-        pytest.param([each for each in FAULTS if each in CHEAP], id="cheap rows"),
+        pytest.param([each for each in FAULTS if each in CHEAP], id="cheap rows", marks=pytest.mark.soak),
         pytest.param([each for each in FAULTS if each not in SLOW + CHEAP], id="quick rows", marks=pytest.mark.soak),
         pytest.param(SLOW, id="slow rows", marks=pytest.mark.soak),
     ],

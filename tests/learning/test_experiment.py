@@ -161,6 +161,7 @@ async def test_interrupted_workers_finish_their_current_rollout_and_the_experime
     assert 0 < learned.default.done_now < 1_000
 
 
+@pytest.mark.soak
 async def test_the_workers_end_when_their_parent_dies_and_nothing_is_lost(tmp_path: Path) -> None:
     url = f"sqlite:///{tmp_path}/memory.db"
     command = [sys.executable, "-m", "pycrorm_async", "learn", "--url", url, "--rollouts", "5000", "--workers", "2"]

@@ -76,6 +76,7 @@ async def test_from_every_candidate_the_furniture_can_be_opened_and_closed(
             scene.world.restore_state(before)
 
 
+@pytest.mark.soak_on("sink_area_drawer")
 @ABOUT
 @pytest.mark.parametrize(("name", "now"), [("sink_area_drawer", 0.13), ("fridge_door", 0.77)])
 async def test_half_open_furniture_can_be_opened_or_closed_from_every_candidate(
@@ -121,6 +122,7 @@ def _aside(pose: Pose, goal: tuple[float, float]) -> float:
     return math.remainder(pose.yaw - towards, math.tau)
 
 
+@pytest.mark.soak
 def test_the_requested_arms_reach(scene: Scene) -> None:
     handle = ObjectPart("sink_area_drawer_handle", scene.kitchen)
 
