@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
-from pycrorm_async.cli.output import duration, moment, print_json, print_table
+from pycrorm_async.cli.output import duration, moment, print_json, print_table, stdout
 from pycrorm_async.cli.pending_events import note_pending_events
 from pycrorm_async.cli.tree import simulated_by
 from pycrorm_async.query.named_queries import EpisodeSummary
@@ -17,6 +17,10 @@ from pycrorm_async.query.reading import Reading
 from pycrorm_async.store.address import DatabaseAddress
 
 __all__ = ["episodes"]
+
+_WIDTH_WITH_ROBOTS = 100
+"""Bounds the width of a terminal on which the table has the robots: on one of 80 characters the description has none
+to spare."""
 
 
 def episodes(
@@ -47,6 +51,10 @@ def episodes(
         (e.number, moment(e.started_at), duration(e.duration_ns), e.status, e.nodes, e.failed, _description(e, numbers))
         for e in summaries
     ]
+    if stdout.width >= _WIDTH_WITH_ROBOTS and any(each.robots for each in summaries):
+        columns = (*columns, "robots")
+        names = (", ".join(robot.name for robot in each.robots) for each in summaries)
+        rows = [(*row, name) for row, name in zip(rows, names, strict=True)]
     if any(each.tags for each in summaries):
         columns = (*columns, "tags")
         rows = [(*row, ", ".join(e.tags)) for row, e in zip(rows, summaries, strict=True)]

@@ -26,8 +26,6 @@ from pycrorm_async.orm.actions import (
 )
 from pycrorm_async.orm.base import (
     Base,
-    Concept,
-    ConceptAncestor,
     Pose,
     Position,
     ProcessMetaData,
@@ -52,6 +50,8 @@ from pycrorm_async.orm.motions import (
 from pycrorm_async.orm.objects import (
     Attachment,
     BelieveObject,
+    Concept,
+    ConceptAncestor,
     JointChange,
     LocatedObject,
     Object,
@@ -62,12 +62,13 @@ from pycrorm_async.orm.objects import (
 )
 from pycrorm_async.orm.perception import Detection, Observation, ObservationValue, StateSample
 from pycrorm_async.orm.tree import LocationCandidate, LocationRefusal, LocationResolution, TaskTreeNode
-from pycrorm_async.orm.views import EpisodeTag, PickUpWithContextView, RootFailure, SpatialRelation
+from pycrorm_async.orm.views import EpisodeRobot, EpisodeTag, PickUpWithContextView, RootFailure, SpatialRelation
 
 __all__ = [
     "Base",
     "ProcessMetaData",
     "EpisodeTag",
+    "EpisodeRobot",
     "Position",
     "Quaternion",
     "Pose",

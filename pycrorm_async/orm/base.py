@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import datetime
-from typing import Any, ClassVar, TypeVar, dataclass_transform
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, dataclass_transform
 
 from sqlalchemy import (
     BigInteger,
@@ -22,8 +22,6 @@ from sqlalchemy import (
     event,
     inspect,
     literal_column,
-    or_,
-    select,
 )
 from sqlalchemy.exc import MissingGreenlet, StatementError
 from sqlalchemy.ext.asyncio import AsyncAttrs
@@ -50,15 +48,15 @@ from pycrorm_async.orm.types import EnumName, JsonText, Moment
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.enums import Arms, Grasp, GripperState, ObjectType
 
+if TYPE_CHECKING:
+    from pycrorm_async.orm.views import EpisodeRobot
+
 __all__ = [
     "Base",
     "RowOfEvent",
     "named_if_unloaded",
     "on_request",
     "HybridOnRequest",
-    "Concept",
-    "ConceptAncestor",
-    "is_concept",
     "one_of",
     "many_of",
     "inherited_from",
@@ -250,36 +248,6 @@ class HybridOnRequest(hybrid_property[_Value]):
         return attribute
 
 
-class Concept(Base):
-    """A class of the ontology (SOMA, DUL) and one of its superclasses: several rows if it has several.
-
-    Attributes:
-        parent: its superclass; None for the topmost concepts, such as `Task` and `PhysicalObject`.
-        source: the ontology that defines it, with its version.
-    """
-
-    __tablename__ = "concept"
-
-    name: Mapped[str] = mapped_column(primary_key=True)
-    parent: Mapped[str | None] = mapped_column(primary_key=True)
-    source: Mapped[str]
-
-
-class ConceptAncestor(Base):
-    """A pair of a concept and one of its superclasses, however far up, or itself."""
-
-    __tablename__ = "concept_ancestor"
-
-    concept: Mapped[str] = mapped_column(primary_key=True)
-    ancestor: Mapped[str] = mapped_column(primary_key=True)
-
-
-def is_concept(column: ColumnElement[Any], concept: str) -> ColumnElement[bool]:
-    """Return the condition that a column names this concept or one of its subclasses."""
-    below = select(ConceptAncestor.concept).where(ConceptAncestor.ancestor == concept)
-    return or_(column == concept, column.in_(below))
-
-
 class ProcessMetaData(Base):
     """An episode with its user, plan, software and outcome. `id` is the episode's number in this database.
 
@@ -332,6 +300,9 @@ class ProcessMetaData(Base):
     """In SQL `metadata`, a name of an attribute that SQLAlchemy keeps for itself."""
     tag_rows: Mapped[list[Any]] = relationship("EpisodeTag", viewonly=True, lazy="selectin", order_by="EpisodeTag.tag")
     tags = property(lambda self: [each.tag for each in self.tag_rows], doc="The tags, in alphabetical order.")
+    _robots: Mapped[list[EpisodeRobot]] = relationship(viewonly=True, lazy="select", order_by="EpisodeRobot.id")
+    robots: Mapped[list[EpisodeRobot]] = synonym("_robots", descriptor=on_request("robots"))
+    """The robots that took part, in the order in which they were added. Loaded on request."""
 
     pycram_version: Mapped[str] = synonym("version")
 

@@ -35,12 +35,11 @@ from pycrorm_async.orm.base import (
     RobotState,
     RowOfEvent,
     inherited_from,
-    is_concept,
     many_of,
     one_of,
 )
 from pycrorm_async.orm.known_classes import known_classes
-from pycrorm_async.orm.objects import Object
+from pycrorm_async.orm.objects import Object, is_concept
 from pycrorm_async.orm.types import JsonText
 from pycrorm_async.task_status import TaskStatus
 

@@ -1,4 +1,4 @@
-"""Map objects at each moment of their history, their descriptions, removals, attachments and joint changes.
+"""Map objects at each moment of their history, their descriptions, removals, attachments, joint changes, and concepts.
 
 A row of `object` is an object at one moment: one row when it was added and one each time it moved. An action refers to
 the row that was current when it started, so `PickUpAction.object.pose` is the pose at execution. All rows of one object
@@ -11,13 +11,13 @@ from datetime import datetime
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
-from sqlalchemy import ColumnElement, ForeignKey, FromClause, and_, select
+from sqlalchemy import ColumnElement, ForeignKey, FromClause, and_, or_, select
 from sqlalchemy.orm import Mapped, mapped_column, relationship, synonym
 
 from pycrorm_async.events.codec import description_of
 from pycrorm_async.events.types import DescriptionDeclared
 from pycrorm_async.events.values import BoxValue, MeshValue
-from pycrorm_async.orm.base import Base, Pose, ProcessMetaData, RowOfEvent, is_concept, on_request, one_of
+from pycrorm_async.orm.base import Base, Pose, ProcessMetaData, RowOfEvent, on_request, one_of
 from pycrorm_async.orm.types import JsonText
 from pycrorm_async.world.enums import ObjectType
 
@@ -25,6 +25,9 @@ if TYPE_CHECKING:
     from pycrorm_async.orm.tree import TaskTreeNode
 
 __all__ = [
+    "Concept",
+    "ConceptAncestor",
+    "is_concept",
     "ObjectConcept",
     "ObjectDescription",
     "Object",
@@ -38,6 +41,36 @@ __all__ = [
 
 _STEPS_MAX = 6
 """Bounds the relationships between a query's class and an `ObjectPart` with a loaded `part_of`; no class needs more."""
+
+
+class Concept(Base):
+    """A class of the ontology (SOMA, DUL) and one of its superclasses: several rows if it has several.
+
+    Attributes:
+        parent: its superclass; None for the topmost concepts, such as `Task` and `PhysicalObject`.
+        source: the ontology that defines it, with its version.
+    """
+
+    __tablename__ = "concept"
+
+    name: Mapped[str] = mapped_column(primary_key=True)
+    parent: Mapped[str | None] = mapped_column(primary_key=True)
+    source: Mapped[str]
+
+
+class ConceptAncestor(Base):
+    """A pair of a concept and one of its superclasses, however far up, or itself."""
+
+    __tablename__ = "concept_ancestor"
+
+    concept: Mapped[str] = mapped_column(primary_key=True)
+    ancestor: Mapped[str] = mapped_column(primary_key=True)
+
+
+def is_concept(column: ColumnElement[Any], concept: str) -> ColumnElement[bool]:
+    """Return the condition that a column names this concept or one of its subclasses."""
+    below = select(ConceptAncestor.concept).where(ConceptAncestor.ancestor == concept)
+    return or_(column == concept, column.in_(below))
 
 
 class ObjectConcept(Base):

@@ -1,4 +1,4 @@
-"""Map the built-in views for learning and for failures; `projections.schema.user_views` has those of users."""
+"""Map the built-in views for learning and failures, and of episodes; `user_views` has those of users."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pycrorm_async.orm.tree import TaskTreeNode
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.enums import Arms, Grasp, ObjectType
 
-__all__ = ["EpisodeTag", "PickUpWithContextView", "RootFailure", "SpatialRelation"]
+__all__ = ["EpisodeRobot", "EpisodeTag", "PickUpWithContextView", "RootFailure", "SpatialRelation"]
 
 
 class PickUpWithContextView(Base):
@@ -153,3 +153,22 @@ class EpisodeTag(Base):
     process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"), primary_key=True)
     tag: Mapped[str] = mapped_column(primary_key=True)
     time: Mapped[datetime]
+
+
+class EpisodeRobot(RowOfEvent, Base):
+    """A robot that took part in an episode, as it was when it was added to the world.
+
+    Attributes:
+        id: of its first row in `object`.
+        model, serial: of its `RobotDescription`; None without one, and in episodes of version 0.1.0.
+        description_fingerprint: of its `ObjectDescription`; None in episodes of version 0.1.0.
+    """
+
+    __tablename__ = "episode_robot"
+
+    id: Mapped[int] = mapped_column(ForeignKey("object.id"), primary_key=True)
+    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"))
+    name: Mapped[str]
+    model: Mapped[str | None]
+    serial: Mapped[str | None]
+    description_fingerprint: Mapped[str | None] = mapped_column(ForeignKey("object_description.fingerprint"))

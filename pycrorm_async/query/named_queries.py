@@ -12,11 +12,10 @@ from sqlalchemy.ext.asyncio import AsyncConnection
 from sqlalchemy.orm import aliased
 
 from pycrorm_async.events.ids import SLOT_NODE, row_id, row_key
-from pycrorm_async.orm import Designator, EpisodeTag, Object, Observation, ProcessMetaData, TaskTreeNode
+from pycrorm_async.orm import Designator, EpisodeRobot, EpisodeTag, Object, Observation, ProcessMetaData, TaskTreeNode
 from pycrorm_async.orm.base import same_row
 from pycrorm_async.store.episode_lookup import number_named
 from pycrorm_async.task_status import TaskStatus
-from pycrorm_async.world.enums import ObjectType
 
 __all__ = ["EpisodeSummary", "NodeSummary", "RobotSummary", "SimulatingNode", "episodes", "episode_named", "task_tree"]
 
@@ -194,19 +193,14 @@ async def episodes(connection: AsyncConnection, number: int | None = None) -> li
 
 async def _robots(connection: AsyncConnection, number: int | None) -> dict[int, list[RobotSummary]]:
     """Return the robots of every episode, or of the one with this number, by episode."""
-    added = Object.__table__
-    query = (
-        select(
-            added.c.process_metadata_id, added.c.name, added.c.model, added.c.serial, added.c.description_fingerprint
-        )
-        .where(added.c.obj_type == ObjectType.ROBOT.name, added.c.id == added.c.identity_id)
-        .order_by(added.c.id)
-    )
+    robot = EpisodeRobot
+    query = select(robot.__table__).order_by(robot.id)
     if number is not None:
-        query = query.where(added.c.process_metadata_id == number)
+        query = query.where(robot.process_metadata_id == number)
     robots: dict[int, list[RobotSummary]] = {}
-    for episode, *facts in await connection.execute(query):
-        robots.setdefault(episode, []).append(RobotSummary(*facts))
+    for row in await connection.execute(query):
+        summary = RobotSummary(row.name, row.model, row.serial, row.description_fingerprint)
+        robots.setdefault(row.process_metadata_id, []).append(summary)
     return robots
 
 

@@ -8,6 +8,8 @@ from typing import Any
 
 import pytest
 
+from pycrorm_async.cli.episodes import episodes
+from pycrorm_async.cli.output import stdout
 from tests.commands import answer, one_line_of, pycrorm
 from tests.databases import ask
 
@@ -53,6 +55,17 @@ EVENTS = ["e2-e22", "e6-e11", "e7-e10", "e12-e19", "e13-e18", "e14-e17"]
 def ridden(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the folder with the memory of a successful ride."""
     return after_a_ride(tmp_path_factory.mktemp("ridden"), "plan", code=0)
+
+
+@pytest.mark.parametrize(("width", "robots"), [(99, False), (100, True)])
+def test_the_list_of_episodes_names_their_robots_on_a_terminal_wide_enough(
+    ridden: Path, width: int, robots: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(stdout, "width", width)
+    episodes(f"sqlite:///{ridden / 'memory.db'}")
+    printed = capsys.readouterr().out
+    assert "Take the milk for a ride." in printed
+    assert (("robots" in printed), ("pr2" in printed)) == (robots, robots)
 
 
 def after_a_ride(place: Path, plan: str, code: int) -> Path:

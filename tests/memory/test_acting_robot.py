@@ -9,14 +9,18 @@ from pathlib import Path
 
 import pytest
 from sqlalchemy import select, text
+from sqlalchemy.orm import selectinload
 
 from pycrorm_async import Memory
 from pycrorm_async.errors import CallerError
+from pycrorm_async.operations.copy import copy_episodes
 from pycrorm_async.orm import (
     Action,
+    EpisodeRobot,
     NavigateAction,
     ParkArmsAction,
     PickUpWithContextView,
+    ProcessMetaData,
     TaskTreeNode,
 )
 from pycrorm_async.orm import Object as RecordedObject
@@ -47,6 +51,7 @@ from pycrorm_async.world import (
 )
 from pycrorm_async.world.models.courier import courier_urdf
 from tests.commands import answer, pycrorm
+from tests.databases import ask
 
 pytestmark = pytest.mark.slow
 
@@ -127,6 +132,19 @@ async def test_every_episode_names_its_robots_with_model_serial_and_description(
             ]
             parked = (await session.scalars(select(ParkArmsAction).where(ParkArmsAction.arm == arm))).one()
             assert (parked.arm, parked.robot) == (arm, "many")
+            asked = select(ProcessMetaData).order_by(ProcessMetaData.id)
+            episodes = (await session.scalars(asked.options(selectinload(ProcessMetaData.robots)))).all()
+            assert [[(each.name, each.description_fingerprint) for each in one.robots] for one in episodes] == [
+                [],
+                [(each.name, each.description) for each in two.robots],
+            ]
+            joined = select(ProcessMetaData.description).join(ProcessMetaData.robots)
+            assert list(await session.scalars(joined.where(EpisodeRobot.serial == "C-03"))) == ["two"]
+        async with memory.session() as session:
+            (_, unloaded) = (await session.scalars(asked)).all()
+            with pytest.raises(CallerError, match=r"selectinload\(ProcessMetaData.robots\)"):
+                _ = unloaded.robots
+            assert [each.name for each in await unloaded.awaitable_attrs.robots] == ["eve", "many"]
         then = await memory.as_of(str(two.number), sequence=two.end_sequence)
         assert [(each.model, each.serial) for each in then.world.objects] == [("courier", "C-03"), ("many", None)]
         assert [(each.name, each.pose.position.x) for each in then.world.robots] == [("eve", 1), ("many", 0)]
@@ -136,6 +154,16 @@ async def test_every_episode_names_its_robots_with_model_serial_and_description(
     assert [each["model"] for each in shown[1]["robots"]] == ["courier", "many"]
     lines = pycrorm("show", "2", "--url", database_url, cwd=tmp_path).stdout
     assert "eve (courier C-03), many" in lines
+    wide = pycrorm("episodes", "--url", database_url, cwd=tmp_path).stdout
+    assert "robots" in wide
+    assert "eve, many" in wide
+    by_hand = "SELECT process_metadata_id, name, model, serial, description_fingerprint FROM episode_robot ORDER BY id"
+    rows = ask(database_url, by_hand)
+    assert rows == [(2, each.name, each.model, each.serial, each.description) for each in two.robots]
+    assert pycrorm("rebuild", "--url", database_url, cwd=tmp_path).returncode == 0
+    assert ask(database_url, by_hand) == rows
+    await copy_episodes(database_url, f"sqlite:///{tmp_path}/copy.db")
+    assert ask(f"sqlite:///{tmp_path}/copy.db", by_hand) == rows
     moment = pycrorm("show", "2", "--at", "9", "--url", database_url, cwd=tmp_path).stdout
     assert "eve at (1.000, 0.000), heading 0.0°; many at (0.000, 0.000), heading 0.0°" in moment
 

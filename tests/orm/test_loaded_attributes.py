@@ -12,7 +12,15 @@ from sqlalchemy.orm import selectinload, undefer
 
 from pycrorm_async import Memory
 from pycrorm_async.errors import CallerError
-from pycrorm_async.orm import Action, Base, LocationResolution, Object, PickUpWithContextView, TaskTreeNode
+from pycrorm_async.orm import (
+    Action,
+    Base,
+    LocationResolution,
+    Object,
+    PickUpWithContextView,
+    ProcessMetaData,
+    TaskTreeNode,
+)
 from pycrorm_async.plan import TransportAction, simulated_robot
 from pycrorm_async.world import Arms, BulletWorld, ObjectType, Pose
 from pycrorm_async.world import Object as WorldObject
@@ -24,7 +32,7 @@ CLASSES = [
     for each in sorted(Base.registry.mappers, key=str)
     if each.class_.__module__.startswith("pycrorm_async.orm")
 ]
-ON_REQUEST = {"parent", "children", "ancestors", "node", "parameters", "refusals", "description"}
+ON_REQUEST = {"parent", "children", "ancestors", "node", "parameters", "refusals", "description", "robots"}
 ON_REQUEST_OF_PICK_UPS = {"object_z", "object_qx", "object_qy", "object_qz", "object_qw", "height_over_torso"}
 ON_REQUEST_OF_PICK_UPS |= {"robot", "scene"}
 
@@ -108,6 +116,7 @@ async def test_attributes_on_request_are_loaded_as_the_error_says(
             (Object, "node", selectinload(Object.node)),
             (Action, "node", selectinload(Action.node)),
             (Action, "parameters", undefer(Action.parameters)),
+            (ProcessMetaData, "robots", selectinload(ProcessMetaData.robots)),
             (LocationResolution, "refusals", selectinload(LocationResolution.refusals)),
             (PickUpWithContextView, "object_z", undefer(PickUpWithContextView.object_z)),
         ]

@@ -33,11 +33,13 @@ from pycrorm_async.events.values import (
 )
 from pycrorm_async.orm import (
     Action,
+    EpisodeRobot,
     LocationResolution,
     NavigateAction,
     Object,
     PickUpAction,
     PickUpWithContextView,
+    ProcessMetaData,
     RootFailure,
     SpatialRelation,
     TaskTreeNode,
@@ -203,6 +205,11 @@ async def spatial_relations(reading: Reading) -> None:
         await session.scalars(select(SpatialRelation).where(SpatialRelation.process_metadata_id == ASKED))
 
 
+async def an_episode_with_robots(reading: Reading) -> None:
+    query = select(ProcessMetaData).where(ProcessMetaData.id == ASKED)
+    await rows_of(reading, query.options(selectinload(ProcessMetaData.robots)))
+
+
 async def the_tree(reading: Reading) -> None:
     assert len(await reading.tree(ASKED)) == 5
 
@@ -220,6 +227,8 @@ async def a_snapshot(reading: Reading) -> None:
         pytest.param(of_episode(TaskTreeNode, selectinload(TaskTreeNode.children)), id="nodes with children"),
         pytest.param(of_episode(Object, selectinload(Object.node)), id="objects with nodes"),
         pytest.param(of_episode(LocationResolution, selectinload(LocationResolution.refusals)), id="places"),
+        pytest.param(of_episode(EpisodeRobot), id="robots"),
+        pytest.param(an_episode_with_robots, id="an episode with its robots"),
         pytest.param(of_episode(PickUpWithContextView), id="pick-ups"),
         pytest.param(a_frame_of_pick_ups, id="a data frame of pick-ups"),
         pytest.param(of_episode(RootFailure), id="where failures began"),

@@ -100,6 +100,7 @@ def everything(number: int, thinker: NodeReference | None = None) -> Script:
     careful = put(NodeStarted("action", either, name_of(CAREFUL), slowly, robot, simulated))
     put(NodeEnded(careful, "SUCCEEDED"))
     put(ObjectRemoved(ObjectReference(milk, moved)))
+    put(ObjectAdded("pr2", "ROBOT", pose()))
     put(NodeEnded(either, "SUCCEEDED"))
     put(Observed("force", {"x": 1.5}, root))
     put(NodeEnded(root, "SUCCEEDED"))

@@ -47,6 +47,7 @@ from pycrorm_async.projections.schema.root_failure_view import root_failures
 from pycrorm_async.projections.schema.tables import CORE, EPISODE, OWN, column_type, leaf_columns, make_table
 from pycrorm_async.projections.schema.views.concept_views import concept_views
 from pycrorm_async.projections.schema.views.spatial_relation_view import SpatialTables, spatial_relations
+from pycrorm_async.world.enums import ObjectType
 
 __all__ = ["public_views", "projection_views", "View"]
 
@@ -201,6 +202,14 @@ def _episode_tag(core: dict[str, Table], _layout: Layout) -> Select[Any]:
     return select(*columns).where(changes.c.added, not_(select(later.c.id).where(is_later).exists()))
 
 
+def _episode_robot(core: dict[str, Table], _layout: Layout) -> Select[Any]:
+    """Return the robots of episodes: the rows of robots from when they were added."""
+    rows = core["object"]
+    columns = rows.c.id, rows.c.process_metadata_id, rows.c.name, rows.c.model, rows.c.serial
+    robots = select(*columns, rows.c.description_fingerprint, *_sequence(rows))
+    return robots.where(rows.c.obj_type == ObjectType.ROBOT.name, rows.c.id == rows.c.identity_id)
+
+
 def _designator_type(layout: Layout) -> View:
     """Return the view of declarations. It never parses one that is not JSON, whichever column a query reads."""
     payload: ColumnElement[Any] = _declaration.c.payload
@@ -324,6 +333,7 @@ def _quaternion(core: dict[str, Table], _layout: Layout) -> Select[Any]:
 _CUT: dict[str, tuple[str, _Cut]] = {
     "process_metadata": ("process_metadata", _process_metadata),
     "episode_tag": ("episode_tagging", _episode_tag),
+    "episode_robot": ("object", _episode_robot),
     "task_tree_node": ("task_tree_node", _task_tree_node),
     "designator": ("task_tree_node", _designator),
     "action": ("task_tree_node", _of_kind("action")),
