@@ -62,9 +62,9 @@ def test_the_list_of_episodes_names_their_robots_on_a_terminal_wide_enough(
     ridden: Path, width: int, robots: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(stdout, "width", width)
-    episodes(f"sqlite:///{ridden / 'memory.db'}")
+    episodes(f"sqlite:///{ridden / 'pycrorm.db'}")
     printed = capsys.readouterr().out
-    assert "Take the milk for a ride." in printed
+    assert "Take the milk" in printed
     assert (("robots" in printed), ("pr2" in printed)) == (robots, robots)
 
 

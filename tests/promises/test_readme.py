@@ -36,7 +36,7 @@ def python_of(page: str) -> list[str]:
 
 PLAN, QUESTIONS, CELLS = python_of("README.md")
 TIDY, LIFTER, STEREO = python_of("pycrorm_async/plan/README.md")
-COURSE, AROUND, BEGAN, TAGGED, SEEN, THEN, AGAIN, RATE = python_of("pycrorm_async/query/README.md")
+COURSE, AROUND, ROBOTS, BEGAN, TAGGED, SEEN, THEN, AGAIN, RATE = python_of("pycrorm_async/query/README.md")
 BETTER, ORIGINS = python_of("pycrorm_async/learning/README.md")
 
 
@@ -193,6 +193,18 @@ async def test_a_node_shows_the_nodes_around_it(tmp_path: Path, capsys: pytest.C
     mover = await names["asked"]()
     assert mover.kind == "motion"
     assert capsys.readouterr().out.endswith("['TransportAction', None]\n")
+
+
+async def test_episodes_have_their_robots(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "tidy.py").write_text(TIDY)
+    done = await asyncio.to_thread(pycrorm, "run", "tidy.py", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    names: dict[str, Any] = {}
+    exec("from pycrorm_async import Memory", names)
+    opened = f"    async with Memory.open({f'sqlite:///{tmp_path}/pycrorm.db'!r}) as memory:\n"
+    exec(f"async def asked():\n{opened}{textwrap.indent(ROBOTS, '        ')}", names)
+    await names["asked"]()
+    assert capsys.readouterr().out.endswith("[('pr2', None)]\n")
 
 
 FAILING = """\
