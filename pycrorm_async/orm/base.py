@@ -367,5 +367,5 @@ class RobotState(RowOfEvent, Base):
     type: Mapped[ObjectType]
     pose_id: Mapped[int] = mapped_column(ForeignKey("pose.id"))
 
-    pose: Mapped[Pose] = one_of(lambda: RobotState.pose_id, "pose", lazy="joined", innerjoin=True)
+    pose: Mapped[Pose] = one_of(lambda: RobotState.pose_id, "pose", lazy="selectin")
     process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True, lazy="selectin")

@@ -1,4 +1,4 @@
-"""Query plans of a PostgreSQL server that has never analysed the tables: none reads an episode once for each row."""
+"""Query plans of a PostgreSQL server, with statistics and without: none reads an episode once for each row."""
 
 from __future__ import annotations
 
@@ -19,12 +19,13 @@ from pycrorm_async.orm import (
     PickUpWithContextView,
     Pose,
     SpatialRelation,
+    TaskTreeNode,
 )
 from pycrorm_async.query.experience import PickUpExperience
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.world import ObjectType
-from tests.databases import Server, ask, run_in_own_loop
+from tests.databases import Server, ask, ask_to_change, run_in_own_loop
 
 pytestmark = pytest.mark.slow
 
@@ -36,9 +37,9 @@ episode for each pick-up reads more."""
 Question = Callable[[Reading], Coroutine[Any, Any, None]]
 
 
-@pytest.fixture(scope="module")
-def unanalysed(server: Server, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """The URL of a memory of rollouts without statistics."""
+@pytest.fixture(scope="module", params=["without statistics", "with statistics"])
+def rollouts(request: pytest.FixtureRequest, server: Server, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """The URL of a memory of rollouts."""
     url, spool = server.new_database(), Path(tmp_path_factory.mktemp("spool"))
     spool_rollouts(EPISODES * PICK_UPS, spool, seed=69, an_episode=PICK_UPS)
 
@@ -47,6 +48,8 @@ def unanalysed(server: Server, tmp_path_factory: pytest.TempPathFactory) -> Iter
 
     run_in_own_loop(store())
     assert ask(url, "SELECT count(*) FROM pg_stats WHERE schemaname = 'memory_tables'") == [(0,)]
+    if request.param == "with statistics":
+        ask_to_change(url, "ANALYZE")
     yield url
     server.drop(url)
 
@@ -107,9 +110,11 @@ async def rows_read(log: EventLog, statements: list[tuple[str, Any]]) -> dict[st
         pytest.param(rows_of(select(SpatialRelation)), id="spatial relations"),
         pytest.param(rows_of(select(Pose).join(PickUpAction.object).join(Object.pose)), id="a join"),
         pytest.param(the_tree, id="the task tree"),
+        pytest.param(rows_of(select(PickUpAction)), id="actions as objects"),
+        pytest.param(rows_of(select(TaskTreeNode)), id="nodes as objects"),
     ],
 )
-async def test_no_query_reads_an_episode_once_for_each_row(unanalysed: str, question: Question) -> None:
+async def test_no_query_reads_an_episode_once_for_each_row(rollouts: str, question: Question) -> None:
     statements: list[tuple[str, Any]] = []
 
     def note(_connection: Any, _cursor: Any, text: str, parameters: Any, _context: Any, _many: bool) -> None:
@@ -117,13 +122,13 @@ async def test_no_query_reads_an_episode_once_for_each_row(unanalysed: str, ques
 
     event.listen(Engine, "before_cursor_execute", note)
     try:
-        async with Reading.open(unanalysed) as reading:
+        async with Reading.open(rollouts) as reading:
             await question(reading)
     finally:
         event.remove(Engine, "before_cursor_execute", note)
-    log = await EventLog.open(DatabaseAddress.parse(unanalysed), create=False)
+    log = await EventLog.open(DatabaseAddress.parse(rollouts), create=False)
     read = await rows_read(log, statements)
     await log.close()
-    [(poses,)] = ask(unanalysed, "SELECT count(*) FROM memory.pose")
+    [(poses,)] = ask(rollouts, "SELECT count(*) FROM memory.pose")
     assert {text: rows for text, rows in read.items() if rows > TURNS_A_ROW * poses} == {}
     assert read
