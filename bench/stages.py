@@ -38,11 +38,11 @@ from pycrorm_async.events.ids import EpisodeId, episode_id
 from pycrorm_async.events.types import EpisodeStarted, NodeEnded, NodeStarted
 from pycrorm_async.hooks.declaration import Declarations
 from pycrorm_async.hooks.plan_recorder import current_episode
-from pycrorm_async.hooks.values.value_snapshot import encode_parameter
 from pycrorm_async.plan import BaseMotion
 from pycrorm_async.plan.execution.observer import recorder
 from pycrorm_async.plan.task_tree import TaskTreeNode
 from pycrorm_async.queue import RecorderQueue
+from pycrorm_async.recording.values.value_snapshot import encode_parameter
 from pycrorm_async.world import BulletWorld
 
 _TASKS = 100

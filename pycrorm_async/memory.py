@@ -32,12 +32,9 @@ from pycrorm_async.connected_var import set_inside
 from pycrorm_async.errors import CallerError, EpisodeParked, PycrormError, TablesForeign
 from pycrorm_async.events.ids import episode_id
 from pycrorm_async.events.tags import checked_tags
-from pycrorm_async.hooks.emitter import Emitter
 from pycrorm_async.hooks.episode import Episode
 from pycrorm_async.hooks.observations import Observations
 from pycrorm_async.hooks.plan_recorder import Recorder, current_episode
-from pycrorm_async.hooks.provenance import PlanSource, Provenance
-from pycrorm_async.hooks.values.episode_arguments import read_labels
 from pycrorm_async.memory_parts import Parts
 from pycrorm_async.memory_reading import ObservingMemory, ReadableMemory
 from pycrorm_async.memory_status import MemoryStatus
@@ -56,6 +53,9 @@ from pycrorm_async.queue.files.locks import call_in_forked_child
 from pycrorm_async.queue.files.spool import Spool
 from pycrorm_async.queue.live.delegated_writer import DelegatedWriter
 from pycrorm_async.queue.live.recorder_queue import RecorderQueue
+from pycrorm_async.recording.values.episode_arguments import read_labels
+from pycrorm_async.recording.writing.emitter import Emitter
+from pycrorm_async.recording.writing.provenance import PlanSource, Provenance
 from pycrorm_async.settings import Settings, Writer
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 
 from pycrorm_async.connected_var import ConnectedVar, set_inside
 from pycrorm_async.errors import CallerError
-from pycrorm_async.hooks.emitter import Emitter
 from pycrorm_async.hooks.observations import Observations
 from pycrorm_async.hooks.plan_recorder import Recorder
 from pycrorm_async.plan.execution.observer import recorder
@@ -18,6 +17,7 @@ from pycrorm_async.query.experience import PickUpExperience
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.queue.live.delegated_writer import DelegatedWriter
 from pycrorm_async.queue.live.recorder_queue import RecorderQueue
+from pycrorm_async.recording.writing.emitter import Emitter
 from pycrorm_async.world.observers import watcher
 from pycrorm_async.writer.writer_thread import WriterThread
 

@@ -13,12 +13,12 @@ from sqlalchemy.ext.asyncio import AsyncSession
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.blobs import Blob
 from pycrorm_async.hooks.episode import Episode
-from pycrorm_async.hooks.event_feed import BUFFER_EVENTS, EventStream, RecordedEvent, Subscription
 from pycrorm_async.memory_parts import PartsHolder
 from pycrorm_async.plan.task_tree import TaskTreeNode
 from pycrorm_async.query.as_of import AnyEpisode
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.snapshot import Moment
+from pycrorm_async.recording.writing.event_feed import BUFFER_EVENTS, EventStream, RecordedEvent, Subscription
 
 if TYPE_CHECKING:
     from pandas import DataFrame

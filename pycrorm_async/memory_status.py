@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from typing import NamedTuple, Self
 
 from pycrorm_async.errors import PycrormError
-from pycrorm_async.hooks.emitter import Faults
-from pycrorm_async.hooks.values.missing_values import Missing
 from pycrorm_async.memory_parts import Parts
+from pycrorm_async.recording.values.missing_values import Missing
+from pycrorm_async.recording.writing.emitter import Faults
 from pycrorm_async.writer.background_writer import WriterState
 from pycrorm_async.writer.writer_thread import WriterThread
 

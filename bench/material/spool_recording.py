@@ -24,8 +24,7 @@ from pycrorm_async.events.types import (
     ObjectAdded,
 )
 from pycrorm_async.events.values import FailureValue, ObjectReference, PoseValue, RobotValue
-from pycrorm_async.hooks.declaration import DeclaredType, declared_type
-from pycrorm_async.hooks.emitter import Emitter
+from pycrorm_async.hooks.declaration import declared_type
 from pycrorm_async.plan.actions.basic import (
     FaceAtPerformable,
     LookAtActionPerformable,
@@ -35,6 +34,8 @@ from pycrorm_async.plan.actions.basic import (
 from pycrorm_async.plan.designator import Designator
 from pycrorm_async.plan.motions.motions import LookingMotion, MoveGripperMotion, MoveMotion, MoveTCPMotion
 from pycrorm_async.queue import RecorderQueue
+from pycrorm_async.recording.declarations.declared_type import DeclaredType
+from pycrorm_async.recording.writing.emitter import Emitter
 from pycrorm_async.settings import Settings
 
 __all__ = ["spool_tree", "spool_rollouts", "Recording", "DECLARED"]

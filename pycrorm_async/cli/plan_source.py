@@ -6,7 +6,7 @@ import os
 import subprocess
 from pathlib import Path
 
-from pycrorm_async.hooks.provenance import PlanSource
+from pycrorm_async.recording.writing.provenance import PlanSource
 
 __all__ = ["plan_source"]
 

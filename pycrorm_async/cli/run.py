@@ -30,10 +30,10 @@ from pycrorm_async.cli.plan_loader import LoadedPlan, load_plan
 from pycrorm_async.cli.plan_source import plan_source
 from pycrorm_async.errors import CallerError, EpisodeParked
 from pycrorm_async.events.tags import checked_tags
-from pycrorm_async.hooks.values.texts import message_of
 from pycrorm_async.memory import Memory
 from pycrorm_async.projections.custom.discovery import load_projections
 from pycrorm_async.query.named_queries import EpisodeSummary
+from pycrorm_async.recording.values.texts import message_of
 from pycrorm_async.settings import OnFull, OnUnrecordable, RecordMeshes, Settings
 
 __all__ = ["run"]

@@ -11,8 +11,7 @@ import dataclasses
 import typing
 import weakref
 from collections.abc import Callable, Mapping, Sequence
-from enum import Enum
-from typing import Any, NamedTuple
+from typing import Any
 
 from msgspec.structs import replace
 
@@ -29,7 +28,9 @@ from pycrorm_async.events.fields import (
 from pycrorm_async.events.ids import SLOT_FIRST_FIELD
 from pycrorm_async.events.types import DesignatorTypeDeclared
 from pycrorm_async.events.values import FieldDeclared
-from pycrorm_async.hooks.values.parameter_types import (
+from pycrorm_async.plan.designator import Designator
+from pycrorm_async.recording.declarations.declared_type import DeclaredType, Field, Undeclared
+from pycrorm_async.recording.values.parameter_types import (
     OUR_PACKAGE,
     Parameter,
     Shape,
@@ -39,10 +40,9 @@ from pycrorm_async.hooks.values.parameter_types import (
     type_text,
     undecorated_fields,
 )
-from pycrorm_async.hooks.values.texts import clean, cut, message_of
-from pycrorm_async.plan.designator import Designator
+from pycrorm_async.recording.values.texts import clean, cut, message_of
 
-__all__ = ["DeclaredType", "Field", "Undeclared", "Declarations", "declared_type"]
+__all__ = ["Declarations", "declared_type"]
 
 
 _NESTED_MAX = 8
@@ -51,41 +51,6 @@ _REASON_MAX = 500
 """Bounds the characters of the reason why a field or class cannot be declared; reasons may quote a user's names."""
 _DTYPE_IN_USE = "already has the dtype or table {!r} (set a class attribute `dtype` on one of the two)"
 _ALIAS_IN_USE = "already has the alias {!r} (only one class can have it)"
-
-
-class Field(NamedTuple):
-    """A declared field, the attribute path to its value, and its enum class if it is an enum."""
-
-    declared: FieldDeclared
-    path: tuple[str, ...]
-    enum: type[Enum] | None
-
-
-class Undeclared(NamedTuple):
-    """A field without a column, the attribute path to its value, and the reason."""
-
-    name: str
-    path: tuple[str, ...]
-    reason: str
-
-
-class DeclaredType(NamedTuple):
-    """The declaration of a designator class, encoded, with the paths to read its parameters.
-
-    Attributes:
-        payload: the encoded declaration; empty if the class cannot be declared.
-        fingerprint: fingerprint of the payload; empty if the class cannot be declared.
-        undeclared: fields whose values are recorded as missing.
-        fault: reason why the class, or one of its aliases, cannot be declared.
-    """
-
-    dtype: str
-    payload: bytes
-    fingerprint: str
-    fields: tuple[Field, ...]
-    declaration: DesignatorTypeDeclared
-    undeclared: tuple[Undeclared, ...] = ()
-    fault: str | None = None
 
 
 class Declarations:

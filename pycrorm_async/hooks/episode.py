@@ -38,17 +38,14 @@ from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.events.tags import changed_tags
 from pycrorm_async.events.types import EpisodeEnded, EpisodeTagged, NodeEnded, NodeStarted
 from pycrorm_async.events.values import FailureValue, NodeReference, NodeStatus, ObjectReference, RobotValue
-from pycrorm_async.hooks.declaration import DeclaredType
-from pycrorm_async.hooks.emitter import UNAWAITED_MAX, Emitter
-from pycrorm_async.hooks.episode_events import (
-    EpisodeOpening,
-    current_task,
-    end_statuses,
-    episode_started,
-    location_resolved,
-    object_detected,
-)
-from pycrorm_async.hooks.values.event_fitting import (
+from pycrorm_async.hooks.episode_events import location_resolved, object_detected
+from pycrorm_async.hooks.world_recorder import WorldRecorder
+from pycrorm_async.plan.designator import Designator
+from pycrorm_async.plan.execution.observer import Candidate, Refusal, Seen
+from pycrorm_async.plan.execution.unawaited_performs import CalledPerforms
+from pycrorm_async.plan.task_tree import TaskTreeNode
+from pycrorm_async.recording.declarations.declared_type import DeclaredType
+from pycrorm_async.recording.values.event_fitting import (
     episode_text_of,
     fit_detection,
     fit_episode_end,
@@ -56,13 +53,10 @@ from pycrorm_async.hooks.values.event_fitting import (
     fit_node_end,
     fit_resolution,
 )
-from pycrorm_async.hooks.values.parameters import ROBOT, fit_node_start, read_parameters
-from pycrorm_async.hooks.values.value_snapshot import encode_or_missing, failure_value, missing_in
-from pycrorm_async.hooks.world_recorder import WorldRecorder
-from pycrorm_async.plan.designator import Designator
-from pycrorm_async.plan.execution.observer import Candidate, Refusal, Seen
-from pycrorm_async.plan.execution.unawaited_performs import CalledPerforms
-from pycrorm_async.plan.task_tree import TaskTreeNode
+from pycrorm_async.recording.values.parameters import ROBOT, fit_node_start, read_parameters
+from pycrorm_async.recording.values.value_snapshot import encode_or_missing, failure_value, missing_in
+from pycrorm_async.recording.writing.emitter import UNAWAITED_MAX, Emitter
+from pycrorm_async.recording.writing.episode_opening import EpisodeOpening, current_task, end_statuses, episode_started
 from pycrorm_async.world.bullet import BulletWorld
 from pycrorm_async.world.enums import ObjectType
 from pycrorm_async.world.objects import Object

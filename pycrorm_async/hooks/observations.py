@@ -15,12 +15,12 @@ from msgspec.structs import replace
 from pycrorm_async.errors import SpoolFull, SpoolStuck, Unrecordable
 from pycrorm_async.events.codec import NotEncodable, encoded_bytes
 from pycrorm_async.events.types import Observed
-from pycrorm_async.hooks.emitter import Emitter
 from pycrorm_async.hooks.episode import Episode
 from pycrorm_async.hooks.plan_recorder import Recorder
-from pycrorm_async.hooks.values.observed_values import ObservedReader
-from pycrorm_async.hooks.values.texts import clean, clean_repr, cut
 from pycrorm_async.plan.task_tree import TaskTreeNode, current_node
+from pycrorm_async.recording.values.observed_values import ObservedReader
+from pycrorm_async.recording.values.texts import clean, clean_repr, cut
+from pycrorm_async.recording.writing.emitter import Emitter
 
 __all__ = ["Observations"]
 

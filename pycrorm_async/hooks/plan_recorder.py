@@ -33,17 +33,18 @@ from pycrorm_async.errors import DeclarationRefused, EpisodeRefused, SpoolFull, 
 from pycrorm_async.events.envelope import Heading
 from pycrorm_async.events.ids import EpisodeId, episode_id, episode_text
 from pycrorm_async.events.values import NodeReference
-from pycrorm_async.hooks.declaration import Declarations, DeclaredType
-from pycrorm_async.hooks.emitter import Emitter
+from pycrorm_async.hooks.declaration import Declarations
 from pycrorm_async.hooks.episode import Episode, NodeRecord
-from pycrorm_async.hooks.episode_events import EpisodeOpening, current_task
-from pycrorm_async.hooks.provenance import Provenance
 from pycrorm_async.hooks.sampler import Sampler
-from pycrorm_async.hooks.values.episode_arguments import NO_LABELS, Labels, check_arguments
-from pycrorm_async.hooks.values.event_fitting import EPISODE_TEXT_MAX
 from pycrorm_async.plan.execution.observer import Candidate, Refusal, Seen, Simulation, current_simulation
 from pycrorm_async.plan.execution.unawaited_performs import CalledPerforms
 from pycrorm_async.plan.task_tree import TaskTreeNode
+from pycrorm_async.recording.declarations.declared_type import DeclaredType
+from pycrorm_async.recording.values.episode_arguments import NO_LABELS, Labels, check_arguments
+from pycrorm_async.recording.values.event_fitting import EPISODE_TEXT_MAX
+from pycrorm_async.recording.writing.emitter import Emitter
+from pycrorm_async.recording.writing.episode_opening import EpisodeOpening, current_task
+from pycrorm_async.recording.writing.provenance import Provenance
 from pycrorm_async.world.bullet import BulletWorld
 from pycrorm_async.world.enums import ObjectType
 from pycrorm_async.world.observers import current_world

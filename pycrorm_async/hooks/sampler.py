@@ -25,8 +25,8 @@ from contextlib import contextmanager
 
 from pycrorm_async.errors import SpoolFull, SpoolStuck
 from pycrorm_async.events.types import StateSampled
-from pycrorm_async.hooks.emitter import Emitter
 from pycrorm_async.hooks.episode import Episode
+from pycrorm_async.recording.writing.emitter import Emitter
 from pycrorm_async.world.objects import Object
 from pycrorm_async.world.robots.acting_robot import acting_robot
 

@@ -33,11 +33,11 @@ from pycrorm_async.events.types import (
     ObjectRemoved,
 )
 from pycrorm_async.events.values import ObjectReference, PoseValue, RobotValue
-from pycrorm_async.hooks.emitter import Emitter
-from pycrorm_async.hooks.values.event_fitting import clean_texts
-from pycrorm_async.hooks.values.texts import clean
-from pycrorm_async.hooks.values.value_snapshot import pose_value
 from pycrorm_async.plan.task_tree import current_node
+from pycrorm_async.recording.values.event_fitting import clean_texts
+from pycrorm_async.recording.values.texts import clean
+from pycrorm_async.recording.values.value_snapshot import pose_value
+from pycrorm_async.recording.writing.emitter import Emitter
 from pycrorm_async.world.bullet import BulletWorld
 from pycrorm_async.world.objects import Object
 from pycrorm_async.world.pose import Pose

@@ -23,7 +23,6 @@ from sqlalchemy import inspect as inspect_row
 
 from pycrorm_async import orm
 from pycrorm_async.errors import CallerError
-from pycrorm_async.hooks.values.parameter_types import Parameter, Shape, Unresolved, parameters_of, shape_of
 from pycrorm_async.plan.current_robot import require_world
 from pycrorm_async.plan.designator import Designator
 from pycrorm_async.plan.object_designators import (
@@ -34,6 +33,7 @@ from pycrorm_async.plan.object_designators import (
     designator_of,
 )
 from pycrorm_async.projections.fold.column_values import is_missing
+from pycrorm_async.recording.values.parameter_types import Parameter, Shape, Unresolved, parameters_of, shape_of
 from pycrorm_async.world.enums import ObjectType
 from pycrorm_async.world.objects import Object
 from pycrorm_async.world.pose import Pose

@@ -14,7 +14,7 @@ import pytest
 
 from pycrorm_async.cli import plan_source as reader
 from pycrorm_async.cli.plan_source import plan_source
-from pycrorm_async.hooks.provenance import PlanSource
+from pycrorm_async.recording.writing.provenance import PlanSource
 from tests.commands import pycrorm
 
 PLAN = "async def plan():\n    pass\n"

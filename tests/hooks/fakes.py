@@ -15,12 +15,12 @@ from pycrorm_async.events.envelope import Heading
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.events.order import OrderCheck
 from pycrorm_async.events.types import Happening
-from pycrorm_async.hooks.emitter import Emitter
 from pycrorm_async.hooks.episode import Episode
 from pycrorm_async.hooks.plan_recorder import Recorder, current_episode
 from pycrorm_async.plan.designator import ActionAbstract
 from pycrorm_async.plan.execution.observer import recorder
 from pycrorm_async.plan.object_designators import ObjectDesignator, ObjectPart
+from pycrorm_async.recording.writing.emitter import Emitter
 from pycrorm_async.settings import Settings
 from pycrorm_async.world.observers import watcher
 

@@ -11,10 +11,11 @@ import pytest
 
 from pycrorm_async.errors import DeclarationRefused
 from pycrorm_async.events.values import FieldDeclared
-from pycrorm_async.hooks.declaration import Declarations, DeclaredType, declared_type
+from pycrorm_async.hooks.declaration import Declarations, declared_type
 from pycrorm_async.plan.actions.basic import PickUpActionPerformable
 from pycrorm_async.plan.designator import ActionAbstract
 from pycrorm_async.plan.object_designators import ObjectDesignator
+from pycrorm_async.recording.declarations.declared_type import DeclaredType
 from pycrorm_async.world.enums import Arms
 from pycrorm_async.world.pose import Pose
 

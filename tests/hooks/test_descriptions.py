@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from pycrorm_async.events.types import DescriptionDeclared, ObjectAdded
-from pycrorm_async.hooks import descriptions
+from pycrorm_async.recording.declarations import descriptions
 from pycrorm_async.settings import Settings
 from pycrorm_async.world import BulletWorld, Object, ObjectType
 from pycrorm_async.world.models.primitives import box_urdf

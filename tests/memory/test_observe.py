@@ -314,7 +314,7 @@ async def test_a_process_killed_between_blob_and_record_loses_no_blob_that_an_ev
     script.write_text(f"""
 import asyncio, os, signal
 from pycrorm_async import Blob, Memory
-from pycrorm_async.hooks.emitter import Emitter
+from pycrorm_async.recording.writing.emitter import Emitter
 
 async def main():
     async with Memory.open({database_url!r}, spool={str(tmp_path / "spool")!r}, writer="daemon") as memory:

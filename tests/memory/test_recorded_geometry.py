@@ -16,12 +16,12 @@ import pytest
 from sqlalchemy import select
 
 from pycrorm_async import Memory, Reading, world_of
-from pycrorm_async.hooks.values.missing_values import Missing
 from pycrorm_async.operations.rebuild import rebuild_memory
 from pycrorm_async.operations.recovery import recover
 from pycrorm_async.orm import Object as ObjectRow
 from pycrorm_async.orm import ObjectDescription
 from pycrorm_async.query.recorded_world import RecordedWorld
+from pycrorm_async.recording.values.missing_values import Missing
 from pycrorm_async.settings import Settings
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose, copied
 from pycrorm_async.world.robots.robot_description import PR2

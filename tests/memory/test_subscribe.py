@@ -15,8 +15,8 @@ import pytest
 
 from pycrorm_async import Memory
 from pycrorm_async.events.types import EpisodeEnded, EpisodeStarted, NodeEnded, NodeStarted, ObjectAdded
-from pycrorm_async.hooks.event_feed import RecordedEvent
 from pycrorm_async.plan import ActionAbstract, PlanFailure
+from pycrorm_async.recording.writing.event_feed import RecordedEvent
 from pycrorm_async.world import BulletWorld, Object, ObjectType
 from tests.databases import ask
 

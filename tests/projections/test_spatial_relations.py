@@ -22,10 +22,10 @@ from pycrorm_async.events.types import (
     ObjectRemoved,
 )
 from pycrorm_async.events.values import BlobReference, ObjectReference
-from pycrorm_async.hooks.descriptions import Descriptions
-from pycrorm_async.hooks.values.missing_values import MissingValues
 from pycrorm_async.orm import SpatialRelation
 from pycrorm_async.query.reading import Reading
+from pycrorm_async.recording.declarations.descriptions import Descriptions
+from pycrorm_async.recording.values.missing_values import MissingValues
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.world import BulletWorld, Object, ObjectType

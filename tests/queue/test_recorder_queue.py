@@ -13,9 +13,9 @@ import pytest
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import EpisodeRefused, InternalError, SpoolClosed, SpoolUnavailable
 from pycrorm_async.events.envelope import Heading, Record
-from pycrorm_async.hooks.event_sink import EventSink
 from pycrorm_async.queue import RecorderQueue, Spool
 from pycrorm_async.queue.files.locks import FileLock
+from pycrorm_async.recording.writing.event_sink import EventSink
 from pycrorm_async.settings import Settings
 from pycrorm_async.writer.ports import Source
 from tests.queue.factories import (

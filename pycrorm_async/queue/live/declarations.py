@@ -4,7 +4,7 @@ The repeated declarations are ordinary records with positions of their own. The 
 
 A plan may make any number of objects with descriptions of their own, so only the latest descriptions are repeated, an
 eighth of a segment. The hooks put a description again before they use one that they put long ago, see
-`hooks.descriptions`. So a segment with an object has the object's description too.
+`recording.declarations.descriptions`. So a segment with an object has the object's description too.
 """
 
 from __future__ import annotations

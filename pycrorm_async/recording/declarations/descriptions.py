@@ -17,8 +17,8 @@ from pycrorm_async.events.codec import NotEncodable, encode, fingerprint
 from pycrorm_async.events.envelope import Heading
 from pycrorm_async.events.types import DescriptionDeclared
 from pycrorm_async.events.values import BlobReference, BoxValue, LinkBoxValue, MeshValue
-from pycrorm_async.hooks.values.missing_values import MissingValues
-from pycrorm_async.hooks.values.texts import clean, cut, message_of
+from pycrorm_async.recording.values.missing_values import MissingValues
+from pycrorm_async.recording.values.texts import clean, cut, message_of
 from pycrorm_async.settings import Settings
 from pycrorm_async.world.models.link_boxes import link_boxes
 from pycrorm_async.world.models.mesh_boxes import mesh_files, meshed_links, with_mesh_files

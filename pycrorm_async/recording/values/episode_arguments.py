@@ -8,10 +8,10 @@ from typing import Any, Final, NamedTuple
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.codec import NotEncodable, encoded_bytes
 from pycrorm_async.events.tags import checked_tags
-from pycrorm_async.hooks.emitter import BlobRefused, Emitter
-from pycrorm_async.hooks.values.event_fitting import EPISODE_TEXT_MAX
-from pycrorm_async.hooks.values.observed_values import ObservedReader
-from pycrorm_async.hooks.values.value_snapshot import NO_REFERENCES
+from pycrorm_async.recording.values.event_fitting import EPISODE_TEXT_MAX
+from pycrorm_async.recording.values.observed_values import ObservedReader
+from pycrorm_async.recording.values.value_snapshot import NO_REFERENCES
+from pycrorm_async.recording.writing.emitter import BlobRefused, Emitter
 
 __all__ = ["NO_LABELS", "Labels", "check_arguments", "read_labels"]
 

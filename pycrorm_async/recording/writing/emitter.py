@@ -12,11 +12,11 @@ from pycrorm_async.events.envelope import Heading
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.events.types import Happening
 from pycrorm_async.events.values import BlobReference
-from pycrorm_async.hooks.descriptions import Descriptions
-from pycrorm_async.hooks.event_feed import EventFeed
-from pycrorm_async.hooks.event_sink import EventSink
-from pycrorm_async.hooks.values.missing_values import MissingValues
-from pycrorm_async.hooks.values.texts import clean, cut, message_of
+from pycrorm_async.recording.declarations.descriptions import Descriptions
+from pycrorm_async.recording.values.missing_values import MissingValues
+from pycrorm_async.recording.values.texts import clean, cut, message_of
+from pycrorm_async.recording.writing.event_feed import EventFeed
+from pycrorm_async.recording.writing.event_sink import EventSink
 from pycrorm_async.settings import Settings
 
 __all__ = ["BlobRefused", "Emitter", "Faults"]

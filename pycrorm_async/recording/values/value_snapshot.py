@@ -27,9 +27,9 @@ from pycrorm_async.events.values import (
     ObjectValue,
     PoseValue,
 )
-from pycrorm_async.hooks.values.texts import clean, clean_repr, cut, message_of, reading_fault
 from pycrorm_async.plan.language.outcome import Outcome
 from pycrorm_async.plan.object_designators import BelieveObject, LocatedObject, ObjectDesignator, ObjectPart
+from pycrorm_async.recording.values.texts import clean, clean_repr, cut, message_of, reading_fault
 from pycrorm_async.world.objects import Object
 from pycrorm_async.world.pose import Pose
 

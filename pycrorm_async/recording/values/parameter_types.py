@@ -18,9 +18,9 @@ from enum import Enum
 from typing import Any, NamedTuple
 
 from pycrorm_async.events.values import FieldType, ItemType
-from pycrorm_async.hooks.values.value_snapshot import OBJECT_TYPES
 from pycrorm_async.plan.constructor_arguments import ARGUMENTS
 from pycrorm_async.plan.designator import Designator
+from pycrorm_async.recording.values.value_snapshot import OBJECT_TYPES
 from pycrorm_async.world.pose import Pose
 
 __all__ = [

@@ -19,7 +19,7 @@ from pycrorm_async.events.types import (
     ObjectDetected,
 )
 from pycrorm_async.events.values import FailureValue, MissingValue, PoseValue
-from pycrorm_async.hooks.values.texts import clean, cut
+from pycrorm_async.recording.values.texts import clean, cut
 
 __all__ = [
     "EPISODE_TEXT_MAX",

@@ -12,11 +12,11 @@ from msgspec.structs import replace
 from pycrorm_async.events.codec import NotEncodable, encoded_bytes
 from pycrorm_async.events.types import NodeStarted
 from pycrorm_async.events.values import MissingValue
-from pycrorm_async.hooks.declaration import DeclaredType
-from pycrorm_async.hooks.values.event_fitting import fits
-from pycrorm_async.hooks.values.texts import reading_fault
-from pycrorm_async.hooks.values.value_snapshot import References, UnrecordableValue, encode_parameter, missing_value
 from pycrorm_async.plan.designator import Designator
+from pycrorm_async.recording.declarations.declared_type import DeclaredType
+from pycrorm_async.recording.values.event_fitting import fits
+from pycrorm_async.recording.values.texts import reading_fault
+from pycrorm_async.recording.values.value_snapshot import References, UnrecordableValue, encode_parameter, missing_value
 
 __all__ = ["ROBOT", "read_parameters", "fit_node_start"]
 

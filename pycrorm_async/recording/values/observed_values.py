@@ -16,8 +16,8 @@ import numpy as np
 from pycrorm_async.events.blobs import Blob
 from pycrorm_async.events.codec import unwritable
 from pycrorm_async.events.values import BlobReference, MissingValue
-from pycrorm_async.hooks.values.texts import reading_fault
-from pycrorm_async.hooks.values.value_snapshot import ITEMS_MAX, References, encode_or_missing, missing_in
+from pycrorm_async.recording.values.texts import reading_fault
+from pycrorm_async.recording.values.value_snapshot import ITEMS_MAX, References, encode_or_missing, missing_in
 
 __all__ = ["ARRAY_ITEMS_MAX", "NPY", "ObservedReader"]
 

@@ -1,0 +1,1 @@
+"""Any executive writes episodes through this package, also our own plan layer."""

@@ -1,0 +1,1 @@
+"""Declare the types of designators and the descriptions of objects."""

@@ -1,0 +1,1 @@
+"""Write the events of episodes into the queue."""
