@@ -55,6 +55,7 @@ from pycrorm_async.queue.live.delegated_writer import DelegatedWriter
 from pycrorm_async.queue.live.recorder_queue import RecorderQueue
 from pycrorm_async.recording.values.episode_arguments import read_labels
 from pycrorm_async.recording.writing.emitter import Emitter
+from pycrorm_async.recording.writing.open_episodes import OpenEpisodes
 from pycrorm_async.recording.writing.provenance import PlanSource, Provenance
 from pycrorm_async.settings import Settings, Writer
 from pycrorm_async.store.address import DatabaseAddress
@@ -222,7 +223,8 @@ class Memory(ReadableMemory, ObservingMemory):
                 await reading.refresh()
         emitter = Emitter(queue, self._settings)
         provenance = Provenance.of(self._plan_source, self._settings, self._clock)
-        recorder = Recorder(emitter, clock=self._clock, software=__version__, provenance=provenance)
+        episodes = OpenEpisodes(emitter, self._clock)
+        recorder = Recorder(emitter, episodes=episodes, software=__version__, provenance=provenance)
         observations = Observations(emitter, recorder)
         return Parts(queue, writer, reading, emitter, recorder, observations, PickUpExperience(reading))
 
@@ -232,7 +234,7 @@ class Memory(ReadableMemory, ObservingMemory):
         if self._parts is None:  # in a forked child the memory belongs to the parent
             return
         recorder = self._parts.recorder
-        for episode in recorder.open_episodes:
+        for episode in recorder.episodes.all:
             recorder.close_episode(episode, error or asyncio.CancelledError("the memory was closed"))
         self._parts.emitter.is_closed = self._parts.experience.is_closed = True
         recorder.close()
@@ -336,7 +338,7 @@ class Memory(ReadableMemory, ObservingMemory):
         parts = self._open_parts
         added, removed = checked_tags(tags), checked_tags(remove)
         name = str(episode.id if isinstance(episode, EpisodeSummary) else episode)
-        for each in parts.recorder.open_episodes:
+        for each in parts.recorder.episodes.all:
             if str(each) == name:
                 each.tag(added, removed)
                 return
@@ -380,12 +382,12 @@ class Memory(ReadableMemory, ObservingMemory):
     @property
     def recent_episodes(self) -> tuple[str, ...]:
         """The ids of the last hundred episodes this memory opened."""
-        return self._open_parts.recorder.recent_episodes
+        return self._open_parts.recorder.episodes.recent
 
     @property
     def opened_count(self) -> int:
         """The number of episodes this memory opened."""
-        return self._open_parts.recorder.opened_count
+        return self._open_parts.recorder.episodes.opened_count
 
     @property
     def is_open(self) -> bool:

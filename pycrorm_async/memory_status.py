@@ -71,7 +71,7 @@ class MemoryStatus(NamedTuple):
             unawaited=emitter.unawaited,
             missing=emitter.missing.count,
             samples_left_out=recorder.samples_left_out,
-            episodes_continued=recorder.continued_count,
+            episodes_continued=recorder.episodes.continued_count,
             writer=parts.writer.state if isinstance(parts.writer, WriterThread) else None,
             unadopted=dict(unadopted),
             spool_fault=queue.setback,

@@ -1,43 +1,25 @@
-"""An `Episode` records one open episode: it numbers the nodes, observes the world and writes how the episode ended.
+"""An `Episode` records one open episode of our own plan layer: its nodes, its world and what it perceived.
 
 Theory of operation. Starts of nodes, observations and changes of the world reach an episode in the thread of the plan,
 through `Recorder` and `WorldRecorder`. Ends of nodes do so too, except when a plan is dropped unfinished: then the
 garbage collector closes its coroutines and thereby ends its nodes, in any thread and in the middle of whatever that
-thread is doing. The sampler's thread reads `id`, `world` and `continue_at`.
+thread is doing. The sampler's thread reads `id`, `world` and `continue_at`. How an episode is continued in a follow-up
+is described in `recording.writing.episode_writer`; meanwhile the sampler takes only the first and the last sample of
+each motion.
 
-`_open_nodes` holds every node that started and whose end is not written. The call that removes a node writes its end,
-so no node has two; if writing raises, it restores the node, which then ends LOST with the episode. `_ending` holds a
-node while a thread writes its end. `end` and `continue_as` wait, for a limited time, until it is empty, because the end
-of a node must precede the end of the episode. `end_node` never waits, because the garbage collector may call it.
-
-A sequence has 26 bits, so an episode can run out of sequences. When one reaches `continue_at`, `continue_as` ends it,
-and the same `Episode` object continues under a new id, so that contexts and nodes that refer to it stay valid. Every
-open node ends INTERRUPTED with the reason EpisodeContinued, innermost first, then the root and the episode itself. The
-follow-up begins with EpisodeStarted, which names the former episode, then a root, the world as it is then, and a start
-of each interrupted node, outermost first. Such a start names the sequence that it continues and holds the node's
-parameters and the robot's state as they are then. So each perform has exactly one row whose status is its outcome, and
-the duration of a node is the sum of its parts.
-
-Only a start, an observation or a change of the world triggers a follow-up, after it has been recorded itself. An end
-never does, because the garbage collector may cause it. Until the next start, events use the reserve of sequences behind
-`continue_at`, and the sampler takes only the first and the last sample of each motion. If an end cannot be written, the
-next event tries again; `_interrupted` then holds the nodes that have an end and, if they still run then, are started
-again in the follow-up. `NodeRecord.episode_id` is the id under which the node's sequence counts; a node whose
-`episode_id` is not the episode's current id is never referred to in the follow-up.
+`NodeRecord.episode_id` is the id under which the node's sequence counts; a node whose `episode_id` is not the episode's
+current id is never referred to in the follow-up.
 """
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from typing import Final, Literal, NamedTuple
 
-from pycrorm_async.errors import Unrecordable
 from pycrorm_async.events.codec import NotEncodable
-from pycrorm_async.events.ids import EpisodeId, episode_text
-from pycrorm_async.events.tags import changed_tags
-from pycrorm_async.events.types import EpisodeEnded, EpisodeTagged, NodeEnded, NodeStarted
-from pycrorm_async.events.values import FailureValue, NodeReference, NodeStatus, ObjectReference, RobotValue
+from pycrorm_async.events.ids import EpisodeId
+from pycrorm_async.events.types import NodeEnded, NodeStarted
+from pycrorm_async.events.values import NodeReference, NodeStatus, ObjectReference, RobotValue
 from pycrorm_async.hooks.episode_events import location_resolved, object_detected
 from pycrorm_async.hooks.world_recorder import WorldRecorder
 from pycrorm_async.plan.designator import Designator
@@ -47,30 +29,19 @@ from pycrorm_async.plan.task_tree import TaskTreeNode
 from pycrorm_async.recording.declarations.declared_type import DeclaredType
 from pycrorm_async.recording.values.event_fitting import (
     episode_text_of,
-    fit_detection,
-    fit_episode_end,
-    fit_episode_start,
-    fit_node_end,
     fit_resolution,
 )
-from pycrorm_async.recording.values.parameters import ROBOT, fit_node_start, read_parameters
-from pycrorm_async.recording.values.value_snapshot import encode_or_missing, failure_value, missing_in
+from pycrorm_async.recording.values.parameters import read_parameters
+from pycrorm_async.recording.values.value_snapshot import encode_or_missing, failure_value
 from pycrorm_async.recording.writing.emitter import UNAWAITED_MAX, Emitter
-from pycrorm_async.recording.writing.episode_opening import EpisodeOpening, current_task, end_statuses, episode_started
+from pycrorm_async.recording.writing.episode_opening import EpisodeOpening, current_task
+from pycrorm_async.recording.writing.episode_writer import EpisodeWriter
 from pycrorm_async.world.bullet import BulletWorld
 from pycrorm_async.world.enums import ObjectType
 from pycrorm_async.world.objects import Object
 from pycrorm_async.world.observers import current_world
 
-__all__ = ["Episode", "NodeRecord", "CONTINUED"]
-
-CONTINUED: Final = "EpisodeContinued"
-"""The failure type of nodes and episodes that ended because a follow-up episode continues them."""
-
-_RESERVE_EVENTS_MAX = 2**20
-"""Bounds the sequences reserved behind `continue_at`: more open nodes than fit into a process' memory."""
-_LAST_ENDS_S = 1.0
-"""Bounds how long the end of an episode waits for ends of nodes in other threads; each takes microseconds."""
+__all__ = ["Episode", "NodeRecord"]
 
 
 class NodeRecord(NamedTuple):
@@ -91,54 +62,31 @@ class NodeRecord(NamedTuple):
     episode_id: EpisodeId
 
 
-class Episode:
-    """An open or closed episode.
+class Episode(EpisodeWriter[TaskTreeNode]):
+    """An open or closed episode of our own plan layer.
 
     Attributes:
-        id: 16 bytes of a UUIDv7; `str(episode)` is its text. A continued episode has the id of its latest follow-up.
-        continue_at: the first sequence that triggers a follow-up episode.
         task: the asyncio task that opened the episode; None outside any task.
-        closed: whether the last event has been written, or its writing has begun.
-        simulated: whether the episode is a simulation.
         world: the recorder of its world; None without a world.
         faults: faults of the plan, each type once: performs that were never awaited.
         calls: performs called in the episode's context.
     """
 
-    def __init__(self, emitter: Emitter, episode: EpisodeId, opening: EpisodeOpening) -> None:
-        self.id = episode
+    def __init__(
+        self,
+        emitter: Emitter,
+        episode: EpisodeId,
+        opening: EpisodeOpening,
+        declared: Callable[[TaskTreeNode], DeclaredType],
+    ) -> None:
+        super().__init__(emitter, episode, opening)
         self.task = current_task()
-        self.closed = False
-        self.simulated: Final = opening.simulated
         self.world: WorldRecorder | None = None
         self.faults: tuple[str, ...] = ()
         self.calls: Final = CalledPerforms(self._note_unawaited)
-        self._emitter = emitter
-        self._opening = opening
+        self._declared = declared
         self._entered_world: str | None = None
-        self._open_nodes: dict[int, TaskTreeNode] = {}
-        self._interrupted: dict[int, TaskTreeNode] = {}
-        self._ending: set[TaskTreeNode] = set()
-        events_max = emitter.settings.episode_events_max
-        self._continue_at: Final = events_max - min(events_max // 8, _RESERVE_EVENTS_MAX)
-        self.continue_at = self._continue_at
-        self._root = self._start(None, None)
-        self._root_ended = False
-
-    def _start(self, continues: EpisodeId | None, root: int | None) -> int:
-        """Write the start of the episode and of its root node; return the root's sequence."""
-        started = episode_started(self._opening, continues)
-        started, shortened = fit_episode_start(started, self._emitter.settings.record_bytes_max)
-        for name in shortened:
-            self._emitter.missing.note("Episode", name, "its text is too long for an episode and was cut")
-        self._emitter.put(self.id, started)
-        return self._emitter.put(self.id, NodeStarted("root", simulated=self._opening.simulated, continues=root))
-
-    def __str__(self) -> str:
-        return episode_text(self.id)
-
-    def __repr__(self) -> str:
-        return f"<Episode {self}{' closed' if self.closed else ''}>"
+        self.open()
 
     # --- world ------------------------------------------------------------------------------------------------
 
@@ -196,17 +144,7 @@ class Episode:
             simulated=self.simulated,
             continues=continues,
         )
-        if missing:
-            self._note_parameters(declared, missing, may_refuse=continues is None)
-        try:
-            sequence = self._emitter.put(self.id, event)
-        except NotEncodable:
-            missing = {}
-            event = fit_node_start(event, self._emitter.settings.record_bytes_max, missing)
-            self._note_parameters(declared, missing, may_refuse=continues is None)
-            sequence = self._emitter.put(self.id, event)
-        self._open_nodes[sequence] = node
-        return sequence
+        return self._put_start(node, event, declared.dtype, missing, may_refuse=continues is None)
 
     def end_node(self, node: TaskTreeNode) -> None:
         """Write how a node ended."""
@@ -245,77 +183,42 @@ class Episode:
         node: TaskTreeNode | None,
     ) -> int:  # fmt: skip
         """Write the request to perception and its result; return the sequence."""
-        detected = object_detected(source, object_type, seen, self, node=self._sequence_of(node))
-        try:
-            return self._emitter.put(self.id, detected)
-        except NotEncodable as error:
-            self._emitter.missing.note("ObjectDetected", "seen", error.reason)
-            return self._emitter.put(self.id, fit_detection(detected, self._emitter.settings.record_bytes_max))
+        return self._put_detection(object_detected(source, object_type, seen, self, node=self._sequence_of(node)))
 
-    def tag(self, added: Sequence[str], removed: Sequence[str]) -> None:
-        """Write a change of the episode's tags. Raises `CallerError` for a removed tag that it does not have."""
-        tags = changed_tags(self._opening.labels.tags, added, removed)
-        self._emitter.put(self.id, EpisodeTagged(tuple(added), tuple(removed)))
-        self._opening = self._opening.with_tags(tags)
+    # --- the end and the follow-up ----------------------------------------------------------------------------
 
     def end(self, failure: BaseException | None) -> None:
-        """Write the end of the episode. Nodes that are still open end LOST, because no later end can be recorded."""
-        if self.closed:
-            return
-        self.calls.close()
-        self.closed = True
-        if self.world is not None:
-            self.leave_world(self.world.world, emptied=False)
-        for sequence in sorted(self._open_nodes, reverse=True):
-            self._close_node(NodeEnded(sequence, "LOST"), "Episode")
-        self._wait_for_ends()
-        status, root_status = end_statuses(failure)
-        value = failure_value(failure, self) if failure is not None else None
-        if not self._root_ended:
-            self._put_end(NodeEnded(self._root, root_status, value), "Episode")
-        ended = EpisodeEnded(status, value, world=self._described_world())
-        try:
-            self._emitter.put(self.id, ended)
-        except NotEncodable:
-            self._emitter.put(self.id, fit_episode_end(ended, self._emitter.settings.record_bytes_max))
+        """Write the end of the episode, after reporting performs that were never awaited."""
+        if not self.closed:
+            self.calls.close()
+        super().end(failure)
 
-    def continue_as(self, follow_up: EpisodeId, declared: Callable[[TaskTreeNode], DeclaredType]) -> dict[int, int]:
+    def continue_as(self, follow_up: EpisodeId) -> dict[int, int]:
         """End the episode and continue it under the id `follow_up`; map the old sequences of open nodes to the new."""
-        former, root, world = self.id, self._root, self.world
-        self._interrupted.update(self._open_nodes)
-        open_nodes = sorted(self._interrupted.items())
-        reason = FailureValue(CONTINUED, f"the episode continues in episode {episode_text(follow_up)}")
-        for sequence, node in reversed(open_nodes):
-            interrupted = NodeEnded(sequence, "INTERRUPTED", reason)
-            self._close_node(interrupted if node.ended_ns is None else NodeEnded(sequence, "LOST"), "Episode")
-        self._wait_for_ends()
-        if not self._root_ended:  # it ended in an attempt before this one
-            self._put_end(NodeEnded(root, "INTERRUPTED", reason), "Episode")
-            self._root_ended = True
-        self._emitter.put(former, EpisodeEnded("INTERRUPTED", reason, episode_text(follow_up), self._described_world()))
-        self.id = follow_up
-        last = self._root = self._start(former, root)
-        self._root_ended = False
-        self._interrupted.clear()
-        if world is not None:
-            world.stop()
-            self.world = WorldRecorder(self._emitter, follow_up, world.world, world.continue_)
-            last = max(last, self.world.last)
-        renumbered: dict[int, int] = {}
-        for sequence, node in open_nodes:
-            if node.ended_ns is not None:
-                continue
-            try:
-                last = renumbered[sequence] = self.start_node(node, declared(node), continues=sequence)
-            except Exception as error:  # noqa: BLE001  the other nodes continue nevertheless
-                self._emitter.note_fault("NodeStarted", error)
-                continue
-            node.record = node.record._replace(sequence=last, episode_id=follow_up)
-        # The world and the tree may reach the limit at once; doubling it prevents an endless chain of follow-ups.
-        self.continue_at = max(self._continue_at, 2 * last)
+        renumbered = super().continue_as(follow_up)
         if self.world is not None:
             self.world.continue_at = self.continue_at
         return renumbered
+
+    def _has_ended(self, node: TaskTreeNode) -> bool:
+        return node.ended_ns is not None
+
+    def _restart_node(self, node: TaskTreeNode, sequence: int) -> int:
+        new = self.start_node(node, self._declared(node), continues=sequence)
+        node.record = node.record._replace(sequence=new, episode_id=self.id)
+        return new
+
+    def _restart_world(self) -> int:
+        former = self.world
+        if former is None:
+            return 0
+        former.stop()
+        self.world = WorldRecorder(self._emitter, self.id, former.world, former.continue_)
+        return self.world.last
+
+    def _leave_world(self) -> None:
+        if self.world is not None:
+            self.leave_world(self.world.world, emptied=False)
 
     def _described_world(self) -> str | None:
         """Return the description of the world that was entered inside the episode; None if none was."""
@@ -344,14 +247,6 @@ class Episode:
             node = node.parent
         return None
 
-    def _note_parameters(self, declared: DeclaredType, missing: Mapping[str, str], *, may_refuse: bool) -> None:
-        """Count the missing values of a start. Raises `Unrecordable` if `may_refuse` and the settings ask for it."""
-        parameters = [name for name in missing if name != ROBOT]
-        if may_refuse and parameters and self._emitter.settings.on_unrecordable == "refuse":
-            raise Unrecordable(declared.dtype, " and ".join(parameters), missing[parameters[0]])
-        for name, reason in missing.items():
-            self._emitter.missing.note(declared.dtype, name, reason)
-
     def _robot_state(self) -> RobotValue | None:
         if self.world is None:
             return None
@@ -364,31 +259,3 @@ class Episode:
         except Exception as error:  # noqa: BLE001  the node is recorded without the robot's state
             self._emitter.note_fault("robot state", error)
             return None
-
-    def _close_node(self, event: NodeEnded, owner: str) -> None:
-        """Remove the node and write its end; no effect if it was removed, as the garbage collector may do meanwhile."""
-        node = self._open_nodes.pop(event.node, None)
-        if node is None:
-            return
-        try:
-            self._put_end(event, owner)
-        except BaseException:
-            self._open_nodes[event.node] = node  # so that it ends LOST with the episode
-            raise
-
-    def _wait_for_ends(self) -> None:
-        """Wait until other threads have written the ends of nodes that they are ending, for a limited time."""
-        deadline = time.monotonic() + _LAST_ENDS_S
-        while self._ending and time.monotonic() < deadline:
-            time.sleep(0.001)
-
-    def _put_end(self, event: NodeEnded, owner: str) -> None:
-        if event.failure is not None or event.result is not None:
-            for field, value in (("failure", event.failure and event.failure.arguments), ("result", event.result)):
-                for each in missing_in(value):
-                    self._emitter.missing.note(owner, field, each.missing)
-        try:
-            self._emitter.put(self.id, event)
-        except NotEncodable as error:
-            self._emitter.missing.note(owner, "failure" if event.failure is not None else "result", error.reason)
-            self._emitter.put(self.id, fit_node_end(event, self._emitter.settings.record_bytes_max))

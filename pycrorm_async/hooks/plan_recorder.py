@@ -13,25 +13,19 @@ value that cannot be recorded is recorded as missing.
 
 `node_ended` may also run in a thread and context of the garbage collector, when it closes a plan that was dropped
 unfinished. So it resets `current_episode` only if the context still holds the node's episode, and it never starts a
-follow-up (see `episode`). `continue_episode` moves an episode to its follow-up. `_continuing` holds the former id
-meanwhile, so that another event cannot start a second move, and `_open` holds the episode under both ids, because
-`episode_here` looks it up by its current id, which changes during the move.
+follow-up (see `episode`).
 """
 
 from __future__ import annotations
 
 import logging
-import os
-from collections import deque
 from collections.abc import Awaitable, Callable
 from contextlib import nullcontext
 from contextvars import ContextVar
-from typing import Literal
+from typing import Any, Literal
 
-from pycrorm_async.clock import Clock
 from pycrorm_async.errors import DeclarationRefused, EpisodeRefused, SpoolFull, Unrecordable
 from pycrorm_async.events.envelope import Heading
-from pycrorm_async.events.ids import EpisodeId, episode_id, episode_text
 from pycrorm_async.events.values import NodeReference
 from pycrorm_async.hooks.declaration import Declarations
 from pycrorm_async.hooks.episode import Episode, NodeRecord
@@ -44,6 +38,8 @@ from pycrorm_async.recording.values.episode_arguments import NO_LABELS, Labels, 
 from pycrorm_async.recording.values.event_fitting import EPISODE_TEXT_MAX
 from pycrorm_async.recording.writing.emitter import Emitter
 from pycrorm_async.recording.writing.episode_opening import EpisodeOpening, current_task
+from pycrorm_async.recording.writing.episode_writer import EpisodeWriter
+from pycrorm_async.recording.writing.open_episodes import OpenEpisodes
 from pycrorm_async.recording.writing.provenance import Provenance
 from pycrorm_async.world.bullet import BulletWorld
 from pycrorm_async.world.enums import ObjectType
@@ -52,9 +48,6 @@ from pycrorm_async.world.observers import current_world
 __all__ = ["Recorder", "current_episode"]
 
 _log = logging.getLogger("pycrorm_async")
-RECENT_MAX = 100
-"""Bounds the ids in `recent_episodes`, because a process may open any number of episodes."""
-
 current_episode: ContextVar[Episode | None] = ContextVar("current_episode", default=None)
 """The innermost episode opened in this context; it may be closed already."""
 
@@ -66,26 +59,19 @@ class Recorder:
         self,
         emitter: Emitter,
         *,
-        clock: Clock,
+        episodes: OpenEpisodes,
         software: str,
         provenance: Provenance | None = None,
-        randomness: Callable[[int], bytes] = os.urandom,
     ) -> None:
         self._emitter = emitter
-        self._clock = clock
+        self.episodes = episodes
         self._software = software
         self._provenance = provenance
-        self._randomness = randomness
         self._strict = emitter.settings.on_unrecordable == "refuse"
         self._declarations = Declarations(strict=self._strict)
         self._sampler = _sampler_of(emitter)
         self.calls = CalledPerforms(lambda designator: emitter.note_unawaited(getattr(designator, "dtype", "it")))
         """Performs called outside any episode."""
-        self._open: dict[EpisodeId, Episode] = {}
-        self._recent: deque[EpisodeId] = deque(maxlen=RECENT_MAX)
-        self.opened_count = 0
-        self.continued_count = 0
-        self._continuing: set[EpisodeId] = set()
 
     @property
     def is_closed(self) -> bool:
@@ -114,7 +100,6 @@ class Recorder:
     ) -> Episode:
         """Start an episode; a simulation if this context is in one."""
         simulation, world = current_simulation.get(), current_world.get()
-        new_id = episode_id(self._clock.wall_ns(), self._randomness(10))
         opening = EpisodeOpening(
             description,
             self._software,
@@ -126,9 +111,8 @@ class Recorder:
             provenance=self._provenance,
             labels=labels,
         )
-        episode = Episode(self._emitter, new_id, opening)
-        self._open[new_id] = episode
-        self._note_opened(episode)
+        episode = Episode(self._emitter, self.episodes.new_id(), opening, self._declared)
+        self.episodes.add(episode)
         if world is not None:
             self._enter(episode, world)
         return episode
@@ -138,46 +122,18 @@ class Recorder:
 
     def continue_episode(self, episode: Episode) -> None:
         """Continue an episode that reached `continue_at` in a follow-up episode. Exceptions are counted, not raised."""
-        if episode.id in self._continuing or self._emitter.is_closed:
-            return
-        former, follow_up = episode.id, episode_id(self._clock.wall_ns(), self._randomness(10))
-        self._continuing.add(former)
-        self._open[follow_up] = episode
-        try:
-            with self._sampler.renumbering(episode) if self._sampler is not None else nullcontext() as renumber:
-                renumbered = episode.continue_as(follow_up, self._declared)
-                if renumber is not None:
-                    renumber(renumbered)
-        except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
-            self._emitter.note_fault("EpisodeStarted", error)
-        finally:
-            self._open.pop(former if episode.id == follow_up else follow_up, None)
-            self._continuing.discard(former)
-        if episode.id == follow_up:
-            self.continued_count += 1
-            self._note_opened(episode)
-            _log.info("episode %s reached its event limit and continues in episode %s", episode_text(former), episode)
+        around = self._sampler.renumbering(episode) if self._sampler is not None else nullcontext()
+        self.episodes.continue_episode(episode, around)
 
     def _declared(self, node: TaskTreeNode) -> DeclaredType:
         assert node.designator is not None
         return self._declarations.of(type(node.designator), self._declare)
 
-    def _note_opened(self, episode: Episode) -> None:
-        if not episode.simulated:
-            self._recent.append(episode.id)
-            self.opened_count += 1
-
-    def close_episode(self, episode: Episode, failure: BaseException | None) -> None:
+    def close_episode(self, episode: EpisodeWriter[Any], failure: BaseException | None) -> None:
         """Write the end of an episode that `failure` left, or None. Exceptions are counted, not raised."""
-        if self._emitter.is_closed:
-            return
-        self._open.pop(episode.id, None)
-        try:
-            if self._sampler is not None:
-                self._sampler.stop_episode(episode)
-            episode.end(failure)
-        except Exception as error:  # noqa: BLE001  a fault of the memory must not replace the plan's outcome
-            self._emitter.note_fault("EpisodeEnded", error)
+        if self._sampler is not None and not self._emitter.is_closed:
+            self._sample(self._sampler.stop_episode, episode)
+        self.episodes.close(episode, failure)
 
     @property
     def samples_left_out(self) -> int:
@@ -190,31 +146,17 @@ class Recorder:
         if self._sampler is not None:
             self._sampler.close()
 
-    @property
-    def open_episodes(self) -> tuple[Episode, ...]:
-        """The open episodes, oldest first."""
-        return tuple(self._open.values())
-
-    @property
-    def recent_episodes(self) -> tuple[str, ...]:
-        """The ids of the last 100 episodes opened, including ended ones, without simulations."""
-        return tuple(map(episode_text, self._recent))
-
     def episode_here(self) -> Episode | None:
         """Return the open episode of this memory in this context; None if only one of the two is a simulation."""
         episode = current_episode.get()
-        if episode is None or episode.closed or episode.id not in self._open:
+        if episode is None or episode.closed or episode not in self.episodes:
             return None
         return episode if episode.simulated is (current_simulation.get() is not None) else None
 
     def episode_of(self, node: TaskTreeNode) -> Episode | None:
         """Return the open episode of this memory in which the node is recorded; None without one."""
         record: NodeRecord | None = node.record
-        return record.episode if record is not None and record.episode in self._open.values() else None
-
-    def last_opened(self) -> Episode | None:
-        """Return the open episode that was opened last in any context, without simulations; None without one."""
-        return next((each for each in reversed(self.open_episodes) if not each.simulated), None)
+        return record.episode if record is not None and record.episode in self.episodes else None
 
     # --- the port of the plan layer ----------------------------------------------------------------------------------
 
@@ -253,7 +195,7 @@ class Recorder:
             if declared.fault is not None:
                 self._emitter.missing.note(declared.dtype, "type", declared.fault)
             if self._sampler is not None and node.kind == "motion" and episode.acts_in_recorded_world:
-                self._sample(self._sampler.begin, node.record)
+                self._sample(self._sampler.begin, episode, sequence)
             if sequence >= episode.continue_at:
                 self.continue_episode(episode)
 
@@ -262,7 +204,7 @@ class Recorder:
         if record is None or self._emitter.is_closed:
             return
         if self._sampler is not None and node.kind == "motion":
-            self._sample(self._sampler.end, record)
+            self._sample(self._sampler.end, record.episode, record.sequence)
         try:
             record.episode.end_node(node)
         except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
@@ -328,9 +270,9 @@ class Recorder:
         if current_episode.get() is record.episode:  # the garbage collector may close the plan in another context
             current_episode.set(record.outer_episode)
 
-    def _sample(self, step: Callable[[Episode, int], None], record: NodeRecord) -> None:
+    def _sample(self, step: Callable[..., None], *arguments: object) -> None:
         try:
-            step(record.episode, record.sequence)
+            step(*arguments)
         except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
             self._emitter.note_fault("StateSampled", error)
 

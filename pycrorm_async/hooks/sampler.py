@@ -22,11 +22,13 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from typing import Any
 
 from pycrorm_async.errors import SpoolFull, SpoolStuck
 from pycrorm_async.events.types import StateSampled
 from pycrorm_async.hooks.episode import Episode
 from pycrorm_async.recording.writing.emitter import Emitter
+from pycrorm_async.recording.writing.episode_writer import EpisodeWriter
 from pycrorm_async.world.objects import Object
 from pycrorm_async.world.robots.acting_robot import acting_robot
 
@@ -93,7 +95,7 @@ class Sampler:
                 self._sample(motion, margin=0.0)
                 motion.is_over = True
 
-    def stop_episode(self, episode: Episode) -> None:
+    def stop_episode(self, episode: EpisodeWriter[Any]) -> None:
         """Stop sampling all motions of an episode, before the episode ends."""
         with self._changed:
             for key in [key for key in self._running if key[0] is episode]:

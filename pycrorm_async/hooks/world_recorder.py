@@ -2,12 +2,8 @@
 
 Theory of operation. The world calls its observer synchronously from its setters, in the thread of the plan. Each call
 builds one event and puts it into the queue at once, so the values are those of that moment and the events have the
-order of the changes. The sequence of an object's `ObjectAdded` identifies the object; the sequence of its latest
-`ObjectAdded` or `ObjectMoved` is its current row. `_references` holds both for every object of the world.
-
-A setter must not fail because of a memory, so `_put` catches and counts every exception; the object then keeps its
-former row. An object whose `ObjectAdded` failed has no row, and its later changes are not recorded, because an event
-that names an object without a row would be damage.
+order of the changes. The rows of the objects, and what happens if an event cannot be written, are those of
+`ObjectRows`.
 
 The recorder starts with `ObjectAdded` and `ObjectAttached` for the present state of the world. `continue_at` is out of
 reach meanwhile, and while `empty` removes the objects, because a follow-up episode would start with the state of a
@@ -21,23 +17,19 @@ import math
 import sys
 from collections.abc import Callable, Mapping
 
-from pycrorm_async.events.codec import NotEncodable
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.events.types import (
-    Happening,
-    JointsMoved,
     ObjectAdded,
     ObjectAttached,
     ObjectDetached,
     ObjectMoved,
-    ObjectRemoved,
 )
 from pycrorm_async.events.values import ObjectReference, PoseValue, RobotValue
 from pycrorm_async.plan.task_tree import current_node
-from pycrorm_async.recording.values.event_fitting import clean_texts
 from pycrorm_async.recording.values.texts import clean
 from pycrorm_async.recording.values.value_snapshot import pose_value
 from pycrorm_async.recording.writing.emitter import Emitter
+from pycrorm_async.recording.writing.object_rows import ObjectRows
 from pycrorm_async.world.bullet import BulletWorld
 from pycrorm_async.world.objects import Object
 from pycrorm_async.world.pose import Pose
@@ -47,28 +39,20 @@ from pycrorm_async.world.world_copy import counterpart, related
 __all__ = ["WorldRecorder"]
 
 
-class WorldRecorder:
+class WorldRecorder(ObjectRows[Object]):
     """Observes one world for one episode; the constructor records the present state of the world.
 
     Attributes:
         world: the observed world.
         sampled: for each robot, the last sampled value of each channel in this episode.
-        last: sequence of the last event it recorded; 0 before the first.
-        continue_at: the first sequence at which a change calls `continue_`.
-        continue_: moves the episode to a follow-up.
     """
 
     def __init__(
         self, emitter: Emitter, episode: EpisodeId, world: BulletWorld, continue_: Callable[[], None] = lambda: None
     ) -> None:
+        super().__init__(emitter, episode, continue_)
         self.world = world
-        self.last = 0
-        self.continue_at = sys.maxsize  # no follow-up before the present state is recorded
-        self.continue_ = continue_
         self.sampled: dict[Object, dict[str, float]] = {}
-        self._emitter = emitter
-        self._episode = episode
-        self._references: dict[Object, ObjectReference] = {}
         self._robots: dict[Object, tuple[Pose, PoseValue, str]] = {}
         for each in world.objects:
             self.object_added(each)
@@ -142,10 +126,8 @@ class WorldRecorder:
         return red, green, blue, opacity
 
     def object_removed(self, removed: Object) -> None:
-        reference = self._references.pop(removed, None)
         self._robots.pop(removed, None)
-        if reference is not None:
-            self._put(lambda: ObjectRemoved(reference, self._causing_node()))
+        self._put_removed(removed, self._causing_node)
 
     def object_moved(self, moved: Object) -> None:
         reference = self._references.get(moved)
@@ -164,23 +146,13 @@ class WorldRecorder:
         )
 
     def joints_moved(self, moved: Object, positions: Mapping[str, float]) -> None:
-        reference = self._references.get(moved)
-        if reference is not None:
-            self._put(lambda: JointsMoved(reference, dict(positions), self._causing_node()))
+        self._put_joints(moved, positions, self._causing_node)
 
     def object_attached(self, parent: Object, child: Object, link: str | None) -> None:
-        pair = self._reference_pair(parent, child)
-        if pair is not None:
-            self._put(lambda: ObjectAttached(*pair, link, self._causing_node()))
+        self._put_attachment(ObjectAttached, parent, child, link, self._causing_node)
 
     def object_detached(self, parent: Object, child: Object, link: str | None) -> None:
-        pair = self._reference_pair(parent, child)
-        if pair is not None:
-            self._put(lambda: ObjectDetached(*pair, link, self._causing_node()))
-
-    def _reference_pair(self, parent: Object, child: Object) -> tuple[ObjectReference, ObjectReference] | None:
-        first, second = self._references.get(parent), self._references.get(child)
-        return (first, second) if first is not None and second is not None else None
+        self._put_attachment(ObjectDetached, parent, child, link, self._causing_node)
 
     def _causing_node(self) -> int | None:
         """Return the node that caused a change: the context's innermost recorded node, if this episode recorded it."""
@@ -191,31 +163,6 @@ class WorldRecorder:
             sequence: int = node.record.sequence
             return sequence
         return None
-
-    def _put(
-        self, build: Callable[[], Happening], *, row_of: Object | None = None, identity: int | None = None
-    ) -> None:
-        """Build and record an event. Exceptions are counted, so that the world's setter succeeds.
-
-        The event becomes the current row of the object `row_of`, and its identity too if `identity` is None.
-        """
-        if self._emitter.is_closed:
-            return
-        try:
-            event = build()
-            try:
-                sequence = self._emitter.put(self._episode, event)
-            except NotEncodable as unencodable:
-                self._emitter.missing.note(type(event).__name__, "value", str(unencodable))
-                sequence = self._emitter.put(self._episode, clean_texts(event))
-            self.last = sequence
-        except Exception as error:  # noqa: BLE001  a setter of the world must not fail because of a memory
-            self._emitter.note_fault("a change of the world", error)
-            return
-        if row_of is not None:
-            self._references[row_of] = ObjectReference(sequence if identity is None else identity, sequence)
-        if sequence >= self.continue_at:
-            self.continue_()
 
 
 def _model(added: Object) -> tuple[str | None, str | None]:

@@ -21,6 +21,7 @@ from pycrorm_async.plan.designator import ActionAbstract
 from pycrorm_async.plan.execution.observer import recorder
 from pycrorm_async.plan.object_designators import ObjectDesignator, ObjectPart
 from pycrorm_async.recording.writing.emitter import Emitter
+from pycrorm_async.recording.writing.open_episodes import OpenEpisodes
 from pycrorm_async.settings import Settings
 from pycrorm_async.world.observers import watcher
 
@@ -95,7 +96,8 @@ class RecorderCase:
     def __init__(self, settings: Settings) -> None:
         self.sink = ListSink()
         self.emitter = Emitter(self.sink, settings)
-        self.recorder = Recorder(self.emitter, clock=SYSTEM_CLOCK, software="test")
+        episodes = OpenEpisodes(self.emitter, SYSTEM_CLOCK)
+        self.recorder = Recorder(self.emitter, episodes=episodes, software="test")
 
     @contextmanager
     def episode(self) -> Iterator[Episode]:

@@ -114,9 +114,9 @@ async def test_each_part_names_the_next_and_every_perform_has_one_row_with_its_o
             last = episode.id
         names: list[EpisodeId] = list(case.sink.sequences)
         assert names[-1] == last
-        assert len(names) == 1 + case.recorder.continued_count > 4
-        assert case.recorder.recent_episodes == tuple(map(episode_text, names))
-        assert case.recorder.open_episodes == ()
+        assert len(names) == 1 + case.recorder.episodes.continued_count > 4
+        assert case.recorder.episodes.recent == tuple(map(episode_text, names))
+        assert case.recorder.episodes.all == ()
     assert assert_no_faults(case)
 
     parts = parts_of(case.sink)
@@ -356,7 +356,7 @@ async def test_a_follow_up_whose_event_cannot_be_written_is_retried_and_every_no
 
         await MovingActionPerformable().perform()
     assert case.emitter.faults.total == 1
-    assert case.recorder.continued_count == 1
+    assert case.recorder.episodes.continued_count == 1
     ended = {f"day {number} SUCCEEDED": 1 for number in range(60)} | {"other SUCCEEDED": 3}
     if put > 1:  # it ended before the second attempt, and its end says that the episode continues
         del ended["day 41 SUCCEEDED"]

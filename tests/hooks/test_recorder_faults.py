@@ -185,6 +185,6 @@ async def test_a_start_that_fails_by_a_fault_of_the_recorder_leaves_no_episode_o
         await NoteActionPerformable("second").perform()
         await NoteActionPerformable("third").perform()
         assert case.emitter.faults.total == 1
-        assert case.recorder.open_episodes == ()
+        assert case.recorder.episodes.all == ()
     for name in case.sink.sequences:
         assert findings(case.sink.of(name)) == []

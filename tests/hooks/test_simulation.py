@@ -319,9 +319,9 @@ async def test_simulations_are_not_among_the_recent_episodes() -> None:
     with recorder_case() as case:
         with case.episode() as real, SimulatedTaskTree():
             pass
-        assert case.recorder.recent_episodes == (str(real),)
-        assert case.recorder.opened_count == 1
-        assert case.recorder.open_episodes == ()
+        assert case.recorder.episodes.recent == (str(real),)
+        assert case.recorder.episodes.opened_count == 1
+        assert case.recorder.episodes.all == ()
 
 
 async def test_a_description_that_is_too_long_is_cut() -> None:

@@ -1,0 +1,254 @@
+"""An `EpisodeWriter` writes the events of one open episode and continues it in a follow-up when it gets too long.
+
+Theory of operation. What starts nodes is not known here: `N` is an executive's own record of a node. `_open_nodes`
+holds every node that started and whose end is not written. The call that removes a node writes its end, so no node has
+two; if writing raises, it restores the node, which then ends LOST with the episode. `_ending` holds a node while a
+thread writes its end. `end` and `continue_as` wait, for a limited time, until it is empty, because the end of a node
+must precede the end of the episode. The end of a node never waits, because the garbage collector may call it.
+
+A sequence has 26 bits, so an episode can run out of sequences. When one reaches `continue_at`, `continue_as` ends it,
+and the same `EpisodeWriter` continues under a new id, so that whatever refers to it stays valid. Every open node ends
+INTERRUPTED with the reason EpisodeContinued, innermost first, then the root and the episode itself. The follow-up
+begins with EpisodeStarted, which names the former episode, then a root, the world as it is then, and a start of each
+interrupted node, outermost first. Such a start names the sequence that it continues and holds the node's parameters
+and the robot's state as they are then. So each perform has exactly one row whose status is its outcome, and the
+duration of a node is the sum of its parts.
+
+Only a start, an observation or a change of the world triggers a follow-up, after it has been recorded itself. An end
+never does, because the garbage collector may cause it. Until the next start, events use the reserve of sequences behind
+`continue_at`. If an end cannot be written, the next event tries again; `_interrupted` then holds the nodes that have an
+end and, if they still run then, are started again in the follow-up.
+"""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import Any, Final, Generic, TypeVar
+
+from pycrorm_async.errors import Unrecordable
+from pycrorm_async.events.codec import NotEncodable
+from pycrorm_async.events.ids import EpisodeId, episode_text
+from pycrorm_async.events.tags import changed_tags
+from pycrorm_async.events.types import EpisodeEnded, EpisodeTagged, NodeEnded, NodeStarted, ObjectDetected
+from pycrorm_async.events.values import FailureValue, ObjectReference
+from pycrorm_async.recording.values.event_fitting import (
+    fit_detection,
+    fit_episode_end,
+    fit_episode_start,
+    fit_node_end,
+)
+from pycrorm_async.recording.values.parameters import ROBOT, fit_node_start
+from pycrorm_async.recording.values.value_snapshot import failure_value, missing_in
+from pycrorm_async.recording.writing.emitter import Emitter
+from pycrorm_async.recording.writing.episode_opening import EpisodeOpening, end_statuses, episode_started
+from pycrorm_async.world.objects import Object
+
+__all__ = ["CONTINUED", "EpisodeWriter"]
+
+CONTINUED: Final = "EpisodeContinued"
+"""The failure type of nodes and episodes that ended because a follow-up episode continues them."""
+
+_RESERVE_EVENTS_MAX = 2**20
+"""Bounds the sequences reserved behind `continue_at`: more open nodes than fit into a process' memory."""
+_LAST_ENDS_S = 1.0
+"""Bounds how long the end of an episode waits for ends of nodes in other threads; each takes microseconds."""
+
+N = TypeVar("N")
+
+
+class EpisodeWriter(ABC, Generic[N]):
+    """An open or closed episode.
+
+    Attributes:
+        id: 16 bytes of a UUIDv7; `str(episode)` is its text. A continued episode has the id of its latest follow-up.
+        continue_at: the first sequence that triggers a follow-up episode.
+        closed: whether the last event has been written, or its writing has begun.
+        simulated: whether the episode is a simulation.
+    """
+
+    def __init__(self, emitter: Emitter, episode: EpisodeId, opening: EpisodeOpening) -> None:
+        self.id = episode
+        self.closed = False
+        self.simulated: Final = opening.simulated
+        self._emitter = emitter
+        self._opening = opening
+        self._open_nodes: dict[int, N] = {}
+        self._interrupted: dict[int, N] = {}
+        self._ending: set[N] = set()
+        events_max = emitter.settings.episode_events_max
+        self._continue_at: Final = events_max - min(events_max // 8, _RESERVE_EVENTS_MAX)
+        self.continue_at = self._continue_at
+        self._root = 0
+        self._root_ended = False
+
+    def __str__(self) -> str:
+        return episode_text(self.id)
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {self}{' closed' if self.closed else ''}>"
+
+    # --- what an executive adds -------------------------------------------------------------------------------
+
+    @abstractmethod
+    def reference(self, world_object: Object) -> ObjectReference | None:
+        """Return the object's current row in this episode; None without a row."""
+
+    @abstractmethod
+    def node_or_root(self, node: Any) -> int:
+        """Return the sequence of this node or of its nearest recorded ancestor; None gives the root."""
+
+    @abstractmethod
+    def _has_ended(self, node: N) -> bool:
+        """Whether the executive has ended a node whose end is not written."""
+
+    @abstractmethod
+    def _restart_node(self, node: N, sequence: int) -> int:
+        """Write the start of a node that continues `sequence` of the former episode; return its new sequence."""
+
+    @abstractmethod
+    def _restart_world(self) -> int:
+        """Write the world as it is now; return the last sequence, 0 without a world."""
+
+    @abstractmethod
+    def _leave_world(self) -> None:
+        """Write no more changes of the world."""
+
+    @abstractmethod
+    def _described_world(self) -> str | None:
+        """Return the description of the world that was entered inside the episode; None if none was."""
+
+    # --- the episode ------------------------------------------------------------------------------------------
+
+    def open(self) -> None:
+        """Write the start of the episode."""
+        self._root = self._start(None, None)
+
+    def _start(self, continues: EpisodeId | None, root: int | None) -> int:
+        """Write the start of the episode and of its root node; return the root's sequence."""
+        started = episode_started(self._opening, continues)
+        started, shortened = fit_episode_start(started, self._emitter.settings.record_bytes_max)
+        for name in shortened:
+            self._emitter.missing.note("Episode", name, "its text is too long for an episode and was cut")
+        self._emitter.put(self.id, started)
+        return self._emitter.put(self.id, NodeStarted("root", simulated=self._opening.simulated, continues=root))
+
+    def tag(self, added: Sequence[str], removed: Sequence[str]) -> None:
+        """Write a change of the episode's tags. Raises `CallerError` for a removed tag that it does not have."""
+        tags = changed_tags(self._opening.labels.tags, added, removed)
+        self._emitter.put(self.id, EpisodeTagged(tuple(added), tuple(removed)))
+        self._opening = self._opening.with_tags(tags)
+
+    def end(self, failure: BaseException | None) -> None:
+        """Write the end of the episode. Nodes that are still open end LOST, because no later end can be recorded."""
+        if self.closed:
+            return
+        self.closed = True
+        self._leave_world()
+        for sequence in sorted(self._open_nodes, reverse=True):
+            self._close_node(NodeEnded(sequence, "LOST"), "Episode")
+        self._wait_for_ends()
+        status, root_status = end_statuses(failure)
+        value = failure_value(failure, self) if failure is not None else None
+        if not self._root_ended:
+            self._put_end(NodeEnded(self._root, root_status, value), "Episode")
+        ended = EpisodeEnded(status, value, world=self._described_world())
+        try:
+            self._emitter.put(self.id, ended)
+        except NotEncodable:
+            self._emitter.put(self.id, fit_episode_end(ended, self._emitter.settings.record_bytes_max))
+
+    def continue_as(self, follow_up: EpisodeId) -> dict[int, int]:
+        """End the episode and continue it under the id `follow_up`; map the old sequences of open nodes to the new."""
+        former, root = self.id, self._root
+        self._interrupted.update(self._open_nodes)
+        open_nodes = sorted(self._interrupted.items(), key=lambda item: item[0])
+        reason = FailureValue(CONTINUED, f"the episode continues in episode {episode_text(follow_up)}")
+        for sequence, node in reversed(open_nodes):
+            interrupted = NodeEnded(sequence, "INTERRUPTED", reason)
+            self._close_node(NodeEnded(sequence, "LOST") if self._has_ended(node) else interrupted, "Episode")
+        self._wait_for_ends()
+        if not self._root_ended:  # it ended in an attempt before this one
+            self._put_end(NodeEnded(root, "INTERRUPTED", reason), "Episode")
+            self._root_ended = True
+        self._emitter.put(former, EpisodeEnded("INTERRUPTED", reason, episode_text(follow_up), self._described_world()))
+        self.id = follow_up
+        self._root = self._start(former, root)
+        self._root_ended = False
+        self._interrupted.clear()
+        last = max(self._root, self._restart_world())
+        renumbered: dict[int, int] = {}
+        for sequence, node in open_nodes:
+            if self._has_ended(node):
+                continue
+            try:
+                last = renumbered[sequence] = self._restart_node(node, sequence)
+            except Exception as error:  # noqa: BLE001  the other nodes continue nevertheless
+                self._emitter.note_fault("NodeStarted", error)
+        # The world and the tree may reach the limit at once; doubling it prevents an endless chain of follow-ups.
+        self.continue_at = max(self._continue_at, 2 * last)
+        return renumbered
+
+    # --- nodes and perception -----------------------------------------------------------------------------------
+
+    def _put_start(
+        self, node: N, event: NodeStarted, owner: str, missing: Mapping[str, str], *, may_refuse: bool
+    ) -> int:
+        """Write the start of a node and return its sequence. `missing` has the reason for each missing value.
+
+        Raises `Unrecordable` if `may_refuse` and the settings ask for it.
+        """
+        if missing:
+            self._note_parameters(owner, missing, may_refuse=may_refuse)
+        try:
+            sequence = self._emitter.put(self.id, event)
+        except NotEncodable:
+            unfitting: dict[str, str] = {}
+            event = fit_node_start(event, self._emitter.settings.record_bytes_max, unfitting)
+            self._note_parameters(owner, unfitting, may_refuse=may_refuse)
+            sequence = self._emitter.put(self.id, event)
+        self._open_nodes[sequence] = node
+        return sequence
+
+    def _note_parameters(self, owner: str, missing: Mapping[str, str], *, may_refuse: bool) -> None:
+        parameters = [name for name in missing if name != ROBOT]
+        if may_refuse and parameters and self._emitter.settings.on_unrecordable == "refuse":
+            raise Unrecordable(owner, " and ".join(parameters), missing[parameters[0]])
+        for name, reason in missing.items():
+            self._emitter.missing.note(owner, name, reason)
+
+    def _close_node(self, event: NodeEnded, owner: str) -> None:
+        """Remove the node and write its end; no effect if it was removed, as the garbage collector may do meanwhile."""
+        node = self._open_nodes.pop(event.node, None)
+        if node is None:
+            return
+        try:
+            self._put_end(event, owner)
+        except BaseException:
+            self._open_nodes[event.node] = node  # so that it ends LOST with the episode
+            raise
+
+    def _wait_for_ends(self) -> None:
+        """Wait until other threads have written the ends of nodes that they are ending, for a limited time."""
+        deadline = time.monotonic() + _LAST_ENDS_S
+        while self._ending and time.monotonic() < deadline:
+            time.sleep(0.001)
+
+    def _put_end(self, event: NodeEnded, owner: str) -> None:
+        if event.failure is not None or event.result is not None:
+            for field, value in (("failure", event.failure and event.failure.arguments), ("result", event.result)):
+                for each in missing_in(value):
+                    self._emitter.missing.note(owner, field, each.missing)
+        try:
+            self._emitter.put(self.id, event)
+        except NotEncodable as error:
+            self._emitter.missing.note(owner, "failure" if event.failure is not None else "result", error.reason)
+            self._emitter.put(self.id, fit_node_end(event, self._emitter.settings.record_bytes_max))
+
+    def _put_detection(self, detected: ObjectDetected) -> int:
+        try:
+            return self._emitter.put(self.id, detected)
+        except NotEncodable as error:
+            self._emitter.missing.note("ObjectDetected", "seen", error.reason)
+            return self._emitter.put(self.id, fit_detection(detected, self._emitter.settings.record_bytes_max))
