@@ -14,12 +14,7 @@ import asyncio
 import logging
 import os
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
-from contextlib import (
-    AbstractContextManager,
-    AsyncExitStack,
-    asynccontextmanager,
-    suppress,
-)
+from contextlib import AbstractContextManager, AsyncExitStack, asynccontextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -53,6 +48,7 @@ from pycrorm_async.queue.files.locks import call_in_forked_child
 from pycrorm_async.queue.files.spool import Spool
 from pycrorm_async.queue.live.delegated_writer import DelegatedWriter
 from pycrorm_async.queue.live.recorder_queue import RecorderQueue
+from pycrorm_async.recording.recording import Recording
 from pycrorm_async.recording.values.episode_arguments import read_labels
 from pycrorm_async.recording.writing.emitter import Emitter
 from pycrorm_async.recording.writing.open_episodes import OpenEpisodes
@@ -60,6 +56,7 @@ from pycrorm_async.recording.writing.provenance import PlanSource, Provenance
 from pycrorm_async.settings import Settings, Writer
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
+from pycrorm_async.sync_memory import SyncMemory
 from pycrorm_async.writer.writer_thread import WriterThread
 
 __all__ = ["Memory", "MemoryStatus"]
@@ -170,6 +167,11 @@ class Memory(ReadableMemory, ObservingMemory):
         memory = cls.open(url, spool=spool, views=views, projections=projections, writer=writer, settings=settings)
         return await memory._enter(Parts.in_process)  # noqa: SLF001  its own class
 
+    @classmethod
+    def sync(cls, url: str, **options: Any) -> SyncMemory:
+        """Return a memory to enter with `with`, for code without asyncio; the arguments are those of `open`."""
+        return SyncMemory(cls.open(url, **options))
+
     async def close(self) -> None:
         """Store and fold all recorded events; open episodes end as INTERRUPTED. A second call has no effect."""
         await self.__aexit__(None, None, None)
@@ -225,8 +227,9 @@ class Memory(ReadableMemory, ObservingMemory):
         provenance = Provenance.of(self._plan_source, self._settings, self._clock)
         episodes = OpenEpisodes(emitter, self._clock)
         recorder = Recorder(emitter, episodes=episodes, software=__version__, provenance=provenance)
-        observations = Observations(emitter, recorder)
-        return Parts(queue, writer, reading, emitter, recorder, observations, PickUpExperience(reading))
+        known, observations = recorder.known_types, Observations(emitter, recorder)
+        recording = Recording(emitter, episodes, known, software=__version__, provenance=provenance)
+        return Parts(queue, writer, reading, emitter, recorder, recording, observations, PickUpExperience(reading))
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None

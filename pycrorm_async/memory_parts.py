@@ -17,6 +17,7 @@ from pycrorm_async.query.experience import PickUpExperience
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.queue.live.delegated_writer import DelegatedWriter
 from pycrorm_async.queue.live.recorder_queue import RecorderQueue
+from pycrorm_async.recording.recording import Recording
 from pycrorm_async.recording.writing.emitter import Emitter
 from pycrorm_async.world.observers import watcher
 from pycrorm_async.writer.writer_thread import WriterThread
@@ -32,6 +33,7 @@ class Parts(NamedTuple):
     reading: Reading
     emitter: Emitter
     recorder: Recorder
+    recording: Recording
     observations: Observations
     experience: PickUpExperience
 

@@ -18,6 +18,7 @@ from pycrorm_async.plan.task_tree import TaskTreeNode
 from pycrorm_async.query.as_of import AnyEpisode
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.snapshot import Moment
+from pycrorm_async.recording.recording import Recording
 from pycrorm_async.recording.writing.event_feed import BUFFER_EVENTS, EventStream, RecordedEvent, Subscription
 
 if TYPE_CHECKING:
@@ -77,6 +78,11 @@ class ReadableMemory(PartsHolder):
 
 class ObservingMemory(PartsHolder):
     """The observations and subscriptions of a memory. Each method raises `CallerError` while it is not open."""
+
+    @property
+    def recording(self) -> Recording:
+        """Writes episodes of an executive that is not ours, from any thread and without asyncio."""
+        return self._open_parts.recording
 
     def observe(self, name: str, values: object, *, node: TaskTreeNode | None = None) -> None:
         """Record an observation of your own in the open episode: a measurement, a message, an image.

@@ -13,13 +13,14 @@ from typing import Any, Final, Literal, get_args
 
 from pycrorm_async.errors import CallerError
 
-__all__ = ["FILE_MODES", "FileAccess", "Settings", "OnFull", "OnUnrecordable", "RecordMeshes", "Writer"]
+__all__ = ["FILE_MODES", "FileAccess", "Fold", "Settings", "OnFull", "OnUnrecordable", "RecordMeshes", "Writer"]
 
 OnFull = Literal["wait", "fail"]
 RecordMeshes = Literal["boxes", "files"]
 OnUnrecordable = Literal["record_missing", "refuse"]
 Writer = Literal["thread", "daemon"]
 FileAccess = Literal["owner", "group"]
+Fold = Literal["idle", "at_end"]
 FILE_MODES: Final[Mapping[FileAccess, int]] = {"owner": 0o600, "group": 0o660}
 """Mode of a file in the spool and of a SQLite database, by file access."""
 _MAY_BE_NONE = frozenset({"sample_interval_ms"})
@@ -32,6 +33,7 @@ _CHOICES = {
     "on_unrecordable": get_args(OnUnrecordable),
     "record_meshes": get_args(RecordMeshes),
     "file_access": get_args(FileAccess),
+    "fold": get_args(Fold),
 }
 
 
@@ -64,6 +66,8 @@ class Settings:
         fold_worker_answer_s: a fold worker that has not answered for this long is replaced even while it runs. A batch
             takes about a second, so this limit catches endless loops, not slow disks.
         idle_ms: a plan that has emitted no event for this long counts as idle, and its events are folded.
+        fold: the writer thread folds when the plan idles ("idle"), or only at a flush and at the end of the memory
+            ("at_end"): for an executive that sleeps often, because the fold competes with it for the interpreter.
         flush_timeout_s: `flush` and closing fail when the database has stored no event for this long; none is lost.
         connect_timeout_s: the first connection to a database may take this long.
         sample_interval_ms: the robot's state is sampled at this interval while a motion runs, and also at the motion's
@@ -98,6 +102,7 @@ class Settings:
     fold_worker_stopped_s: float = 10.0
     fold_worker_answer_s: float = 300.0
     idle_ms: int = 200
+    fold: Fold = "idle"
     flush_timeout_s: float = 15.0
     connect_timeout_s: float = 10.0
     sample_interval_ms: int | None = None

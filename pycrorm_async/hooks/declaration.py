@@ -8,6 +8,7 @@ without a type. In strict mode both cases raise `DeclarationRefused` the first t
 from __future__ import annotations
 
 import dataclasses
+import inspect
 import typing
 import weakref
 from collections.abc import Callable, Mapping, Sequence
@@ -30,6 +31,8 @@ from pycrorm_async.events.types import DesignatorTypeDeclared
 from pycrorm_async.events.values import FieldDeclared
 from pycrorm_async.plan.designator import Designator
 from pycrorm_async.recording.declarations.declared_type import DeclaredType, Field, Undeclared
+from pycrorm_async.recording.declarations.known_types import KnownTypes
+from pycrorm_async.recording.declarations.known_types import type_text as type_text_of
 from pycrorm_async.recording.values.parameter_types import (
     OUR_PACKAGE,
     Parameter,
@@ -42,7 +45,7 @@ from pycrorm_async.recording.values.parameter_types import (
 )
 from pycrorm_async.recording.values.texts import clean, cut, message_of
 
-__all__ = ["Declarations", "declared_type"]
+__all__ = ["Declarations", "built_in_declaration", "declared_type"]
 
 
 _NESTED_MAX = 8
@@ -56,7 +59,7 @@ _ALIAS_IN_USE = "already has the alias {!r} (only one class can have it)"
 class Declarations:
     """Holds the declarations of all designator classes that one memory has recorded.
 
-    Only one of two live classes with the same dtype is declared.
+    Only one of two live classes with the same dtype is declared. `known` holds their fields for all executives.
 
     Args:
         strict: raise `DeclarationRefused` for a class or field that cannot be declared, instead of omitting it.
@@ -64,10 +67,10 @@ class Declarations:
 
     def __init__(self, *, strict: bool = True) -> None:
         self._strict = strict
+        self.known = KnownTypes(built_in_declaration)
         self._declared: weakref.WeakKeyDictionary[type, DeclaredType] = weakref.WeakKeyDictionary()
         self._classes_by_name: dict[str, weakref.ref[type]] = {}
         self._classes_by_alias: dict[str, weakref.ref[type]] = {}
-        self._field_types_by_dtype: dict[str, dict[str, str]] = {}
 
     def of(self, designator: type[Designator], on_new: Callable[[DeclaredType], None]) -> DeclaredType:
         """Return the declaration of a class; before returning it for the first time, call `on_new` with it."""
@@ -80,7 +83,7 @@ class Declarations:
             declaration = declared.declaration
             self._classes_by_name |= dict.fromkeys((declaration.dtype, declaration.table), weakref.ref(designator))
             self._classes_by_alias |= dict.fromkeys(declaration.aliases, weakref.ref(designator))
-            self._field_types_by_dtype.setdefault(declaration.dtype, {}).update(_field_types(declared))
+            self.known.note(declaration)
         self._declared[designator] = declared
         return declared
 
@@ -89,7 +92,7 @@ class Declarations:
             declared = declared_type(
                 designator,
                 strict=self._strict,
-                field_types=self._field_types_by_dtype.get(designator.dtype, {}),
+                field_types=self.known.fields_of(designator.dtype),
                 classes_by_alias=self._classes_by_alias,
             )
             fault = declared.fault or self._fault_in_names(designator, declared)
@@ -126,13 +129,12 @@ def _conflict(
     return None
 
 
-def _field_types(declared: DeclaredType) -> dict[str, str]:
-    return {each.name: _type_text(each) for each in declared.declaration.fields}
-
-
-def _type_text(field: FieldDeclared) -> str:
-    """Describe a field's type; an enum counts as text, because its members are stored as text."""
-    return f"{'text' if field.type == 'enum' else field.type}{f' of {field.item}' if field.item else ''}"
+def built_in_declaration(dtype: str) -> DesignatorTypeDeclared | None:
+    """Return the declaration of the plan layer's own type with this dtype; None if it has none."""
+    for designator in _built_in_classes(dtype):
+        if not inspect.isabstract(designator):
+            return declared_type(designator, strict=False).declaration
+    return None
 
 
 def _descendants(root: type) -> typing.Iterator[Any]:
@@ -219,7 +221,7 @@ def _declarable_fields(
     if strict and combined_fault is not None:
         raise DeclarationRefused(_path(designator), combined_fault)
     for field in fields:
-        name, kind = field.declared.name, _type_text(field.declared)
+        name, kind = field.declared.name, type_text_of(field.declared)
         fault = fault_in_fields([*accepted, field.declared]) if combined_fault is not None else None
         if field_types.get(name, kind) != kind:
             fault = f"field {name!r} was {field_types[name]} before and is {kind} now (rename it, or set another dtype)"

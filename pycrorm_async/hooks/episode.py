@@ -31,8 +31,9 @@ from pycrorm_async.recording.values.event_fitting import (
     episode_text_of,
     fit_resolution,
 )
+from pycrorm_async.recording.values.failure_values import failure_value
 from pycrorm_async.recording.values.parameters import read_parameters
-from pycrorm_async.recording.values.value_snapshot import encode_or_missing, failure_value
+from pycrorm_async.recording.values.value_snapshot import encode_or_missing
 from pycrorm_async.recording.writing.emitter import UNAWAITED_MAX, Emitter
 from pycrorm_async.recording.writing.episode_opening import EpisodeOpening, current_task
 from pycrorm_async.recording.writing.episode_writer import EpisodeWriter
@@ -96,10 +97,10 @@ class Episode(EpisodeWriter[TaskTreeNode]):
         The world's recorder calls `continue_` when a change of the world has reached `continue_at`.
         """
         if self.world is None:
-            self.world = WorldRecorder(self._emitter, self.id, world, continue_)
+            self.world = WorldRecorder(self.emitter, self.id, world, continue_)
             self.world.continue_at = self.continue_at
         elif self.world.world is not world:
-            self._emitter.missing.note("Episode", "second world", f"{self} records only the world entered first")
+            self.emitter.missing.note("Episode", "second world", f"{self} records only the world entered first")
 
     @property
     def acts_in_recorded_world(self) -> bool:
@@ -171,12 +172,12 @@ class Episode(EpisodeWriter[TaskTreeNode]):
             node=number,
         )  # fmt: skip
         try:
-            return self._emitter.put(self.id, resolved)
+            return self.emitter.put(self.id, resolved)
         except NotEncodable as error:
-            fitted = fit_resolution(resolved, self._emitter.settings.record_bytes_max)
+            fitted = fit_resolution(resolved, self.emitter.settings.record_bytes_max)
             shortened = "offered" if len(fitted.offered) < len(resolved.offered) else "refused"
-            self._emitter.missing.note(resolved.location, shortened, error.reason)
-            return self._emitter.put(self.id, fitted)
+            self.emitter.missing.note(resolved.location, shortened, error.reason)
+            return self.emitter.put(self.id, fitted)
 
     def record_detection(
         self, *, source: Literal["camera", "world_state"], object_type: ObjectType | None, seen: tuple[Seen, ...],
@@ -187,11 +188,11 @@ class Episode(EpisodeWriter[TaskTreeNode]):
 
     # --- the end and the follow-up ----------------------------------------------------------------------------
 
-    def end(self, failure: BaseException | None) -> None:
+    def end_episode(self, failure: BaseException | None) -> None:
         """Write the end of the episode, after reporting performs that were never awaited."""
         if not self.closed:
             self.calls.close()
-        super().end(failure)
+        super().end_episode(failure)
 
     def continue_as(self, follow_up: EpisodeId) -> dict[int, int]:
         """End the episode and continue it under the id `follow_up`; map the old sequences of open nodes to the new."""
@@ -213,7 +214,7 @@ class Episode(EpisodeWriter[TaskTreeNode]):
         if former is None:
             return 0
         former.stop()
-        self.world = WorldRecorder(self._emitter, self.id, former.world, former.continue_)
+        self.world = WorldRecorder(self.emitter, self.id, former.world, former.continue_)
         return self.world.last
 
     def _leave_world(self) -> None:
@@ -227,7 +228,7 @@ class Episode(EpisodeWriter[TaskTreeNode]):
         return self._entered_world
 
     def _note_unawaited(self, designator: type[Designator]) -> None:
-        self._emitter.note_unawaited(designator.dtype)
+        self.emitter.note_unawaited(designator.dtype)
         fault = f"{designator.dtype}.perform() was called and never awaited"
         if fault not in self.faults:
             self.faults = (*self.faults[1 - UNAWAITED_MAX :], fault)
@@ -252,10 +253,10 @@ class Episode(EpisodeWriter[TaskTreeNode]):
             return None
         current = current_world.get()
         if current is not self.world.world and current is not None:
-            self._emitter.missing.note("Episode", "robot of a second world", "the episode records only the first world")
+            self.emitter.missing.note("Episode", "robot of a second world", "the episode records only the first world")
             return None
         try:
             return self.world.robot()
         except Exception as error:  # noqa: BLE001  the node is recorded without the robot's state
-            self._emitter.note_fault("robot state", error)
+            self.emitter.note_fault("robot state", error)
             return None

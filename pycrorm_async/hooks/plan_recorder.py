@@ -25,7 +25,6 @@ from contextvars import ContextVar
 from typing import Any, Literal
 
 from pycrorm_async.errors import DeclarationRefused, EpisodeRefused, SpoolFull, Unrecordable
-from pycrorm_async.events.envelope import Heading
 from pycrorm_async.events.values import NodeReference
 from pycrorm_async.hooks.declaration import Declarations
 from pycrorm_async.hooks.episode import Episode, NodeRecord
@@ -34,6 +33,7 @@ from pycrorm_async.plan.execution.observer import Candidate, Refusal, Seen, Simu
 from pycrorm_async.plan.execution.unawaited_performs import CalledPerforms
 from pycrorm_async.plan.task_tree import TaskTreeNode
 from pycrorm_async.recording.declarations.declared_type import DeclaredType
+from pycrorm_async.recording.declarations.known_types import KnownTypes
 from pycrorm_async.recording.values.episode_arguments import NO_LABELS, Labels, check_arguments
 from pycrorm_async.recording.values.event_fitting import EPISODE_TEXT_MAX
 from pycrorm_async.recording.writing.emitter import Emitter
@@ -72,6 +72,11 @@ class Recorder:
         self._sampler = _sampler_of(emitter)
         self.calls = CalledPerforms(lambda designator: emitter.note_unawaited(getattr(designator, "dtype", "it")))
         """Performs called outside any episode."""
+
+    @property
+    def known_types(self) -> KnownTypes:
+        """The types declared in this memory, by any executive."""
+        return self._declarations.known
 
     @property
     def is_closed(self) -> bool:
@@ -127,7 +132,7 @@ class Recorder:
 
     def _declared(self, node: TaskTreeNode) -> DeclaredType:
         assert node.designator is not None
-        return self._declarations.of(type(node.designator), self._declare)
+        return self._declarations.of(type(node.designator), self._emitter.put_declaration)
 
     def close_episode(self, episode: EpisodeWriter[Any], failure: BaseException | None) -> None:
         """Write the end of an episode that `failure` left, or None. Exceptions are counted, not raised."""
@@ -174,7 +179,7 @@ class Recorder:
         outer_episode = current_episode.get()
         implicit: Episode | None = None
         try:
-            declared = self._declarations.of(type(node.designator), self._declare)
+            declared = self._declarations.of(type(node.designator), self._emitter.put_declaration)
             episode = self.episode_here()
             if episode is None:
                 dtype = declared.dtype
@@ -275,11 +280,6 @@ class Recorder:
             step(*arguments)
         except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
             self._emitter.note_fault("StateSampled", error)
-
-    def _declare(self, declared: DeclaredType) -> None:
-        kind = type(declared.declaration)
-        self._emitter.put_payload(Heading(None, kind.__name__, kind.version), declared.payload)
-        self._emitter.feed.note_type(declared.fingerprint, declared.dtype)
 
     # --- the port of the world ---------------------------------------------------------------------------------------
 

@@ -83,10 +83,9 @@ class LiveWriter:
             await self._drain.abandon(error)
             raise
         async with asyncio.TaskGroup() as tasks:
-            background_tasks = (
-                tasks.create_task(self._fold_when_idle(), name="pycrorm fold when idle"),
-                tasks.create_task(self._adopt_all(), name="pycrorm adopt"),
-            )
+            background_tasks = [tasks.create_task(self._adopt_all(), name="pycrorm adopt")]
+            if self._settings.fold == "idle":
+                background_tasks.append(tasks.create_task(self._fold_when_idle(), name="pycrorm fold when idle"))
             try:
                 await self._drain.run()
             except Exception as error:  # noqa: BLE001 - noted, and raised below and by every flush

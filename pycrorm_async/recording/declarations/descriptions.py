@@ -10,6 +10,7 @@ import base64
 import hashlib
 import os
 import zlib
+from collections.abc import Collection
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
@@ -22,10 +23,9 @@ from pycrorm_async.recording.values.texts import clean, cut, message_of
 from pycrorm_async.settings import Settings
 from pycrorm_async.world.models.link_boxes import link_boxes
 from pycrorm_async.world.models.mesh_boxes import mesh_files, meshed_links, with_mesh_files
-from pycrorm_async.world.objects import Object
 from pycrorm_async.world.queries.bounding_boxes import BoundingBox
 
-__all__ = ["Descriptions"]
+__all__ = ["Described", "Descriptions"]
 
 _KNOWN_MAX = 1_000
 """Bounds the descriptions kept, because a program may generate any number. When it is reached all are dropped."""
@@ -46,6 +46,18 @@ class DescriptionSink(Protocol):
 
     def put_blob(self, content: bytes, media_type: str) -> BlobReference:
         """Raises `ValueError` with the reason if it refuses the blob."""
+        ...
+
+
+class Described(Protocol):
+    """An object with a description; `world.objects.Object` is one."""
+
+    @property
+    def description_text(self) -> str: ...
+    @property
+    def links(self) -> Collection[str]: ...
+    def box_in_link(self, link: str) -> BoundingBox | None:
+        """Return the box around the collision shapes of a link, in its frame; None if it has none."""
         ...
 
 
@@ -76,7 +88,7 @@ class Descriptions:
         self._put: dict[str, int] = {}
         self._put_bytes = 0
 
-    def declare(self, described: Object) -> str | None:
+    def declare(self, described: Described) -> str | None:
         """Return the fingerprint of the object's description, which is in the queue then.
 
         An exception is counted as a missing value, because adding an object must not fail; it returns None then.
@@ -87,7 +99,7 @@ class Descriptions:
             self._missing.note("ObjectAdded", "description", _reason(error))
             return None
 
-    def _declare(self, described: Object) -> str:
+    def _declare(self, described: Described) -> str:
         text = described.description_text
         if len(self._known) >= _KNOWN_MAX:
             self._files.clear()
@@ -113,7 +125,7 @@ class Descriptions:
         while self._put_bytes > self._put_bytes_max and len(self._put) > 1:
             self._put_bytes -= self._put.pop(next(iter(self._put)))
 
-    def _encoded(self, described: Object, files: tuple[str, ...]) -> _Declared:
+    def _encoded(self, described: Described, files: tuple[str, ...]) -> _Declared:
         text = described.description_text
         meshes = {file: self._mesh(Path(file)) for file in files}
         meshed = meshed_links(text) if files else ()

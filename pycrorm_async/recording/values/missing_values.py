@@ -38,6 +38,13 @@ class MissingValues:
 
     def note(self, owner: str, field: str, reason: str) -> None:
         """Count one missing value, and warn if it is the first of its type and field."""
+        self._note(owner, field, f"is recorded as missing: {reason}", reason)
+
+    def note_renamed(self, owner: str, field: str, name: str, reason: str) -> None:
+        """Count a field or type whose values are kept under another name, and warn if it is the first of its type."""
+        self._note(owner, field, f"is recorded as {name!r}: {reason}", f"recorded as {name!r}: {reason}")
+
+    def _note(self, owner: str, field: str, text: str, reason: str) -> None:
         self._total += 1
         self._last = f"{owner}.{field}: {reason}"
         if (owner, field) in self._warned or len(self._warned) > WARNED_MAX:
@@ -46,9 +53,4 @@ class MissingValues:
         if len(self._warned) > WARNED_MAX:
             _log.warning("more than %d fields have missing values; further ones are only counted in status", WARNED_MAX)
         else:
-            _log.warning(
-                "%s.%s is recorded as missing: %s (further missing values of this field are only counted in status)",
-                owner,
-                field,
-                reason,
-            )
+            _log.warning("%s.%s %s (further values of this field are only counted in status)", owner, field, text)

@@ -20,7 +20,6 @@ import numpy as np
 
 from pycrorm_async.events.codec import unwritable
 from pycrorm_async.events.values import (
-    FailureValue,
     FieldDeclared,
     MissingValue,
     ObjectReference,
@@ -29,19 +28,21 @@ from pycrorm_async.events.values import (
 )
 from pycrorm_async.plan.language.outcome import Outcome
 from pycrorm_async.plan.object_designators import BelieveObject, LocatedObject, ObjectDesignator, ObjectPart
-from pycrorm_async.recording.values.texts import clean, clean_repr, cut, message_of, reading_fault
+from pycrorm_async.recording.values.texts import clean, clean_repr, cut, reading_fault
 from pycrorm_async.world.objects import Object
 from pycrorm_async.world.pose import Pose
 
 __all__ = [
+    "DEPTH_MAX",
     "OBJECT_TYPES",
+    "REASON_MAX",
     "UnrecordableValue",
+    "RefusedValue",
     "References",
     "NO_REFERENCES",
     "pose_value",
     "encode_parameter",
     "encode_or_missing",
-    "failure_value",
     "missing_in",
     "missing_value",
 ]
@@ -51,22 +52,23 @@ OBJECT_TYPES: tuple[type, ...] = (ObjectDesignator, Object)
 
 ObjectDtype: TypeAlias = Literal["Object", "ObjectPart", "BelieveObject", "LocatedObject"]
 
-_TEXT_MAX = 2_000
-"""Bounds the characters of a failure's message."""
-_REASON_MAX = 500
+REASON_MAX = 500
 """Bounds the characters of the reason why a value is missing, and of the messages inside an exception group."""
-_NAME_MAX = 500
-"""Bounds the characters of an exception's qualified class name."""
-_DEPTH_MAX = 8
+DEPTH_MAX = 8
 """Bounds the nesting of a result, of a failure's arguments and of exception groups."""
-_GROUP_MAX = 100
-"""Bounds the recorded exceptions of one exception group."""
 ITEMS_MAX = 2**19
 """Bounds the items of one value. An item takes at least two bytes, so more exceed the default `record_bytes_max`."""
 
 
 class UnrecordableValue(ValueError):
     """JSON or the declared column cannot hold the value unchanged; the message states the reason."""
+
+
+class RefusedValue:
+    """Stands for a value that an executive's own conversion refused; it is recorded as missing for this reason."""
+
+    def __init__(self, reason: str) -> None:
+        self.reason = reason
 
 
 class References(Protocol):
@@ -121,7 +123,7 @@ def encode_or_missing(value: Any, references: References) -> Any:
 
 def missing_value(reason: str, value: Any) -> MissingValue:
     """Build the `MissingValue` that replaces a value, with a shortened reason and repr."""
-    return MissingValue(cut(clean(reason), _REASON_MAX), clean_repr(value))
+    return MissingValue(cut(clean(reason), REASON_MAX), clean_repr(value))
 
 
 def missing_in(value: Any) -> Iterator[MissingValue]:
@@ -131,48 +133,6 @@ def missing_in(value: Any) -> Iterator[MissingValue]:
     elif isinstance(value, list | dict):
         for each in value.values() if isinstance(value, dict) else value:
             yield from missing_in(each)
-
-
-def failure_value(failure: BaseException, references: References) -> FailureValue:
-    """Copy class, message and arguments of an exception. Never raises anything but `KeyboardInterrupt`."""
-    return FailureValue(
-        type=cut(_path_of(type(failure)), _NAME_MAX),
-        message=cut(clean(message_of(failure)), _TEXT_MAX),
-        arguments=_arguments_or_missing(failure, references),
-    )
-
-
-def _path_of(kind: type) -> str:
-    try:
-        return clean(f"{kind.__module__}.{kind.__qualname__}")
-    except Exception as error:  # noqa: BLE001  a metaclass may raise anything
-        return f"<an exception whose class has no name: {type(error).__name__}>"
-
-
-def _arguments_or_missing(failure: BaseException, references: References) -> list[Any]:
-    try:
-        return _arguments(failure, references, 0)
-    except KeyboardInterrupt:
-        raise
-    except BaseException as error:  # noqa: BLE001  `args` may be a property that raises anything
-        return [MissingValue(reading_fault(error))]
-
-
-def _arguments(failure: BaseException, references: References, depth: int) -> list[Any]:
-    """Encode the arguments of an exception; for a group, its message and the encoded exceptions inside it."""
-    if not isinstance(failure, BaseExceptionGroup):
-        return [encode_or_missing(each, references) for each in failure.args]
-    if depth > _DEPTH_MAX:
-        return [missing_value(f"it is nested more than {_DEPTH_MAX} deep", failure)]
-    inside = [
-        {
-            "type": cut(_path_of(type(each)).rpartition(".")[2], _NAME_MAX),
-            "message": cut(clean(message_of(each)), _REASON_MAX),
-            "arguments": _arguments(each, references, depth + 1),
-        }
-        for each in failure.exceptions[:_GROUP_MAX]
-    ]
-    return [cut(clean(str(failure.message)), _TEXT_MAX), inside]
 
 
 # --- one encoder per declared type --------------------------------------------------------------------------------
@@ -221,7 +181,9 @@ def _encode_datetime(value: Any, _enum: type[Enum] | None, _references: Referenc
     return value.astimezone(UTC).isoformat(timespec="microseconds")
 
 
-def _encode_member(value: Any, enum: type[Enum] | None, _references: References) -> str:
+def _encode_member(value: Any, enum: type[Enum] | None, references: References) -> str:
+    if enum is None and isinstance(value, str) and not isinstance(value, Enum):
+        return _encode_text(value, None, references)  # the name of a member of another executive's enum
     if enum is not None and not isinstance(value, enum):
         raise UnrecordableValue(f"{clean_repr(value)} is not a member of {enum.__name__}")
     name = value.name
@@ -232,13 +194,13 @@ def _encode_member(value: Any, enum: type[Enum] | None, _references: References)
 
 
 def _encode_pose(value: Any, _enum: type[Enum] | None, _references: References) -> PoseValue:
-    if not isinstance(value, Pose):
+    if not isinstance(value, Pose | PoseValue):
         raise _mismatch("Pose", value)
     if not math.isfinite(sum(value.position) + sum(value.orientation)):
         raise UnrecordableValue(f"the pose holds a number that is not finite: {value}")
     if unwritable(value.frame):
         raise UnrecordableValue(f"the pose's frame: {unwritable(value.frame)}")
-    return pose_value(value)
+    return pose_value(value) if isinstance(value, Pose) else value
 
 
 def _encode_object(value: Any, _enum: type[Enum] | None, references: References) -> ObjectReference | ObjectValue:
@@ -250,6 +212,8 @@ def _encode_object(value: Any, _enum: type[Enum] | None, references: References)
         return _object_value("LocatedObject", value, _row_in_force(value.reference, references))
     if isinstance(value, BelieveObject):
         return _object_value("BelieveObject", value)
+    if isinstance(value, ObjectReference | ObjectValue):
+        return value
     if isinstance(value, ObjectDesignator):
         row = references.reference(value.world_object) if value.world_object is not None else None
         return row or _unrecorded_object(value)
@@ -339,6 +303,14 @@ def _stop_at_limit(items: Iterable[Any]) -> Iterator[Any]:
         yield each
 
 
+_ENCODERS_BY_CLASS: tuple[tuple[Any, Callable[[Any, type[Enum] | None, References], Any]], ...] = (
+    ((Pose, PoseValue), _encode_pose),
+    (datetime, _encode_datetime),
+    ((*OBJECT_TYPES, ObjectReference, ObjectValue), _encode_object),
+)
+"""The encoders of values without a declared type."""
+
+
 class _ValueReader:
     """Converts one value without a declared type to a JSON value. Raises `UnrecordableValue`."""
 
@@ -351,8 +323,8 @@ class _ValueReader:
         self._left -= 1
         if self._left < 0:
             raise UnrecordableValue(f"it holds more than {ITEMS_MAX:,} items")
-        if depth > _DEPTH_MAX:
-            raise UnrecordableValue(f"it is nested more than {_DEPTH_MAX} deep")
+        if depth > DEPTH_MAX:
+            raise UnrecordableValue(f"it is nested more than {DEPTH_MAX} deep")
         if isinstance(value, Enum):
             return _require_writable(value.name)
         if value is None or isinstance(value, bool | np.bool_):
@@ -361,14 +333,14 @@ class _ValueReader:
             return _require_writable(_as_built_in(value))
         if isinstance(value, np.generic):
             return self.read(value.item(), depth + 1)
-        for kind, encode in ((Pose, _encode_pose), (datetime, _encode_datetime), (OBJECT_TYPES, _encode_object)):
+        for kind, encode in _ENCODERS_BY_CLASS:
             if isinstance(value, kind):
                 return encode(value, None, self._references)
         if isinstance(value, Outcome):
             value = value.in_brief()
         if isinstance(value, Mapping | list | tuple | np.ndarray):
             return self._container(value, depth)
-        raise UnrecordableValue(f"JSON cannot hold a {type(value).__name__}")
+        raise _mismatch("JSON", value)
 
     def _container(self, value: Any, depth: int) -> Any:
         if id(value) in self._enclosing_ids:
@@ -393,4 +365,8 @@ def _as_built_in(value: str | float) -> str | int | float:
 
 
 def _mismatch(declared: str, value: Any) -> UnrecordableValue:
+    if isinstance(value, RefusedValue):
+        return UnrecordableValue(value.reason)
+    if declared == "JSON":
+        return UnrecordableValue(f"JSON cannot hold a {type(value).__name__}")
     return UnrecordableValue(f"declared as {declared}, got a {type(value).__name__}")

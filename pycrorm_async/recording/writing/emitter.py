@@ -12,6 +12,7 @@ from pycrorm_async.events.envelope import Heading
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.events.types import Happening
 from pycrorm_async.events.values import BlobReference
+from pycrorm_async.recording.declarations.declared_type import DeclaredType
 from pycrorm_async.recording.declarations.descriptions import Descriptions
 from pycrorm_async.recording.values.missing_values import MissingValues
 from pycrorm_async.recording.values.texts import clean, cut, message_of
@@ -99,6 +100,12 @@ class Emitter:
                 if threading.current_thread().name.startswith(_THREAD_NAME_PREFIX):
                     raise
                 self.sink.block_until_room(_BLOCK_S)
+
+    def put_declaration(self, declared: DeclaredType) -> None:
+        """Append the declaration of a designator type."""
+        kind = type(declared.declaration)
+        self.put_payload(Heading(None, kind.__name__, kind.version), declared.payload)
+        self.feed.note_type(declared.fingerprint, declared.dtype)
 
     def offer(self, episode: EpisodeId, event: Happening) -> int:
         """Append an event without using the reserve and without waiting; raise `SpoolFull` if there is no room."""

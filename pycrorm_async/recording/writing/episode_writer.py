@@ -3,8 +3,8 @@
 Theory of operation. What starts nodes is not known here: `N` is an executive's own record of a node. `_open_nodes`
 holds every node that started and whose end is not written. The call that removes a node writes its end, so no node has
 two; if writing raises, it restores the node, which then ends LOST with the episode. `_ending` holds a node while a
-thread writes its end. `end` and `continue_as` wait, for a limited time, until it is empty, because the end of a node
-must precede the end of the episode. The end of a node never waits, because the garbage collector may call it.
+thread writes its end. The ends of episodes wait, for a limited time, until it is empty, because the end of a node must
+precede the end of its episode. The end of a node never waits, because the garbage collector may cause it.
 
 A sequence has 26 bits, so an episode can run out of sequences. When one reaches `continue_at`, `continue_as` ends it,
 and the same `EpisodeWriter` continues under a new id, so that whatever refers to it stays valid. Every open node ends
@@ -39,8 +39,9 @@ from pycrorm_async.recording.values.event_fitting import (
     fit_episode_start,
     fit_node_end,
 )
+from pycrorm_async.recording.values.failure_values import failure_value
 from pycrorm_async.recording.values.parameters import ROBOT, fit_node_start
-from pycrorm_async.recording.values.value_snapshot import failure_value, missing_in
+from pycrorm_async.recording.values.value_snapshot import missing_in
 from pycrorm_async.recording.writing.emitter import Emitter
 from pycrorm_async.recording.writing.episode_opening import EpisodeOpening, end_statuses, episode_started
 from pycrorm_async.world.objects import Object
@@ -62,6 +63,7 @@ class EpisodeWriter(ABC, Generic[N]):
     """An open or closed episode.
 
     Attributes:
+        emitter: puts the events into the queue and counts faults.
         id: 16 bytes of a UUIDv7; `str(episode)` is its text. A continued episode has the id of its latest follow-up.
         continue_at: the first sequence that triggers a follow-up episode.
         closed: whether the last event has been written, or its writing has begun.
@@ -72,7 +74,7 @@ class EpisodeWriter(ABC, Generic[N]):
         self.id = episode
         self.closed = False
         self.simulated: Final = opening.simulated
-        self._emitter = emitter
+        self.emitter = emitter
         self._opening = opening
         self._open_nodes: dict[int, N] = {}
         self._interrupted: dict[int, N] = {}
@@ -128,19 +130,19 @@ class EpisodeWriter(ABC, Generic[N]):
     def _start(self, continues: EpisodeId | None, root: int | None) -> int:
         """Write the start of the episode and of its root node; return the root's sequence."""
         started = episode_started(self._opening, continues)
-        started, shortened = fit_episode_start(started, self._emitter.settings.record_bytes_max)
+        started, shortened = fit_episode_start(started, self.emitter.settings.record_bytes_max)
         for name in shortened:
-            self._emitter.missing.note("Episode", name, "its text is too long for an episode and was cut")
-        self._emitter.put(self.id, started)
-        return self._emitter.put(self.id, NodeStarted("root", simulated=self._opening.simulated, continues=root))
+            self.emitter.missing.note("Episode", name, "its text is too long for an episode and was cut")
+        self.emitter.put(self.id, started)
+        return self.emitter.put(self.id, NodeStarted("root", simulated=self._opening.simulated, continues=root))
 
     def tag(self, added: Sequence[str], removed: Sequence[str]) -> None:
         """Write a change of the episode's tags. Raises `CallerError` for a removed tag that it does not have."""
         tags = changed_tags(self._opening.labels.tags, added, removed)
-        self._emitter.put(self.id, EpisodeTagged(tuple(added), tuple(removed)))
+        self.emitter.put(self.id, EpisodeTagged(tuple(added), tuple(removed)))
         self._opening = self._opening.with_tags(tags)
 
-    def end(self, failure: BaseException | None) -> None:
+    def end_episode(self, failure: BaseException | None) -> None:
         """Write the end of the episode. Nodes that are still open end LOST, because no later end can be recorded."""
         if self.closed:
             return
@@ -155,9 +157,9 @@ class EpisodeWriter(ABC, Generic[N]):
             self._put_end(NodeEnded(self._root, root_status, value), "Episode")
         ended = EpisodeEnded(status, value, world=self._described_world())
         try:
-            self._emitter.put(self.id, ended)
+            self.emitter.put(self.id, ended)
         except NotEncodable:
-            self._emitter.put(self.id, fit_episode_end(ended, self._emitter.settings.record_bytes_max))
+            self.emitter.put(self.id, fit_episode_end(ended, self.emitter.settings.record_bytes_max))
 
     def continue_as(self, follow_up: EpisodeId) -> dict[int, int]:
         """End the episode and continue it under the id `follow_up`; map the old sequences of open nodes to the new."""
@@ -172,7 +174,7 @@ class EpisodeWriter(ABC, Generic[N]):
         if not self._root_ended:  # it ended in an attempt before this one
             self._put_end(NodeEnded(root, "INTERRUPTED", reason), "Episode")
             self._root_ended = True
-        self._emitter.put(former, EpisodeEnded("INTERRUPTED", reason, episode_text(follow_up), self._described_world()))
+        self.emitter.put(former, EpisodeEnded("INTERRUPTED", reason, episode_text(follow_up), self._described_world()))
         self.id = follow_up
         self._root = self._start(former, root)
         self._root_ended = False
@@ -185,7 +187,7 @@ class EpisodeWriter(ABC, Generic[N]):
             try:
                 last = renumbered[sequence] = self._restart_node(node, sequence)
             except Exception as error:  # noqa: BLE001  the other nodes continue nevertheless
-                self._emitter.note_fault("NodeStarted", error)
+                self.emitter.note_fault("NodeStarted", error)
         # The world and the tree may reach the limit at once; doubling it prevents an endless chain of follow-ups.
         self.continue_at = max(self._continue_at, 2 * last)
         return renumbered
@@ -202,21 +204,21 @@ class EpisodeWriter(ABC, Generic[N]):
         if missing:
             self._note_parameters(owner, missing, may_refuse=may_refuse)
         try:
-            sequence = self._emitter.put(self.id, event)
+            sequence = self.emitter.put(self.id, event)
         except NotEncodable:
             unfitting: dict[str, str] = {}
-            event = fit_node_start(event, self._emitter.settings.record_bytes_max, unfitting)
+            event = fit_node_start(event, self.emitter.settings.record_bytes_max, unfitting)
             self._note_parameters(owner, unfitting, may_refuse=may_refuse)
-            sequence = self._emitter.put(self.id, event)
+            sequence = self.emitter.put(self.id, event)
         self._open_nodes[sequence] = node
         return sequence
 
     def _note_parameters(self, owner: str, missing: Mapping[str, str], *, may_refuse: bool) -> None:
         parameters = [name for name in missing if name != ROBOT]
-        if may_refuse and parameters and self._emitter.settings.on_unrecordable == "refuse":
+        if may_refuse and parameters and self.emitter.settings.on_unrecordable == "refuse":
             raise Unrecordable(owner, " and ".join(parameters), missing[parameters[0]])
         for name, reason in missing.items():
-            self._emitter.missing.note(owner, name, reason)
+            self.emitter.missing.note(owner, name, reason)
 
     def _close_node(self, event: NodeEnded, owner: str) -> None:
         """Remove the node and write its end; no effect if it was removed, as the garbage collector may do meanwhile."""
@@ -239,16 +241,16 @@ class EpisodeWriter(ABC, Generic[N]):
         if event.failure is not None or event.result is not None:
             for field, value in (("failure", event.failure and event.failure.arguments), ("result", event.result)):
                 for each in missing_in(value):
-                    self._emitter.missing.note(owner, field, each.missing)
+                    self.emitter.missing.note(owner, field, each.missing)
         try:
-            self._emitter.put(self.id, event)
+            self.emitter.put(self.id, event)
         except NotEncodable as error:
-            self._emitter.missing.note(owner, "failure" if event.failure is not None else "result", error.reason)
-            self._emitter.put(self.id, fit_node_end(event, self._emitter.settings.record_bytes_max))
+            self.emitter.missing.note(owner, "failure" if event.failure is not None else "result", error.reason)
+            self.emitter.put(self.id, fit_node_end(event, self.emitter.settings.record_bytes_max))
 
     def _put_detection(self, detected: ObjectDetected) -> int:
         try:
-            return self._emitter.put(self.id, detected)
+            return self.emitter.put(self.id, detected)
         except NotEncodable as error:
-            self._emitter.missing.note("ObjectDetected", "seen", error.reason)
-            return self._emitter.put(self.id, fit_detection(detected, self._emitter.settings.record_bytes_max))
+            self.emitter.missing.note("ObjectDetected", "seen", error.reason)
+            return self.emitter.put(self.id, fit_detection(detected, self.emitter.settings.record_bytes_max))

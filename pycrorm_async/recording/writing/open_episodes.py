@@ -111,6 +111,6 @@ class OpenEpisodes:
             return
         self._open.pop(episode.id, None)
         try:
-            episode.end(failure)
+            episode.end_episode(failure)
         except Exception as error:  # noqa: BLE001  a fault of the memory must not replace the plan's outcome
             self._emitter.note_fault("EpisodeEnded", error)

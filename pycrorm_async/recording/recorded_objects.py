@@ -1,0 +1,165 @@
+"""`RecordedObjects` writes the objects of an episode whose executive reports them by keys of its own.
+
+It keeps the last reported state of each object, because a follow-up episode begins with it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+from pycrorm_async.events.ids import EpisodeId
+from pycrorm_async.events.types import ObjectAdded, ObjectAttached, ObjectDetached, ObjectMoved
+from pycrorm_async.events.values import ObjectReference, PoseValue, RobotValue
+from pycrorm_async.recording.values.texts import clean
+from pycrorm_async.recording.writing.emitter import Emitter
+from pycrorm_async.recording.writing.object_rows import ObjectRows
+from pycrorm_async.world.queries.bounding_boxes import BoundingBox
+
+__all__ = ["RecordedObject", "RecordedObjects"]
+
+Node = Callable[[], int | None]
+
+
+@dataclass(slots=True)
+class RecordedObject:
+    """An object as it was last reported: pose and joints as they are now, the rest as it was added.
+
+    `torso_joint` is the joint whose position is the torso height, of a robot.
+    """
+
+    name: str
+    object_type: str
+    pose: PoseValue
+    joints: dict[str, float] = field(default_factory=dict)
+    urdf: str | None = None
+    color: tuple[float, float, float, float] | None = None
+    model: str | None = None
+    serial: str | None = None
+    mass_kg: float | None = None
+    torso_joint: str | None = None
+
+
+class _Described(NamedTuple):
+    """A description without the shapes that Bullet would compute."""
+
+    description_text: str
+    links: tuple[str, ...] = ()
+
+    def box_in_link(self, link: str) -> BoundingBox | None:  # noqa: ARG002  the port's signature
+        return None
+
+
+class RecordedObjects(ObjectRows[Hashable]):
+    """The objects of one episode; begins with those of the episode that it continues."""
+
+    def __init__(
+        self, emitter: Emitter, episode: EpisodeId, continue_: Callable[[], None], former: RecordedObjects | None = None
+    ) -> None:
+        super().__init__(emitter, episode, continue_)
+        self._objects: dict[Hashable, RecordedObject] = {}
+        self._attached: dict[Hashable, tuple[Hashable, str | None]] = {}
+        self._renewed: dict[int, ObjectReference] = {}
+        if former is None:
+            return
+        for key, each in former._objects.items():  # noqa: SLF001  of the same class
+            self.add(key, each, _no_node)
+        for child, (parent, link) in former._attached.items():  # noqa: SLF001  of the same class
+            self.attach(parent, child, link, _no_node)
+        for key, before in former._references.items():  # noqa: SLF001  of the same class
+            if (now := self._references.get(key)) is not None:
+                self._renewed[before.object] = now
+
+    def renewed(self, value: Any) -> Any:
+        """Return a value of the former episode with references to rows of this one; None for an object that left."""
+        if isinstance(value, ObjectReference):
+            return self._renewed.get(value.object)
+        if isinstance(value, dict):
+            return {key: self.renewed(each) for key, each in value.items()}
+        return [self.renewed(each) for each in value] if isinstance(value, list) else value
+
+    def reference(self, key: Hashable) -> ObjectReference | None:
+        """Return the current row of an object; None if there is none of this key."""
+        return self._references.get(key)
+
+    def robot(self, key: Hashable) -> RobotValue | None:
+        """Return the state of the object as that of the acting robot; None if there is none of this key."""
+        known = self._objects.get(key)
+        if known is None:
+            return None
+        torso = known.joints.get(known.torso_joint) if known.torso_joint is not None else None
+        return RobotValue(known.pose, clean(known.object_type), torso, self._references.get(key), clean(known.name))
+
+    def add(self, key: Hashable, added: RecordedObject, node: Node) -> None:
+        """Write that an object entered the world; of a known key, its new pose and joints."""
+        if key in self._references:
+            self.move(key, added.pose, node)
+            self.turn(key, added.joints, node)
+            return
+        self._put(
+            lambda: ObjectAdded(
+                clean(added.name),
+                clean(added.object_type),
+                added.pose,
+                dict(added.joints),
+                node(),
+                self._emitter.descriptions.declare(_Described(added.urdf)) if added.urdf is not None else None,
+                added.color,
+                clean(added.model) if added.model is not None else None,
+                clean(added.serial) if added.serial is not None else None,
+                added.mass_kg,
+            ),
+            row_of=key,
+        )
+        self._objects[key] = added
+
+    def move(self, key: Hashable, pose: PoseValue, node: Node) -> None:
+        """Write a new pose of an object, if it has changed."""
+        known, reference = self._objects.get(key), self._references.get(key)
+        if known is None or reference is None:
+            return
+        if (pose.position, pose.orientation, pose.frame) == (
+            known.pose.position,
+            known.pose.orientation,
+            known.pose.frame,
+        ):
+            return
+        known.pose = pose
+        self._put(
+            lambda: ObjectMoved(reference.object, clean(known.name), clean(known.object_type), pose, node()),
+            row_of=key,
+            identity=reference.object,
+        )
+
+    def turn(self, key: Hashable, positions: Mapping[str, float], node: Node) -> None:
+        """Write those joint positions of an object that have changed."""
+        known = self._objects.get(key)
+        if known is None:
+            return
+        changed = {name: each for name, each in positions.items() if known.joints.get(name) != each}
+        if changed:
+            known.joints |= changed
+            self._put_joints(key, changed, node)
+
+    def attach(self, parent: Hashable, child: Hashable, link: str | None, node: Node) -> None:
+        """Write that `child` moves with `parent`."""
+        self._attached[child] = (parent, link)
+        self._put_attachment(ObjectAttached, parent, child, link, node)
+
+    def detach(self, parent: Hashable, child: Hashable, node: Node) -> None:
+        """Write that `child` no longer moves with `parent`."""
+        _, link = self._attached.pop(child, (parent, None))
+        self._put_attachment(ObjectDetached, parent, child, link, node)
+
+    def remove(self, key: Hashable, node: Node) -> None:
+        """Write that an object left the world."""
+        self._objects.pop(key, None)
+        self._attached = {
+            child: (parent, link) for child, (parent, link) in self._attached.items() if key not in (child, parent)
+        }
+        self._put_removed(key, node)
+
+
+def _no_node() -> None:
+    return None

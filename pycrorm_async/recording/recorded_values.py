@@ -1,0 +1,104 @@
+"""Copy the values that an executive hands over, through its own conversion, into values of events."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Mapping
+from typing import Any, Protocol
+
+from pycrorm_async.events.values import ObjectReference, PoseValue
+from pycrorm_async.recording.declarations.declared_type import DeclaredType
+from pycrorm_async.recording.values.texts import clean, message_of, reading_fault
+from pycrorm_async.recording.values.value_snapshot import (
+    References,
+    RefusedValue,
+    UnrecordableValue,
+    encode_or_missing,
+    encode_parameter,
+    missing_value,
+)
+from pycrorm_async.world.pose import Pose
+
+__all__ = ["Convert", "RecordedValues", "pose_of"]
+
+Convert = Callable[[Any], Any]
+
+
+class _Objects(Protocol):
+    def reference(self, key: Hashable) -> ObjectReference | None: ...
+
+
+class RecordedValues:
+    """Converts values for one episode. `convert` is the executive's; it is called with each value and each item."""
+
+    def __init__(self, convert: Convert | None, objects: Callable[[], _Objects], references: References) -> None:
+        self._convert = convert
+        self._objects = objects
+        self._references = references
+
+    def parameters(self, declared: DeclaredType, values: Mapping[str, Any], missing: dict[str, str]) -> dict[str, Any]:
+        """Return the parameters by field name; add to `missing` the reason for each that becomes a `MissingValue`."""
+        parameters: dict[str, Any] = {}
+        known = set()
+        for field, path, enum in declared.fields:
+            known.add(path[0])
+            value = values.get(path[0])
+            if value is None:
+                continue
+            try:
+                converted = self.converted(value, as_object="object" in (field.type, field.item))
+                if converted is not None:
+                    parameters[field.name] = encode_parameter(field, enum, converted, self._references)
+            except UnrecordableValue as refusal:
+                missing[field.name] = str(refusal)
+                parameters[field.name] = missing_value(str(refusal), value)
+            except Exception as error:  # noqa: BLE001  a __float__ of the user's may raise anything
+                missing[field.name] = fault = reading_fault(error)
+                parameters[field.name] = missing_value(fault, value)
+        reasons = {each.path[0]: each.reason for each in declared.undeclared}
+        for name, value in values.items():
+            if value is not None and name not in known:
+                text = clean(str(name))
+                missing[text] = reason = reasons.get(name, f"{declared.dtype} was declared without this field")
+                parameters[text] = missing_value(reason, value)
+        return parameters
+
+    def any(self, value: Any) -> Any:
+        """Return a JSON value, or a `MissingValue`. Never raises."""
+        return encode_or_missing(self.converted(value), self._references)
+
+    def converted(self, value: Any, *, as_object: bool = False, is_item: bool = False) -> Any:
+        """Return the value as the executive converts it; a `RefusedValue` with the reason for one that it cannot.
+
+        With `as_object` the key of an object becomes a reference to its row.
+        """
+        if as_object and (reference := self._known_object(value)) is not None:
+            return reference
+        if self._convert is not None:
+            try:
+                value = self._convert(value)
+            except Exception as error:  # noqa: BLE001  an executive's conversion may raise anything
+                return RefusedValue(message_of(error) if isinstance(error, ValueError) else reading_fault(error))
+            if as_object and (reference := self._known_object(value)) is not None:
+                return reference
+        if is_item:
+            return value
+        if type(value) in (list, tuple):
+            return [self.converted(each, as_object=as_object, is_item=True) for each in value]
+        if type(value) is dict:
+            return {key: self.converted(each, as_object=as_object, is_item=True) for key, each in value.items()}
+        return value
+
+    def _known_object(self, value: Any) -> ObjectReference | None:
+        try:
+            return self._objects().reference(value)
+        except TypeError:  # it is not hashable, so it is no key
+            return None
+
+
+def pose_of(pose: Pose | PoseValue) -> PoseValue:
+    """Copy a pose. Raises `ValueError` for anything else."""
+    if isinstance(pose, PoseValue):
+        return pose
+    if isinstance(pose, Pose):
+        return PoseValue(pose.position, pose.orientation, pose.frame, pose.time_ns)
+    raise ValueError(f"a pose must be a Pose or a PoseValue, not a {type(pose).__name__}")

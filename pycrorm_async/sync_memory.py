@@ -1,0 +1,126 @@
+"""`SyncMemory` is a memory for code without asyncio: one thread of its own holds the asynchronous one.
+
+>>> with Memory.sync("sqlite:///memory.db") as memory:
+...     with memory.recording.episode(description="Tutorial") as episode:
+...         executive.run(observer=episode)
+...     memory.flush()
+
+The thread ends with the process if the memory is never closed; its events are then in the spool, and the next memory
+of that database stores them.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Coroutine
+from concurrent.futures import Future
+from types import TracebackType
+from typing import TYPE_CHECKING, Any, Self, TypeVar
+
+from sqlalchemy import Select
+
+from pycrorm_async.errors import CallerError, FlushTimeout
+from pycrorm_async.memory_status import MemoryStatus
+from pycrorm_async.recording.recording import Recording
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+    from pycrorm_async.memory import Memory
+
+__all__ = ["SyncMemory"]
+
+T = TypeVar("T")
+
+
+class SyncMemory:
+    """A memory to use with `with`, once; `Memory.sync` makes it. Its methods may be called from any thread."""
+
+    def __init__(self, memory: Memory) -> None:
+        self._memory = memory
+        self._thread: threading.Thread | None = None
+        self._opened: Future[asyncio.AbstractEventLoop] = Future()
+        self._closing: asyncio.Future[BaseException | None] | None = None
+        self._closed: Future[None] = Future()
+
+    def __enter__(self) -> Self:
+        if self._thread is not None:
+            raise CallerError("a memory can be entered once: call Memory.sync again")
+        self._thread = threading.Thread(target=self._run, name="pycrorm memory", daemon=True)
+        self._thread.start()
+        self._opened.result()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        if not self._memory.is_open:  # in a forked child it belongs to the parent
+            return
+        assert self._closing is not None
+        self._opened.result().call_soon_threadsafe(self._closing.set_result, error)
+        self._closed.result()
+
+    def _run(self) -> None:
+        try:
+            asyncio.run(self._hold())
+        except BaseException as error:  # noqa: BLE001  it is raised where the memory is used
+            (self._closed if self._opened.done() else self._opened).set_exception(error)
+        else:
+            self._closed.set_result(None)
+
+    async def _hold(self) -> None:
+        """Hold the memory open, in one task, until it is closed."""
+        loop = asyncio.get_running_loop()
+        self._closing = loop.create_future()
+        await self._memory.__aenter__()
+        self._opened.set_result(loop)
+        error = await self._closing
+        await self._memory.__aexit__(type(error) if error is not None else None, error, None)
+
+    def _await(self, coroutine: Coroutine[Any, Any, T], timeout_s: float | None = None) -> T:
+        """Run a coroutine in the memory's thread and return its result. Raises `TimeoutError` after `timeout_s`."""
+        if not self._memory.is_open:
+            coroutine.close()
+            raise CallerError("this memory is not open: use `with Memory.sync(url) as memory`")
+        future = asyncio.run_coroutine_threadsafe(coroutine, self._opened.result())
+        try:
+            return future.result(timeout_s)
+        except BaseException:  # also Ctrl-C, which must not leave the coroutine running
+            future.cancel()
+            raise
+
+    @property
+    def recording(self) -> Recording:
+        """Writes episodes; see `Recording`."""
+        return self._memory.recording
+
+    @property
+    def status(self) -> MemoryStatus:
+        """The present state of the memory."""
+        return self._memory.status
+
+    @property
+    def recent_episodes(self) -> tuple[str, ...]:
+        """The ids of the last hundred episodes this memory opened."""
+        return self._memory.recent_episodes
+
+    def synced(self) -> None:
+        """Wait until all events recorded so far survive a power loss; raises as `Memory.synced` does."""
+        self._await(self._memory.synced())
+
+    def flush(self, timeout_s: float | None = None) -> None:
+        """Wait until all events recorded so far are visible in the tables; raises as `Memory.flush` does.
+
+        Raises `FlushTimeout` also after `timeout_s`, if it is given. The events are safe in the spool.
+        """
+        try:
+            self._await(self._memory.flush(), timeout_s)
+        except TimeoutError as error:
+            raise FlushTimeout(
+                f"not finished after {timeout_s:g} s; everything recorded is safe in the spool"
+            ) from error
+
+    def dataframe(self, statement: Select[*tuple[Any, ...]], *, simulated: bool = False) -> DataFrame:
+        """Return the rows as a pandas DataFrame (extra `learning`); with `simulated`, those of simulations too."""
+        return self._await(self._memory.dataframe(statement, simulated=simulated))
