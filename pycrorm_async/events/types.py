@@ -188,6 +188,7 @@ class ObjectAdded(Happening, frozen=True):
         model, serial: of a robot with a `RobotDescription`: the model's name, and what distinguishes robots of one
             model, if it is known.
         mass_kg: as given, or the sum of the masses in the description; None if it is not known.
+        base_link: of a robot: the link whose frame has the pose, in every event; None: the root link.
     """
 
     name: str
@@ -200,6 +201,7 @@ class ObjectAdded(Happening, frozen=True):
     model: str | None = None
     serial: str | None = None
     mass_kg: float | None = None
+    base_link: str | None = None
 
 
 class ObjectRemoved(Happening, frozen=True):

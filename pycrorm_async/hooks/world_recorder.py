@@ -112,6 +112,7 @@ class WorldRecorder(ObjectRows[Object]):
                 self._color(added),
                 *_model(added),
                 added.mass_kg,
+                clean(added.base_link) or None,
             ),
             row_of=added,
         )

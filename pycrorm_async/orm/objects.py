@@ -131,6 +131,7 @@ class Object(RowOfEvent, Base):
         description_fingerprint: fingerprint of its description when it was added; None in later rows.
         model, serial: of a robot with a `RobotDescription`, when it was added; None in later rows.
         mass_kg: when it was added; None in later rows, and if it is not known.
+        base_link: of a robot, when it was added: the link that has the pose; None in later rows, and for the root link.
         description: its description, in every row; None in episodes of older versions. Not loaded by default: use
             `selectinload(Object.description)` or `await row.awaitable_attrs.description`.
         node_id: the node that moved or added it; None if no node did.
@@ -155,6 +156,7 @@ class Object(RowOfEvent, Base):
     model: Mapped[str | None]
     serial: Mapped[str | None]
     mass_kg: Mapped[float | None]
+    base_link: Mapped[str | None]
 
     pose: Mapped[Pose | None] = one_of(lambda: Object.pose_id, "pose")
     _description: Mapped[ObjectDescription | None] = relationship(

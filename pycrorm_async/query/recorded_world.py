@@ -122,7 +122,15 @@ def world_of(
             kind = _object_type(each)
             robot = robot_description(each.model) if each.model is not None else None
             added = Object(
-                each.name, kind, urdf, each.pose, world=world, color=each.color, mass_kg=each.mass_kg, robot=robot
+                each.name,
+                kind,
+                urdf,
+                each.pose,
+                world=world,
+                color=each.color,
+                mass_kg=each.mass_kg,
+                robot=robot,
+                base_link=each.base_link or "",
             )
             if is_point:
                 added.label(each.name)
@@ -153,6 +161,8 @@ def _shape(then: ObjectThen, world: WorldThen) -> _Shape:
         except (ValueError, ParseError) as error:
             reason = f"its description is missing: {error}"
     links = {each.link for each in world.attachments if each.parent == then.name and each.link is not None}
+    if then.base_link is not None:
+        links.add(then.base_link)
     with contextlib.suppress(DescriptionNotLoadable):  # no robot or environment of that name is built in
         built_in = built_in_urdf(then.name, _object_type(then))
         if _fits(built_in, set(then.joints), links):

@@ -44,13 +44,14 @@ class ObjectThen:
         id, identity_id: of its current row and of its first row in `orm.Object`. An object that is removed and added
             again under its old name has a new identity.
         object_type: name of the member of `ObjectType`.
-        pose: of its root link's frame, in "map".
+        pose: of its base link's frame, in "map".
         joints: rad or m, by name.
-        attached_to: name and link of the object that it moves with; the link is None for the root link.
+        attached_to: name and link of the object that it moves with; the link is None for the base link.
         description_fingerprint: of its description in `WorldThen.descriptions`; None in episodes of older versions.
         color: red, green, blue, opacity, 0 to 1; None if the description alone says it.
         model, serial: of a robot with a `RobotDescription`; None in episodes of older versions.
         mass_kg: None if it is not known.
+        base_link: None for the root link.
     """
 
     id: int
@@ -65,6 +66,7 @@ class ObjectThen:
     model: str | None = None
     serial: str | None = None
     mass_kg: float | None = None
+    base_link: str | None = None
 
 
 @dataclass(frozen=True)
@@ -77,7 +79,7 @@ class RobotThen:
 
 
 class AttachmentThen(NamedTuple):
-    """`child` moves with `link` of `parent` (None: the root link); objects by name."""
+    """`child` moves with `link` of `parent` (None: the base link); objects by name."""
 
     parent: str
     child: str

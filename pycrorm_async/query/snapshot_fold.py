@@ -73,6 +73,7 @@ class _WorldObject:
     model: str | None = None
     serial: str | None = None
     mass_kg: float | None = None
+    base_link: str | None = None
     attached_to: tuple[int, str | None] | None = None
 
 
@@ -163,6 +164,7 @@ class MomentFold:
                     happening.model,
                     happening.serial,
                     happening.mass_kg,
+                    happening.base_link,
                 )
                 self._names[sequence] = name
             case ObjectMoved():
@@ -303,6 +305,7 @@ class MomentFold:
             model=value.model,
             serial=value.serial,
             mass_kg=value.mass_kg,
+            base_link=value.base_link,
         )
 
 

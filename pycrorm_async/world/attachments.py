@@ -21,7 +21,7 @@ __all__ = ["Attachment", "Attachments"]
 
 @dataclass(frozen=True, slots=True)
 class Attachment:
-    """A child that moves with `link` of `parent` (None: its root link) at the pose `relative` to that link."""
+    """A child that moves with `link` of `parent` (None: its base link) at the pose `relative` to that link."""
 
     parent: Object
     child: Object

@@ -3,6 +3,10 @@
 Poses and joint positions are kept here exactly as they were set; Bullet gets a copy and computes the frames of the
 links. A body notifies no observer, checks no limits and ignores attachments: `objects.Object` does that, and code
 outside this package uses `Object` only.
+
+The pose is that of one link, the base, which is the root of the description unless a robot has another one. The pose of
+the root follows from the base's pose and the joints between them, so pose and joint positions are the whole state. A
+joint above the base moves the base, and the root keeps its pose.
 """
 
 from __future__ import annotations
@@ -14,9 +18,10 @@ from typing import Any
 
 from pycrorm_async.world.bullet_loader import captured, engine
 from pycrorm_async.world.enums import JointType
-from pycrorm_async.world.errors import DescriptionNotLoadable
+from pycrorm_async.world.errors import DescriptionNotLoadable, UnknownLink
 from pycrorm_async.world.pose import IDENTITY, Pose, Quaternion, Vector, product, rotated
 from pycrorm_async.world.queries.bounding_boxes import BoundingBox, Frame, Solid, box_around, solids_of
+from pycrorm_async.world.robots.joint_chain import Joint, along, divided
 
 __all__ = ["Body", "Color"]
 
@@ -30,12 +35,18 @@ _AT_ORIGIN: Frame = (Vector(0.0, 0.0, 0.0), IDENTITY)
 
 
 class Body:
-    """One body: its links and joints by name, its pose, its joint positions."""
+    """One body: its links and joints by name, its pose, its joint positions.
 
-    def __init__(self, name: str, urdf: str, client: int, pose: Pose, color: Color | None) -> None:
+    Args:
+        pose: of the base link's frame; None means that the root link's frame is at the origin.
+        base: the base link; empty for the root link.
+    """
+
+    def __init__(
+        self, name: str, urdf: str, client: int, pose: Pose | None, color: Color | None, base: str = ""
+    ) -> None:
         self.client = client
         self.number = _load(name, urdf, client)
-        self.pose = pose
         self.positions: dict[str, float] = {}
         self.limits: dict[str, tuple[float, float]] = {}
         self.joint_types: dict[str, JointType] = {}
@@ -45,17 +56,24 @@ class Body:
         self._inertial: dict[int, Frame] = {}  # Bullet places a link by its centre of mass, in the link's frame
         self._inertial_back: dict[int, Frame] = {}
         self._read()
+        self.base = base or self.root
+        """The link whose frame is the body's pose."""
+        if self.base not in self._link_numbers:
+            self.unload()
+            raise UnknownLink(name, self.base, self.links)
+        self._to_base: tuple[Joint, ...] = divided(urdf, "", base)[1] if self.base != self.root else ()
+        self.pose = self.root_pose = Pose()
         self.solids: dict[str, tuple[Solid, ...]] = {
             link: solids_of(engine(), client, self.number, number, self._inertial[number])
             for link, number in self._link_numbers.items()
         }
         if color is not None:
             self._paint(color)
-        self.place(pose)
+        self.place(along(self._to_base, self.positions) if pose is None else pose)
 
     @property
     def root(self) -> str:
-        """The name of the link whose frame is the body's pose."""
+        """The name of the description's root link."""
         return next(iter(self._link_numbers))
 
     @property
@@ -68,30 +86,37 @@ class Body:
         return self._link_numbers[link]
 
     def place(self, pose: Pose) -> None:
-        """Move the root link's frame to this pose."""
-        position, orientation = _compose((pose.position, pose.orientation), self._inertial[_ROOT])
+        """Move the base link's frame to this pose."""
+        root = self.root_at(pose)
+        position, orientation = _compose((root.position, root.orientation), self._inertial[_ROOT])
         engine().resetBasePositionAndOrientation(self.number, position, orientation, physicsClientId=self.client)
-        self.pose = pose
+        self.pose, self.root_pose = pose, root
+
+    def root_at(self, pose: Pose) -> Pose:
+        """Return the pose that the root link's frame has when the base link's frame is at this pose."""
+        return pose @ along(self._to_base, self.positions).inverse() if self._to_base else pose
 
     def turn(self, positions: Mapping[str, float]) -> None:
-        """Set these joints together, rad or m."""
+        """Set these joints together, rad or m; the root link keeps its pose."""
+        above = [joint for joint in self.movable_above[self.base] if joint in positions]
+        moves_base = any(positions[joint] != self.positions[joint] for joint in above)
         self._turn_in_bullet(positions)
         self.positions.update(positions)
+        if moves_base:
+            self.place(self.root_pose @ along(self._to_base, self.positions))
 
     def link_frame(self, link: str) -> Frame:
         """Return the link's frame in "map"."""
-        number = self._link_numbers[link]
-        if number == _ROOT:
+        if link == self.base:
             return self.pose.position, self.pose.orientation
-        state = engine().getLinkState(self.number, number, computeForwardKinematics=True, physicsClientId=self.client)
-        return self._link_frame(number, state)
+        return self._frame_in_bullet(link)
 
     def link_frame_at(self, link: str, positions: Mapping[str, float]) -> Frame:
         """Return the link's frame in "map" at these joint positions; sets the joints in Bullet and restores them."""
         current = {joint: self.positions[joint] for joint in positions}
         try:
             self._turn_in_bullet(positions)
-            return self.link_frame(link)
+            return self._frame_in_bullet(link)
         finally:
             self._turn_in_bullet(current)
 
@@ -104,7 +129,7 @@ class Body:
             states = engine().getLinkStates(
                 self.number, numbers, computeForwardKinematics=True, physicsClientId=self.client
             )
-        frames = {_ROOT: (self.pose.position, self.pose.orientation)}
+        frames = {_ROOT: (self.root_pose.position, self.root_pose.orientation)}
         for number, state in zip(numbers, states, strict=True):
             frames[number] = self._link_frame(number, state)
         return box_around((frames[self._link_numbers[link]], self.solids[link]) for link in shaped)
@@ -125,6 +150,13 @@ class Body:
         numbers = [self._joint_numbers[joint] for joint in positions]
         values = [[position] for position in positions.values()]
         engine().resetJointStatesMultiDof(self.number, numbers, values, physicsClientId=self.client)
+
+    def _frame_in_bullet(self, link: str) -> Frame:
+        number = self._link_numbers[link]
+        if number == _ROOT:
+            return self.root_pose.position, self.root_pose.orientation
+        state = engine().getLinkState(self.number, number, computeForwardKinematics=True, physicsClientId=self.client)
+        return self._link_frame(number, state)
 
     def _link_frame(self, number: int, state: Sequence[Any]) -> Frame:
         # Bullet returns the link's own frame in single precision; its inertial frame has double precision.

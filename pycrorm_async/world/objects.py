@@ -51,15 +51,17 @@ class Object:
         name: unique in its world.
         object_type: the kind of object; the first one of type ROBOT becomes `world.robot`.
         description: URDF text, or the path of a .urdf file; None means the built-in shape for that name and type.
-        pose: pose of the root link's frame, in "map"; None means the origin. `reset` restores it.
+        pose: pose of the base link's frame, in "map"; None means the root link's at the origin. `reset` restores it.
         world: the world to add it to; None means the current world of this context.
         color: red, green, blue, opacity, 0 to 1.
         mass_kg: None means the sum of the masses in the description, which may be unknown.
         robot: the description of a robot; None means the built-in or registered one with the object's name. Without
             `description` the model is that of the robot's description, or the built-in one of its name.
+        base_link: the link whose pose is the robot's pose, empty for the root link; None means that of the robot's
+            description. The base link of any other object is its root link.
 
     Raises:
-        ObjectRefused, NoWorld, WorldClosed, DuplicateName, DescriptionNotLoadable, PoseRefused.
+        ObjectRefused, NoWorld, WorldClosed, DuplicateName, DescriptionNotLoadable, PoseRefused, UnknownLink.
     """
 
     name: str
@@ -87,6 +89,7 @@ class Object:
         color: Color | None = None,
         mass_kg: float | None = None,
         robot: RobotDescription | None = None,
+        base_link: str | None = None,
     ) -> None:
         _check_identity(name, object_type)
         _check_mass(name, mass_kg)
@@ -100,9 +103,15 @@ class Object:
         self.object_type = object_type
         self.world = world
         self.copy_of = None
-        self.original_pose = _check_pose(name, pose if pose is not None else Pose())
-        if robot is None and object_type is ObjectType.ROBOT:
+        if pose is not None:
+            _check_pose(name, pose)
+        is_robot = object_type is ObjectType.ROBOT
+        if base_link and not is_robot:
+            raise ObjectRefused(f"only a robot has a base link other than its root, but {name!r} is {object_type.name}")
+        if robot is None and is_robot:
             robot = robot_description(name)
+        if base_link is None and is_robot and robot is not None:
+            base_link = robot.base_link
         if description is None and robot is not None:
             description = robot.urdf
         if description is None:
@@ -112,7 +121,8 @@ class Object:
         self.color = color
         self._mass_kg = mass_kg
         self.chains = {}
-        self.body = Body(name, self.description_text, client, self.original_pose, color)
+        self.body = Body(name, self.description_text, client, pose, color, base_link or "")
+        self.original_pose = self.body.pose
         world.add(self)
 
     def __repr__(self) -> str:
@@ -126,7 +136,7 @@ class Object:
         return self.body.pose
 
     def set_pose(self, pose: Pose) -> None:
-        """Move the root link's frame to this pose, together with the objects attached to it.
+        """Move the base link's frame to this pose, together with the objects attached to this one.
 
         An object that is attached to a parent stays attached, at its new pose relative to the parent.
 
@@ -135,15 +145,24 @@ class Object:
         """
         self.check_present()
         self.body.place(_check_pose(self.name, pose))
-        attachments = self.world.attachments
-        if (attachment := attachments.of(self)) is not None:
-            attachments.put(attachment.parent, self, attachment.link)
-        self.world.notify_moved([self, *attachments.carry(self)])
+        self._keep_attached()
+        self.world.notify_moved([self, *self.world.attachments.carry(self)])
+
+    @property
+    def base_link(self) -> str:
+        """The link whose frame is a robot's pose; empty for the root link."""
+        return "" if self.body.base == self.body.root else self.body.base
+
+    def root_pose(self, pose: Pose | None = None) -> Pose:
+        """Return the pose of the root link's frame, now or with the object at `pose` and its joints as they are."""
+        return self.body.root_pose if pose is None else self.body.root_at(pose)
 
     def link_pose(self, link: str | None = None) -> Pose:
-        """Return the pose of a link's frame in "map"; None means the root link. Raises `UnknownLink`."""
-        if link is None or link == self.body.root:
+        """Return the pose of a link's frame in "map"; None means the base link. Raises `UnknownLink`."""
+        if link is None or link == self.body.base:
             return self.body.pose
+        if link == self.body.root:
+            return self.body.root_pose
         self._check_link(link)
         self.check_present()
         position, orientation = self.body.link_frame(link)
@@ -235,8 +254,11 @@ class Object:
             raise UnknownJoint(self.name, joint, self.joints) from None
 
     def joints_above(self, link: str | None) -> tuple[str, ...]:
-        """Return the movable joints between a link and the root, nearest first. Raises `UnknownLink`."""
-        return () if link is None else self.body.movable_above[self._check_link(link)]
+        """Return the movable joints between a link (None: the base link) and the root, nearest first.
+
+        Raises `UnknownLink`.
+        """
+        return self.body.movable_above[self.body.base if link is None else self._check_link(link)]
 
     def set_joint_position(self, joint: str, position: float) -> None:
         """Set one joint; see `set_joint_positions`."""
@@ -245,7 +267,7 @@ class Object:
     def set_joint_positions(self, positions: Mapping[str, float]) -> None:
         """Set joints, rad or m, in one motion, and carry along the objects attached to the links they move.
 
-        All errors are raised before anything is moved.
+        A joint above the base link moves the base too. All errors are raised before anything is moved.
 
         Raises:
             JointLimitExceeded: a position is outside its hard limits (by more than 1e-6) or not finite.
@@ -259,16 +281,20 @@ class Object:
             if not (within and abs(position) <= COORDINATE_MAX):
                 raise JointLimitExceeded(self.name, joint, position, (lower, upper))
         if targets:
+            before = self.body.pose
             self.body.turn(targets)
-            carried = self.world.attachments.carry(self, targets)
+            moved = [self] if self.body.pose != before else []
+            if moved:
+                self._keep_attached()
+            moved += self.world.attachments.carry(self, targets)
             self.world.notify_joints(self, targets)
-            self.world.notify_moved(carried)
+            self.world.notify_moved(moved)
 
     # --- attachments ------------------------------------------------------------------------------------------
 
     @property
     def attachments(self) -> dict[Object, str | None]:
-        """The attached objects, each with the link it moves with (None: the root link)."""
+        """The attached objects, each with the link it moves with (None: the base link)."""
         return {each.child: each.link for each in self.world.attachments.on(self)}
 
     @property
@@ -278,7 +304,7 @@ class Object:
         return None if attachment is None else attachment.parent
 
     def attach(self, child: Object, link: str | None = None) -> None:
-        """Attach `child` at its current pose to `link` (None: the root link), so that it moves with it.
+        """Attach `child` at its current pose to `link` (None: the base link), so that it moves with it.
 
         Raises:
             AttachmentRefused: the child is attached already, to this or another object, or it carries this one.
@@ -315,14 +341,14 @@ class Object:
         self.check_present()
         self.detach_all()
         joints = {joint: 0.0 for joint, position in self.body.positions.items() if position != 0.0}
+        before = self.body.pose
         if joints:
             self.body.turn(joints)
-        moved = self.body.pose != self.original_pose
-        if moved:
+        if self.body.pose != self.original_pose:
             self.body.place(self.original_pose)
         if joints:
             self.world.notify_joints(self, joints)
-        if moved:
+        if self.body.pose != before:
             self.world.notify_moved([self])
 
     def remove(self) -> None:
@@ -334,6 +360,12 @@ class Object:
         _ = self.world.client
         if not self.world.has(self):
             raise ObjectNotInWorld(self.name, tuple(present.name for present in self.world.objects))
+
+    def _keep_attached(self) -> None:
+        """Keep the attachment to the parent at the object's new pose."""
+        attachments = self.world.attachments
+        if (attachment := attachments.of(self)) is not None:
+            attachments.put(attachment.parent, self, attachment.link)
 
     def _check_link(self, link: str) -> str:
         if link not in self.body.movable_above:

@@ -56,7 +56,7 @@ class WorldObserver(Protocol):
         ...
 
     def object_attached(self, parent: Object, child: Object, link: str | None) -> None:
-        """Called after `child` was attached to `link` of `parent` (None: its root link)."""
+        """Called after `child` was attached to `link` of `parent` (None: its base link)."""
         ...
 
     def object_detached(self, parent: Object, child: Object, link: str | None) -> None:

@@ -97,12 +97,13 @@ def _check(obj: Object, object_state: ObjectState) -> None:
 def _apply(states: Mapping[Object, ObjectState]) -> _Differences:
     differences = _Differences([], [])
     for obj, object_state in states.items():
-        positions = obj.body.positions
+        positions, before = obj.body.positions, obj.pose
         joints = {joint: value for joint, value in object_state.joints.items() if positions[joint] != value}
         if joints:
             obj.body.turn(joints)
             differences.joints.append((obj, joints))
         if obj.pose != object_state.pose:
             obj.body.place(object_state.pose)
+        if obj.pose != before:
             differences.poses.append(obj)
     return differences

@@ -73,12 +73,13 @@ def _copy_object(obj: Object, copy: BulletWorld) -> Object:
         world=copy,
         color=obj.color,
         mass_kg=obj.mass_kg,
+        base_link=obj.base_link,
     )
     object_copy.copy_of = obj
     object_copy.robot_description = obj.robot_description
     object_copy.chains = obj.chains
-    object_copy.body.place(obj.pose)
     object_copy.body.turn(obj.joint_positions())
+    object_copy.body.place(obj.pose)
     return object_copy
 
 

@@ -167,7 +167,7 @@ def test_a_node_with_a_robot_is_a_node_a_pose_and_a_leaf() -> None:
         "object": [
             (
                 row(1), 1, "Object", "pr2", "ROBOT", row(1), None, row(1), time_us(1), None,
-                '{"torso_lift_joint":0.25,"wheel":-1.5}', "urdf-1", "[1.0,0.0,0.5,1.0]", "pr2", "7", None,
+                '{"torso_lift_joint":0.25,"wheel":-1.5}', "urdf-1", "[1.0,0.0,0.5,1.0]", "pr2", "7", None, None,
             ),
         ],
         "pose": [
@@ -294,9 +294,9 @@ def test_a_part_and_a_believed_object_have_rows_of_their_own() -> None:
     assert rows_by_table["object"][1:] == [
         (
             row(2, 2), 1, "ObjectPart", "handle", "GENERIC_OBJECT", row(2, 2), row(1), None, time_us(2), row(2),
-            *[None] * 6,
+            *[None] * 7,
         ),
-        (row(2, 3), 1, "BelieveObject", "cup", None, None, None, None, time_us(2), row(2), *[None] * 6),
+        (row(2, 3), 1, "BelieveObject", "cup", None, None, None, None, time_us(2), row(2), *[None] * 7),
     ]  # fmt: skip
     assert rows_by_table["pose"][1:] == [(row(2, 2), 1, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 1.0, "map", POSE_US)]
     assert rows_by_table["open_action(id,process_metadata_id,object_designator_id,cup_id)"] == [
@@ -325,7 +325,7 @@ def test_each_change_of_the_world_is_one_row() -> None:
     script.put(ObjectRemoved(milk_before, root))
     rows_by_table = rows_of(script)
     assert rows_by_table["object"][2] == (
-        row(4), 1, "Object", "milk", "MILK", row(4), None, row(2), time_us(4), row(3), *[None] * 6,
+        row(4), 1, "Object", "milk", "MILK", row(4), None, row(2), time_us(4), row(3), *[None] * 7,
     )  # fmt: skip
     assert rows_by_table["pose"][2] == (row(4), 1, 9.0, 9.0, 9.0, 0.0, 0.0, 0.0, 1.0, "map", POSE_US)
     assert rows_by_table["attachment"] == [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -10,7 +11,16 @@ import pytest
 from pycrorm_async import world_of
 from pycrorm_async.errors import CallerError
 from pycrorm_async.query.snapshot import Moment, ObjectThen, WorldThen
-from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose, WorldMode, current_world
+from pycrorm_async.world import (
+    COURIER,
+    BulletWorld,
+    Object,
+    ObjectType,
+    Pose,
+    WorldMode,
+    current_world,
+    register_robot,
+)
 from pycrorm_async.world.errors import DuplicateName, UnknownJoint, UnknownLink, WorldClosed
 from pycrorm_async.world.models.primitives import box_urdf
 
@@ -74,6 +84,21 @@ def test_a_point_has_the_recorded_joints_links_and_attachments(name: str) -> Non
         }
         robot.set_pose(Pose([5, 5, 5], AT.orientation))
         assert milk.pose.position == bowl.pose.position == pytest.approx((5, 5, 5))
+
+
+def test_a_point_whose_base_link_is_recorded_is_at_its_pose() -> None:
+    then = replace(recorded_snapshot("rover", "ROBOT", joints={"arm": 0.5}), base_link="base")
+    with world_of(snapshot(then)) as world:
+        [rover] = world.objects
+        assert (rover.base_link, rover.pose, rover.link_pose("base")) == ("base", AT, AT)
+
+
+def test_a_recorded_robot_has_the_recorded_base_link_and_not_that_of_its_description_here() -> None:
+    register_robot(replace(COURIER, name="rover", base_link="column_link"))
+    then = replace(recorded_snapshot("courier", "ROBOT"), model="rover")
+    with world_of(snapshot(then)) as world:
+        [rover] = world.objects
+        assert (rover.base_link, rover.root_pose()) == ("", AT)
 
 
 def test_a_users_description_replaces_the_built_in_shape(tmp_path: Path) -> None:

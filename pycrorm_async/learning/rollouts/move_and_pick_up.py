@@ -19,7 +19,7 @@ from pycrorm_async.plan.actions.descriptions import ActionDescription
 from pycrorm_async.plan.current_robot import require_robot
 from pycrorm_async.plan.failures import ObjectUnreachable
 from pycrorm_async.plan.locations.base_clearance import base_clearance
-from pycrorm_async.plan.locations.base_poses import face
+from pycrorm_async.plan.locations.base_poses import base_height_m, face
 from pycrorm_async.plan.object_designators import ObjectDesignatorDescription, ObjectLike, designator_of, in_world
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.enums import Arms, Grasp
@@ -157,7 +157,8 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
         for _ in range(_DRAWS_MAX):
             for choice in policy.sample(self._rng, self.samples):
                 place = self.chosen(choice).standing_position
-                if all(clearance.refusal(each) is None for each in (place, face(place, self.target.pose))):
+                facing = face(place, self.target.pose, height_m=place.position.z)
+                if clearance.refusal(place) is None and clearance.refusal(facing) is None:
                     clear.append(choice)
             if len(clear) >= self.samples:
                 break
@@ -169,7 +170,7 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
     def chosen(self, choice: PickUpChoice) -> MoveAndPickUpPerformable:
         """Return the action for this choice and the object's current pose.
 
-        The base's position is the point of the floor that has these x and y in the object's own frame. Raises
+        The base's position is above the point of the floor that has these x and y in the object's own frame. Raises
         `ObjectUnreachable` for an object that lies on its side, whose x-y plane does not map to the floor.
         """
         pose = self.target.pose
@@ -178,7 +179,7 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
             message = f"{self.target.name} lies on its side: its frame gives no position on the floor"
             raise ObjectUnreachable(message, self.target.name)
         x, y, z = (pose @ Pose((choice.relative_x, choice.relative_y, 0.0))).position
-        standing_position = Pose((x - z * up.x / up.z, y - z * up.y / up.z, 0.0))
+        standing_position = Pose((x - z * up.x / up.z, y - z * up.y / up.z, base_height_m()))
         return MoveAndPickUpPerformable(standing_position, self.target, choice.arm, choice.grasp)
 
 

@@ -18,12 +18,14 @@ from pycrorm_async.plan.locations.base_clearance import BaseClearance, base_clea
 from pycrorm_async.plan.motions.process_modules import chosen_limits
 from pycrorm_async.plan.object_designators import ObjectLike, in_world, pose_of
 from pycrorm_async.world.enums import Arms, Grasp
+from pycrorm_async.world.observers import current_world
 from pycrorm_async.world.pose import Pose, yaw_quaternion
 from pycrorm_async.world.queries.costmaps import Costmap, GaussianCostmap, OccupancyCostmap, VisibilityCostmap
+from pycrorm_async.world.robots.acting_robot import acting_robot
 from pycrorm_async.world.robots.kinematics import Unreachable, solve
 from pycrorm_async.world.robots.robot_description import Drive, PR2Description
 
-__all__ = ["Reach", "face", "reaching_arms", "resolve_robot", "base_poses"]
+__all__ = ["Reach", "base_height_m", "face", "reaching_arms", "resolve_robot", "base_poses"]
 
 CELLS_MAX = 600
 """Bounds the cells per search at which kinematics is checked, so that a search without a solution ends."""
@@ -56,9 +58,9 @@ def base_poses(
     robots = [each for each in (reacher, viewer) if each is not None]
     clearance = base_clearance(robots)
     costmap = _costmap(target, goal, robots, viewer, clearance)
-    clear = 0
+    clear, height_m = 0, base_height_m(reacher or viewer)
     for cell in _cells(costmap, robots, every=clearance is not None):
-        base_pose = face(cell, goal)
+        base_pose = face(cell, goal, height_m=height_m)
         if clearance is not None and (collision := clearance.refusal(base_pose)) is not None:
             yield base_pose, Reach(refusal=collision)
             continue
@@ -103,11 +105,20 @@ def resolve_robot(meant: ObjectLike) -> CurrentRobot:
     return CurrentRobot(body, body.robot_description)
 
 
-def face(place: Pose, goal: Pose, *, turned: float = 0.0) -> Pose:
-    """Return the pose on the floor at the place that faces the goal, rotated by `turned` (rad) to the left."""
+def base_height_m(robot: CurrentRobot | None = None) -> float:
+    """Return the height of a robot's base link, which driving keeps: of this robot, else of the acting one, else 0."""
+    if robot is not None:
+        return robot.body.pose.position.z
+    world = current_world.get()
+    acting = acting_robot(world) if world is not None else None
+    return acting.pose.position.z if acting is not None else 0.0
+
+
+def face(place: Pose, goal: Pose, *, height_m: float, turned: float = 0.0) -> Pose:
+    """Return the upright pose at the place that faces the goal, rotated by `turned` (rad) to the left."""
     x, y, _ = place.position
     heading = math.atan2(goal.position.y - y, goal.position.x - x) + turned
-    return Pose((x, y, 0.0), yaw_quaternion(heading))
+    return Pose((x, y, height_m), yaw_quaternion(heading))
 
 
 def reaching_arms(

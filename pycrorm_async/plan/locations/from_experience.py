@@ -20,7 +20,7 @@ from pycrorm_async.plan.failures import ObjectUnreachable, PlanFailure
 from pycrorm_async.plan.field_types import check_properties
 from pycrorm_async.plan.geometry.grasp_poses import pick_up_poses
 from pycrorm_async.plan.locations.base_clearance import base_clearance
-from pycrorm_async.plan.locations.base_poses import Reach, reaching_arms, resolve_robot
+from pycrorm_async.plan.locations.base_poses import Reach, base_height_m, reaching_arms, resolve_robot
 from pycrorm_async.plan.locations.designators import Location, LocationDesignator
 from pycrorm_async.plan.object_designators import ObjectDesignator, ObjectLike, designator_of, pose_of
 from pycrorm_async.world.enums import Arms
@@ -130,9 +130,10 @@ class _ExperienceLocation(LocationDesignator):
         free = OccupancyCostmap(
             require_world(), origin, distance_to_obstacle_m=CLEARANCE_M, size_cells=_CELLS, ignore=ignored
         )
+        height_m = base_height_m(robot)
         for each in self.past:
             pose = target_pose @ each.stand
-            base_pose = _upright_pose(pose)
+            base_pose = _upright_pose(pose, height_m)
             if base_pose is None:
                 yield Refusal(pose, "the base would lean")
                 continue
@@ -153,11 +154,11 @@ class _ExperienceLocation(LocationDesignator):
         return ObjectUnreachable(f"no past success is usable for {name} in this scene", name)
 
 
-def _upright_pose(base: Pose) -> Pose | None:
-    """Project the base pose to the floor; None if it leans, because the object lies and the recorded ones stood."""
+def _upright_pose(base: Pose, height_m: float) -> Pose | None:
+    """Move the base pose to this height; None if it leans, because the object lies and the recorded ones stood."""
     if rotated(base.orientation, (0.0, 0.0, 1.0)).z < _UPRIGHT_MIN:
         return None
-    return Pose((base.position.x, base.position.y, 0.0), yaw_quaternion(base.yaw), base.frame)
+    return Pose((base.position.x, base.position.y, height_m), yaw_quaternion(base.yaw), base.frame)
 
 
 def _reach(robot: CurrentRobot, base_pose: Pose, target_pose: Pose, past: PastSuccess) -> Reach:

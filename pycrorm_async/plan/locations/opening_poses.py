@@ -14,7 +14,7 @@ from pycrorm_async.plan.current_robot import CurrentRobot
 from pycrorm_async.plan.geometry.articulation import Handle, closed_position, hand_poses, handle_of, opened_position
 from pycrorm_async.plan.geometry.grasp_poses import approach
 from pycrorm_async.plan.locations.base_clearance import base_clearance
-from pycrorm_async.plan.locations.base_poses import Reach, face, reaching_arms, resolve_robot
+from pycrorm_async.plan.locations.base_poses import Reach, base_height_m, face, reaching_arms, resolve_robot
 from pycrorm_async.plan.object_designators import ObjectLike
 from pycrorm_async.world.enums import Arms
 from pycrorm_async.world.pose import Pose
@@ -41,12 +41,12 @@ def opening_poses(part: ObjectLike, robot: ObjectLike, arm: Arms | None) -> Iter
     handle, reacher = handle_of(part), resolve_robot(robot)
     handle_pose = handle.whole.link_pose_at(handle.link, {handle.joint: closed_position(handle)})
     goals = _goals(handle)
-    clearance = base_clearance([reacher])
+    clearance, height_m = base_clearance([reacher]), base_height_m(reacher)
     for costmap in _costmaps(handle, handle_pose, reacher):
         cells = costmap.best(CELLS_MAX)
         for number in range(HEADINGS):
             for cell in cells:
-                base_pose = face(cell, handle_pose, turned=number * math.tau / HEADINGS)
+                base_pose = face(cell, handle_pose, height_m=height_m, turned=number * math.tau / HEADINGS)
                 collision = clearance.refusal(base_pose) if clearance is not None else None
                 if collision is not None:
                     yield base_pose, Reach(refusal=collision)

@@ -63,7 +63,7 @@ def _turned(robot: CurrentRobot, target: Pose) -> dict[str, float]:
         tool_link=description.camera_link,
         tool_in_link=description.camera_in_link,
     )
-    point = target.relative_to(body.pose).position
+    point = target.relative_to(body.root_pose()).position
     positions = body.joint_positions()
     for _ in range(ROUNDS_MAX):
         largest = 0.0

@@ -176,7 +176,7 @@ def _check_base_clear(robot: CurrentRobot, goal: Pose) -> None:
     """Raise `NavigationGoalInCollision` if the base, the torso or the head collides at this pose of the base."""
     check_in_map(goal)
     links = robot.base_links()
-    carried = [obj for obj, link in robot.body.attachments.items() if (link or robot.body.body.root) in links]
+    carried = [obj for obj, link in robot.body.attachments.items() if (link or robot.body.body.base) in links]
     collisions = collisions_at(robot.body, {}, links=links, carried=carried, base=goal)
     if collisions:
         part, obj = collisions[0]

@@ -236,7 +236,7 @@ def _object_added(event: StoredEvent, added: ObjectAdded, _designators: Designat
     joints = json_text(added.joints) if added.joints else None
     color = json_text(added.color) if added.color is not None else None
     rows.inserts["pose"].append(pose_row(own, number, added.pose))
-    details = joints, added.description, color, added.model, added.serial, added.mass_kg
+    details = joints, added.description, color, added.model, added.serial, added.mass_kg, added.base_link
     rows.inserts["object"].append((*_object_row(event, added, own, own, node), *details))
 
 

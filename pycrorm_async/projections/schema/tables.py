@@ -41,7 +41,6 @@ Storage: TypeAlias = Literal["key", "row", "pose", "object", "integer", "real", 
 
 OWN = "pycrorm_own_"
 """The prefix of the tables of custom projections, so that they never collide with the table of a designator."""
-
 EPISODE = "process_metadata_id"
 """The column that names the episode of a row. In `process_metadata` and `simulated_episode` it is `id`."""
 
@@ -138,6 +137,7 @@ CORE: dict[str, dict[str, Storage]] = {
         "model": "text",
         "serial": "text",
         "mass_kg": "real",
+        "base_link": "text",
     },
     "object_removal": {
         **_ROW,

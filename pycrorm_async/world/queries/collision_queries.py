@@ -50,18 +50,18 @@ def _moved(robot: Object, positions: Mapping[str, float], carried: Iterable[Obje
     originals = [(obj, obj.pose, robot.attachments[obj]) for obj in carried]
     relative_poses = [pose.relative_to(robot.link_pose(link)) for _, pose, link in originals]
     try:
-        if base is not original_base:
-            body.place(base)
         if positions:
             body.turn(positions)
+        if base is not original_base:
+            body.place(base)
         for (obj, _, link), relative_pose in zip(originals, relative_poses, strict=True):
             obj.body.place(robot.link_pose(link) @ relative_pose)
         yield
     finally:
-        if base is not original_base:
-            body.place(original_base)
         if original_positions:
             body.turn(original_positions)
+        if robot.pose is not original_base:
+            body.place(original_base)
         for obj, pose, _ in originals:
             obj.body.place(pose)
 

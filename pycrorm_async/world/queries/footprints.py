@@ -33,14 +33,14 @@ _ROUNDING_M = 1e-9
 
 
 class Footprint(NamedTuple):
-    """A rectangle on the floor in the axes of the robot's root link, m."""
+    """A rectangle on the floor in the axes of the robot's base link, m."""
 
     x: tuple[float, float]
     y: tuple[float, float]
 
     @property
     def inner_radius_m(self) -> float:
-        """The radius of the largest circle around the root link's origin inside the rectangle; 0 if it is outside."""
+        """The radius of the largest circle around the base link's origin inside the rectangle; 0 if it is outside."""
         return max(0.0, min(-self.x[0], self.x[1], -self.y[0], self.y[1]))
 
 
@@ -52,7 +52,7 @@ def footprint_of(robot: Object, links: Collection[str]) -> Footprint:
     origin = robot.pose
     parts: list[tuple[Object, str]] = [(robot, link) for link in links]
     for child, link in robot.attachments.items():
-        if (link or robot.body.root) in links:
+        if (link or robot.body.base) in links:
             parts += [(child, each) for each in child.links]
     placed = []
     for whole, link in parts:

@@ -17,19 +17,18 @@ from __future__ import annotations
 import math
 import tempfile
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
-from xml.etree.ElementTree import Element, SubElement, fromstring, tostring
+from xml.etree.ElementTree import Element, SubElement, tostring
 
 import numpy as np
 import optik
 from numpy.typing import NDArray
 
-from pycrorm_async.errors import CallerError
 from pycrorm_async.world.enums import JointType
-from pycrorm_async.world.pose import Pose, Quaternion, Vector, product, rotated
+from pycrorm_async.world.pose import Pose, Vector, product, rotated
+from pycrorm_async.world.robots.joint_chain import Joint, along, divided
 from pycrorm_async.world.robots.robot_description import Bounds
 
-__all__ = ["Chain", "Joint", "joints_between"]
+__all__ = ["Chain"]
 
 STARTS_MAX = 100
 """Bounds the starts of a search: with 20, one of a thousand reachable poses was refused, with 100 none of 4,000."""
@@ -43,21 +42,6 @@ DESCENTS_MAX, STEPS_MAX = 20, 60
 _EXACT, _DAMPING_MAX = 1e-9, 1e6
 _PARALLEL = 1e-9
 _GOLDEN = (math.sqrt(5) - 1) / 2
-_ENDLESS = Bounds(-math.inf, math.inf)
-_MOVABLE = {"revolute": JointType.REVOLUTE, "continuous": JointType.CONTINUOUS, "prismatic": JointType.PRISMATIC}
-
-
-class Joint(NamedTuple):
-    """One joint of a chain; `kind` is FIXED if it cannot move."""
-
-    name: str
-    kind: JointType
-    child: str
-    origin: Pose
-    rpy: tuple[float, float, float]
-    """The rotation of `origin` as the model has it, which no conversion rounds."""
-    axis: Vector
-    bounds: Bounds
 
 
 class Chain:
@@ -73,7 +57,7 @@ class Chain:
     """
 
     def __init__(self, urdf: str, *, base_link: str, tool_link: str, tool_in_link: Pose | None) -> None:
-        self._above, self._arm = _divided(urdf, base_link, tool_link)
+        self._above, self._arm = divided(urdf, base_link, tool_link)
         self._tool = tool_in_link
         self._solvers: dict[tuple[Bounds, ...], optik.Robot] = {}
         self.joints = tuple(each.name for each in self._arm if each.kind is not JointType.FIXED)
@@ -82,7 +66,7 @@ class Chain:
         """The limits of the model."""
         last = max((number for number, each in enumerate(self._arm) if each.kind is not JointType.FIXED), default=-1)
         self._fixed_behind = len(self._arm) - last - 1
-        behind = _along(self._arm[last + 1 :], {})
+        behind = along(self._arm[last + 1 :], {})
         self._behind = behind if tool_in_link is None else behind @ tool_in_link
         """The tool's frame in the link that the last joint moves."""
         first = next((number for number, each in enumerate(self._arm) if each.kind is not JointType.FIXED), 0)
@@ -94,20 +78,20 @@ class Chain:
 
     def forward(self, positions: Mapping[str, float]) -> Pose:
         """Return the tool's frame in the root link at these joint positions; joints that are left out are at 0."""
-        tool = _along((*self._above, *self._arm), positions)
+        tool = along((*self._above, *self._arm), positions)
         return tool if self._tool is None else tool @ self._tool
 
     def axes(self, positions: Mapping[str, float]) -> dict[str, Vector]:
         """Return the axis of each revolute joint of the arm, in the root link, at these joint positions."""
         return {
-            each.name: rotated(_along((*self._above, *self._arm[: number + 1]), positions).orientation, each.axis)
+            each.name: rotated(along((*self._above, *self._arm[: number + 1]), positions).orientation, each.axis)
             for number, each in enumerate(self._arm)
             if each.kind in (JointType.REVOLUTE, JointType.CONTINUOUS)
         }
 
     def distance_m(self, target: Pose, positions: Mapping[str, float]) -> float:
         """Return the distance of a target in the root link from the first joint of the arm, with that joint at 0."""
-        first = _along((*self._above, *self._to_first), {**positions, **dict.fromkeys(self.joints, 0.0)})
+        first = along((*self._above, *self._to_first), {**positions, **dict.fromkeys(self.joints, 0.0)})
         return math.dist(first.position, target.position)
 
     def solve(
@@ -123,7 +107,7 @@ class Chain:
         if any(lower > upper for lower, upper in ranges):
             return None
         # The last link that a joint moves, in the link at which the arm begins.
-        goal = (target @ self._behind.inverse()).relative_to(_along(self._above, positions))
+        goal = (target @ self._behind.inverse()).relative_to(along(self._above, positions))
         moving = self._arm[: len(self._arm) - self._fixed_behind]
         if any(each.kind is JointType.PRISMATIC for each in moving):
             angles = _descend(moving, ranges, goal)
@@ -140,88 +124,6 @@ class Chain:
             name: min(max(angle, lower), upper)
             for name, angle, (lower, upper) in zip(self.joints, angles, ranges, strict=True)
         }
-
-
-def joints_between(urdf: str, base_link: str, tool_link: str) -> tuple[str, ...]:
-    """Return the movable joints between two links, from the base to the tool. Raises `CallerError` as `Chain` does."""
-    return tuple(each.name for each in _divided(urdf, base_link, tool_link)[1] if each.kind is not JointType.FIXED)
-
-
-def _divided(urdf: str, base_link: str, tool_link: str) -> tuple[tuple[Joint, ...], tuple[Joint, ...]]:
-    """Return the joints from the root to the base link, and those from there to the tool."""
-    robot = fromstring(urdf)  # noqa: S314  loaded by the caller's own process, and checked before
-    links = {each.get("name", "") for each in robot.findall("link")}
-    for link in (base_link, tool_link):
-        if link and link not in links:
-            raise CallerError(f"the model {robot.get('name')!r} has no link {link!r}: correct the robot's description")
-    above = {_end(each, "child"): each for each in robot.findall("joint")}
-    path: list[Joint] = []
-    link = tool_link
-    while link in above:
-        path.insert(0, _joint(above[link]))
-        link = _end(above[link], "parent")
-    passed = [link, *(each.child for each in path)]  # from the root to the tool
-    if base_link and base_link not in passed:
-        raise CallerError(f"{tool_link!r} does not hang on {base_link!r}: correct the robot's description")
-    begin = passed.index(base_link) if base_link else 0
-    return tuple(path[:begin]), tuple(path[begin:])
-
-
-def _joint(element: Element) -> Joint:
-    kind = _MOVABLE.get(element.get("type", ""), JointType.FIXED)
-    axis, limit = element.find("axis"), element.find("limit")
-    x, y, z = _numbers(None if axis is None else axis.get("xyz"), (1.0, 0.0, 0.0))
-    length = math.hypot(x, y, z) or 1.0
-    bounds = _ENDLESS
-    if kind is not JointType.CONTINUOUS and limit is not None:
-        bounds = Bounds(float(limit.get("lower", 0.0)), float(limit.get("upper", 0.0)))
-    origin = element.find("origin")
-    at, rpy = (None, None) if origin is None else (origin.get("xyz"), origin.get("rpy"))
-    roll, pitch, yaw = _numbers(rpy, (0.0, 0.0, 0.0))
-    turn = product(product(_about((0, 0, 1), yaw), _about((0, 1, 0), pitch)), _about((1, 0, 0), roll))
-    return Joint(
-        element.get("name", ""),
-        kind,
-        _end(element, "child"),
-        Pose(_numbers(at, (0.0, 0.0, 0.0)), turn),
-        (roll, pitch, yaw),
-        Vector(x / length, y / length, z / length),
-        bounds,
-    )
-
-
-def _end(joint: Element, end: str) -> str:
-    element = joint.find(end)
-    return "" if element is None else element.get("link", "")
-
-
-def _numbers(text: str | None, default: tuple[float, float, float]) -> tuple[float, float, float]:
-    if text is None:
-        return default
-    x, y, z = map(float, text.split())
-    return x, y, z
-
-
-def _along(joints: Sequence[Joint], positions: Mapping[str, float]) -> Pose:
-    """Return the frame of the last joint's child in the parent of the first, without drift: only products."""
-    x = y = z = 0.0
-    turn = Quaternion(0.0, 0.0, 0.0, 1.0)
-    for each in joints:
-        step = rotated(turn, each.origin.position)
-        x, y, z, turn = x + step.x, y + step.y, z + step.z, product(turn, each.origin.orientation)
-        position = 0.0 if each.kind is JointType.FIXED else positions.get(each.name, 0.0)
-        if each.kind is JointType.PRISMATIC:
-            step = rotated(turn, [position * along for along in each.axis])
-            x, y, z = x + step.x, y + step.y, z + step.z
-        elif position:
-            turn = product(turn, _about(each.axis, position))
-    return Pose((x, y, z), turn)
-
-
-def _about(axis: Sequence[float], angle: float) -> Quaternion:
-    x, y, z = axis
-    sine = math.sin(angle / 2)
-    return Quaternion(x * sine, y * sine, z * sine, math.cos(angle / 2))
 
 
 def _norm(pose: Pose) -> float:
@@ -264,7 +166,7 @@ def _miss(
     frame, left = Pose(), iter(angles)
     for each in joints:
         position = 0.0 if each.kind is JointType.FIXED else float(next(left))
-        frame = frame @ _along([each], {each.name: position})
+        frame = frame @ along([each], {each.name: position})
         if each.kind is not JointType.FIXED:
             frames.append((each, frame))
     (x, y, z), turn = frame.position, frame.orientation
@@ -308,7 +210,7 @@ def _solver(joints: Sequence[Joint], ranges: Sequence[Bounds]) -> optik.Robot:
             continue
         origin, rpy = each.origin, each.rpy
         if fixed:
-            origin = _along(fixed, {}) @ each.origin
+            origin = along(fixed, {}) @ each.origin
             rpy = _rpy(origin)
             fixed.clear()
         lower, upper = ranges[number]

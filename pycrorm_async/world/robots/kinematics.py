@@ -88,8 +88,8 @@ def solve(
 ) -> dict[str, float]:
     """Return joint angles by name, rad, that bring the arm's tool frame to the target; moves nothing.
 
-    The robot is taken at its current pose and torso height unless `base` or `torso_height` (m) is passed. For hard
-    limits the narrower of the loaded model's and the description's apply.
+    The robot is taken at its current pose and torso height unless `base` (the pose of its base link) or `torso_height`
+    (m) is passed. For hard limits the narrower of the loaded model's and the description's apply.
 
     Raises:
         Unreachable: no posture within the limits reaches the target.
@@ -99,9 +99,9 @@ def solve(
     description = robot.robot_description
     if description is None:
         raise CallerError(f"{robot.name!r} has no robot description, so its arms are unknown")
-    base = robot.pose if base is None else base
+    root = robot.root_pose(base)
     if not isinstance(description, PR2Description):
-        return _solve_chain(robot, description, arm, target, base, torso_height, limits)
+        return _solve_chain(robot, description, arm, target, root, torso_height, limits)
     arm_description = _one_arm(description.arms, description, arm)
     bounds = _bounds(arm_description, limits)
     if limits is Limits.HARD:
@@ -109,7 +109,7 @@ def solve(
             _narrow(bound, robot.joint_limits(name)) for name, bound in zip(arm_description.joints, bounds, strict=True)
         ]
     height = robot.joint_position(description.torso_joint) if torso_height is None else torso_height
-    reach = _reach(description, arm_description, target, base=base, torso_height=height)
+    reach = _reach(description, arm_description, target, root=root, torso_height=height)
     return _solve(arm_description, arm, target, reach, bounds, limits)
 
 
@@ -133,7 +133,7 @@ def solve_from(
     True
     """
     arm_description = _one_arm(description.arms, description, arm)
-    reach = _reach(description, arm_description, target, base=base, torso_height=torso_height)
+    reach = _reach(description, arm_description, target, root=base, torso_height=torso_height)
     return _solve(arm_description, arm, target, reach, _bounds(arm_description, limits), limits)
 
 
@@ -142,18 +142,18 @@ def _solve_chain(
     description: RobotDescription,
     arm: Arms,
     target: Pose,
-    base: Pose,
+    root: Pose,
     torso_height: float | None,
     limits: Limits,
 ) -> dict[str, float]:
-    """Solve for a robot without a closed form."""
+    """Solve for a robot without a closed form, whose root link is at `root`."""
     arm_description = _one_arm(description.arms, description, arm)
-    _check(target, base)
+    _check(target, root)
     chain = chain_of(robot, arm)
     positions = robot.joint_positions()
     if torso_height is not None and description.torso_joint is not None:
         positions[description.torso_joint] = torso_height
-    goal = target.relative_to(base)
+    goal = target.relative_to(root)
     distance = chain.distance_m(goal, positions)
     if distance > chain.reach_m:
         raise Unreachable(
@@ -243,15 +243,15 @@ def _leads_to(arm_description: PR2Arm, angles: Sequence[float], reach: Reach) ->
 
 
 def _reach(
-    description: PR2Description, arm_description: PR2Arm, target: Pose, *, base: Pose, torso_height: float
+    description: PR2Description, arm_description: PR2Arm, target: Pose, *, root: Pose, torso_height: float
 ) -> Reach:
     """Convert the target to the axes of the torso."""
-    _check(target, base)
-    x, y, z, w = base.orientation
+    _check(target, root)
+    x, y, z, w = root.orientation
     back = Quaternion(-x, -y, -z, w)
-    from_base = rotated(back, [a - b for a, b in zip(target.position, base.position, strict=True)])
+    from_root = rotated(back, [a - b for a, b in zip(target.position, root.position, strict=True)])
     shoulder = _shoulder(description, arm_description, torso_height)
-    tool = Vector(*(a - b for a, b in zip(from_base, shoulder, strict=True)))
+    tool = Vector(*(a - b for a, b in zip(from_root, shoulder, strict=True)))
     return arm_ik.reach(arm_description, tool, product(back, target.orientation))
 
 
@@ -298,9 +298,9 @@ def _one_arm(arms: Mapping[Arms, A], description: RobotDescription, arm: Arms) -
     return arm_description
 
 
-def _check(target: Pose, base: Pose) -> None:
-    if target.frame != base.frame:
-        raise CallerError(f"the target is in frame {target.frame!r}, the robot in {base.frame!r}")
+def _check(target: Pose, root: Pose) -> None:
+    if target.frame != root.frame:
+        raise CallerError(f"the target is in frame {target.frame!r}, the robot in {root.frame!r}")
     if not math.isfinite(sum(target.position) + sum(target.orientation)):
         raise CallerError(f"the target is not finite: {target!r}")
 

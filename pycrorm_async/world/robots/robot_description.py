@@ -1,8 +1,8 @@
 """Describe robots for plans: arms, grippers, torso, head, camera, limits and named postures.
 
 A `RobotDescription` is a constant; the robot's current pose and joint positions are in the world. Lengths are in
-metres, angles in rad, poses of links those of the loaded model (URDF), whose root link is the base. What a robot lacks
-is None or empty in its description, and an action that needs it fails with `CapabilityAbsenceFailure`.
+metres, angles in rad, poses of links those of the loaded model (URDF). What a robot lacks is None or empty in its
+description, and an action that needs it fails with `CapabilityAbsenceFailure`.
 
 >>> PR2.arms[Arms.LEFT].tool_frame
 'l_gripper_tool_frame'
@@ -140,7 +140,7 @@ _VIEW = FieldOfView(1.0, 0.75)  # about that of an ordinary colour camera
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class RobotDescription:
-    """A robot: its base, which is the root link of its model, and what is mounted on it.
+    """A robot: its base and what is mounted on it.
 
     >>> PANDA = RobotDescription(name="panda", drive=Drive.FIXED, arms={Arms.RIGHT: arm}, urdf=Path("panda.urdf"))
     >>> robot = Object("panda", ObjectType.ROBOT, robot=PANDA)
@@ -154,6 +154,9 @@ class RobotDescription:
     """Distinguishes robots of one model; None if there is no need."""
     urdf: str | Path | None = None
     """The model that an `Object` of this robot loads; None for a built-in one. See `Object`."""
+    base_link: str = ""
+    """The link whose pose is the robot's pose, x ahead and z up; empty for the model's root link. It may be above the
+    floor, and joints above it may move it."""
     drive: Drive = Drive.OMNIDIRECTIONAL
     arms: Mapping[Arms, ArmDescription] = field(default_factory=dict)
     torso_joint: str | None = None

@@ -15,7 +15,7 @@ from xml.etree.ElementTree import Element, fromstring
 from pycrorm_async.errors import CallerError
 from pycrorm_async.world.enums import Arms, GripperState
 from pycrorm_async.world.pose import Pose
-from pycrorm_async.world.robots.chain_ik import joints_between
+from pycrorm_async.world.robots.joint_chain import joints_between
 from pycrorm_async.world.robots.robot_description import ArmDescription, RobotDescription, with_payload
 from pycrorm_async.world.urdf_checks import urdf_text
 
@@ -30,6 +30,7 @@ def describe_robot(
     arms: Mapping[Arms, ArmDescription] | None = None,
     park: str = "park",
     payload_kg: float | Mapping[Arms, float] | None = None,
+    base_link: str = "",
     **facts: Any,
 ) -> RobotDescription:
     """Return the description of a robot whose model is this URDF (text, or the path of a file).
@@ -40,12 +41,16 @@ def describe_robot(
 
     Args:
         payload_kg: the greatest mass that each arm lifts, or by arm; a URDF does not have it.
+        base_link: see `RobotDescription`.
         facts: further attributes of `RobotDescription`, such as `drive`, `torso_joint`, `camera_link`.
 
     Raises:
-        CallerError: URDF and SRDF do not fit together, or neither describes an arm that `arms` names.
+        CallerError: URDF and SRDF do not fit together, neither describes an arm that `arms` names, or the model has no
+            such base link.
         DescriptionNotLoadable: the URDF has a fault.
     """
+    if base_link:
+        joints_between(urdf_text(name, urdf), "", base_link)
     postures: dict[str, dict[str, float]] = {}
     if srdf is not None:
         semantics = _parsed(name, srdf)
@@ -56,7 +61,7 @@ def describe_robot(
             arms = _arms(name, urdf_text(name, urdf), semantics, postures.get(park, {}))
     facts.setdefault("postures", postures)
     arms = dict(arms or {}) if payload_kg is None else with_payload(arms or {}, payload_kg)
-    return RobotDescription(name=name, urdf=urdf, arms=arms, **facts)
+    return RobotDescription(name=name, urdf=urdf, base_link=base_link, arms=arms, **facts)
 
 
 def describe_arm(
