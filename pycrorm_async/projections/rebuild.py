@@ -218,7 +218,7 @@ class Rebuild:
         )
 
     async def _gather_statistics(self) -> None:
-        """Let the planner know the new tables: without statistics, questions about them may take minutes."""
+        """Let the planner know the new tables: without statistics, queries of them may take minutes."""
         async with self._log.engine.begin() as connection:
             making = await self._making.generation(connection, "share")
             names = [*(CORE if self._projection is None else ()), *making.layout.leaves]

@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import re
 import shlex
+import shutil
 import sqlite3
 import textwrap
 from pathlib import Path
@@ -74,16 +75,32 @@ def test_the_plan_runs_and_is_recorded(tmp_path: Path) -> None:
     ]
 
 
-def test_the_plan_with_every_expression_runs_and_the_milk_is_at_its_goal(tmp_path: Path) -> None:
-    (tmp_path / "tidy.py").write_text(TIDY)
-    done = pycrorm("run", "tidy.py", cwd=tmp_path)
+@pytest.fixture(scope="module")
+def tidied(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Perform the plan with every expression once, in a folder that keeps its memory. Tests only read it."""
+    folder = tmp_path_factory.mktemp("tidied")
+    (folder / "tidy.py").write_text(TIDY)
+    done = pycrorm("run", "tidy.py", cwd=folder)
     assert done.returncode == 0, done.stderr
     assert "no milk to be seen" not in done.stdout
-    tree = answer("show", "1", cwd=tmp_path)["tree"]
+    return folder
+
+
+async def run_block(block: str, folder: Path, result: str = "None") -> Any:
+    """Run a block of a page with the memory in this folder open, and return its variable `result`."""
+    names: dict[str, Any] = {}
+    opened = f"    async with Memory.open({f'sqlite:///{folder}/pycrorm.db'!r}) as memory:\n"
+    body = textwrap.indent(f"{block}\nreturn {result}", " " * 8)
+    exec(f"from pycrorm_async import Memory\nasync def run():\n{opened}{body}", names)
+    return await names["run"]()
+
+
+def test_the_plan_with_every_expression_runs_and_the_milk_is_at_its_goal(tidied: Path) -> None:
+    tree = answer("show", "1", cwd=tidied)["tree"]
     top = [node["dtype"] for node in tree if node["depth"] == 1]
     assert top == ["Parallel", "Sequential", "Sequential", "TransportAction"]
     assert {node["status"] for node in tree} == {"SUCCEEDED"}
-    with contextlib.closing(sqlite3.connect(tmp_path / "pycrorm.db")) as plain:
+    with contextlib.closing(sqlite3.connect(tidied / "pycrorm.db")) as plain:
         question = "SELECT x, y, z FROM object JOIN pose ON pose.id = pose_id WHERE name = 'milk' ORDER BY object.id"
         *_, resting = plain.execute(question).fetchall()
     assert resting == pytest.approx((1.3, 0.45, 0.95), abs=1e-6)
@@ -164,46 +181,22 @@ def test_the_users_projection_counts_the_attempts(tmp_path: Path) -> None:
     assert [status for *_, status in tried] == ["SUCCEEDED"]
 
 
-async def test_actions_have_their_durations(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "tidy.py").write_text(TIDY)
-    done = await asyncio.to_thread(pycrorm, "run", "tidy.py", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    names: dict[str, Any] = {}
-    exec("from pycrorm_async import Memory", names)
-    body = textwrap.indent(COURSE.replace("> 0.1", ">= 0"), "        ")
-    exec(
-        f"async def asked():\n    async with Memory.open({f'sqlite:///{tmp_path}/pycrorm.db'!r}) as memory:\n{body}",
-        names,
-    )
-    await names["asked"]()
+async def test_actions_have_their_durations(tidied: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    await run_block(COURSE.replace("> 0.1", ">= 0"), tidied)
     lines = [line.split(maxsplit=4) for line in capsys.readouterr().out.splitlines()]
     assert ("TransportAction", "SUCCEEDED") in [(dtype, status) for dtype, status, *_ in lines]
     durations = [float(duration) for _, _, duration, *_ in lines]
     assert durations == sorted(durations, reverse=True)
 
 
-async def test_a_node_shows_the_nodes_around_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "tidy.py").write_text(TIDY)
-    done = await asyncio.to_thread(pycrorm, "run", "tidy.py", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    names: dict[str, Any] = {}
-    exec("from pycrorm_async import Memory", names)
-    opened = f"    async with Memory.open({f'sqlite:///{tmp_path}/pycrorm.db'!r}) as memory:\n"
-    exec(f"async def asked():\n{opened}{textwrap.indent(AROUND, '        ')}        return mover", names)
-    mover = await names["asked"]()
+async def test_a_node_shows_the_nodes_around_it(tidied: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    mover = await run_block(AROUND, tidied, "mover")
     assert mover.kind == "motion"
     assert capsys.readouterr().out.endswith("['TransportAction', None]\n")
 
 
-async def test_episodes_have_their_robots(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "tidy.py").write_text(TIDY)
-    done = await asyncio.to_thread(pycrorm, "run", "tidy.py", cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
-    names: dict[str, Any] = {}
-    exec("from pycrorm_async import Memory", names)
-    opened = f"    async with Memory.open({f'sqlite:///{tmp_path}/pycrorm.db'!r}) as memory:\n"
-    exec(f"async def asked():\n{opened}{textwrap.indent(ROBOTS, '        ')}", names)
-    await names["asked"]()
+async def test_episodes_have_their_robots(tidied: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    await run_block(ROBOTS, tidied)
     assert capsys.readouterr().out.endswith("[('pr2', None)]\n")
 
 
@@ -227,12 +220,7 @@ async def test_failures_are_counted_where_they_began(tmp_path: Path) -> None:
     (tmp_path / "knock.py").write_text(FAILING)
     done = await asyncio.to_thread(pycrorm, "run", "knock.py", cwd=tmp_path)
     assert done.returncode == 1, done.stderr
-    names: dict[str, Any] = {}
-    exec("from pycrorm_async import Memory", names)
-    opened = f"    async with Memory.open({f'sqlite:///{tmp_path}/pycrorm.db'!r}) as memory:\n"
-    body = textwrap.indent(BEGAN, "        ") + "        return frame"
-    exec(f"async def asked():\n{opened}{body}", names)
-    frame = await names["asked"]()
+    frame = await run_block(BEGAN, tmp_path, "frame")
     assert frame.drop(columns="object").to_dict("records") == [
         {"path": "root > Parallel > KnockAction", "reason": "PlanFailure", "times": 2}
     ]
@@ -240,30 +228,21 @@ async def test_failures_are_counted_where_they_began(tmp_path: Path) -> None:
 
 
 async def test_tags_are_given_changed_and_queried(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    names: dict[str, Any] = {}
-    exec("from pycrorm_async import Memory", names)
-    opened = f"    async with Memory.open({f'sqlite:///{tmp_path}/pycrorm.db'!r}) as memory:\n"
-    exec(f"async def asked():\n{opened}{textwrap.indent(TAGGED, '        ')}", names)
-    await names["asked"]()
+    await run_block(TAGGED, tmp_path)
     assert capsys.readouterr().out == "Set the table ['good', 'kitchen', 'night'] {'batch': 7}\n"
 
 
 async def test_observations_are_recorded_and_queried(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    names: dict[str, Any] = {}
-    exec("from pycrorm_async import Memory", names)
-    opened = f"    async with Memory.open({f'sqlite:///{tmp_path}/pycrorm.db'!r}) as memory:\n"
-    exec(f"async def asked():\n{opened}{textwrap.indent(SEEN, '        ')}        return frame", names)
-    frame = await names["asked"]()
+    frame = await run_block(SEEN, tmp_path, "frame")
     assert frame.number.tolist() == [1.5]
     assert "Blob(content=b'the bytes of an image', media_type='image/png')" in capsys.readouterr().out
 
 
 async def test_a_snapshot_is_printed_and_restored_in_another_world(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tidied: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "tidy.py").write_text(TIDY)
-    assert pycrorm("run", "tidy.py", cwd=tmp_path).returncode == 0
+    shutil.copyfile(tidied / "pycrorm.db", tmp_path / "pycrorm.db")
     names: dict[str, object] = {}
     exec("from pycrorm_async.world import *\nfrom pycrorm_async import Memory", names)
     setting = """
