@@ -6,6 +6,7 @@ its own.
 
 from __future__ import annotations
 
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any, NamedTuple
 
@@ -49,8 +50,9 @@ class Provenance(NamedTuple):
 
     @classmethod
     def of(cls, source: PlanSource | None, settings: Settings, clock: Clock) -> Provenance:
-        """Read the versions of the installed libraries; takes about a millisecond."""
-        return cls(source, _installed_libraries(), settings.changed(), clock)
+        """Read the versions of the installed libraries; takes 3 ms the first time."""
+        versions = {name: installed for name in _LIBRARIES if (installed := _version(name)) is not None}
+        return cls(source, versions, settings.changed(), clock)
 
     def fields(self) -> dict[str, Any]:
         """Return the fields of `EpisodeStarted`, with the clock's quality at this moment."""
@@ -66,11 +68,10 @@ class Provenance(NamedTuple):
         }
 
 
-def _installed_libraries() -> dict[str, str]:
-    versions = {}
-    for name in _LIBRARIES:
-        try:
-            versions[name] = version(name)
-        except PackageNotFoundError:  # a source tree that is not installed
-            continue
-    return versions
+@cache
+def _version(package: str) -> str | None:
+    """Return the version of an installed package; None for a source tree that is not installed."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
