@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 import pycrorm_async.orm  # noqa: F401
 from pycrorm_async.cli.main import app
 from pycrorm_async.clock import SYSTEM_CLOCK
-from pycrorm_async.hooks.provenance import Provenance
+from pycrorm_async.recording.writing.provenance import Provenance
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.dialects import dialect_of
