@@ -17,7 +17,7 @@ from pycrorm_async.projections.schema.generations import (
     read_generations,
 )
 from pycrorm_async.projections.schema.materialised_views import materialised_tables
-from pycrorm_async.projections.schema.tables import CORE
+from pycrorm_async.projections.schema.tables import CORE, OF_NO_EPISODE
 from pycrorm_async.projections.table_names import physical_name
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
@@ -49,7 +49,7 @@ async def clear(log: EventLog) -> list[str]:
                 continue
             is_built_in = owner == SHOWN
             tables = [
-                *(CORE if is_built_in else ()),
+                *(CORE | OF_NO_EPISODE if is_built_in else ()),
                 *generation.layout.leaves,
                 *materialised_tables(generation.layout),
                 checkpoints.TABLE if is_built_in else f"{checkpoints.TABLE}_{owner.removeprefix(PROJECTION)}",

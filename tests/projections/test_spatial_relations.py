@@ -23,6 +23,7 @@ from pycrorm_async.events.types import (
 )
 from pycrorm_async.events.values import BlobReference, ObjectReference
 from pycrorm_async.orm import SpatialRelation
+from pycrorm_async.projections.verify.verify import verify
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.recording.declarations.descriptions import Descriptions
 from pycrorm_async.recording.values.missing_values import MissingValues
@@ -32,7 +33,8 @@ from pycrorm_async.world import BulletWorld, Object, ObjectType
 from pycrorm_async.world.models.kitchen import kitchen_urdf
 from pycrorm_async.world.models.link_boxes import link_boxes
 from tests.projections.event_script import PICK_UP, T0_NS, Script, declarations, declared, field, name_of, pose, row
-from tests.projections.sql_queries import stored_and_folded
+from tests.projections.sql_queries import ask, stored_and_folded
+from tests.projections.verify_cases import rebuilt
 
 PLACE = declared(
     "PlaceAction",
@@ -251,3 +253,33 @@ def test_the_boxes_of_the_kitchen_are_those_of_its_links() -> None:
     assert (drawer.center, drawer.half) == ((-1.315, 1.0, 0.74), (0.235, 0.3, 0.1))
     assert (drawer.joint, drawer.axis) == ("kitchen_island_upper_drawer_joint", (1.0, 0.0, 0.0))
     assert "fridge_door" not in boxes
+
+
+async def boxes_by_model(log: EventLog, generation: int = 1001) -> dict[str, int]:
+    return dict(await ask(log, f"SELECT model, count(*) FROM zz_pycrorm_link_box__{generation} GROUP BY model"))
+
+
+@pytest.mark.slow
+async def test_the_boxes_of_a_description_are_stored_once_rebuilt_and_verified(log: EventLog) -> None:
+    declared_, tidying = Declared(), Tidying()
+    kitchen = declared_.description(kitchen_urdf())
+    crate = declared_.description(box_urdf("crate", "0.6 0.4 0.3"))
+    tidying.add("home", "ENVIRONMENT", 9, 0, 0, description=kitchen)
+    records = [*declarations(PICK_UP, PLACE), *declared_.records, *tidying.script.records]
+    projector = await stored_and_folded(log, records)
+    links = sum(not each.link.endswith("_handle") for each in link_boxes(kitchen_urdf()))
+    assert await boxes_by_model(log) == {kitchen: links}  # no object is made from the other one yet
+    again = Script(2)
+    for description in (crate, kitchen, crate):
+        again.put(ObjectAdded("it", "GENERIC_OBJECT", pose(), description=description))
+    await log.append(again.records)
+    await projector.catch_up()
+    assert await boxes_by_model(log) == {kitchen: links, crate: 1}
+    rows = sorted(await ask(log, "SELECT * FROM zz_pycrorm_link_box__1001"), key=repr)
+    async with log.writing() as connection:
+        await connection.exec_driver_sql(f"UPDATE zz_pycrorm_link_box__1001 SET hx = 7.0 WHERE model = '{crate}'")
+    [difference] = (await verify(log)).differences
+    assert str(difference) == "pycrorm_link_box.hx is 7.0, and should be 0.3"
+    await rebuilt(log)
+    assert sorted(await ask(log, "SELECT * FROM zz_pycrorm_link_box__1002"), key=repr) == rows
+    assert (await verify(log)).drift == 0

@@ -235,6 +235,8 @@ def _object_added(event: StoredEvent, added: ObjectAdded, _designators: Designat
     node = _node(event, added.node)
     joints = json_text(added.joints) if added.joints else None
     color = json_text(added.color) if added.color is not None else None
+    if added.description is not None:
+        rows.descriptions.add(added.description)
     rows.inserts["pose"].append(pose_row(own, number, added.pose))
     details = joints, added.description, color, added.model, added.serial, added.mass_kg, added.base_link
     rows.inserts["object"].append((*_object_row(event, added, own, own, node), *details))

@@ -64,6 +64,7 @@ class Rows:
         nodes, episodes: rows to insert, by id.
         inserts: rows to insert into the other core tables, by table.
         leaves: rows to insert into leaf tables, by (table, columns).
+        descriptions: fingerprints of the descriptions of added objects.
         node_ends, episode_ends: updates of rows that an earlier batch inserted.
         lost: numbers of the episodes whose nodes that are RUNNING in the tables become LOST.
     """
@@ -73,6 +74,7 @@ class Rows:
         self.episodes: dict[int, dict[str, Any]] = {}
         self.inserts: dict[str, list[Row]] = {table: [] for table in COLUMNS}
         self.leaves: dict[tuple[str, tuple[str, ...]], list[Row]] = {}
+        self.descriptions: set[str] = set()
         self.node_ends: list[NodeEnd] = []
         self.episode_ends: list[EpisodeEnd] = []
         self.lost: list[int] = []

@@ -10,6 +10,7 @@ from sqlalchemy import text
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.projections.fold.fold import fold
+from pycrorm_async.projections.fold.link_boxes import insert_link_boxes
 from pycrorm_async.projections.fold.parameters import Designators
 from pycrorm_async.projections.fold.row_batch import EpisodeEnd, NodeEnd, Rows
 from pycrorm_async.projections.schema.tables import CORE, column_type
@@ -50,6 +51,8 @@ class TableRows:
         """
         dialect, rows = dialect_of(connection), self._rows
         await dialect.insert(connection, self._insertion)
+        if rows.descriptions:
+            await insert_link_boxes(connection, generation, rows.descriptions)
         for table, fields, ends in (
             ("task_tree_node", NodeEnd._fields, rows.node_ends),
             ("process_metadata", EpisodeEnd._fields, rows.episode_ends),

@@ -34,14 +34,15 @@ from sqlalchemy.ext.asyncio import AsyncConnection
 from sqlalchemy.schema import CreateColumn, CreateIndex, CreateTable, ExecutableDDLElement, Index
 
 from pycrorm_async.errors import DatabaseForeign, TablesOutdated
+from pycrorm_async.projections.schema.estimates import expected
 from pycrorm_async.projections.schema.layout import Layout
 from pycrorm_async.projections.schema.materialised_views import make_materialised, materialised_tables, shown_texts
 from pycrorm_async.projections.schema.public_views import projection_views, public_views
 from pycrorm_async.projections.schema.tables import (
     CORE,
+    OF_NO_EPISODE,
     OWN,
     Storage,
-    expected,
     indexed,
     leaf_columns,
     make_table,
@@ -203,7 +204,7 @@ async def make_generation(connection: AsyncConnection, number: int) -> Generatio
     """Create the tables that every memory has, in a generation of this number. `show` makes them visible."""
     await dialect_of(connection).make_place(connection)
     await connection.exec_driver_sql(_CREATE)
-    await make_empty(connection, CORE, number)
+    await make_empty(connection, CORE | OF_NO_EPISODE, number)
     return Generation(number, 0, Layout(), {})
 
 

@@ -42,10 +42,19 @@ from pycrorm_async.events.codec import DESCRIPTION_PREFIX
 from pycrorm_async.events.fields import table_name
 from pycrorm_async.events.ids import SEQUENCE_MAX, SLOT_MAX
 from pycrorm_async.projections.schema.layout import Layout
-from pycrorm_async.projections.schema.pick_up_view import pick_ups_with_context
-from pycrorm_async.projections.schema.root_failure_view import root_failures
-from pycrorm_async.projections.schema.tables import CORE, EPISODE, OWN, column_type, leaf_columns, make_table
+from pycrorm_async.projections.schema.tables import (
+    CORE,
+    EPISODE,
+    LINK_BOX,
+    OF_NO_EPISODE,
+    OWN,
+    column_type,
+    leaf_columns,
+    make_table,
+)
 from pycrorm_async.projections.schema.views.concept_views import concept_views
+from pycrorm_async.projections.schema.views.pick_up_view import pick_ups_with_context
+from pycrorm_async.projections.schema.views.root_failure_view import root_failures
 from pycrorm_async.projections.schema.views.spatial_relation_view import SpatialTables, spatial_relations
 from pycrorm_async.world.enums import ObjectType
 
@@ -150,8 +159,9 @@ def public_views(
         views["PickUpWithContextView"] = shown(view, node)
         if _PLACED in layout.leaves:
             placed = _leaf(_PLACED, layout, leaves, lambda view, _: view).subquery("placed")
+            link_box = make_table(LINK_BOX, OF_NO_EPISODE[LINK_BOX], generation, stored)
             tables = SpatialTables(*(core[name] for name in _OF_RELATIONS))
-            views["spatial_relation"] = spatial_relations(tables, picked, placed, simulated=simulated)
+            views["spatial_relation"] = spatial_relations(tables, link_box, picked, placed, simulated=simulated)
     views["designator_type"] = _designator_type(layout)
     views["object_description"] = select(_declaration).where(_is_description)
     return {**views, **concept_views()}

@@ -21,19 +21,19 @@ from sqlalchemy.sql.functions import FunctionElement
 from sqlalchemy.types import TypeEngine
 
 from pycrorm_async.projections.table_names import index_name, physical_name
-from pycrorm_async.store.dialect import Expected
 
 __all__ = [
     "Storage",
     "EPISODE",
     "OWN",
     "CORE",
+    "LINK_BOX",
+    "OF_NO_EPISODE",
     "COLUMNS",
     "leaf_columns",
     "make_table",
     "column_type",
     "indexed",
-    "expected",
 ]
 
 Storage: TypeAlias = Literal["key", "row", "pose", "object", "integer", "real", "text", "boolean", "time", "json"]
@@ -255,9 +255,30 @@ CORE: dict[str, dict[str, Storage]] = {
 lookup in a small table that consists of its key only.
 """
 
+LINK_BOX = "pycrorm_link_box"
+OF_NO_EPISODE: dict[str, dict[str, Storage]] = {
+    LINK_BOX: {
+        "model": "key",
+        "position": "key",
+        "link": "text",
+        "joint": "text",
+        **{f"{letter}{axis}": "real" for letter in "cha" for axis in "xyz"},
+    },
+}
+"""Columns of the table of the boxes around the links of descriptions, which belong to no episode; it has no view.
+
+A box has the fingerprint of its description as `model`, its centre, half of its edges, and the direction in which its
+joint slides it; in m, in the frame of the root link.
+"""
+
 COLUMNS = {table: tuple(columns) for table, columns in CORE.items()}
 
-_TEXT_KEYS = {("parameter_item", "field"), ("joint_change", "joint"), ("state_sample", "channel")}
+_TEXT_KEYS = {
+    ("parameter_item", "field"),
+    ("joint_change", "joint"),
+    ("state_sample", "channel"),
+    (LINK_BOX, "model"),
+}
 
 _INDEXED = {
     "episode_tagging": ("process_metadata_id", "tag"),
@@ -283,19 +304,6 @@ _SECOND_COLUMNS = {("task_tree_node", "dtype"): ("status",)}
 _INCLUDES = {("task_tree_node", "dtype"): ("id", "robot_pose_id", "torso_height", "robot", "simulated")}
 """Columns stored in PostgreSQL's index without being part of its key. An index-only scan saves reading a page for each
 node, so the learning query over 50,000 pick-ups takes some 70 ms instead of 100."""
-
-_EXPECTED = {"process_metadata": 1_000, "simulated_episode": 100}
-_EXPECTED_CORE, _EXPECTED_LEAF = 1_000_000, 50_000
-_ALIKE = {
-    "process_metadata_id": [1_000],
-    "parent_id": [4],
-    "status": [250_000],
-    "dtype": [50_000, 25_000],
-    "obj_type": [10_000],
-}
-_ALIKE_OTHERS = [10]
-"""Estimates for a memory of a thousand episodes, given to SQLite's planner: the rows of each table, and the rows that
-have the same value in an index's first column and in its first two."""
 
 
 def make_table(name: str, columns: dict[str, Storage], generation: int, stored: Callable[[str], str]) -> Table:
@@ -374,15 +382,6 @@ def indexed(name: str, columns: dict[str, Storage]) -> tuple[str, ...]:
     if name in CORE:
         return _INDEXED.get(name, ())
     return tuple(column for column, storage in columns.items() if storage == "object")
-
-
-def expected(name: str, columns: dict[str, Storage], generation: int) -> Expected:
-    """Return the estimates for a planner without statistics of its own; the proportions matter, not the sizes."""
-    rows = _EXPECTED.get(name, _EXPECTED_CORE if name in CORE else _EXPECTED_LEAF)
-    alike = {
-        index_name(name, column, generation): _ALIKE.get(column, _ALIKE_OTHERS) for column in indexed(name, columns)
-    }
-    return Expected(physical_name(name, generation), rows, alike)
 
 
 def column_type(storage: Storage) -> TypeEngine[Any]:

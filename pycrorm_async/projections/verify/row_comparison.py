@@ -15,7 +15,7 @@ from sqlalchemy.ext.asyncio import AsyncConnection
 from pycrorm_async.events.ids import row_key
 from pycrorm_async.projections.fold.row_batch import Row
 from pycrorm_async.projections.schema.generations import Generation
-from pycrorm_async.projections.schema.tables import CORE, Storage, leaf_columns, make_table
+from pycrorm_async.projections.schema.tables import CORE, LINK_BOX, OF_NO_EPISODE, Storage, leaf_columns, make_table
 
 __all__ = ["Comparison", "Difference", "Range"]
 
@@ -85,7 +85,17 @@ class Comparison:
         }
         for name, columns in (dict(core) | leaves).items():
             self._tables[name] = make_table(name, columns, generation.number, stored)
-        self.tables = [each.name for each in self._tables.values()]
+        self._link_box = make_table(LINK_BOX, OF_NO_EPISODE[LINK_BOX], generation.number, stored)
+        self.tables = [each.name for each in (*self._tables.values(), *((self._link_box,) if core is CORE else ()))]
+
+    async def box_differences(
+        self, connection: AsyncConnection, boxes: Mapping[str, Sequence[Row]]
+    ) -> list[Difference]:
+        """Return the differences in the boxes of these descriptions, given by fingerprint."""
+        stored = await _rows(connection, self._link_box, self._link_box.c.model.in_(sorted(boxes)))
+        folded = {row[:2]: row for rows in boxes.values() for row in rows}
+        self.count += len(stored)
+        return [*_compared(LINK_BOX, [*self._link_box.columns.keys()], folded, stored)]
 
     async def differences(
         self,

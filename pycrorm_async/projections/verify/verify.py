@@ -16,6 +16,7 @@ from pycrorm_async.errors import DamageError, DatabaseUnavailable, TablesOutdate
 from pycrorm_async.events.blobs import references_in
 from pycrorm_async.events.codec import DESCRIPTION_PREFIX, fingerprint
 from pycrorm_async.projections.custom.projection import Projection
+from pycrorm_async.projections.fold.link_boxes import boxes_of
 from pycrorm_async.projections.fold.parameters import Designators
 from pycrorm_async.projections.fold.row_batch import Rows
 from pycrorm_async.projections.schema.generations import Generation, current_generation
@@ -278,6 +279,9 @@ class _TablesCheck:
         try:
             with self._log.translated():
                 differences = await comparison.differences(connection, rows, within, carried=carried, settled=settled)
+                if rows.descriptions:
+                    boxes = await boxes_of(connection, rows.descriptions)
+                    differences += await comparison.box_differences(connection, boxes)
         except DamageError as fault:
             self.result.add_damage(None, None, str(fault))
             return

@@ -4,9 +4,7 @@ The view selects from the tables and not from the public views, because each of 
 here the node is checked once. PostgreSQL cannot estimate how many rows such a check leaves, and with one for each table
 it read all pick-ups where the latest 2,000 were wanted.
 
-Poses and objects are joined as outer joins. All tables have the episode's column in common, so from inner joins
-PostgreSQL concludes that it can join a pick-up with all poses of its episode before the node that names one of them.
-Without statistics it did, and 100 pick-ups took half a minute. An outer join follows the rows that its condition names.
+Poses and objects are joined as outer joins (see `joins`).
 """
 
 from __future__ import annotations
@@ -14,10 +12,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from typing import Any, Self
 
-from sqlalchemy import Boolean, ColumnElement, FromClause, ScalarSelect, Select, Table, and_, func, select
+from sqlalchemy import Boolean, ColumnElement, FromClause, ScalarSelect, Select, Table, func, select
 from sqlalchemy.ext.compiler import compiles
 
-from pycrorm_async.projections.schema.tables import EPISODE
+from pycrorm_async.projections.schema.views.joins import present, same_episode
 
 __all__ = ["pick_ups_with_context"]
 
@@ -87,22 +85,12 @@ def pick_ups_with_context(
             of_episode(world).label("scene"),
         )
         .select_from(picked)
-        .join(node, _same(node, picked, node.c.id == picked.c.id))
-        .outerjoin(robot, _same(robot, node, robot.c.id == node.c.robot_pose_id))
-        .outerjoin(object_, _same(object_, picked, object_.c.id == picked.c.object_designator_id))
-        .outerjoin(place, _same(place, object_, place.c.id == object_.c.pose_id))
-        .where(_PlannerHint(node.c.dtype.in_(dtypes)), _present(robot), _present(place))
+        .join(node, same_episode(node, picked, node.c.id == picked.c.id))
+        .outerjoin(robot, same_episode(robot, node, robot.c.id == node.c.robot_pose_id))
+        .outerjoin(object_, same_episode(object_, picked, object_.c.id == picked.c.object_designator_id))
+        .outerjoin(place, same_episode(place, object_, place.c.id == object_.c.pose_id))
+        .where(_PlannerHint(node.c.dtype.in_(dtypes)), present(robot), present(place))
     )
-
-
-def _present(row: FromClause) -> ColumnElement[bool]:
-    """Return the condition that an outer join has a row. From IS NOT NULL PostgreSQL would make it an inner join."""
-    return func.coalesce(row.c.id, 0) > 0
-
-
-def _same(one: FromClause, other: FromClause, by_id: ColumnElement[bool]) -> ColumnElement[bool]:
-    """Return the condition of a join within an episode."""
-    return and_(by_id, one.c[EPISODE] == other.c[EPISODE])
 
 
 def _seen_from(place: Any, robot: Any) -> Iterator[ColumnElement[Any]]:

@@ -1,0 +1,24 @@
+"""Join the rows of one episode by id.
+
+All tables have the episode's column in common, so from inner joins PostgreSQL concludes that it can join a row with all
+rows of its episode before the row that names one of them. Without statistics it does, and 100 pick-ups took half a
+minute. An outer join follows the rows that its condition names.
+"""
+
+from __future__ import annotations
+
+from sqlalchemy import ColumnElement, FromClause, and_, func
+
+from pycrorm_async.projections.schema.tables import EPISODE
+
+__all__ = ["present", "same_episode"]
+
+
+def same_episode(one: FromClause, other: FromClause, condition: ColumnElement[bool]) -> ColumnElement[bool]:
+    """Return the condition of a join within an episode."""
+    return and_(condition, one.c[EPISODE] == other.c[EPISODE])
+
+
+def present(row: FromClause) -> ColumnElement[bool]:
+    """Return the condition that an outer join has a row. From IS NOT NULL PostgreSQL would make it an inner join."""
+    return func.coalesce(row.c.id, 0) > 0
