@@ -2,21 +2,32 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from pycrorm_async.errors import CallerError
+from pycrorm_async.learning.rollouts.move_and_pick_up import MoveAndPickUp
 from pycrorm_async.plan import (
     ActionAbstract,
+    BelieveObject,
+    CostmapLocation,
+    DatabaseCostmapLocation,
+    GripAction,
     GripActionPerformable,
+    ObjectPart,
+    PickUpAction,
     PickUpActionPerformable,
+    TransportAction,
     TransportActionPerformable,
     simulated_robot,
 )
+from pycrorm_async.plan.experience import PastSuccess
 from pycrorm_async.plan.failures import CapabilityAbsenceFailure
 from pycrorm_async.world import (
     COURIER,
@@ -152,3 +163,86 @@ def test_a_copy_of_a_world_has_the_masses(world: BulletWorld) -> None:
     with copied(world) as copy:
         masses = [each.mass_kg for obj in (given, described) if (each := counterpart(obj, copy)) is not None]
     assert masses == [7, 1.06]
+
+
+@pytest.fixture
+def lopsided() -> Iterator[Object]:
+    """Return a PR2 whose left arm lifts 1 kg and whose right arm lifts 5 kg, before a milk of 1.06 kg."""
+    with BulletWorld(), simulated_robot:
+        payloads = {Arms.LEFT: 1.0, Arms.RIGHT: 5.0}
+        arms = {arm: replace(PR2.arms[arm], payload_kg=kg) for arm, kg in payloads.items()}
+        robot = Object("lopsided", ObjectType.ROBOT, robot=replace(PR2, arms=arms))
+        robot.set_joint_position("torso_lift_joint", 0.3)
+        Object("milk", ObjectType.MILK, pose=Pose([1.3, 0.2, 0.9]))
+        yield robot
+
+
+def with_mass(robot: Object, mass_kg: float) -> Object:
+    """Replace the milk by one of this mass."""
+    milk = robot.world.object("milk")
+    milk.remove()
+    return Object("milk", ObjectType.MILK, pose=milk.pose, mass_kg=mass_kg)
+
+
+@pytest.mark.parametrize(
+    ("mass_kg", "offered"),
+    [(0.5, {Arms.LEFT, Arms.RIGHT}), (1.06, {Arms.RIGHT}), (9.0, {Arms.LEFT, Arms.RIGHT})],
+    ids=["light", "for one arm", "for none"],
+)
+async def test_where_the_arm_is_open_one_that_lifts_the_object_is_chosen(
+    lopsided: Object, mass_kg: float, offered: set[Arms]
+) -> None:
+    milk = with_mass(lopsided, mass_kg)
+    arms = [Arms.LEFT, Arms.RIGHT]
+    first = Arms.LEFT if Arms.LEFT in offered else Arms.RIGHT
+    goal = Pose([1.3, 0.0, 0.9])
+    assert PickUpAction(milk, arms, [Grasp.FRONT]).resolve().arm is first
+    assert TransportAction(milk, arms, [goal]).resolve().arm is first
+    assert GripAction(arms, milk, [1.0]).resolve().gripper is first
+    places = [*itertools.islice(CostmapLocation(milk, reachable_for=lopsided), 30)]
+    assert {arm for place in places for arm in place.reachable_arms} == offered
+
+    class Known:
+        async def successes(self, object_type: ObjectType, *, arm: Arms | None) -> Sequence[PastSuccess]:
+            return [PastSuccess(each, Grasp.FRONT, 0.3, Pose([-0.6, 0, -0.9]), 0.5) for each in arms]
+
+    past = [each async for each in DatabaseCostmapLocation(milk, lopsided, experience=Known())]
+    assert {arm for place in past for arm in place.reachable_arms} == offered
+    fetching = MoveAndPickUp(milk, samples=30, rng=np.random.default_rng(1))
+    assert {each.arm for each in fetching.plain()} == {each.arm for each in fetching} == offered
+
+
+async def test_a_required_arm_is_not_replaced_and_no_combination_is_lost(lopsided: Object) -> None:
+    milk = lopsided.world.object("milk")
+    assert CostmapLocation(milk, lopsided, reachable_arm=Arms.LEFT).resolve().reachable_arms == (Arms.LEFT,)
+    assert PickUpAction(milk, Arms.LEFT, [Grasp.FRONT]).resolve().arm is Arms.LEFT
+    light = Object("light", ObjectType.MILK, pose=Pose([1, 1, 1]), mass_kg=0.1)
+    every = PickUpAction([milk, light], [Arms.LEFT, Arms.RIGHT], [Grasp.FRONT, Grasp.TOP])
+    assert [(each.object_designator, each.arm, each.grasp) for each in every] == [
+        (milk, Arms.RIGHT, Grasp.FRONT),
+        (milk, Arms.RIGHT, Grasp.TOP),
+        *((light, arm, grasp) for arm in (Arms.LEFT, Arms.RIGHT) for grasp in (Grasp.FRONT, Grasp.TOP)),
+        (milk, Arms.LEFT, Grasp.FRONT),
+        (milk, Arms.LEFT, Grasp.TOP),
+    ]
+    assert {each.arm for each in MoveAndPickUp(milk, arms=[Arms.LEFT]).plain()} == {Arms.LEFT}
+
+
+async def test_what_an_arm_chosen_so_lifts_is_transported(lopsided: Object) -> None:
+    milk = lopsided.world.object("milk")
+    goal = Pose([1.3, 0.0, 0.9])
+    await TransportAction(milk, [Arms.LEFT, Arms.RIGHT], [goal]).resolve().perform()
+    assert milk.pose.distance(goal) < 1e-5
+
+
+def test_a_lacking_arm_or_an_absent_robot_or_object_leaves_the_first_alternative(courier: Object) -> None:
+    arms = [Arms.LEFT, Arms.RIGHT]
+    milk = Object("milk", ObjectType.MILK, pose=PLACE, mass_kg=99)
+    believed = BelieveObject("milk?", ObjectType.MILK, PLACE)
+    handle = ObjectPart("milk", milk)
+    for load in (milk, believed, handle):
+        assert PickUpAction(load, arms, [Grasp.FRONT]).resolve().arm is Arms.LEFT
+    courier.remove()
+    assert PickUpAction(milk, arms, [Grasp.FRONT]).resolve().arm is Arms.LEFT
+    milk.remove()
+    assert PickUpAction(milk, arms, [Grasp.FRONT]).resolve().arm is Arms.LEFT

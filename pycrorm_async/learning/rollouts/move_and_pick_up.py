@@ -10,7 +10,7 @@ from sqlalchemy import Select, select
 from pycrorm_async.errors import CallerError, ImpossibleCondition
 from pycrorm_async.learning.policies.default_policy import default_policy
 from pycrorm_async.learning.policies.evidence import Evidence
-from pycrorm_async.learning.policies.policy import PickUpChoice, Policy
+from pycrorm_async.learning.policies.policy import ARMS, PickUpChoice, Policy
 from pycrorm_async.learning.policies.policy_file import name_of
 from pycrorm_async.learning.rollouts.feasible_places import free_and_visible
 from pycrorm_async.orm import PickUpWithContextView
@@ -18,6 +18,7 @@ from pycrorm_async.plan.actions.basic import MoveAndPickUpPerformable
 from pycrorm_async.plan.actions.descriptions import ActionDescription
 from pycrorm_async.plan.current_robot import require_robot
 from pycrorm_async.plan.failures import ObjectUnreachable
+from pycrorm_async.plan.geometry.gripper_checks import lifting_arms
 from pycrorm_async.plan.locations.base_clearance import base_clearance
 from pycrorm_async.plan.locations.base_poses import base_height_m, face
 from pycrorm_async.plan.object_designators import ObjectDesignatorDescription, ObjectLike, designator_of, in_world
@@ -68,8 +69,9 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
         if samples < 1:
             raise CallerError(f"samples must be >= 1, got {samples}")
         self.target = target.resolve() if isinstance(target, ObjectDesignatorDescription) else designator_of(target)
+        self._arms = frozenset(arms) if arms is not None else None
         evidence = Evidence(
-            arms=frozenset(arms) if arms is not None else None,
+            arms=self._arms,
             grasps=frozenset(grasps) if grasps is not None else None,
         )
         policy = default_policy() if policy is None else policy
@@ -107,16 +109,27 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
         return self.target.pose.position.z - robot.body.pose.position.z - torso
 
     def policy_here(self) -> Policy:
-        """Condition the policy on the object's height. Raises `ObjectUnreachable` if that has probability 0."""
-        return self._condition(Evidence(height=_around(self.height)), "at this height")
+        """Condition the policy on the object's height, and its mass if an allowed arm does not lift it.
+
+        Raises `ObjectUnreachable` if that has probability 0.
+        """
+        return self._condition(Evidence(self._strong_enough(), height=_around(self.height)), "at this height")
 
     def grounded(self) -> Policy:
-        """Condition the policy on the object's height and on the free places that see the object.
+        """Condition the policy as `policy_here` does, and on the free places that see the object.
 
         Raises `ObjectUnreachable` if that has probability 0.
         """
         region = free_and_visible(require_robot(), in_world(self.target))
-        return self._condition(Evidence(region=region, height=_around(self.height)), "in this scene")
+        return self._condition(
+            Evidence(self._strong_enough(), region=region, height=_around(self.height)), "in this scene"
+        )
+
+    def _strong_enough(self) -> frozenset[Arms] | None:
+        """Return the allowed arms that lift the object; None if that does not rule one out."""
+        allowed = ARMS if self._arms is None else tuple(self._arms)
+        lifting = lifting_arms(require_robot(), allowed, self.target)
+        return frozenset(lifting) if len(lifting) < len(allowed) else None
 
     def _condition(self, evidence: Evidence, where: str) -> Policy:
         try:

@@ -1,7 +1,7 @@
 """Descriptions of actions hold alternatives for each property; `resolve()` uses the first alternative of each.
 
 A property with one value needs no list: `ParkArmsAction(Arms.LEFT)`. Iterating a description yields every combination,
-the last property varying fastest:
+the last property varying fastest; those in which the arm is too weak for the object come last:
 
 >>> [each.motion.name for each in SetGripperAction([Arms.LEFT], [GripperState.OPEN, GripperState.CLOSE])]
 ['OPEN', 'CLOSE']
@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterable, Iterator
-from typing import TYPE_CHECKING, Any, Generic, NoReturn, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, NoReturn, TypeAlias, TypeVar
 
 from pycrorm_async.plan.actions.basic import (
     LookAtActionPerformable,
@@ -30,11 +30,14 @@ from pycrorm_async.plan.actions.manipulation import (
     ReleaseActionPerformable,
 )
 from pycrorm_async.plan.actions.transport import DetectActionPerformable, TransportActionPerformable
-from pycrorm_async.plan.errors import NotResolved
+from pycrorm_async.plan.current_robot import require_robot
+from pycrorm_async.plan.errors import NoRobotHere, NotResolved
 from pycrorm_async.plan.failures import IllPosedGoalFailure
+from pycrorm_async.plan.geometry.gripper_checks import lifting_arms
 from pycrorm_async.plan.language.operators import Composable
 from pycrorm_async.plan.object_designators import ObjectDesignatorDescription, ObjectLike, ObjectPart
 from pycrorm_async.world.enums import Arms, Grasp, GripperState
+from pycrorm_async.world.errors import NoWorld
 from pycrorm_async.world.pose import Pose
 
 __all__ = [
@@ -68,6 +71,9 @@ class ActionDescription(Composable, Generic[P]):
     Object descriptions among the alternatives are matched against the world at each resolution or iteration.
     """
 
+    _lifting: ClassVar[tuple[str, str] | None] = None
+    """The properties that name the arm and the object that it lifts."""
+
     def __init__(self, performable: Callable[..., P], **alternatives: Any) -> None:
         self._performable = performable
         self._alternatives = {name: _as_alternatives(each) for name, each in alternatives.items()}
@@ -82,6 +88,8 @@ class ActionDescription(Composable, Generic[P]):
     def resolve(self) -> P:
         """Return the performable with the first alternative of each property.
 
+        Of several arms it is the first one that lifts the object (`ArmDescription.payload_kg`), if one does.
+
         Raises:
             IllPosedGoalFailure: a property has no alternative.
             ObjectNotFound: no object in the world matches the description.
@@ -90,9 +98,19 @@ class ActionDescription(Composable, Generic[P]):
 
     def __iter__(self) -> Iterator[P]:
         """Yield every combination, the last property varying fastest. Raises as `resolve` does."""
-        choices = [self._choices(name, among) for name, among in self._alternatives.items()]
-        for combination in itertools.product(*choices):
-            yield self._performable(**dict(zip(self._alternatives, combination, strict=True)))
+        choices = {name: self._choices(name, among) for name, among in self._alternatives.items()}
+        combinations = (dict(zip(choices, each, strict=True)) for each in itertools.product(*choices.values()))
+        if self._lifting is None or len(choices[self._lifting[0]]) == 1:
+            yield from (self._performable(**each) for each in combinations)
+            return
+        arm, load = self._lifting
+        too_weak: list[dict[str, Any]] = []
+        for each in combinations:
+            if each[arm] in _arms_for(each[load], choices[arm]):
+                yield self._performable(**each)
+            else:
+                too_weak.append(each)
+        yield from (self._performable(**each) for each in too_weak)
 
     def _choices(self, name: str, among: ObjectDesignatorDescription | tuple[Any, ...]) -> tuple[Any, ...]:
         if isinstance(among, ObjectDesignatorDescription):
@@ -100,6 +118,14 @@ class ActionDescription(Composable, Generic[P]):
         if not among:
             raise IllPosedGoalFailure(f"{type(self).__name__} has no alternative for {name}", name)
         return among
+
+
+def _arms_for(load: ObjectLike, arms: tuple[Arms, ...]) -> tuple[Arms, ...]:
+    """Return the arms that lift the object; all of them outside a world with a robot."""
+    try:
+        return lifting_arms(require_robot(), arms, load)
+    except (NoWorld, NoRobotHere):
+        return arms
 
 
 def _as_alternatives(value: Any) -> ObjectDesignatorDescription | tuple[Any, ...]:
@@ -153,6 +179,8 @@ class LookAtAction(ActionDescription[LookAtActionPerformable]):
 class PickUpAction(ActionDescription[PickUpActionPerformable]):
     """Pick up an object: a given one, one of several, or one that matches a description."""
 
+    _lifting = "arm", "object_designator"
+
     def __init__(self, object_designator_description: Objects, arms: OneOrMore[Arms], grasps: OneOrMore[Grasp]) -> None:
         super().__init__(
             PickUpActionPerformable,
@@ -178,6 +206,8 @@ class PlaceAction(ActionDescription[PlaceActionPerformable]):
 
 class GripAction(ActionDescription[GripActionPerformable]):
     """Close a gripper on an object between its fingers, with one of these efforts (N)."""
+
+    _lifting = "gripper", "object_designator"
 
     def __init__(
         self, grippers: OneOrMore[Arms], object_designator_description: Objects, efforts: OneOrMore[float]
@@ -227,6 +257,8 @@ class DetectAction(ActionDescription[DetectActionPerformable]):
 
 class TransportAction(ActionDescription[TransportActionPerformable]):
     """Fetch an object and place it at one of these poses."""
+
+    _lifting = "arm", "object_designator"
 
     def __init__(
         self, object_designator_description: Objects, arms: OneOrMore[Arms], target_locations: OneOrMore[Pose]

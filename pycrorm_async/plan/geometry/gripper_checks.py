@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 from pycrorm_async.plan.current_robot import CurrentRobot
 from pycrorm_async.plan.failures import (
     CapabilityAbsenceFailure,
@@ -9,12 +11,14 @@ from pycrorm_async.plan.failures import (
     IllPosedGoalFailure,
     PerceptionObjectNotInWorld,
 )
+from pycrorm_async.plan.object_designators import ObjectLike, ObjectPart, in_world
 from pycrorm_async.world.enums import Arms, GripperState, ObjectType
 from pycrorm_async.world.objects import Object
 from pycrorm_async.world.pose import Pose, Quaternion
 from pycrorm_async.world.queries.bounding_boxes import box_around
+from pycrorm_async.world.robots.robot_description import ArmDescription
 
-__all__ = ["check_fits", "check_same_world", "check_free", "check_takable", "take"]
+__all__ = ["check_fits", "check_same_world", "check_free", "check_takable", "lifting_arms", "take"]
 
 
 def check_takable(robot: CurrentRobot, arm: Arms, target: Object) -> None:
@@ -31,11 +35,36 @@ def check_takable(robot: CurrentRobot, arm: Arms, target: Object) -> None:
     if target.object_type in (ObjectType.ROBOT, ObjectType.ENVIRONMENT):
         raise IllPosedGoalFailure(f"{target.name} cannot be held by a gripper", target.name)
     check_free(robot, arm, target)
+    if (overload := _overload(robot.one_arm(arm), arm, target)) is not None:
+        raise overload
+
+
+def lifting_arms(robot: CurrentRobot, among: Iterable[Arms], target: ObjectLike) -> tuple[Arms, ...]:
+    """Return the arms of `among` that lift the object; all of them if none does, so that the action says why.
+
+    All of them also for a part of an object, and for an object that is not in the world. An arm that the robot lacks is
+    among them, because the action says that too.
+    """
+    arms, described = tuple(among), robot.description.arms
+    if isinstance(target, ObjectPart):
+        return arms
+    try:
+        load = in_world(target)
+    except PerceptionObjectNotInWorld:
+        return arms
+    too_weak = {arm for arm in arms if arm in described and _overload(described[arm], arm, load) is not None}
+    if too_weak.issuperset(arm for arm in arms if arm in described):
+        return arms
+    return tuple(arm for arm in arms if arm not in too_weak)
+
+
+def _overload(described: ArmDescription, arm: Arms, target: Object) -> CapabilityAbsenceFailure | None:
+    """Return the failure of lifting the object and all that is attached to it; None within the arm's payload."""
     mass_kg = sum(each.mass_kg or 0.0 for each in (target, *target.world.attachments.below(target)))
-    payload_kg = robot.one_arm(arm).payload_kg
-    if payload_kg is not None and mass_kg > payload_kg:
-        message = f"{target.name} weighs {mass_kg:g} kg, the {arm.name} arm lifts {payload_kg:g} kg"
-        raise CapabilityAbsenceFailure(message, target.name, mass_kg, payload_kg)
+    if described.payload_kg is None or mass_kg <= described.payload_kg:
+        return None
+    message = f"{target.name} weighs {mass_kg:g} kg, the {arm.name} arm lifts {described.payload_kg:g} kg"
+    return CapabilityAbsenceFailure(message, target.name, mass_kg, described.payload_kg)
 
 
 def check_same_world(robot: CurrentRobot, obj: Object) -> None:

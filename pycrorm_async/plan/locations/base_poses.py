@@ -14,6 +14,7 @@ from typing import NamedTuple
 from pycrorm_async.plan.current_robot import CurrentRobot, check_in_map, require_world
 from pycrorm_async.plan.errors import NoRobotHere
 from pycrorm_async.plan.geometry.grasp_poses import pick_up_poses, place_pose, retract
+from pycrorm_async.plan.geometry.gripper_checks import lifting_arms
 from pycrorm_async.plan.locations.base_clearance import BaseClearance, base_clearance
 from pycrorm_async.plan.motions.process_modules import chosen_limits
 from pycrorm_async.plan.object_designators import ObjectLike, in_world, pose_of
@@ -52,8 +53,9 @@ def base_poses(
     viewer = resolve_robot(visible_for) if visible_for is not None else None
     goal = target if isinstance(target, Pose) else pose_of(target)
     check_in_map(goal)
+    arms = _arms(reacher, reachable_arm, target) if reacher is not None else reachable_arm
     if reacher is not None and reacher.description.drive is Drive.FIXED:
-        yield _checked(reacher.body.pose, target, goal, reacher, viewer, reachable_arm)
+        yield _checked(reacher.body.pose, target, goal, reacher, viewer, arms)
         return
     robots = [each for each in (reacher, viewer) if each is not None]
     clearance = base_clearance(robots)
@@ -66,7 +68,15 @@ def base_poses(
             continue
         if (clear := clear + 1) > CELLS_MAX:
             return
-        yield _checked(base_pose, target, goal, reacher, viewer, reachable_arm)
+        yield _checked(base_pose, target, goal, reacher, viewer, arms)
+
+
+def _arms(robot: CurrentRobot, arm: Arms | None, target: Pose | ObjectLike) -> Arms | tuple[Arms, ...]:
+    """Return the required arm; without one those that lift the target, or reach it if it is a pose."""
+    if arm is not None:
+        return arm
+    candidates = tuple(robot.description.arms)
+    return candidates if isinstance(target, Pose) else lifting_arms(robot, candidates, target)
 
 
 def _cells(costmap: Costmap, robots: list[CurrentRobot], *, every: bool) -> list[Pose]:
@@ -87,14 +97,14 @@ def _checked(
     goal: Pose,
     reacher: CurrentRobot | None,
     viewer: CurrentRobot | None,
-    arm: Arms | None,
+    arms: Arms | tuple[Arms, ...] | None,
 ) -> tuple[Pose, Reach]:
     """Return the base pose with the arms that reach the target from there, or with the reason why none does."""
     if viewer is not None and not _sees(viewer, base_pose, target, goal):
         return base_pose, Reach(refusal="the target is not visible from here")
     if reacher is None:
         return base_pose, Reach()
-    return base_pose, reaching_arms(reacher, arm, base_pose, partial(_goals, reacher, base_pose, target, goal))
+    return base_pose, reaching_arms(reacher, arms, base_pose, partial(_goals, reacher, base_pose, target, goal))
 
 
 def resolve_robot(meant: ObjectLike) -> CurrentRobot:
@@ -123,7 +133,7 @@ def face(place: Pose, goal: Pose, *, height_m: float, turned: float = 0.0) -> Po
 
 def reaching_arms(
     robot: CurrentRobot,
-    arm: Arms | None,
+    arm: Arms | tuple[Arms, ...] | None,
     base_pose: Pose,
     goals: Callable[[Arms], Iterable[Pose]],
     *,
@@ -132,13 +142,16 @@ def reaching_arms(
     """Return the arms that reach all their goals from this base pose, or a refusal if the required ones do not.
 
     Args:
-        arm: the required arm; BOTH requires both, None any.
+        arm: the required arm; BOTH requires both, several any of these, None any.
         torso_height: m; None means the current height.
 
     Raises `CapabilityAbsenceFailure` for an arm that the robot lacks.
     """
     limits = chosen_limits()
-    candidates = tuple(robot.description.arms if arm is None else robot.each_arm(arm))
+    if isinstance(arm, tuple):
+        candidates = arm
+    else:
+        candidates = tuple(robot.description.arms if arm is None else robot.each_arm(arm))
     reaching: list[Arms] = []
     refusals: list[str] = []
     for candidate in candidates:

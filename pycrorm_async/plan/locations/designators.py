@@ -169,7 +169,8 @@ class CostmapLocation(LocationDesignator):
             from the front (`Grasp.FRONT`), for a pose those of placing the held object, with the torso and the arms
             as they are now, within the limits of the chosen robot (`simulated_robot_within`).
         visible_for: the robot that must see the target.
-        reachable_arm: the arm that must reach the target; BOTH requires each of the two.
+        reachable_arm: the arm that must reach the target; BOTH requires each of the two. None means any arm that lifts
+            the object (`ArmDescription.payload_kg`), if one does.
 
     Where collisions count, the base with its heading is clear of obstacles; elsewhere its middle is 0.32 m away from
     them. The search considers up to 600 such places, best first. Resolving raises `ObjectUnreachable` (for an object),

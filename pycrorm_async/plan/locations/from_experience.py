@@ -19,6 +19,7 @@ from pycrorm_async.plan.experience import Experience, PastSuccess, experience
 from pycrorm_async.plan.failures import ObjectUnreachable, PlanFailure
 from pycrorm_async.plan.field_types import check_properties
 from pycrorm_async.plan.geometry.grasp_poses import pick_up_poses
+from pycrorm_async.plan.geometry.gripper_checks import lifting_arms
 from pycrorm_async.plan.locations.base_clearance import base_clearance
 from pycrorm_async.plan.locations.base_poses import Reach, base_height_m, reaching_arms, resolve_robot
 from pycrorm_async.plan.locations.designators import Location, LocationDesignator
@@ -45,7 +46,8 @@ class DatabaseCostmapLocation:
         reachable_for: the robot. Restricts the result to places from which it reaches all three goals of the pick-up
             with the arm, grasp and torso height of the past success, with its arms as they are now, within the limits
             of the chosen robot.
-        reachable_arm: use only successes with this arm, LEFT or RIGHT.
+        reachable_arm: use only successes with this arm, LEFT or RIGHT; None means any arm that lifts the object, if one
+            does.
         experience: the source of past successes; None means the open memory.
 
     Each place has the arm, the grasp and the torso height of the past success, and is 0.3 m clear of obstacles; where
@@ -89,7 +91,7 @@ class DatabaseCostmapLocation:
                 " `async with Memory.open(url)`, or pass one as `experience`"
             )
         past = await source.successes(designator_of(self.target).object_type, arm=self.reachable_arm)
-        return _ExperienceLocation(self.target, self.reachable_for, past)
+        return _ExperienceLocation(self.target, self.reachable_for, self.reachable_arm, past)
 
 
 class _PlaceIterator:
@@ -116,6 +118,7 @@ class _ExperienceLocation(LocationDesignator):
 
     target: ObjectLike
     reachable_for: ObjectLike | None
+    reachable_arm: Arms | None
     past: Sequence[PastSuccess]
 
     def _name(self) -> str:
@@ -130,7 +133,7 @@ class _ExperienceLocation(LocationDesignator):
         free = OccupancyCostmap(
             require_world(), origin, distance_to_obstacle_m=CLEARANCE_M, size_cells=_CELLS, ignore=ignored
         )
-        height_m = base_height_m(robot)
+        height_m, lifting = base_height_m(robot), self._lifting(robot)
         for each in self.past:
             pose = target_pose @ each.stand
             base_pose = _upright_pose(pose, height_m)
@@ -142,12 +145,21 @@ class _ExperienceLocation(LocationDesignator):
             else:
                 is_free = free.value_at(*base_pose.position[:2])
                 refusal = None if is_free else f"an obstacle is nearer than {CLEARANCE_M} m"
+            if refusal is None and each.arm not in lifting:
+                refusal = f"the {each.arm.name} arm does not lift the object, another one does"
             if refusal is None and robot is not None:
                 refusal = _reach(robot, base_pose, target_pose, each).refusal
             if refusal is not None:
                 yield Refusal(base_pose, refusal)
             else:
                 yield Location(base_pose, (each.arm,), each.grasp, each.torso_height)
+
+    def _lifting(self, robot: CurrentRobot | None) -> tuple[Arms, ...]:
+        """Return the arms of past successes to repeat: where the arm is open, those that lift the target."""
+        used = dict.fromkeys(each.arm for each in self.past)
+        if robot is None or self.reachable_arm is not None:
+            return tuple(used)
+        return lifting_arms(robot, [*robot.description.arms, *used], self.target)
 
     def _no_place_failure(self) -> PlanFailure:
         name = self.target.name
