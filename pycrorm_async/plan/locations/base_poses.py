@@ -9,7 +9,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
+from itertools import islice
 from typing import NamedTuple
+
+import numpy as np
 
 from pycrorm_async.plan.current_robot import CurrentRobot, check_in_map, require_world
 from pycrorm_async.plan.errors import NoRobotHere
@@ -79,16 +82,15 @@ def _arms(robot: CurrentRobot, arm: Arms | None, target: Pose | ObjectLike) -> A
     return candidates if isinstance(target, Pose) else lifting_arms(robot, candidates, target)
 
 
-def _cells(costmap: Costmap, robots: list[CurrentRobot], *, every: bool) -> list[Pose]:
-    """Return the middles of the cells to search: the best ones, or with `every` all of them.
+def _cells(costmap: Costmap, robots: list[CurrentRobot], *, every: bool) -> Iterator[Pose]:
+    """Yield the middles of the cells to search: the best ones, or with `every` all of them.
 
     The best cells are as near to the target as a PR2 stands. For other robots, whose arms reach from other distances,
     they are spread over the whole map, best first.
     """
     if all(isinstance(robot.description, PR2Description) for robot in robots):
-        return costmap.best(costmap.map.size if every else CELLS_MAX)
-    cells = costmap.best(costmap.map.size)
-    return cells[:: max(1, len(cells) // CELLS_MAX)]
+        return islice(costmap.ranked(), None if every else CELLS_MAX)
+    return costmap.ranked(every=max(1, int(np.count_nonzero(costmap.map)) // CELLS_MAX))
 
 
 def _checked(

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
+from itertools import islice
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -87,21 +88,26 @@ class Costmap:
 
         Cells of equal value are ordered by their distance from the origin, then by x, then by y.
         """
+        return list(islice(self.ranked(), count_max))
+
+    def ranked(self, *, every: int = 1) -> Iterator[Pose]:
+        """Yield each middle, or one of `every` so many, in the order of `best`.
+
+        Poses are made one by one: those of a whole map take half a second, and most searches end at an early one.
+        """
         values = self.map.ravel()
         steps = cell_steps(self.size_cells)
         distance = (steps[:, None] ** 2 + steps[None, :] ** 2).ravel()
-        order = np.lexsort((distance, -values))[:count_max]
-        chosen = order[values[order] > 0]
-        rows, columns = np.divmod(chosen, self.size_cells)
+        order = np.lexsort((distance, -values))
+        rows, columns = np.divmod(order[values[order] > 0][::every], self.size_cells)
         x, y, z = self.origin.position
-        return [
-            Pose((place_x, place_y, z), self.origin.orientation)
-            for place_x, place_y in zip(
-                (x + steps[rows] * self.resolution_m).tolist(),
-                (y + steps[columns] * self.resolution_m).tolist(),
-                strict=True,
-            )
-        ]
+        middles = zip(
+            (x + steps[rows] * self.resolution_m).tolist(),
+            (y + steps[columns] * self.resolution_m).tolist(),
+            strict=True,
+        )
+        for place_x, place_y in middles:
+            yield Pose((place_x, place_y, z), self.origin.orientation)
 
 
 class OccupancyCostmap(Costmap):
