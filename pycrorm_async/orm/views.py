@@ -156,7 +156,10 @@ class EpisodeTag(Base):
 
 
 class EpisodeRobot(RowOfEvent, Base):
-    """A robot that took part in an episode, as it was when it was added to the world.
+    """A robot that took part in an episode, as it was when it was first added to the world.
+
+    A robot that was removed and added again, also to another world, has one row. If its description has changed, it has
+    a row for each; robots of one name that differ in model or serial have a row each, too.
 
     Attributes:
         id: of its first row in `object`.

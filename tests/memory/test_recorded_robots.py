@@ -2,19 +2,57 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from sqlalchemy import select
+from sqlalchemy.orm import selectinload
 
 from pycrorm_async import Memory, world_of
+from pycrorm_async.orm import EpisodeRobot, PickUpAction, ProcessMetaData
 from pycrorm_async.orm import Object as RecordedObject
-from pycrorm_async.orm import PickUpAction
 from pycrorm_async.plan import PickUpActionPerformable, simulated_robot
 from pycrorm_async.plan.failures import CapabilityAbsenceFailure
-from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose
+from pycrorm_async.world import COURIER, Arms, BulletWorld, Grasp, Object, ObjectType, Pose
 
 pytestmark = pytest.mark.slow
+
+
+async def test_a_robot_that_is_added_again_has_one_row(database_url: str, tmp_path: Path) -> None:
+    def add(name: str, serial: str | None = None) -> Object:
+        return Object(name, ObjectType.ROBOT, robot=replace(COURIER, serial=serial))
+
+    async with Memory.open(database_url, spool=tmp_path / "spool") as memory:
+        async with memory.episode(description="again"):
+            with BulletWorld() as world:
+                add("ada", "A-1").remove()
+                add("bob")
+                ada = add("ada", "A-1")
+                ada.set_pose(Pose([1, 0, 0]))
+                ada.remove()
+                add("ada", "A-2").remove()
+                world.object("bob").remove()
+                add("bob").set_joint_position("arm_yaw_joint", 0.5)
+            with BulletWorld():
+                add("bob")
+        async with memory.episode(description="other"):
+            with BulletWorld():
+                add("bob")
+        await memory.flush()
+        async with memory.session() as session:
+            asked = select(ProcessMetaData).options(selectinload(ProcessMetaData.robots)).order_by(ProcessMetaData.id)
+            episodes = (await session.scalars(asked)).all()
+            first = select(RecordedObject.id).order_by(RecordedObject.id).limit(1)
+            assert episodes[0].robots[0].id == (await session.scalars(first)).one()
+            joined = select(RecordedObject.sequence).join(EpisodeRobot, RecordedObject.id == EpisodeRobot.id)
+            sequences = (await session.scalars(joined.order_by(EpisodeRobot.id))).all()
+            assert sequences == (await session.scalars(select(EpisodeRobot.sequence).order_by(EpisodeRobot.id))).all()
+        robots = [[(each.name, each.serial) for each in one.robots] for one in episodes]
+        assert robots == [[("ada", "A-1"), ("bob", None), ("ada", "A-2")], [("bob", None)]]
+        assert len(sequences) == 4
+        summaries = await memory.reading.episodes()
+        assert [[(each.name, each.serial) for each in one.robots] for one in summaries] == robots
 
 
 async def test_an_object_that_was_too_heavy_is_recorded_with_its_mass_and_the_reason(

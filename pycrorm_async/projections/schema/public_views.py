@@ -213,10 +213,11 @@ def _episode_tag(core: dict[str, Table], _layout: Layout) -> Select[Any]:
 
 
 def _episode_robot(core: dict[str, Table], _layout: Layout) -> Select[Any]:
-    """Return the robots of episodes: the rows of robots from when they were added."""
+    """Return the robots of episodes, each once, however often it was added: with the row of the first time."""
     rows = core["object"]
-    columns = rows.c.id, rows.c.process_metadata_id, rows.c.name, rows.c.model, rows.c.serial
-    robots = select(*columns, rows.c.description_fingerprint, *_sequence(rows))
+    robot = rows.c.process_metadata_id, rows.c.name, rows.c.model, rows.c.serial, rows.c.description_fingerprint
+    first = func.min(rows.c.id)
+    robots = select(first.label("id"), *robot, _event_of(first).label("sequence")).group_by(*robot)
     return robots.where(rows.c.obj_type == ObjectType.ROBOT.name, rows.c.id == rows.c.identity_id)
 
 
@@ -251,11 +252,11 @@ def _task_tree_node(core: dict[str, Table], _layout: Layout) -> Select[Any]:
 
 def _sequence(rows: Table) -> tuple[ColumnElement[Any], ...]:
     """Return the column `sequence` of rows that have an id: the sequence of their event."""
-    return (_event_of(rows).label("sequence"),) if "id" in rows.c else ()
+    return (_event_of(rows.c.id).label("sequence"),) if "id" in rows.c else ()
 
 
-def _event_of(rows: Table) -> ColumnElement[int]:
-    return rows.c.id.bitwise_rshift(SLOT_MAX.bit_length()).bitwise_and(SEQUENCE_MAX)
+def _event_of(row: ColumnElement[int]) -> ColumnElement[int]:
+    return row.bitwise_rshift(SLOT_MAX.bit_length()).bitwise_and(SEQUENCE_MAX)
 
 
 def _duration(nodes: Table) -> ColumnElement[Any]:
