@@ -15,6 +15,7 @@ from pycrorm_async.errors import InternalError, SpoolFull
 from pycrorm_async.queue import RecorderQueue
 from pycrorm_async.queue.files.segment import Segment
 from pycrorm_async.queue.live.notifier import Notifier
+from pycrorm_async.settings import Settings
 from tests.queue.factories import DECLARED, MONOTONIC_NS, WALL_NS, drain, make, node, started
 
 PATIENCE_S = 20.0
@@ -92,6 +93,26 @@ async def test_a_finalizer_that_runs_during_a_put_records_after_it(tmp_path: Pat
     records = await drain(queue)
     assert [each.sequence for each in records] == [1, 2, 3, 4, 5]
     assert [each.payload for each in records] == [b"{}", b"written", *[b"from a plan that was dropped"] * 3]
+    queue.release()
+
+
+@pytest.mark.usefixtures("busy_collector")
+def test_every_finalizer_between_puts_records_whenever_its_collection_becomes_due(tmp_path: Path) -> None:
+    """From Python 3.12 on a due collection runs at the next call, also when the put has taken the lock meanwhile."""
+    queue = make(tmp_path, settings=Settings())
+    queue.put_nowait(started(), b"{}")
+    sequences: list[int] = []
+
+    def work() -> None:
+        for _ in range(500):
+            Dropped(lambda: sequences.append(queue.put_nowait(node(), b"from a plan", reserved=True)))
+            queue.put_nowait(node(), b"x")
+
+    assert finishes(work)
+    gc.collect()
+    assert len(set(sequences)) == len(sequences) == 500
+    assert gc.isenabled()
+    queue.close()
     queue.release()
 
 

@@ -148,68 +148,66 @@ class Appender:
         gc_lock, thread = self._gc_lock, get_ident()
         if gc_lock.owner == thread:
             raise gc_lock.reentered()
-        try:
-            with gc_lock.lock:
-                try:
-                    gc_lock.owner = thread
-                    gc_lock.paused = isenabled()
-                    disable()
-                    if self._refusal is not None:
-                        raise self._refusal()
-                    if episode is None:
-                        kind = DECLARATION
-                        self._declare(body, name, version, payload)
-                    elif (last := self.open.get(episode)) is not None:
-                        sequence = last[0] + 1
-                    elif type_name == EPISODE_STARTED:
-                        self._check_open_episodes()
-                        sequence = 1
-                    else:
-                        raise InternalError(f"episode {episode_text(episode)} is not open: it cannot take {type_name}")
+        with gc_lock.lock:
+            try:
+                gc_lock.paused = paused = isenabled()
+                disable()
+                gc_lock.paused, gc_lock.owner = paused, thread
+                if self._refusal is not None:
+                    raise self._refusal()
+                if episode is None:
+                    kind = DECLARATION
+                    self._declare(body, name, version, payload)
+                elif (last := self.open.get(episode)) is not None:
+                    sequence = last[0] + 1
+                elif type_name == EPISODE_STARTED:
+                    self._check_open_episodes()
+                    sequence = 1
+                else:
+                    raise InternalError(f"episode {episode_text(episode)} is not open: it cannot take {type_name}")
+                end = self._offset + HEADER_BYTES + len(body)
+                if end > (self._end if reserved else self._ordinary_end):
+                    self._find_room(HEADER_BYTES + len(body), reserved=reserved)
                     end = self._offset + HEADER_BYTES + len(body)
-                    if end > (self._end if reserved else self._ordinary_end):
-                        self._find_room(HEADER_BYTES + len(body), reserved=reserved)
-                        end = self._offset + HEADER_BYTES + len(body)
-                    offset = self._offset
-                    position = self.position + 1
-                    wall_ns, monotonic_ns = self._wall_ns(), self._monotonic_ns()
-                    header = encode_header(
-                        kind,
-                        len(name),
-                        version,
-                        len(payload),
-                        position,
-                        sequence,
-                        wall_ns,
-                        monotonic_ns,
-                        owner,
-                        self._salt,
-                        body_checksum,
-                    )
-                    span_checksum = crc32(header[CHECKSUM_START:], self._span_checksum)
-                    buffer = self._buffer
-                    # No calls from here to the blank line, so that a KeyboardInterrupt cannot separate the record from
-                    # the bookkeeping. The header comes last, because a body alone does not decode.
-                    buffer[offset + HEADER_BYTES : end] = body
-                    buffer[offset : offset + HEADER_BYTES] = header
-                    self._offset = end
-                    self.position = position
-                    self._span_count += 1
-                    self._span_checksum = span_checksum
-                    if episode is not None:
-                        self.open[episode] = (sequence, wall_ns, monotonic_ns)
-                        if type_name == EPISODE_ENDED:
-                            del self.open[episode]
+                offset = self._offset
+                position = self.position + 1
+                wall_ns, monotonic_ns = self._wall_ns(), self._monotonic_ns()
+                header = encode_header(
+                    kind,
+                    len(name),
+                    version,
+                    len(payload),
+                    position,
+                    sequence,
+                    wall_ns,
+                    monotonic_ns,
+                    owner,
+                    self._salt,
+                    body_checksum,
+                )
+                span_checksum = crc32(header[CHECKSUM_START:], self._span_checksum)
+                buffer = self._buffer
+                # No calls from here to the blank line, so that a KeyboardInterrupt cannot separate the record from
+                # the bookkeeping. The header comes last, because a body alone does not decode.
+                buffer[offset + HEADER_BYTES : end] = body
+                buffer[offset : offset + HEADER_BYTES] = header
+                self._offset = end
+                self.position = position
+                self._span_count += 1
+                self._span_checksum = span_checksum
+                if episode is not None:
+                    self.open[episode] = (sequence, wall_ns, monotonic_ns)
+                    if type_name == EPISODE_ENDED:
+                        del self.open[episode]
 
-                    if self._quiet:
-                        self._wake()
-                        self._quiet = False
-                finally:
-                    if gc_lock.paused:
-                        enable()
-        finally:
-            if gc_lock.owner == thread:
+                if self._quiet:
+                    self._wake()
+                    self._quiet = False
+            finally:
                 gc_lock.owner = 0
+                if gc_lock.paused:
+                    gc_lock.paused = False
+                    enable()
         return sequence
 
     def _check_open_episodes(self) -> None:

@@ -1,17 +1,20 @@
 """Provide a lock that disables garbage collection while held, so that a finalizer cannot try to acquire it again.
 
-**Theory of operation.** The garbage collector may run at any allocation, in any thread, and close a suspended plan
-there; the plan's `finally` records its end. In a thread that holds the queue's lock, this put would wait for the lock
-of its own thread for ever. A reentrant lock would be worse, because the put would write a record inside a half-written
-one. So the lock's holder disables the collector.
+**Theory of operation.** The garbage collector may run at any allocation, from Python 3.12 on at the first call after
+it, in any thread, and close a suspended plan there; the plan's `finally` records its end. In a thread that holds the
+queue's lock, this put would write a record inside a half-written one. So the lock's holder disables the collector.
 
 The thread takes the lock first and disables the collector second. In the other order two threads could interleave, and
 leave the collector off for ever, or on while one of them holds the lock. `paused` records whether this lock's holder
 turned the collector off; only the holder reads or writes it.
 
-The collector is one switch for the whole process, so another queue or the program itself may turn it on while the lock
-is held. A signal handler may also run at any time. `owner` catches both: a thread that meets its own id raises
-`InternalError` instead of waiting for itself. Other threads may read a stale `owner`, but never their own id.
+A collection that became due before may still run until `gc.disable` has returned, and the next one as soon as
+`gc.enable` has. Nothing is half-written at these moments, so the lock is reentrant: a put from a finalizer is done
+there, inside the other one. It leaves `paused` as it needs it itself, so the outer put assigns it once more.
+
+`owner` is set while a record may be half-written. The collector is one switch for the whole process, so another queue
+or the program itself may turn it on meanwhile, and a signal handler may run at any time. A thread that meets its own id
+raises `InternalError`. Other threads may read a stale `owner`, but never their own id.
 
 `pause_gc` extends the pause beyond the lock, for a thread that takes a second lock which a put may need too
 (`Appender._making`). It hands the pause from `paused` to `_pause_extended` under the lock, so there is no moment in
@@ -38,33 +41,30 @@ class GcSafeLock:
     __slots__ = ("_pause_extended", "lock", "owner", "paused")
 
     def __init__(self) -> None:
-        self.lock = threading.Lock()
+        self.lock = threading.RLock()
         self.owner = 0
         self.paused = False
         self._pause_extended = False
 
     def run(self, work: Callable[[], _T]) -> _T:
-        """Do the work under the lock. Raises `InternalError` if this thread holds the lock already.
+        """Do the work under the lock. Raises `InternalError` if this thread is doing such work already.
 
         Not a context manager, because a KeyboardInterrupt in our `__enter__` would leave the lock taken.
         """
         thread = threading.get_ident()
         if self.owner == thread:
             raise self.reentered()
-        try:
-            with self.lock:
-                try:
-                    self.owner = thread
-                    self.paused = gc.isenabled()
-                    gc.disable()
-                    return work()
-                finally:
-                    if self.paused:
-                        gc.enable()
-        finally:
-            # Reset `owner` after the release, which allocates: a finalizer that runs there must still be refused.
-            if self.owner == thread:
+        with self.lock:
+            try:
+                self.paused = paused = gc.isenabled()
+                gc.disable()
+                self.paused, self.owner = paused, thread
+                return work()
+            finally:
                 self.owner = 0
+                if self.paused:
+                    self.paused = False
+                    gc.enable()
 
     def reentered(self) -> InternalError:
         """Return the error for a thread that would wait for itself."""
@@ -80,7 +80,7 @@ class GcSafeLock:
 
     def abandon(self) -> None:
         """Enable the collector in a forked child, which may lack the thread that would end the pause."""
-        if self._pause_extended or (self.owner and self.paused):
+        if self._pause_extended or self.paused:
             gc.enable()
 
     def _pause_gc(self) -> None:
