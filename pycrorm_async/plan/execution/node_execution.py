@@ -35,6 +35,7 @@ from __future__ import annotations
 import asyncio
 import functools
 import inspect
+import sys
 from collections.abc import Callable, Coroutine
 from contextvars import ContextVar, Token
 from typing import TYPE_CHECKING, Any
@@ -81,11 +82,17 @@ def wrap_perform(perform: Callable[[Any], Coroutine[Any, Any, Any]]) -> Callable
         calls.waiting += 1
         return coroutine
 
-    # `inspect.iscoroutinefunction` must stay true; before Python 3.12 this flag is the only way.
-    plain: Any = performed
-    plain.__code__ = plain.__code__.replace(co_flags=plain.__code__.co_flags | inspect.CO_COROUTINE)
+    _mark_coroutine_function(performed)
     setattr(performed, _MARK, True)
     return performed
+
+
+def _mark_coroutine_function(function: Any) -> None:
+    """Make `inspect.iscoroutinefunction` true for a function that returns a coroutine."""
+    if sys.version_info >= (3, 12):
+        inspect.markcoroutinefunction(function)
+    else:
+        function.__code__ = function.__code__.replace(co_flags=function.__code__.co_flags | inspect.CO_COROUTINE)
 
 
 def _with_node(  # noqa: C901  one function, because a call costs more than most of these steps
