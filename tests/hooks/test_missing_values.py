@@ -126,7 +126,7 @@ LONG_NAMED = type("Long" * 30_000, (Exception,), {"__module__": "\ud800"})
 SCALARS = [
     math.nan, math.inf, "\x00", "\ud800", "x" * 5_000, b"\xff", 2**70, decimal.Decimal("NaN"), object(), Raising("x"),
     RaisingAny(), Foreign.ODD, ObjectType.MILK, Pose([math.nan, 0, 0]), Pose(frame="\ud800"), np.float64("nan"),
-    np.zeros((40, 40)), np.array(None), np.datetime64("NaT"), lambda: None, int, asyncio, LookupError("\ud800"),
+    np.zeros((40, 40)), np.array(None), np.datetime64("NaT", "s"), lambda: None, int, asyncio, LookupError("\ud800"),
     range(10**12), {1: 2}, {"a": {"b": [math.nan]}}, memoryview(b"x"), circle(), Inner(math.nan, -1), 10**5_000,
 ]  # fmt: skip
 
