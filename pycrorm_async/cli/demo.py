@@ -44,6 +44,7 @@ from pycrorm_async.query.named_queries import NodeSummary
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.world import Arms, BulletWorld, Grasp, ObjectType, Pose
 from pycrorm_async.world import Object as WorldObject
+from pycrorm_async.world.bullet_loader import engine
 
 __all__ = ["demo", "kitchen_world", "breakfast"]
 
@@ -80,6 +81,7 @@ async def breakfast() -> None:
 
 def demo(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None, as_json: JsonOption = False) -> None:
     """Run and record the thesis' example plan, then query it."""
+    engine()  # raises `BulletMissing` before a database is created
     answers = asyncio.run(_run_and_query(url, spool))
     if as_json:
         print_json(answers.document())

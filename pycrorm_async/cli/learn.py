@@ -30,6 +30,7 @@ from pycrorm_async.learning.rollouts.rollouts import Tally
 from pycrorm_async.learning.rollouts.scene import Scene
 from pycrorm_async.progress_bar import watched
 from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.world.bullet_loader import engine
 from pycrorm_async.world.robots.robot_description import Limits
 
 __all__ = ["learn"]
@@ -85,7 +86,7 @@ def learn(
     The thesis used 50,000 rollouts: --rollouts 50000 --evaluate 10000 --workers 2. Needs the extra 'learning'.
     """
     # These checks come first, so that a missing package or a bad path does not fail after an hour of rollouts.
-    _check_extra()
+    _check_packages()
     _check_files(policy, figure)
     experiment = Experiment(
         rollouts=rollouts,
@@ -121,12 +122,17 @@ def learn(
     note(f"The policy is in {policy}, its figure in {figure}. Next: pycrorm episodes{option}")
 
 
-def _check_extra() -> None:
-    for module, package in (("jpt", "pyjpt"), ("matplotlib", "matplotlib"), ("pandas", "pandas")):
+def _check_packages() -> None:
+    for module, package in (
+        ("jpt", "pyjpt (for Python up to 3.12)"),
+        ("matplotlib", "matplotlib"),
+        ("pandas", "pandas"),
+    ):
         try:
             importlib.import_module(module)
         except ImportError:
             raise MissingExtra(f"{package} is not installed: pip install 'pycrorm-async[learning]'") from None
+    engine()  # raises `BulletMissing`
 
 
 def _check_files(policy: Path, figure: Path) -> None:

@@ -1,5 +1,9 @@
 """Load Bullet when the first world is entered, and keep its output away from stdout and stderr.
 
+Two packages ship the same Bullet: pybullet has wheels up to Python 3.11, and pycram-bullet, the fork of the institute
+behind PyCRAM, has wheels for 3.11 and 3.12 and calls its module `pycram_bullet`. Either serves; no other module of this
+package imports one of them.
+
 Bullet prints with C's `printf`, which cannot be switched off: a greeting at import, warnings when it loads a body.
 Meanwhile this module points C's own `stdout` and `stderr` to a buffer in memory. Python and child processes write to
 the file descriptors and not through those pointers, so their output is not affected. The buffer holds Bullet's error
@@ -12,26 +16,35 @@ import ctypes
 from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import cache
+from importlib import import_module
 from importlib.util import find_spec
 from threading import Lock
 from typing import Any
 
+from pycrorm_async.world.errors import BulletMissing
+
 __all__ = ["engine", "captured"]
 
+_MODULES = ("pybullet", "pycram_bullet")
 _STREAMS_LOCK = Lock()  # a process has one C stdout
 
 
 @cache
 def engine() -> Any:
-    """Return the module `pybullet`, imported at the first call."""
-    spec = find_spec("pybullet")
-    if spec is not None and spec.origin is not None:
+    """Return the module of Bullet, imported at the first call: `pybullet` or else `pycram_bullet`.
+
+    Raises `BulletMissing` if neither is installed.
+    """
+    for name in _MODULES:
+        spec = find_spec(name)
+        if spec is None or spec.origin is None:
+            continue
         # Load the library before the streams are redirected: its C++ runtime keeps the streams it finds when it
         # starts, and would flush the freed memory buffer at exit.
         ctypes.CDLL(spec.origin)
-    with captured():
-        import pybullet
-    return pybullet
+        with captured():
+            return import_module(name)
+    raise BulletMissing
 
 
 @contextmanager

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from pycrorm_async.errors import CallerError
+import sys
+
+from pycrorm_async.errors import CallerError, MissingExtra
 from pycrorm_async.world.pose import COORDINATE_MAX, Pose
 
 __all__ = [
     "WorldError",
     "WorldUnavailable",
+    "BulletMissing",
     "WorldClosed",
     "NoWorld",
     "ObjectRefused",
@@ -29,6 +32,16 @@ class WorldError(CallerError):
 
 class WorldUnavailable(WorldError):
     """Bullet cannot open a world: a window without a display, or too many worlds at once."""
+
+
+class BulletMissing(WorldUnavailable, MissingExtra):
+    """No Bullet is installed; the message names the command that installs it on this Python."""
+
+    def __init__(self) -> None:
+        message = "no world can be opened, because no Bullet is installed: pip install 'pycrorm-async[world]'"
+        if sys.version_info >= (3, 13):
+            message += " pybullet (no wheel for this Python: compiles for about 8 minutes with a C++ compiler)"
+        super().__init__(message)
 
 
 class WorldClosed(WorldError):

@@ -141,6 +141,7 @@ def test_bad_input_is_one_line(tmp_path: Path, arguments: tuple[str, ...], code:
 def test_without_the_extra_the_error_names_it(tmp_path: Path) -> None:
     (tmp_path / "jpt.py").write_text("raise ImportError")  # imported before the real one
     done = pycrorm(*SMALL, cwd=tmp_path)
-    assert one_line_of(done).endswith("pyjpt is not installed: pip install 'pycrorm-async[learning]'")
+    command = "pip install 'pycrorm-async[learning]'"
+    assert one_line_of(done).endswith(f"pyjpt (for Python up to 3.12) is not installed: {command}")
     assert done.returncode == 2
     assert not (tmp_path / "pycrorm.db").exists()

@@ -18,6 +18,7 @@ from pycrorm_async.plan.failures import PlanFailure
 from pycrorm_async.recording.writing.provenance import PlanSource
 from pycrorm_async.settings import Settings
 from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose
+from tests.bullet import INSTALLED_BULLETS
 
 SOURCE = PlanSource("ab" * 32, "cd" * 20, git_dirty=True)
 
@@ -42,7 +43,7 @@ async def test_an_episode_holds_source_libraries_settings_and_clock(database_url
         assert each.settings == {"sync_interval_ms": 20, "on_full": "fail"}
         assert each.libraries is not None
         assert each.libraries["numpy"] == version("numpy")
-        assert {"pybullet", "msgspec", "SQLAlchemy"} <= set(each.libraries)
+        assert {"msgspec", "SQLAlchemy", *INSTALLED_BULLETS} <= set(each.libraries)
         assert each.clock_synchronized is (quality.synchronized if quality else None)
     assert "password" not in str(episode.settings)
 

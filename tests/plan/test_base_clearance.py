@@ -9,7 +9,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 import numpy as np
-import pybullet
 import pytest
 
 from pycrorm_async.learning.rollouts.move_and_pick_up import MoveAndPickUp
@@ -32,6 +31,7 @@ from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Po
 from pycrorm_async.world.models.primitives import box_urdf
 from pycrorm_async.world.pose import yaw_quaternion
 from pycrorm_async.world.robots.robot_description import Limits
+from tests import bullet
 from tests.plan.conftest import Scene
 from tests.plan.fake_observer import Recording
 
@@ -81,7 +81,7 @@ def collisions(obj: Object, links: Sequence[str] | None = None) -> set[str]:
         for other in obj.world.objects
         if other is not obj
         for number in numbers
-        for point in pybullet.getClosestPoints(
+        for point in bullet.getClosestPoints(
             obj.body.number, other.body.number, 0.0, number, physicsClientId=obj.world.client
         )
         if point[8] < -TOUCH_M

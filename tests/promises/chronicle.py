@@ -8,7 +8,6 @@ from datetime import UTC, datetime, timedelta
 from itertools import groupby
 from typing import Any, NamedTuple
 
-import pybullet
 import pytest
 from sqlalchemy import Select, select
 
@@ -17,6 +16,7 @@ from pycrorm_async.orm import Attachment, JointChange, ObjectRemoval, TaskTreeNo
 from pycrorm_async.orm import Object as ObjectRow
 from pycrorm_async.plan.task_tree import current_node
 from pycrorm_async.world import BulletWorld, Object, Pose
+from tests import bullet
 from tests.promises.lab import at, every, turned
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
@@ -153,10 +153,10 @@ def numbers(pose: Pose) -> tuple[float, ...]:
 def assert_pose_in_bullet(world_object: Object, pose: Pose) -> None:
     """Assert the pose of the root link in Bullet, which itself gives the centre of mass."""
     body, client = world_object.body.number, world_object.world.client
-    facts = pybullet.getDynamicsInfo(body, -1, physicsClientId=client)
-    to_root = pybullet.invertTransform(facts[3], facts[4])
-    centre = pybullet.getBasePositionAndOrientation(body, physicsClientId=client)
-    position, orientation = pybullet.multiplyTransforms(*centre, *to_root)
+    facts = bullet.getDynamicsInfo(body, -1, physicsClientId=client)
+    to_root = bullet.invertTransform(facts[3], facts[4])
+    centre = bullet.getBasePositionAndOrientation(body, physicsClientId=client)
+    position, orientation = bullet.multiplyTransforms(*centre, *to_root)
     assert position == pytest.approx(pose.position, abs=1e-6)
     same_sign = sum(a * b for a, b in zip(orientation, pose.orientation, strict=True)) > 0
     assert [each if same_sign else -each for each in orientation] == pytest.approx(list(pose.orientation), abs=1e-5)
@@ -166,8 +166,8 @@ def joints_of_bullet(world_object: Object) -> dict[str, float]:
     """Return every joint's position in Bullet."""
     body, client = world_object.body.number, world_object.world.client
     return {
-        pybullet.getJointInfo(body, index, physicsClientId=client)[1].decode(): pybullet.getJointState(
+        bullet.getJointInfo(body, index, physicsClientId=client)[1].decode(): bullet.getJointState(
             body, index, physicsClientId=client
         )[0]
-        for index in range(pybullet.getNumJoints(body, physicsClientId=client))
+        for index in range(bullet.getNumJoints(body, physicsClientId=client))
     }

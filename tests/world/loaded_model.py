@@ -7,11 +7,10 @@ import random
 from collections.abc import Mapping
 from pathlib import Path
 
-import pybullet
-
 from pycrorm_async.world.enums import Arms
 from pycrorm_async.world.pose import Pose, Quaternion, Vector, product
 from pycrorm_async.world.robots.robot_description import PR2, Limits
+from tests import bullet
 
 LINK_WORLD_POSITION, LINK_WORLD_ORIENTATION = 4, 5
 
@@ -20,37 +19,37 @@ class LoadedModel:
     """One URDF in a Bullet of its own, without a window."""
 
     def __init__(self, urdf: Path) -> None:
-        self._client = pybullet.connect(pybullet.DIRECT)
-        self._body = pybullet.loadURDF(str(urdf), useFixedBase=True, physicsClientId=self._client)
+        self._client = bullet.connect(bullet.DIRECT)
+        self._body = bullet.loadURDF(str(urdf), useFixedBase=True, physicsClientId=self._client)
         facts = [
-            pybullet.getJointInfo(self._body, index, physicsClientId=self._client)
-            for index in range(pybullet.getNumJoints(self._body, physicsClientId=self._client))
+            bullet.getJointInfo(self._body, index, physicsClientId=self._client)
+            for index in range(bullet.getNumJoints(self._body, physicsClientId=self._client))
         ]
-        self.root: str = pybullet.getBodyInfo(self._body, physicsClientId=self._client)[0].decode()
+        self.root: str = bullet.getBodyInfo(self._body, physicsClientId=self._client)[0].decode()
         self.links: dict[str, int] = {fact[12].decode(): fact[0] for fact in facts}
         self._joints: dict[str, int] = {fact[1].decode(): fact[0] for fact in facts}
         self.limits: dict[str, tuple[float, float]] = {
-            fact[1].decode(): (fact[8], fact[9]) for fact in facts if fact[2] != pybullet.JOINT_FIXED
+            fact[1].decode(): (fact[8], fact[9]) for fact in facts if fact[2] != bullet.JOINT_FIXED
         }
 
     def close(self) -> None:
-        pybullet.disconnect(physicsClientId=self._client)
+        bullet.disconnect(physicsClientId=self._client)
 
     def put(self, *, base: Pose, joints: Mapping[str, float]) -> None:
-        pybullet.resetBasePositionAndOrientation(
+        bullet.resetBasePositionAndOrientation(
             self._body, base.position, base.orientation, physicsClientId=self._client
         )
         for name, value in joints.items():
-            pybullet.resetJointState(self._body, self._joints[name], value, physicsClientId=self._client)
+            bullet.resetJointState(self._body, self._joints[name], value, physicsClientId=self._client)
 
     def link_pose(self, link: str) -> Pose:
-        state = pybullet.getLinkState(
+        state = bullet.getLinkState(
             self._body, self.links[link], computeForwardKinematics=True, physicsClientId=self._client
         )
         return Pose(state[LINK_WORLD_POSITION], state[LINK_WORLD_ORIENTATION])
 
     def bounding_box(self, link: str) -> tuple[Vector, Vector]:
-        lower, upper = pybullet.getAABB(self._body, self.links[link], physicsClientId=self._client)
+        lower, upper = bullet.getAABB(self._body, self.links[link], physicsClientId=self._client)
         return Vector(*lower), Vector(*upper)
 
 

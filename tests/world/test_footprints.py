@@ -14,6 +14,7 @@ from pycrorm_async.world.models.pr2 import pr2_mesh_urdf_path
 from pycrorm_async.world.models.primitives import box_urdf
 from pycrorm_async.world.pose import yaw_quaternion
 from pycrorm_async.world.queries.footprints import Footprint, Obstacles, footprint_of
+from tests import bullet
 
 SQUARE = Footprint((-0.3, 0.3), (-0.3, 0.3))
 
@@ -74,8 +75,6 @@ def test_an_empty_world_and_shapes_above_every_robot_have_no_outlines(world: Bul
 
 
 def test_without_an_overlap_of_outlines_there_is_no_collision(world: BulletWorld) -> None:
-    import pybullet
-
     rng = random.Random(20261123)
     robot = Object("pr2", ObjectType.ROBOT, world=world)
     tables = [
@@ -90,7 +89,7 @@ def test_without_an_overlap_of_outlines_there_is_no_collision(world: BulletWorld
         hit = any(
             point[8] < -1e-3
             for table in tables
-            for point in pybullet.getClosestPoints(
+            for point in bullet.getClosestPoints(
                 robot.body.number, table.body.number, 0.0, robot.body.link_number("base_link"),
                 physicsClientId=world.client,
             )

@@ -184,7 +184,9 @@ def _pyjpt() -> SimpleNamespace:
         from jpt.trees import JPT
         from jpt.variables import NumericVariable, SymbolicVariable
     except ImportError:
-        raise MissingExtra("learning needs pyjpt: pip install 'pycrorm-async[learning]'") from None
+        raise MissingExtra(
+            "learning needs pyjpt, which exists up to Python 3.12: pip install 'pycrorm-async[learning]'"
+        ) from None
     return SimpleNamespace(
         Impurity=Impurity,
         JPT=JPT,

@@ -15,7 +15,7 @@ from pycrorm_async.settings import Settings
 
 __all__ = ["PlanSource", "Provenance"]
 
-_LIBRARIES = ("pycrorm-async", "pybullet", "numpy", "msgspec", "SQLAlchemy", "aiosqlite", "asyncpg")
+_LIBRARIES = ("pycrorm-async", "pybullet", "pycram-bullet", "numpy", "msgspec", "SQLAlchemy", "aiosqlite", "asyncpg")
 """The packages whose versions are recorded: those that act in the world, encode events and store them."""
 
 

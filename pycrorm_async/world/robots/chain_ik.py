@@ -17,16 +17,20 @@ from __future__ import annotations
 import math
 import tempfile
 from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 from xml.etree.ElementTree import Element, SubElement, tostring
 
 import numpy as np
-import optik
 from numpy.typing import NDArray
 
+from pycrorm_async.errors import MissingExtra
 from pycrorm_async.world.enums import JointType
 from pycrorm_async.world.pose import Pose, Vector, product, rotated
 from pycrorm_async.world.robots.joint_chain import Joint, along, divided
 from pycrorm_async.world.robots.robot_description import Bounds
+
+if TYPE_CHECKING:
+    import optik
 
 __all__ = ["Chain"]
 
@@ -115,7 +119,7 @@ class Chain:
             solver = self._solvers.get(ranges)
             if solver is None:
                 self._solvers[ranges] = solver = _solver(moving, ranges)
-            config = optik.SolverConfig(max_time=TIME_MAX_S, max_restarts=STARTS_MAX, tol_f=_ERROR_MAX)
+            config = _optik().SolverConfig(max_time=TIME_MAX_S, max_restarts=STARTS_MAX, tol_f=_ERROR_MAX)
             answer = solver.ik(config, _matrix(goal), _start(ranges, 0))
             angles = None if answer is None else answer[0]
         if angles is None:
@@ -226,9 +230,18 @@ def _solver(joints: Sequence[Joint], ranges: Sequence[Bounds]) -> optik.Robot:
     with tempfile.NamedTemporaryFile("w", suffix=".urdf", encoding="utf-8") as file:
         file.write(tostring(robot, encoding="unicode"))
         file.flush()
-        solver = optik.Robot.from_urdf_file(file.name, "link 0", f"link {number}")
+        solver: optik.Robot = _optik().Robot.from_urdf_file(file.name, "link 0", f"link {number}")
     solver.set_parallelism(1)
     return solver
+
+
+def _optik() -> Any:
+    """Import the library when the first chain is solved. Raises `MissingExtra`."""
+    try:
+        import optik
+    except ImportError:
+        raise MissingExtra("the posture of this arm needs optik: pip install 'pycrorm-async[world]'") from None
+    return optik
 
 
 def _rpy(pose: Pose) -> tuple[float, float, float]:
