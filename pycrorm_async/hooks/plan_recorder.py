@@ -154,14 +154,14 @@ class Recorder:
     def episode_here(self) -> Episode | None:
         """Return the open episode of this memory in this context; None if only one of the two is a simulation."""
         episode = current_episode.get()
-        if episode is None or episode.closed or episode not in self.episodes:
+        if episode is None or episode.closed or episode.id not in self.episodes.by_id:
             return None
         return episode if episode.simulated is (current_simulation.get() is not None) else None
 
     def episode_of(self, node: TaskTreeNode) -> Episode | None:
         """Return the open episode of this memory in which the node is recorded; None without one."""
         record: NodeRecord | None = node.record
-        return record.episode if record is not None and record.episode in self.episodes else None
+        return record.episode if record is not None and record.episode.id in self.episodes.by_id else None
 
     # --- the port of the plan layer ----------------------------------------------------------------------------------
 

@@ -1,7 +1,7 @@
 """`OpenEpisodes` holds the open episodes of one memory, whichever executive writes them.
 
 Theory of operation. `continue_episode` moves an episode to its follow-up. `_continuing` holds the former id meanwhile,
-so that another event cannot start a second move, and `_open` holds the episode under both ids, because it is looked up
+so that another event cannot start a second move, and `by_id` holds the episode under both ids, because it is looked up
 by its current id, which changes during the move.
 """
 
@@ -32,6 +32,7 @@ class OpenEpisodes:
     """The open episodes of one memory, and the ids of those opened last.
 
     Attributes:
+        by_id: the open episodes.
         opened_count, continued_count: the numbers of episodes opened and of follow-ups, without simulations.
     """
 
@@ -39,7 +40,7 @@ class OpenEpisodes:
         self._emitter = emitter
         self._clock = clock
         self._randomness = randomness
-        self._open: dict[EpisodeId, AnyWriter] = {}
+        self.by_id: dict[EpisodeId, AnyWriter] = {}
         self._recent: deque[EpisodeId] = deque(maxlen=RECENT_MAX)
         self._continuing: set[EpisodeId] = set()
         self.opened_count = 0
@@ -51,7 +52,7 @@ class OpenEpisodes:
 
     def add(self, episode: AnyWriter) -> None:
         """Add an episode whose start is written."""
-        self._open[episode.id] = episode
+        self.by_id[episode.id] = episode
         self._note_opened(episode)
 
     def _note_opened(self, episode: AnyWriter) -> None:
@@ -59,13 +60,10 @@ class OpenEpisodes:
             self._recent.append(episode.id)
             self.opened_count += 1
 
-    def __contains__(self, episode: AnyWriter) -> bool:
-        return episode.id in self._open
-
     @property
     def all(self) -> tuple[AnyWriter, ...]:
         """The open episodes, oldest first."""
-        return tuple(self._open.copy().values())
+        return tuple(self.by_id.copy().values())
 
     @property
     def recent(self) -> tuple[str, ...]:
@@ -89,7 +87,7 @@ class OpenEpisodes:
             return
         former, follow_up = episode.id, self.new_id()
         self._continuing.add(former)
-        self._open[follow_up] = episode
+        self.by_id[follow_up] = episode
         try:
             with around as renumber:
                 renumbered = episode.continue_as(follow_up)
@@ -98,7 +96,7 @@ class OpenEpisodes:
         except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
             self._emitter.note_fault("EpisodeStarted", error)
         finally:
-            self._open.pop(former if episode.id == follow_up else follow_up, None)
+            self.by_id.pop(former if episode.id == follow_up else follow_up, None)
             self._continuing.discard(former)
         if episode.id == follow_up:
             self.continued_count += 1
@@ -109,7 +107,7 @@ class OpenEpisodes:
         """Write the end of an episode that `failure` left, or None. Exceptions are counted, not raised."""
         if self._emitter.is_closed:
             return
-        self._open.pop(episode.id, None)
+        self.by_id.pop(episode.id, None)
         try:
             episode.end_episode(failure)
         except Exception as error:  # noqa: BLE001  a fault of the memory must not replace the plan's outcome
