@@ -30,10 +30,19 @@ from pycrorm_async.events.values import (
     RobotValue,
     SeenValue,
 )
+from pycrorm_async.recording.checked_arguments import (
+    END_STATUSES,
+    failure_of,
+    joints_of,
+    link_of,
+    object_of,
+    pose_of,
+    struct_of,
+)
 from pycrorm_async.recording.counted_calls import counted
 from pycrorm_async.recording.declarations.declared_type import DeclaredType
-from pycrorm_async.recording.recorded_objects import RecordedObject, RecordedObjects
-from pycrorm_async.recording.recorded_values import Convert, RecordedValues, pose_of
+from pycrorm_async.recording.recorded_objects import RecordedObjects
+from pycrorm_async.recording.recorded_values import Convert, RecordedValues
 from pycrorm_async.recording.values.failure_values import failure_value
 from pycrorm_async.recording.values.texts import clean_repr
 from pycrorm_async.recording.writing.emitter import Emitter
@@ -134,7 +143,7 @@ class RecordedEpisode(EpisodeWriter[_Node]):
         if key in self._nodes:
             self._note("NodeStarted", f"the key {clean_repr(key)} starts a second node before the first has ended")
             self._end(self._nodes[key], NodeEnded(self._nodes[key].sequence, "LOST"))
-        state = robot if robot is None or isinstance(robot, RobotValue) else self._objects.robot(robot)
+        state = struct_of(robot, RobotValue) if isinstance(robot, RobotValue) else self._objects.robot(robot)
         node = _Node(key, type, self._find(parent), state)
         missing: dict[str, str] = {}
         node.parameters = self._values.parameters(type, parameters, missing)
@@ -162,14 +171,17 @@ class RecordedEpisode(EpisodeWriter[_Node]):
         self,
         key: Hashable,
         status: NodeStatus = "SUCCEEDED",
-        failure: BaseException | FailureValue | None = None,
+        failure: BaseException | FailureValue | str | None = None,
         result: Any = None,
     ) -> None:
-        """Record that a node ended. A key that no open node has is counted."""
+        """Record that a node ended. A key that no open node has is counted, and so is an unknown status, as ERROR."""
         node = self._nodes.get(key)
         if node is None:
             raise CallerError(f"no open node has the key {clean_repr(key)}")
-        value = failure_value(failure, self) if isinstance(failure, BaseException) else failure
+        if status not in END_STATUSES:
+            self._note("NodeEnded", f"{clean_repr(status)} is not a status ({', '.join(sorted(END_STATUSES))})")
+            status = "ERROR"
+        value = failure_value(failure, self) if isinstance(failure, BaseException) else self._failure(failure)
         encoded = self._values.any(result) if result is not None else None
         self._end(node, NodeEnded(node.sequence, status, value, encoded))
 
@@ -220,8 +232,10 @@ class RecordedEpisode(EpisodeWriter[_Node]):
             color, model, serial, mass_kg: see `events.types.ObjectAdded`.
             torso_joint: of a robot with a torso that is lifted, the joint that does it.
         """
-        at = pose_of(pose)
-        added = RecordedObject(name, object_type, at, dict(joints), urdf, color, model, serial, mass_kg, torso_joint)
+        added = object_of(
+            name, object_type, pose, joints, urdf=urdf, color=color, model=model, serial=serial, mass_kg=mass_kg,
+            torso_joint=torso_joint,
+        )  # fmt: skip
         self._objects.add(key, added, self._cause(node))
 
     @counted("ObjectMoved")
@@ -232,14 +246,14 @@ class RecordedEpisode(EpisodeWriter[_Node]):
     @counted("JointsMoved")
     def joints_moved(self, key: Hashable, joints: Mapping[str, float], *, node: Hashable | None = None) -> None:
         """Record new joint positions (rad or m); only those that changed."""
-        self._objects.turn(self._known(key), joints, self._cause(node))
+        self._objects.turn(self._known(key), joints_of(joints), self._cause(node))
 
     @counted("ObjectAttached")
     def object_attached(
         self, parent: Hashable, child: Hashable, link: str | None = None, *, node: Hashable | None = None
     ) -> None:
         """Record that `child` moves with `link` of `parent` from now on."""
-        self._objects.attach(self._known(parent), self._known(child), link, self._cause(node))
+        self._objects.attach(self._known(parent), self._known(child), link_of(link), self._cause(node))
 
     @counted("ObjectDetached")
     def object_detached(self, parent: Hashable, child: Hashable, *, node: Hashable | None = None) -> None:
@@ -276,9 +290,9 @@ class RecordedEpisode(EpisodeWriter[_Node]):
     ) -> None:
         """Record a result of perception; `object_type` is the type searched for."""
         found = self._find(node)
-        event = ObjectDetected(
-            source, object_type, tuple(seen), self.node_or_root(found) if found is not None else None
-        )
+        number = self.node_or_root(found) if found is not None else None
+        percepts = tuple(struct_of(each, SeenValue) for each in seen)
+        event = struct_of(ObjectDetected(source, object_type, percepts, number), ObjectDetected)
         if self._put_detection(event) >= self.continue_at:
             self._continue()
 
@@ -342,6 +356,13 @@ class RecordedEpisode(EpisodeWriter[_Node]):
         return None
 
     # --- inside -----------------------------------------------------------------------------------------------
+
+    def _failure(self, failure: object) -> FailureValue | None:
+        try:
+            return failure_of(failure) if failure is not None else None
+        except CallerError as error:  # the node has ended nevertheless
+            self.emitter.note_fault("NodeEnded", error)
+            return None
 
     def _find(self, key: Hashable | None) -> _Node | None:
         if key is None:

@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.events.types import ObjectAdded, ObjectAttached, ObjectDetached, ObjectMoved
 from pycrorm_async.events.values import ObjectReference, PoseValue, RobotValue
-from pycrorm_async.recording.values.texts import clean
 from pycrorm_async.recording.writing.emitter import Emitter
 from pycrorm_async.recording.writing.object_rows import ObjectRows
 from pycrorm_async.world.queries.bounding_boxes import BoundingBox
@@ -89,7 +88,7 @@ class RecordedObjects(ObjectRows[Hashable]):
         if known is None:
             return None
         torso = known.joints.get(known.torso_joint) if known.torso_joint is not None else None
-        return RobotValue(known.pose, clean(known.object_type), torso, self._references.get(key), clean(known.name))
+        return RobotValue(known.pose, known.object_type, torso, self._references.get(key), known.name)
 
     def add(self, key: Hashable, added: RecordedObject, node: Node) -> None:
         """Write that an object entered the world; of a known key, its new pose and joints."""
@@ -99,15 +98,15 @@ class RecordedObjects(ObjectRows[Hashable]):
             return
         self._put(
             lambda: ObjectAdded(
-                clean(added.name),
-                clean(added.object_type),
+                added.name,
+                added.object_type,
                 added.pose,
                 dict(added.joints),
                 node(),
                 self._emitter.descriptions.declare(_Described(added.urdf)) if added.urdf is not None else None,
                 added.color,
-                clean(added.model) if added.model is not None else None,
-                clean(added.serial) if added.serial is not None else None,
+                added.model,
+                added.serial,
                 added.mass_kg,
             ),
             row_of=key,
@@ -127,7 +126,7 @@ class RecordedObjects(ObjectRows[Hashable]):
             return
         known.pose = pose
         self._put(
-            lambda: ObjectMoved(reference.object, clean(known.name), clean(known.object_type), pose, node()),
+            lambda: ObjectMoved(reference.object, known.name, known.object_type, pose, node()),
             row_of=key,
             identity=reference.object,
         )

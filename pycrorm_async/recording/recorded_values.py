@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Mapping
 from typing import Any, Protocol
 
-from pycrorm_async.events.values import ObjectReference, PoseValue
+from pycrorm_async.events.values import ObjectReference
 from pycrorm_async.recording.declarations.declared_type import DeclaredType
 from pycrorm_async.recording.values.texts import clean, message_of, reading_fault
 from pycrorm_async.recording.values.value_snapshot import (
@@ -16,9 +16,8 @@ from pycrorm_async.recording.values.value_snapshot import (
     encode_parameter,
     missing_value,
 )
-from pycrorm_async.world.pose import Pose
 
-__all__ = ["Convert", "RecordedValues", "pose_of"]
+__all__ = ["Convert", "RecordedValues"]
 
 Convert = Callable[[Any], Any]
 
@@ -93,12 +92,3 @@ class RecordedValues:
             return self._objects().reference(value)
         except TypeError:  # it is not hashable, so it is no key
             return None
-
-
-def pose_of(pose: Pose | PoseValue) -> PoseValue:
-    """Copy a pose. Raises `ValueError` for anything else."""
-    if isinstance(pose, PoseValue):
-        return pose
-    if isinstance(pose, Pose):
-        return PoseValue(pose.position, pose.orientation, pose.frame, pose.time_ns)
-    raise ValueError(f"a pose must be a Pose or a PoseValue, not a {type(pose).__name__}")

@@ -118,7 +118,7 @@ def declare_type(
 
 def _dtype(own: str, kind: str, known: KnownTypes) -> tuple[str, str | None]:
     """Return the first name that the type may have, and the reason why it is not its own; its own if none may be."""
-    plain = re.sub(r"[\W_]+", "_", own).strip("_") or kind
+    plain = re.sub(r"[\W_]+", "_", own).strip("_") or "Unnamed"
     if not plain.isidentifier():
         plain = f"{kind}_{plain}"
     first_fault: str | None = None

@@ -200,7 +200,11 @@ def _encode_pose(value: Any, _enum: type[Enum] | None, _references: References) 
         raise UnrecordableValue(f"the pose holds a number that is not finite: {value}")
     if unwritable(value.frame):
         raise UnrecordableValue(f"the pose's frame: {unwritable(value.frame)}")
-    return pose_value(value) if isinstance(value, Pose) else value
+    if isinstance(value, Pose):
+        return pose_value(value)
+    if (len(value.position), len(value.orientation)) != (3, 4):
+        raise UnrecordableValue(f"a position has 3 numbers and an orientation 4: {value}")
+    return value
 
 
 def _encode_object(value: Any, _enum: type[Enum] | None, references: References) -> ObjectReference | ObjectValue:

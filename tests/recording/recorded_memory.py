@@ -1,0 +1,47 @@
+"""A memory of an executive that knows no asyncio, and what its tables and log say afterwards."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+from pathlib import Path
+from typing import Any
+
+from pycrorm_async.projections.verify.verify import verify
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.log import EventLog
+from tests.databases import ask
+
+
+def url_of(folder: Path) -> str:
+    return f"sqlite:///{folder / 'memory.db'}"
+
+
+def nodes(folder: Path) -> list[tuple[Any, ...]]:
+    """Return (dtype, dtype of the parent, status, failure message) of each node but the roots, in order."""
+    return [
+        tuple(row)
+        for row in ask(
+            folder / "memory.db",
+            "SELECT node.dtype, parent.dtype, node.status, node.failure_message FROM task_tree_node AS node"
+            " JOIN task_tree_node AS parent ON parent.id = node.parent_id ORDER BY node.id",
+        )
+    ]
+
+
+def events(folder: Path, kind: str) -> list[dict[str, Any]]:
+    """Return the payloads of the events of one type, in order."""
+    rows = ask(folder / "memory.db", f"SELECT payload FROM event WHERE type = '{kind}' ORDER BY episode, sequence")
+    return [json.loads(payload) for (payload,) in rows]
+
+
+def assert_verified(folder: Path) -> None:
+    async def problems() -> list[str]:
+        log = await EventLog.open(DatabaseAddress.parse(url_of(folder)), create=False)
+        try:
+            result = await verify(log)
+            return [str(each) for each in (*result.damages, *result.differences, *result.stopped)]
+        finally:
+            await log.close()
+
+    assert asyncio.run(problems()) == []

@@ -1,0 +1,431 @@
+"""Episodes that another executive writes: from any thread, by keys of its own, without ever raising."""
+
+from __future__ import annotations
+
+import asyncio
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pycrorm_async import Memory, Settings, recover
+from pycrorm_async.errors import CallerError
+from pycrorm_async.events.values import FailureValue, ObjectReference, PoseValue, RobotValue, SeenValue
+from pycrorm_async.plan.failures import NavigationGoalInCollision
+from pycrorm_async.recording.recorded_episode import RecordedEpisode
+from pycrorm_async.recording.recording import Recording
+from pycrorm_async.sync_memory import SyncMemory
+from pycrorm_async.world.pose import Pose
+from tests.commands import environment, pycrorm
+from tests.databases import ask
+from tests.recording.recorded_memory import assert_verified, events, nodes, url_of
+
+AT_END = Settings(fold="at_end")
+HERE = Pose([1, 2, 3])
+
+
+class Side(Enum):
+    LEFT = 1
+
+
+def opened(folder: Path, settings: Settings = AT_END) -> SyncMemory:
+    return Memory.sync(url_of(folder), settings=settings)
+
+
+def faults_of(folder: Path, write: Callable[[Recording, RecordedEpisode], None]) -> tuple[int, str | None]:
+    """Return how many faults were counted while `write` ran in an episode, and the last one."""
+    with opened(folder) as memory:
+        with memory.recording.episode(description="d") as episode:
+            write(memory.recording, episode)
+        return memory.status.faults
+
+
+def test_a_tree_written_by_threads_has_the_parents_that_they_named(tmp_path: Path) -> None:
+    with opened(tmp_path) as memory, memory.recording.episode(description="twenty times three") as episode:
+        parallel = memory.recording.type("language", "Parallel")
+        move = memory.recording.type("motion", "MoveArm", {"number": int})
+        for number in range(20):
+            episode.start(("parallel", number), parallel)
+
+            def branch(key: tuple[int, int], above: int = number) -> None:
+                episode.start(key, move, {"number": above}, parent=("parallel", above))
+                episode.end(key, "FAILED" if key[1] else "SUCCEEDED")
+
+            threads = [threading.Thread(target=branch, args=((number, each),)) for each in range(3)]
+            for thread in threads:
+                thread.start()
+            for thread in threads:
+                thread.join()
+            episode.end(("parallel", number))
+    rows = ask(
+        tmp_path / "memory.db",
+        "SELECT node.parent_id, move.number FROM move_arm AS move JOIN task_tree_node AS node ON node.id = move.id",
+    )
+    parents = [each for (each,) in ask(tmp_path / "memory.db", "SELECT id FROM parallel ORDER BY id")]
+    assert sorted(rows) == sorted((parents[number], number) for number in range(20) for _ in range(3))
+    assert_verified(tmp_path)
+
+
+def test_what_happened_is_in_the_tables_and_in_show(tmp_path: Path) -> None:
+    with opened(tmp_path) as memory:
+        recording = memory.recording
+        pick_up = recording.type(
+            "action", "PickUpAction", {"object_designator": "object", "arm": Side, "grasp": "enum"}
+        )
+        with recording.episode(
+            description="breakfast",
+            plan="breakfast",
+            seed=3,
+            tags=["demo"],
+            metadata={"executive": "mine"},
+            world="flat",
+        ) as episode:
+            episode.object_added(
+                7, "pr2", "ROBOT", HERE, {"torso": 0.2}, torso_joint="torso", model="PR2", urdf="<robot name='r'/>"
+            )
+            episode.object_added("m", "milk", "MILK", Pose([1, 0, 1]), color=(1, 1, 1, 1), mass_kg=1.0)
+            episode.start("p", pick_up, {"object_designator": "m", "arm": Side.LEFT, "grasp": "FRONT"}, robot=7)
+            episode.joints_moved(7, {"torso": 0.3, "elbow": 1.0}, node="p")
+            episode.object_moved("m", Pose([1, 0, 1.2]), node="p")
+            episode.object_attached(7, "m", "l_gripper", node="p")
+            episode.observe("force", {"x": 1.5}, node="p")
+            reference = episode.reference("m")
+            episode.detected(
+                [SeenValue("milk", "MILK", PoseValue((1, 0, 1), (0, 0, 0, 1), "map", 0), reference)], node="p"
+            )
+            episode.end("p", "FAILED", NavigationGoalInCollision("the table"), {"tried": [1, HERE]})
+            episode.object_detached(7, "m")
+            episode.object_removed("m")
+        assert (memory.status.faults.total, memory.status.missing.total) == (0, 0)
+        assert memory.recent_episodes == (str(episode),)
+    file = tmp_path / "memory.db"
+    assert nodes(tmp_path) == [("PickUpAction", None, "FAILED", "the table")]
+    picked = "SELECT arm, grasp, object.name FROM pick_up_action JOIN object ON object.id = object_designator_id"
+    assert ask(file, picked) == [("LEFT", "FRONT", "milk")]
+    robot = "SELECT robot, torso_height FROM task_tree_node WHERE dtype = 'PickUpAction' AND robot_pose_id IS NOT NULL"
+    assert ask(file, robot) == [("pr2", 0.2)]
+    assert sorted(ask(file, "SELECT joint, position FROM joint_change WHERE node_id IS NOT NULL")) == [
+        ("elbow", 1.0),
+        ("torso", 0.3),
+    ]
+    assert ask(file, "SELECT kind, link FROM attachment ORDER BY id") == [
+        ("attached", "l_gripper"),
+        ("detached", "l_gripper"),
+    ]
+    (result,) = [each["result"] for each in events(tmp_path, "NodeEnded") if "result" in each]
+    assert result["tried"][1]["position"] == [1.0, 2.0, 3.0]
+    shown = pycrorm("show", "last", "--url", url_of(tmp_path), cwd=tmp_path).stdout
+    assert "NavigationGoalInCollision: the table" in shown
+    assert "robot     pr2 (PR2)" in shown
+    assert_verified(tmp_path)
+
+
+def test_values_go_through_the_conversion_and_what_it_refuses_is_missing_with_its_reason(tmp_path: Path) -> None:
+    class Grip:
+        def __init__(self, object_key: str) -> None:
+            self.object_key = object_key
+
+    def convert(value: Any) -> Any:
+        if isinstance(value, Grip):
+            return value.object_key
+        if isinstance(value, bytes):
+            raise ValueError("bytes are not kept")  # noqa: TRY004  as an executive would
+        return 1 / 0 if value == "fault" else value
+
+    with opened(tmp_path) as memory:
+        kind = memory.recording.type(
+            "action", "GripIt", {"what": "object", "all": ("list", "object"), "raw": "text", "text": str}
+        )
+        with memory.recording.episode(description="d", convert=convert) as episode:
+            episode.object_added("m", "milk", "MILK", HERE)
+            episode.start("g", kind, {"what": Grip("m"), "all": [Grip("m"), "m"], "raw": b"1", "text": "fault"})
+            episode.observe("seen", {"grip": Grip("m"), "raw": b"1"}, node="g")
+            episode.end("g", result={"grip": Grip("m")})
+        assert memory.status.faults == (0, None)
+        assert memory.status.missing.total == 3
+    (started,) = [each for each in events(tmp_path, "NodeStarted") if "designator" in each]
+    row = {"object": 3, "row": 3}
+    assert started["parameters"]["what"] == row
+    assert started["parameters"]["all"] == [row, row]
+    assert started["parameters"]["raw"]["missing"] == "bytes are not kept"
+    assert "ZeroDivisionError" in started["parameters"]["text"]["missing"]
+    (observed,) = events(tmp_path, "Observed")
+    assert (observed["values"]["grip"], observed["missing"]["raw"]) == ("m", "bytes are not kept")
+    assert_verified(tmp_path)
+
+
+def test_an_end_without_a_start_is_counted(tmp_path: Path) -> None:
+    total, last = faults_of(tmp_path, lambda _, episode: episode.end("never"))
+    assert total == 1
+    assert last is not None
+    assert "no open node has the key 'never'" in last
+
+
+def test_a_key_in_use_ends_its_first_node_lost_and_starts_the_second(tmp_path: Path) -> None:
+    def write(recording: Recording, episode: RecordedEpisode) -> None:
+        kind = recording.type("action", "Twice")
+        episode.start(1, kind)
+        episode.start(1, kind)
+        episode.end(1)
+        episode.start(1, kind)  # after its end a key is free again
+        episode.end(1)
+
+    assert faults_of(tmp_path, write)[0] == 1
+    assert [row[2] for row in nodes(tmp_path)] == ["LOST", "SUCCEEDED", "SUCCEEDED"]
+    assert_verified(tmp_path)
+
+
+def test_an_unknown_parent_is_counted_and_an_ended_one_is_kept(tmp_path: Path) -> None:
+    def write(recording: Recording, episode: RecordedEpisode) -> None:
+        kind = recording.type("action", "Step")
+        episode.start("a", kind)
+        episode.end("a")
+        episode.start("b", kind, parent="a")
+        episode.end("b")
+        episode.start("c", kind, parent="never")
+        episode.end("c")
+
+    assert faults_of(tmp_path, write)[0] == 1
+    assert [row[1] for row in nodes(tmp_path)] == [None, "Step", None]
+
+
+def test_nodes_open_at_the_end_are_lost_and_counted_once(tmp_path: Path) -> None:
+    def write(recording: Recording, episode: RecordedEpisode) -> None:
+        for key in range(3):
+            episode.start(key, recording.type("action", "Step"))
+
+    total, last = faults_of(tmp_path, write)
+    assert total == 1
+    assert last is not None
+    assert "3 nodes were open" in last
+    assert [row[2] for row in nodes(tmp_path)] == ["LOST"] * 3
+    assert_verified(tmp_path)
+
+
+def test_a_thread_that_outlives_the_episode_is_counted_and_disturbs_nothing(tmp_path: Path) -> None:
+    with opened(tmp_path) as memory:
+        kind = memory.recording.type("action", "Step")
+        ended = threading.Event()
+        with memory.recording.episode(description="d") as episode:
+            episode.start("in time", kind)
+
+            def late() -> None:
+                ended.wait()
+                episode.end("in time")
+                episode.start("late", kind)
+                episode.observe("late", 1.0)
+
+            thread = threading.Thread(target=late)
+            thread.start()
+            episode.end("in time")
+        ended.set()
+        thread.join()
+        assert memory.status.faults.total == 3
+    assert len(nodes(tmp_path)) == 1
+    assert events(tmp_path, "Observed") == []
+
+
+@pytest.mark.parametrize("misuse", ["unhashable", "no pose", "unknown object", "no type", "bad status"])
+def test_misuse_is_counted_and_never_raises(tmp_path: Path, misuse: str) -> None:
+    def write(recording: Recording, episode: RecordedEpisode) -> None:
+        anything: Any = []
+        if misuse == "unhashable":
+            episode.start(anything, recording.type("action", "Step"))
+        elif misuse == "no pose":
+            episode.object_added("m", "milk", "MILK", anything)
+        elif misuse == "unknown object":
+            episode.object_moved("m", HERE)
+        elif misuse == "no type":
+            episode.start("a", anything)
+        else:
+            episode.start("a", recording.type("action", "Step"))
+            episode.end("a", anything)
+
+    assert faults_of(tmp_path, write)[0] >= 1
+    with opened(tmp_path) as memory, memory.recording.episode(description="after it") as episode:
+        episode.start("a", memory.recording.type("action", "Step"))
+        episode.end("a")
+    assert nodes(tmp_path)[-1][2] == "SUCCEEDED"
+    assert_verified(tmp_path)
+
+
+def test_arguments_of_an_episode_that_do_not_fit_are_refused_at_once(tmp_path: Path) -> None:
+    anything: Any = 3
+    with opened(tmp_path) as memory:
+        for arguments in ({"description": anything}, {"seed": 2**70}, {"convert": anything}, {"tags": anything}):
+            with pytest.raises(CallerError):
+                memory.recording.episode(**arguments)
+
+
+def test_a_simulation_names_the_node_that_imagined_it(tmp_path: Path) -> None:
+    with opened(tmp_path) as memory:
+        kind = memory.recording.type("action", "Plan")
+        with memory.recording.episode(description="real") as real:
+            real.start("p", kind)
+            thought = memory.recording.episode(description="t", simulated=True, thought_by=real.node_reference("p"))
+            thought.start("q", kind)
+            thought.end("q")
+            thought.close()
+            real.end("p")
+        assert memory.recent_episodes == (str(real),)
+    assert [each.get("thought_by") for each in events(tmp_path, "EpisodeStarted")] == [
+        None,
+        {"episode": str(real), "node": 3},
+    ]
+    assert ask(tmp_path / "memory.db", "SELECT count(*) FROM process_metadata") == [(1,)]  # a query leaves it out
+    assert_verified(tmp_path)
+
+
+def test_a_failure_that_leaves_the_block_ends_the_episode_with_its_status(tmp_path: Path) -> None:
+    with opened(tmp_path) as memory:
+        for failure in (NavigationGoalInCollision("n"), ValueError("v"), KeyboardInterrupt()):
+            with pytest.raises(type(failure)), memory.recording.episode(description="d"):
+                raise failure
+        memory.recording.episode(description="left open")
+    statuses = [each for (each,) in ask(tmp_path / "memory.db", "SELECT status FROM process_metadata ORDER BY id")]
+    assert statuses == ["FAILED", "ERROR", "INTERRUPTED", "INTERRUPTED"]
+
+
+def test_a_long_episode_continues_with_its_open_nodes_and_its_objects(tmp_path: Path) -> None:
+    with opened(tmp_path, Settings(episode_events_max=200)) as memory:
+        kind = memory.recording.type("action", "Step", {"number": int, "what": "object"})
+        with memory.recording.episode(description="long") as episode:
+            episode.object_added("x", "cup", "CUP", HERE)  # so that the follow-ups have the others at other sequences
+            episode.object_added("r", "pr2", "ROBOT", HERE, {"j": 1.0})
+            episode.object_added("m", "milk", "MILK", HERE)
+            episode.object_attached("r", "m")
+            episode.object_removed("x")
+            episode.start("outer", kind, {"what": "m"}, robot="r")
+            for number in range(300):
+                episode.start(number, kind, {"number": number, "what": "m"}, parent="outer", robot="r")
+                episode.object_moved("m", Pose([number, 0, 0]), node=number)
+                episode.end(number)
+            episode.end("outer")
+        assert memory.status.faults == (0, None)
+        continued = memory.status.episodes_continued
+        assert continued > 3
+    assert_verified(tmp_path)
+    file = tmp_path / "memory.db"
+    numbers = ask(file, "SELECT number FROM step JOIN task_tree_node USING (id) WHERE status = 'SUCCEEDED' ORDER BY id")
+    assert [each for (each,) in numbers if each is not None] == list(range(300))
+    outers = [
+        each for each in events(tmp_path, "NodeStarted") if "designator" in each and "number" not in each["parameters"]
+    ]
+    assert len(outers) == continued + 1
+    assert all("what" in each["parameters"] for each in outers)
+    assert len(events(tmp_path, "ObjectAttached")) == continued + 1
+
+
+def test_threads_that_reach_the_limit_together_continue_the_episode_once(tmp_path: Path) -> None:
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        with opened(tmp_path, Settings(episode_events_max=200)) as memory:
+            kind = memory.recording.type("action", "Step", {"thread": int, "number": int})
+            with memory.recording.episode(description="long") as episode:
+
+                def work(thread: int) -> None:
+                    episode.start(thread, kind, {"thread": thread})
+                    for number in range(300):
+                        episode.start((thread, number), kind, {"thread": thread, "number": number}, parent=thread)
+                        episode.end((thread, number))
+                    episode.end(thread)
+
+                threads = [threading.Thread(target=work, args=(each,)) for each in range(4)]
+                for each in threads:
+                    each.start()
+                for each in threads:
+                    each.join()
+            assert memory.status.faults == (0, None)
+    finally:
+        sys.setswitchinterval(interval)
+    assert_verified(tmp_path)
+    rows = ask(
+        tmp_path / "memory.db",
+        "SELECT step.thread, step.number, above.thread FROM step JOIN task_tree_node AS node USING (id)"
+        " JOIN step AS above ON above.id = node.parent_id"
+        " WHERE node.status = 'SUCCEEDED' AND step.number IS NOT NULL ORDER BY 1, 2",
+    )
+    assert rows == [(thread, number, thread) for thread in range(4) for number in range(300)]
+
+
+def test_a_forked_child_records_nothing_and_does_not_hang(tmp_path: Path) -> None:
+    script = (
+        "import os, sys, threading\n"
+        "from pycrorm_async import Memory\n"
+        "with Memory.sync(sys.argv[1]) as memory, memory.recording.episode(description='d') as episode:\n"
+        "    kind = memory.recording.type('action', 'Step')\n"
+        "    episode.start('a', kind)\n"
+        "    with episode.lock:\n"
+        "        child = os.fork()\n"
+        "        if child == 0:\n"
+        "            late = threading.Thread(target=lambda: episode.start('child', kind), daemon=True)\n"
+        "            late.start()\n"
+        "            late.join(10)\n"
+        "            memory.__exit__(None, None, None)\n"
+        "            os._exit(8 if late.is_alive() else 7)\n"
+        "    _, status = os.waitpid(child, 0)\n"
+        "    assert os.waitstatus_to_exitcode(status) == 7\n"
+        "    episode.end('a')\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", script, url_of(tmp_path)],
+        env=environment(), capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, "")
+    assert nodes(tmp_path) == [("Step", None, "SUCCEEDED", None)]
+
+
+def test_what_was_written_before_a_kill_is_stored_by_the_next_memory(tmp_path: Path) -> None:
+    script = (
+        "import os, sys\n"
+        "from pycrorm_async import Memory\n"
+        "memory = Memory.sync(sys.argv[1]).__enter__()\n"
+        "episode = memory.recording.episode(description='d')\n"
+        "kind = memory.recording.type('action', 'Step', {'number': int})\n"
+        "for number in range(10**6):\n"
+        "    episode.start(number, kind, {'number': number})\n"
+        "    episode.end(number)\n"
+        "    os.write(1, b'%d\\n' % number)\n"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", script, url_of(tmp_path)], env=environment(), stdout=subprocess.PIPE
+    ) as process:
+        assert process.stdout is not None
+        announced = [int(process.stdout.readline()) for _ in range(500)]
+        process.kill()
+        announced += map(int, process.stdout.read().rpartition(b"\n")[0].split())
+    asyncio.run(recover(url_of(tmp_path)))
+    succeeded = "SELECT number FROM step JOIN task_tree_node USING (id) WHERE status = 'SUCCEEDED'"
+    assert set(announced) <= {number for (number,) in ask(tmp_path / "memory.db", succeeded)}
+    assert_verified(tmp_path)
+
+
+def test_a_full_spool_is_waited_for_by_a_thread(tmp_path: Path) -> None:
+    small = Settings(spool_bytes_max=2**20, spool_reserve_bytes=2**18, segment_bytes=2**16, record_bytes_max=2**14)
+    with Memory.sync(url_of(tmp_path), settings=small, writer="daemon") as memory:
+        kind = memory.recording.type("action", "Step", {"text": str})
+        with memory.recording.episode(description="d") as episode:
+            assert episode.wait_for_room(0.0)
+            for number in range(10_000):
+                if not episode.wait_for_room(0.0):
+                    break
+                episode.start(number, kind, {"text": "x" * 1_000})
+                episode.end(number)
+            assert number < 9_999
+            assert not episode.wait_for_room(0.05)
+        assert memory.status.faults == (0, None)
+
+
+def test_a_status_given_with_a_failure_of_another_language(tmp_path: Path) -> None:
+    with opened(tmp_path) as memory, memory.recording.episode(description="d") as episode:
+        episode.start("a", memory.recording.type("action", "Step"), robot=RobotValue(
+            PoseValue((0, 0, 0), (0, 0, 0, 1), "map", 0), "ROBOT", None, ObjectReference(1, 1), "r"
+        ))  # fmt: skip
+        episode.end("a", "INTERRUPTED", FailureValue("bt.Preempted", "a higher priority"))
+    assert nodes(tmp_path) == [("Step", None, "INTERRUPTED", "a higher priority")]

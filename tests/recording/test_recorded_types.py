@@ -1,0 +1,129 @@
+"""Types of nodes that an executive declares by names, and the fields that cannot keep theirs."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pycrorm_async import Memory, Settings
+from pycrorm_async.plan import ActionAbstract
+from pycrorm_async.recording.declarations.recorded_type import FieldSpec
+from pycrorm_async.world.pose import Pose
+from tests.databases import ask
+from tests.recording.recorded_memory import assert_verified, events, nodes, url_of
+
+AT_END = Settings(fold="at_end")
+
+
+@dataclass
+class TellActionPerformable(ActionAbstract):
+    """Has a text, of which an executive will say that it is a number."""
+
+    words: str
+
+    async def perform(self) -> None:
+        """Do nothing."""
+
+
+def recorded(folder: Path, dtype: str, fields: Mapping[str, Any], values: Mapping[str, Any]) -> int:
+    """Record one node of a type, and return how many values and names were counted as missing."""
+    with Memory.sync(url_of(folder), settings=AT_END) as memory:
+        kind = memory.recording.type("action", dtype, fields)
+        assert memory.recording.type("action", dtype, fields) is kind
+        with memory.recording.episode(description="d") as episode:
+            episode.object_added("m", "milk", "MILK", Pose([1, 2, 3]))
+            episode.start("a", kind, values)
+            episode.end("a")
+        assert memory.status.faults == (0, None)
+        missing = memory.status.missing.total
+    assert_verified(folder)
+    return missing
+
+
+def test_a_field_that_contradicts_a_built_in_type_is_kept_under_its_type(tmp_path: Path) -> None:
+    fields = {"object_designator": "text", "arm": str, "grasp": "real"}
+    assert recorded(tmp_path, "PickUpAction", fields, {"object_designator": "milk", "arm": "LEFT", "grasp": 1.5}) == 2
+    columns = "SELECT object_designator_text, arm, grasp_real FROM pick_up_action"
+    assert ask(tmp_path / "memory.db", columns) == [("milk", "LEFT", 1.5)]
+    (declared,) = events(tmp_path, "NodeStarted")[1:]
+    assert declared["parameters"] == {"object_designator_text": "milk", "arm": "LEFT", "grasp_real": 1.5}
+
+
+def test_a_built_in_type_keeps_its_concept_and_bases(tmp_path: Path) -> None:
+    recorded(tmp_path, "PickUpAction", {"arm": str}, {"arm": "LEFT"})
+    ((payload,),) = ask(
+        tmp_path / "memory.db", "SELECT payload FROM pycrorm_declaration WHERE payload LIKE '%PickUpAction%'"
+    )
+    assert json.loads(payload)["concept"] == "PickingUp"
+
+
+def test_a_field_that_contradicts_an_earlier_declaration_is_kept_under_its_type(tmp_path: Path) -> None:
+    with Memory.sync(url_of(tmp_path), settings=AT_END) as memory:
+        with memory.recording.episode(description="d") as episode:
+            values: dict[FieldSpec, Any] = {"integer": 3, "text": "three", "boolean": True}
+            for number, (kind, value) in enumerate(values.items()):
+                declared = memory.recording.type("action", "Count", {"number": kind})
+                episode.start(number, declared, {"number": value})
+                episode.end(number)
+        memory.flush()
+        assert memory.status.missing.total == 2
+    rows = ask(tmp_path / "memory.db", "SELECT number, number_text, number_boolean FROM count ORDER BY id")
+    assert rows == [(3, None, None), (None, "three", None), (None, None, 1)]
+    assert_verified(tmp_path)
+
+
+async def test_a_field_that_contradicts_a_class_of_the_plan_layer_is_kept_under_its_type(tmp_path: Path) -> None:
+    async with Memory.open(url_of(tmp_path)) as memory:
+        async with memory.episode(description="ours"):
+            await TellActionPerformable("hello").perform()
+        with memory.recording.episode(description="theirs") as episode:
+            episode.start("a", memory.recording.type("action", "TellAction", {"words": "real"}), {"words": 1.0})
+            episode.end("a")
+        await memory.flush()
+        assert memory.status.faults == (0, None)
+    rows = ask(tmp_path / "memory.db", "SELECT words, words_real FROM tell_action ORDER BY id")
+    assert rows == [("hello", None), (None, 1.0)]
+
+
+@pytest.mark.parametrize(
+    ("field", "kept"),
+    [
+        ("id", "id_text"),
+        ("target frame", "target_frame"),
+        ("2nd", "field_2nd"),
+        ("_x", "x"),
+        ("é", "é"),
+        ("Ω-1", "Ω_1"),
+    ],
+)
+def test_a_field_whose_name_cannot_be_a_column_gets_a_similar_one(tmp_path: Path, field: str, kept: str) -> None:
+    assert recorded(tmp_path, "Odd", {field: "text", "plain": "text"}, {field: "a", "plain": "b"}) == (kept != field)
+    assert ask(tmp_path / "memory.db", f'SELECT "{kept}", plain FROM odd') == [("a", "b")]
+
+
+@pytest.mark.parametrize(
+    ("dtype", "kept"),
+    [("Say it!", "Say_it"), ("__start__", "start"), ("Event", "EventAction"), ("", "Unnamed"), ("7", "action_7")],
+)
+def test_a_type_whose_name_cannot_be_a_table_gets_a_similar_one(tmp_path: Path, dtype: str, kept: str) -> None:
+    assert recorded(tmp_path, dtype, {"text": "text"}, {"text": "hi"}) == 1
+    assert nodes(tmp_path)[0][0] == kept
+
+
+def test_values_of_fields_without_a_type_are_missing_with_the_reason(tmp_path: Path) -> None:
+    fields: dict[str, Any] = {"thing": object, "kind": "colour", "number": int}
+    values = {"thing": 1, "kind": "red", "number": "no number", "undeclared": 4}
+    assert recorded(tmp_path, "Odd", fields, values) == 6  # two types, and four values
+    (started,) = [each for each in events(tmp_path, "NodeStarted") if "designator" in each]
+    assert all("missing" in each for each in started["parameters"].values())
+    assert started["parameters"]["number"]["missing"] == "declared as int, got a str"
+
+
+def test_a_built_in_motion_is_not_declared_as_an_action(tmp_path: Path) -> None:
+    assert recorded(tmp_path, "MoveTCPMotion", {}, {}) >= 1
+    assert nodes(tmp_path)[0][2] == "SUCCEEDED"
