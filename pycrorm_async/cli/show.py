@@ -14,7 +14,7 @@ from pycrorm_async.cli.output import duration, moment, print_facts, print_json
 from pycrorm_async.cli.pending_events import note_pending_events
 from pycrorm_async.cli.snapshot_view import parse_moment, print_snapshot
 from pycrorm_async.cli.tree import print_tree, simulated_by
-from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary, RobotSummary
+from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.snapshot import Moment
 
@@ -70,18 +70,13 @@ def _show(episode: str, url: str, spool: Path | None, *, events: bool, full: boo
             "continues": f"episode {summary.continues}" if summary.continues else None,
             "continued": f"in episode {summary.continued_in}" if summary.continued_in else None,
             "simulated": simulated_by(summary) if summary.simulated else None,
-            "robot": ", ".join(map(_robot, summary.robots)) or None,
+            "robot": ", ".join(map(str, summary.robots)) or None,
             "tags": ", ".join(summary.tags) or None,
             "metadata": _pairs(summary.metadata),
             **_provenance(summary, full=full),
         },
     )
     print_tree(tree, events=events, full=full)
-
-
-def _robot(robot: RobotSummary) -> str:
-    model = " ".join(each for each in (robot.model, robot.serial) if each is not None)
-    return f"{robot.name} ({model})" if model not in ("", robot.name) else robot.name
 
 
 def _provenance(summary: EpisodeSummary, *, full: bool) -> dict[str, str | None]:

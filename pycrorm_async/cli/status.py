@@ -1,4 +1,4 @@
-"""`pycrorm status` reports recorders and writers, the lag of database and tables, and everything that is stopped."""
+"""`pycrorm status` reports recorders, running episodes, the lag of database and tables, and what is stopped."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import msgspec
 
 from pycrorm_async.cli.durability import Durability, durability, print_durability, summarise_kept_segments
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
-from pycrorm_async.cli.output import note, print_json, print_table, problem, stdout
+from pycrorm_async.cli.output import moment, note, print_json, print_table, problem, stdout
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import DatabaseError
 from pycrorm_async.operations.destination import shared_address
@@ -19,7 +19,9 @@ from pycrorm_async.operations.fold_worker import FoldWorkerState
 from pycrorm_async.operations.fold_workers import DaemonNote
 from pycrorm_async.projections.custom.discovery import installed_projections
 from pycrorm_async.projections.custom.projection_tables import ProjectionState, states
+from pycrorm_async.projections.schema.generations import PROJECTION_VERSION, SHOWN, read_generation
 from pycrorm_async.projections.schema.unmade_types import failed_views, unmade_types
+from pycrorm_async.query.named_queries import RunningEpisode, running_episodes
 from pycrorm_async.queue.files.spool import RecorderFolder, Spool
 from pycrorm_async.queue.maintenance.inspection import inspect_folder
 from pycrorm_async.store.address import DatabaseAddress
@@ -28,6 +30,8 @@ from pycrorm_async.store.log import EventLog
 __all__ = ["status", "RecorderState", "EpisodeState", "RefusedState"]
 
 
+RUNNING_MAX = 20
+"""Bounds the running episodes that are listed: a simulator may have hundreds, and the newest say most."""
 _DRAINED_BY = {"itself": "itself", "another": "another process", "nobody": "no process"}
 """The table's words for the values of `RecorderState.drained`, which are part of the `--json` document."""
 
@@ -88,7 +92,9 @@ class RefusedState:
 
 
 def status(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None, as_json: JsonOption = False) -> int:
-    """Report recorders, writers, and the lag of database and tables. Changes nothing.
+    """Report recorders, writers, running episodes with their robots, and the lag of database and tables.
+
+    Changes nothing.
 
     Exit code 1 if an episode or a recorder is stopped or a designator type has no tables or a view is left out, 3
     if the database or the spool is unavailable.
@@ -106,13 +112,14 @@ def status(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None, as_json: Jso
     workers = _workers(place.writer_note())
     episodes: list[EpisodeState] = []
     projections: list[ProjectionState] = []
+    running: tuple[list[RunningEpisode], int] = [], 0
     limits_near: list[str] = []
     unmade: dict[str, str] = {}
     views: dict[str, str] = {}
     kept, log_durability = summarise_kept_segments(place.path), None
     fault: str | None = None
     try:
-        episodes, projections, limits_near, unmade, views, log_durability = asyncio.run(_query(address))
+        episodes, running, projections, limits_near, unmade, views, log_durability = asyncio.run(_query(address))
     except DatabaseError as error:
         fault = str(error)
     if as_json:
@@ -132,11 +139,14 @@ def status(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None, as_json: Jso
                 "failed_views": views,
                 "kept": kept,
                 "stored_on": None if log_durability is None else log_durability.stored_on._asdict(),
+                "running": running[0],
+                "running_total": running[1],
                 "went_back": [] if log_durability is None else [each._asdict() for each in log_durability.went_back],
             }
         )
     else:
         _print(place, recorders, episodes, has_daemon=has_daemon, database_answered=fault is None)
+        _print_running(*running)
         _print_workers(workers)
         print_durability(kept, log_durability)
         for projection in projections:
@@ -184,6 +194,16 @@ def _workers(note: bytes | None) -> Sequence[FoldWorkerState]:
         return ()
 
 
+def _print_running(episodes: Sequence[RunningEpisode], total: int) -> None:
+    if not episodes:
+        return
+    print_table(
+        "Running episodes" if total == len(episodes) else f"The {len(episodes)} newest of {total} running episodes",
+        ("episode", "id", "started", "description", "robots"),
+        [(e.number, e.id, moment(e.started_at), e.description, ", ".join(map(str, e.robots))) for e in episodes],
+    )
+
+
 def _print_workers(workers: Sequence[FoldWorkerState]) -> None:
     if not workers:
         return
@@ -227,7 +247,15 @@ def _recorder(folder: RecorderFolder) -> RecorderState:
 
 async def _query(
     address: DatabaseAddress,
-) -> tuple[list[EpisodeState], list[ProjectionState], list[str], dict[str, str], dict[str, str], Durability]:
+) -> tuple[
+    list[EpisodeState],
+    tuple[list[RunningEpisode], int],
+    list[ProjectionState],
+    list[str],
+    dict[str, str],
+    dict[str, str],
+    Durability,
+]:
     log = await EventLog.open(address, create=False)
     try:
         rows = {each.number: each for each in [*await log.behind(), *await log.stopped()]}
@@ -243,6 +271,7 @@ async def _query(
         projections = await states(log, installed_projections(()))
         return (
             episode_states,
+            await _running(log),
             projections,
             await log.limits_near(),
             await unmade_types(log),
@@ -251,6 +280,15 @@ async def _query(
         )
     finally:
         await log.close()
+
+
+async def _running(log: EventLog) -> tuple[list[RunningEpisode], int]:
+    """Query the running episodes; none where this version cannot read the tables."""
+    async with log.snapshot() as connection:
+        generation = await read_generation(connection, SHOWN)
+        if generation is None or generation.version != PROJECTION_VERSION:
+            return [], 0
+        return await running_episodes(connection, RUNNING_MAX)
 
 
 def _print(

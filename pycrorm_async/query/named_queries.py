@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 from typing import Any
@@ -50,6 +50,22 @@ class RobotSummary:
     model: str | None
     serial: str | None
     description: str | None
+
+    def __str__(self) -> str:
+        """Return the name, with model and serial as far as they add to it."""
+        model = " ".join(each for each in (self.model, self.serial) if each is not None)
+        return f"{self.name} ({model})" if model not in ("", self.name) else self.name
+
+
+@dataclass(frozen=True)
+class RunningEpisode:
+    """An episode that has not ended, as far as the tables show it, and the robots that took part so far."""
+
+    number: int
+    id: str
+    started_at: datetime
+    description: str
+    robots: tuple[RobotSummary, ...]
 
 
 @dataclass(frozen=True)
@@ -148,7 +164,7 @@ async def episodes(connection: AsyncConnection, number: int | None = None) -> li
     query = _overview()
     if number is not None:
         query = query.where(ProcessMetaData.id == number)
-    robots = await _robots(connection, number)
+    robots = await _robots(connection, None if number is None else [number])
     tags: dict[int, list[str]] = {}
     tagged = select(EpisodeTag.process_metadata_id, EpisodeTag.tag).order_by(EpisodeTag.tag)
     if number is not None:
@@ -191,12 +207,27 @@ async def episodes(connection: AsyncConnection, number: int | None = None) -> li
     ]
 
 
-async def _robots(connection: AsyncConnection, number: int | None) -> dict[int, list[RobotSummary]]:
-    """Return the robots of every episode, or of the one with this number, by episode."""
+async def running_episodes(connection: AsyncConnection, limit: int) -> tuple[list[RunningEpisode], int]:
+    """Return the running episodes that started last, at most `limit`, the newest first; and the number of all."""
+    episode = ProcessMetaData
+    total = func.count().over().label("total")
+    query = select(episode.id, episode.uuid, episode.created_at, episode.description, total)
+    query = query.where(episode.status == TaskStatus.RUNNING.name).order_by(episode.id.desc()).limit(limit)
+    rows = (await connection.execute(query)).all()
+    robots = await _robots(connection, [each.id for each in rows])
+    episodes = [
+        RunningEpisode(each.id, each.uuid, each.created_at, each.description, tuple(robots.get(each.id, ())))
+        for each in rows
+    ]
+    return episodes, rows[0].total if rows else 0
+
+
+async def _robots(connection: AsyncConnection, numbers: Collection[int] | None) -> dict[int, list[RobotSummary]]:
+    """Return the robots of every episode, or of those with these numbers, by episode."""
     robot = EpisodeRobot
     query = select(robot.__table__).order_by(robot.id)
-    if number is not None:
-        query = query.where(robot.process_metadata_id == number)
+    if numbers is not None:
+        query = query.where(robot.process_metadata_id.in_(numbers))
     robots: dict[int, list[RobotSummary]] = {}
     for row in await connection.execute(query):
         summary = RobotSummary(row.name, row.model, row.serial, row.description_fingerprint)
