@@ -317,7 +317,9 @@ def test_a_long_episode_continues_with_its_open_nodes_and_its_objects(tmp_path: 
         each for each in events(tmp_path, "NodeStarted") if "designator" in each and "number" not in each["parameters"]
     ]
     assert len(outers) == continued + 1
-    assert all("what" in each["parameters"] for each in outers)
+    rows = [each["parameters"]["what"] for each in outers]
+    assert rows[0] == {"object": 5, "row": 5}
+    assert {each["object"] for each in rows[1:]} == {4}  # as the follow-ups number it
     assert len(events(tmp_path, "ObjectAttached")) == continued + 1
 
 
