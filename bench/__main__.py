@@ -45,6 +45,7 @@ class Run(NamedTuple):
 
 RUNS = (
     Run("hook"),
+    Run("recording"),
     Run("stages"),
     Run("busy"),
     Run("busy postgresql", ("--postgresql",)),

@@ -35,8 +35,8 @@ def python_of(page: str) -> list[str]:
     return re.findall(r"```python\n(.*?)```", PAGES[page], re.DOTALL)
 
 
-PLAN, QUESTIONS, CELLS = python_of("README.md")
-TIDY, LIFTER, STEREO = python_of("pycrorm_async/plan/README.md")
+PLAN, QUESTIONS, EXECUTIVE = python_of("README.md")
+TIDY, LIFTER, STEREO, CELLS = python_of("pycrorm_async/plan/README.md")
 COURSE, AROUND, ROBOTS, BEGAN, TAGGED, SEEN, THEN, AGAIN, RATE = python_of("pycrorm_async/query/README.md")
 BETTER, ORIGINS = python_of("pycrorm_async/learning/README.md")
 
@@ -154,6 +154,14 @@ async def test_the_queries_have_answers(tmp_path: Path, monkeypatch: pytest.Monk
     assert [each.whom for each in greeted] == ["Ada"]
     assert len(frame) == 0
     assert await asyncio.to_thread((tmp_path / "memory.db").exists)
+
+
+def test_a_users_executive_is_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    exec(EXECUTIVE, {})
+    shown = pycrorm("show", "last", cwd=tmp_path).stdout
+    assert "NavigateAction  target_location=(1.00, 0.00, 0.00) speed=0.5  FAILED" in shown
+    assert "the left wheel slipped" in shown
 
 
 async def test_a_perform_after_a_memory_and_a_world_were_connected_is_recorded(

@@ -21,7 +21,7 @@ AT_END = Settings(fold="at_end")
 
 
 @dataclass
-class TellActionPerformable(ActionAbstract):
+class AnnounceActionPerformable(ActionAbstract):
     """Has a text, of which an executive will say that it is a number."""
 
     words: str
@@ -80,13 +80,13 @@ def test_a_field_that_contradicts_an_earlier_declaration_is_kept_under_its_type(
 async def test_a_field_that_contradicts_a_class_of_the_plan_layer_is_kept_under_its_type(tmp_path: Path) -> None:
     async with Memory.open(url_of(tmp_path)) as memory:
         async with memory.episode(description="ours"):
-            await TellActionPerformable("hello").perform()
+            await AnnounceActionPerformable("hello").perform()
         with memory.recording.episode(description="theirs") as episode:
-            episode.start("a", memory.recording.type("action", "TellAction", {"words": "real"}), {"words": 1.0})
+            episode.start("a", memory.recording.type("action", "AnnounceAction", {"words": "real"}), {"words": 1.0})
             episode.end("a")
         await memory.flush()
         assert memory.status.faults == (0, None)
-    rows = ask(tmp_path / "memory.db", "SELECT words, words_real FROM tell_action ORDER BY id")
+    rows = ask(tmp_path / "memory.db", "SELECT words, words_real FROM announce_action ORDER BY id")
     assert rows == [("hello", None), (None, 1.0)]
 
 
