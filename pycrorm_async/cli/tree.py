@@ -46,7 +46,7 @@ def print_tree(nodes: Sequence[NodeSummary], *, events: bool = False, full: bool
 
 
 def _line(node: NodeSummary, *, events: bool, full: bool) -> Text:
-    line = Text.from_markup(escape(node.dtype or "root"))
+    line = Text.from_markup(escape(node.dtype or node.kind))
     if node.parameters:
         line.append(f"  {parameters_text(node.parameters, full=full)}", style="dim")
     line.append(f"  {node.status}", style=_STYLES.get(node.status, "red"))

@@ -131,7 +131,7 @@ class NodeSummary:
 
     Attributes:
         depth: 0 at the root.
-        dtype: its designator type; None at the root.
+        dtype: its designator type; None at the root, and of a type that could not be declared.
         duration_ns: None while it runs, and if it is LOST.
         sequence, end_sequence: the events of its start and its end; `end_sequence` is None while it runs, and if it is
             LOST.

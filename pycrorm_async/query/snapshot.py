@@ -181,6 +181,6 @@ class Moment:
 
     def __str__(self) -> str:
         lines = [f"episode {self.number} at {self.time_s:.3f} s, event {self.sequence}: {self.status}"]
-        lines += [f"{'  ' * (each.depth + 1)}{each.dtype or 'root'} {each.status}" for each in self.tree]
+        lines += [f"{'  ' * (each.depth + 1)}{each.dtype or each.kind} {each.status}" for each in self.tree]
         lines += [f"{each.name} {each.pose!r}" for each in self.world.objects]
         return "\n".join(lines)

@@ -14,6 +14,7 @@ from pycrorm_async import Memory, Settings
 from pycrorm_async.plan import ActionAbstract
 from pycrorm_async.recording.declarations.recorded_type import FieldSpec
 from pycrorm_async.world.pose import Pose
+from tests.commands import pycrorm
 from tests.databases import ask
 from tests.recording.recorded_memory import assert_verified, events, nodes, url_of
 
@@ -124,6 +125,7 @@ def test_values_of_fields_without_a_type_are_missing_with_the_reason(tmp_path: P
     assert started["parameters"]["number"]["missing"] == "declared as int, got a str"
 
 
-def test_a_built_in_motion_is_not_declared_as_an_action(tmp_path: Path) -> None:
-    assert recorded(tmp_path, "MoveTCPMotion", {}, {}) >= 1
-    assert nodes(tmp_path)[0][2] == "SUCCEEDED"
+def test_a_node_of_a_type_that_cannot_be_declared_is_shown_as_its_kind(tmp_path: Path) -> None:
+    assert recorded(tmp_path, "MoveTCPMotion", {}, {}) == 1  # it is a motion, not an action
+    assert nodes(tmp_path) == [(None, None, "SUCCEEDED", None)]
+    assert "── action  SUCCEEDED" in pycrorm("show", "last", "--url", url_of(tmp_path), cwd=tmp_path).stdout
