@@ -1,0 +1,1 @@
+"""Integrations record what other executives perform, through the package `recording`."""
