@@ -35,19 +35,13 @@ def events(folder: Path, kind: str) -> list[dict[str, Any]]:
     return [json.loads(payload) for (payload,) in rows]
 
 
-def problems(url: str) -> list[str]:
-    """Return what `verify` finds in a memory."""
-
-    async def found() -> list[str]:
-        log = await EventLog.open(DatabaseAddress.parse(url), create=False)
+def assert_verified(folder: Path) -> None:
+    async def problems() -> list[str]:
+        log = await EventLog.open(DatabaseAddress.parse(url_of(folder)), create=False)
         try:
             result = await verify(log)
             return [str(each) for each in (*result.damages, *result.differences, *result.stopped)]
         finally:
             await log.close()
 
-    return asyncio.run(found())
-
-
-def assert_verified(folder: Path) -> None:
-    assert problems(url_of(folder)) == []
+    assert asyncio.run(problems()) == []

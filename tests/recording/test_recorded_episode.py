@@ -15,7 +15,7 @@ import pytest
 
 from pycrorm_async import Memory, Settings, recover
 from pycrorm_async.errors import CallerError
-from pycrorm_async.events.values import EpisodeStatus, FailureValue, ObjectReference, PoseValue, RobotValue, SeenValue
+from pycrorm_async.events.values import FailureValue, ObjectReference, PoseValue, RobotValue, SeenValue
 from pycrorm_async.plan.failures import NavigationGoalInCollision
 from pycrorm_async.recording.recorded_episode import RecordedEpisode
 from pycrorm_async.recording.recording import Recording
@@ -24,8 +24,6 @@ from pycrorm_async.world.pose import Pose
 from tests.commands import environment, pycrorm
 from tests.databases import ask
 from tests.recording.recorded_memory import assert_verified, events, nodes, url_of
-
-pytestmark = pytest.mark.slow
 
 AT_END = Settings(fold="at_end")
 HERE = Pose([1, 2, 3])
@@ -194,6 +192,26 @@ def test_an_unknown_parent_is_counted_and_an_ended_one_is_kept(tmp_path: Path) -
 
     assert faults_of(tmp_path, write)[0] == 1
     assert [row[1] for row in nodes(tmp_path)] == [None, "Step", None]
+
+
+def test_what_a_start_returned_names_its_node_long_after_its_end(tmp_path: Path) -> None:
+    with opened(tmp_path) as memory, memory.recording.episode() as episode:
+        job = memory.recording.type("action", "Job", {"number": int})
+        first = episode.start("key", job, {"number": 0})
+        episode.end("key")
+        for number in range(1, 1_500):
+            episode.start("key", job, {"number": number})
+            episode.end("key")
+        episode.observe("ticks", 7, node=first)
+        episode.start("child", job, {"number": -1}, parent=first)
+        episode.end("child")
+        assert memory.status.faults.total == 0
+    of_observation = "SELECT number FROM job JOIN observation ON job.id = node_id"
+    of_child = (
+        "SELECT job.number FROM job JOIN task_tree_node AS node ON node.parent_id = job.id"
+        " JOIN job AS child ON child.id = node.id"
+    )
+    assert ask(tmp_path / "memory.db", of_observation) == ask(tmp_path / "memory.db", of_child) == [(0,)]
 
 
 def test_nodes_open_at_the_end_are_lost_and_counted_once(tmp_path: Path) -> None:
@@ -433,17 +451,3 @@ def test_a_status_given_with_a_failure_of_another_language(tmp_path: Path) -> No
         ))  # fmt: skip
         episode.end("a", "INTERRUPTED", FailureValue("bt.Preempted", "a higher priority"))
     assert nodes(tmp_path) == [("Step", None, "INTERRUPTED", "a higher priority")]
-
-
-@pytest.mark.parametrize(
-    ("status", "root"), [("FAILED", "FAILED"), ("INTERRUPTED", "CANCELLED"), ("ERROR", "ERROR"), (None, "ERROR")]
-)
-def test_an_executive_states_the_outcome_of_a_failure_that_only_it_knows(
-    tmp_path: Path, status: EpisodeStatus | None, root: str
-) -> None:
-    with opened(tmp_path) as memory:
-        memory.recording.episode(description="d").close(ValueError("a failure of its own"), status)
-    ended = ask(tmp_path / "memory.db", "SELECT status, failure_type, failure_message FROM process_metadata")
-    assert [tuple(each) for each in ended] == [(status or "ERROR", "builtins.ValueError", "a failure of its own")]
-    roots = ask(tmp_path / "memory.db", "SELECT status FROM task_tree_node WHERE kind = 'root'")
-    assert [tuple(each) for each in roots] == [(root,)]
