@@ -56,7 +56,6 @@ from pycrorm_async.projections.schema.views.concept_views import concept_views
 from pycrorm_async.projections.schema.views.pick_up_view import pick_ups_with_context
 from pycrorm_async.projections.schema.views.root_failure_view import root_failures
 from pycrorm_async.projections.schema.views.spatial_relation_view import SpatialTables, spatial_relations
-from pycrorm_async.projections.schema.views.world_line import world_line
 from pycrorm_async.world.enums import ObjectType
 
 __all__ = ["public_views", "projection_views", "View"]
@@ -193,8 +192,7 @@ def _happened(rows: Table, simulations: Table) -> ColumnElement[bool]:
 
 def _process_metadata(core: dict[str, Table], _layout: Layout) -> Select[Any]:
     episodes = core["process_metadata"]
-    line = world_line(core["object"], core["object_removal"], episodes.c.id)
-    world = func.coalesce(episodes.c.world, episodes.c.entered_world, line).label("world")
+    world = func.coalesce(episodes.c.world, episodes.c.entered_world).label("world")
     first, *others = (world if each.name == "world" else each for each in episodes.c if each.name != "entered_world")
     return select(first, _episode.c.id.label("uuid"), *others).join_from(
         episodes, _episode, _episode.c.number == episodes.c.id
