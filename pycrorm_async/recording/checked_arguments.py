@@ -59,7 +59,7 @@ def object_of(
     name: str, object_type: str, pose: Pose | PoseValue, joints: Mapping[str, float], **others: Any
 ) -> RecordedObject:
     """Copy the description of an object; `others` are the further attributes of `RecordedObject`."""
-    texts = {each: others[each] for each in ("urdf", "model", "serial", "torso_joint")} | {"name": name}
+    texts = {each: others[each] for each in ("urdf", "model", "serial", "base_link", "torso_joint")} | {"name": name}
     for what, text in texts.items():
         if text is not None and not isinstance(text, str):
             raise CallerError(f"the {what} of an object is a text, not {clean_repr(text)}")
@@ -73,6 +73,7 @@ def object_of(
         model=link_of(others["model"]),
         serial=link_of(others["serial"]),
         mass_kg=_number_of("mass", others["mass_kg"]),
+        base_link=link_of(others["base_link"]),
         torso_joint=others["torso_joint"],
     )
 

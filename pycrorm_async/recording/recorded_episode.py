@@ -223,6 +223,7 @@ class RecordedEpisode(EpisodeWriter[_Node]):
         model: str | None = None,
         serial: str | None = None,
         mass_kg: float | None = None,
+        base_link: str | None = None,
         torso_joint: str | None = None,
         node: Hashable | None = None,
     ) -> None:
@@ -233,12 +234,12 @@ class RecordedEpisode(EpisodeWriter[_Node]):
             object_type: `ROBOT`, `MILK`, …; a type of `world.ObjectType` where one fits.
             joints: positions by name, rad or m.
             urdf: the text of its description, which is recorded once.
-            color, model, serial, mass_kg: see `events.types.ObjectAdded`.
+            color, model, serial, mass_kg, base_link: see `events.types.ObjectAdded`.
             torso_joint: of a robot with a torso that is lifted, the joint that does it.
         """
         added = object_of(
             name, object_type, pose, joints, urdf=urdf, color=color, model=model, serial=serial, mass_kg=mass_kg,
-            torso_joint=torso_joint,
+            base_link=base_link, torso_joint=torso_joint,
         )  # fmt: skip
         self._objects.add(key, added, self._cause(node))
 

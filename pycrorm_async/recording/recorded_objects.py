@@ -37,6 +37,7 @@ class RecordedObject:
     model: str | None = None
     serial: str | None = None
     mass_kg: float | None = None
+    base_link: str | None = None
     torso_joint: str | None = None
 
 
@@ -108,6 +109,7 @@ class RecordedObjects(ObjectRows[Hashable]):
                 added.model,
                 added.serial,
                 added.mass_kg,
+                added.base_link,
             ),
             row_of=key,
         )
