@@ -268,7 +268,7 @@ def _pr2_arm(prefix: str, side: float, park: tuple[float, ...]) -> PR2Arm:
             }
         ),
         opening_m=0.086,
-        payload_kg=1.8,  # of the manufacturer's data sheet
+        payload_kg=1.8,  # Willow Garage, "Hardware Systems": willowgarage.com/pages/robots/hardware-systems
         park=MappingProxyType(dict(zip(joints, park, strict=True))),
     )
 
@@ -316,7 +316,7 @@ COURIER = RobotDescription(
                     }
                 ),
                 opening_m=0.09,
-                payload_kg=3.0,  # of arms of its size, such as those of TIAGo and UR3e
+                payload_kg=3.0,  # assumed: no such robot was built; arms of its size are said to lift as much
                 park=MappingProxyType(dict(zip(_COURIER_JOINTS, (0.0, -1.9, 2.5, 0.0, 0.9, 0.0), strict=True))),
             )
         }
