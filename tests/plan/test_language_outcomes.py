@@ -334,16 +334,18 @@ async def test_several_other_exceptions_are_raised_as_a_group() -> None:
 
 
 async def test_an_exception_of_a_cleanup_precedes_the_cancellation() -> None:
+    sleeping = asyncio.Event()
+
     class Careless(ActionAbstract):
         async def perform(self) -> None:
+            sleeping.set()
             try:
                 await asyncio.sleep(60)
             finally:
                 raise KeyError("cleanup")
 
     task = asyncio.create_task((Careless() | Step("a", turns=1000)).perform())
-    await asyncio.sleep(0)
-    await asyncio.sleep(0)
+    await sleeping.wait()
     task.cancel()
     with pytest.raises(KeyError, match="cleanup"):
         await task
