@@ -6,10 +6,12 @@ import io
 import json
 import math
 import os
+import sys
 import threading
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
+from subprocess import run
 from typing import Any
 
 import numpy as np
@@ -27,7 +29,7 @@ from pycrorm_async.projections.verify.findings import VerifyResult
 from pycrorm_async.projections.verify.verify import verify
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from tests.commands import answer, pycrorm, run_script
+from tests.commands import answer, environment, pycrorm
 from tests.databases import Server, ask_to_change
 from tests.table_comparison import differences, tables_of
 
@@ -299,7 +301,7 @@ async def test_a_long_episode_continues_and_threads_stop_at_its_last_events(tmp_
 
 
 def returncode(script: Path) -> int:
-    return run_script(script.read_text()).returncode
+    return run([sys.executable, str(script)], env=environment(), check=False).returncode
 
 
 @pytest.mark.soak_on("postgresql")

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import subprocess
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -11,7 +12,7 @@ from typing import Any
 import pytest
 
 from tests.cli.note_plan import NOTES_PLAN
-from tests.commands import Started, answer, pycrorm
+from tests.commands import COMMAND, answer, environment, pycrorm
 from tests.databases import ask, ask_to_change
 
 pytestmark = pytest.mark.slow
@@ -24,8 +25,10 @@ def folder(tmp_path: Path) -> Path:
 
 
 @contextmanager
-def started(folder: Path) -> Iterator[Started]:
-    process = Started("writer", cwd=folder)
+def started(folder: Path) -> Iterator[subprocess.Popen[str]]:
+    command = [*COMMAND, "writer"]
+    process = subprocess.Popen(command, cwd=folder, env=environment(), stderr=subprocess.PIPE, text=True)
+    assert process.stderr is not None
     assert process.stderr.readline().startswith("draining")
     yield process
     process.kill()
@@ -33,7 +36,7 @@ def started(folder: Path) -> Iterator[Started]:
 
 
 @pytest.fixture
-def daemon(folder: Path) -> Iterator[Started]:
+def daemon(folder: Path) -> Iterator[subprocess.Popen[str]]:
     with started(folder) as process:
         yield process
 
@@ -69,7 +72,9 @@ def wait_for_workers(folder: Path, count: int) -> list[int]:
     raise AssertionError(workers(folder))
 
 
-def test_a_worker_folds_and_its_death_is_reported_and_shown_and_it_is_restarted(folder: Path, daemon: Started) -> None:
+def test_a_worker_folds_and_its_death_is_reported_and_shown_and_it_is_restarted(
+    folder: Path, daemon: subprocess.Popen[str]
+) -> None:
     first, other = wait_for_workers(folder, 2)
     notes = 3
     assert noted(folder) == notes
@@ -96,7 +101,7 @@ def test_a_worker_folds_and_its_death_is_reported_and_shown_and_it_is_restarted(
     assert workers(folder) == []
 
 
-def test_a_suspended_worker_ends_with_a_daemon_that_is_killed(folder: Path, daemon: Started) -> None:
+def test_a_suspended_worker_ends_with_a_daemon_that_is_killed(folder: Path, daemon: subprocess.Popen[str]) -> None:
     assert noted(folder) == 3
     stopped, idle = wait_for_workers(folder, 2)
     os.kill(stopped, signal.SIGSTOP)
@@ -108,7 +113,7 @@ def test_a_suspended_worker_ends_with_a_daemon_that_is_killed(folder: Path, daem
 
 @pytest.mark.parametrize("end", [signal.SIGTERM, signal.SIGINT])
 def test_a_terminal_signal_to_both_ends_a_worker_with_the_daemon_and_no_sooner(
-    folder: Path, daemon: Started, end: signal.Signals
+    folder: Path, daemon: subprocess.Popen[str], end: signal.Signals
 ) -> None:
     pids = wait_for_workers(folder, 2)
     for each in pids:
@@ -125,10 +130,11 @@ def test_a_terminal_signal_to_both_ends_a_worker_with_the_daemon_and_no_sooner(
     assert all(map(is_gone, pids))
 
 
-def test_the_reason_why_a_worker_cannot_fold_is_reported(folder: Path, daemon: Started) -> None:
+def test_the_reason_why_a_worker_cannot_fold_is_reported(folder: Path, daemon: subprocess.Popen[str]) -> None:
     assert noted(folder) == 3
     ask_to_change(f"sqlite:///{folder}/pycrorm.db", "DROP TABLE zz_task_tree_node__1001")
-    plan = Started("run", "notes.py", "--writer", "daemon", cwd=folder)
+    plan = subprocess.Popen([*COMMAND, "run", "notes.py", "--writer", "daemon"], cwd=folder, env=environment())
+    assert daemon.stderr is not None
     output = ""
     while "cannot be brought" not in output:
         output = daemon.stderr.readline()
@@ -137,7 +143,7 @@ def test_the_reason_why_a_worker_cannot_fold_is_reported(folder: Path, daemon: S
     while ask(f"sqlite:///{folder}/pycrorm.db", ended) != [(8,)]:  # appending continues
         time.sleep(0.01)
     plan.kill()
-    plan.communicate()
+    plan.wait()
     assert "no such table: zz_task_tree_node__1001" in output
 
 
@@ -148,7 +154,10 @@ LONG_PLAN = NOTES_PLAN.replace('in "abc"', f"in map(str, range({MANY}))") + "   
 def leave_many_notes(folder: Path) -> str:
     """Run a plan that takes many notes and is killed before they are drained; return the URL of their database."""
     (folder / "long.py").write_text(f"import os\n{LONG_PLAN}")
-    assert pycrorm("run", "long.py", "--writer", "daemon", cwd=folder).returncode == -signal.SIGKILL
+    done = subprocess.run(
+        [*COMMAND, "run", "long.py", "--writer", "daemon"], cwd=folder, env=environment(), check=False
+    )
+    assert done.returncode == -signal.SIGKILL
     return f"sqlite:///{folder}/pycrorm.db"
 
 

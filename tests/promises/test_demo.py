@@ -125,6 +125,7 @@ def same(row: Any, pose: Pose) -> bool:
     return (row.x, row.y, row.z) == pose.position and (row.qx, row.qy, row.qz, row.qw) == pose.orientation
 
 
+@pytest.mark.every_python
 async def test_the_memory_of_the_demo_has_its_tree_and_its_answers(tmp_path: Path, database_url: str) -> None:
     async with Memory.open(database_url, spool=tmp_path / "spool") as memory:
         async with memory.episode(description="Tutorial for getting familiar with the memory") as episode:
@@ -262,6 +263,7 @@ async def test_the_plan_also_runs_on_the_mesh_model(tmp_path: Path) -> None:
         assert {node.status for node in nodes} == {"SUCCEEDED"}
 
 
+@pytest.mark.every_python
 def test_the_demo_command_prints_the_tree_and_the_answers(tmp_path: Path) -> None:
     first = answer("demo", cwd=tmp_path)
     names = [node["dtype"] or "root" for node in first["tree"]]

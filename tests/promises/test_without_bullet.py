@@ -1,0 +1,139 @@
+"""The package needs neither a Bullet nor the extras for what needs no world, and loads none of them there."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.commands import environment, one_line_of
+
+pytestmark = [pytest.mark.slow, pytest.mark.every_python]
+
+WITHOUT_EXTRAS = """
+import sys
+from importlib.abc import MetaPathFinder
+
+EXTRAS = {"pybullet", "pycram_bullet", "optik", "jpt", "pandas", "matplotlib", "cmeel"}
+
+class Absent(MetaPathFinder):
+    wanted = []
+
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] in EXTRAS:
+            self.wanted.append(name)
+            raise ModuleNotFoundError(name)
+
+sys.meta_path.insert(0, Absent())
+"""
+
+RECORDING = """
+import asyncio
+from dataclasses import dataclass
+
+import pycrorm_async
+from pycrorm_async import Memory
+from pycrorm_async.plan import ActionAbstract
+from pycrorm_async.world import Pose
+
+@dataclass
+class WaitActionPerformable(ActionAbstract):
+    seconds: float
+    at: Pose
+
+    async def perform(self):
+        await asyncio.sleep(0)
+
+async def plan():
+    await WaitActionPerformable(0.5, Pose([1, 2, 3])).perform()
+
+async def of_our_own():
+    async with Memory.open("sqlite:///pycrorm.db") as memory:
+        async with memory.episode(description="of our plan layer"):
+            await plan()
+            memory.observe("battery", {"volts": 24.1})
+        await memory.flush()
+
+asyncio.run(of_our_own())
+with Memory.sync("sqlite:///pycrorm.db") as memory:
+    navigate = memory.recording.type("action", "NavigateAction", {"target_location": "pose"})
+    with memory.recording.episode(description="of another executive") as episode:
+        episode.start("a", navigate, {"target_location": Pose([1, 0, 0])})
+        episode.end("a")
+    memory.flush()
+    assert memory.status.faults.total == 0, memory.status
+"""
+
+VERBS = """
+from pathlib import Path
+
+from pycrorm_async.cli.main import main
+
+Path("waiting.py").write_text("async def plan():\\n    pass\\n")
+codes = {}
+for words in (
+    "--help", "run waiting.py", "status", "episodes", "show 1", "show 2 --at 0", "events 1", "tag 1 good",
+    "writer --once", "verify", "rebuild", "copy --from sqlite:///pycrorm.db --to sqlite:///other.db", "spool inspect",
+):
+    sys.argv = ["pycrorm", *words.split()]
+    try:
+        main()
+    except SystemExit as exiting:
+        codes[words] = exiting.code
+"""
+
+PRINTING = """
+import json
+print(json.dumps([codes, Absent.wanted, sorted(EXTRAS & set(sys.modules))]))
+"""
+
+
+def run(script: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-W", "error", "-c", script]
+    return subprocess.run(
+        command, cwd=folder, env=environment(), capture_output=True, text=True, timeout=300, check=False
+    )
+
+
+def test_recording_and_every_verb_that_needs_no_world_loads_no_extra(tmp_path: Path) -> None:
+    done = run(WITHOUT_EXTRAS + RECORDING + VERBS + PRINTING, tmp_path)
+    assert done.returncode == 0, done.stderr
+    codes, wanted, loaded = json.loads(done.stdout.splitlines()[-1])
+    assert set(codes.values()) == {0}, (codes, done.stderr)
+    assert (len(codes), wanted, loaded) == (13, [], [])
+    assert "WaitAction" in done.stdout
+    assert "of another executive" in done.stdout
+
+
+ABSENT = "import sys; sys.modules |= dict.fromkeys(('pybullet', 'pycram_bullet', 'optik')); "
+LINE = "no world can be opened, because no Bullet is installed: pip install 'pycrorm-async[world]'"
+
+
+@pytest.mark.parametrize("verb", ["demo", "learn --rollouts 30"])
+def test_a_verb_that_needs_a_world_says_first_what_to_install(tmp_path: Path, verb: str) -> None:
+    pytest.importorskip("jpt", reason="learn names the first missing package")
+    words = ["pycrorm", *verb.split()]
+    done = run(f"{ABSENT} from pycrorm_async.cli.main import main; sys.argv = {words}; main()", tmp_path)
+    assert done.returncode == 2
+    assert one_line_of(done).startswith(f"pycrorm: {LINE}")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_world_says_what_to_install_and_how_long_that_takes(tmp_path: Path) -> None:
+    opening = "from pycrorm_async.world import BulletWorld\ntry:\n    BulletWorld().__enter__()\n"
+    done = run(f"{ABSENT}\n{opening}except Exception as error:\n    print(type(error).__mro__, error)", tmp_path)
+    assert all(name in done.stdout for name in ("BulletMissing", "WorldUnavailable", "MissingExtra"))
+    compiling = " pybullet (no wheel for this Python: compiles for about 8 minutes with a C++ compiler)"
+    assert done.stdout.endswith(f" {LINE}{compiling if sys.version_info >= (3, 13) else ''}\n")
+
+
+def test_a_failed_plan_says_in_one_line_what_to_install(tmp_path: Path) -> None:
+    plan = "from pycrorm_async.world import BulletWorld\nasync def plan():\n    with BulletWorld():\n        pass\n"
+    (tmp_path / "sweep.py").write_text(plan)
+    words = ["pycrorm", "run", "sweep.py"]
+    done = run(f"{ABSENT} from pycrorm_async.cli.main import main; sys.argv = {words}; main()", tmp_path)
+    assert done.returncode == 1
+    assert one_line_of(done).startswith(f"pycrorm: the plan sweep.py:plan failed: BulletMissing: {LINE}")
