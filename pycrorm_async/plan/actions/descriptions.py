@@ -10,7 +10,7 @@ the last property varying fastest; those in which the arm is too weak for the ob
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, NoReturn, TypeAlias, TypeVar
 
 from pycrorm_async.plan.actions.basic import (
@@ -98,19 +98,24 @@ class ActionDescription(Composable, Generic[P]):
 
     def __iter__(self) -> Iterator[P]:
         """Yield every combination, the last property varying fastest. Raises as `resolve` does."""
-        choices = {name: self._choices(name, among) for name, among in self._alternatives.items()}
-        combinations = (dict(zip(choices, each, strict=True)) for each in itertools.product(*choices.values()))
-        if self._lifting is None or len(choices[self._lifting[0]]) == 1:
-            yield from (self._performable(**each) for each in combinations)
-            return
-        arm, load = self._lifting
+        choices = [self._choices(name, among) for name, among in self._alternatives.items()]
         too_weak: list[dict[str, Any]] = []
-        for each in combinations:
-            if each[arm] in _arms_for(each[load], choices[arm]):
-                yield self._performable(**each)
+        for combination in itertools.product(*choices):
+            properties = dict(zip(self._alternatives, combination, strict=True))
+            if self._is_too_weak(properties):
+                too_weak.append(properties)
             else:
-                too_weak.append(each)
-        yield from (self._performable(**each) for each in too_weak)
+                yield self._performable(**properties)
+        for properties in too_weak:
+            yield self._performable(**properties)
+
+    def _is_too_weak(self, properties: Mapping[str, Any]) -> bool:
+        """Return whether another arm of the alternatives lifts the object and this one does not."""
+        if self._lifting is None:
+            return False
+        arm, load = self._lifting
+        arms = self._alternatives[arm]
+        return isinstance(arms, tuple) and len(arms) > 1 and properties[arm] not in _arms_for(properties[load], arms)
 
     def _choices(self, name: str, among: ObjectDesignatorDescription | tuple[Any, ...]) -> tuple[Any, ...]:
         if isinstance(among, ObjectDesignatorDescription):
