@@ -10,7 +10,8 @@ from pathlib import Path
 import pytest
 from sqlalchemy import select
 
-from pycrorm_async import Memory, Settings, world_of
+from pycrorm_async import Memory, Reading, Settings, world_of
+from pycrorm_async.operations.copy import copy_episodes
 from pycrorm_async.orm import NavigateAction, TaskTreeNode
 from pycrorm_async.orm import Object as RecordedObject
 from pycrorm_async.plan import (
@@ -35,6 +36,8 @@ from pycrorm_async.world import (
     describe_arm,
     describe_robot,
 )
+from tests.commands import pycrorm
+from tests.databases import ask
 from tests.world.base_links import RAILS, link_poses, rail_robot, raised_robot
 
 pytestmark = pytest.mark.slow
@@ -107,6 +110,7 @@ async def test_every_link_is_seen_again_at_its_place_after_every_action(
             ends = select(TaskTreeNode.end_sequence).where(TaskTreeNode.parent_id.in_(roots)).order_by(TaskTreeNode.id)
             sequences = [each for each in await session.scalars(ends) if each is not None]
         assert len(sequences) == len(seen) == len(actions)
+        last = await memory.as_of("last", sequence=sequences[-1], meshes=True)
         for sequence, poses in zip(sequences, seen, strict=True):
             then = await memory.as_of("last", sequence=sequence, meshes=True)
             assert then.world.object("robot").base_link == "base_link"
@@ -118,3 +122,12 @@ async def test_every_link_is_seen_again_at_its_place_after_every_action(
                 height = recorded.object("cup").pose.position.z
                 robot.set_pose(robot.pose @ Pose([0, 0, 1]))
                 assert recorded.object("cup").pose.position.z == pytest.approx(height + 1)
+    assert pycrorm("verify", "--url", database_url, cwd=tmp_path).returncode == 0
+    assert pycrorm("rebuild", "--url", database_url, cwd=tmp_path).returncode == 0
+    copy = f"sqlite:///{tmp_path}/copy.db"
+    await copy_episodes(database_url, copy)
+    by_hand = "SELECT name, base_link FROM object WHERE base_link IS NOT NULL"
+    assert ask(database_url, by_hand) == ask(copy, by_hand) == [("robot", "base_link")]
+    async with Reading.open(copy) as reading:
+        again = await reading.as_of("last", sequence=sequences[-1], meshes=True)
+    assert (again.world.objects, again.world.meshes) == (last.world.objects, last.world.meshes)
