@@ -5,16 +5,20 @@ import json
 import multiprocessing
 import os
 import runpy
+import signal
 import subprocess
 import sys
 import tempfile
 import threading
+import time
 import traceback
 import warnings
 from multiprocessing import forkserver
+from multiprocessing.connection import Connection
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path
-from typing import Any, Final, NoReturn
+from types import ModuleType
+from typing import IO, Any, Final, NoReturn
 from unittest import mock
 
 COMMAND = [sys.executable, "-W", "error", "-m", "pycrorm_async"]
@@ -48,10 +52,23 @@ def pycrorm(*arguments: str | Path, cwd: Path, timeout_s: float = 300) -> subpro
     The process is forked from one that has loaded the program and done nothing else, because loading takes a second and
     there are hundreds of calls. Calls that start `COMMAND` show that the result is the same.
     """
+    return _finished([str(each) for each in arguments], cwd, None, timeout_s)
+
+
+def run_script(
+    script: str, *arguments: str | Path, cwd: Path | None = None, timeout_s: float = 300
+) -> subprocess.CompletedProcess[str]:
+    """Return exit code, stdout and stderr of a Python script, run as `python -c` in a process that is forked likewise.
+
+    It finds the package imported. A script whose imports matter needs an interpreter of its own.
+    """
+    return _finished([str(each) for each in arguments], cwd or Path.cwd(), script, timeout_s)
+
+
+def _finished(words: list[str], cwd: Path, script: str | None, timeout_s: float) -> subprocess.CompletedProcess[str]:
     with tempfile.TemporaryDirectory() as folder:
         outputs = [Path(folder) / name for name in ("out", "err")]
-        words = [str(each) for each in arguments]
-        process = FORKED.Process(target=_run, args=(words, str(cwd), *map(str, outputs)))
+        process = FORKED.Process(target=_run_to_files, args=(words, str(cwd), script, *map(str, outputs)))
         fork(process)
         process.join(timeout_s)
         if process.exitcode is None:
@@ -61,20 +78,120 @@ def pycrorm(*arguments: str | Path, cwd: Path, timeout_s: float = 300) -> subpro
         return subprocess.CompletedProcess(words, process.exitcode, *(each.read_text() for each in outputs))
 
 
-def _run(arguments: list[str], cwd: str, out: str, err: str) -> NoReturn:
+class Started:
+    """A command that runs beside the test, forked likewise, with what tests use of a `subprocess.Popen`.
+
+    With `output`, stdout and stderr are appended to this file; otherwise they are pipes of text.
+    """
+
+    def __init__(self, *arguments: str | Path, cwd: Path, output: Path | None = None, **settings: str) -> None:
+        self.stdout, out = _pipe()
+        self.stderr, err = _pipe()
+        words = [str(each) for each in arguments]
+        place = None if output is None else str(output)
+        self._process = FORKED.Process(target=_run_beside, args=(words, str(cwd), settings, out, err, place))
+        fork(self._process)
+        out.close()
+        err.close()
+        if output is not None:
+            self.stdout.close()
+            self.stderr.close()
+        self._reaping = threading.Lock()
+
+    @property
+    def pid(self) -> int:
+        assert self._process.pid is not None
+        return self._process.pid
+
+    def poll(self) -> int | None:
+        """Return the exit code; None while the process runs. Of several threads, only one can read the code."""
+        with self._reaping:
+            return self._process.exitcode
+
+    @property
+    def returncode(self) -> int | None:
+        return self.poll()
+
+    def send_signal(self, number: int) -> None:
+        if self.poll() is None:
+            os.kill(self.pid, number)
+
+    def kill(self) -> None:
+        self.send_signal(signal.SIGKILL)
+
+    def wait(self, timeout: float = 300) -> int:
+        deadline = time.monotonic() + timeout
+        while (code := self.poll()) is None:
+            if time.monotonic() > deadline:
+                raise subprocess.TimeoutExpired("pycrorm", timeout)
+            time.sleep(0.005)
+        return code
+
+    def communicate(self, timeout: float = 300) -> tuple[str, str]:
+        """Return the rest of stdout and stderr once the process has ended and closed them."""
+        rest = {}
+
+        def read(name: str, stream: IO[str]) -> None:
+            with stream:
+                rest[name] = stream.read()
+
+        streams = (("out", self.stdout), ("err", self.stderr))
+        readers = [threading.Thread(target=read, args=each, daemon=True) for each in streams if not each[1].closed]
+        for each in readers:
+            each.start()
+        self.wait(timeout)
+        for each in readers:
+            each.join()
+        return rest.get("out", ""), rest.get("err", "")
+
+
+def _pipe() -> tuple[IO[str], Connection]:
+    mine, its = FORKED.Pipe(duplex=False)
+    with mine:
+        return os.fdopen(os.dup(mine.fileno()), encoding="utf-8"), its
+
+
+def _run_to_files(arguments: list[str], cwd: str, script: str | None, out: str, err: str) -> NoReturn:
     for path, stream in ((out, 1), (err, 2)):
-        file = os.open(path, os.O_WRONLY | os.O_CREAT)
-        os.dup2(file, stream)
-        os.close(file)
+        _redirect(stream, path)
+    _run(arguments, cwd, {}, script)
+
+
+def _run_beside(
+    arguments: list[str], cwd: str, settings: dict[str, str], out: Connection, err: Connection, output: str | None
+) -> NoReturn:
+    for pipe, stream in ((out, 1), (err, 2)):
+        if output is None:
+            os.dup2(pipe.fileno(), stream)
+        else:
+            _redirect(stream, output)
+        pipe.close()
+    # The streams of the server remember that they are files with a position.
+    sys.stdout = os.fdopen(1, "w", encoding="utf-8", closefd=False)
+    sys.stderr = os.fdopen(2, "w", encoding="utf-8", buffering=1, closefd=False)
+    _run(arguments, cwd, settings)
+
+
+def _redirect(stream: int, path: str) -> None:
+    file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND)
+    os.dup2(file, stream)
+    os.close(file)
+
+
+def _run(arguments: list[str], cwd: str, settings: dict[str, str], script: str | None = None) -> NoReturn:
     os.chdir(cwd)
     os.environ.clear()
-    os.environ.update(environment())
+    os.environ.update(environment() | settings)
     sys.path.insert(0, cwd)
     sys.argv = ["pycrorm", *arguments]
     warnings.simplefilter("error")
     code: Any = 0
     try:
-        runpy.run_module("pycrorm_async", run_name="__main__", alter_sys=False)
+        if script is None:
+            runpy.run_module("pycrorm_async", run_name="__main__", alter_sys=False)
+        else:
+            sys.modules["__main__"] = module = ModuleType("__main__")
+            exec(script, module.__dict__)
     except SystemExit as leaving:
         code = leaving.code or 0
     except BaseException:  # noqa: BLE001  as the interpreter would

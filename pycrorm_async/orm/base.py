@@ -267,7 +267,10 @@ class ProcessMetaData(Base):
     python: Mapped[str]
     plan: Mapped[str | None]
     world: Mapped[str | None]
-    """The world in one line: at the start, or, if it was entered inside the episode, when it was left."""
+    """The world in one line: at the start, or, if it was entered inside the episode, when it was left.
+
+    Of an episode that runs or is LOST: name and type of the objects in the world that was entered inside it.
+    """
     seed: Mapped[int | None]
     status: Mapped[str]
     ended_at: Mapped[datetime | None]

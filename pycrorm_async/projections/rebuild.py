@@ -46,6 +46,7 @@ from pycrorm_async.projections.run import checkpoints
 from pycrorm_async.projections.run.batch_fold import TABLES, BatchFold
 from pycrorm_async.projections.run.pipeline import FoldPipeline
 from pycrorm_async.projections.run.targets import WHOLE, Share, SideTarget
+from pycrorm_async.projections.schema.core_columns import CORE, OF_NO_EPISODE
 from pycrorm_async.projections.schema.generations import (
     MAKING,
     PROJECTION,
@@ -67,7 +68,6 @@ from pycrorm_async.projections.schema.mapped_tables import mapped_leaves
 from pycrorm_async.projections.schema.materialised_views import refresh_some
 from pycrorm_async.projections.schema.public_views import public_views
 from pycrorm_async.projections.schema.session_views import with_views
-from pycrorm_async.projections.schema.tables import CORE
 from pycrorm_async.projections.schema.user_views import UserView, view_text, with_user_views
 from pycrorm_async.projections.table_names import next_number, physical_name
 from pycrorm_async.store.dialect import RowRefused
@@ -221,7 +221,7 @@ class Rebuild:
         """Let the planner know the new tables: without statistics, queries of them may take minutes."""
         async with self._log.engine.begin() as connection:
             making = await self._making.generation(connection, "share")
-            names = [*(CORE if self._projection is None else ()), *making.layout.leaves]
+            names = [*(CORE | OF_NO_EPISODE if self._projection is None else ()), *making.layout.leaves]
             tables = [physical_name(each, self.number) for each in names]
             await dialect_of(connection).gather_statistics(connection, tables)
 

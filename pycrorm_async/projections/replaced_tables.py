@@ -8,6 +8,7 @@ from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.errors import DatabaseForeign
 from pycrorm_async.projections.run import checkpoints
+from pycrorm_async.projections.schema.core_columns import CORE, OF_NO_EPISODE
 from pycrorm_async.projections.schema.generations import (
     PROJECTION,
     PROJECTION_VERSION,
@@ -17,7 +18,6 @@ from pycrorm_async.projections.schema.generations import (
     read_generations,
 )
 from pycrorm_async.projections.schema.materialised_views import materialised_tables
-from pycrorm_async.projections.schema.tables import CORE, OF_NO_EPISODE
 from pycrorm_async.projections.table_names import physical_name
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog

@@ -84,7 +84,7 @@ class EpisodeSummary:
         continued_in: UUID of the episode that continues this one.
         plan, plan_sha256, git_commit, git_dirty: the plan's name, the hash of its file, the commit of its repository,
             and whether the work tree differed from it.
-        world: the world in one line.
+        world: the world in one line; see `ProcessMetaData.world`.
         libraries, settings: version by package; the settings that differ from their defaults.
         clock_synchronized, clock_error_us: whether a time service kept the clock, and its estimated error.
         robots: the robots that took part, in the order in which they were added.

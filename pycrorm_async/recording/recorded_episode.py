@@ -22,6 +22,7 @@ from pycrorm_async.errors import CallerError
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.events.types import NodeEnded, NodeStarted, ObjectDetected
 from pycrorm_async.events.values import (
+    EpisodeStatus,
     FailureValue,
     NodeReference,
     NodeStatus,
@@ -96,6 +97,7 @@ class RecordedEpisode(EpisodeWriter[_Node]):
         super().__init__(emitter, episodes.new_id(), opening)
         self._episodes = episodes
         self.lock = threading.RLock()
+        self._end_status: EpisodeStatus | None = None
         self._nodes: dict[Hashable, _Node] = {}
         self._ended: OrderedDict[Hashable, _Node] = OrderedDict()
         self._objects = RecordedObjects(emitter, self.id, self._continue)
@@ -110,13 +112,17 @@ class RecordedEpisode(EpisodeWriter[_Node]):
     ) -> None:
         self.close(error)
 
-    def close(self, failure: BaseException | None = None) -> None:
-        """End the episode. Without a failure it SUCCEEDED; nodes that are still open end LOST, and are counted."""
+    def close(self, failure: BaseException | None = None, status: EpisodeStatus | None = None) -> None:
+        """End the episode. Without a failure it SUCCEEDED; nodes that are still open end LOST, and are counted.
+
+        `status` is for a failure whose class only the executive knows: FAILED, ERROR or INTERRUPTED.
+        """
         if self.emitter.is_closed:
             return
         with self.lock:
             if self._nodes and failure is None and not self.closed:
                 self._note("EpisodeEnded", f"{len(self._nodes)} nodes were open at the end of episode {self}")
+            self._end_status = status
             self._episodes.close(self, failure)
 
     # --- nodes ------------------------------------------------------------------------------------------------
@@ -313,8 +319,6 @@ class RecordedEpisode(EpisodeWriter[_Node]):
             time.sleep(_ROOM_POLL_S)
         return not self.emitter.is_closed
 
-    # --- the port of the writer -------------------------------------------------------------------------------
-
     def node_or_root(self, node: Any) -> int:
         """Return the sequence of this node; of None, and of a node of an episode that this one continues, the root."""
         return node.sequence if isinstance(node, _Node) and node.episode_id == self.id else self._root
@@ -325,6 +329,12 @@ class RecordedEpisode(EpisodeWriter[_Node]):
             super().end_episode(failure)
             self._nodes.clear()
             self._ended.clear()
+
+    def _end_statuses(self, failure: BaseException | None) -> tuple[EpisodeStatus, NodeStatus]:
+        status = self._end_status
+        if status is None:
+            return super()._end_statuses(failure)
+        return status, ("CANCELLED" if status == "INTERRUPTED" else status)
 
     def tag(self, added: Sequence[str], removed: Sequence[str]) -> None:
         """Write a change of the episode's tags. Raises `CallerError` for a removed tag that it does not have."""
@@ -359,8 +369,6 @@ class RecordedEpisode(EpisodeWriter[_Node]):
 
     def _described_world(self) -> str | None:
         return None
-
-    # --- inside -----------------------------------------------------------------------------------------------
 
     def _failure(self, failure: object) -> FailureValue | None:
         try:

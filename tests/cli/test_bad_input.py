@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.commands import COMMAND, answer, environment, one_line_of, pycrorm
+from tests.commands import COMMAND, Started, answer, environment, one_line_of, pycrorm
 
 pytestmark = pytest.mark.slow
 
@@ -204,26 +204,13 @@ def test_a_plan_that_exits_the_program_has_failed_and_keeps_its_record(folder: P
 def test_ctrl_c_in_a_plan_that_never_suspends_ends_the_episode_as_interrupted(
     folder: Path, signal_number: signal.Signals
 ) -> None:
-    process = subprocess.Popen(
-        [*COMMAND, "run", "plans.py:endless"],
-        cwd=folder,
-        env=environment(),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        bufsize=0,
-    )
-    assert process.stdout is not None
-    assert process.stderr is not None
-    assert process.stdout.read(1) == b"."
+    process = Started("run", "plans.py:endless", cwd=folder)
+    assert process.stdout.read(1) == "."
     time.sleep(0.05)
     process.send_signal(signal_number)
-    dots = 1
-    while chunk := process.stdout.read(1 << 16):
-        dots += chunk.count(b".")
-    errors = process.stderr.read().decode()
-    process.stdout.close()
-    process.stderr.close()
-    assert process.wait(30) == 130
+    output, errors = process.communicate(30)
+    dots = 1 + output.count(".")
+    assert process.returncode == 130
     *note, reason = errors.splitlines()
     assert note in ([], ["recorded events are being stored; Ctrl-C again exits at once without losing any"])  # if slow
     assert reason == "pycrorm: interrupted; all events recorded so far are kept"

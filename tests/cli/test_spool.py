@@ -2,7 +2,6 @@
 
 import os
 import signal
-import subprocess
 from pathlib import Path
 
 import pytest
@@ -10,7 +9,7 @@ import pytest
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import parse_episode_id
 from pycrorm_async.queue.sources.dead_letters import DeadLetters
-from tests.commands import COMMAND, answer, environment, one_line_of, pycrorm
+from tests.commands import Started, answer, one_line_of, pycrorm
 from tests.queue.factories import overwrite
 
 pytestmark = pytest.mark.slow
@@ -40,16 +39,14 @@ async def forever(memory):
 def left(tmp_path: Path) -> Path:
     """Return the spool that a killed plan left; its writer may have stored some of it."""
     (tmp_path / "notes.py").write_text(PLAN)
-    plan = subprocess.Popen(
-        [*COMMAND, "run", "notes.py:forever"], cwd=tmp_path, env=environment(), stdout=subprocess.PIPE, bufsize=0
-    )
-    assert plan.stdout is not None
+    plan = Started("run", "notes.py:forever", cwd=tmp_path)
     count = 0
     while count < 200:
-        count += len(os.read(plan.stdout.fileno(), 1000))
-    plan.send_signal(signal.SIGKILL)
-    plan.wait()
-    plan.stdout.close()
+        dots = os.read(plan.stdout.fileno(), 1000)
+        assert dots, plan.communicate()
+        count += len(dots)
+    plan.kill()
+    plan.communicate()
     return tmp_path / "pycrorm.db.spool"
 
 
@@ -121,13 +118,10 @@ def test_a_repaired_spool_names_the_next_command(left: Path) -> None:
 
 def test_a_live_plans_spool_is_reported_and_not_repaired(tmp_path: Path) -> None:
     (tmp_path / "notes.py").write_text(PLAN)
-    plan = subprocess.Popen(
-        [*COMMAND, "run", "notes.py:forever"], cwd=tmp_path, env=environment(), stdout=subprocess.PIPE, bufsize=0
-    )
+    plan = Started("run", "notes.py:forever", cwd=tmp_path)
     spool = tmp_path / "pycrorm.db.spool"
     try:
-        assert plan.stdout is not None
-        assert plan.stdout.read(1) == b"."
+        assert plan.stdout.read(1) == "."
         plan.send_signal(signal.SIGSTOP)
         document = answer("spool", "inspect", spool, cwd=tmp_path)
         assert [each["alive"] for each in document["recorders"]] == [True]
@@ -136,9 +130,7 @@ def test_a_live_plans_spool_is_reported_and_not_repaired(tmp_path: Path) -> None
         refused = pycrorm("spool", "repair", spool, cwd=tmp_path)
     finally:
         plan.kill()
-        plan.wait()
-        assert plan.stdout is not None
-        plan.stdout.close()
+        plan.communicate()
     assert damaged.returncode == 4
     assert "stop its process first" in one_line_of(damaged)
     assert refused.returncode == 3

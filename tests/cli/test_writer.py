@@ -2,7 +2,6 @@
 
 import json
 import signal
-import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any
 import pytest
 
 from tests.cli.note_plan import NOTES_PLAN
-from tests.commands import COMMAND, answer, environment, one_line_of, pycrorm
+from tests.commands import Started, answer, one_line_of, pycrorm
 from tests.databases import ask_to_change
 
 pytestmark = pytest.mark.slow
@@ -34,21 +33,9 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def start(*arguments: str, cwd: Path, **settings: str) -> subprocess.Popen[str]:
-    return subprocess.Popen(
-        [*COMMAND, *arguments],
-        cwd=cwd,
-        env=environment() | settings,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-
-
 @pytest.fixture
-def daemon(folder: Path) -> Iterator[subprocess.Popen[str]]:
-    process = start("writer", cwd=folder)
-    assert process.stderr is not None
+def daemon(folder: Path) -> Iterator[Started]:
+    process = Started("writer", cwd=folder)
     assert process.stderr.readline() == f"draining {folder}/pycrorm.db.spool into {URL}\n"
     yield process
     if process.poll() is None:
@@ -56,7 +43,7 @@ def daemon(folder: Path) -> Iterator[subprocess.Popen[str]]:
     process.communicate()
 
 
-def output_until_exit(process: subprocess.Popen[str], with_signal: int) -> list[str]:
+def output_until_exit(process: Started, with_signal: int) -> list[str]:
     """Return the lines until it exits, with code 0, within the time that it names."""
     process.send_signal(with_signal)
     _, errors = process.communicate(timeout=15)
@@ -66,9 +53,7 @@ def output_until_exit(process: subprocess.Popen[str], with_signal: int) -> list[
 
 
 @pytest.mark.parametrize("with_signal", [signal.SIGTERM, signal.SIGINT])
-def test_a_plan_beside_a_daemon_is_in_the_database_at_its_end(
-    folder: Path, daemon: subprocess.Popen[str], with_signal: int
-) -> None:
+def test_a_plan_beside_a_daemon_is_in_the_database_at_its_end(folder: Path, daemon: Started, with_signal: int) -> None:
     done = answer("run", "notes.py", "--writer", "daemon", cwd=folder)
     assert [(each["number"], each["status"], each["nodes"]) for each in done["episodes"]] == [(1, "SUCCEEDED", 4)]
     [appeared, ended, goodbye] = output_until_exit(daemon, with_signal)
@@ -80,7 +65,7 @@ def test_a_plan_beside_a_daemon_is_in_the_database_at_its_end(
 
 
 def test_the_environment_may_select_the_writer_and_without_a_daemon_nothing_is_lost(folder: Path) -> None:
-    process = start("run", "notes.py", cwd=folder, PYCRORM_WRITER="daemon")
+    process = Started("run", "notes.py", cwd=folder, PYCRORM_WRITER="daemon")
     output, errors = process.communicate(timeout=60)
     assert (process.returncode, output) == (0, "")
     assert "11 events are safe in" in " ".join(errors.split())
@@ -94,7 +79,7 @@ def test_the_environment_may_select_the_writer_and_without_a_daemon_nothing_is_l
     assert len(answer("episodes", cwd=folder)) == 1
 
 
-def test_a_second_daemon_is_one_line_and_exit_code_3(folder: Path, daemon: subprocess.Popen[str]) -> None:
+def test_a_second_daemon_is_one_line_and_exit_code_3(folder: Path, daemon: Started) -> None:
     done = pycrorm("writer", cwd=folder)
     assert done.returncode == 3
     assert one_line_of(done) == (
@@ -103,9 +88,8 @@ def test_a_second_daemon_is_one_line_and_exit_code_3(folder: Path, daemon: subpr
     assert pycrorm("writer", "--once", cwd=folder).returncode == 0
 
 
-def test_a_plan_killed_beside_a_daemon_is_recovered_by_it(folder: Path, daemon: subprocess.Popen[str]) -> None:
-    plan = start("run", "notes.py:waits", "--writer", "daemon", cwd=folder)
-    assert plan.stdout is not None
+def test_a_plan_killed_beside_a_daemon_is_recovered_by_it(folder: Path, daemon: Started) -> None:
+    plan = Started("run", "notes.py:waits", "--writer", "daemon", cwd=folder)
     assert plan.stdout.readline() == "waiting\n"
     [recorder] = until(folder, lambda document: [r for r in document["recorders"] if r["folded"]])
     assert (recorder["alive"], recorder["drained"]) == (True, "another")
@@ -134,9 +118,8 @@ def until(folder: Path, wanted: Any) -> Any:
         assert time.monotonic() < deadline, done.stdout
 
 
-def test_a_plan_with_its_own_writer_is_not_drained_by_a_daemon(folder: Path, daemon: subprocess.Popen[str]) -> None:
-    plan = start("run", "notes.py:waits", cwd=folder)
-    assert plan.stdout is not None
+def test_a_plan_with_its_own_writer_is_not_drained_by_a_daemon(folder: Path, daemon: Started) -> None:
+    plan = Started("run", "notes.py:waits", cwd=folder)
     assert plan.stdout.readline() == "waiting\n"
     time.sleep(1.2)  # the daemon scans twice
     [recorder] = answer("status", cwd=folder)["recorders"]

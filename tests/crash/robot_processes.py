@@ -7,12 +7,12 @@ the memory.
 from __future__ import annotations
 
 import random
-import subprocess
+import signal
 import time
 from collections import defaultdict
 from pathlib import Path
 
-from tests.commands import COMMAND, environment, pycrorm
+from tests.commands import Started, pycrorm
 from tests.crash.forked_processes import ForkedProcess
 from tests.crash.step_robot import run_step_robot
 from tests.databases import ask
@@ -61,7 +61,7 @@ class Lab:
         self.rng = random.Random(seed)
         self.robots: list[RobotProcess] = []
         self.gone: list[RobotProcess] = []
-        self.daemon: subprocess.Popen[bytes] | None = None
+        self.daemon: Started | None = None
         self.log = folder / "daemon.log"
 
     def start_robot(self, name: str | None = None) -> RobotProcess:
@@ -82,24 +82,18 @@ class Lab:
         self.robots = []
 
     def start_daemon(self) -> None:
-        with self.log.open("ab") as log:
-            self.daemon = subprocess.Popen(
-                [*COMMAND, "writer", "--url", self.url, "--spool", str(self.spool)],
-                stderr=log,
-                stdout=log,
-                cwd=self.folder,
-                env=environment(),
-            )
+        self.daemon = Started("writer", "--url", self.url, "--spool", self.spool, cwd=self.folder, output=self.log)
 
     def kill_daemon(self) -> None:
         assert self.daemon is not None
         self.daemon.kill()
-        self.daemon.wait()
+        self.daemon.communicate()
 
     def stop_daemon(self) -> int:
         assert self.daemon is not None
-        self.daemon.terminate()
-        return self.daemon.wait(timeout=HANGS_S)
+        self.daemon.send_signal(signal.SIGTERM)
+        self.daemon.communicate(timeout=HANGS_S)
+        return self.daemon.wait()
 
     def wait_for_log(self, words: str) -> None:
         deadline = time.monotonic() + HANGS_S

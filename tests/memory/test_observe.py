@@ -6,12 +6,10 @@ import io
 import json
 import math
 import os
-import sys
 import threading
 from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path
-from subprocess import run
 from typing import Any
 
 import numpy as np
@@ -29,7 +27,7 @@ from pycrorm_async.projections.verify.findings import VerifyResult
 from pycrorm_async.projections.verify.verify import verify
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from tests.commands import answer, environment, pycrorm
+from tests.commands import answer, pycrorm, run_script
 from tests.databases import Server, ask_to_change
 from tests.table_comparison import differences, tables_of
 
@@ -301,7 +299,7 @@ async def test_a_long_episode_continues_and_threads_stop_at_its_last_events(tmp_
 
 
 def returncode(script: Path) -> int:
-    return run([sys.executable, str(script)], env=environment(), check=False).returncode
+    return run_script(script.read_text()).returncode
 
 
 @pytest.mark.soak_on("postgresql")

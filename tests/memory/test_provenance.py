@@ -19,6 +19,7 @@ from pycrorm_async.recording.writing.provenance import PlanSource
 from pycrorm_async.settings import Settings
 from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose
 from tests.bullet import INSTALLED_BULLETS
+from tests.commands import answer, pycrorm
 
 SOURCE = PlanSource("ab" * 32, "cd" * 20, git_dirty=True)
 
@@ -94,6 +95,59 @@ async def test_a_world_that_is_entered_inside_an_episode_is_described(database_u
         "BulletWorld (DIRECT): milk (MILK)",
         "BulletWorld (DIRECT): spoon (SPOON)",
     ]
+
+
+async def test_the_world_of_an_episode_that_runs_or_is_lost_is_that_of_its_objects(
+    database_url: str, tmp_path: Path
+) -> None:
+    async with Memory.open(database_url, spool=tmp_path / "spool") as memory:
+
+        async def world() -> str | None:
+            await memory.flush()
+            return (await memory.reading.episode("last")).world
+
+        with BulletWorld():
+            Object("cup", ObjectType.JEROEN_CUP)  # in no episode
+        async with memory.episode(description="running"):
+            assert await world() is None
+            with BulletWorld() as entered:
+                assert await world() is None
+                Object("pr2", ObjectType.ROBOT)
+                bowl = Object("bowl", ObjectType.BOWL)
+                assert await world() == "pr2 (ROBOT), bowl (BOWL)"
+                bowl.remove()
+                milk = Object("milk", ObjectType.MILK)
+                assert await world() == "pr2 (ROBOT), milk (MILK)"
+                milk.remove()
+                Object("milk", ObjectType.MILK).set_pose(Pose([1, 0, 0]))
+                assert await world() == "pr2 (ROBOT), milk (MILK)"
+                entered.object("pr2").remove()
+            assert await world() == "pr2 (ROBOT), bowl (BOWL), milk (MILK)"
+        assert await world() == "BulletWorld (DIRECT): milk (MILK)"
+
+
+@pytest.mark.slow
+def test_a_lost_episode_names_the_objects_of_its_world(tmp_path: Path) -> None:
+    program = """
+import asyncio, os, signal
+from pycrorm_async import Memory
+from pycrorm_async.world import BulletWorld, Object, ObjectType
+async def main():
+    async with Memory.open("sqlite:///memory.db") as memory:
+        async with memory.episode(description="killed"):
+            with BulletWorld():
+                Object("pr2", ObjectType.ROBOT)
+                Object("bowl", ObjectType.BOWL).remove()
+                Object("milk", ObjectType.MILK)
+                os.kill(os.getpid(), signal.SIGKILL)
+asyncio.run(main())
+"""
+    subprocess.run([sys.executable, "-c", program], cwd=tmp_path, check=False)
+    url = f"sqlite:///{tmp_path}/memory.db"
+    assert pycrorm("writer", "--once", "--url", url, cwd=tmp_path).returncode == 0
+    [episode] = answer("episodes", "--url", url, cwd=tmp_path)
+    assert (episode["status"], episode["world"]) == ("LOST", "pr2 (ROBOT), milk (MILK)")
+    assert "pr2 (ROBOT), milk (MILK)" in pycrorm("show", "1", "--url", url, cwd=tmp_path).stdout
 
 
 @pytest.mark.slow

@@ -6,8 +6,6 @@ import json
 import os
 import shutil
 import signal
-import subprocess
-import sys
 from collections.abc import Callable
 from importlib.metadata import distribution
 from pathlib import Path
@@ -25,7 +23,7 @@ from pycrorm_async.recording.values.missing_values import Missing
 from pycrorm_async.settings import Settings
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose, copied
 from pycrorm_async.world.robots.robot_description import PR2
-from tests.commands import environment
+from tests.commands import run_script
 from tests.golden.unpacking import unpack_memory_v1
 
 ROBOTS = "cmeel.prefix/share/example-robot-data/robots"
@@ -111,14 +109,7 @@ asyncio.run(see(sys.argv[1], sys.argv[2] == "files"))
 def seen_again(url: str, folder: Path, sequence: int, meshes: str = "boxes") -> dict[str, object]:
     """Return the report of a new process in another folder."""
     folder.mkdir()
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", SEE, url, meshes, str(sequence)],
-        cwd=folder,
-        env=environment(),
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = run_script(SEE, url, meshes, str(sequence), cwd=folder)
     assert done.returncode == 0, done.stderr
     answer: dict[str, object] = json.loads(done.stdout)
     return answer
@@ -217,8 +208,7 @@ asyncio.run(die(*sys.argv[1:]))
 
 def killed_plan(url: str, spool: Path, robot: Path) -> list[float]:
     """Return the position of the arm's tip when the plan was killed."""
-    words = [sys.executable, "-c", DIES, url, str(spool), str(robot)]
-    died = subprocess.run(words, env=environment(), capture_output=True, text=True, check=False)
+    died = run_script(DIES, url, spool, robot)
     assert died.returncode == -signal.SIGKILL, died.stderr
     return [*map(float, died.stdout.split())]
 

@@ -2,8 +2,6 @@
 
 import asyncio
 import contextvars
-import subprocess
-import sys
 import threading
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +15,7 @@ from pycrorm_async.errors import (
 from pycrorm_async.plan import ActionAbstract
 from pycrorm_async.plan.execution.observer import recorder
 from pycrorm_async.world.observers import watcher
-from tests.commands import environment
+from tests.commands import run_script
 from tests.memory.note_actions import NoteActionPerformable, texts, url_of
 
 pytestmark = pytest.mark.slow
@@ -78,9 +76,7 @@ async def test_the_next_memory_adopts_the_folder_of_a_killed_process(tmp_path: P
         "        os.kill(os.getpid(), signal.SIGKILL)\n"
         "asyncio.run(main())\n"
     )
-    done = await asyncio.to_thread(
-        subprocess.run, [sys.executable, "-c", script, url_of(tmp_path)], env=environment(), check=False
-    )
+    done = await asyncio.to_thread(run_script, script, url_of(tmp_path))
     assert done.returncode == -9
     async with Memory.open(url_of(tmp_path)) as memory:
         await NoteActionPerformable("after").perform()
@@ -148,15 +144,7 @@ async def test_a_forked_child_does_not_affect_the_memory_of_its_parent(tmp_path:
         "        await NoteActionPerformable('after').perform()\n"
         "asyncio.run(main())\n"
     )
-    done = await asyncio.to_thread(
-        subprocess.run,
-        [sys.executable, "-c", script, url_of(tmp_path)],
-        env=environment(),
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
+    done = await asyncio.to_thread(run_script, script, url_of(tmp_path), timeout_s=60)
     assert (done.returncode, done.stderr) == (0, "")
     async with Reading.open(url_of(tmp_path)) as reading:
         assert await texts(reading) == ["before", "after"]

@@ -5,8 +5,6 @@ from __future__ import annotations
 import asyncio
 import signal
 import sqlite3
-import subprocess
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -38,7 +36,7 @@ from pycrorm_async.plan.object_designators import designator_of
 from pycrorm_async.world import Arms, BulletWorld, Grasp, ObjectType, Pose
 from pycrorm_async.world import Object as WorldObject
 from pycrorm_async.world.pose import yaw_quaternion
-from tests.commands import answer, environment, pycrorm
+from tests.commands import answer, pycrorm, run_script
 from tests.memory.note_actions import NoteActionPerformable, texts, url_of
 
 pytestmark = pytest.mark.slow
@@ -177,9 +175,7 @@ async def test_a_simulation_whose_process_is_killed_is_lost_with_the_episode_aro
         "            os.kill(os.getpid(), signal.SIGKILL)\n"
         "asyncio.run(main())\n"
     )
-    done = await asyncio.to_thread(
-        subprocess.run, [sys.executable, "-c", script, url_of(tmp_path)], env=environment(), check=False
-    )
+    done = await asyncio.to_thread(run_script, script, url_of(tmp_path))
     assert done.returncode == -signal.SIGKILL
     assert (await recover(url_of(tmp_path))).failed == {}
     async with Reading.open(url_of(tmp_path)) as reading:

@@ -1,8 +1,6 @@
 """User types in a memory: subclasses, mapped classes, views, data frames, and processes that lack the class."""
 
 import asyncio
-import subprocess
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,7 +13,7 @@ from pycrorm_async.orm import Action, Designator, PickUpAction, TaskTreeNode
 from pycrorm_async.plan import ActionAbstract, PickUpActionPerformable
 from pycrorm_async.plan.object_designators import BelieveObject
 from pycrorm_async.world import Arms, Grasp, ObjectType, Pose
-from tests.commands import environment
+from tests.commands import run_script
 from tests.memory.note_actions import NoteActionPerformable, url_of
 
 pytestmark = pytest.mark.slow
@@ -74,14 +72,7 @@ async def test_a_process_that_lacks_the_class_still_reads_its_rows(tmp_path: Pat
         "        print([node.action.text if node.action else None for node in nodes])\n"
         "asyncio.run(main())\n"
     )
-    done = await asyncio.to_thread(
-        subprocess.run,
-        [sys.executable, "-c", script, url_of(tmp_path)],
-        env=environment(),
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = await asyncio.to_thread(run_script, script, url_of(tmp_path))
     assert done.stdout.splitlines() == [
         "NoteAction NoteAction seen",
         "NoteAction NoteAction seen",

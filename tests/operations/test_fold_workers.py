@@ -2,7 +2,6 @@
 
 import os
 import signal
-import subprocess
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -12,7 +11,7 @@ from typing import Any
 import pytest
 
 from tests.cli.note_plan import NOTES_PLAN
-from tests.commands import COMMAND, answer, environment, pycrorm
+from tests.commands import Started, answer, pycrorm
 from tests.databases import ask, ask_to_change
 
 pytestmark = pytest.mark.slow
@@ -25,10 +24,8 @@ def folder(tmp_path: Path) -> Path:
 
 
 @contextmanager
-def started(folder: Path) -> Iterator[subprocess.Popen[str]]:
-    command = [*COMMAND, "writer"]
-    process = subprocess.Popen(command, cwd=folder, env=environment(), stderr=subprocess.PIPE, text=True)
-    assert process.stderr is not None
+def started(folder: Path) -> Iterator[Started]:
+    process = Started("writer", cwd=folder)
     assert process.stderr.readline().startswith("draining")
     yield process
     process.kill()
@@ -36,7 +33,7 @@ def started(folder: Path) -> Iterator[subprocess.Popen[str]]:
 
 
 @pytest.fixture
-def daemon(folder: Path) -> Iterator[subprocess.Popen[str]]:
+def daemon(folder: Path) -> Iterator[Started]:
     with started(folder) as process:
         yield process
 
@@ -72,9 +69,7 @@ def wait_for_workers(folder: Path, count: int) -> list[int]:
     raise AssertionError(workers(folder))
 
 
-def test_a_worker_folds_and_its_death_is_reported_and_shown_and_it_is_restarted(
-    folder: Path, daemon: subprocess.Popen[str]
-) -> None:
+def test_a_worker_folds_and_its_death_is_reported_and_shown_and_it_is_restarted(folder: Path, daemon: Started) -> None:
     first, other = wait_for_workers(folder, 2)
     notes = 3
     assert noted(folder) == notes
@@ -101,7 +96,7 @@ def test_a_worker_folds_and_its_death_is_reported_and_shown_and_it_is_restarted(
     assert workers(folder) == []
 
 
-def test_a_suspended_worker_ends_with_a_daemon_that_is_killed(folder: Path, daemon: subprocess.Popen[str]) -> None:
+def test_a_suspended_worker_ends_with_a_daemon_that_is_killed(folder: Path, daemon: Started) -> None:
     assert noted(folder) == 3
     stopped, idle = wait_for_workers(folder, 2)
     os.kill(stopped, signal.SIGSTOP)
@@ -113,7 +108,7 @@ def test_a_suspended_worker_ends_with_a_daemon_that_is_killed(folder: Path, daem
 
 @pytest.mark.parametrize("end", [signal.SIGTERM, signal.SIGINT])
 def test_a_terminal_signal_to_both_ends_a_worker_with_the_daemon_and_no_sooner(
-    folder: Path, daemon: subprocess.Popen[str], end: signal.Signals
+    folder: Path, daemon: Started, end: signal.Signals
 ) -> None:
     pids = wait_for_workers(folder, 2)
     for each in pids:
@@ -130,11 +125,10 @@ def test_a_terminal_signal_to_both_ends_a_worker_with_the_daemon_and_no_sooner(
     assert all(map(is_gone, pids))
 
 
-def test_the_reason_why_a_worker_cannot_fold_is_reported(folder: Path, daemon: subprocess.Popen[str]) -> None:
+def test_the_reason_why_a_worker_cannot_fold_is_reported(folder: Path, daemon: Started) -> None:
     assert noted(folder) == 3
     ask_to_change(f"sqlite:///{folder}/pycrorm.db", "DROP TABLE zz_task_tree_node__1001")
-    plan = subprocess.Popen([*COMMAND, "run", "notes.py", "--writer", "daemon"], cwd=folder, env=environment())
-    assert daemon.stderr is not None
+    plan = Started("run", "notes.py", "--writer", "daemon", cwd=folder)
     output = ""
     while "cannot be brought" not in output:
         output = daemon.stderr.readline()
@@ -143,7 +137,7 @@ def test_the_reason_why_a_worker_cannot_fold_is_reported(folder: Path, daemon: s
     while ask(f"sqlite:///{folder}/pycrorm.db", ended) != [(8,)]:  # appending continues
         time.sleep(0.01)
     plan.kill()
-    plan.wait()
+    plan.communicate()
     assert "no such table: zz_task_tree_node__1001" in output
 
 
@@ -154,10 +148,7 @@ LONG_PLAN = NOTES_PLAN.replace('in "abc"', f"in map(str, range({MANY}))") + "   
 def leave_many_notes(folder: Path) -> str:
     """Run a plan that takes many notes and is killed before they are drained; return the URL of their database."""
     (folder / "long.py").write_text(f"import os\n{LONG_PLAN}")
-    done = subprocess.run(
-        [*COMMAND, "run", "long.py", "--writer", "daemon"], cwd=folder, env=environment(), check=False
-    )
-    assert done.returncode == -signal.SIGKILL
+    assert pycrorm("run", "long.py", "--writer", "daemon", cwd=folder).returncode == -signal.SIGKILL
     return f"sqlite:///{folder}/pycrorm.db"
 
 

@@ -1,4 +1,4 @@
-"""The fold of events into rows; every expected row is written here by hand, column by column as in `tables.CORE`."""
+"""The fold of events into rows; every expected row is written here by hand, column by column as in `CORE`."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from pycrorm_async.projections.fold.column_values import json_text
 from pycrorm_async.projections.fold.fold import CannotFold, fold
 from pycrorm_async.projections.fold.parameters import Designators
 from pycrorm_async.projections.fold.row_batch import Rows
-from pycrorm_async.projections.schema.tables import COLUMNS
+from pycrorm_async.projections.schema.core_columns import COLUMNS
 from tests.projections.event_script import (
     NAVIGATE,
     PICK_UP,

@@ -76,10 +76,12 @@ async def test_the_overview_has_a_line_for_every_episode(reading: Reading) -> No
     first = EpisodeSummary(
         number=1, id="00000000-0000-7000-8000-000000000001", started_at=moment(1), ended_at=None, duration_ns=None,
         status="RUNNING", description="episode 1", created_by="me", nodes=4, failed=1,
+        world="milk (MILK)",
     )  # fmt: skip
     second = EpisodeSummary(
         number=2, id="00000000-0000-7000-8000-000000000002", started_at=moment(1), ended_at=moment(11),
         duration_ns=10_000_000_000, status="SUCCEEDED", description="episode 2", created_by="me", nodes=4, failed=1,
+        world="milk (MILK)",
         end_sequence=11,
     )  # fmt: skip
     summaries = await reading.episodes()

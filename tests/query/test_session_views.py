@@ -39,7 +39,7 @@ from pycrorm_async.events.values import (
 from pycrorm_async.orm import Action, Motion, PickUpAction, PickUpWithContextView, ProcessMetaData, TaskTreeNode
 from pycrorm_async.orm import Pose as PoseRow
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.projections.schema.tables import COLUMNS
+from pycrorm_async.projections.schema.core_columns import COLUMNS
 from pycrorm_async.projections.schema.user_views import UserView
 from pycrorm_async.query.named_queries import SimulatingNode
 from pycrorm_async.query.reading import Reading

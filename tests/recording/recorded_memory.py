@@ -35,13 +35,19 @@ def events(folder: Path, kind: str) -> list[dict[str, Any]]:
     return [json.loads(payload) for (payload,) in rows]
 
 
-def assert_verified(folder: Path) -> None:
-    async def problems() -> list[str]:
-        log = await EventLog.open(DatabaseAddress.parse(url_of(folder)), create=False)
+def problems(url: str) -> list[str]:
+    """Return what `verify` finds in a memory."""
+
+    async def found() -> list[str]:
+        log = await EventLog.open(DatabaseAddress.parse(url), create=False)
         try:
             result = await verify(log)
             return [str(each) for each in (*result.damages, *result.differences, *result.stopped)]
         finally:
             await log.close()
 
-    assert asyncio.run(problems()) == []
+    return asyncio.run(found())
+
+
+def assert_verified(folder: Path) -> None:
+    assert problems(url_of(folder)) == []

@@ -15,7 +15,7 @@ import pytest
 
 from pycrorm_async import Memory, Settings, recover
 from pycrorm_async.errors import CallerError
-from pycrorm_async.events.values import FailureValue, ObjectReference, PoseValue, RobotValue, SeenValue
+from pycrorm_async.events.values import EpisodeStatus, FailureValue, ObjectReference, PoseValue, RobotValue, SeenValue
 from pycrorm_async.plan.failures import NavigationGoalInCollision
 from pycrorm_async.recording.recorded_episode import RecordedEpisode
 from pycrorm_async.recording.recording import Recording
@@ -24,6 +24,8 @@ from pycrorm_async.world.pose import Pose
 from tests.commands import environment, pycrorm
 from tests.databases import ask
 from tests.recording.recorded_memory import assert_verified, events, nodes, url_of
+
+pytestmark = pytest.mark.slow
 
 AT_END = Settings(fold="at_end")
 HERE = Pose([1, 2, 3])
@@ -453,3 +455,17 @@ def test_a_status_given_with_a_failure_of_another_language(tmp_path: Path) -> No
         ))  # fmt: skip
         episode.end("a", "INTERRUPTED", FailureValue("bt.Preempted", "a higher priority"))
     assert nodes(tmp_path) == [("Step", None, "INTERRUPTED", "a higher priority")]
+
+
+@pytest.mark.parametrize(
+    ("status", "root"), [("FAILED", "FAILED"), ("INTERRUPTED", "CANCELLED"), ("ERROR", "ERROR"), (None, "ERROR")]
+)
+def test_an_executive_states_the_outcome_of_a_failure_that_only_it_knows(
+    tmp_path: Path, status: EpisodeStatus | None, root: str
+) -> None:
+    with opened(tmp_path) as memory:
+        memory.recording.episode(description="d").close(ValueError("a failure of its own"), status)
+    ended = ask(tmp_path / "memory.db", "SELECT status, failure_type, failure_message FROM process_metadata")
+    assert [tuple(each) for each in ended] == [(status or "ERROR", "builtins.ValueError", "a failure of its own")]
+    roots = ask(tmp_path / "memory.db", "SELECT status FROM task_tree_node WHERE kind = 'root'")
+    assert [tuple(each) for each in roots] == [(root,)]

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import subprocess
-import sys
 from urllib.parse import urlsplit
 
 import asyncpg
@@ -22,6 +20,7 @@ from pycrorm_async.store.postgresql.roles import GRANTS
 from pycrorm_async.store.postgresql.tables import MIGRATIONS
 from pycrorm_async.store.schema import Birth, make_or_migrate
 from tests.databases import Server, ask
+from tests.store.concurrent_openers import open_at_once
 from tests.store.factories import declaration, episode, record, run_of
 
 pytestmark = pytest.mark.slow
@@ -114,46 +113,11 @@ async def test_a_migration_that_fails_leaves_the_log_as_it_was(database_url: str
     assert ask(database_url, "SELECT format FROM pycrorm_log") == [(1,)]
 
 
-OPENER = """
-import asyncio, sys
-from pycrorm_async.projections.projector import Projector
-from pycrorm_async.store.append import Appending
-from pycrorm_async.store.dialects import dialect_of
-from pycrorm_async.store.address import DatabaseAddress
-from pycrorm_async.store.log import EventLog
-
-async def main():
-    sys.stdin.readline()
-    log = await EventLog.open(DatabaseAddress.parse(sys.argv[1]), create=True)
-    await Projector(log).open()
-    print(log.log_id)
-    await log.close()
-
-asyncio.run(main())
-"""
-
-
 def test_eight_processes_that_open_a_new_database_at_once_agree_on_one_log_and_one_set_of_tables(
     server: Server,
 ) -> None:
     url = server.new_database()
-    openers = [
-        subprocess.Popen(
-            [sys.executable, "-c", OPENER, url],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        for _ in range(8)
-    ]
-    for each in openers:
-        assert each.stdin is not None
-        each.stdin.write("now\n")
-        each.stdin.flush()
-    outputs = [each.communicate() for each in openers]
-    assert [error for _, error in outputs] == [""] * 8
-    ids = {output.strip() for output, _ in outputs}
+    ids = set(open_at_once(url, 8, tables=True))
     assert len(ids) == 1
     assert ask(url, "SELECT id FROM pycrorm_log") == [(ids.pop(),)]
     assert ask(url, "SELECT count(*) FROM memory_tables.pycrorm_generation") == [(1,)]

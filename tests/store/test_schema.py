@@ -15,6 +15,7 @@ from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.schema import Birth, make_or_migrate, recognise
 from pycrorm_async.store.sqlite.tables import MIGRATIONS
 from tests.databases import ask
+from tests.store.concurrent_openers import open_at_once
 from tests.store.factories import declaration, episode, run_of
 
 pytestmark = pytest.mark.slow
@@ -171,28 +172,7 @@ async def test_reading_does_not_migrate_an_older_log(address: DatabaseAddress) -
 
 
 def test_many_processes_that_open_a_new_log_concurrently_agree_on_one(tmp_path: Path) -> None:
-    script = """
-import asyncio, sys
-from pycrorm_async.store.address import DatabaseAddress
-from pycrorm_async.store.log import EventLog
-async def main():
-    sys.stdin.readline()
-    log = await EventLog.open(DatabaseAddress.parse(sys.argv[1]), create=True)
-    print(log.log_id)
-    await log.close()
-asyncio.run(main())
-"""
-    url = f"sqlite:///{tmp_path}/memory.db"
-    openers = [
-        subprocess.Popen([sys.executable, "-c", script, url], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
-        for _ in range(6)
-    ]
-    for each in openers:
-        assert each.stdin is not None
-        each.stdin.write("now\n")
-        each.stdin.flush()
-    ids = [each.communicate()[0].strip() for each in openers]
-    assert [each.returncode for each in openers] == [0] * 6
+    ids = open_at_once(f"sqlite:///{tmp_path}/memory.db", 6, tables=False)
     assert ids == [ids[0]] * 6
     assert len(ids[0]) == 36
 

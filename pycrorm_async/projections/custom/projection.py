@@ -24,7 +24,7 @@ from pycrorm_async.errors import CallerError
 from pycrorm_async.events.fields import is_reserved
 from pycrorm_async.events.types import Happening
 from pycrorm_async.projections.fold.column_values import in_slot, row
-from pycrorm_async.projections.schema.tables import Storage
+from pycrorm_async.projections.schema.core_columns import Storage
 from pycrorm_async.projections.schema.user_views import UserView
 
 __all__ = ["Projection", "Event", "Changes", "Column", "OF_EVERY_TABLE", "columns_of"]

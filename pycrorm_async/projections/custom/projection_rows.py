@@ -14,7 +14,8 @@ from pycrorm_async.projections.fold.column_values import is_missing, json_text, 
 from pycrorm_async.projections.fold.fold import CannotFold, happening_of
 from pycrorm_async.projections.fold.row_batch import Row
 from pycrorm_async.projections.fold.row_writer import stored_rows
-from pycrorm_async.projections.schema.tables import OWN, Storage, column_type
+from pycrorm_async.projections.schema.core_columns import OWN, Storage
+from pycrorm_async.projections.schema.tables import column_type
 from pycrorm_async.projections.table_names import physical_name
 from pycrorm_async.store.dialect import Insertion
 from pycrorm_async.store.dialects import dialect_of

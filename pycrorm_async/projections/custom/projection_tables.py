@@ -24,6 +24,7 @@ from pycrorm_async.projections.run import checkpoints
 from pycrorm_async.projections.run.batch_fold import Batch, BatchFold
 from pycrorm_async.projections.run.pipeline import FoldPipeline
 from pycrorm_async.projections.run.targets import SideTarget
+from pycrorm_async.projections.schema.core_columns import OWN, Storage
 from pycrorm_async.projections.schema.generations import (
     PROJECTION,
     Generation,
@@ -35,7 +36,6 @@ from pycrorm_async.projections.schema.generations import (
     write_generation,
 )
 from pycrorm_async.projections.schema.layout import Layout
-from pycrorm_async.projections.schema.tables import OWN, Storage
 from pycrorm_async.projections.schema.user_views import with_user_views
 from pycrorm_async.projections.table_names import next_number
 from pycrorm_async.store.log import EventLog

@@ -14,7 +14,7 @@ import msgspec
 from pycrorm_async.events.ids import SEQUENCE_MAX, SLOT_MAX, row_id, row_key
 from pycrorm_async.events.values import FieldDeclared, ObjectReference, ObjectValue, PoseValue
 from pycrorm_async.projections.fold.row_batch import Row
-from pycrorm_async.projections.schema.tables import COLUMNS
+from pycrorm_async.projections.schema.core_columns import COLUMNS
 
 __all__ = [
     "AS_IT_IS",

@@ -14,7 +14,8 @@ from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.events.codec import UnknownShape, description_of, fingerprint
 from pycrorm_async.projections.fold.row_batch import Row
-from pycrorm_async.projections.schema.tables import LINK_BOX, OF_NO_EPISODE, make_table
+from pycrorm_async.projections.schema.core_columns import LINK_BOX, OF_NO_EPISODE
+from pycrorm_async.projections.schema.tables import make_table
 from pycrorm_async.projections.table_names import physical_name
 from pycrorm_async.store.dialects import dialect_of
 

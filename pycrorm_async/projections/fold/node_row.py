@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Any, Final
 
-from pycrorm_async.projections.schema import tables
+from pycrorm_async.projections.schema import core_columns
 
 (
     ID,
@@ -34,7 +34,9 @@ from pycrorm_async.projections.schema import tables
     SIMULATED,
     PARAMETERS,
 ) = range(22)
-assert [each.lower() for each in globals() if each.isupper()] == [*tables.CORE["task_tree_node"]], "the order differs"
+assert [each.lower() for each in globals() if each.isupper()] == [*core_columns.CORE["task_tree_node"]], (
+    "the order differs"
+)
 
 OUTCOME: Final = slice(REASON, RESULT + 1)
 """The columns reason to result."""

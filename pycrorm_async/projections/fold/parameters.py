@@ -22,7 +22,7 @@ from pycrorm_async.projections.fold.column_values import (
     scalar,
 )
 from pycrorm_async.projections.fold.row_batch import Row
-from pycrorm_async.projections.schema.tables import EPISODE
+from pycrorm_async.projections.schema.core_columns import EPISODE
 from pycrorm_async.store.stored import StoredEvent
 
 __all__ = ["Designators", "DesignatorFold", "ParameterRows"]

@@ -1,6 +1,6 @@
 """Collect the rows of one batch of events: those to insert, and changes to rows that the tables contain already.
 
-A node that starts and ends in one batch is one row to insert. Rows are tuples in the order of `tables.COLUMNS`. Until
+A node that starts and ends in one batch is one row to insert. Rows are tuples in the order of `core_columns`. Until
 the batch is complete later events change the rows of nodes and episodes, which are lists (`node_row`) and dicts.
 """
 
@@ -18,7 +18,7 @@ from pycrorm_async.projections.fold.node_row import (
     PROCESS_METADATA_ID,
     STATUS,
 )
-from pycrorm_async.projections.schema.tables import COLUMNS
+from pycrorm_async.projections.schema.core_columns import COLUMNS
 
 __all__ = ["Rows", "Row", "NodeEnd", "EpisodeEnd"]
 

@@ -13,7 +13,8 @@ from pycrorm_async.projections.fold.fold import fold
 from pycrorm_async.projections.fold.link_boxes import insert_link_boxes
 from pycrorm_async.projections.fold.parameters import Designators
 from pycrorm_async.projections.fold.row_batch import EpisodeEnd, NodeEnd, Rows
-from pycrorm_async.projections.schema.tables import CORE, column_type
+from pycrorm_async.projections.schema.core_columns import CORE
+from pycrorm_async.projections.schema.tables import column_type
 from pycrorm_async.projections.table_names import physical_name
 from pycrorm_async.store.dialect import Insertion, RowsByTable
 from pycrorm_async.store.dialects import dialect_of

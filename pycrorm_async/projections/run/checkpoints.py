@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from sqlalchemy import TableClause, column, or_, select, table, text, update
 from sqlalchemy.ext.asyncio import AsyncConnection
 
-from pycrorm_async.projections.schema.tables import Storage
+from pycrorm_async.projections.schema.core_columns import Storage
 from pycrorm_async.projections.table_names import physical_name
 from pycrorm_async.store.dialect import Progress, RowRefused
 from pycrorm_async.store.dialects import dialect_of

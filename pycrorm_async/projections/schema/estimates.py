@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from pycrorm_async.projections.schema.tables import CORE, LINK_BOX, Storage, indexed
+from pycrorm_async.projections.schema.core_columns import CORE, LINK_BOX, Storage
+from pycrorm_async.projections.schema.tables import indexed
 from pycrorm_async.projections.table_names import index_name, physical_name
 from pycrorm_async.store.dialect import Expected
 

@@ -34,19 +34,12 @@ from sqlalchemy.ext.asyncio import AsyncConnection
 from sqlalchemy.schema import CreateColumn, CreateIndex, CreateTable, ExecutableDDLElement, Index
 
 from pycrorm_async.errors import DatabaseForeign, TablesOutdated
+from pycrorm_async.projections.schema.core_columns import CORE, OF_NO_EPISODE, OWN, Storage
 from pycrorm_async.projections.schema.estimates import expected
 from pycrorm_async.projections.schema.layout import Layout
 from pycrorm_async.projections.schema.materialised_views import make_materialised, materialised_tables, shown_texts
 from pycrorm_async.projections.schema.public_views import projection_views, public_views
-from pycrorm_async.projections.schema.tables import (
-    CORE,
-    OF_NO_EPISODE,
-    OWN,
-    Storage,
-    indexed,
-    leaf_columns,
-    make_table,
-)
+from pycrorm_async.projections.schema.tables import indexed, leaf_columns, make_table
 from pycrorm_async.projections.schema.user_views import view_text
 from pycrorm_async.projections.table_names import index_name, physical_name
 from pycrorm_async.store.dialects import dialect_of
@@ -351,7 +344,10 @@ def _definitions(
     name: str, columns: tuple[tuple[str, Storage], ...], generation: int, stored: _Stored, syntax: _Syntax
 ) -> tuple[str, ...]:
     table = make_table(name, dict(columns), generation, stored)
-    indexes = sorted(table.indexes, key=lambda each: str(each.name))
+    indexes = sorted(
+        (each for each in table.indexes if each.info.get("dialect", syntax.name) == syntax.name),
+        key=lambda each: str(each.name),
+    )
     definitions: list[ExecutableDDLElement] = [CreateTable(table), *map(CreateIndex, indexes)]
     return tuple(str(each.compile(dialect=syntax.dialect)) for each in definitions)
 

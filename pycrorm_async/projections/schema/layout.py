@@ -19,7 +19,7 @@ from pycrorm_async.events.codec import UnknownShape, declaration_of, fingerprint
 from pycrorm_async.events.fields import fault_in_declaration, mapped_declaration, table_name
 from pycrorm_async.events.types import DesignatorTypeDeclared
 from pycrorm_async.events.values import FieldType
-from pycrorm_async.projections.schema.tables import Storage
+from pycrorm_async.projections.schema.core_columns import Storage
 
 __all__ = ["Layout", "DesignatorType", "Leaf", "MaterialisedView", "LayoutConflict", "STORED_AS", "Union", "unite"]
 

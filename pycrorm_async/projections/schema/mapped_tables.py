@@ -15,8 +15,8 @@ from sqlalchemy.types import TypeEngine
 
 from pycrorm_async.orm import Action, Designator, Language, Motion
 from pycrorm_async.orm.types import Moment
+from pycrorm_async.projections.schema.core_columns import EPISODE, Storage
 from pycrorm_async.projections.schema.layout import Leaf
-from pycrorm_async.projections.schema.tables import EPISODE, Storage
 
 __all__ = ["mapped_leaves", "storage_of"]
 

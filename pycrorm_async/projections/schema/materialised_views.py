@@ -14,8 +14,9 @@ from sqlalchemy.ext.asyncio import AsyncConnection
 from sqlalchemy.schema import CreateIndex, CreateTable
 
 from pycrorm_async.errors import DatabaseError
+from pycrorm_async.projections.schema.core_columns import EPISODE, Storage
 from pycrorm_async.projections.schema.layout import Layout, MaterialisedView
-from pycrorm_async.projections.schema.tables import EPISODE, Storage, make_table
+from pycrorm_async.projections.schema.tables import make_table
 from pycrorm_async.projections.table_names import index_name, physical_name
 from pycrorm_async.store.dialects import dialect_of
 
@@ -55,8 +56,7 @@ def shown_texts(layout: Layout, generation: int, stored: Callable[[str], str]) -
     """Return name and public SQL of every user's view; that of a materialised view selects from its table."""
     texts = dict(layout.user_views)
     for name, kept in layout.kept.items():
-        renamed = any(stored(each) != each for each in kept.columns)
-        columns = ", ".join(f'"{stored(each)}" AS "{each}"' for each in kept.columns) if renamed else "*"
+        columns = ", ".join(f'"{stored(each)}" AS "{each}"' for each in kept.columns)
         texts[name] = f"SELECT {columns} FROM {physical_name(kept.table, generation)}"  # noqa: S608
     return texts
 

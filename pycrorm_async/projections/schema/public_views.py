@@ -41,21 +41,14 @@ from sqlalchemy.sql.selectable import CompoundSelect
 from pycrorm_async.events.codec import DESCRIPTION_PREFIX
 from pycrorm_async.events.fields import table_name
 from pycrorm_async.events.ids import SEQUENCE_MAX, SLOT_MAX
+from pycrorm_async.projections.schema.core_columns import CORE, EPISODE, LINK_BOX, OF_NO_EPISODE, OWN
 from pycrorm_async.projections.schema.layout import Layout
-from pycrorm_async.projections.schema.tables import (
-    CORE,
-    EPISODE,
-    LINK_BOX,
-    OF_NO_EPISODE,
-    OWN,
-    column_type,
-    leaf_columns,
-    make_table,
-)
+from pycrorm_async.projections.schema.tables import column_type, columns_in_order, leaf_columns, make_table
 from pycrorm_async.projections.schema.views.concept_views import concept_views
 from pycrorm_async.projections.schema.views.pick_up_view import pick_ups_with_context
 from pycrorm_async.projections.schema.views.root_failure_view import root_failures
 from pycrorm_async.projections.schema.views.spatial_relation_view import SpatialTables, spatial_relations
+from pycrorm_async.projections.schema.views.world_line import world_line
 from pycrorm_async.world.enums import ObjectType
 
 __all__ = ["public_views", "projection_views", "View"]
@@ -146,7 +139,9 @@ def public_views(
     def shown(view: Select[Any], rows: Table) -> Select[Any]:
         return view if simulated else view.where(_happened(rows, simulations))
 
-    views: dict[str, View] = {name: shown(select(*each.c, *_sequence(each)), each) for name, each in core.items()}
+    views: dict[str, View] = {
+        name: shown(select(*columns_in_order(each), *_sequence(each)), each) for name, each in core.items()
+    }
     views |= {name: shown(make(core, layout), core[home]) for name, (home, make) in _CUT.items()}
     leaves = {
         name: make_table(name, leaf_columns(columns), generation, stored) for name, columns in layout.leaves.items()
@@ -178,7 +173,7 @@ def projection_views(
     views: dict[str, View] = {}
     for name, columns in layout.leaves.items():
         rows = make_table(name, leaf_columns(columns), number, stored)
-        view = select(*map(_labelled, rows.c))
+        view = select(*map(_labelled, columns_in_order(rows)))
         views[name.removeprefix(OWN)] = view if simulated else view.where(_happened(rows, simulations))
     return views
 
@@ -192,8 +187,10 @@ def _happened(rows: Table, simulations: Table) -> ColumnElement[bool]:
 
 def _process_metadata(core: dict[str, Table], _layout: Layout) -> Select[Any]:
     episodes = core["process_metadata"]
-    world = func.coalesce(episodes.c.world, episodes.c.entered_world).label("world")
-    first, *others = (world if each.name == "world" else each for each in episodes.c if each.name != "entered_world")
+    line = world_line(core["object"], core["object_removal"], episodes.c.id)
+    world = func.coalesce(episodes.c.world, episodes.c.entered_world, line).label("world")
+    columns = columns_in_order(episodes)
+    first, *others = (world if each.name == "world" else each for each in columns if each.name != "entered_world")
     return select(first, _episode.c.id.label("uuid"), *others).join_from(
         episodes, _episode, _episode.c.number == episodes.c.id
     )
@@ -246,7 +243,7 @@ def _designator_type(layout: Layout) -> View:
 def _task_tree_node(core: dict[str, Table], _layout: Layout) -> Select[Any]:
     nodes = core["task_tree_node"]
     action_id = case((nodes.c.dtype.is_not(None), nodes.c.id), else_=null())
-    columns = (each for each in nodes.c if each.key != "parameters")
+    columns = (each for each in columns_in_order(nodes) if each.key != "parameters")
     return select(*columns, *_sequence(nodes), action_id.label("action_id"), _duration(nodes))
 
 
@@ -327,7 +324,9 @@ def _root_failure(core: dict[str, Table], _layout: Layout) -> Select[Any]:
 
 def _pose(core: dict[str, Table], _layout: Layout) -> Select[Any]:
     poses = core["pose"]
-    return select(*poses.c, *_sequence(poses), poses.c.id.label("position_id"), poses.c.id.label("orientation_id"))
+    return select(
+        *columns_in_order(poses), *_sequence(poses), poses.c.id.label("position_id"), poses.c.id.label("orientation_id")
+    )
 
 
 def _position(core: dict[str, Table], _layout: Layout) -> Select[Any]:

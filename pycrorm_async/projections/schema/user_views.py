@@ -16,9 +16,9 @@ from sqlalchemy import Dialect, Select, TableClause, column, table
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.fields import is_reserved
+from pycrorm_async.projections.schema.core_columns import EPISODE
 from pycrorm_async.projections.schema.layout import Layout, MaterialisedView
 from pycrorm_async.projections.schema.mapped_tables import storage_of
-from pycrorm_async.projections.schema.tables import EPISODE
 
 __all__ = ["UserView", "with_user_views", "view_texts", "view_text"]
 

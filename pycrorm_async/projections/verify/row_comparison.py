@@ -14,8 +14,9 @@ from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.events.ids import row_key
 from pycrorm_async.projections.fold.row_batch import Row
+from pycrorm_async.projections.schema.core_columns import CORE, LINK_BOX, OF_NO_EPISODE, Storage
 from pycrorm_async.projections.schema.generations import Generation
-from pycrorm_async.projections.schema.tables import CORE, LINK_BOX, OF_NO_EPISODE, Storage, leaf_columns, make_table
+from pycrorm_async.projections.schema.tables import leaf_columns, make_table
 
 __all__ = ["Comparison", "Difference", "Range"]
 
@@ -93,7 +94,8 @@ class Comparison:
     ) -> list[Difference]:
         """Return the differences in the boxes of these descriptions, given by fingerprint."""
         stored = await _rows(connection, self._link_box, self._link_box.c.model.in_(sorted(boxes)))
-        folded = {row[:2]: row for rows in boxes.values() for row in rows}
+        in_order = itemgetter(*map([*OF_NO_EPISODE[LINK_BOX]].index, self._link_box.columns.keys()))
+        folded = {row[:2]: in_order(row) for rows in boxes.values() for row in rows}
         self.count += len(stored)
         return [*_compared(LINK_BOX, [*self._link_box.columns.keys()], folded, stored)]
 
@@ -155,6 +157,10 @@ class Comparison:
             keys = _key_of(columns, table)
             if whole == columns:
                 into.update((keys(row), row) for row in folded)
+                continue
+            if set(whole) <= set(columns):
+                in_order = itemgetter(*map(columns.index, whole))
+                into.update((keys(row), in_order(row)) for row in folded)
                 continue
             places = [columns.index(each) if each in columns else None for each in whole]
             for row in folded:

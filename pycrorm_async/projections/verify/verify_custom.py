@@ -13,8 +13,8 @@ from pycrorm_async.projections.custom.projection_tables import CustomFoldDefinit
 from pycrorm_async.projections.fold.fold import CannotFold
 from pycrorm_async.projections.run import checkpoints
 from pycrorm_async.projections.run.batch_fold import Batch
+from pycrorm_async.projections.schema.core_columns import OWN
 from pycrorm_async.projections.schema.generations import Generation, projections_in, read_generations
-from pycrorm_async.projections.schema.tables import OWN
 from pycrorm_async.projections.verify.findings import VerifyResult
 from pycrorm_async.projections.verify.parts import EpisodeRange, Place
 from pycrorm_async.projections.verify.row_comparison import Comparison, Difference, Range

@@ -32,7 +32,7 @@ from pycrorm_async.events.codec import NotEncodable
 from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.events.tags import changed_tags
 from pycrorm_async.events.types import EpisodeEnded, EpisodeTagged, NodeEnded, NodeStarted, ObjectDetected
-from pycrorm_async.events.values import FailureValue, ObjectReference
+from pycrorm_async.events.values import EpisodeStatus, FailureValue, NodeStatus, ObjectReference
 from pycrorm_async.recording.values.event_fitting import (
     fit_detection,
     fit_episode_end,
@@ -151,7 +151,7 @@ class EpisodeWriter(ABC, Generic[N]):
         for sequence in sorted(self._open_nodes, reverse=True):
             self._close_node(NodeEnded(sequence, "LOST"), "Episode")
         self._wait_for_ends()
-        status, root_status = end_statuses(failure)
+        status, root_status = self._end_statuses(failure)
         value = failure_value(failure, self) if failure is not None else None
         if not self._root_ended:
             self._put_end(NodeEnded(self._root, root_status, value), "Episode")
@@ -160,6 +160,10 @@ class EpisodeWriter(ABC, Generic[N]):
             self.emitter.put(self.id, ended)
         except NotEncodable:
             self.emitter.put(self.id, fit_episode_end(ended, self.emitter.settings.record_bytes_max))
+
+    def _end_statuses(self, failure: BaseException | None) -> tuple[EpisodeStatus, NodeStatus]:
+        """Return the statuses of the episode and of its root node."""
+        return end_statuses(failure)
 
     def continue_as(self, follow_up: EpisodeId) -> dict[int, int]:
         """End the episode and continue it under the id `follow_up`; map the old sequences of open nodes to the new."""

@@ -15,7 +15,9 @@ from pycrorm_async.settings import Settings
 
 __all__ = ["PlanSource", "Provenance"]
 
-_LIBRARIES = ("pycrorm-async", "pybullet", "pycram-bullet", "numpy", "msgspec", "SQLAlchemy", "aiosqlite", "asyncpg")
+_LIBRARIES = tuple(
+    "pycrorm-async pycram-robotics pybullet pycram-bullet numpy msgspec SQLAlchemy aiosqlite asyncpg".split()
+)
 """The packages whose versions are recorded: those that act in the world, encode events and store them."""
 
 

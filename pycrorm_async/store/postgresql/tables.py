@@ -123,6 +123,7 @@ _BEHIND = f"CREATE INDEX episode_behind ON {LOG}.episode (number) WHERE folded <
 _STOPPED = f"CREATE INDEX episode_stopped ON {LOG}.episode (number) WHERE refused IS NOT NULL OR parked IS NOT NULL"
 
 # integer holds both parts of the key (`events.ids`) in half the bytes. Logs of 0.1.0 have bigint, which reads alike.
+# No room in the pages of the key, because events are only appended.
 # text, because jsonb refuses U+0000, reorders keys and rounds numbers; text keeps the bytes of the queue.
 _EVENT = f"""
 CREATE TABLE {LOG}.event (
@@ -133,7 +134,7 @@ CREATE TABLE {LOG}.event (
     wall_ns bigint NOT NULL,
     monotonic_ns bigint NOT NULL,
     payload text NOT NULL,
-    PRIMARY KEY (episode, sequence)
+    PRIMARY KEY (episode, sequence) WITH (fillfactor = 100)
 )"""
 
 _REFUSAL = f"""
@@ -182,10 +183,10 @@ CREATE TABLE IF NOT EXISTS {LOG}.pycrorm_incarnation (
 DIGEST = (
     f"""
 CREATE TABLE IF NOT EXISTS {LOG}.pycrorm_digest (
-    episode bigint NOT NULL,
-    sequence bigint NOT NULL,
+    episode integer NOT NULL,
+    sequence integer NOT NULL,
     digest text NOT NULL,
-    PRIMARY KEY (episode, sequence)
+    PRIMARY KEY (episode, sequence) WITH (fillfactor = 100)
 )""",
     f"""
 CREATE OR REPLACE TRIGGER digest_is_not_changed BEFORE UPDATE OR DELETE OR TRUNCATE ON {LOG}.pycrorm_digest

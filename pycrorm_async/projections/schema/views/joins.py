@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from sqlalchemy import ColumnElement, FromClause, and_, func
 
-from pycrorm_async.projections.schema.tables import EPISODE
+from pycrorm_async.projections.schema.core_columns import EPISODE
 
 __all__ = ["present", "same_episode"]
 

@@ -15,7 +15,7 @@ from sqlalchemy import Boolean, ColumnElement, Select, Table, Text, exists, lite
 from sqlalchemy.ext.compiler import compiles
 
 from pycrorm_async.events.ids import SEQUENCE_MAX, SLOT_MAX
-from pycrorm_async.projections.schema.tables import EPISODE
+from pycrorm_async.projections.schema.core_columns import EPISODE
 from pycrorm_async.task_status import TaskStatus
 
 __all__ = ["root_failures"]

@@ -1,0 +1,277 @@
+"""`remember` records unmodified plans of PyCRAM: `with remember("sqlite:///memory.db"): plan.perform()`.
+
+It observes PyCRAM from outside. PyCRAM's callbacks of plans report actions, motions and code; replaced methods report
+what has no callback: actions that another action performs, expressions of the language, branches in threads, plans in
+the prospection world, and changes of a Bullet world. Leaving the block removes all of them.
+
+Theory of operation. Each thread has a stack of the nodes that run in it, because PyCRAM has one current node for all
+threads and so loses nodes of parallel branches or gives them wrong parents. The stack of a branch begins with the
+parallel node; that of a thread that the plan starts itself is empty, so its first node is a child of the root. PyCRAM
+has two nodes for an action, a description and what it resolves to; only the latter is recorded, unless the description
+fails before it is resolved. The first node in the prospection world opens a simulated episode, which ends with PyCRAM's
+`with` block; objects have the same keys in it as in the real one. An exception of this package is counted in
+`memory.status` and does not reach the plan.
+"""
+
+from __future__ import annotations
+
+import itertools
+import sys
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from importlib import metadata as packages
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, Final
+
+from pycrorm_async.errors import CallerError, MissingExtra
+from pycrorm_async.events.values import NodeStatus
+from pycrorm_async.integrations.pycram_episodes import PyCRAMEpisodes, RunningNode
+from pycrorm_async.integrations.pycram_values import PyCRAMValues
+from pycrorm_async.integrations.pycram_world import PyCRAMWorld
+from pycrorm_async.integrations.seams import Seams, guarded
+from pycrorm_async.memory import Memory
+from pycrorm_async.recording.declarations.declared_type import DeclaredType
+from pycrorm_async.recording.declarations.recorded_type import RecordedKind
+from pycrorm_async.recording.recorded_episode import RecordedEpisode
+from pycrorm_async.recording.recording import Recording
+from pycrorm_async.settings import Settings, Writer
+
+__all__ = ["KNOWN_VERSIONS", "remember"]
+
+KNOWN_VERSIONS: Final = ("1.0.4",)
+"""The versions of the distribution `pycram-robotics` whose methods this module replaces."""
+_ONE_AT_A_TIME: Final = threading.Lock()
+"""Held while a `remember` is active, because the methods that it replaces are those of the whole process."""
+
+
+@contextmanager
+def remember(
+    url: str,
+    *,
+    description: str = "a PyCRAM plan",
+    plan: str | None = None,
+    seed: int | None = None,
+    tags: Sequence[str] = (),
+    metadata: Mapping[str, Any] = MappingProxyType({}),
+    spool: Path | str | None = None,
+    writer: Writer | None = None,
+    settings: Settings | None = None,
+) -> Iterator[RecordedEpisode]:
+    """Record the PyCRAM plans that any thread performs in this block, as one episode of the memory at this URL.
+
+    The arguments are those of `Memory.open` and `Memory.episode`. By default the tables are made when the block ends,
+    because PyCRAM sleeps often and a fold in its pauses takes time from the plan.
+
+    Raises:
+        MissingExtra: PyCRAM is not installed.
+        CallerError: this version of PyCRAM is unknown, or another `remember` is active in this process.
+        PycrormError: as of `Memory.open`; nothing of PyCRAM is replaced then.
+    """
+    _check_version()
+    if not _ONE_AT_A_TIME.acquire(blocking=False):
+        raise CallerError("another `remember` is active in this process: leave its block first, or perform inside it")
+    try:
+        settings = settings or Settings(fold="at_end")
+        with Memory.sync(url, spool=spool, writer=writer, settings=settings) as memory:
+            observer = _PyCRAMPlans(memory.recording)
+            with observer.observing(
+                description=description, plan=plan, seed=seed, tags=tags, metadata=metadata
+            ) as episode:
+                yield episode
+    finally:
+        _ONE_AT_A_TIME.release()
+
+
+def _check_version() -> None:
+    known, install = " or ".join(KNOWN_VERSIONS), "pip install 'pycrorm-async[pycram]'"
+    try:
+        installed = packages.version("pycram-robotics")
+    except packages.PackageNotFoundError:
+        raise MissingExtra(f"PyCRAM (pycram-robotics {known}) is not installed: {install}") from None
+    if installed not in KNOWN_VERSIONS:
+        raise CallerError(f"PyCRAM {installed} is unknown, only {known} can be recorded: {install}")
+
+
+class _PyCRAMPlans:
+    """Observes the plans of this process."""
+
+    def __init__(self, recording: Recording) -> None:
+        self.seams = Seams(recording)
+        self._values = PyCRAMValues()
+        self._pycram = self._values.pycram
+        self._episodes = PyCRAMEpisodes(recording, self._values)
+        self._world = PyCRAMWorld(self.seams, self._values, self._episodes)
+        self._thread = self._episodes.thread
+        self._keys = itertools.count(1)
+        self._types: dict[type, DeclaredType] = {}
+        self._parallel: dict[int, RunningNode] = {}
+
+    @contextmanager
+    def observing(self, **labels: Any) -> Iterator[RecordedEpisode]:
+        """Record an episode until the block ends."""
+        world = self._pycram.World.current_world
+        self._episodes.real = episode = self._episodes.open(world, **labels)
+        self.seams.is_on = True
+        try:
+            self._connect()
+            self._add_world(world)
+            yield episode
+        finally:
+            self._end_simulation(sys.exception())
+            self.seams.remove()
+            self._episodes.close(episode, sys.exception())
+
+    def _connect(self) -> None:
+        plan, used, seams = self._pycram.Plan, self._pycram, self.seams
+        seams.callback(plan.add_on_start_callback, plan.remove_on_start_callback, self._node_started)
+        seams.callback(plan.add_on_end_callback, plan.remove_on_end_callback, self._node_ended)
+        seams.around(plan, "perform", self._whole_plan)
+        seams.around(used.ActionDescription, "perform", self._nested_action)
+        for expression in (used.SequentialNode, used.TryInOrderNode, used.RepeatNode, used.MonitorNode):
+            seams.around(expression, "perform", self._expression)
+        for expression in (used.ParallelNode, used.TryAllNode):
+            seams.around(expression, "perform", self._expression)
+        seams.around(used.ParallelNode, "_lang_call", self._branch)
+        seams.around(used.UseProspectionWorld, "__exit__", self._leave_prospection)
+        self._world.connect()
+
+    @guarded
+    def _add_world(self, world: Any) -> None:
+        self._episodes.add_world(self._episodes.real, world)
+
+    # --- nodes ------------------------------------------------------------------------------------------------
+
+    @guarded
+    def _node_started(self, node: Any) -> None:
+        used, nodes = self._pycram, self._thread.nodes
+        if isinstance(node, used.ActionNode):
+            nodes.append(RunningNode(node, self._episodes.present(), None, "action"))
+        elif isinstance(node, used.ResolvedActionNode):
+            if nodes and nodes[-1].key is None:
+                nodes[-1].is_resolved = True
+            self._start(node, "action", node.designator_ref)
+        elif isinstance(node, used.MotionNode):
+            self._start(node, "motion", node.designator_ref)
+        elif isinstance(node, used.CodeNode):
+            self._start(node, "language", node)
+
+    @guarded
+    def _node_ended(self, node: Any) -> None:
+        started = next((each for each in reversed(self._thread.nodes) if each.of is node), None)
+        if started is None:
+            return
+        statuses = self._pycram.TaskStatus
+        if node.status is statuses.SUCCEEDED:
+            self._end(started, "SUCCEEDED", None, node.result)
+        else:  # PyCRAM knows plan failures only: after any other exception the node is still RUNNING
+            failure = node.reason if node.status is statuses.FAILED else sys.exception()
+            self._end(started, self._values.status(failure), failure)
+
+    def _start(self, of: Any, kind: RecordedKind, designator: Any) -> RunningNode:
+        self._world.flush()
+        values, type_ = self._values.parameters(designator), type(designator)
+        node = RunningNode(of, self._episodes.present(), next(self._keys), kind)
+        self._write_start(node, type_, values)
+        self._thread.nodes.append(node)
+        return node
+
+    def _write_start(self, node: RunningNode, type_: type, values: dict[str, Any]) -> None:
+        declared = self._types.get(type_)
+        if declared is None:
+            base, fields = self._pycram.ActionDescription, self._values.field_types(type_, values)
+            bases = [each.__name__ for each in type_.__mro__[1:] if issubclass(each, base) and each is not base]
+            dtype = type_.__name__.removesuffix("Node")
+            declared = self._types[type_] = self.seams.recording.type(node.kind, dtype, fields, bases=bases)
+        episode = node.episode
+        episode.wait_for_room()
+        episode.start(
+            node.key, declared, values, parent=self._episodes.cause(episode), robot=self._values.robot(episode)
+        )
+
+    def _end(
+        self, node: RunningNode, status: NodeStatus, failure: BaseException | None = None, result: Any = None
+    ) -> None:
+        """End a node, and those inside it whose end PyCRAM did not report."""
+        self._world.flush()
+        nodes = self._thread.nodes
+        while nodes and (inner := nodes.pop()) is not node:
+            if inner.key is not None:
+                inner.episode.end(inner.key, "ERROR", failure)
+        if node.key is None and not node.is_resolved and status != "SUCCEEDED":
+            node.key = next(self._keys)
+            self._write_start(node, node.of.action, self._values.options(node.of))
+        if node.key is not None:
+            if type(getattr(node.of, "designator_ref", None)).__name__ == "DetectingMotion" and result:
+                self._world.detected(node, result)
+            node.episode.end(node.key, status, failure, result)
+
+    def _whole_plan(self, call: Callable[[], Any], _plan: Any) -> Any:
+        """Perform a plan, and end the nodes that a callback of another library kept PyCRAM from ending."""
+        running = len(self._thread.nodes)
+        try:
+            return call()
+        finally:
+            if len(self._thread.nodes) > running:
+                self._finish(self._thread.nodes[running], sys.exception())
+
+    def _nested_action(self, call: Callable[[], Any], action: Any) -> Any:
+        nodes = self._thread.nodes
+        if nodes and getattr(nodes[-1].of, "designator_ref", None) is action:
+            return call()  # of the node that has just started
+        return self._performed(call, action, "action")
+
+    def _expression(self, call: Callable[[], Any], expression: Any) -> Any:
+        return self._performed(call, expression, "language")
+
+    def _performed(self, call: Callable[[], Any], designator: Any, kind: RecordedKind) -> Any:
+        node = self._begin(designator, kind)
+        if node is None:
+            return call()
+        self._parallel[id(designator)] = node
+        try:
+            result = call()
+        except BaseException as failure:
+            self._finish(node, failure)
+            raise
+        finally:
+            self._parallel.pop(id(designator), None)
+        self._finish(node, None, result)
+        return result
+
+    @guarded
+    def _begin(self, designator: Any, kind: RecordedKind) -> RunningNode:
+        return self._start(designator, kind, designator)
+
+    @guarded
+    def _finish(self, node: RunningNode, failure: BaseException | None, result: Any = None) -> None:
+        status = getattr(node.of, "status", None)
+        if failure is not None or status is self._pycram.TaskStatus.FAILED:
+            failure = failure if failure is not None else node.of.reason
+            self._end(node, self._values.status(failure), failure)
+        elif status is self._pycram.TaskStatus.INTERRUPTED:
+            self._end(node, "INTERRUPTED")
+        else:
+            self._end(node, "SUCCEEDED", None, result)
+
+    def _branch(self, call: Callable[[], Any], parallel: Any, _child: Any) -> Any:
+        """Perform a branch below the parallel node, in the thread of the branch."""
+        nodes, node = self._thread.nodes, self._parallel.get(id(parallel))
+        nodes += [node] if node is not None else []
+        try:
+            return call()
+        finally:
+            nodes.clear()
+
+    def _leave_prospection(self, call: Callable[[], Any], context: Any, *exception: Any) -> Any:
+        is_outermost = context.prev_world is not None
+        result = call()
+        if is_outermost:
+            self._end_simulation(exception[1])
+        return result
+
+    @guarded
+    def _end_simulation(self, failure: BaseException | None) -> None:
+        self._world.flush()
+        self._episodes.end_simulation(failure)

@@ -1,0 +1,105 @@
+"""`PyCRAMEpisodes` holds the nodes that run in each thread, the episode of the real world, and that of a simulation."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+from pycrorm_async.events.values import PoseValue
+from pycrorm_async.integrations.pycram_values import PyCRAMValues
+from pycrorm_async.recording.declarations.recorded_type import RecordedKind
+from pycrorm_async.recording.recorded_episode import RecordedEpisode
+from pycrorm_async.recording.recording import Recording
+
+__all__ = ["PyCRAMEpisodes", "RunningNode"]
+
+
+class RunningNode:
+    """A node that runs: PyCRAM's node, or the action that another one performs, and the key that it is recorded under.
+
+    A description of an action has no key: what it resolves to is recorded, or the description once it has failed.
+    """
+
+    def __init__(self, of: Any, episode: RecordedEpisode, key: int | None, kind: RecordedKind) -> None:
+        self.of, self.episode, self.key, self.kind = of, episode, key, kind
+        self.is_resolved = False
+
+
+class _Thread(threading.local):
+    """The nodes that run in this thread, innermost last, and what its motion has changed, by `id` of the object."""
+
+    def __init__(self) -> None:
+        self.nodes: list[RunningNode] = []
+        self.poses: dict[int, tuple[Any, PoseValue]] = {}
+        self.joints: dict[int, tuple[Any, dict[str, float]]] = {}
+
+
+class PyCRAMEpisodes:
+    """The episodes of one `remember`.
+
+    Attributes:
+        thread: what runs in the calling thread.
+        real: the episode of the real world.
+    """
+
+    real: RecordedEpisode
+
+    def __init__(self, recording: Recording, values: PyCRAMValues) -> None:
+        self.thread = _Thread()
+        self._recording = recording
+        self._values = values
+        self._simulation: RecordedEpisode | None = None
+        self._lock = threading.Lock()
+
+    def open(self, world: Any, **labels: Any) -> RecordedEpisode:
+        """Open an episode in this world."""
+        name = type(world).__name__ if world is not None else None
+        episode = self._recording.episode(
+            world=name, convert=lambda value: self._values.value(value, episode), **labels
+        )
+        return episode
+
+    def add_world(self, episode: RecordedEpisode, world: Any) -> None:
+        """Record the objects that are in the world, and which of them are attached to which."""
+        objects = list(world.objects) if world is not None else []
+        for each in objects:
+            episode.object_added(self._values.key(each), **self._values.description(each))
+        for each in objects:
+            for child, attachment in each.attachments.items():
+                if not attachment.is_inverse:
+                    link = attachment.parent_link.name
+                    episode.object_attached(self._values.key(each), self._values.key(child), link)
+
+    def present(self) -> RecordedEpisode:
+        """Return the episode of what happens now; open one for the first node in the prospection world."""
+        world = self._values.pycram.World.current_world
+        if world is None or not world.is_prospection_world:
+            return self.real
+        with self._lock:
+            if self._simulation is None:
+                thinker = self.real.node_reference(self.cause(self.real))
+                description = "a simulation in the prospection world"
+                self._simulation = self.open(world, description=description, simulated=True, thought_by=thinker)
+                self.add_world(self._simulation, world)
+            return self._simulation
+
+    def of(self, world: Any) -> RecordedEpisode | None:
+        """Return the episode of a world; None for a prospection world in which no node has run."""
+        return self._simulation if world.is_prospection_world else self.real
+
+    def cause(self, episode: RecordedEpisode) -> int | None:
+        """Return the key of the innermost node of this thread in an episode; None without one."""
+        nodes = reversed(self.thread.nodes)
+        return next((each.key for each in nodes if each.key is not None and each.episode is episode), None)
+
+    def end_simulation(self, failure: BaseException | None) -> None:
+        """End the simulation, if there is one."""
+        with self._lock:
+            simulation, self._simulation = self._simulation, None
+        if simulation is not None:
+            self.close(simulation, failure)
+
+    def close(self, episode: RecordedEpisode, failure: BaseException | None) -> None:
+        """End an episode that this exception left."""
+        status = self._values.status(failure) if failure is not None else "SUCCEEDED"
+        episode.close(failure, "INTERRUPTED" if status == "CANCELLED" else status)

@@ -1,0 +1,232 @@
+"""Convert what PyCRAM holds into what events hold: parameters and their types, poses, objects, the acting robot."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+import typing
+from collections.abc import Hashable
+from datetime import datetime
+from enum import Enum
+from importlib import import_module
+from pathlib import Path
+from types import NoneType, SimpleNamespace, UnionType
+from typing import Any, Final
+
+import numpy as np
+
+from pycrorm_async.events.fields import table_name
+from pycrorm_async.events.values import ItemType, NodeStatus, ObjectValue, PoseValue, RobotValue
+from pycrorm_async.recording.declarations.recorded_type import FieldSpec
+from pycrorm_async.recording.recorded_episode import RecordedEpisode
+
+__all__ = ["PyCRAM", "PyCRAMValues"]
+
+PyCRAM = Any
+"""A namespace of PyCRAM's classes; PyCRAM has no types."""
+_USED: Final = {
+    "plan": "Plan ActionNode ResolvedActionNode MotionNode",
+    "language": "CodeNode MonitorNode ParallelNode RepeatNode SequentialNode TryAllNode TryInOrderNode",
+    "designator": "ActionDescription BaseMotion ObjectDesignatorDescription",
+    "description": "Link",
+    "failures": "PlanFailure",
+    "robot_description": "RobotDescription",
+    "datastructures.enums": "JointType TaskStatus",
+    "datastructures.pose": "Pose PoseStamped",
+    "datastructures.world": "UseProspectionWorld World",
+    "world_concepts.world_object": "Object",
+    "worlds.bullet_world": "BulletWorld",
+}
+_OBJECT_TYPES: Final = {"PhysicalObject": "GENERIC_OBJECT", "Cereal": "BREAKFAST_CEREAL"}
+"""PyCRAM's concepts that have another name here."""
+_MONITOR_INTERVAL_S: Final = 0.1
+"""PyCRAM's time between two evaluations of a condition."""
+
+
+class PyCRAMValues:
+    """Converts the values of the installed PyCRAM.
+
+    Attributes:
+        pycram: the namespace of PyCRAM's classes.
+    """
+
+    def __init__(self) -> None:
+        modules = {each: import_module(f"pycram.{module}") for module, names in _USED.items() for each in names.split()}
+        self.pycram: PyCRAM = SimpleNamespace(**{name: getattr(module, name) for name, module in modules.items()})
+        used = self.pycram
+        self._field_types: tuple[tuple[type, ItemType], ...] = (
+            (Enum, "enum"),  # before `int`, which some of PyCRAM's enums are
+            (bool, "boolean"),
+            (int, "integer"),
+            (float, "real"),
+            (datetime, "datetime"),
+            (used.Pose, "pose"),
+            (used.PoseStamped, "pose"),
+            (used.Object, "object"),
+            (used.Link, "object"),
+            (used.ObjectDesignatorDescription, "object"),
+        )
+
+    # --- parameters -------------------------------------------------------------------------------------------
+
+    def parameters(self, designator: Any) -> dict[str, Any]:
+        """Return the parameters of an action, a motion or an expression by the names of their fields."""
+        used = self.pycram
+        if isinstance(designator, used.RepeatNode):
+            return {"times": designator.repeat}
+        if isinstance(designator, used.MonitorNode):
+            condition = getattr(designator.condition, "_value", None)
+            return {"condition": _function_name(condition), "interval_s": _MONITOR_INTERVAL_S}
+        if isinstance(designator, used.CodeNode):
+            return {
+                "function": _function_name(designator.function),
+                "arguments": {key: repr(each) for key, each in designator.kwargs.items()},
+            }
+        if not isinstance(designator, used.ActionDescription | used.BaseMotion):
+            return {}
+        values = {each.name: getattr(designator, each.name) for each in _fields(type(designator))}
+        return _with_grasp(values)
+
+    def options(self, node: Any) -> dict[str, Any]:
+        """Return those parameters of an unresolved action that have one value only."""
+        values = {each.name: node.kwargs.get(each.name) for each in _fields(node.action)}
+        return _with_grasp({name: None if isinstance(each, list | tuple) else each for name, each in values.items()})
+
+    def field_types(self, designator: type, values: dict[str, Any]) -> dict[str, FieldSpec]:
+        """Return the types of the fields: those of the annotations, or of the values where these leave it open."""
+        try:
+            hints = typing.get_type_hints(designator)
+        except Exception:  # noqa: BLE001  an annotation may name what its module does not import
+            hints = {}
+        hints |= {"grasp": Enum, "approach_direction": Enum, "rotate_gripper": bool}
+        return {name: self._field_type(hints.get(name, type(each)), each) for name, each in values.items()}
+
+    def _field_type(self, hint: Any, value: Any) -> FieldSpec:
+        arguments = [each for each in typing.get_args(hint) if each is not NoneType]
+        if typing.get_origin(hint) in (typing.Union, UnionType):
+            return next((each for each in map(self._scalar_type, arguments) if each != "text"), "text")
+        kind = typing.get_origin(hint) or hint
+        if kind is list or kind is dict:
+            items = list(value.values() if isinstance(value, dict) else value or ())
+            item = self._scalar_type(arguments[-1] if arguments else type(items[0]) if items else str)
+            return ("list" if kind is list else "dict", item)
+        return self._scalar_type(kind)
+
+    def _scalar_type(self, kind: Any) -> ItemType:
+        if not isinstance(kind, type):
+            return "text"
+        return next((name for each, name in self._field_types if issubclass(kind, each)), "text")
+
+    def status(self, failure: BaseException | None) -> NodeStatus:
+        """Return the status of a node that this exception left; None stands for a failure that PyCRAM does not name."""
+        if failure is None or isinstance(failure, self.pycram.PlanFailure):
+            return "FAILED"
+        return "ERROR" if isinstance(failure, Exception) else "CANCELLED"  # SystemExit, too: a world exits at Ctrl-C
+
+    # --- values -----------------------------------------------------------------------------------------------
+
+    def value(self, value: Any, episode: RecordedEpisode) -> Any:
+        """Convert a parameter or a result for this episode. Raises `ValueError` with the reason if it cannot."""
+        used = self.pycram
+        if isinstance(value, used.Object):
+            return episode.reference(self.key(value)) or ObjectValue("Object", value.name, self.object_type(value))
+        if isinstance(value, used.Link):
+            owner = value.parent_entity
+            part_of = episode.reference(self.key(owner))
+            return ObjectValue("ObjectPart", value.name, self.object_type(owner), self.pose(value.pose), part_of)
+        if isinstance(value, used.ObjectDesignatorDescription):
+            types = [self._type_name(each) for each in value.types or ()]
+            return ObjectValue("BelieveObject", ", ".join(value.names or types), types[0] if types else None)
+        if isinstance(value, used.PoseStamped | used.Pose):
+            return self.pose(value)
+        if isinstance(value, type):
+            return value.__name__
+        return value.tolist() if isinstance(value, np.ndarray | np.generic) else value
+
+    def pose(self, pose: Any) -> PoseValue:
+        """Copy a `Pose` or a `PoseStamped`."""
+        position, turn, header = pose.position, pose.orientation, getattr(pose, "header", None)
+        stamp = header.stamp if header is not None else None
+        return PoseValue(
+            (float(position.x), float(position.y), float(position.z)),
+            (float(turn.x), float(turn.y), float(turn.z), float(turn.w)),
+            header.frame_id if header is not None else "map",
+            int(stamp.timestamp() * 1e9) if isinstance(stamp, datetime) else time.time_ns(),
+        )
+
+    # --- objects ----------------------------------------------------------------------------------------------
+
+    def key(self, world_object: Any) -> Hashable:
+        """Return the key of an object; one in the prospection world has that of the object it is a copy of."""
+        return id(self._original(world_object))
+
+    def _original(self, world_object: Any) -> Any:
+        world = world_object.world
+        if not world.is_prospection_world:
+            return world_object
+        return world.world_sync.prospection_object_to_object_map.get(world_object, world_object)
+
+    def object_type(self, world_object: Any) -> str:
+        """Return the type under which an object is recorded, by PyCRAM's concept.
+
+        >>> values.object_type(milk), values.object_type(kitchen)
+        ('MILK', 'ENVIRONMENT')
+        """
+        original = self._original(world_object)  # a copy has no concept
+        if original.is_a_robot:
+            return "ROBOT"
+        return "ENVIRONMENT" if original.is_an_environment else self._type_name(original.obj_type)
+
+    def _type_name(self, concept: type) -> str:
+        name = concept.__name__
+        return _OBJECT_TYPES.get(name, table_name(name).upper())
+
+    def description(self, world_object: Any) -> dict[str, Any]:
+        """Return what is recorded once about an object, as arguments of `RecordedEpisode.object_added`."""
+        robot = (
+            self.pycram.RobotDescription.current_robot_description if self._original(world_object).is_a_robot else None
+        )
+        fixed = self.pycram.JointType.FIXED
+        path = Path(world_object.path) if world_object.path is not None else None
+        color = world_object.color if world_object.has_one_link else None
+        return {
+            "name": world_object.name,
+            "object_type": self.object_type(world_object),
+            "pose": self.pose(world_object.pose),
+            "joints": {name: float(each.position) for name, each in world_object.joints.items() if each.type != fixed},
+            "urdf": path.read_text() if path is not None and path.suffix == ".urdf" and path.is_file() else None,
+            "color": tuple(map(float, color.get_rgba())) if color is not None else None,
+            "model": robot.name if robot is not None else None,
+            "torso_joint": (robot.torso_joint or None) if robot is not None else None,
+        }
+
+    def robot(self, episode: RecordedEpisode) -> RobotValue | None:
+        """Return the state of PyCRAM's robot, which acts also in the prospection world; None without one."""
+        robot, description = self.pycram.World.robot, self.pycram.RobotDescription.current_robot_description
+        if robot is None:
+            return None
+        torso = robot.get_joint_position(description.torso_joint) if description.torso_joint in robot.joints else None
+        reference = episode.reference(self.key(robot))
+        torso_m = float(torso) if torso is not None else None
+        return RobotValue(self.pose(robot.pose), "ROBOT", torso_m, reference, robot.name)
+
+
+def _function_name(function: Any) -> str:
+    return str(getattr(function, "__qualname__", type(function).__qualname__))
+
+
+def _fields(designator: type) -> list[dataclasses.Field[Any]]:
+    return [each for each in dataclasses.fields(designator) if each.init and not each.name.startswith("_")]
+
+
+def _with_grasp(values: dict[str, Any]) -> dict[str, Any]:
+    """Put the side of a grasp description under `grasp`, as `PickUpAction` has it, and the rest under its own names."""
+    if "grasp_description" not in values:
+        return values
+    grasp = values.pop("grasp_description")
+    side = None if grasp is None else grasp.vertical_alignment or grasp.approach_direction
+    return values | {
+        "grasp": side,
+        "approach_direction": getattr(grasp, "approach_direction", None),
+        "rotate_gripper": getattr(grasp, "rotate_gripper", None),
+    }

@@ -1,0 +1,112 @@
+"""`PyCRAMWorld` records the objects of PyCRAM's Bullet worlds: poses, joints, attachments, also of worlds made later.
+
+PyCRAM sets joints one by one and moves what the robot holds each time, so what a motion changes is collected in its
+thread and recorded once, when the motion ends.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from pycrorm_async.events.values import SeenValue
+from pycrorm_async.integrations.pycram_episodes import PyCRAMEpisodes, RunningNode
+from pycrorm_async.integrations.pycram_values import PyCRAMValues
+from pycrorm_async.integrations.seams import Seams, guarded
+
+__all__ = ["PyCRAMWorld"]
+
+
+class PyCRAMWorld:
+    """Observes the worlds of this process."""
+
+    def __init__(self, seams: Seams, values: PyCRAMValues, episodes: PyCRAMEpisodes) -> None:
+        self.seams = seams
+        self._values = values
+        self._episodes = episodes
+
+    def connect(self) -> None:
+        """Add the seams."""
+        used = self._values.pycram
+        self.seams.after(used.World, "add_object", self._object_added)
+        self.seams.around(used.World, "remove_object", self._remove_object)
+        self.seams.after(used.BulletWorld, "reset_object_base_pose", self._object_moved)
+        self.seams.after(used.BulletWorld, "_reset_joint_position", self._joint_moved)
+        self.seams.after(used.Object, "attach", self._attached)
+        self.seams.after(used.Object, "detach", self._detached)
+
+    @guarded
+    def _object_added(self, world: Any, added: Any) -> None:
+        if (episode := self._episodes.of(world)) is not None:
+            cause = self._episodes.cause(episode)
+            episode.object_added(self._values.key(added), **self._values.description(added), node=cause)
+
+    def _remove_object(self, call: Callable[[], Any], world: Any, removed: Any) -> Any:
+        key = self._values.key(removed)  # the prospection world forgets what it is a copy of
+        result = call()
+        self._object_removed(world, key)
+        return result
+
+    @guarded
+    def _object_removed(self, world: Any, key: Any) -> None:
+        self.flush()
+        if (episode := self._episodes.of(world)) is not None and episode.reference(key) is not None:
+            episode.object_removed(key, node=self._episodes.cause(episode))
+
+    @guarded
+    def _object_moved(self, world: Any, moved: Any, pose: Any) -> None:
+        if self._episodes.of(world) is not None:
+            self._episodes.thread.poses[id(moved)] = (moved, self._values.pose(pose))
+            self._flush_unless_moving()
+
+    @guarded
+    def _joint_moved(self, world: Any, joint: Any, position: float) -> None:
+        if self._episodes.of(world) is not None:
+            owner = joint.object
+            joints = self._episodes.thread.joints
+            joints.setdefault(id(owner), (owner, {}))[1][joint.name] = float(position)
+            self._flush_unless_moving()
+
+    @guarded
+    def _attached(self, parent: Any, child: Any, *_: Any, **__: Any) -> None:
+        self.flush()
+        if (episode := self._episodes.of(parent.world)) is not None:
+            keys, link = (self._values.key(parent), self._values.key(child)), parent.attachments[child].parent_link.name
+            episode.object_attached(*keys, link, node=self._episodes.cause(episode))
+
+    @guarded
+    def _detached(self, parent: Any, child: Any) -> None:
+        self.flush()
+        if (episode := self._episodes.of(parent.world)) is not None:
+            keys = self._values.key(parent), self._values.key(child)
+            episode.object_detached(*keys, node=self._episodes.cause(episode))
+
+    def detected(self, node: RunningNode, result: Any) -> None:
+        """Record what a detecting motion returned."""
+        values, episode = self._values, node.episode
+        seen = []
+        for each in result:
+            if isinstance(each, values.pycram.Object):
+                row = episode.reference(values.key(each))
+                seen.append(SeenValue(each.name, values.object_type(each), values.pose(each.pose), row))
+        episode.detected(seen, node=node.key)
+
+    def _flush_unless_moving(self) -> None:
+        nodes = self._episodes.thread.nodes
+        if not nodes or nodes[-1].kind != "motion":
+            self.flush()
+
+    def flush(self) -> None:
+        """Record what this thread has changed in the world."""
+        thread = self._episodes.thread
+        if not thread.poses and not thread.joints:
+            return
+        poses, thread.poses, joints, thread.joints = thread.poses, {}, thread.joints, {}
+        for moved, pose in poses.values():
+            episode, key = self._episodes.of(moved.world), self._values.key(moved)
+            if episode is not None and episode.reference(key) is not None:
+                episode.object_moved(key, pose, node=self._episodes.cause(episode))
+        for moved, positions in joints.values():
+            episode, key = self._episodes.of(moved.world), self._values.key(moved)
+            if episode is not None and episode.reference(key) is not None:
+                episode.joints_moved(key, positions, node=self._episodes.cause(episode))

@@ -1,0 +1,83 @@
+"""`Seams` replace methods of another library's classes, and restore them whichever way the block ends."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
+from functools import partial, wraps
+from typing import Any, Protocol
+
+from pycrorm_async.recording.recording import Recording
+
+__all__ = ["Seams", "guarded"]
+
+
+class _Observer(Protocol):
+    seams: Seams
+
+
+class Seams:
+    """The methods replaced and the callbacks added since `is_on` was set; `remove` removes all of them.
+
+    A method that another library has replaced in turn stays: its seam of ours then performs the method alone.
+    """
+
+    def __init__(self, recording: Recording) -> None:
+        self.recording = recording
+        self.is_on = False
+        self._undo = ExitStack()
+
+    def remove(self) -> None:
+        """Remove all seams; those that still run in other threads do nothing from now on."""
+        self.is_on = False
+        self._undo.close()
+
+    def around(self, owner: type, name: str, perform: Callable[..., Any]) -> None:
+        """Call `perform(call, subject, *args)` in place of a method, where `call()` performs the method itself."""
+        original = vars(owner)[name]
+
+        @wraps(original)
+        def seam(subject: Any, *args: Any, **kwargs: Any) -> Any:
+            call = partial(original, subject, *args, **kwargs)
+            return perform(call, subject, *args, **kwargs) if self.is_on else call()
+
+        def restore() -> None:
+            if vars(owner).get(name) is seam:
+                setattr(owner, name, original)
+
+        setattr(owner, name, seam)
+        self._undo.callback(restore)
+
+    def after(self, owner: type, name: str, report: Callable[..., Any]) -> None:
+        """Call `report(subject, *args)` after a method."""
+
+        def perform(call: Callable[[], Any], *args: Any, **kwargs: Any) -> Any:
+            result = call()
+            report(*args, **kwargs)
+            return result
+
+        self.around(owner, name, perform)
+
+    def callback(self, add: Callable[[Any], None], remove: Callable[[Any], None], callback: Callable[..., Any]) -> None:
+        """Add a callback; remove it with the seams, unless another library has removed it."""
+        add(callback)
+        self._undo.callback(_without_fault, remove, callback)
+
+
+def _without_fault(remove: Callable[[Any], None], callback: Callable[..., Any]) -> None:
+    with suppress(ValueError, KeyError):
+        remove(callback)
+
+
+def guarded(method: Callable[..., Any]) -> Callable[..., Any]:
+    """Count what a method of an observer raises, so that it does not reach the plan; do nothing without the seams."""
+
+    @wraps(method)
+    def call(self: _Observer, *args: Any, **kwargs: Any) -> Any:
+        try:
+            return method(self, *args, **kwargs) if self.seams.is_on else None
+        except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
+            self.seams.recording.note_fault(f"{type(self).__name__}.{method.__name__}", error)
+            return None
+
+    return call
