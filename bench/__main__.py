@@ -54,6 +54,7 @@ RUNS = (
     Run("others"),
     Run("daemon"),
     Run("daemon postgresql", ("--postgresql",)),
+    Run("behaviour_trees"),
     Run("digests"),
     Run("thesis"),
     Run("thesis postgresql", ("--postgresql",), quick=False),

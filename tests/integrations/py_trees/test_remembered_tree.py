@@ -186,6 +186,16 @@ def test_a_pre_empted_subtree_ends_interrupted_before_its_parent(tmp_path: Path)
     assert [name for (name,) in ends] == ["alarm", "alarm", "drive", "patrol", "robot"]
 
 
+def test_a_pre_empted_subtree_ends_in_the_tick_that_stopped_it(tmp_path: Path) -> None:
+    ticked = tree(selector("robot", Scripted("dock", named("FR")), Scripted("drive", named("R"))))
+    with Memory.sync(url_of(tmp_path)) as memory, RememberedTree(ticked, memory.recording) as episode:
+        tick(ticked, 2)
+        episode.observe("after the tick", 1)
+    ends = "SELECT end_sequence FROM designator WHERE parameters ->> 'name' = 'drive'"
+    after = "SELECT sequence FROM observation WHERE name = 'after the tick'"
+    assert ask(tmp_path / "memory.db", ends) < ask(tmp_path / "memory.db", after)
+
+
 def test_what_is_stopped_between_ticks_ends_and_starts_again(tmp_path: Path) -> None:
     def run(ticked: Any) -> None:
         tick(ticked, 2)
@@ -295,6 +305,27 @@ def test_values_of_the_blackboard_that_cannot_be_compared_reach_no_tick(tmp_path
     status = remembered(tmp_path, Scripted("look", named("S")), run)
     assert [value for name, *_, value in observations(tmp_path) if name == "blackboard/number"] == [0, 1, 2]
     assert status.faults.total == 0
+
+
+def test_a_fault_of_the_visitor_is_counted_and_reaches_no_tick(tmp_path: Path) -> None:
+    class Vain(Scripted):
+        @property
+        def feedback_message(self) -> str:
+            raise OSError("no feedback")
+
+        @feedback_message.setter
+        def feedback_message(self, text: str) -> None: ...
+
+    def refuse(key: str) -> bool:
+        raise OSError(key)
+
+    def run(ticked: Any) -> None:
+        Blackboard.set("key", 1)
+        tick(ticked, 3)
+
+    status = remembered(tmp_path, sequence("job", Vain("look", named("S"))), run, blackboard=refuse)
+    assert status.faults.total > 0
+    assert [each[0] for each in nodes(tmp_path)][:2] == ["job", "look"]
 
 
 def test_an_exception_in_a_behaviour_reaches_the_program_and_ends_its_branch_as_an_error(tmp_path: Path) -> None:
