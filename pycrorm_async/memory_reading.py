@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import AbstractAsyncContextManager
 from datetime import datetime
+from os import PathLike
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sqlalchemy import Select
@@ -20,6 +22,7 @@ from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.snapshot import Moment
 from pycrorm_async.recording.recording import Recording
 from pycrorm_async.recording.writing.event_feed import BUFFER_EVENTS, EventStream, RecordedEvent, Subscription
+from pycrorm_async.report.write import report as write_report
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -66,6 +69,19 @@ class ReadableMemory(PartsHolder):
     ) -> Moment:
         """Return the task tree and the world at any moment of an episode, up to the last flush; see `Reading.as_of`."""
         return await self._open_parts.reading.as_of(episode, time=time, sequence=sequence, meshes=meshes)
+
+    async def report(
+        self,
+        episode: AnyEpisode,
+        path: str | PathLike[str] | None = None,
+        *,
+        force: bool = False,
+        first: int | None = None,
+        last: int | None = None,
+    ) -> Path:
+        """Write an episode, up to the last flush, as one HTML file; see `pycrorm_async.report.write.report`."""
+        reading = self._open_parts.reading
+        return await write_report(reading, episode, path, force=force, first=first, last=last)
 
     async def blob(self, name: str) -> Blob | None:
         """Return the blob with this SHA-256, up to the last flush; None if it is not stored."""

@@ -89,7 +89,8 @@ def demo(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None, as_json: JsonO
     answers.print()
     address = DatabaseAddress.parse(url)
     option = "" if url == DEFAULT_URL else f" --url {shlex.quote(address.to_type)}"
-    note(f"The database is {address}. Next: pycrorm episodes{option} | pycrorm show {answers.episode}{option}")
+    verbs = ("episodes", f"show {answers.episode}", f"report {answers.episode}")
+    note(f"The database is {address}. Next: {' | '.join(f'pycrorm {verb}{option}' for verb in verbs)}")
 
 
 @dataclass

@@ -83,7 +83,21 @@ def _print_version(requested: bool) -> None:  # noqa: FBT001  typer passes it by
 
 
 _HELP = "Episodic memory for robots: record plans as events and query them as tables."
-_VERBS = ("demo", "run", "episodes", "show", "events", "tag", "copy", "writer", "status", "rebuild", "verify", "learn")
+_VERBS = (
+    "demo",
+    "run",
+    "episodes",
+    "show",
+    "report",
+    "events",
+    "tag",
+    "copy",
+    "writer",
+    "status",
+    "rebuild",
+    "verify",
+    "learn",
+)
 _GROUPS: Mapping[str, tuple[str, tuple[str, ...]]] = {
     "spool": (
         "The write-ahead queue's files: inspect, repair, or store them in another database.",

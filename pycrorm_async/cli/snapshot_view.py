@@ -6,9 +6,10 @@ import math
 
 from pycrorm_async.cli.output import moment as wall_clock
 from pycrorm_async.cli.output import print_facts, print_table
-from pycrorm_async.cli.tree import parameters_text, print_tree
+from pycrorm_async.cli.tree import print_tree
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.blobs import BLOB_KEY
+from pycrorm_async.query.parameter_text import parameters_text
 from pycrorm_async.query.snapshot import Moment, ObjectThen, ObservationThen, RobotThen
 
 __all__ = ["print_snapshot", "parse_moment"]

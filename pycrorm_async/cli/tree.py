@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
 
-import msgspec
 from rich.markup import escape
 from rich.text import Text
 from rich.tree import Tree
 
 from pycrorm_async.cli.output import duration, stdout
-from pycrorm_async.events.blobs import BLOB_KEY
 from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary
+from pycrorm_async.query.parameter_text import one_line, parameters_text
 
-__all__ = ["print_tree", "parameters_text", "simulated_by"]
+__all__ = ["print_tree", "simulated_by"]
 
-_TEXT_MAX = 60
-"""Bounds the characters of a text parameter, so that a node fits on one line."""
 _MESSAGE_MAX = 100
 """Bounds the characters of a failure's message, so that a failed node takes few lines."""
 _SIMULATIONS_MAX = 10
@@ -57,7 +53,7 @@ def _line(node: NodeSummary, *, events: bool, full: bool) -> Text:
     if node.observations:
         line.append(f"  {node.observations} observation{'s' * (node.observations > 1)}", style="dim")
     if node.reason:
-        message = _text(node.failure_message or "", None if full else _MESSAGE_MAX)
+        message = one_line(node.failure_message or "", None if full else _MESSAGE_MAX)
         line.append(f"  {node.reason}{': ' if message else ''}{message}", style="red")
     if node.thoughts:
         listed = node.thoughts if full else node.thoughts[:_SIMULATIONS_MAX]
@@ -73,34 +69,3 @@ def simulated_by(episode: EpisodeSummary) -> str:
     if by is None:
         return "outside any episode"
     return f"by {by.dtype or 'the plan'} of episode {by.episode if by.episode is not None else by.id}"
-
-
-def parameters_text(parameters: Mapping[str, Any], *, full: bool = False) -> str:
-    """Format parameters on one line; with `full`, long texts, lists, dicts and reasons of missing values too.
-
-    >>> parameters_text({"arm": "LEFT", "target": {"position": [0.6, 0.4, 0.0], "orientation": [0, 0, 0, 1]}})
-    'arm=LEFT target=(0.60, 0.40, 0.00)'
-    """
-    return " ".join(f"{name}={_value_text(value, full=full)}" for name, value in parameters.items())
-
-
-def _value_text(value: Any, *, full: bool) -> str:
-    if isinstance(value, dict) and "position" in value:
-        return "(" + ", ".join(f"{each:.2f}" for each in value["position"]) + ")"
-    if isinstance(value, dict) and BLOB_KEY in value:
-        return f"{value.get('media_type')} of {value.get('size')} bytes"
-    if isinstance(value, dict) and value.get("name"):
-        return str(value["name"])
-    if isinstance(value, dict) and "missing" in value:
-        return f"? ({_text(value['missing'], None)})" if full else "?"
-    if isinstance(value, float):
-        return f"{value:g}"
-    if isinstance(value, dict | list):
-        return msgspec.json.encode(value).decode() if full else f"{len(value)} entries"
-    return _text(value, None if full else _TEXT_MAX)
-
-
-def _text(value: object, characters_max: int | None) -> str:
-    """Format a text on one line; an ellipsis marks the cut."""
-    text = " ".join(str(value).split())
-    return text if characters_max is None or len(text) <= characters_max else f"{text[:characters_max]}…"

@@ -27,7 +27,7 @@ from pycrorm_async.store.stored import StoredEvent
 if TYPE_CHECKING:
     from pycrorm_async.hooks.episode import Episode
 
-__all__ = ["AnyEpisode", "as_of"]
+__all__ = ["AnyEpisode", "as_of", "unreadable"]
 
 AnyEpisode: TypeAlias = "int | str | Episode | EpisodeSummary"
 """An episode by its number, its id or the first digits of it, `last`, or as an `Episode` or `EpisodeSummary`."""
@@ -94,7 +94,7 @@ def _read(fold: MomentFold, page: Sequence[StoredEvent], within: _Within, log: E
         try:
             fold.read(event)
         except CannotFold as reason:
-            raise _unreadable(fold.id, event, str(reason), log) from None
+            raise unreadable(fold.id, event, str(reason), log) from None
     return True
 
 
@@ -125,7 +125,8 @@ def _number(value: Any, kind: type) -> float | None:
     return float(value) if is_number and abs(value) < _NUMBERS_END else None
 
 
-def _unreadable(episode: str, event: StoredEvent, reason: str, log: EventLog) -> PycrormError:
+def unreadable(episode: str, event: StoredEvent, reason: str, log: EventLog) -> PycrormError:
+    """Return the error for an event that cannot be folded: of a newer version, or damaged."""
     shape = EVENT_TYPES.get(event.type)
     if shape is not None and event.version <= shape.version:
         return LogDamaged(episode, event.sequence, reason)

@@ -205,6 +205,11 @@ class Reading:
             raise UnknownEpisode(f"this database has no event of the episode {episode} yet")
         return number
 
+    async def log(self) -> EventLog:
+        """Return the log of events, open until `close`."""
+        await self._ready()
+        return self._log
+
     # --- connections ------------------------------------------------------------------------------------------
 
     async def _ready(self) -> None:

@@ -1,0 +1,46 @@
+"""Format recorded parameters on one line, for the terminal and for the report."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import msgspec
+
+from pycrorm_async.events.blobs import BLOB_KEY
+
+__all__ = ["parameters_text", "one_line"]
+
+_TEXT_MAX = 60
+"""Bounds the characters of a text parameter, so that a node fits on one line."""
+
+
+def parameters_text(parameters: Mapping[str, Any], *, full: bool = False) -> str:
+    """Format parameters on one line; with `full`, long texts, lists, dicts and reasons of missing values too.
+
+    >>> parameters_text({"arm": "LEFT", "target": {"position": [0.6, 0.4, 0.0], "orientation": [0, 0, 0, 1]}})
+    'arm=LEFT target=(0.60, 0.40, 0.00)'
+    """
+    return " ".join(f"{name}={_value_text(value, full=full)}" for name, value in parameters.items())
+
+
+def _value_text(value: Any, *, full: bool) -> str:
+    if isinstance(value, dict) and "position" in value:
+        return "(" + ", ".join(f"{each:.2f}" for each in value["position"]) + ")"
+    if isinstance(value, dict) and BLOB_KEY in value:
+        return f"{value.get('media_type')} of {value.get('size')} bytes"
+    if isinstance(value, dict) and value.get("name"):
+        return str(value["name"])
+    if isinstance(value, dict) and "missing" in value:
+        return f"? ({one_line(value['missing'], None)})" if full else "?"
+    if isinstance(value, float):
+        return f"{value:g}"
+    if isinstance(value, dict | list):
+        return msgspec.json.encode(value).decode() if full else f"{len(value)} entries"
+    return one_line(value, None if full else _TEXT_MAX)
+
+
+def one_line(text: object, characters_max: int | None) -> str:
+    """Format a text on one line; an ellipsis marks the cut."""
+    line = " ".join(str(text).split())
+    return line if characters_max is None or len(line) <= characters_max else f"{line[:characters_max]}…"

@@ -1,0 +1,118 @@
+"""Write the document of an episode into one HTML file that opens offline and makes no request.
+
+The Content-Security-Policy allows the page's own style and scripts by their hashes, and nothing else. Recorded text is
+in the page only as JSON in which `<` is escaped, and in its title; the scripts set it as text.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import html
+import os
+import re
+import tempfile
+from collections.abc import Mapping
+from functools import cache
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from pycrorm_async.errors import CallerError
+
+__all__ = ["page_of", "write_page", "refuse_existing"]
+
+_MODULES = "dom episode bodies scene_view map_view tree_view gantt_view panels main".split()
+_TITLE_MAX = 200
+"""Bounds the characters of the description in title and heading."""
+_ESCAPES = {
+    b"<": rb"\u003c",
+    b">": rb"\u003e",
+    b"&": rb"\u0026",
+    b"\xe2\x80\xa8": rb"\u2028",
+    b"\xe2\x80\xa9": rb"\u2029",
+}
+_IMPORT = re.compile(r"^import \{[^}]*\} from \"\./\w+\.js\";\n", re.MULTILINE)
+_EXPORT = re.compile(r"^export (?=(const|class|function) )", re.MULTILINE)
+
+
+def page_of(document: Mapping[str, Any]) -> str:
+    """Return the page of a document from `episode_document`."""
+    episode = document["episode"]
+    heading = episode["description"][:_TITLE_MAX] or f"Episode {episode['number']}"
+    three, program, style = _asset("assets/three.bundle.js"), _program(), _asset("web/page.css")
+    policy = (
+        f"default-src 'none'; script-src {_hash(three)} {_hash(program)}; style-src {_hash(style)};"
+        " img-src data:; base-uri 'none'; form-action 'none'"
+    )
+    parts = {
+        "policy": policy,
+        "generator": html.escape(f"pycrorm {episode['software']}"),
+        "title": html.escape(f"{heading} · episode {episode['number']}"),
+        "heading": html.escape(heading),
+        "style": style,
+        "document": _safe_json(document),
+        "three": three,
+        "program": program,
+    }
+    return re.sub(r"\{(\w+)\}", lambda match: parts[match[1]], _asset("web/page.html"))
+
+
+def refuse_existing(path: Path, *, force: bool) -> None:
+    """Raise `CallerError` for a path that a page cannot have: that of a file, without `force`, or of a folder."""
+    if path.is_dir():
+        raise CallerError(f"{path} is a folder: give the name of a file in it, for example {path / 'report.html'}")
+    if path.exists() and not force:
+        raise CallerError(f"{path} exists: add --force to replace it, or give another name")
+    if not path.parent.is_dir():
+        raise CallerError(f"the folder {path.parent} does not exist: create it first")
+
+
+def write_page(page: str, path: Path, *, force: bool = False) -> None:
+    """Write a page to a file that is complete as soon as it has its name. Raises `CallerError`, `OSError`."""
+    refuse_existing(path, force=force)
+    descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name[:100]}.", suffix=".part")
+    written = Path(name)
+    try:
+        with os.fdopen(descriptor, "w", encoding="utf-8") as file:
+            file.write(page)
+        written.chmod(0o666 & ~_umask())
+        if force:
+            written.replace(path)
+        else:
+            path.hardlink_to(written)  # fails, unlike a renaming, if another process made the file meanwhile
+    except FileExistsError:
+        raise CallerError(f"{path} exists: add --force to replace it, or give another name") from None
+    finally:
+        written.unlink(missing_ok=True)
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def _safe_json(document: Mapping[str, Any]) -> str:
+    """Encode as JSON that ends no <script> element, whatever the document holds."""
+    encoded = msgspec.json.encode(document)
+    for each, escaped in _ESCAPES.items():
+        encoded = encoded.replace(each, escaped)
+    return encoded.decode()
+
+
+@cache
+def _program() -> str:
+    """Return the page's modules as one, in the order of their imports, without the imports among them."""
+    return "\n".join(_EXPORT.sub("", _IMPORT.sub("", _asset(f"web/{name}.js"))) for name in _MODULES)
+
+
+@cache
+def _asset(name: str) -> str:
+    return resources.files("pycrorm_async.report").joinpath(name).read_text(encoding="utf-8")
+
+
+def _hash(text: str) -> str:
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"

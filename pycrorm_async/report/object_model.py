@@ -1,0 +1,136 @@
+"""Read the links, joints and shapes of a URDF as plain values, for forward kinematics in the page.
+
+A mesh is drawn as the box around its link's collision shapes. A link without a visual shape has its collision shapes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Any
+from xml.etree.ElementTree import Element, ParseError, fromstring
+
+from pycrorm_async.events.types import DescriptionDeclared
+from pycrorm_async.world.models.mesh_boxes import with_boxes
+from pycrorm_async.world.pose import Vector
+from pycrorm_async.world.queries.bounding_boxes import BoundingBox
+
+__all__ = ["object_model", "point_model"]
+
+_POINT: dict[str, Any] = {"root": "", "shapes": {"": [["sphere", [0.03], [0, 0, 0], [0, 0, 0], [1, 0, 1, 1]]]}}
+
+
+def point_model(reason: str) -> dict[str, Any]:
+    """Return the model of an object whose shape is unknown: a magenta point."""
+    return {**_POINT, "joints": [], "assumed": f"a point, because {reason}"}
+
+
+def object_model(description: DescriptionDeclared) -> dict[str, Any]:
+    """Return root link, shapes by link, and joints in the order of the tree.
+
+    A shape is `[kind, sizes, xyz, rpy, rgba or None]`; a joint is `[name, type, parent, child, xyz, rpy, axis, mimic]`,
+    with `mimic` as `[joint, multiplier, offset]` or None.
+    """
+    if description.missing is not None:
+        return point_model(f"its description is missing: {description.missing}")
+    try:
+        return _model(fromstring(_without_meshes(description)))  # noqa: S314  a memory has recorded it
+    except (ValueError, ParseError) as error:
+        return point_model(f"its description cannot be read: {error}")
+
+
+def _without_meshes(description: DescriptionDeclared) -> str:
+    if not description.meshes:
+        return description.text
+    boxes = {link: BoundingBox(Vector(*box.min), Vector(*box.max)) for link, box in description.boxes.items()}
+    return with_boxes(description.text, boxes)
+
+
+def _model(robot: Element) -> dict[str, Any]:
+    colors = {each.get("name"): color for each in robot.findall("material") if (color := _rgba(each)) is not None}
+    shapes = {link.get("name", ""): list(_shapes(link, colors)) for link in robot.findall("link")}
+    joints = [_joint(each) for each in robot.findall("joint")]
+    children = {joint[3] for joint in joints}
+    root = next((link for link in shapes if link not in children), None)
+    if root is None:
+        raise ValueError("it has no root link")
+    ordered, reached = [], {root}
+    while rest := [each for each in joints if each[2] in reached and each[3] not in reached]:
+        ordered += rest
+        reached |= {each[3] for each in rest}
+    return {"root": root, "shapes": {name: each for name, each in shapes.items() if each}, "joints": ordered}
+
+
+def _joint(joint: Element) -> list[Any]:
+    xyz, rpy = _origin(joint)
+    axis, mimic = joint.find("axis"), joint.find("mimic")
+    copied = None
+    if mimic is not None:
+        copied = [mimic.get("joint", ""), _number(mimic.get("multiplier", "1")), _number(mimic.get("offset", "0"))]
+    return [
+        joint.get("name", ""),
+        joint.get("type", "fixed"),
+        _link(joint, "parent"),
+        _link(joint, "child"),
+        xyz,
+        rpy,
+        _numbers(axis.get("xyz", "1 0 0"), 3) if axis is not None else [1.0, 0.0, 0.0],
+        copied,
+    ]
+
+
+def _link(joint: Element, end: str) -> str:
+    found = joint.find(end)
+    return found.get("link", "") if found is not None else ""
+
+
+def _shapes(link: Element, colors: dict[str | None, list[float]]) -> Iterator[list[Any]]:
+    visuals = link.findall("visual") or link.findall("collision")
+    for visual in visuals:
+        geometry = visual.find("geometry")
+        if geometry is None:
+            continue
+        xyz, rpy = _origin(visual)
+        material = visual.find("material")
+        color = None if material is None else _rgba(material) or colors.get(material.get("name"))
+        for shape in geometry:
+            sizes = _sizes(shape)
+            if sizes is not None:
+                yield [shape.tag, sizes, xyz, rpy, color]
+
+
+def _sizes(shape: Element) -> list[float] | None:
+    match shape.tag:
+        case "box":
+            return _numbers(shape.get("size", ""), 3)
+        case "cylinder" | "capsule":
+            return [_number(shape.get("radius", "")), _number(shape.get("length", ""))]
+        case "sphere":
+            return [_number(shape.get("radius", ""))]
+    return None
+
+
+def _rgba(material: Element) -> list[float] | None:
+    color = material.find("color")
+    return None if color is None else _numbers(color.get("rgba", ""), 4)
+
+
+def _origin(element: Element) -> tuple[list[float], list[float]]:
+    origin = element.find("origin")
+    if origin is None:
+        return [0.0] * 3, [0.0] * 3
+    return _numbers(origin.get("xyz", "0 0 0"), 3), _numbers(origin.get("rpy", "0 0 0"), 3)
+
+
+def _numbers(text: str, count: int) -> list[float]:
+    numbers = [_number(each) for each in text.split()]
+    if len(numbers) != count:
+        raise ValueError(f"{text!r} has {len(numbers)} numbers instead of {count}")
+    return numbers
+
+
+def _number(text: str) -> float:
+    number = float(text)
+    if not math.isfinite(number):
+        raise ValueError(f"{text!r} is not a finite number")
+    return round(number, 5)

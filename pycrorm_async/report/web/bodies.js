@@ -1,0 +1,122 @@
+// Builds each object as nested groups, one for each link, so that setting joints and a pose is forward kinematics.
+
+const GREY = [0.62, 0.64, 0.68, 1];
+
+export class Body {
+  constructor(object, model) {
+    this.object = object;
+    this.group = new THREE.Group();
+    this.links = new Map([[model.root, new THREE.Group()]]);
+    this.group.add(this.links.get(model.root));
+    this.joints = model.joints.filter((each) => this.#addJoint(each)).map(([name, type, , child, , , axis, mimic]) => ({
+      name,
+      type,
+      mimic,
+      axis: new THREE.Vector3(...axis).normalize(),
+      moved: this.links.get(child),
+    }));
+    this.movable = this.joints.filter((each) => each.type !== "fixed");
+    for (const [link, shapes] of Object.entries(model.shapes)) {
+      for (const each of shapes) this.links.get(link)?.add(meshOf(each, object.color));
+    }
+    this.base = object.base_link ? this.links.get(object.base_link) : null;
+  }
+
+  #addJoint([, , parent, child, xyz, rpy]) {
+    const holder = this.links.get(parent);
+    if (holder === undefined || this.links.has(child)) return false;
+    const origin = new THREE.Group();
+    place(origin, xyz, rpy);
+    const link = new THREE.Group();
+    origin.add(link);
+    holder.add(origin);
+    this.links.set(child, link);
+    return true;
+  }
+
+  /** Put the object at its pose and its joints at their positions after an event. */
+  update(event) {
+    const { joints, poses } = this.object;
+    for (const each of this.movable) {
+      const [source, multiplier, offset] = joints.has(each.name) ? [each.name, 1, 0] : each.mimic ?? [each.name, 1, 0];
+      const track = joints.get(source);
+      const position = (track === undefined ? 0 : track.valueAt(event)) * multiplier + offset;
+      if (each.type === "prismatic") each.moved.position.copy(each.axis).multiplyScalar(position);
+      else each.moved.quaternion.setFromAxisAngle(each.axis, position);
+    }
+    const [x, y, z, ...orientation] = poses.valueAt(event);
+    const root = this.group;
+    root.position.set(x, y, z);
+    root.quaternion.set(...orientation);
+    if (this.base) {
+      root.updateMatrixWorld(true);
+      const inRoot = root.matrixWorld.clone().invert().multiply(this.base.matrixWorld);
+      root.matrixWorld.clone().multiply(inRoot.invert()).decompose(root.position, root.quaternion, root.scale);
+    }
+    root.updateMatrixWorld(true);
+  }
+}
+
+function place(group, xyz, [roll, pitch, yaw]) {
+  group.position.set(...xyz);
+  group.rotation.set(roll, pitch, yaw, "ZYX");
+}
+
+function meshOf([kind, sizes, xyz, rpy, color], override) {
+  const [red, green, blue, opacity] = override ?? color ?? GREY;
+  const material = new THREE.MeshStandardMaterial({ roughness: 0.75, metalness: 0.05 });
+  material.color.setRGB(red, green, blue, "srgb");
+  if (opacity < 1) Object.assign(material, { transparent: true, opacity });
+  const mesh = new THREE.Mesh(geometryOf(kind, sizes), material);
+  mesh.castShadow = mesh.receiveShadow = true;
+  const group = new THREE.Group();
+  place(group, xyz, rpy);
+  group.add(mesh);
+  return group;
+}
+
+function geometryOf(kind, sizes) {
+  if (kind === "box") return new THREE.BoxGeometry(...sizes);
+  if (kind === "sphere") return new THREE.SphereGeometry(sizes[0], 20, 14);
+  return new THREE.CylinderGeometry(sizes[0], sizes[0], sizes[1], 24).rotateX(Math.PI / 2);
+}
+
+/** The bodies of an episode, made when they are first needed. */
+export class Bodies {
+  constructor(episode) {
+    this.episode = episode;
+    this.made = new Map();
+  }
+
+  of(object) {
+    if (!this.made.has(object.id)) {
+      const model = this.episode.models[object.model] ?? this.episode.models[""];
+      this.made.set(object.id, new Body(object, model));
+    }
+    return this.made.get(object.id);
+  }
+
+  /** The bodies that are in the world after an event, in their state then. */
+  at(event) {
+    const present = this.episode.presentAt(event).map((each) => this.of(each));
+    for (const each of present) each.update(event);
+    return present;
+  }
+}
+
+const COLORS = ["--path-1", "--path-2", "--path-3", "--path-4"];
+
+/** The ways of the objects that moved during a node: name, variable of the colour, dash, and positions. */
+export function pathsOf(episode, node) {
+  if (node === null) return [];
+  const paths = [];
+  for (const object of episode.objects) {
+    const { at, values } = object.poses;
+    const points = values.filter((_, index) => at[index] <= node.lastEvent && (at[index + 1] ?? Infinity) > node.start);
+    const moved = points.filter((each, index) => index === 0 || distance(each, points[index - 1]) > 1e-3);
+    if (moved.length > 1) paths.push({ object, color: COLORS[paths.length % COLORS.length], points: moved.slice(-400) });
+  }
+  return paths;
+}
+
+const distance = ([x, y, z], [u, v, w]) => Math.hypot(x - u, y - v, z - w);

@@ -1,0 +1,32 @@
+// Makes elements. Text is only ever set as text, never as markup, because everything shown was recorded by programs.
+
+export function element(tag, attributes = {}, ...children) {
+  const made = document.createElement(tag);
+  for (const [name, value] of Object.entries(attributes)) {
+    if (name.startsWith("on")) made.addEventListener(name.slice(2), value);
+    else if (value !== null && value !== undefined && value !== false) made.setAttribute(name, value);
+  }
+  made.append(...children.filter((each) => each !== null && each !== undefined));
+  return made;
+}
+
+/** Recorded text in an element of its own direction, so that right-to-left text does not reorder its surroundings. */
+export const recorded = (text, attributes = {}) => element("bdi", attributes, String(text));
+
+const SVG = "http://www.w3.org/2000/svg";
+
+export function svg(tag, attributes = {}, ...children) {
+  const made = document.createElementNS(SVG, tag);
+  for (const [name, value] of Object.entries(attributes)) made.setAttribute(name, value);
+  made.append(...children);
+  return made;
+}
+
+export function duration(seconds) {
+  if (seconds >= 100) return `${seconds.toFixed(0)} s`;
+  if (seconds >= 1) return `${seconds.toFixed(2)} s`;
+  if (seconds >= 1e-3) return `${(seconds * 1e3).toFixed(1)} ms`;
+  return `${(seconds * 1e6).toFixed(0)} µs`;
+}
+
+export const colorOf = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();

@@ -1,0 +1,209 @@
+// Puts the page together: one moment, `event`, that the tree, the scene, the chart and the panels show.
+
+import { Bodies, pathsOf } from "./bodies.js";
+import { duration, element, recorded } from "./dom.js";
+import { Episode, signOf } from "./episode.js";
+import { GanttView } from "./gantt_view.js";
+import { MapView } from "./map_view.js";
+import { Panels } from "./panels.js";
+import { SceneView } from "./scene_view.js";
+import { TreeView } from "./tree_view.js";
+
+const PLAYED_S = 20;
+const HELP = "Space plays. ← → go by one event, with Shift by ten; Home and End to the ends. F goes to the next failure, A changes the axis.";
+const part = (name) => document.getElementById(name);
+
+class Page {
+  constructor(episode) {
+    this.episode = episode;
+    this.event = this.#eventInAddress() ?? episode.opens;
+    this.selected = null;
+    this.playing = null;
+    const seek = (event) => this.seek(event);
+    const select = (node, options) => this.select(node, options);
+    this.bodies = new Bodies(episode);
+    this.map = new MapView(part("map"), episode, this.bodies);
+    this.view = this.#sceneOrMap();
+    this.tree = new TreeView(part("tree"), episode, { onSelect: select });
+    this.gantt = new GanttView(part("gantt"), episode, { onSeek: seek, onSelect: select });
+    this.panels = new Panels(part("panels"), episode, { onSeek: seek, onSelect: select });
+    this.#head();
+    this.#controls();
+    this.#listen();
+    const events = Math.max(episode.last - episode.first, 1);
+    if (episode.secondsAt(episode.last) / events > 0.05) this.#changeAxis();
+    this.show();
+  }
+
+  #eventInAddress() {
+    const match = /^#e(\d+)$/.exec(location.hash);
+    if (match === null) return null;
+    return Math.min(Math.max(Number(match[1]), this.episode.first), this.episode.last);
+  }
+
+  #sceneOrMap() {
+    try {
+      return new SceneView(part("scene"), this.episode, this.bodies);
+    } catch {
+      document.body.classList.add("no-webgl");
+      return this.map;
+    }
+  }
+
+  #head() {
+    const { episode } = this;
+    part("status").textContent = `${signOf(episode.status)} ${episode.status}`;
+    part("status").className = `badge is-${episode.status.toLowerCase()}`;
+    const failed = episode.nodes.filter((each) => each.failed).length;
+    const roots = episode.rootFailures.length;
+    const whole = episode.first === 1 && episode.last === episode.head;
+    const facts = [
+      `episode ${episode.number}`,
+      episode.started,
+      duration(episode.secondsAt(episode.last)),
+      `${episode.nodes.length} nodes${failed ? `, ${failed} failed from ${roots} cause${roots === 1 ? "" : "s"}` : ""}`,
+      `by ${episode.created_by}`,
+      episode.simulated ? "a simulation" : null,
+      episode.tags.length > 0 ? episode.tags.join(", ") : null,
+      whole ? null : `events ${episode.first} to ${episode.last} of ${episode.head}`,
+    ].filter((each) => each !== null);
+    part("facts").replaceChildren(...facts.map((each) => recorded(each)));
+    const assumed = episode.objects
+      .map((each) => [each.name, (episode.models[each.model] ?? episode.models[""]).assumed])
+      .filter(([, reason]) => reason);
+    const notes = assumed.slice(0, 3).map(([name, reason]) => element("p", {}, recorded(`${name} is drawn as ${reason}`)));
+    if (episode.objects.length === 0) notes.push(element("p", {}, "This episode recorded no objects: there is no scene to draw."));
+    part("notes").replaceChildren(...notes);
+  }
+
+  #controls() {
+    const { episode } = this;
+    this.play = element("button", { type: "button", title: "play (space)", onclick: () => this.togglePlay() }, "▶");
+    this.slider = element("input", { type: "range", min: episode.first, max: episode.last, step: 1, "aria-label": "event" });
+    this.slider.addEventListener("input", () => this.seek(Number(this.slider.value)));
+    this.clock = element("output", { class: "clock" });
+    this.axis = element("button", { type: "button", title: "axis of the chart (A)", onclick: () => this.#changeAxis() }, "by event");
+    const help = element("button", { type: "button", title: HELP, "aria-label": HELP, onclick: () => this.#help() }, "?");
+    part("controls").append(this.play, this.slider, this.clock, this.axis, help);
+  }
+
+  #help() {
+    part("help").textContent = part("help").textContent ? "" : HELP;
+  }
+
+  #changeAxis() {
+    this.gantt.setAxis(!this.gantt.byTime);
+    this.axis.textContent = this.gantt.byTime ? "by time" : "by event";
+  }
+
+  #listen() {
+    addEventListener("hashchange", () => {
+      const event = this.#eventInAddress();
+      if (event !== null && event !== this.event) this.seek(event);
+    });
+    addEventListener("keydown", (pressed) => this.#press(pressed));
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => this.#paint());
+    matchMedia("print").addEventListener("change", ({ matches }) => (matches ? this.#print() : this.show()));
+    addEventListener("beforeprint", () => this.#print());
+    addEventListener("afterprint", () => this.show());
+  }
+
+  #press(pressed) {
+    if (pressed.ctrlKey || pressed.metaKey || pressed.altKey) return;
+    if (pressed.target instanceof HTMLButtonElement && pressed.key === " ") return;
+    const step = pressed.shiftKey ? 10 : 1;
+    const { first, last } = this.episode;
+    const actions = {
+      " ": () => this.togglePlay(),
+      ArrowRight: () => this.seek(this.event + step),
+      ArrowLeft: () => this.seek(this.event - step),
+      Home: () => this.seek(first),
+      End: () => this.seek(last),
+      f: () => this.#nextFailure(),
+      a: () => this.#changeAxis(),
+      "?": () => this.#help(),
+    };
+    const action = actions[pressed.key.length === 1 ? pressed.key.toLowerCase() : pressed.key];
+    if (action === undefined) return;
+    pressed.preventDefault();
+    action();
+  }
+
+  #nextFailure() {
+    const failures = this.episode.rootFailures;
+    const next = failures.find((each) => each.lastEvent > this.event) ?? failures[0];
+    if (next !== undefined) this.select(next);
+  }
+
+  seek(event) {
+    const { first, last } = this.episode;
+    this.event = Math.min(Math.max(Math.round(event), first), last);
+    this.selected = null;
+    this.show();
+  }
+
+  /** Show a node and the moment at which it ended, or its last one. */
+  select(node, { seek = true } = {}) {
+    this.selected = node;
+    if (seek) {
+      this.event = node.lastEvent;
+      this.tree.reveal(node);
+    }
+    this.panels.open("details");
+    this.show();
+  }
+
+  togglePlay() {
+    if (this.playing !== null) {
+      cancelAnimationFrame(this.playing);
+      this.playing = null;
+    } else {
+      const { first, last, opens } = this.episode;
+      if (this.event >= Math.min(last, opens)) this.event = first;
+      this.#step(performance.now(), this.event, Math.max(last - first, 1) / PLAYED_S);
+    }
+    this.play.textContent = this.playing === null ? "▶" : "❚❚";
+  }
+
+  #step(began, from, rate) {
+    this.playing = requestAnimationFrame(() => {
+      const event = Math.floor(from + ((performance.now() - began) / 1000) * Math.max(rate, 4));
+      if (event !== this.event) this.seek(Math.min(event, this.episode.opens));
+      if (event < this.episode.opens) this.#step(began, from, rate);
+      else this.togglePlay();
+    });
+  }
+
+  #paint() {
+    this.view.paint();
+    this.gantt.draw();
+  }
+
+  show() {
+    const { episode, event } = this;
+    const running = episode.runningAt(event);
+    const action = this.selected ?? running.filter((each) => each.kind === "action").at(-1) ?? null;
+    this.action = action;
+    this.view.show(event, action, pathsOf(episode, action));
+    this.tree.show(event, running, { scroll: this.selected === null });
+    this.tree.select(this.selected);
+    this.gantt.show(event, this.selected);
+    this.panels.show(event, this.selected, running);
+    this.slider.value = event;
+    this.slider.setAttribute("aria-valuetext", `event ${event}`);
+    this.clock.textContent = `${duration(episode.secondsAt(event))} · event ${event} of ${episode.last}`;
+    if (matchMedia("print").matches) this.#print();
+    clearTimeout(this.writing);
+    this.writing = setTimeout(() => history.replaceState(null, "", `#e${this.event}`), 250);
+  }
+
+  #print() {
+    this.map.show(this.event, this.action, pathsOf(this.episode, this.action));
+    this.tree.drawForPrint();
+    this.panels.drawForPrint();
+  }
+}
+
+const page = new Page(new Episode(JSON.parse(part("episode").textContent)));
+document.documentElement.dataset.ready = "yes";
+globalThis.pycrormPage = page;

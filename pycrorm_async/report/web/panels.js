@@ -1,0 +1,202 @@
+// Shows what belongs to a node or to the moment: details, failures by reason, percepts, observations, states.
+
+import { failureGroups, lastUpTo, signOf } from "./episode.js";
+import { duration, element, recorded, svg } from "./dom.js";
+
+const LISTED_MAX = 200;
+const MESSAGES_MAX = 5;
+const LINKS_MAX = 12;
+
+export class Panels {
+  constructor(holder, episode, { onSeek, onSelect }) {
+    Object.assign(this, { holder, episode, onSeek, onSelect });
+    const { rootFailures, detections, observations, attachments, samples, series } = episode;
+    const curves = series.size + samples.reduce((sum, [, each]) => sum + each.size, 0);
+    this.tabs = [
+      ["details", "Details", null, () => this.#details()],
+      ["failures", "Failures", rootFailures.length, () => this.#failures()],
+      ["detections", "Percepts", detections.length, () => this.#detections()],
+      ["attachments", "Attachments", attachments.length, () => this.#attachments()],
+      ["observations", "Observations", observations.length, () => this.#observations()],
+      ["states", "Curves", curves, () => this.#curves()],
+    ].filter(([name, , count]) => count === null || count > 0 || name === "failures");
+    this.bar = element("div", { class: "tabs", role: "tablist" });
+    this.body = element("div", { class: "panel", role: "tabpanel", tabindex: 0 });
+    holder.append(this.bar, this.body);
+    this.current = rootFailures.length > 0 ? "failures" : "details";
+    this.#drawBar();
+  }
+
+  #drawBar() {
+    this.bar.replaceChildren(
+      ...this.tabs.map(([name, title, count]) =>
+        element(
+          "button",
+          { type: "button", role: "tab", "aria-selected": String(name === this.current), onclick: () => this.open(name) },
+          title,
+          count === null ? null : element("span", { class: "count" }, String(count)),
+        ),
+      ),
+    );
+  }
+
+  open(name) {
+    this.current = name;
+    this.#drawBar();
+    this.body.scrollTop = 0;
+    this.#draw();
+  }
+
+  show(event, selected, running) {
+    Object.assign(this, { event, selected, running });
+    this.#draw();
+  }
+
+  #draw() {
+    if (this.event === undefined) return;
+    const [, , , content] = this.tabs.find(([name]) => name === this.current);
+    this.body.replaceChildren(...content());
+  }
+
+  /** Draw all panels below one another, for print. */
+  drawForPrint() {
+    const parts = this.tabs.flatMap(([, title, , content]) => [element("h2", {}, title), ...content()]);
+    this.body.replaceChildren(...parts);
+  }
+
+  #moment(event) {
+    return element("button", { type: "button", class: "moment", onclick: () => this.onSeek(event) }, `e${event}`);
+  }
+
+  #node(start) {
+    const node = this.episode.nodeAt.get(start);
+    if (node === undefined) return null;
+    return element("button", { type: "button", class: "moment", onclick: () => this.onSelect(node) }, recorded(node.name));
+  }
+
+  #details() {
+    const node = this.selected ?? this.running.at(-1);
+    if (node === undefined) return [element("p", { class: "quiet" }, "No node runs at this moment.")];
+    const { episode } = this;
+    const facts = [
+      ["status", element("span", {}, `${signOf(node.status)} ${node.status}`)],
+      ["events", element("span", {}, this.#moment(node.start), " to ", node.end ? this.#moment(node.end) : "no end")],
+      ["took", node.end ? duration(episode.secondsAt(node.end) - episode.secondsAt(node.start)) : "unknown"],
+      ["parameters", node.parameters ? recorded(node.parameters) : null],
+      ["reason", node.reason ? recorded(node.reason) : null],
+      ["message", node.message ? recorded(node.message, { class: "long" }) : null],
+      ["below", node.parent ? this.#node(node.parent.start) : null],
+    ].filter(([, value]) => value !== null);
+    const list = element("dl", {}, ...facts.flatMap(([name, value]) => [element("dt", {}, name), element("dd", {}, value)]));
+    const places = episode.locations.filter((each) => each.node === node.start).slice(0, LISTED_MAX);
+    const chosen = places.map((each) => {
+      const refused = Object.entries(each.refused).map(([reason, count]) => `${count} ${reason}`).join(", ");
+      const text = `${each.location}: ${each.offered} of ${each.considered} places offered`;
+      return element("p", {}, this.#moment(each.at), " ", recorded(refused ? `${text}; refused: ${refused}` : text));
+    });
+    return [element("h3", {}, recorded(node.name)), list, ...chosen];
+  }
+
+  #failures() {
+    const { rootFailures, failure } = this.episode;
+    if (rootFailures.length === 0) {
+      return [element("p", { class: "quiet" }, failure ? `${failure.reason}: ${failure.message}` : "Nothing failed.")];
+    }
+    return failureGroups(rootFailures).map(({ reason, failures, messages }) => {
+      const shown = messages.slice(0, MESSAGES_MAX).flatMap((alike) => {
+        const links = alike.slice(0, LINKS_MAX).map((each) => this.#nodeMoment(each));
+        const left = alike.length > LINKS_MAX ? ` and ${alike.length - LINKS_MAX} like it` : "";
+        return [element("p", { class: "long" }, recorded(alike[0].message)), element("p", {}, ...links, left)];
+      });
+      const others = messages.length - MESSAGES_MAX;
+      return element(
+        "div",
+        { class: "failure" },
+        element("p", {}, element("strong", {}, `✗ ${failures.length} × `), recorded(reason, { class: "reason" })),
+        ...shown,
+        others > 0 ? element("p", { class: "quiet" }, `${others} other messages`) : null,
+      );
+    });
+  }
+
+  #nodeMoment(node) {
+    const made = element("button", { type: "button", class: "moment", onclick: () => this.onSelect(node) });
+    made.append(recorded(node.name), ` e${node.end || node.start}`);
+    return made;
+  }
+
+  /** The entries around the moment, at most `LISTED_MAX`; those after it are pale. */
+  #around(entries, row) {
+    const here = lastUpTo(entries.map((each) => each.at), this.event);
+    const from = Math.max(0, Math.min(here - LISTED_MAX / 2, entries.length - LISTED_MAX));
+    const listed = entries.slice(from, from + LISTED_MAX);
+    const rows = listed.map((each) => {
+      const made = row(each);
+      if (each.at > this.event) made.classList.add("later");
+      return made;
+    });
+    const left = entries.length - listed.length;
+    return left > 0 ? [...rows, element("p", { class: "quiet" }, `${left} others are not listed here.`)] : rows;
+  }
+
+  #detections() {
+    return this.#around(this.episode.detections, ({ at, source, type, seen, node }) => {
+      const percepts = seen.map(([name, kind, [x, y, z], visible]) => {
+        const share = visible === null ? "" : `, ${Math.round(visible * 100)} % visible`;
+        return `${name} (${kind}) at (${x}, ${y}, ${z})${share}`;
+      });
+      const what = percepts.length > 0 ? percepts.join("; ") : "nothing seen";
+      return element("p", {}, this.#moment(at), ` ${source.replace("_", " ")} `, type ? `looked for ${type}: ` : "", recorded(what), " ", this.#node(node));
+    });
+  }
+
+  #attachments() {
+    const { episode } = this;
+    const entries = episode.attachments.map(([parent, child, link, at, to]) => ({ parent, child, link, at, to }));
+    return this.#around(entries, ({ parent, child, link, at, to }) => {
+      const held = at <= this.event && (to === 0 || to > this.event);
+      const text = ` ${episode.nameOf(child)} moved with ${episode.nameOf(parent)}${link ? ` (${link})` : ""}`;
+      const until = to ? element("span", {}, " until ", this.#moment(to)) : " to the end";
+      return element("p", { class: held ? "lit" : "" }, this.#moment(at), recorded(text), until, held ? " ◂ now" : "");
+    });
+  }
+
+  #observations() {
+    return this.#around(this.episode.observations, ({ at, name, values, node }) =>
+      element("p", {}, this.#moment(at), " ", recorded(name, { class: "name" }), " ", recorded(values), " ", this.#node(node)),
+    );
+  }
+
+  #curves() {
+    const { episode } = this;
+    const named = [...episode.series].map(([name, track]) => [name, track]);
+    for (const [id, channels] of episode.samples) {
+      for (const [name, track] of channels) named.push([`${episode.nameOf(id)} ${name}`, track]);
+    }
+    const moving = named.filter(([, track]) => new Set(track.values).size > 1);
+    const shown = moving.slice(0, 60).map(([name, track]) => this.#curve(name, track));
+    const left = named.length - shown.length;
+    const note = left > 0 ? [element("p", { class: "quiet" }, `${left} more have one value only or are not shown.`)] : [];
+    return [element("div", { class: "curves" }, ...shown), ...note];
+  }
+
+  #curve(name, track) {
+    const { first, last } = this.episode;
+    const [width, height] = [220, 46];
+    const low = track.values.reduce((one, other) => Math.min(one, other), Infinity);
+    const high = track.values.reduce((one, other) => Math.max(one, other), -Infinity);
+    const x = (event) => ((event - first) / Math.max(last - first, 1)) * width;
+    const y = (value) => height - 3 - ((value - low) / (high - low || 1)) * (height - 6);
+    let path = "";
+    const step = Math.max(1, Math.floor(track.at.length / 1000));
+    for (let index = 0; index < track.at.length; index += step) {
+      const here = `${x(track.at[index]).toFixed(1)},${y(track.values[index]).toFixed(1)}`;
+      path += index === 0 ? `M${here}` : `H${here.split(",")[0]}V${here.split(",")[1]}`;
+    }
+    path += `H${width}`;
+    const picture = svg("svg", { viewBox: `0 0 ${width} ${height}`, class: "curve", preserveAspectRatio: "none", "aria-hidden": "true" });
+    picture.append(svg("path", { d: path }), svg("line", { x1: x(this.event), x2: x(this.event), y1: 0, y2: height }));
+    const value = Number(track.valueAt(this.event)).toPrecision(4);
+    return element("figure", {}, element("figcaption", {}, recorded(name), element("b", {}, value)), picture);
+  }
+}

@@ -1,0 +1,190 @@
+// Shows the task tree as a list of rows, of which only those in sight are elements: a tree may have 100,000 nodes.
+
+import { signOf } from "./episode.js";
+import { duration, element, recorded } from "./dom.js";
+
+const ROW_PX = 26;
+const OPEN_MAX = 300;
+const PRINTED_MAX = 2000;
+
+export class TreeView {
+  constructor(holder, episode, { onSelect }) {
+    this.holder = holder;
+    this.episode = episode;
+    this.onSelect = onSelect;
+    this.open = new Set();
+    this.selected = null;
+    this.event = episode.opens;
+    this.spacer = element("div", { class: "rows", role: "presentation" });
+    holder.append(this.spacer);
+    holder.addEventListener("scroll", () => this.#draw());
+    holder.addEventListener("keydown", (pressed) => this.#press(pressed));
+    new ResizeObserver(() => this.#draw()).observe(holder);
+    this.#openAtFailures();
+    this.#list();
+  }
+
+  /** Open all of a small tree; of a large one the ways to the first failures, or the first level. */
+  #openAtFailures() {
+    const { nodes } = this.episode;
+    if (nodes.length <= OPEN_MAX) {
+      for (const each of nodes) this.open.add(each);
+      return;
+    }
+    for (const each of nodes) if (each.parent === null) this.open.add(each);
+    let rows = this.#countRows();
+    for (const failure of this.episode.rootFailures) {
+      for (let each = failure.parent; each !== null && !this.open.has(each); each = each.parent) {
+        this.open.add(each);
+        rows += each.children.length;
+      }
+      if (rows > OPEN_MAX) break;
+    }
+  }
+
+  #countRows() {
+    return [...this.open].reduce((sum, each) => sum + each.children.length, 0);
+  }
+
+  #list() {
+    this.rows = [];
+    const visit = (node) => {
+      this.rows.push({ node });
+      if (node.isRootFailure && node.message) this.rows.push({ node, message: true });
+      if (this.open.has(node)) node.children.forEach(visit);
+    };
+    this.episode.nodes.filter((each) => each.parent === null).forEach(visit);
+    this.rowOf = new Map();
+    this.rows.forEach(({ node, message }, index) => message || this.rowOf.set(node, index));
+    this.#draw();
+  }
+
+  /** Light the nodes of the moment after an event, and bring the innermost into sight. */
+  show(event, running, { scroll = true } = {}) {
+    this.event = event;
+    this.printing = false;
+    this.running = new Set(running);
+    if (scroll) {
+      const innermost = running.filter((each) => this.rowOf.has(each)).at(-1);
+      if (innermost !== undefined) this.#bringIntoSight(innermost);
+    }
+    this.#draw();
+  }
+
+  reveal(node) {
+    for (let each = node.parent; each !== null; each = each.parent) this.open.add(each);
+    this.#list();
+    this.#bringIntoSight(node);
+  }
+
+  select(node) {
+    this.selected = node;
+    this.#draw();
+  }
+
+  #bringIntoSight(node) {
+    const top = this.rowOf.get(node) * ROW_PX;
+    const { scrollTop, clientHeight } = this.holder;
+    if (top < scrollTop || top + 2 * ROW_PX > scrollTop + clientHeight) {
+      this.holder.scrollTop = top - clientHeight / 3;
+    }
+  }
+
+  #press(pressed) {
+    const step = { ArrowDown: 1, ArrowUp: -1 }[pressed.key];
+    const here = this.selected !== null ? this.rowOf.get(this.selected) ?? 0 : 0;
+    if (step !== undefined) {
+      let next = here + step;
+      while (this.rows[next]?.message) next += step;
+      if (this.rows[next] !== undefined) this.#choose(this.rows[next].node);
+    } else if (this.selected !== null && ["ArrowLeft", "ArrowRight"].includes(pressed.key)) {
+      this.#toggle(this.selected, pressed.key === "ArrowRight");
+    } else return;
+    pressed.preventDefault();
+    pressed.stopPropagation();
+  }
+
+  #choose(node) {
+    this.#bringIntoSight(node);
+    this.onSelect(node);
+  }
+
+  #toggle(node, open = !this.open.has(node)) {
+    if (open) this.open.add(node);
+    else this.open.delete(node);
+    this.#list();
+  }
+
+  /** Make all rows elements for print, up to a bound. */
+  drawForPrint() {
+    this.printing = true;
+    this.spacer.replaceChildren(...this.rows.slice(0, PRINTED_MAX).map((row) => this.#rowOf(row)));
+    const left = this.rows.length - PRINTED_MAX;
+    if (left > 0) this.spacer.append(element("div", { class: "row" }, `… ${left} more rows`));
+    this.spacer.style.height = "auto";
+  }
+
+  #draw() {
+    if (this.printing) return;
+    const { scrollTop, clientHeight } = this.holder;
+    const from = Math.max(0, Math.floor(scrollTop / ROW_PX) - 4);
+    const to = Math.min(this.rows.length, from + Math.ceil(clientHeight / ROW_PX) + 8);
+    this.spacer.style.height = `${this.rows.length * ROW_PX}px`;
+    const drawn = this.rows.slice(from, to).map((row, index) => {
+      const made = this.#rowOf(row);
+      made.style.position = "absolute";
+      made.style.top = `${(from + index) * ROW_PX}px`;
+      return made;
+    });
+    this.spacer.replaceChildren(...drawn);
+  }
+
+  #rowOf({ node, message }) {
+    const made = message ? this.#messageOf(node) : this.#nodeRow(node);
+    made.style.paddingInlineStart = `${8 + Math.min(node.depth, 12) * 14 + (message ? 34 : 0)}px`;
+    made.addEventListener("click", () => this.onSelect(node));
+    return made;
+  }
+
+  #messageOf(node) {
+    const made = element("div", { class: "row message" });
+    made.append(recorded(node.message.slice(0, 300)));
+    return made;
+  }
+
+  #nodeRow(node) {
+    const open = this.open.has(node);
+    const classes = ["row", `is-${node.status.toLowerCase()}`];
+    if (this.running?.has(node)) classes.push("lit");
+    if (node.start > this.event) classes.push("later");
+    if (node === this.selected) classes.push("selected");
+    const toggle = element("span", { class: "toggle" }, node.children.length === 0 ? "" : open ? "▾" : "▸");
+    if (node.children.length > 0) {
+      toggle.addEventListener("click", (clicked) => {
+        clicked.stopPropagation();
+        this.#toggle(node);
+      });
+    }
+    const hidden = !open && node.children.length > 0 ? element("span", { class: "count" }, `${node.children.length}`) : null;
+    const inside = !open && node.holdsFailure && !node.failed ? element("span", { class: "count bad" }, "✗ inside") : null;
+    const took = node.end ? duration(this.episode.secondsAt(node.end) - this.episode.secondsAt(node.start)) : "";
+    return element(
+      "div",
+      {
+        class: classes.join(" "),
+        role: "treeitem",
+        "aria-level": node.depth + 1,
+        "aria-expanded": node.children.length > 0 ? String(open) : null,
+        "aria-selected": String(node === this.selected),
+      },
+      toggle,
+      element("span", { class: "sign", title: node.status }, signOf(node.status)),
+      recorded(node.name, { class: "name" }),
+      hidden,
+      inside,
+      node.reason ? recorded(node.reason, { class: "reason" }) : null,
+      recorded(node.parameters.slice(0, 200), { class: "parameters" }),
+      element("span", { class: "took" }, took),
+    );
+  }
+}

@@ -1,0 +1,191 @@
+"""Drive a real headless Chromium over the pipe of its DevTools protocol: open pages, ask them, photograph them."""
+
+import base64
+import json
+import os
+import select
+import shutil
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+__all__ = ["Browser", "Tab", "chromium", "browser"]
+
+_FLAGS = (
+    "--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking"
+    " --disable-component-update --disable-sync --hide-scrollbars --disable-dev-shm-usage"
+    " --use-gl=angle --use-angle=swiftshader --enable-unsafe-swiftshader --remote-debugging-pipe"
+).split()
+
+
+def chromium() -> str | None:
+    """Return the path of an installed Chromium, or None."""
+    return next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+
+
+class Browser:
+    """A running Chromium; one command at a time."""
+
+    def __init__(self, read: int, write: int) -> None:
+        self._read, self._write = read, write
+        self._pending = b""
+        self._number = 0
+        self.events: list[dict[str, Any]] = []
+
+    def call(self, method: str, session: str | None = None, **parameters: Any) -> dict[str, Any]:
+        self._number += 1
+        message = {"id": self._number, "method": method, "params": parameters}
+        if session is not None:
+            message["sessionId"] = session
+        os.write(self._write, json.dumps(message).encode() + b"\0")
+        while True:
+            answer = self._receive(60)
+            if answer.get("id") == self._number:
+                assert "error" not in answer, f"{method}: {answer['error']}"
+                return dict(answer["result"])
+            self.events.append(answer)
+
+    def _receive(self, timeout_s: float) -> dict[str, Any]:
+        deadline = time.monotonic() + timeout_s
+        while b"\0" not in self._pending:
+            ready, _, _ = select.select([self._read], [], [], max(0.0, deadline - time.monotonic()))
+            assert ready, "Chromium did not answer"
+            part = os.read(self._read, 2**20)
+            assert part, "Chromium has exited"
+            self._pending += part
+        first, _, self._pending = self._pending.partition(b"\0")
+        return dict(json.loads(first))
+
+    @contextmanager
+    def open(
+        self,
+        path: Path,
+        *,
+        width: int = 1400,
+        height: int = 900,
+        fragment: str = "",
+        media: str = "",
+        dark: bool = False,
+        script: str = "",
+    ) -> Iterator["Tab"]:
+        """Open a page and wait until it is ready. `script` runs before the page's own scripts."""
+        target = self.call("Target.createTarget", url="about:blank")["targetId"]
+        session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
+        tab = Tab(self, session)
+        try:
+            for domain in ("Page", "Runtime", "Log", "Network"):
+                tab.call(f"{domain}.enable")
+            size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+            tab.call("Emulation.setDeviceMetricsOverride", **size)
+            scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
+            tab.call("Emulation.setEmulatedMedia", media=media, features=[scheme])
+            if script:
+                tab.call("Page.addScriptToEvaluateOnNewDocument", source=script)
+            tab.call("Page.navigate", url=f"{path.resolve().as_uri()}{fragment}")
+            tab.wait_for("document.documentElement?.dataset.ready === 'yes'")
+            yield tab
+        finally:
+            self.call("Target.closeTarget", targetId=target)
+
+
+class Tab:
+    """An open page."""
+
+    def __init__(self, browser: Browser, session: str) -> None:
+        self._browser, self._session = browser, session
+
+    def call(self, method: str, **parameters: Any) -> dict[str, Any]:
+        return self._browser.call(method, self._session, **parameters)
+
+    def ask(self, expression: str) -> Any:
+        """Return the value of a JavaScript expression."""
+        answer = self.call("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
+        assert "exceptionDetails" not in answer, answer["exceptionDetails"]
+        return answer["result"].get("value")
+
+    def wait_for(self, condition: str, timeout_s: float = 60) -> None:
+        deadline = time.monotonic() + timeout_s
+        while not self.ask(condition):
+            assert time.monotonic() < deadline, f"{condition} did not become true; {self.problems()}"
+            time.sleep(0.05)
+
+    def settle(self) -> None:
+        """Wait until the page has drawn twice."""
+        self.ask("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => done(true))))")
+
+    def press(self, key: str, *, code: str = "", modifiers: int = 0) -> None:
+        text = key if len(key) == 1 else ""
+        for kind in ("keyDown", "keyUp"):
+            self.call(
+                "Input.dispatchKeyEvent",
+                type=kind,
+                key=key,
+                code=code or key,
+                text=text if kind == "keyDown" else "",
+                modifiers=modifiers,
+            )
+
+    def _events(self, method: str) -> list[dict[str, Any]]:
+        mine = [each for each in self._browser.events if each.get("sessionId") == self._session]
+        return [each["params"] for each in mine if each["method"] == method]
+
+    def problems(self) -> list[str]:
+        """Return the page's exceptions, and its messages of warnings and errors."""
+        thrown = [str(each["exceptionDetails"]) for each in self._events("Runtime.exceptionThrown")]
+        printed = [
+            str(each["args"])
+            for each in self._events("Runtime.consoleAPICalled")
+            if each["type"] in ("error", "warning")
+        ]
+        logged = [
+            each["entry"]["text"]
+            for each in self._events("Log.entryAdded")
+            if each["entry"]["level"] in ("error", "warning") and "GPU stall" not in each["entry"]["text"]
+        ]
+        return thrown + printed + logged
+
+    def requests(self) -> list[str]:
+        """Return the addresses that the page asked for, data: addresses apart."""
+        asked = [str(each["request"]["url"]) for each in self._events("Network.requestWillBeSent")]
+        return [each for each in asked if not each.startswith("data:")]
+
+    def photograph(self, path: Path, *, whole: bool = False) -> Path:
+        self.settle()
+        answer = self.call("Page.captureScreenshot", format="png", captureBeyondViewport=whole)
+        path.write_bytes(base64.b64decode(answer["data"]))
+        return path
+
+    def print(self, path: Path) -> Path:
+        answer = self.call("Page.printToPDF", printBackground=False)
+        path.write_bytes(base64.b64decode(answer["data"]))
+        return path
+
+
+@contextmanager
+def browser(folder: Path, *flags: str) -> Iterator[Browser]:
+    """Start Chromium with a profile in a folder, and stop it at the end."""
+    program = chromium()
+    assert program is not None, "no Chromium is installed"
+    to_browser, from_test = os.pipe()
+    from_browser, to_test = os.pipe()
+    command = [program, *_FLAGS, *flags, f"--user-data-dir={folder / 'profile'}"]
+    script = f'exec "$@" 3<&{to_browser} 4>&{to_test}'
+    with (folder / "chromium.log").open("wb") as log:
+        process = subprocess.Popen(
+            ["bash", "-c", script, "bash", *command], pass_fds=(to_browser, to_test), stdout=log, stderr=log
+        )
+    os.close(to_browser)
+    os.close(to_test)
+    try:
+        yield Browser(from_browser, from_test)
+    finally:
+        os.close(from_test)
+        try:
+            process.wait(10)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()
+        os.close(from_browser)

@@ -1,0 +1,75 @@
+"""Fixtures of the report's tests: one browser for each test process, and memories with episodes to show."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.commands import pycrorm
+from tests.report.browser import Browser, browser, chromium
+
+BREAKFAST = '''
+import os, signal
+from pycrorm_async.cli.demo import kitchen_world
+from pycrorm_async.plan import NavigateAction, ObjectDesignatorDescription, ParkArmsAction, PickUpAction, PlanFailure
+from pycrorm_async.plan import TransportAction, simulated_robot
+from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose
+
+async def plan(dies=False):
+    """Bring the milk </script><b onload=alert(1)>"""
+    with BulletWorld(), simulated_robot:
+        kitchen_world()
+        milk = ObjectDesignatorDescription(names=["milk"])
+        await ParkArmsAction([Arms.BOTH]).resolve().perform()
+        await NavigateAction([Pose([-2.6, -1.5, 0])]).resolve().perform()
+        for arm in (Arms.RIGHT, Arms.LEFT):
+            try:
+                await PickUpAction(milk, [arm], [Grasp.FRONT]).resolve().perform()
+            except PlanFailure:
+                pass
+        if dies:
+            os.kill(os.getpid(), signal.SIGKILL)
+        await TransportAction(milk, [Arms.LEFT], [Pose([1.3, 0.45, 0.9])]).resolve().perform()
+
+async def dies():
+    """Die while the robot works"""
+    await plan(dies=True)
+
+async def drives():
+    """Drive the courier"""
+    with BulletWorld(), simulated_robot:
+        Object("courier", ObjectType.ROBOT)
+        await NavigateAction([Pose([1, 0.5, 0])]).resolve().perform()
+'''
+
+
+@pytest.fixture(scope="session")
+def chrome(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    """Return a running browser; skip the test without one."""
+    if chromium() is None:
+        pytest.skip("no Chromium is installed")
+    with browser(tmp_path_factory.mktemp("chromium")) as running:
+        yield running
+
+
+@pytest.fixture(scope="session")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with a memory: 1 breakfast with caught failures, 2 a killed plan, 3 another robot."""
+    folder = tmp_path_factory.mktemp("recorded")
+    (folder / "breakfast.py").write_text(BREAKFAST)
+    for function, code in (("plan", 0), ("dies", -9), ("drives", 0)):
+        done = pycrorm("run", f"breakfast.py:{function}", "--sample-interval-ms", "1", cwd=folder)
+        assert done.returncode == code, done.stderr
+    pycrorm("writer", "--once", cwd=folder)
+    return folder
+
+
+@pytest.fixture(scope="session")
+def pages(recorded: Path) -> dict[str, Path]:
+    """Return the pages of the recorded episodes by their functions."""
+    found = {}
+    for number, name in enumerate(("plan", "dies", "drives"), 1):
+        done = pycrorm("report", str(number), "--out", f"{name}.html", cwd=recorded)
+        assert done.returncode == 0, done.stderr
+        found[name] = recorded / f"{name}.html"
+    return found

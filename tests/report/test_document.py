@@ -1,0 +1,173 @@
+"""The document of an episode, without a browser: what the page is given, and what it is given of a window."""
+
+import zlib
+from base64 import b64encode
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from pycrorm_async.errors import CallerError, UnknownEpisode
+from pycrorm_async.events.types import DescriptionDeclared
+from pycrorm_async.memory import Memory
+from pycrorm_async.query.reading import Reading
+from pycrorm_async.recording.recorded_episode import RecordedEpisode
+from pycrorm_async.report.episode_data import episode_document
+from pycrorm_async.report.html_page import page_of
+from pycrorm_async.report.object_model import object_model
+from pycrorm_async.report.tracks import Texts, Track
+from pycrorm_async.world import Pose
+
+HOSTILE = "</script><script>alert(1)</script> & \u2028\u202e]]> {title} <!--"
+
+
+def record(memory: Any, episode: RecordedEpisode) -> None:
+    """Write one episode by the public seam: a robot drives with a hostile text, and one of two nodes fails."""
+    drive = memory.recording.type("action", "DriveAction", {"text": str, "speed": float})
+    episode.object_added("base", "turtle\u202e", "ROBOT", Pose([0, 0, 0]))
+    episode.start("one", drive, {"text": HOSTILE, "speed": 0.5}, robot="base")
+    episode.object_moved("base", Pose([1, 2, 0]), node="one")
+    episode.observe("battery", {"volts": 24.5, "cells": [1, 2], "ok": True}, node="one")
+    episode.end("one", "SUCCEEDED")
+    episode.start("two", drive, {"text": "x", "speed": 1.0}, robot="base")
+    episode.end("two", "FAILED", "é" * 500_000)
+
+
+@pytest.fixture
+def url(tmp_path: Path) -> str:
+    """Return the URL of a memory with one recorded episode."""
+    url = f"sqlite:///{tmp_path / 'memory.db'}"
+    with Memory.sync(url) as memory:
+        with memory.recording.episode(description=HOSTILE) as episode:
+            record(memory, episode)
+        memory.flush()
+    return url
+
+
+async def document_of(url: str, **window: Any) -> dict[str, Any]:
+    async with Reading.open(url) as reading:
+        return await episode_document(reading, "last", **window)
+
+
+def names_of(document: dict[str, Any], column: int) -> list[str]:
+    return [document["texts"][number] for number in document["nodes"][column]]
+
+
+async def test_a_document_has_every_node_object_observation_and_time(url: str) -> None:
+    document = await document_of(url)
+    assert names_of(document, 4) == ["", "DriveAction", "DriveAction"]
+    assert names_of(document, 6) == ["SUCCEEDED", "SUCCEEDED", "FAILED"]
+    assert names_of(document, 5)[1].endswith("speed=0.5")
+    assert [(each["name"], each["type"]) for each in document["objects"]] == [("turtle\u202e", "ROBOT")]
+    assert [each[:2] for each in document["objects"][0]["poses"][1]] == [[0.0, 0.0], [1.0, 2.0]]
+    assert [each["name"] for each in document["observations"]] == ["battery"]
+    assert document["series"] == {"battery.volts": [[document["observations"][0]["at"]], [24.5]]}
+    assert len(document["times"]) == document["episode"]["head"]
+
+
+async def test_an_object_without_a_description_is_a_point_and_the_page_gives_the_reason(url: str) -> None:
+    document = await document_of(url)
+    model = document["models"][document["objects"][0]["model"]]
+    assert "description" in model["assumed"]
+
+
+async def test_a_message_of_a_mebibyte_is_cut_and_its_length_is_in_the_page(url: str) -> None:
+    document = await document_of(url)
+    message = names_of(document, 8)[2]
+    assert len(message) < 21_000
+    assert message.endswith("more characters)")
+
+
+async def test_hostile_text_ends_no_script_and_survives_the_way_into_the_page(url: str) -> None:
+    document = await document_of(url)
+    page = page_of(document)
+    assert page.count("</script>") == 3
+    assert page.count("<script") == 3
+    assert "\u2028" not in page.partition('id="episode">')[2]
+    encoded = page.partition('id="episode">')[2].partition("</script>")[0]
+    assert msgspec.json.decode(encoded) == msgspec.json.decode(msgspec.json.encode(document))
+    assert msgspec.json.decode(encoded)["episode"]["description"] == HOSTILE
+
+
+async def test_a_window_has_the_nodes_that_run_in_it_and_the_world_before_it(url: str) -> None:
+    whole = await document_of(url)
+    second = whole["nodes"][0][2]
+    window = await document_of(url, first=second)
+    assert window["nodes"][0] == [whole["nodes"][0][0], second]
+    assert window["objects"][0]["poses"][1] == [[1.0, 2.0, 0.0, 0.0, 0.0, 0.0, 1.0]]
+    assert window["observations"] == []
+    assert (window["episode"]["first"], window["episode"]["head"]) == (second, whole["episode"]["head"])
+    early = await document_of(url, last=4)
+    assert names_of(early, 6) == ["RUNNING", "RUNNING"]
+    assert early["episode"]["last"] == 4
+
+
+async def test_an_unknown_episode_and_an_empty_window_are_refused(url: str) -> None:
+    async with Reading.open(url) as reading:
+        with pytest.raises(UnknownEpisode, match="'7'"):
+            await episode_document(reading, "7")
+        with pytest.raises(CallerError, match="none from event 99"):
+            await episode_document(reading, 1, first=99)
+        with pytest.raises(CallerError, match="none from event 3"):
+            await episode_document(reading, 1, first=3, last=2)
+
+
+async def test_a_memory_reports_a_running_episode(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path / 'memory.db'}"
+    async with Memory.open(url) as memory, memory.episode(description="still running") as episode:
+        memory.observe("battery", 24.0)
+        await memory.flush()
+        path = await memory.report(episode, tmp_path / "page.html")
+    assert path == tmp_path / "page.html"
+    assert '"status":"RUNNING"' in path.read_text()
+
+
+def test_a_track_keeps_each_change_once_and_one_value_before_the_window() -> None:
+    track = Track(10)
+    for sequence, value in ((1, 0.0), (4, 1.0), (9, 2.0), (12, 2.0), (13, 3.0), (13, 4.0), (20, 5.0)):
+        track.set(sequence, value)
+    assert track.columns() == [[9, 4, 7], [2.0, 4.0, 5.0]]
+
+
+def test_texts_are_numbered_once_and_cut_to_their_share() -> None:
+    texts = Texts()
+    assert [texts.number(each) for each in ("", "a" * 100, "b", "b")] == [0, 1, 2, 2]
+    assert texts.cut(30, shortest=1, longest=50) == ["", f"{'a' * 10}… (90 more characters)", "b"]
+
+
+URDF = """<robot name="r"><material name="red"><color rgba="1 0 0 1"/></material>
+<link name="base"><visual><origin xyz="0 0 1"/><geometry><box size="1 2 3"/></geometry>
+<material name="red"/></visual></link>
+<link name="arm"><collision><geometry><cylinder radius="0.1" length="2"/></geometry></collision></link>
+<link name="tip"/>
+<joint name="turn" type="revolute"><parent link="base"/><child link="arm"/>
+<origin xyz="0 0 2" rpy="0 0 1"/><axis xyz="0 0 1"/></joint>
+<joint name="end" type="fixed"><parent link="arm"/><child link="tip"/>
+<mimic joint="turn" multiplier="2"/></joint></robot>"""
+
+
+def described(urdf: str) -> DescriptionDeclared:
+    return DescriptionDeclared(urdf=b64encode(zlib.compress(urdf.encode())).decode())
+
+
+def test_a_model_has_the_shapes_and_joints_of_the_urdf() -> None:
+    assert object_model(described(URDF)) == {
+        "root": "base",
+        "shapes": {
+            "base": [["box", [1, 2, 3], [0, 0, 1], [0, 0, 0], [1, 0, 0, 1]]],
+            "arm": [["cylinder", [0.1, 2], [0, 0, 0], [0, 0, 0], None]],
+        },
+        "joints": [
+            ["turn", "revolute", "base", "arm", [0, 0, 2], [0, 0, 1], [0, 0, 1], None],
+            ["end", "fixed", "arm", "tip", [0, 0, 0], [0, 0, 0], [1, 0, 0], ["turn", 2, 0]],
+        ],
+    }
+
+
+@pytest.mark.parametrize(
+    "urdf", ["", "<robot", "<robot/>", URDF.replace("1 2 3", "1 2"), URDF.replace("1 2 3", "1 2 inf")]
+)
+def test_a_description_that_cannot_be_read_is_a_point(urdf: str) -> None:
+    model = object_model(described(urdf))
+    assert model["assumed"].startswith("a point, because its description cannot be read")

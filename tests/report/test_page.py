@@ -1,0 +1,162 @@
+"""The page in a real Chromium: it opens by one request and shows the episode, at any width and without WebGL."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.report.browser import Browser, Tab
+
+pytestmark = pytest.mark.slow
+
+NO_WEBGL = """
+HTMLCanvasElement.prototype.getContext = ((original) => function (kind, ...rest) {
+  return kind.startsWith("webgl") ? null : original.call(this, kind, ...rest);
+})(HTMLCanvasElement.prototype.getContext);
+"""
+
+POSE = "pycrormPage.bodies.of(pycrormPage.episode.objects.find((each) => each.name === '{}')).group.position.toArray()"
+
+
+def assert_quiet(tab: Tab, page: Path) -> None:
+    """Assert that the page wrote no error and asked for nothing but itself."""
+    assert tab.problems() == []
+    assert tab.requests() == [page.as_uri()]
+
+
+def position(tab: Tab, name: str) -> list[float]:
+    return [round(each, 2) for each in tab.ask(POSE.format(name))]
+
+
+@pytest.mark.parametrize("width", [420, 800, 1400])
+@pytest.mark.parametrize("dark", [False, True])
+def test_a_page_opens_by_one_request_and_is_no_wider_than_its_window(
+    chrome: Browser, pages: dict[str, Path], width: int, dark: bool
+) -> None:
+    with chrome.open(pages["plan"], width=width, dark=dark) as tab:
+        tab.settle()
+        assert tab.ask("document.documentElement.scrollWidth") == width
+        assert tab.ask("document.querySelectorAll('#tree .row').length") > 5
+        assert tab.ask("document.querySelector('#scene canvas').clientWidth") > 300
+        assert_quiet(tab, pages["plan"])
+
+
+def test_it_opens_at_the_last_moment_before_the_world_is_emptied(chrome: Browser, pages: dict[str, Path]) -> None:
+    with chrome.open(pages["plan"]) as tab:
+        assert tab.ask("pycrormPage.episode.presentAt(pycrormPage.event).map((each) => each.name)") == [
+            "kitchen",
+            "pr2",
+            "milk",
+            "cereal",
+        ]
+        assert position(tab, "milk") == [1.3, 0.45, 0.9]
+        assert tab.ask("pycrormPage.event") < tab.ask("pycrormPage.episode.last")
+
+
+def test_an_address_with_an_event_opens_the_page_at_that_moment(chrome: Browser, pages: dict[str, Path]) -> None:
+    with chrome.open(pages["plan"], fragment="#e10") as tab:
+        assert tab.ask("pycrormPage.event") == 10
+        assert position(tab, "milk") == [1.3, 1.0, 0.9]
+        tab.ask("location.hash = '#e12'")
+        tab.wait_for("pycrormPage.event === 12")
+
+
+def test_keys_and_the_slider_move_the_moment_and_the_address_follows(chrome: Browser, pages: dict[str, Path]) -> None:
+    with chrome.open(pages["plan"], fragment="#e10") as tab:
+        tab.press("ArrowRight")
+        tab.press("ArrowRight", modifiers=8)
+        assert tab.ask("pycrormPage.event") == 21
+        tab.press("Home")
+        assert tab.ask("pycrormPage.event") == 1
+        tab.ask("{const s = document.querySelector('input'); s.value = 30; s.dispatchEvent(new Event('input'))}")
+        assert tab.ask("pycrormPage.event") == 30
+        tab.wait_for("location.hash === '#e30'")
+        tab.press("f")
+        assert tab.ask("pycrormPage.selected.reason") == "IKError"
+        tab.press(" ", code="Space")
+        tab.wait_for("pycrormPage.event > 40")
+        tab.press(" ", code="Space")
+        assert_quiet(tab, pages["plan"])
+
+
+def test_failures_are_grouped_by_reason_with_their_count(chrome: Browser, pages: dict[str, Path]) -> None:
+    with chrome.open(pages["plan"]) as tab:
+        assert tab.ask("[...document.querySelectorAll('.failure')].map((each) => each.children[0].textContent)") == [
+            "✗ 2 × IKError"  # noqa: RUF001  the page's sign
+        ]
+        assert "4 failed from 2 causes" in tab.ask("document.getElementById('facts').textContent")
+
+
+def test_every_tab_draws(chrome: Browser, pages: dict[str, Path]) -> None:
+    with chrome.open(pages["plan"]) as tab:
+        names = tab.ask("pycrormPage.panels.tabs.map(([name]) => name)")
+        assert names == ["details", "failures", "attachments", "states"]
+        for name in names:
+            tab.ask(f"pycrormPage.panels.open('{name}')")
+            assert len(tab.ask("document.querySelector('.panel').textContent")) > 20
+        assert_quiet(tab, pages["plan"])
+
+
+def test_the_scene_is_drawn_with_forward_kinematics(chrome: Browser, pages: dict[str, Path]) -> None:
+    gripper = "pycrormPage.bodies.of(pycrormPage.episode.objects[1]).links.get('l_gripper_tool_frame')"
+    where = f"(new THREE.Vector3()).setFromMatrixPosition({gripper}.matrixWorld).toArray()"
+    with chrome.open(pages["plan"]) as tab:
+        tab.ask("pycrormPage.seek(pycrormPage.episode.attachments[0][3])")
+        held, milk = tab.ask(where), tab.ask(POSE.format("milk"))
+        assert max(abs(one - other) for one, other in zip(held, milk, strict=True)) < 0.05
+
+
+def test_a_map_takes_the_place_of_the_scene_without_webgl(chrome: Browser, pages: dict[str, Path]) -> None:
+    with chrome.open(pages["plan"], script=NO_WEBGL) as tab:
+        assert tab.ask("document.body.className") == "no-webgl"
+        assert tab.ask("document.querySelectorAll('#map polygon').length") > 20
+        assert tab.ask("[...document.querySelectorAll('#map text')].map((each) => each.textContent)") == [
+            "pr2",
+            "milk",
+            "cereal",
+        ]
+        assert_quiet(tab, pages["plan"])
+
+
+def test_print_has_the_map_all_rows_and_all_panels(chrome: Browser, pages: dict[str, Path], tmp_path: Path) -> None:
+    with chrome.open(pages["plan"], media="print") as tab:
+        tab.wait_for("document.querySelectorAll('#map polygon').length > 20")
+        rows = tab.ask("document.querySelectorAll('#tree .row').length")
+        assert rows == tab.ask("pycrormPage.tree.rows.length")
+        assert tab.ask("document.querySelectorAll('.panel h2').length") == 4
+        assert tab.print(tmp_path / "page.pdf").stat().st_size > 10_000
+        assert_quiet(tab, pages["plan"])
+
+
+def test_the_page_of_a_lost_episode_shows_the_world_at_its_last_event(chrome: Browser, pages: dict[str, Path]) -> None:
+    with chrome.open(pages["dies"]) as tab:
+        assert tab.ask("document.getElementById('status').textContent") == "? LOST"
+        assert tab.ask("pycrormPage.episode.presentAt(pycrormPage.event).length") == 4
+        assert tab.ask("pycrormPage.episode.nodes[0].status") == "LOST"
+        assert_quiet(tab, pages["dies"])
+
+
+def test_a_robot_that_is_not_the_pr2_is_drawn(chrome: Browser, pages: dict[str, Path]) -> None:
+    with chrome.open(pages["drives"]) as tab:
+        assert position(tab, "courier") == [1.0, 0.5, 0.0]
+        assert tab.ask("pycrormPage.bodies.of(pycrormPage.episode.objects[0]).links.size") > 5
+        assert_quiet(tab, pages["drives"])
+
+
+def test_recorded_text_is_never_markup(chrome: Browser, pages: dict[str, Path]) -> None:
+    description = "Bring the milk </script><b onload=alert(1)>"
+    assert pages["plan"].read_text().count("</script>") == 3
+    with chrome.open(pages["plan"]) as tab:
+        assert tab.ask("document.querySelector('h1').textContent") == description
+        assert tab.ask("document.title") == f"{description} · episode 1"
+        assert tab.ask("document.querySelectorAll('h1 b, #tree b').length") == 0
+
+
+def test_the_policy_lets_no_other_script_run(chrome: Browser, pages: dict[str, Path]) -> None:
+    with chrome.open(pages["plan"]) as tab:
+        added: Any = (
+            "{const s = document.createElement('script'); s.textContent = 'window.ran = 1'; document.body.append(s)}"
+        )
+        tab.ask(added)
+        assert tab.ask("window.ran") is None
+        assert any("Content Security Policy" in each for each in tab.problems())

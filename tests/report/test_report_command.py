@@ -1,0 +1,71 @@
+"""`pycrorm report`: the file it writes, and one line for each mistake that prevents it."""
+
+import json
+import resource
+from pathlib import Path
+
+import pytest
+
+from pycrorm_async.report.html_page import write_page
+from tests.commands import one_line_of, pycrorm
+
+pytestmark = pytest.mark.slow
+
+
+def test_the_command_prints_the_file_and_its_size(recorded: Path, tmp_path: Path) -> None:
+    done = pycrorm("report", "1", "--out", tmp_path / "a b.html", "--json", cwd=recorded)
+    assert json.loads(done.stdout) == {
+        "file": str(tmp_path / "a b.html"),
+        "bytes": (tmp_path / "a b.html").stat().st_size,
+    }
+
+
+def test_without_a_name_the_file_is_named_after_the_episode(recorded: Path) -> None:
+    done = pycrorm("report", "last", cwd=recorded)
+    assert (done.returncode, done.stdout) == (0, "episode-3.html\n")
+    assert (recorded / "episode-3.html").exists()
+
+
+def test_a_file_that_exists_is_replaced_only_when_asked(recorded: Path, tmp_path: Path) -> None:
+    file = tmp_path / "page.html"
+    file.write_text("mine")
+    done = pycrorm("report", "1", "--out", file, cwd=recorded)
+    assert done.returncode == 2
+    assert one_line_of(done) == f"pycrorm: {file} exists: add --force to replace it, or give another name"
+    assert file.read_text() == "mine"
+    assert pycrorm("report", "1", "--out", file, "--force", cwd=recorded).returncode == 0
+    assert file.read_text().startswith("<!doctype html>")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("77",), "pycrorm: there is no episode '77' (`pycrorm episodes` lists the 3 there are)"),
+        (("1", "--out", "none/page.html"), "pycrorm: the folder none does not exist: create it first"),
+        (("1", "--from", "9999", "--out", "window.html"), "and none from event 9999 to"),
+    ],
+)
+def test_mistakes_are_one_line_and_leave_no_file(recorded: Path, arguments: tuple[str, ...], message: str) -> None:
+    before = sorted(recorded.glob("*.html"))
+    done = pycrorm("report", *arguments, cwd=recorded)
+    assert done.returncode == 2
+    assert message in one_line_of(done)
+    assert sorted(recorded.glob("*.html")) == before
+
+
+def test_a_memory_that_does_not_exist_is_one_line(tmp_path: Path) -> None:
+    done = pycrorm("report", "1", cwd=tmp_path)
+    assert done.returncode == 3
+    assert "pycrorm.db" in one_line_of(done)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_disk_that_fills_leaves_no_partial_file(tmp_path: Path) -> None:
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
+    try:
+        with pytest.raises(OSError, match="File too large"):
+            write_page("x" * 100_000, tmp_path / "page.html")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert list(tmp_path.iterdir()) == []
