@@ -107,6 +107,14 @@ async def rows_read(log: EventLog, statements: list[tuple[str, Any]]) -> dict[st
             frame_of(select(PickUpWithContextView.arm).where(PickUpWithContextView.status == "SUCCEEDED")),
             id="the learning question",
         ),
+        pytest.param(
+            frame_of(select(PickUpWithContextView.arm).where(PickUpWithContextView.relative_x > 0.5)),
+            id="pick-ups by the place of the robot",
+        ),
+        pytest.param(
+            frame_of(select(PickUpWithContextView.arm).where(PickUpWithContextView.object_z > 0.5)),
+            id="pick-ups by the place in the object's frame",
+        ),
         pytest.param(rows_of(select(SpatialRelation)), id="spatial relations"),
         pytest.param(rows_of(select(Pose).join(PickUpAction.object).join(Object.pose)), id="a join"),
         pytest.param(the_tree, id="the task tree"),

@@ -15,9 +15,11 @@ from typing import Any, Self
 from sqlalchemy import Boolean, ColumnElement, FromClause, ScalarSelect, Select, Table, func, select
 from sqlalchemy.ext.compiler import compiles
 
-from pycrorm_async.projections.schema.views.joins import present, same_episode
+from pycrorm_async.projections.schema.views.joins import numbers, present, same_episode
 
 __all__ = ["pick_ups_with_context"]
+
+_POSE = "x y z qx qy qz qw"
 
 
 class _PlannerHint(ColumnElement[bool]):
@@ -55,6 +57,7 @@ def pick_ups_with_context(
     """Return the view's query. A node, its designator and its leaf row have the same id, so they join without a key
     column. `dtypes` are all dtypes that a node with a row in `picked` may have."""
     robot, place = pose.alias("robot"), pose.alias("there")
+    stands, lies = numbers(robot, _POSE), numbers(place, _POSE)
 
     def of_episode(value: ColumnElement[Any]) -> ScalarSelect[Any]:
         # A subquery, which costs nothing where the column is not selected.
@@ -68,18 +71,18 @@ def pick_ups_with_context(
             picked.c.arm,
             picked.c.grasp,
             node.c.torso_height,
-            (robot.c.x - place.c.x).label("relative_x"),
-            (robot.c.y - place.c.y).label("relative_y"),
-            robot.c.qx.label("quaternion_x"),
-            robot.c.qy.label("quaternion_y"),
-            robot.c.qz.label("quaternion_z"),
-            robot.c.qw.label("quaternion_w"),
+            (stands.x - lies.x).label("relative_x"),
+            (stands.y - lies.y).label("relative_y"),
+            stands.qx.label("quaternion_x"),
+            stands.qy.label("quaternion_y"),
+            stands.qz.label("quaternion_z"),
+            stands.qw.label("quaternion_w"),
             object_.c.obj_type,
             node.c.status,
             node.c.process_metadata_id,
             node.c.id.label("node_id"),
-            *_seen_from(place.c, robot.c),
-            (place.c.z - robot.c.z - node.c.torso_height).label("height_over_torso"),
+            *_seen_from(lies, stands),
+            (lies.z - stands.z - node.c.torso_height).label("height_over_torso"),
             node.c.robot,
             of_episode(episode.c.description).label("description"),
             of_episode(world).label("scene"),
