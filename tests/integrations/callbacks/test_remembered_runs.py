@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from langgraph.graph import START, MessagesState, StateGraph
 from langgraph.types import interrupt
 
 from pycrorm_async import Memory, Settings
+from pycrorm_async.integrations import callbacks
 from pycrorm_async.integrations.callbacks import RememberedRuns
 from pycrorm_async.plan.failures import NavigationGoalNotReached
 from tests.databases import ask
@@ -216,3 +218,11 @@ def test_a_handler_used_after_its_block_and_after_its_memory_disturbs_no_run(tmp
         assert memory.status.faults.total == 1
     assert step.invoke(3, {"callbacks": [runs]}) == 3
     assert len(nodes(tmp_path)) == 1
+
+
+def test_the_example_of_the_readme_is_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    page = Path(callbacks.__file__).with_name("README.md").read_text()
+    [example] = [each for each in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "RememberedRuns" in each]
+    monkeypatch.chdir(tmp_path)
+    exec(example, {})
+    assert ask(tmp_path / "agent.db", "SELECT object_name FROM pick_up") == [("milk",)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -478,3 +479,12 @@ def test_a_killed_tree_keeps_what_its_ticks_announced(tmp_path: Path) -> None:
         ("is near", "job", "SUCCEEDED"),
         ("drive", "job", "LOST"),
     ]
+
+
+def test_the_example_of_the_readme_is_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    page = Path(integration.__file__).with_name("README.md").read_text()
+    [example] = [each for each in re.findall(r"```python\n(.*?)```", page, re.DOTALL) if "RememberedTree" in each]
+    monkeypatch.chdir(tmp_path)
+    exec(example, {})
+    rows = ask(tmp_path / "trees.db", "SELECT dtype, status FROM designator ORDER BY id")
+    assert rows[0] == ("TickCounter", "SUCCEEDED")
