@@ -14,7 +14,8 @@ When the frame starts, it decrements the count and empties the list, which remov
 cannot run any more. A coroutine that is closed or cancelled before its start drops its frame while the coroutine itself
 still exists; the list and the reference vanish with the frame, and no callback runs. That is correct, because such a
 coroutine was awaited or handed to a task. Only a coroutine that is garbage collected without a start has its frame
-until the end; then the weak reference outlives the coroutine, and its callback reports the missing `await`.
+until the end; then the weak reference outlives the coroutine, and its callback reports the missing `await`. Python 3.12
+and 3.13 keep the frame of a coroutine that is closed by `close()` before its start, so there that call is reported too.
 
 At the end of an episode some coroutines may still be referenced and not started. If `waiting` is not 0, `close`
 searches the objects of the process for coroutines that have not started and belong to this episode, and reports those
