@@ -10,7 +10,6 @@ It needs no file but the database: each object is made from its recorded descrip
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -32,7 +31,7 @@ from pycrorm_async.world.pose import Vector
 from pycrorm_async.world.queries.bounding_boxes import BoundingBox
 from pycrorm_async.world.robots.robot_description import robot_description
 
-__all__ = ["world_of", "RecordedWorld"]
+__all__ = ["world_of", "built_in_that_fits", "RecordedWorld"]
 
 
 class RecordedWorld(BulletWorld):
@@ -163,10 +162,9 @@ def _shape(then: ObjectThen, world: WorldThen) -> _Shape:
     links = {each.link for each in world.attachments if each.parent == then.name and each.link is not None}
     if then.base_link is not None:
         links.add(then.base_link)
-    with contextlib.suppress(DescriptionNotLoadable):  # no robot or environment of that name is built in
-        built_in = built_in_urdf(then.name, _object_type(then))
-        if _fits(built_in, set(then.joints), links):
-            return _Shape(built_in, f"the built-in shape, because {reason}")
+    built_in = built_in_that_fits(then.name, _object_type(then), joints=set(then.joints), links=links)
+    if built_in is not None:
+        return _Shape(built_in, f"the built-in shape, because {reason}")
     point = point_urdf(then.name, joints=sorted(then.joints), links=sorted(links))
     return _Shape(point, f"a point, because {reason}", is_point=True)
 
@@ -183,7 +181,13 @@ def _recorded_shape(description: DescriptionDeclared, contents: Mapping[str, byt
     return _Shape(urdf, meshes={each.reference: f"{each.sha256}{Path(each.name).suffix}" for each in present})
 
 
-def _fits(urdf: str, joints: set[str], links: set[str]) -> bool:
+def built_in_that_fits(name: str, object_type: ObjectType, *, joints: set[str], links: set[str]) -> str | None:
+    """Return the built-in URDF for a name and a type if it has these joints and links, otherwise None."""
+    try:
+        urdf = built_in_urdf(name, object_type)
+    except DescriptionNotLoadable:  # no robot or environment of that name is built in
+        return None
     robot = fromstring(urdf)  # noqa: S314  our own text
     movable = {each.get("name") for each in robot.iter("joint") if each.get("type") != "fixed"}
-    return joints <= movable and links <= {each.get("name") for each in robot.iter("link")}
+    fits = joints <= movable and links <= {each.get("name") for each in robot.iter("link")}
+    return urdf if fits else None

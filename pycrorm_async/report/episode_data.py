@@ -22,6 +22,7 @@ from pycrorm_async.events.types import (
     LocationResolved,
     NodeEnded,
     NodeStarted,
+    ObjectAdded,
     ObjectDetected,
     Observed,
 )
@@ -29,7 +30,7 @@ from pycrorm_async.projections.fold.fold import CannotFold, happening_of
 from pycrorm_async.query.as_of import unreadable
 from pycrorm_async.query.parameter_text import parameters_text
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.report.object_model import object_model, point_model
+from pycrorm_async.report.object_model import assumed_model, object_model, point_model
 from pycrorm_async.report.recorded_objects import WorldFold
 from pycrorm_async.report.tracks import Texts, Track, rounded
 from pycrorm_async.store.episode_lookup import episode_named
@@ -196,7 +197,7 @@ class EpisodeFold:
             "id": identity,
             "name": added.name,
             "type": added.object_type,
-            "model": added.description if added.description in designs else "",
+            "model": _model_name(added) if _model_name(added) in designs else "",
             "color": added.color,
             "base_link": added.base_link,
             "removed": each.removed or 0,
@@ -251,7 +252,16 @@ async def _models(log: EventLog, fold: EpisodeFold) -> dict[str, Any]:
             models[name] = object_model(description_of(payload))
         except ValueError as error:
             models[name] = point_model(f"its description cannot be read: {error}")
+    for each in fold.world.objects.values():
+        name = _model_name(each.added)
+        if each.added.description is None and name not in models:
+            models[name] = assumed_model(each.added.name, each.added.object_type, set(each.joints))
     return models
+
+
+def _model_name(added: ObjectAdded) -> str:
+    """Return the name of an object's model: its fingerprint, or for an assumed one what the assumption rests on."""
+    return added.description or f"{added.object_type} {added.name}"
 
 
 def _detection(sequence: int, detected: ObjectDetected) -> dict[str, Any]:

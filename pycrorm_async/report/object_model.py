@@ -11,11 +11,13 @@ from typing import Any
 from xml.etree.ElementTree import Element, ParseError, fromstring
 
 from pycrorm_async.events.types import DescriptionDeclared
+from pycrorm_async.query.recorded_world import built_in_that_fits
+from pycrorm_async.world.enums import ObjectType
 from pycrorm_async.world.models.mesh_boxes import with_boxes
 from pycrorm_async.world.pose import Vector
 from pycrorm_async.world.queries.bounding_boxes import BoundingBox
 
-__all__ = ["object_model", "point_model"]
+__all__ = ["object_model", "assumed_model", "point_model"]
 
 _POINT: dict[str, Any] = {"root": "", "shapes": {"": [["sphere", [0.03], [0, 0, 0], [0, 0, 0], [1, 0, 1, 1]]]}}
 
@@ -37,6 +39,16 @@ def object_model(description: DescriptionDeclared) -> dict[str, Any]:
         return _model(fromstring(_without_meshes(description)))  # noqa: S314  a memory has recorded it
     except (ValueError, ParseError) as error:
         return point_model(f"its description cannot be read: {error}")
+
+
+def assumed_model(name: str, object_type: str, joints: set[str]) -> dict[str, Any]:
+    """Return the model of an object without a recorded description: the built-in shape if it fits, or a point."""
+    reason = "its description was not recorded"
+    if object_type in ObjectType.__members__:
+        urdf = built_in_that_fits(name, ObjectType[object_type], joints=joints, links=set())
+        if urdf is not None:
+            return {**_model(fromstring(urdf)), "assumed": f"the built-in shape, because {reason}"}  # noqa: S314  our own
+    return point_model(reason)
 
 
 def _without_meshes(description: DescriptionDeclared) -> str:

@@ -69,7 +69,7 @@ async def test_a_document_has_every_node_object_observation_and_time(url: str) -
 async def test_an_object_without_a_description_is_a_point_and_the_page_gives_the_reason(url: str) -> None:
     document = await document_of(url)
     model = document["models"][document["objects"][0]["model"]]
-    assert "description" in model["assumed"]
+    assert model["assumed"] == "a point, because its description was not recorded"
 
 
 async def test_a_message_of_a_mebibyte_is_cut_and_its_length_is_in_the_page(url: str) -> None:
@@ -171,3 +171,17 @@ def test_a_model_has_the_shapes_and_joints_of_the_urdf() -> None:
 def test_a_description_that_cannot_be_read_is_a_point(urdf: str) -> None:
     model = object_model(described(urdf))
     assert model["assumed"].startswith("a point, because its description cannot be read")
+
+
+async def test_an_object_without_a_description_that_a_built_in_one_fits_has_its_shape(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path / 'memory.db'}"
+    with Memory.sync(url) as memory:
+        with memory.recording.episode(description="two robots") as episode:
+            episode.object_added("one", "pr2", "ROBOT", Pose([0, 0, 0]), joints={"torso_lift_joint": 0.2})
+            episode.object_added("two", "courier", "ROBOT", Pose([0, 0, 0]), joints={"no_such_joint": 0.2})
+        memory.flush()
+    document = await document_of(url)
+    one, two = (document["models"][each["model"]] for each in document["objects"])
+    assert one["assumed"] == "the built-in shape, because its description was not recorded"
+    assert len(one["shapes"]) > 10
+    assert two["assumed"].startswith("a point")

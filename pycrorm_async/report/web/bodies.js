@@ -1,5 +1,7 @@
 // Builds each object as nested groups, one for each link, so that setting joints and a pose is forward kinematics.
 
+import { lastUpTo } from "./episode.js";
+
 const GREY = [0.62, 0.64, 0.68, 1];
 
 export class Body {
@@ -112,7 +114,7 @@ export function pathsOf(episode, node) {
   const paths = [];
   for (const object of episode.objects) {
     const { at, values } = object.poses;
-    const points = values.filter((_, index) => at[index] <= node.lastEvent && (at[index + 1] ?? Infinity) > node.start);
+    const points = values.slice(Math.max(0, lastUpTo(at, node.start)), lastUpTo(at, node.lastEvent) + 1);
     const moved = points.filter((each, index) => index === 0 || distance(each, points[index - 1]) > 1e-3);
     if (moved.length > 1) paths.push({ object, color: COLORS[paths.length % COLORS.length], points: moved.slice(-400) });
   }

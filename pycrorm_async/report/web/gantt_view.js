@@ -63,7 +63,7 @@ export class GanttView {
     turned.preventDefault();
     const [from, to] = this.window;
     const [low, high] = this.#all();
-    const here = from + ((turned.offsetX - PAD_PX) / this.#width()) * (to - from);
+    const here = from + ((turned.offsetX - PAD_PX) / this.width) * (to - from);
     const factor = turned.deltaY > 0 ? 1.25 : 0.8;
     const narrowest = this.byTime ? 1e-5 : 4;
     if ((to - from) * factor < narrowest) return;
@@ -74,18 +74,14 @@ export class GanttView {
     return this.byTime ? this.episode.secondsAt(event) : event;
   }
 
-  #width() {
-    return this.holder.clientWidth - 2 * PAD_PX;
-  }
-
   #xOf(event) {
     const [from, to] = this.window;
-    return PAD_PX + ((this.#position(event) - from) / (to - from)) * this.#width();
+    return PAD_PX + ((this.#position(event) - from) / (to - from)) * this.width;
   }
 
   #eventAt(x) {
     const [from, to] = this.window;
-    const here = from + (Math.min(Math.max(x - PAD_PX, 0), this.#width()) / this.#width()) * (to - from);
+    const here = from + (Math.min(Math.max(x - PAD_PX, 0), this.width) / this.width) * (to - from);
     return this.byTime ? this.episode.eventAt(here) : Math.round(here);
   }
 
@@ -100,6 +96,7 @@ export class GanttView {
   draw() {
     const width = this.holder.clientWidth;
     if (width === 0) return;
+    this.width = width - 2 * PAD_PX;
     const height = this.lanes.nodes.length * LANE_PX + AXIS_PX;
     const ratio = window.devicePixelRatio || 1;
     Object.assign(this.canvas, { width: width * ratio, height: height * ratio });
@@ -118,32 +115,52 @@ export class GanttView {
   }
 
   #drawLane(pen, nodes, y, colors) {
-    let drawnTo = -1;
-    let drawnBad = false;
+    const narrow = new Map();
     for (const node of nodes) {
       const left = Math.max(this.#xOf(node.start), PAD_PX);
-      const right = Math.min(this.#xOf(node.lastEvent), this.holder.clientWidth - PAD_PX);
-      if (right < PAD_PX || left > this.holder.clientWidth - PAD_PX) continue;
-      const bad = FAILED.has(node.status);
-      if (right < drawnTo + 0.7 && (!bad || drawnBad)) continue;
-      const color = colors[{ SUCCEEDED: "good", RUNNING: "run" }[node.status] ?? (bad ? "bad" : "odd")];
-      const wide = Math.max(right - left - 1, 1);
-      const later = node.start > (this.event ?? Infinity);
-      pen.globalAlpha = later ? 0.35 : 1;
-      pen.fillStyle = color;
-      pen.fillRect(left, y + 1, wide, LANE_PX - 3);
-      if (bad && wide > 3) this.#hatch(pen, left, y + 1, wide, LANE_PX - 3, colors["on-bar"]);
-      if (node === this.selected) {
-        pen.strokeStyle = colors.ink;
-        pen.lineWidth = 2;
-        pen.strokeRect(left, y + 1, wide, LANE_PX - 3);
-      }
-      pen.globalAlpha = 1;
-      const ink = later ? colors.ink : colors["on-bar"];
-      if (wide > 24) this.#write(pen, `${bad ? "✗ " : ""}${node.name}`, left + 4, y + LANE_PX / 2, wide - 6, ink);
-      drawnTo = right;
-      drawnBad = bad;
+      const right = Math.min(this.#xOf(node.lastEvent), PAD_PX + this.width);
+      if (right < PAD_PX) continue;
+      if (left > PAD_PX + this.width) break;
+      if (right - left < 1) {
+        const column = Math.floor(left);
+        const [all, bad, start] = narrow.get(column) ?? [0, 0, node.start];
+        narrow.set(column, [all + 1, bad + FAILED.has(node.status), start]);
+      } else this.#drawBar(pen, node, left, right, y, colors);
     }
+    this.#drawNarrow(pen, narrow, y, colors);
+  }
+
+  /** One column of a pixel for many nodes: the red part is the share of them that failed. */
+  #drawNarrow(pen, columns, y, colors) {
+    const height = LANE_PX - 3;
+    for (const [x, [all, bad, start]] of columns) {
+      pen.globalAlpha = start > (this.event ?? Infinity) ? 0.35 : 1;
+      pen.fillStyle = colors.good;
+      pen.fillRect(x, y + 1, 1, height);
+      if (bad === 0) continue;
+      const share = Math.max(3, (bad / all) * height);
+      pen.fillStyle = colors.bad;
+      pen.fillRect(x, y + 1 + height - share, 1, share);
+    }
+    pen.globalAlpha = 1;
+  }
+
+  #drawBar(pen, node, left, right, y, colors) {
+    const bad = FAILED.has(node.status);
+    const later = node.start > (this.event ?? Infinity);
+    const wide = Math.max(right - left - 1, 1);
+    pen.globalAlpha = later ? 0.35 : 1;
+    pen.fillStyle = colors[{ SUCCEEDED: "good", RUNNING: "run" }[node.status] ?? (bad ? "bad" : "odd")];
+    pen.fillRect(left, y + 1, wide, LANE_PX - 3);
+    if (bad && wide > 3) this.#hatch(pen, left, y + 1, wide, LANE_PX - 3, colors["on-bar"]);
+    pen.globalAlpha = 1;
+    if (node === this.selected) {
+      pen.strokeStyle = colors.ink;
+      pen.lineWidth = 2;
+      pen.strokeRect(left, y + 1, wide, LANE_PX - 3);
+    }
+    const ink = later ? colors.ink : colors["on-bar"];
+    if (wide > 24) this.#write(pen, `${bad ? "✗ " : ""}${node.name}`, left + 4, y + LANE_PX / 2, wide - 6, ink);
   }
 
   #hatch(pen, x, y, width, height, color) {
@@ -175,13 +192,13 @@ export class GanttView {
 
   #drawAxis(pen, height, colors) {
     const [from, to] = this.window;
-    const count = Math.max(2, Math.floor(this.#width() / 110));
+    const count = Math.max(2, Math.floor(this.width / 110));
     pen.fillStyle = colors.quiet;
     for (let index = 0; index <= count; index++) {
       const here = from + ((to - from) * index) / count;
       pen.textAlign = index === 0 ? "left" : index === count ? "right" : "center";
       const text = this.byTime ? duration(here) : `e${Math.round(here)}`;
-      pen.fillText(text, PAD_PX + (this.#width() * index) / count, height - AXIS_PX / 2 + 2);
+      pen.fillText(text, PAD_PX + (this.width * index) / count, height - AXIS_PX / 2 + 2);
     }
     pen.textAlign = "left";
   }

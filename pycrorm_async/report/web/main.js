@@ -83,7 +83,7 @@ class Page {
     this.slider.addEventListener("input", () => this.seek(Number(this.slider.value)));
     this.clock = element("output", { class: "clock" });
     this.axis = element("button", { type: "button", title: "axis of the chart (A)", onclick: () => this.#changeAxis() }, "by event");
-    const help = element("button", { type: "button", title: HELP, "aria-label": HELP, onclick: () => this.#help() }, "?");
+    const help = element("button", { type: "button", class: "help", title: HELP, "aria-label": HELP, onclick: () => this.#help() }, "?");
     part("controls").append(this.play, this.slider, this.clock, this.axis, help);
   }
 

@@ -30,7 +30,6 @@ export class SceneView {
     this.paths = new THREE.Group();
     this.scene.add(this.world, this.paths);
     this.paint();
-    this.#frame();
     new ResizeObserver(() => this.#resize()).observe(holder);
   }
 
@@ -75,11 +74,15 @@ export class SceneView {
   #frame() {
     const box = new THREE.Box3();
     for (const each of this.bodies.at(this.episode.opens)) box.expandByObject(each.group);
+    if (this.event !== undefined) this.bodies.at(this.event);
     if (box.isEmpty()) box.expandByPoint(new THREE.Vector3(-1, -1, 0)).expandByPoint(new THREE.Vector3(1, 1, 1));
     const middle = box.getCenter(new THREE.Vector3());
     const reach = Math.max(box.getSize(new THREE.Vector3()).length() / 2, 0.6);
+    const upright = (this.camera.fov * Math.PI) / 360;
+    const narrowest = Math.min(upright, Math.atan(Math.tan(upright) * this.camera.aspect));
+    const away = new THREE.Vector3(-1.3, -1.1, 1.05).setLength((0.9 * reach) / Math.sin(narrowest));
     this.controls.target.copy(middle);
-    this.camera.position.copy(middle).add(new THREE.Vector3(-1.3, -1.1, 1.05).multiplyScalar(reach));
+    this.camera.position.copy(middle).add(away);
     this.controls.update();
   }
 
@@ -89,6 +92,8 @@ export class SceneView {
     this.renderer.setSize(width, height);
     this.camera.aspect = width / height;
     this.camera.updateProjectionMatrix();
+    if (!this.framed) this.#frame();
+    this.framed = true;
     this.#render();
   }
 

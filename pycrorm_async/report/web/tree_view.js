@@ -32,7 +32,7 @@ export class TreeView {
       return;
     }
     for (const each of nodes) if (each.parent === null) this.open.add(each);
-    let rows = this.#countRows();
+    let rows = 0;
     for (const failure of this.episode.rootFailures) {
       for (let each = failure.parent; each !== null && !this.open.has(each); each = each.parent) {
         this.open.add(each);
@@ -40,10 +40,6 @@ export class TreeView {
       }
       if (rows > OPEN_MAX) break;
     }
-  }
-
-  #countRows() {
-    return [...this.open].reduce((sum, each) => sum + each.children.length, 0);
   }
 
   #list() {
