@@ -1,0 +1,137 @@
+"""Measure how much CPU time of its thread a plan of PyCRAM takes with and without this memory.
+
+    .venv-pycram/bin/python -m bench.pycram            25 pairs for each writer, about five minutes
+    .venv-pycram/bin/python -m bench.pycram --quick    two pairs
+
+`python -m tests.integrations.pycram.environment` makes that environment. A plan of 19 nodes (park, raise the torso,
+pick up, drive, place) is performed twice inside `remember` and twice without, in pairs of alternating order. The first
+plan also declares the types of its nodes, which happens once; opening and closing the memory is not measured. The
+measurement is `time.thread_time` of the plan's thread: wall times would say nothing, because PyCRAM sleeps and other
+programs run. `daemon`: no daemon drains the spool, which a process of its own would do. `thread`: the tables are made
+when the block ends, which is the default of `remember`; `idle`: whenever the plan is idle. The script prints one JSON
+line: CPU of a plan in ms, the median ratio of a pair, its quartiles, and the median difference.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import json
+import os
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
+from typing import Any
+
+from tests.integrations.pycram.headless import leave_out_mesh_checks, start_pycram
+
+_PAIRS = 25
+
+
+def measure(folder: Path, pairs: int) -> dict[str, Any]:
+    """Measure all writers in one process and world."""
+    worlds = start_pycram(folder / "home")
+    from pycram.process_module import simulated_robot
+
+    from pycrorm_async.integrations.pycram import remember
+    from pycrorm_async.settings import Settings
+
+    leave_out_mesh_checks()
+    make_world(worlds)
+    kinds: dict[str, dict[str, Any]] = {
+        "daemon": {"writer": "daemon"},
+        "thread": {"writer": "thread"},
+        "idle": {"writer": "thread", "settings": Settings()},
+    }
+    result: dict[str, Any] = {"pairs": pairs}
+    with simulated_robot:
+        for name, arguments in kinds.items():
+            url = f"sqlite:///{folder / name}.db"
+
+            def remembered(url: str = url, arguments: dict[str, Any] = arguments) -> AbstractContextManager[Any]:
+                return remember(url, description="bench", **arguments)
+
+            result[name] = compare(remembered, pairs)
+    return result
+
+
+def compare(remembered: Callable[[], AbstractContextManager[Any]], pairs: int) -> dict[str, Any]:
+    """Return the CPU time of the first and of the second plan of a block, with and without a memory."""
+    measured: dict[bool, list[tuple[float, float]]] = {True: [], False: []}
+    for number in range(pairs):
+        for inside in (True, False) if number % 2 else (False, True):
+            with remembered() if inside else nullcontext():
+                measured[inside].append((perform(), perform()))
+    figures = {}
+    for place, name in enumerate(("first", "second")):
+        with_ms, without_ms = ([each[place] for each in measured[inside]] for inside in (True, False))
+        ratios = [one / other for one, other in zip(with_ms, without_ms, strict=True)]
+        more_ms = [one - other for one, other in zip(with_ms, without_ms, strict=True)]
+        figures[name] = {
+            "without_ms": round(statistics.median(without_ms), 1),
+            "ratio": round(statistics.median(ratios), 3),
+            "ratio_quartiles": [round(each, 3) for each in statistics.quantiles(ratios, n=4)[::2]],
+            "more_ms": round(statistics.median(more_ms), 2),
+        }
+    return figures
+
+
+def make_world(worlds: Any) -> None:
+    from pycram.datastructures.pose import PoseStamped
+    from pycram.world_concepts.world_object import Object
+    from pycrap.ontologies import Milk, Robot
+
+    worlds.BulletWorld()
+    Object("pr2", Robot, "pr2.urdf")
+    Object("milk", Milk, "milk.urdf", pose=PoseStamped.from_list([0.8, 0, 0.9]))
+
+
+def perform() -> float:
+    """Perform the plan from the same state; return the CPU time of this thread, ms."""
+    from pycram.datastructures.enums import Arms, Grasp, TorsoState
+    from pycram.datastructures.pose import GraspDescription, PoseStamped
+    from pycram.datastructures.world import World
+    from pycram.designator import ActionDescription
+    from pycram.designators import action_designator as actions
+    from pycram.language import SequentialPlan
+
+    for action in (ActionDescription, *ActionDescription.__subclasses__()):
+        vars(action).get("_pre_perform_callbacks", []).clear()  # they grow with every action, and each action calls all
+    milk, robot = World.current_world.get_object_by_name("milk"), World.robot
+    robot.set_pose(PoseStamped.from_list([0, 0, 0]))
+    milk.set_pose(PoseStamped.from_list([0.8, 0, 0.9]))
+    plan = SequentialPlan(
+        actions.ParkArmsActionDescription(Arms.BOTH),
+        actions.MoveTorsoActionDescription(TorsoState.HIGH),
+        actions.PickUpActionDescription(milk, Arms.LEFT, GraspDescription(Grasp.FRONT, None, False)),
+        actions.NavigateActionDescription(PoseStamped.from_list([0.1, 0.2, 0]), True),
+        actions.PlaceActionDescription(milk, PoseStamped.from_list([0.9, 0.2, 0.85]), Arms.LEFT),
+    )
+    gc.collect()  # otherwise the plan would pay for what opening a memory leaves
+    before = time.thread_time()
+    plan.perform()
+    return (time.thread_time() - before) * 1_000
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true")
+    pairs = 2 if parser.parse_args().quick else _PAIRS
+    code = 1
+    try:
+        with tempfile.TemporaryDirectory(prefix="pycram_bench_") as folder:
+            line = measure(Path(folder), pairs)
+        print(json.dumps({"command": "python -m bench.pycram" + (" --quick" if pairs == 2 else ""), **line}))
+        code = 0
+    finally:  # PyCRAM's threads do not end
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(code)
+
+
+if __name__ == "__main__":
+    main()
