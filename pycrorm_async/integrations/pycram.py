@@ -185,10 +185,11 @@ class _PyCRAMPlans:
             dtype = type_.__name__.removesuffix("Node")
             declared = self._types[type_] = self.seams.recording.type(node.kind, dtype, fields, bases=bases)
         episode = node.episode
+        # The pose of an action is asked of the world, which physics may have changed; a motion follows at once.
+        is_fresh = node.kind == "action" or episode is not self._episodes.real
+        robot = self._values.robot(episode) if is_fresh else self._values.robot_key()
         episode.wait_for_room()
-        episode.start(
-            node.key, declared, values, parent=self._episodes.cause(episode), robot=self._values.robot(episode)
-        )
+        episode.start(node.key, declared, values, parent=self._episodes.cause(episode), robot=robot)
 
     def _end(
         self, node: RunningNode, status: NodeStatus, failure: BaseException | None = None, result: Any = None
@@ -214,7 +215,11 @@ class _PyCRAMPlans:
             return call()
         finally:
             if len(self._thread.nodes) > running:
-                self._finish(self._thread.nodes[running], sys.exception())
+                self._end_unreported(self._thread.nodes[running], sys.exception())
+
+    @guarded
+    def _end_unreported(self, node: RunningNode, failure: BaseException | None) -> None:
+        self._end(node, self._values.status(failure) if failure is not None else "ERROR", failure)
 
     def _nested_action(self, call: Callable[[], Any], action: Any) -> Any:
         nodes = self._thread.nodes
@@ -258,11 +263,12 @@ class _PyCRAMPlans:
     def _branch(self, call: Callable[[], Any], parallel: Any, _child: Any) -> Any:
         """Perform a branch below the parallel node, in the thread of the branch."""
         nodes, node = self._thread.nodes, self._parallel.get(id(parallel))
+        running = len(nodes)
         nodes += [node] if node is not None else []
         try:
             return call()
         finally:
-            nodes.clear()
+            del nodes[running:]
 
     def _leave_prospection(self, call: Callable[[], Any], context: Any, *exception: Any) -> Any:
         is_outermost = context.prev_world is not None

@@ -27,6 +27,7 @@ PyCRAM = Any
 _USED: Final = {
     "plan": "Plan ActionNode ResolvedActionNode MotionNode",
     "language": "CodeNode MonitorNode ParallelNode RepeatNode SequentialNode TryAllNode TryInOrderNode",
+    "designators.action_designator": "MoveTorsoAction",
     "designator": "ActionDescription BaseMotion ObjectDesignatorDescription",
     "description": "Link",
     "failures": "PlanFailure",
@@ -85,7 +86,16 @@ class PyCRAMValues:
         if not isinstance(designator, used.ActionDescription | used.BaseMotion):
             return {}
         values = {each.name: getattr(designator, each.name) for each in _fields(type(designator))}
+        if isinstance(designator, used.MoveTorsoAction):
+            values["position"] = self._torso_goal(designator)
         return _with_grasp(values)
+
+    def _torso_goal(self, action: Any) -> float | None:
+        """Return the goal of the torso joint, m, which PyCRAM's action names by a state."""
+        description = self.pycram.RobotDescription.current_robot_description
+        joints = description.get_static_joint_chain("torso", action.torso_state) or {}
+        goal = joints.get(description.torso_joint)
+        return float(goal) if goal is not None else None
 
     def options(self, node: Any) -> dict[str, Any]:
         """Return those parameters of an unresolved action that have one value only."""
@@ -98,7 +108,7 @@ class PyCRAMValues:
             hints = typing.get_type_hints(designator)
         except Exception:  # noqa: BLE001  an annotation may name what its module does not import
             hints = {}
-        hints |= {"grasp": Enum, "approach_direction": Enum, "rotate_gripper": bool}
+        hints = {"position": float} | hints | {"grasp": Enum, "approach_direction": Enum, "rotate_gripper": bool}
         return {name: self._field_type(hints.get(name, type(each)), each) for name, each in values.items()}
 
     def _field_type(self, hint: Any, value: Any) -> FieldSpec:
@@ -200,15 +210,19 @@ class PyCRAMValues:
             "torso_joint": (robot.torso_joint or None) if robot is not None else None,
         }
 
+    def robot_key(self) -> Hashable | None:
+        """Return the key of PyCRAM's robot; None without one."""
+        robot = self.pycram.World.robot
+        return self.key(robot) if robot is not None else None
+
     def robot(self, episode: RecordedEpisode) -> RobotValue | None:
         """Return the state of PyCRAM's robot, which acts also in the prospection world; None without one."""
         robot, description = self.pycram.World.robot, self.pycram.RobotDescription.current_robot_description
         if robot is None:
             return None
-        torso = robot.get_joint_position(description.torso_joint) if description.torso_joint in robot.joints else None
-        reference = episode.reference(self.key(robot))
-        torso_m = float(torso) if torso is not None else None
-        return RobotValue(self.pose(robot.pose), "ROBOT", torso_m, reference, robot.name)
+        torso = robot.joints.get(description.torso_joint) if description is not None else None
+        torso_m = float(torso.position) if torso is not None else None
+        return RobotValue(self.pose(robot.pose), "ROBOT", torso_m, episode.reference(self.key(robot)), robot.name)
 
 
 def _function_name(function: Any) -> str:

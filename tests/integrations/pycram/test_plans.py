@@ -209,6 +209,10 @@ async def test_the_view_of_pick_ups_answers_about_plans_of_pycram(run: Run) -> N
     }
 
 
+def test_the_goal_of_the_torso_is_in_metres_as_in_this_packages_own_action(run: Run) -> None:
+    assert run.rows("pick_and_place", "SELECT torso_state, position FROM move_torso_action") == [("HIGH", 0.3)]
+
+
 def test_all_motions_of_parallel_branches_are_stored_below_their_own_actions(run: Run) -> None:
     assert run.rows("parallel_branches", "SELECT count(*) FROM task_tree_node WHERE dtype = 'MoveGripperMotion'") == [
         (60,)
