@@ -38,7 +38,7 @@ class RememberedRuns(BaseCallbackHandler):
         episode: the `RecordedEpisode`, whose keys of nodes are the ids of runs. The arguments are those of its making.
     """
 
-    run_inline = True  # in the task of the run, because the order of events is the order of their reports
+    run_inline = True  # asynchronous runs would else hand each event to a thread, which takes longer than recording it
 
     def __init__(self, recording: Recording, **episode: Any) -> None:
         self._recording = recording

@@ -14,7 +14,7 @@ from langchain_core.documents import Document
 from langchain_core.messages import AIMessage
 from langchain_core.retrievers import BaseRetriever
 from langchain_core.runnables import RunnableLambda, RunnableParallel
-from langchain_core.tools import tool
+from langchain_core.tools import ToolException, tool
 from langgraph.checkpoint.memory import InMemorySaver
 from langgraph.graph import START, MessagesState, StateGraph
 from langgraph.types import interrupt
@@ -26,6 +26,8 @@ from pycrorm_async.plan.failures import NavigationGoalNotReached
 from tests.databases import ask
 from tests.integrations.callbacks.agents import agent, call, pick_up, request
 from tests.recording.recorded_memory import assert_verified, nodes, url_of
+
+pytestmark = pytest.mark.slow
 
 BRING_MILK = [
     AIMessage("", tool_calls=[call("pick_up", "1", object_name="milk", force_n=5), call("drive", "2", place=[1, 2.5])]),
@@ -137,6 +139,19 @@ def test_a_plan_failure_in_a_tool_is_a_failure_and_no_error(tmp_path: Path) -> N
 
     remembered(tmp_path, run)
     assert nodes(tmp_path) == [("navigate", None, "FAILED", "kitchen is blocked")]
+
+
+def test_a_tool_that_answers_with_an_error_has_failed(tmp_path: Path) -> None:
+    @tool
+    def grasp(object_name: str) -> str:
+        """Grasp an object."""
+        raise ToolException(f"{object_name} is slippery")
+
+    grasp.handle_tool_error = True
+    slippery = {"type": "tool_call", **call("grasp", "1", object_name="soap")}
+    remembered(tmp_path, lambda runs: grasp.invoke(slippery, {"callbacks": [runs]}))
+    (row,) = ask(tmp_path / "memory.db", "SELECT status, result FROM grasp JOIN task_tree_node USING (id)")
+    assert (row[0], json.loads(row[1])["content"]) == ("FAILED", "soap is slippery")
 
 
 def test_a_graph_that_waits_for_a_human_is_interrupted(tmp_path: Path) -> None:

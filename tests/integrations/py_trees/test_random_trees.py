@@ -18,6 +18,8 @@ from tests.databases import ask
 from tests.integrations.py_trees.behaviours import FAILURE, RUNNING, SUCCESS, Visits, parallel, selector, sequence, tree
 from tests.recording.recorded_memory import assert_verified, url_of
 
+pytestmark = pytest.mark.slow
+
 _TICKS = 40
 
 

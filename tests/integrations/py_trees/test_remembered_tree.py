@@ -37,6 +37,8 @@ from tests.integrations.py_trees.behaviours import (
 )
 from tests.recording.recorded_memory import assert_verified, url_of
 
+pytestmark = pytest.mark.slow
+
 PATIENT_S = 60.0
 """The time of an instant tick: a busy machine must not turn a check into work."""
 
@@ -430,6 +432,18 @@ def test_a_tree_can_be_remembered_again_in_a_second_episode(tmp_path: Path) -> N
         ask(tmp_path / "memory.db", "SELECT description, status FROM process_metadata") == [("twice", "SUCCEEDED")] * 2
     )
     assert [each[0] for each in nodes(tmp_path)] == ["look", "look"]
+
+
+def test_a_tree_that_runs_for_long_continues_in_follow_up_episodes(tmp_path: Path) -> None:
+    ticked = tree(parallel("both", Scripted("drive", named("R")), Condition("sees milk", named("RS" * 300))))
+    settings = Settings(fold="at_end", episode_events_max=200)
+    with Memory.sync(url_of(tmp_path), settings=settings) as memory:
+        with RememberedTree(ticked, memory.recording, instant_s=PATIENT_S):
+            tick(ticked, 600)
+        assert (memory.status.faults.total, memory.status.episodes_continued > 2) == (0, True)
+    assert_verified(tmp_path)
+    seen = "SELECT count(*) FROM designator WHERE dtype = 'Condition' AND status = 'SUCCEEDED'"
+    assert ask(tmp_path / "memory.db", seen) == [(300,)]
 
 
 def test_an_unknown_version_of_py_trees_is_refused_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
