@@ -25,6 +25,7 @@ from pycrorm_async import __version__
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
 from pycrorm_async.connected_var import set_inside
 from pycrorm_async.errors import CallerError, EpisodeParked, PycrormError, TablesForeign
+from pycrorm_async.events.codec import declaration_of
 from pycrorm_async.events.ids import episode_id
 from pycrorm_async.events.tags import checked_tags
 from pycrorm_async.hooks.episode import Episode
@@ -192,12 +193,13 @@ class Memory(ReadableMemory, ObservingMemory):
 
     async def _open(self) -> Parts:
         address = self._located = self._stack.enter_context(self._address.located())
-        by_daemon = self._settings.writer == "daemon"
+        by_daemon, declared = self._settings.writer == "daemon", []
         spool = Spool(self._spool or address.default_spool, self._settings.file_access)
         if not by_daemon:
             # Open the database before making a spool, and bind the spool before this recorder adds its folder to it.
             access, expected = spool.access, expected_log(address, spool)
             log = await EventLog.open(address, create=True, clock=self._clock, file_access=access, belongs_to=expected)
+            declared = [declaration_of(each) for each in await log.declarations()]
             await log.close()
             spool.bind(log.log_id)
         recorder_id = episode_id(self._clock.wall_ns(), os.urandom(10))
@@ -227,9 +229,19 @@ class Memory(ReadableMemory, ObservingMemory):
         provenance = Provenance.of(self._plan_source, self._settings, self._clock)
         episodes = OpenEpisodes(emitter, self._clock)
         recorder = Recorder(emitter, episodes=episodes, software=__version__, provenance=provenance)
-        known, observations = recorder.known_types, Observations(emitter, recorder)
-        recording = Recording(emitter, episodes, known, software=__version__, provenance=provenance)
-        return Parts(queue, writer, reading, emitter, recorder, recording, observations, PickUpExperience(reading))
+        recording = Recording(
+            emitter, episodes, recorder.known_types, declared, software=__version__, provenance=provenance
+        )
+        return Parts(
+            queue,
+            writer,
+            reading,
+            emitter,
+            recorder,
+            recording,
+            Observations(emitter, recorder),
+            PickUpExperience(reading),
+        )
 
     async def __aexit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
@@ -237,6 +249,7 @@ class Memory(ReadableMemory, ObservingMemory):
         if self._parts is None:  # in a forked child the memory belongs to the parent
             return
         recorder = self._parts.recorder
+        recorder.episodes.refuse_new()
         for episode in recorder.episodes.all:
             recorder.close_episode(episode, error or asyncio.CancelledError("the memory was closed"))
         self._parts.emitter.is_closed = self._parts.experience.is_closed = True
@@ -343,7 +356,7 @@ class Memory(ReadableMemory, ObservingMemory):
         name = str(episode.id if isinstance(episode, EpisodeSummary) else episode)
         for each in parts.recorder.episodes.all:
             if str(each) == name:
-                each.tag(added, removed)
+                each.change_tags(added, removed)
                 return
         await self.flush()
         await tag_episode(self._located, name, added, removed, clock=self._clock)
@@ -375,22 +388,10 @@ class Memory(ReadableMemory, ObservingMemory):
         if parts.reading.is_open:
             await parts.reading.refresh()
 
-    # --- state ------------------------------------------------------------------------------------------------
-
     @property
     def status(self) -> MemoryStatus:
         """The present state of the memory."""
         return MemoryStatus.of(self._open_parts, self._unadopted)
-
-    @property
-    def recent_episodes(self) -> tuple[str, ...]:
-        """The ids of the last hundred episodes this memory opened."""
-        return self._open_parts.recorder.episodes.recent
-
-    @property
-    def opened_count(self) -> int:
-        """The number of episodes this memory opened."""
-        return self._open_parts.recorder.episodes.opened_count
 
     @property
     def is_open(self) -> bool:

@@ -100,6 +100,16 @@ class ObservingMemory(PartsHolder):
         """Writes episodes of an executive that is not ours, from any thread and without asyncio."""
         return self._open_parts.recording
 
+    @property
+    def recent_episodes(self) -> tuple[str, ...]:
+        """The ids of the last hundred episodes this memory opened."""
+        return self._open_parts.recorder.episodes.recent
+
+    @property
+    def opened_count(self) -> int:
+        """The number of episodes this memory opened."""
+        return self._open_parts.recorder.episodes.opened_count
+
     def observe(self, name: str, values: object, *, node: TaskTreeNode | None = None) -> None:
         """Record an observation of your own in the open episode: a measurement, a message, an image.
 

@@ -47,10 +47,18 @@ class SyncMemory:
     def __enter__(self) -> Self:
         if self._thread is not None:
             raise CallerError("a memory can be entered once: call Memory.sync again")
-        self._thread = threading.Thread(target=self._run, name="pycrorm memory", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="memory of pycrorm", daemon=True)
         self._thread.start()
-        self._opened.result()
+        try:
+            self._opened.result()
+        except BaseException:  # Ctrl-C, which must not leave the memory open; or what opening raised
+            self._opened.add_done_callback(self._close_unused)
+            raise
         return self
+
+    def _close_unused(self, opened: Future[asyncio.AbstractEventLoop]) -> None:
+        if opened.exception() is None and self._closing is not None:
+            opened.result().call_soon_threadsafe(self._closing.set_result, None)
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None

@@ -51,7 +51,7 @@ class Observations:
             reason = "no episode is open" if episode is None else "its episode has no more room for observations"
             self._emitter.missing.note("observation", name_of(name), reason)
             return
-        sequence = put_observation(self._emitter, episode, name, values, episode.node_or_root(node))
+        sequence = put_observation(self._emitter, episode, name, values, episode.node_or_root(node), may_refuse=True)
         if sequence >= episode.continue_at:
             if episode is own:
                 self._recorder.continue_episode(own)

@@ -1,99 +1,122 @@
-"""Check what an executive hands over, because a value of a wrong type in the log would stop the fold of its episode.
+"""Copy what an executive hands over, because a value of a wrong type in the log would stop the fold of its episode.
 
-Each function raises `CallerError` with the reason; the recorded episode counts it.
+What is needed (a pose) raises `CallerError`; what can be left out (a colour, one joint) is counted as missing.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from enum import Enum
 from typing import Any, TypeVar, get_args
 
 import msgspec
 
 from pycrorm_async.errors import CallerError
-from pycrorm_async.events.values import FailureValue, NodeStatus, PoseValue
+from pycrorm_async.events.values import NodeStatus, PoseValue
 from pycrorm_async.recording.recorded_objects import RecordedObject
+from pycrorm_async.recording.values.missing_values import MissingValues
 from pycrorm_async.recording.values.texts import clean, clean_repr, message_of
 from pycrorm_async.world.pose import Pose
 
-__all__ = ["END_STATUSES", "failure_of", "joints_of", "link_of", "object_of", "pose_of", "struct_of"]
+__all__ = ["END_STATUSES", "ArgumentReader", "pose_of", "struct_of"]
 
 END_STATUSES = tuple(each for each in get_args(NodeStatus) if each != "RUNNING")
+_INTEGERS = range(-(2**63), 2**63)
 
 S = TypeVar("S", bound=msgspec.Struct)
 
 
 def struct_of(value: object, kind: type[S]) -> S:
-    """Return a value of this class whose parts have the declared types."""
+    """Return a value of this class whose parts have the declared types. Raises `CallerError`."""
     if not isinstance(value, kind):
         raise CallerError(f"expected a {kind.__name__}, got {clean_repr(value)}")
     try:
         return msgspec.convert(msgspec.to_builtins(value), kind)
-    except (msgspec.ValidationError, TypeError) as error:
+    except Exception as error:
         raise CallerError(f"not a whole {kind.__name__}: {message_of(error)}") from error
 
 
 def pose_of(pose: Pose | PoseValue) -> PoseValue:
-    """Copy a pose."""
+    """Copy a pose. Raises `CallerError`, also for a number that is not finite."""
     if isinstance(pose, Pose):
-        return PoseValue(pose.position, pose.orientation, pose.frame, pose.time_ns)
-    return struct_of(pose, PoseValue)
+        value = PoseValue(pose.position, pose.orientation, pose.frame, pose.time_ns)
+    else:
+        value = struct_of(pose, PoseValue)
+    if not math.isfinite(sum(value.position) + sum(value.orientation)):
+        raise CallerError(f"the pose holds a number that is not finite: {clean_repr(pose)}")
+    if value.time_ns not in _INTEGERS:
+        raise CallerError(f"the time of the pose does not fit into 64 bits: {clean_repr(pose)}")
+    return value
 
 
-def joints_of(joints: Mapping[str, float]) -> dict[str, float]:
-    """Copy joint positions; those that are no finite number are left out, as an event cannot hold them."""
-    try:
-        positions = {clean(str(name)): float(position) for name, position in joints.items()}
-    except (AttributeError, TypeError, ValueError) as error:
-        raise CallerError(f"joint positions are numbers by name, not {clean_repr(joints)}") from error
-    return {name: position for name, position in positions.items() if math.isfinite(position)}
+class ArgumentReader:
+    """Copies what describes an object; what it has to leave out is counted in `missing`."""
 
+    def __init__(self, missing: MissingValues) -> None:
+        self._missing = missing
 
-def link_of(link: str | None) -> str | None:
-    """Copy the name of a link."""
-    return clean(str(link)) if link is not None else None
+    def object_of(
+        self, name: str, object_type: str | Enum, pose: Pose | PoseValue, joints: Mapping[str, float], **others: Any
+    ) -> RecordedObject:
+        """Copy the description of an object; `others` are the further attributes of `RecordedObject`."""
+        urdf = others["urdf"]
+        if urdf is not None and not isinstance(urdf, str):
+            self._missing.note("ObjectAdded", "urdf", f"it must be a text, not {clean_repr(urdf)}")
+            urdf = None
+        texts = {each: self.text_of(each, others[each]) for each in ("model", "serial", "base_link", "torso_joint")}
+        return RecordedObject(
+            self.text_of("name", name) or "an object",
+            self.text_of("object_type", object_type) or "UNKNOWN",
+            pose_of(pose),
+            self.joints_of(joints),
+            urdf=urdf,
+            color=self._color_of(others["color"]),
+            mass_kg=self._number_of("mass_kg", others["mass_kg"]),
+            **texts,
+        )
 
+    def text_of(self, what: str, text: object) -> str | None:
+        """Copy a text; of an enum its member's name, of another value its shortened repr."""
+        if text is None:
+            return None
+        if isinstance(text, Enum):
+            return clean(str(text.name))
+        if isinstance(text, str):
+            return clean(str.__str__(text))
+        self._missing.note("ObjectAdded", what, f"it must be a text, not {clean_repr(text)}")
+        return clean_repr(text)
 
-def object_of(
-    name: str, object_type: str, pose: Pose | PoseValue, joints: Mapping[str, float], **others: Any
-) -> RecordedObject:
-    """Copy the description of an object; `others` are the further attributes of `RecordedObject`."""
-    texts = {each: others[each] for each in ("urdf", "model", "serial", "base_link", "torso_joint")} | {"name": name}
-    for what, text in texts.items():
-        if text is not None and not isinstance(text, str):
-            raise CallerError(f"the {what} of an object is a text, not {clean_repr(text)}")
-    return RecordedObject(
-        clean(name),
-        clean(str(object_type)),
-        pose_of(pose),
-        joints_of(joints),
-        urdf=others["urdf"],
-        color=_color_of(others["color"]),
-        model=link_of(others["model"]),
-        serial=link_of(others["serial"]),
-        mass_kg=_number_of("mass", others["mass_kg"]),
-        base_link=link_of(others["base_link"]),
-        torso_joint=others["torso_joint"],
-    )
+    def joints_of(self, joints: Mapping[str, float]) -> dict[str, float]:
+        """Copy joint positions; those that are no finite number are counted as missing."""
+        if not isinstance(joints, Mapping):
+            self._missing.note("JointsMoved", "joints", f"they must be positions by name, not {clean_repr(joints)}")
+            return {}
+        positions: dict[str, float] = {}
+        for name, position in dict(joints).items():
+            text = self.text_of("joint", name)
+            number = self._number_of("joints", position)
+            if text is not None and number is not None:
+                positions[text] = number
+        return positions
 
+    def _number_of(self, what: str, number: Any) -> float | None:
+        if number is None:
+            return None
+        try:
+            if isinstance(number, str | bytes | bool) or not math.isfinite(number):
+                raise ValueError("it must be a finite number")  # noqa: TRY301  counted below
+            return float(number)
+        except Exception as error:  # noqa: BLE001  a __float__ of the user's may raise anything
+            self._missing.note("ObjectAdded", what, f"{clean_repr(number)}: {message_of(error)}")
+            return None
 
-def failure_of(failure: object) -> FailureValue:
-    """Return a failure that is no exception: a `FailureValue`, or a text."""
-    return FailureValue("str", clean(failure)) if isinstance(failure, str) else struct_of(failure, FailureValue)
-
-
-def _number_of(what: str, number: object) -> float | None:
-    if number is None or (isinstance(number, int | float) and math.isfinite(number)):
-        return float(number) if number is not None else None
-    raise CallerError(f"the {what} of an object is a finite number, not {clean_repr(number)}")
-
-
-def _color_of(color: Any) -> tuple[float, float, float, float] | None:
-    if color is None:
-        return None
-    try:
-        red, green, blue, opacity = (_number_of("color", float(each)) or 0.0 for each in color)
-    except (TypeError, ValueError) as error:
-        raise CallerError(f"a color is red, green, blue and opacity, not {clean_repr(color)}") from error
-    return red, green, blue, opacity
+    def _color_of(self, color: Any) -> tuple[float, float, float, float] | None:
+        if color is None:
+            return None
+        parts = [self._number_of("color", each) for each in color] if isinstance(color, list | tuple) else []
+        red, green, blue, opacity, *_ = (*parts, None, None, None, None)
+        if len(parts) != 4 or red is None or green is None or blue is None or opacity is None:
+            self._missing.note("ObjectAdded", "color", f"it must be red, green, blue and opacity: {clean_repr(color)}")
+            return None
+        return red, green, blue, opacity

@@ -5,7 +5,7 @@ It keeps the last reported state of each object, because a follow-up episode beg
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -17,8 +17,6 @@ from pycrorm_async.recording.writing.object_rows import ObjectRows
 from pycrorm_async.world.queries.bounding_boxes import BoundingBox
 
 __all__ = ["RecordedObject", "RecordedObjects"]
-
-Node = Callable[[], int | None]
 
 
 @dataclass(slots=True)
@@ -54,22 +52,27 @@ class _Described(NamedTuple):
 class RecordedObjects(ObjectRows[Hashable]):
     """The objects of one episode; begins with those of the episode that it continues."""
 
-    def __init__(
-        self, emitter: Emitter, episode: EpisodeId, continue_: Callable[[], None], former: RecordedObjects | None = None
-    ) -> None:
-        super().__init__(emitter, episode, continue_)
+    def __init__(self, emitter: Emitter, episode: EpisodeId, former: RecordedObjects | None = None) -> None:
+        super().__init__(emitter, episode)
         self._objects: dict[Hashable, RecordedObject] = {}
-        self._attached: dict[Hashable, tuple[Hashable, str | None]] = {}
+        self._attached: dict[tuple[Hashable, Hashable], str | None] = {}
+        self._identities: set[int] = set()
         self._renewed: dict[int, ObjectReference] = {}
         if former is None:
             return
         for key, each in former._objects.items():  # noqa: SLF001  of the same class
-            self.add(key, each, _no_node)
-        for child, (parent, link) in former._attached.items():  # noqa: SLF001  of the same class
-            self.attach(parent, child, link, _no_node)
+            self.add(key, each, None)
+        for (parent, child), link in former._attached.items():  # noqa: SLF001  of the same class
+            self.attach(parent, child, link, None)
         for key, before in former._references.items():  # noqa: SLF001  of the same class
             if (now := self._references.get(key)) is not None:
                 self._renewed[before.object] = now
+
+    def holds(self, reference: ObjectReference | None) -> bool:
+        """Whether this episode has such a row; True for None."""
+        if reference is None:
+            return True
+        return reference.object in self._identities and reference.object <= reference.row <= self.last
 
     def renewed(self, value: Any) -> Any:
         """Return a value of the former episode with references to rows of this one; None for an object that left."""
@@ -91,19 +94,17 @@ class RecordedObjects(ObjectRows[Hashable]):
         torso = known.joints.get(known.torso_joint) if known.torso_joint is not None else None
         return RobotValue(known.pose, known.object_type, torso, self._references.get(key), known.name)
 
-    def add(self, key: Hashable, added: RecordedObject, node: Node) -> None:
+    def add(self, key: Hashable, added: RecordedObject, node: int | None) -> int:
         """Write that an object entered the world; of a known key, its new pose and joints."""
         if key in self._references:
-            self.move(key, added.pose, node)
-            self.turn(key, added.joints, node)
-            return
-        self._put(
+            return max(self.move(key, added.pose, node), self.turn(key, added.joints, node))
+        sequence = self._put(
             lambda: ObjectAdded(
                 added.name,
                 added.object_type,
                 added.pose,
                 dict(added.joints),
-                node(),
+                node,
                 self._emitter.descriptions.declare(_Described(added.urdf)) if added.urdf is not None else None,
                 added.color,
                 added.model,
@@ -113,54 +114,46 @@ class RecordedObjects(ObjectRows[Hashable]):
             ),
             row_of=key,
         )
-        self._objects[key] = added
+        if sequence:
+            self._objects[key] = added
+            self._identities.add(sequence)
+        return sequence
 
-    def move(self, key: Hashable, pose: PoseValue, node: Node) -> None:
+    def move(self, key: Hashable, pose: PoseValue, node: int | None) -> int:
         """Write a new pose of an object, if it has changed."""
-        known, reference = self._objects.get(key), self._references.get(key)
-        if known is None or reference is None:
-            return
-        if (pose.position, pose.orientation, pose.frame) == (
-            known.pose.position,
-            known.pose.orientation,
-            known.pose.frame,
-        ):
-            return
-        known.pose = pose
-        self._put(
-            lambda: ObjectMoved(reference.object, known.name, known.object_type, pose, node()),
+        known, reference = self._objects[key], self._references[key]
+        last = known.pose
+        if (pose.position, pose.orientation, pose.frame) == (last.position, last.orientation, last.frame):
+            return 0
+        sequence = self._put(
+            lambda: ObjectMoved(reference.object, known.name, known.object_type, pose, node),
             row_of=key,
             identity=reference.object,
         )
+        known.pose = pose if sequence else last
+        return sequence
 
-    def turn(self, key: Hashable, positions: Mapping[str, float], node: Node) -> None:
+    def turn(self, key: Hashable, positions: Mapping[str, float], node: int | None) -> int:
         """Write those joint positions of an object that have changed."""
-        known = self._objects.get(key)
-        if known is None:
-            return
-        changed = {name: each for name, each in positions.items() if known.joints.get(name) != each}
-        if changed:
-            known.joints |= changed
-            self._put_joints(key, changed, node)
+        joints = self._objects[key].joints
+        changed = {name: each for name, each in positions.items() if joints.get(name) != each}
+        sequence = self._put_joints(key, changed, lambda: node) if changed else 0
+        if sequence:
+            joints.update(changed)
+        return sequence
 
-    def attach(self, parent: Hashable, child: Hashable, link: str | None, node: Node) -> None:
+    def attach(self, parent: Hashable, child: Hashable, link: str | None, node: int | None) -> int:
         """Write that `child` moves with `parent`."""
-        self._attached[child] = (parent, link)
-        self._put_attachment(ObjectAttached, parent, child, link, node)
+        self._attached[parent, child] = link
+        return self._put_attachment(ObjectAttached, parent, child, link, lambda: node)
 
-    def detach(self, parent: Hashable, child: Hashable, node: Node) -> None:
+    def detach(self, parent: Hashable, child: Hashable, node: int | None) -> int:
         """Write that `child` no longer moves with `parent`."""
-        _, link = self._attached.pop(child, (parent, None))
-        self._put_attachment(ObjectDetached, parent, child, link, node)
+        link = self._attached.pop((parent, child), None)
+        return self._put_attachment(ObjectDetached, parent, child, link, lambda: node)
 
-    def remove(self, key: Hashable, node: Node) -> None:
+    def remove(self, key: Hashable, node: int | None) -> int:
         """Write that an object left the world."""
         self._objects.pop(key, None)
-        self._attached = {
-            child: (parent, link) for child, (parent, link) in self._attached.items() if key not in (child, parent)
-        }
-        self._put_removed(key, node)
-
-
-def _no_node() -> None:
-    return None
+        self._attached = {pair: link for pair, link in self._attached.items() if key not in pair}
+        return self._put_removed(key, lambda: node)

@@ -5,9 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Hashable, Mapping
 from typing import Any, Protocol
 
-from pycrorm_async.events.values import ObjectReference
+import msgspec
+
+from pycrorm_async.errors import CallerError
+from pycrorm_async.events.values import FailureValue, ObjectReference, ObjectValue, PoseValue
+from pycrorm_async.recording.checked_arguments import pose_of, struct_of
 from pycrorm_async.recording.declarations.declared_type import DeclaredType
-from pycrorm_async.recording.values.texts import clean, message_of, reading_fault
+from pycrorm_async.recording.values.failure_values import failure_value
+from pycrorm_async.recording.values.texts import clean, clean_repr, message_of, reading_fault
 from pycrorm_async.recording.values.value_snapshot import (
     References,
     RefusedValue,
@@ -25,6 +30,8 @@ Convert = Callable[[Any], Any]
 class _Objects(Protocol):
     def reference(self, key: Hashable) -> ObjectReference | None: ...
 
+    def holds(self, reference: ObjectReference | None) -> bool: ...
+
 
 class RecordedValues:
     """Converts values for one episode. `convert` is the executive's; it is called with each value and each item."""
@@ -34,7 +41,7 @@ class RecordedValues:
         self._objects = objects
         self._references = references
 
-    def parameters(self, declared: DeclaredType, values: Mapping[str, Any], missing: dict[str, str]) -> dict[str, Any]:
+    def parameters(self, declared: DeclaredType, values: Mapping[Any, Any], missing: dict[str, str]) -> dict[str, Any]:
         """Return the parameters by field name; add to `missing` the reason for each that becomes a `MissingValue`."""
         parameters: dict[str, Any] = {}
         known = set()
@@ -50,13 +57,15 @@ class RecordedValues:
             except UnrecordableValue as refusal:
                 missing[field.name] = str(refusal)
                 parameters[field.name] = missing_value(str(refusal), value)
-            except Exception as error:  # noqa: BLE001  a __float__ of the user's may raise anything
+            except KeyboardInterrupt:
+                raise
+            except BaseException as error:  # noqa: BLE001  a __float__ of the user's may raise anything
                 missing[field.name] = fault = reading_fault(error)
                 parameters[field.name] = missing_value(fault, value)
         reasons = {each.path[0]: each.reason for each in declared.undeclared}
         for name, value in values.items():
             if value is not None and name not in known:
-                text = clean(str(name))
+                text = clean(name) if isinstance(name, str) else clean_repr(name)
                 missing[text] = reason = reasons.get(name, f"{declared.dtype} was declared without this field")
                 parameters[text] = missing_value(reason, value)
         return parameters
@@ -75,10 +84,14 @@ class RecordedValues:
         if self._convert is not None:
             try:
                 value = self._convert(value)
-            except Exception as error:  # noqa: BLE001  an executive's conversion may raise anything
+            except KeyboardInterrupt:
+                raise
+            except BaseException as error:  # noqa: BLE001  an executive's conversion may raise anything
                 return RefusedValue(message_of(error) if isinstance(error, ValueError) else reading_fault(error))
             if as_object and (reference := self._known_object(value)) is not None:
                 return reference
+        if isinstance(value, msgspec.Struct):
+            return self._checked(value)
         if is_item:
             return value
         if type(value) in (list, tuple):
@@ -86,6 +99,27 @@ class RecordedValues:
         if type(value) is dict:
             return {key: self.converted(each, as_object=as_object, is_item=True) for key, each in value.items()}
         return value
+
+    def failure(self, failure: object) -> FailureValue:
+        """Copy a failure: an exception, a `FailureValue`, or a text. Raises `CallerError` for anything else."""
+        if isinstance(failure, BaseException):
+            return failure_value(failure, self._references)
+        return FailureValue("str", clean(failure)) if isinstance(failure, str) else struct_of(failure, FailureValue)
+
+    def _checked(self, value: msgspec.Struct) -> Any:
+        """Return a value of an event if it is whole, and its rows are those of this episode."""
+        try:
+            if isinstance(value, PoseValue):
+                return pose_of(value)
+            whole = struct_of(value, type(value))
+        except CallerError as error:
+            return RefusedValue(message_of(error))
+        reference = whole.part_of if isinstance(whole, ObjectValue) else whole
+        if isinstance(reference, ObjectReference) and not self._objects().holds(reference):
+            return RefusedValue("it refers to a row that this episode does not have")
+        if isinstance(whole, ObjectValue) and whole.pose is not None:
+            return self._checked(whole.pose) if isinstance(self._checked(whole.pose), RefusedValue) else whole
+        return whole
 
     def _known_object(self, value: Any) -> ObjectReference | None:
         try:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Hashable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Mapping, Sequence
 from types import MappingProxyType
-from typing import Any
+from typing import Any, cast, get_args
 
 from pycrorm_async.errors import CallerError
+from pycrorm_async.events.ids import SEQUENCE_MAX, parse_episode_id
+from pycrorm_async.events.types import DesignatorTypeDeclared
 from pycrorm_async.events.values import NodeReference
 from pycrorm_async.recording.declarations.declared_type import DeclaredType
 from pycrorm_async.recording.declarations.known_types import KnownTypes
@@ -15,12 +17,17 @@ from pycrorm_async.recording.declarations.recorded_type import FieldSpec, Record
 from pycrorm_async.recording.recorded_episode import RecordedEpisode
 from pycrorm_async.recording.recorded_values import Convert
 from pycrorm_async.recording.values.episode_arguments import check_arguments, read_labels
+from pycrorm_async.recording.values.texts import clean_repr
 from pycrorm_async.recording.writing.emitter import Emitter
 from pycrorm_async.recording.writing.episode_opening import EpisodeOpening
 from pycrorm_async.recording.writing.open_episodes import OpenEpisodes
 from pycrorm_async.recording.writing.provenance import Provenance
 
 __all__ = ["Recording"]
+
+
+_TYPES_MAX = 10_000
+"""Bounds the types kept for reuse; when it is reached all are dropped."""
 
 
 class Recording:
@@ -37,6 +44,7 @@ class Recording:
         emitter: Emitter,
         episodes: OpenEpisodes,
         known: KnownTypes,
+        stored: Iterable[DesignatorTypeDeclared],
         *,
         software: str,
         provenance: Provenance | None = None,
@@ -48,6 +56,8 @@ class Recording:
         self._provenance = provenance
         self._types: dict[Hashable, DeclaredType] = {}
         self._lock = threading.RLock()
+        for each in stored:
+            known.note_stored(each)
 
     def type(
         self,
@@ -74,23 +84,34 @@ class Recording:
             concept: the SOMA concept.
             aliases: dtypes the type had before it was renamed.
         """
-        cached = (kind, dtype, tuple(fields.items()), tuple(bases), concept, tuple(aliases))
-        with self._lock:
+        try:
+            cached = (kind, dtype, tuple(fields.items()), tuple(bases), concept, tuple(aliases))
             declared = self._types.get(cached)
-            if declared is None:
-                declared = self._types[cached] = self._declare(kind, dtype, fields, bases, concept, aliases)
-        return declared
+            if declared is None and not self._emitter.is_closed:  # before the lock, which may be held since a fork
+                with self._lock:
+                    if len(self._types) >= _TYPES_MAX:
+                        self._types.clear()
+                    declared = self._types.get(cached) or self._declare(*cached)
+                    self._types[cached] = declared
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:  # noqa: BLE001  a fault of the memory must not reach a plan
+            declared = None
+            self._emitter.note_fault("DesignatorTypeDeclared", error)
+        return declared or _undeclared(kind, dtype)
 
     def _declare(
         self,
         kind: RecordedKind,
         dtype: str,
-        fields: Mapping[str, FieldSpec],
+        fields: Sequence[tuple[str, FieldSpec]],
         bases: Sequence[str],
         concept: str | None,
         aliases: Sequence[str],
     ) -> DeclaredType:
-        made = declare_type(kind, dtype, fields, self._known, bases=bases, concept=concept, aliases=aliases)
+        if not all(isinstance(each, str) for each in (kind, dtype, *bases, *aliases, concept or "")):
+            raise CallerError("the kind, the dtype, the concept, the bases and the aliases of a type must be texts")
+        made = declare_type(kind, dtype, dict(fields), self._known, bases=bases, concept=concept, aliases=aliases)
         declared, missing = made.type, self._emitter.missing
         for name, renamed in made.fields.items():
             missing.note_renamed(declared.dtype, name, *renamed)
@@ -100,11 +121,8 @@ class Recording:
             missing.note_renamed(declared.dtype, "type", *made.dtype)
         if declared.fault is not None:
             missing.note(declared.dtype, "type", declared.fault)
-        if declared.payload and not self._emitter.is_closed:
-            try:
-                self._emitter.put_declaration(declared)
-            except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
-                self._emitter.note_fault("DesignatorTypeDeclared", error)
+        if declared.payload:
+            self._emitter.put_declaration(declared)
         return declared
 
     def episode(
@@ -137,6 +155,10 @@ class Recording:
         text = description or plan or "an episode"
         check_arguments(description=text, plan=plan, seed=seed, strict=False)
         check_arguments(description=world, plan=None, seed=None, strict=False)
+        if thought_by is not None and not _is_whole(thought_by):
+            raise CallerError(f"thought_by must be from `node_reference` of an episode, not {thought_by!r:.100}")
+        if repr(simulated) not in ("True", "False") or isinstance(seed, bool):
+            raise CallerError("simulated must be a bool, and seed an int")
         if convert is not None and not callable(convert):
             raise CallerError(f"convert must be a function, not {convert!r:.100}")
         opening = EpisodeOpening(
@@ -151,16 +173,28 @@ class Recording:
             labels=read_labels(tags, metadata, self._emitter),
         )
         episode = RecordedEpisode(self._emitter, self._episodes, opening, convert)
-        if self._emitter.is_closed:
-            return episode
-        try:
+        if not self._emitter.is_closed:
             episode.open()
-            self._episodes.add(episode)
-        except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
-            self._emitter.note_fault("EpisodeStarted", error)
-            episode.closed = True
         return episode
 
     def note_fault(self, where: str, error: BaseException) -> None:
         """Count a fault of an integration in `Memory.status`, and log it now and then. Raises nothing."""
         self._emitter.note_fault(where, error)
+
+
+def _is_whole(reference: Any) -> bool:
+    try:
+        parse_episode_id(reference.episode)
+        return isinstance(reference, NodeReference) and 0 < reference.node <= SEQUENCE_MAX
+    except (AttributeError, TypeError, ValueError):
+        return False
+
+
+def _undeclared(kind: object, dtype: object) -> DeclaredType:
+    """Return the type of nodes whose type cannot be declared."""
+    known: RecordedKind = "action"
+    if isinstance(kind, str) and kind in get_args(RecordedKind):
+        known = cast("RecordedKind", kind)
+    name = clean_repr(dtype)
+    reason = "its type could not be declared"
+    return DeclaredType(name, b"", "", (), DesignatorTypeDeclared(kind=known, dtype=name, table=""), (), reason)

@@ -29,6 +29,8 @@ __all__ = ["Described", "Descriptions"]
 
 _KNOWN_MAX = 1_000
 """Bounds the descriptions kept, because a program may generate any number. When it is reached all are dropped."""
+_KNOWN_CHARACTERS_MAX = 2**24
+"""Bounds the characters of the descriptions kept."""
 _REASON_MAX = 500
 """Bounds the characters of the reason why a description or a mesh is missing."""
 _HEADING = Heading(None, DescriptionDeclared.__name__, DescriptionDeclared.version)
@@ -85,6 +87,7 @@ class Descriptions:
         self._put_bytes_max = settings.segment_bytes // 16
         self._files: dict[str, tuple[str, ...]] = {}
         self._known: dict[tuple[str, _Stats], _Declared] = {}
+        self._known_characters = 0
         self._put: dict[str, int] = {}
         self._put_bytes = 0
 
@@ -101,12 +104,14 @@ class Descriptions:
 
     def _declare(self, described: Described) -> str:
         text = described.description_text
-        if len(self._known) >= _KNOWN_MAX:
+        if len(self._known) >= _KNOWN_MAX or self._known_characters > _KNOWN_CHARACTERS_MAX:
             self._files.clear()
             self._known.clear()
+            self._known_characters = 0
         files = self._files.get(text)
         if files is None:
             files = self._files[text] = mesh_files(text)
+            self._known_characters += len(text)
         key = text, tuple(map(_stat, files)) if files else ()
         declared = self._known.get(key)
         if declared is None:

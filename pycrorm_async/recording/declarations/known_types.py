@@ -9,6 +9,9 @@ from pycrorm_async.events.values import FieldDeclared
 
 __all__ = ["KnownTypes", "type_text"]
 
+_COLUMNS_MAX = 500
+"""Bounds the names of one table, below the columns that the databases allow."""
+
 
 class KnownTypes:
     """The declared types of one memory. A field of one dtype has one type in all its declarations.
@@ -20,22 +23,42 @@ class KnownTypes:
     def __init__(self, built_in: Callable[[str], DesignatorTypeDeclared | None]) -> None:
         self.built_in = built_in
         self._fields_by_dtype: dict[str, dict[str, str]] = {}
-        self._dtype_by_table: dict[str, str] = {}
+        self._tables: dict[str, str] = {}
+        self._columns: dict[str, dict[str, FieldDeclared]] = {}
 
     def fields_of(self, dtype: str) -> Mapping[str, str]:
-        """Return the types of the fields of a dtype as declared so far, as `type_text` describes them."""
+        """Return the types of the fields of a dtype as this memory declared them, as `type_text` describes them."""
         return self._fields_by_dtype.get(dtype, {})
 
-    def dtype_of(self, table: str) -> str | None:
-        """Return the dtype that has this table; None if none has it."""
-        return self._dtype_by_table.get(table)
+    def fault_in_table(self, table: str, dtype: str) -> str | None:
+        """Return the reason why another type has this table; None if none has."""
+        owner = self._tables.get(table.lower(), dtype)
+        return f"the dtype {owner!r} already has the table {table!r}" if owner != dtype else None
+
+    def fault_in_field(self, field: FieldDeclared, table: str) -> str | None:
+        """Return the reason why this field cannot be a column of the table beside all declared ones; None if it can."""
+        columns = self._columns.get(table.lower(), {})
+        for name in (field.name.lower(), field.column.lower()):
+            known = columns.get(name, field)
+            if (known.name, type_text(known)) != (field.name, type_text(field)):
+                return f"its type is {type_text(field)}, but the table has {known.name!r} as {type_text(known)}"
+        if len(columns) > _COLUMNS_MAX and field.name.lower() not in columns:
+            return f"the table has {_COLUMNS_MAX} columns already"
+        return None
 
     def note(self, declaration: DesignatorTypeDeclared) -> None:
-        """Note a declaration."""
-        self._dtype_by_table.setdefault(declaration.table, declaration.dtype)
-        self._fields_by_dtype.setdefault(declaration.dtype, {}).update(
-            (each.name, type_text(each)) for each in declaration.fields
-        )
+        """Note a declaration of this memory."""
+        fields = ((each.name, type_text(each)) for each in declaration.fields)
+        self._fields_by_dtype.setdefault(declaration.dtype, {}).update(fields)
+        self.note_stored(declaration)
+
+    def note_stored(self, declaration: DesignatorTypeDeclared) -> None:
+        """Note a declaration, also of another process, whose table and columns the database has."""
+        self._tables.setdefault(declaration.table.lower(), declaration.dtype)
+        columns = self._columns.setdefault(declaration.table.lower(), {})
+        for field in declaration.fields:
+            columns.setdefault(field.name.lower(), field)
+            columns.setdefault(field.column.lower(), field)
 
 
 def type_text(field: FieldDeclared) -> str:

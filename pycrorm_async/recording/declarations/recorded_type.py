@@ -25,7 +25,7 @@ from pycrorm_async.events.ids import SLOT_FIRST_FIELD
 from pycrorm_async.events.types import DesignatorTypeDeclared
 from pycrorm_async.events.values import FieldDeclared, FieldType, ItemType, ObjectReference, PoseValue
 from pycrorm_async.recording.declarations.declared_type import DeclaredType, Field, Undeclared
-from pycrorm_async.recording.declarations.known_types import KnownTypes, type_text
+from pycrorm_async.recording.declarations.known_types import KnownTypes
 from pycrorm_async.recording.values.parameter_types import Shape, shape_of
 from pycrorm_async.recording.values.texts import clean, clean_repr, cut
 
@@ -82,13 +82,14 @@ def declare_type(
     dtype, fault = _dtype(own, kind, known)
     renamed = Renamed(dtype, fault) if fault is not None and dtype != own else None
     built_in = known.built_in(dtype)
-    known_types = {each.name: type_text(each) for each in (built_in.fields if built_in is not None else ())}
-    known_types |= known.fields_of(dtype)
+    table = built_in.table if built_in is not None else table_name(dtype)
+    if built_in is not None:
+        known.note_stored(built_in)
     accepted: list[Field] = []
     undeclared: list[Undeclared] = []
     renamed_fields: dict[str, Renamed] = {}
     for name, spec in fields.items():
-        named = _named(str(name), spec, known_types, [each.declared for each in accepted])
+        named = _named(str(name), spec, known, table, [each.declared for each in accepted])
         if isinstance(named, str):
             undeclared.append(Undeclared(clean(str(name)), (name,), cut(clean(named), _REASON_MAX)))
             continue
@@ -98,13 +99,17 @@ def declare_type(
     declaration = DesignatorTypeDeclared(
         kind=kind,  # type: ignore[arg-type]  # checked below
         dtype=dtype,
-        table=built_in.table if built_in is not None else table_name(dtype),
+        table=table,
         concept=concept or (built_in.concept if built_in is not None else None),
         bases=tuple(bases) or (built_in.bases if built_in is not None else ()),
         fields=tuple(each.declared for each in accepted),
         aliases=tuple(aliases),
     )
-    fault = fault_in_declaration(declaration) or _fault_in_kind(declaration, built_in)
+    fault = (
+        fault_in_declaration(declaration)
+        or _fault_in_kind(declaration, built_in)
+        or _fault_in_aliases(declaration, known)
+    )
     if fault is not None:
         placeholder = DesignatorTypeDeclared(kind="action", dtype=own, table="")
         reason = cut(clean(fault), _REASON_MAX)
@@ -125,10 +130,7 @@ def _dtype(own: str, kind: str, known: KnownTypes) -> tuple[str, str | None]:
     for candidate in (own, plain, f"{plain}{kind.title()}"):
         built_in = known.built_in(candidate)
         table = built_in.table if built_in is not None else table_name(candidate)
-        owner = known.dtype_of(table)
-        fault = fault_in_dtype(candidate) or fault_in_table(table)
-        if fault is None and owner not in (None, candidate):
-            fault = f"the dtype {owner!r} already has the table {table!r}"
+        fault = fault_in_dtype(candidate) or fault_in_table(table) or known.fault_in_table(table, candidate)
         if fault is None:
             return candidate, first_fault
         first_fault = first_fault or cut(clean(fault), _REASON_MAX)
@@ -141,8 +143,18 @@ def _fault_in_kind(declaration: DesignatorTypeDeclared, built_in: DesignatorType
     return f"the built-in type {built_in.dtype} is a {built_in.kind}, not a {declaration.kind}"
 
 
+def _fault_in_aliases(declaration: DesignatorTypeDeclared, known: KnownTypes) -> str | None:
+    """Return the reason why the table of a former dtype cannot be this one's; None if it can."""
+    for alias in declaration.aliases:
+        for field in declaration.fields:
+            reason = known.fault_in_field(field, table_name(alias))
+            if reason is not None:
+                return f"its alias {alias!r} does not fit: field {field.name!r}: {reason}"
+    return None
+
+
 def _named(
-    name: str, spec: FieldSpec, known_types: Mapping[str, str], accepted: Sequence[FieldDeclared]
+    name: str, spec: FieldSpec, known: KnownTypes, table: str, accepted: Sequence[FieldDeclared]
 ) -> _Named | str:
     """Return the field under the first name that it may have; the reason if it may have none."""
     shape = _shape(spec)
@@ -159,7 +171,7 @@ def _named(
             enum=f"{shape.enum.__module__}.{shape.enum.__qualname__}" if shape.enum is not None else None,
             item=shape.item,
         )
-        reason = _fault_in_field(declared, known_types, accepted)
+        reason = _fault_in_field(declared, accepted) or known.fault_in_field(declared, table)
         if reason is None:
             return _Named(Field(declared, (name,), shape.enum), first_reason)
         first_reason = first_reason or reason
@@ -176,14 +188,9 @@ def _candidates(name: str, shape: Shape) -> Iterator[str]:
     yield f"{plain}_{shape.kind}"
 
 
-def _fault_in_field(
-    field: FieldDeclared, known_types: Mapping[str, str], accepted: Sequence[FieldDeclared]
-) -> str | None:
+def _fault_in_field(field: FieldDeclared, accepted: Sequence[FieldDeclared]) -> str | None:
     if not field.name.isidentifier() or field.name.startswith("_"):
         return f"{cut(field.name, 100)!r} is not a valid field name"
-    kind = type_text(field)
-    if known_types.get(field.name, kind) != kind:
-        return f"its type is {kind}, but {field.name!r} of this dtype is {known_types[field.name]}"
     return fault_in_fields([*accepted, field])
 
 

@@ -20,12 +20,12 @@ from pycrorm_async.recording.writing.event_feed import EventFeed
 from pycrorm_async.recording.writing.event_sink import EventSink
 from pycrorm_async.settings import Settings
 
-__all__ = ["BlobRefused", "Emitter", "Faults"]
+__all__ = ["THREAD_NAME_PREFIX", "BlobRefused", "Emitter", "Faults"]
 
 _log = logging.getLogger("pycrorm_async")
 _BLOCK_S = 1.0
 """Bounds one wait for room. `put_payload` then tries again, so the value limits only the delay of a missed wake-up."""
-_THREAD_NAME_PREFIX = "pycrorm "
+THREAD_NAME_PREFIX = "pycrorm "
 """The names of all threads of the memory begin with this."""
 _REASON_MAX = 2_000
 """Bounds the characters of the last fault's message in `status`."""
@@ -97,7 +97,7 @@ class Emitter:
             except SpoolFull:
                 # The garbage collector may close a dropped plan in a thread of the memory. Such a thread must not
                 # block here, because these threads are the ones that free space.
-                if threading.current_thread().name.startswith(_THREAD_NAME_PREFIX):
+                if threading.current_thread().name.startswith(THREAD_NAME_PREFIX):
                     raise
                 self.sink.block_until_room(_BLOCK_S)
 

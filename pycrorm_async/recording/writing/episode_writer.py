@@ -136,7 +136,7 @@ class EpisodeWriter(ABC, Generic[N]):
         self.emitter.put(self.id, started)
         return self.emitter.put(self.id, NodeStarted("root", simulated=self._opening.simulated, continues=root))
 
-    def tag(self, added: Sequence[str], removed: Sequence[str]) -> None:
+    def change_tags(self, added: Sequence[str], removed: Sequence[str]) -> None:
         """Write a change of the episode's tags. Raises `CallerError` for a removed tag that it does not have."""
         tags = changed_tags(self._opening.labels.tags, added, removed)
         self.emitter.put(self.id, EpisodeTagged(tuple(added), tuple(removed)))

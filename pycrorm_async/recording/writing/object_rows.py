@@ -35,7 +35,7 @@ class ObjectRows(Generic[K]):
         continue_: moves the episode to a follow-up.
     """
 
-    def __init__(self, emitter: Emitter, episode: EpisodeId, continue_: Callable[[], None]) -> None:
+    def __init__(self, emitter: Emitter, episode: EpisodeId, continue_: Callable[[], None] = lambda: None) -> None:
         self.last = 0
         self.continue_at = sys.maxsize  # no follow-up before the present state is recorded
         self.continue_ = continue_
@@ -43,15 +43,13 @@ class ObjectRows(Generic[K]):
         self._episode = episode
         self._references: dict[K, ObjectReference] = {}
 
-    def _put_removed(self, key: K, node: Callable[[], int | None]) -> None:
+    def _put_removed(self, key: K, node: Callable[[], int | None]) -> int:
         reference = self._references.pop(key, None)
-        if reference is not None:
-            self._put(lambda: ObjectRemoved(reference, node()))
+        return self._put(lambda: ObjectRemoved(reference, node())) if reference is not None else 0
 
-    def _put_joints(self, key: K, positions: Mapping[str, float], node: Callable[[], int | None]) -> None:
+    def _put_joints(self, key: K, positions: Mapping[str, float], node: Callable[[], int | None]) -> int:
         reference = self._references.get(key)
-        if reference is not None:
-            self._put(lambda: JointsMoved(reference, dict(positions), node()))
+        return self._put(lambda: JointsMoved(reference, dict(positions), node())) if reference is not None else 0
 
     def _put_attachment(
         self,
@@ -60,18 +58,19 @@ class ObjectRows(Generic[K]):
         child: K,
         link: str | None,
         node: Callable[[], int | None],
-    ) -> None:
+    ) -> int:
         first, second = self._references.get(parent), self._references.get(child)
-        if first is not None and second is not None:
-            self._put(lambda: kind(first, second, link, node()))
+        if first is None or second is None:
+            return 0
+        return self._put(lambda: kind(first, second, link, node()))
 
-    def _put(self, build: Callable[[], Happening], *, row_of: K | None = None, identity: int | None = None) -> None:
-        """Build and record an event. Exceptions are counted, so that the change of the world succeeds.
+    def _put(self, build: Callable[[], Happening], *, row_of: K | None = None, identity: int | None = None) -> int:
+        """Build and record an event; return its sequence. Exceptions are counted, so that the change succeeds; 0 then.
 
         The event becomes the current row of the object `row_of`, and its identity too if `identity` is None.
         """
         if self._emitter.is_closed:
-            return
+            return 0
         try:
             event = build()
             try:
@@ -82,8 +81,9 @@ class ObjectRows(Generic[K]):
             self.last = sequence
         except Exception as error:  # noqa: BLE001  a change of the world must not fail because of a memory
             self._emitter.note_fault("a change of the world", error)
-            return
+            return 0
         if row_of is not None:
             self._references[row_of] = ObjectReference(sequence if identity is None else identity, sequence)
         if sequence >= self.continue_at:
             self.continue_()
+        return sequence

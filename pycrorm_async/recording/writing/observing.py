@@ -26,19 +26,21 @@ _PATH_BYTES_MAX = 8_192
 """Bounds the bytes of paths and reasons in an event whose values did not fit."""
 
 
-def put_observation(emitter: Emitter, episode: EpisodeWriter[Any], name: object, values: object, node: int) -> int:
+def put_observation(
+    emitter: Emitter, episode: EpisodeWriter[Any], name: object, values: object, node: int, *, may_refuse: bool
+) -> int:
     """Write values under this name, observed by the node with this sequence; return the sequence of the event.
 
-    Returns 0 if the spool has no room; the observation is counted as missing then. Raises `Unrecordable` with
-    `on_unrecordable="refuse"` only.
+    Returns 0 if the spool has no room; the observation is counted as missing then. Raises `Unrecordable` only if
+    `may_refuse` and with `on_unrecordable="refuse"`.
     """
     name = name_of(name)
     reader = ObservedReader(episode, emitter.put_blob)
     event = Observed(name, reader.read(values), node, reader.missing)
     try:
         if reader.missing:
-            _note_missing(emitter, name, reader.missing)
-        return _put(emitter, episode, event)
+            _note_missing(emitter, name, reader.missing, may_refuse=may_refuse)
+        return _put(emitter, episode, event, may_refuse=may_refuse)
     except (SpoolFull, SpoolStuck) as refusal:
         emitter.missing.note("observation", name, str(refusal))
         return 0
@@ -47,19 +49,18 @@ def put_observation(emitter: Emitter, episode: EpisodeWriter[Any], name: object,
             emitter.release_blob(reference)
 
 
-def _put(emitter: Emitter, episode: EpisodeWriter[Any], event: Observed) -> int:
+def _put(emitter: Emitter, episode: EpisodeWriter[Any], event: Observed, *, may_refuse: bool) -> int:
     try:
         return emitter.offer(episode.id, event)
     except NotEncodable as error:
         fitted = _fit(event, error, emitter.settings.record_bytes_max)
-        _note_missing(
-            emitter, event.name, {path: why for path, why in fitted.missing.items() if path not in event.missing}
-        )
+        new = {path: why for path, why in fitted.missing.items() if path not in event.missing}
+        _note_missing(emitter, event.name, new, may_refuse=may_refuse)
         return emitter.offer(episode.id, fitted)
 
 
-def _note_missing(emitter: Emitter, name: str, missing: dict[str, str]) -> None:
-    if emitter.settings.on_unrecordable == "refuse":
+def _note_missing(emitter: Emitter, name: str, missing: dict[str, str], *, may_refuse: bool) -> None:
+    if may_refuse and emitter.settings.on_unrecordable == "refuse":
         path, reason = next(iter(missing.items()))
         raise Unrecordable(f"observation {name!r}", path or "values", reason)
     for path, reason in missing.items():

@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import logging
 import os
+import threading
 from collections import deque
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 from pycrorm_async.clock import Clock
+from pycrorm_async.errors import CallerError
 from pycrorm_async.events.ids import EpisodeId, episode_id, episode_text
 from pycrorm_async.recording.writing.emitter import Emitter
 from pycrorm_async.recording.writing.episode_writer import EpisodeWriter
@@ -43,6 +45,8 @@ class OpenEpisodes:
         self.by_id: dict[EpisodeId, AnyWriter] = {}
         self._recent: deque[EpisodeId] = deque(maxlen=RECENT_MAX)
         self._continuing: set[EpisodeId] = set()
+        self._is_closing = False
+        self._adding = threading.RLock()
         self.opened_count = 0
         self.continued_count = 0
 
@@ -51,9 +55,17 @@ class OpenEpisodes:
         return episode_id(self._clock.wall_ns(), self._randomness(10))
 
     def add(self, episode: AnyWriter) -> None:
-        """Add an episode whose start is written."""
-        self.by_id[episode.id] = episode
+        """Add an episode. Raises `CallerError` after `refuse_new`."""
+        with self._adding:
+            if self._is_closing:
+                raise CallerError("the memory is being closed")
+            self.by_id[episode.id] = episode
         self._note_opened(episode)
+
+    def refuse_new(self) -> None:
+        """Add no episode from now on, because the memory is being closed."""
+        with self._adding:
+            self._is_closing = True
 
     def _note_opened(self, episode: AnyWriter) -> None:
         if not episode.simulated:

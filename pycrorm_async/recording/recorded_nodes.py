@@ -1,0 +1,320 @@
+"""`RecordedNodes` writes the nodes of an episode of any executive, its beginning, its end and its follow-ups.
+
+Theory of operation. Each method first copies its arguments, which may run any code of the caller, and then has
+`OrderedCalls` write them; so a call is whole, and the parent of a node is known when the node starts, whichever thread
+started it. The episode may be continued in between; then `_now` renews what refers to rows. Nothing raises into the
+caller: what goes wrong, and what comes after the end of the episode, is counted in `Memory.status`. `_nodes` holds the
+open nodes by key, `_ended` the last ones that ended, because a child may start after the end of its parent.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from functools import partial
+from typing import Any, get_args
+
+from msgspec.structs import replace
+
+from pycrorm_async.errors import CallerError
+from pycrorm_async.events.ids import EpisodeId
+from pycrorm_async.events.types import NodeEnded, NodeStarted
+from pycrorm_async.events.values import (
+    EpisodeStatus,
+    FailureValue,
+    NodeReference,
+    NodeStatus,
+    RobotValue,
+)
+from pycrorm_async.recording.checked_arguments import END_STATUSES, ArgumentReader, struct_of
+from pycrorm_async.recording.declarations.declared_type import DeclaredType
+from pycrorm_async.recording.ordered_calls import OrderedCalls, counted, noted
+from pycrorm_async.recording.recorded_objects import RecordedObjects
+from pycrorm_async.recording.recorded_values import Convert, RecordedValues
+from pycrorm_async.recording.values.texts import clean_repr
+from pycrorm_async.recording.writing.emitter import Emitter
+from pycrorm_async.recording.writing.episode_opening import EpisodeOpening
+from pycrorm_async.recording.writing.episode_writer import EpisodeWriter
+from pycrorm_async.recording.writing.open_episodes import OpenEpisodes
+
+__all__ = ["RecordedNodes"]
+
+_ENDED_MAX = 1_000
+"""Bounds the keys of ended nodes that a child can still name as its parent."""
+
+
+class _Node:
+    """A node that an executive started, as it is written again when the episode is continued.
+
+    `sequence` counts in the episode with the id `episode_id`. `parent` is the parent, or, when this node has ended, the
+    nearest node above it that was open then.
+    """
+
+    __slots__ = ("declared", "episode_id", "key", "parameters", "parent", "robot", "sequence")
+
+    def __init__(self, key: Hashable, declared: DeclaredType, parameters: dict[str, Any]) -> None:
+        self.key = key
+        self.declared = declared
+        self.parameters = parameters
+        self.parent: _Node | None = None
+        self.robot: RobotValue | None = None
+        self.sequence = 0
+        self.episode_id: EpisodeId | None = None
+
+
+class RecordedNodes(EpisodeWriter[_Node]):
+    """The nodes of a `RecordedEpisode`, and its beginning, end and follow-ups."""
+
+    def __init__(
+        self,
+        emitter: Emitter,
+        episodes: OpenEpisodes,
+        opening: EpisodeOpening,
+        convert: Convert | None,
+    ) -> None:
+        super().__init__(emitter, episodes.new_id(), opening)
+        self._episodes = episodes
+        self._calls = OrderedCalls()
+        self._end_status: EpisodeStatus | None = None
+        self._nodes: dict[Hashable, _Node] = {}
+        self._ended: OrderedDict[Hashable, _Node] = OrderedDict()
+        self._objects = RecordedObjects(emitter, self.id)
+        self._values = RecordedValues(convert, lambda: self._objects, self)
+        self._arguments = ArgumentReader(emitter.missing)
+
+    def close(self, failure: BaseException | None = None, status: EpisodeStatus | None = None) -> None:
+        """End the episode. Without a failure it SUCCEEDED; nodes that are still open end LOST, and are counted.
+
+        `status` is for a failure whose class only the executive knows: FAILED, ERROR or INTERRUPTED.
+        """
+        if not self.emitter.is_closed:
+            self._calls.run(lambda: self._close(failure, status))
+
+    def _close(self, failure: BaseException | None, status: EpisodeStatus | None) -> None:
+        if self._nodes and failure is None and not self.closed:
+            self._note("EpisodeEnded", f"{len(self._nodes)} nodes were open at the end of episode {self}")
+        if status in get_args(EpisodeStatus):
+            self._end_status = status
+        self._episodes.close(self, failure)
+
+    def _write(self, what: str, write: Callable[[], int]) -> None:
+        """Have `write` called after the calls before; it returns the sequence of what it wrote, 0 for nothing."""
+        self._calls.run(lambda: self._written(what, write))
+
+    def _written(self, what: str, write: Callable[[], int]) -> None:
+        if self.closed:
+            self._note(what, f"episode {self} has ended")
+        elif (noted(self.emitter, what, write) or 0) >= self.continue_at:
+            self._episodes.continue_episode(self)
+
+    def _now(self, value: Any, prepared: EpisodeId) -> Any:
+        """Return a value that was copied while the episode had this id, with the rows that are in force now."""
+        return value if prepared == self.id else self._objects.renewed(value)
+
+    # --- nodes ------------------------------------------------------------------------------------------------
+
+    @counted("NodeStarted")
+    def start(
+        self,
+        key: Hashable,
+        type: DeclaredType,  # noqa: A002  the field's word
+        parameters: Mapping[str, Any] = {},
+        *,
+        parent: Hashable | None = None,
+        robot: RobotValue | Hashable | None = None,
+    ) -> Hashable:
+        """Record that a node started; return it.
+
+        As `parent` and `node` the returned value stands for the key, also long after the node has ended and its key
+        names another one.
+
+        Args:
+            key: names the node from now on. If an open node has it, that one ends LOST, and is counted.
+            type: from `Recording.type`.
+            parameters: by field name, copied now.
+            parent: key of the node it runs inside. One that never started is counted, and the root takes its place.
+            robot: the state of the robot that acts, or the key of its object.
+        """
+        hash(key)
+        missing: dict[str, str] = {}
+        prepared = self.id
+        read = partial(self._values.parameters, type, missing=missing)
+        values = noted(self.emitter, "NodeStarted", lambda: read(dict(parameters))) or {}
+        node = _Node(key, type, values)
+        self._write("NodeStarted", lambda: self._start_node(node, parent, robot, missing, prepared))
+        return node
+
+    def _start_node(
+        self, node: _Node, parent: Hashable | None, robot: object, missing: dict[str, str], prepared: EpisodeId
+    ) -> int:
+        key = node.key
+        if key in self._nodes:
+            self._note("NodeStarted", f"the key {clean_repr(key)} starts a second node before the first has ended")
+            self._end_node(self._nodes[key], NodeEnded(self._nodes[key].sequence, "LOST"))
+        node.parent = self._find(parent, "NodeStarted")
+        node.robot = noted(self.emitter, "NodeStarted", lambda: self._robot(robot))
+        node.parameters = self._now(node.parameters, prepared)
+        self._write_start(node, missing, continues=None)
+        self._nodes[key] = node
+        self._ended.pop(key, None)
+        return node.sequence
+
+    def _robot(self, robot: Any) -> RobotValue | None:
+        if robot is None:
+            return None
+        if isinstance(robot, RobotValue):
+            state = struct_of(robot, RobotValue)
+            return state if self._objects.holds(state.object) else replace(state, object=None)
+        if (known := self._objects.robot(robot)) is None:
+            raise CallerError(f"no object has the key {clean_repr(robot)}, so the robot's state is not recorded")
+        return known
+
+    def _write_start(self, node: _Node, missing: Mapping[str, str], continues: int | None) -> None:
+        event = NodeStarted(
+            kind=node.declared.declaration.kind,
+            parent=self.node_or_root(node.parent),
+            designator=node.declared.fingerprint or None,
+            parameters=node.parameters,
+            robot=node.robot,
+            simulated=self.simulated,
+            continues=continues,
+        )
+        node.sequence = self._put_start(node, event, node.declared.dtype, missing, may_refuse=False)
+        node.episode_id = self.id
+
+    @counted("NodeEnded")
+    def end(
+        self,
+        key: Hashable,
+        status: NodeStatus = "SUCCEEDED",
+        failure: BaseException | FailureValue | str | None = None,
+        result: Any = None,
+    ) -> None:
+        """Record that a node ended. A key that no open node has is counted, and so is an unknown status, as ERROR."""
+        key = key.key if isinstance(key, _Node) and self._nodes.get(key.key) is key else key
+        hash(key)
+        if status not in END_STATUSES:
+            self._note("NodeEnded", f"{clean_repr(status)} is not a status ({', '.join(END_STATUSES)})")
+            status = "ERROR"
+        prepared = self.id
+        value = noted(self.emitter, "NodeEnded", lambda: self._values.failure(failure)) if failure is not None else None
+        encoded = self._values.any(result) if result is not None else None
+
+        def write() -> int:
+            node = self._nodes.get(key)
+            if node is None:
+                raise CallerError(f"no open node has the key {clean_repr(key)}")
+            self._end_node(node, NodeEnded(node.sequence, status, value, self._now(encoded, prepared)))
+            return 0  # an end continues no episode
+
+        self._write("NodeEnded", write)
+
+    def _end_node(self, node: _Node, event: NodeEnded) -> None:
+        self._close_node(event, node.declared.dtype)
+        self._nodes.pop(node.key, None)
+        node.parameters, node.robot = {}, None
+        while node.parent is not None and self._nodes.get(node.parent.key) is not node.parent:
+            node.parent = node.parent.parent
+        self._ended[node.key] = node
+        while len(self._ended) > _ENDED_MAX:
+            self._ended.popitem(last=False)
+
+    def is_open(self, key: Hashable) -> bool:
+        """Whether a node with this key has started and not ended."""
+        return bool(noted(self.emitter, "NodeStarted", lambda: key in self._nodes))
+
+    def node_reference(self, key: Hashable | None = None) -> NodeReference:
+        """Return a reference to a node for `Recording.episode(thought_by=…)`; without a known key, to the root."""
+        return NodeReference(str(self), self.node_or_root(self._find(key, "EpisodeStarted")))
+
+    def node_or_root(self, node: Any) -> int:
+        """Return the sequence of this node, or of the nearest above it that is in this episode; None gives the root."""
+        while isinstance(node, _Node):
+            if node.episode_id == self.id:
+                return node.sequence
+            node = node.parent
+        return self._root
+
+    def open(self) -> None:
+        """Write the start of the episode; if that fails, count the fault, and record nothing."""
+        self._calls.run(self._open_now)
+
+    def _open_now(self) -> None:
+        try:
+            self._episodes.add(self)
+            super().open()
+        except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
+            self.emitter.note_fault("EpisodeStarted", error)
+            self._episodes.by_id.pop(self.id, None)
+            self.closed = True
+
+    def end_episode(self, failure: BaseException | None) -> None:
+        """Write the end of the episode."""
+        self._calls.run(lambda: noted(self.emitter, "EpisodeEnded", lambda: self._end_now(failure)))
+
+    def _end_now(self, failure: BaseException | None) -> None:
+        super().end_episode(failure)
+        self._nodes.clear()
+        self._ended.clear()
+
+    def change_tags(self, added: Sequence[str], removed: Sequence[str]) -> None:
+        """Write a change of the episode's tags, as `Memory.tag` asks for it. Raises as `EpisodeWriter` does."""
+        raised: list[BaseException] = []
+
+        def change() -> None:
+            try:
+                super(RecordedNodes, self).change_tags(added, removed)
+            except Exception as error:  # noqa: BLE001  raised to the caller below
+                raised.append(error)
+
+        self._calls.run(change)
+        for each in raised:
+            raise each
+
+    def _end_statuses(self, failure: BaseException | None) -> tuple[EpisodeStatus, NodeStatus]:
+        status = self._end_status
+        if status is None:
+            return super()._end_statuses(failure)
+        return status, ("CANCELLED" if status == "INTERRUPTED" else status)
+
+    def _has_ended(self, node: _Node) -> bool:
+        return self._nodes.get(node.key) is not node
+
+    def _restart_node(self, node: _Node, sequence: int) -> int:
+        node.parameters = self._objects.renewed(node.parameters)
+        if node.robot is not None:
+            node.robot = replace(node.robot, object=self._objects.renewed(node.robot.object))
+        self._write_start(node, {}, continues=sequence)
+        return node.sequence
+
+    def _restart_world(self) -> int:
+        self._objects = RecordedObjects(self.emitter, self.id, self._objects)
+        return self._objects.last
+
+    def _leave_world(self) -> None:
+        """Objects are reported by the executive, so nothing observes them."""
+
+    def _described_world(self) -> str | None:
+        return None
+
+    def _find(self, key: Hashable | None, what: str) -> _Node | None:
+        """Return the node that a key or the value of `start` stands for; count a key that no node has."""
+        if key is None or isinstance(key, _Node):
+            return key
+        node = noted(self.emitter, what, lambda: self._nodes.get(key) or self._ended.get(key))
+        if node is None:
+            self._note(what, f"no node has the key {clean_repr(key)}; the root of the episode takes its place")
+        return node
+
+    def _known(self, key: Hashable) -> Hashable:
+        if self._objects.reference(key) is None:
+            raise CallerError(f"no object has the key {clean_repr(key)}: add it with `object_added` first")
+        return key
+
+    def _cause(self, key: Hashable | None) -> int | None:
+        """Return the sequence of the node that changes the world; None for one of a former episode."""
+        node = self._find(key, "a change of the world")
+        return node.sequence if node is not None and node.episode_id == self.id else None
+
+    def _note(self, what: str, reason: str) -> None:
+        self.emitter.note_fault(what, CallerError(reason))
