@@ -144,7 +144,10 @@ def _with_node(  # noqa: C901  one function, because a call costs more than most
         finally:
             if claim is not None:
                 claim.release()
-        return result
+        try:
+            return result
+        finally:
+            del result  # from Python 3.12 on a failure in it may hold this frame: break the reference cycle
 
     return run
 
