@@ -93,7 +93,7 @@ class Costmap:
     def ranked(self, *, every: int = 1) -> Iterator[Pose]:
         """Yield each middle, or one of `every` so many, in the order of `best`.
 
-        Poses are made one by one: those of a whole map take half a second, and most searches end at an early one.
+        Poses are made one by one: those of a whole map take 0.3 s, and most searches end at an early one.
         """
         values = self.map.ravel()
         steps = cell_steps(self.size_cells)
