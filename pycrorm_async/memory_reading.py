@@ -6,7 +6,6 @@ from collections.abc import Callable
 from contextlib import AbstractAsyncContextManager
 from datetime import datetime
 from os import PathLike
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sqlalchemy import Select
@@ -22,6 +21,7 @@ from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.snapshot import Moment
 from pycrorm_async.recording.recording import Recording
 from pycrorm_async.recording.writing.event_feed import BUFFER_EVENTS, EventStream, RecordedEvent, Subscription
+from pycrorm_async.report.write import Report
 from pycrorm_async.report.write import report as write_report
 
 if TYPE_CHECKING:
@@ -78,7 +78,7 @@ class ReadableMemory(PartsHolder):
         force: bool = False,
         first: int | None = None,
         last: int | None = None,
-    ) -> Path:
+    ) -> Report:
         """Write an episode, up to the last flush, as one HTML file; see `pycrorm_async.report.write.report`."""
         reading = self._open_parts.reading
         return await write_report(reading, episode, path, force=force, first=first, last=last)

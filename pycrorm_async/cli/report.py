@@ -12,6 +12,7 @@ from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlO
 from pycrorm_async.cli.output import note, print_json, stdout
 from pycrorm_async.cli.pending_events import note_pending_events
 from pycrorm_async.query.reading import Reading
+from pycrorm_async.report.write import Report
 from pycrorm_async.report.write import report as write_report
 
 __all__ = ["report"]
@@ -36,14 +37,21 @@ def report(
 ) -> None:
     """Write an episode as one HTML page that opens offline: task tree, Gantt chart, 3D scene, failures."""
 
-    async def write() -> Path:
+    async def write() -> Report:
         async with Reading.open(url) as reading:
             return await write_report(reading, episode, out, force=force, first=first, last=last)
 
     written = asyncio.run(write())
     note_pending_events(url, spool)
+    size = written.path.stat().st_size
     if as_json:
-        print_json({"file": written, "bytes": written.stat().st_size})
+        shown = {"first": written.first, "last": written.last, "events": written.events}
+        print_json({"file": written.path, "bytes": size, **shown})
         return
-    stdout.print(str(written), markup=False, highlight=False, soft_wrap=True)
-    note(f"The page has {written.stat().st_size / 1e6:.1f} MB and opens in any browser, also offline.")
+    stdout.print(str(written.path), markup=False, highlight=False, soft_wrap=True)
+    note(f"The page has {size / 1e6:.1f} MB and opens in any browser, also offline.")
+    if first is None and last is None and written.last < written.events:
+        note(
+            f"It shows the events {written.first} to {written.last} of {written.events}, because there are more nodes"
+            f" than a page can hold; the next page: --from {written.last + 1}"
+        )

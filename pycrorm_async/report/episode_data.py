@@ -42,6 +42,12 @@ __all__ = ["episode_document", "EpisodeFold"]
 _TEXTS_CHARACTERS = 6_000_000
 """Bounds the characters of all texts of a page together, so that it stays below 20 MB."""
 _TEXT_SHORTEST, _TEXT_LONGEST = 80, 20_000
+_NODES_MAX = 100_000
+"""Bounds the nodes of a page: it then has about 10 MB and opens in less than 3 s."""
+_CURVE_POINTS_MAX = 2_000
+"""Bounds the values of a curve, which is a few hundred pixels wide."""
+_LISTED_MAX = 20_000
+"""Bounds the percepts, observations and location resolutions of a page, each."""
 _VALUES_MAX = 2_000
 """Bounds the characters of an observation's values in the page."""
 
@@ -98,13 +104,23 @@ class EpisodeFold:
             case EpisodeEnded():
                 self._ended(happening)
             case ObjectDetected() if sequence >= self._first:
-                self._detections.append(_detection(sequence, happening))
+                self._list(self._detections, _detection(sequence, happening))
             case Observed() if sequence >= self._first:
                 self._observed(sequence, happening)
             case LocationResolved() if sequence >= self._first:
-                self._locations.append(_location(sequence, happening))
+                self._list(self._locations, _location(sequence, happening))
             case _:
                 self.world.read(sequence, happening)
+
+    @property
+    def is_full(self) -> bool:
+        """True if a page can hold no further node."""
+        return len(self._nodes) >= _NODES_MAX
+
+    @staticmethod
+    def _list(entries: list[dict[str, Any]], entry: dict[str, Any]) -> None:
+        if len(entries) < _LISTED_MAX:
+            entries.append(entry)
 
     def _named(self, value: Any) -> Any:
         """Return a parameter with the name of the object that it refers to."""
@@ -141,7 +157,8 @@ class EpisodeFold:
         text = msgspec.json.encode(observed.values).decode()
         if len(text) > _VALUES_MAX:
             text = f"{text[:_VALUES_MAX]}… ({len(text) - _VALUES_MAX:,} more characters)"
-        self._observations.append({"at": sequence, "node": observed.node or 0, "name": observed.name, "values": text})
+        entry = {"at": sequence, "node": observed.node or 0, "name": observed.name, "values": text}
+        self._list(self._observations, entry)
         for path, number in _numbers_in(observed.name, observed.values):
             self._series.setdefault(path, Track(self._first)).set(sequence, number)
 
@@ -183,9 +200,9 @@ class EpisodeFold:
             "detections": self._detections,
             "observations": self._observations,
             "locations": self._locations,
-            "series": {name: track.columns() for name, track in self._series.items()},
+            "series": {name: track.columns(_CURVE_POINTS_MAX) for name, track in self._series.items()},
             "samples": {
-                str(identity): {name: track.columns() for name, track in channels.items()}
+                str(identity): {name: track.columns(_CURVE_POINTS_MAX) for name, track in channels.items()}
                 for identity, channels in world.samples.items()
             },
         }
@@ -211,6 +228,8 @@ async def episode_document(
 ) -> dict[str, Any]:
     """Return the document of an episode, of all its events or of those from `first` to `last`.
 
+    It ends at the event at which the 100,000th node started, if there are more; `document["episode"]` has its `last`.
+
     Raises `UnknownEpisode`; `CallerError` for a window that holds no event; `LogDamaged` or `DatabaseForeign` for an
     event that cannot be read.
     """
@@ -226,13 +245,13 @@ async def episode_document(
     designators = {fingerprint(each): msgspec.json.decode(each, type=_DtypeOnly).dtype for each in declarations}
     async for page in log.pages(row):
         for event in page:
-            if event.sequence > end:
+            if event.sequence > end or fold.is_full:
                 break
             try:
                 fold.read(event, designators)
             except CannotFold as reason:
                 raise unreadable(row.id, event, str(reason), log) from None
-        if page[-1].sequence >= end:
+        if page[-1].sequence >= end or fold.is_full:
             break
     return fold.document(await _models(log, fold))
 

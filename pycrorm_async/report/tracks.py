@@ -39,9 +39,13 @@ class Track:
         self.at.append(sequence)
         self.values.append(value)
 
-    def columns(self) -> list[Any]:
-        """Return the differences of the sequences, and the values."""
-        return [[here - before for before, here in zip([0, *self.at], self.at, strict=False)], self.values]
+    def columns(self, points_max: int | None = None) -> list[Any]:
+        """Return the differences of the sequences, and the values; of more than `points_max` values evenly some."""
+        at, values = self.at, self.values
+        if points_max is not None and len(at) > points_max:
+            step = -(-len(at) // points_max)
+            at, values = at[::step], values[::step]
+        return [[here - before for before, here in zip([0, *at], at, strict=False)], values]
 
 
 class Texts:

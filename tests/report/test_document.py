@@ -13,10 +13,12 @@ from pycrorm_async.events.types import DescriptionDeclared
 from pycrorm_async.memory import Memory
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.recording.recorded_episode import RecordedEpisode
+from pycrorm_async.report import episode_data
 from pycrorm_async.report.episode_data import episode_document
 from pycrorm_async.report.html_page import page_of
 from pycrorm_async.report.object_model import object_model
 from pycrorm_async.report.tracks import Texts, Track
+from pycrorm_async.report.write import Report
 from pycrorm_async.world import Pose
 
 HOSTILE = "</script><script>alert(1)</script> & \u2028\u202e]]> {title} <!--"
@@ -118,9 +120,9 @@ async def test_a_memory_reports_a_running_episode(tmp_path: Path) -> None:
     async with Memory.open(url) as memory, memory.episode(description="still running") as episode:
         memory.observe("battery", 24.0)
         await memory.flush()
-        path = await memory.report(episode, tmp_path / "page.html")
-    assert path == tmp_path / "page.html"
-    assert '"status":"RUNNING"' in path.read_text()
+        written = await memory.report(episode, tmp_path / "page.html")
+    assert written == Report(tmp_path / "page.html", 1, 3, 3)
+    assert '"status":"RUNNING"' in written.path.read_text()
 
 
 def test_a_track_keeps_each_change_once_and_one_value_before_the_window() -> None:
@@ -128,6 +130,21 @@ def test_a_track_keeps_each_change_once_and_one_value_before_the_window() -> Non
     for sequence, value in ((1, 0.0), (4, 1.0), (9, 2.0), (12, 2.0), (13, 3.0), (13, 4.0), (20, 5.0)):
         track.set(sequence, value)
     assert track.columns() == [[9, 4, 7], [2.0, 4.0, 5.0]]
+
+
+def test_of_a_long_curve_a_part_of_the_values_is_kept() -> None:
+    track = Track(1)
+    for sequence in range(1, 11):
+        track.set(sequence, sequence / 2)
+    assert track.columns(4) == [[1, 3, 3, 3], [0.5, 2.0, 3.5, 5.0]]
+
+
+async def test_a_page_ends_where_it_can_hold_no_further_node(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(episode_data, "_NODES_MAX", 2)
+    document = await document_of(url)
+    assert names_of(document, 6) == ["RUNNING", "RUNNING"]
+    assert document["episode"]["last"] == document["nodes"][0][1]
+    assert document["episode"]["last"] < document["episode"]["head"]
 
 
 def test_texts_are_numbered_once_and_cut_to_their_share() -> None:
