@@ -11,18 +11,29 @@ import typer
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
 from pycrorm_async.cli.output import note, print_json, stdout
 from pycrorm_async.cli.pending_events import note_pending_events
+from pycrorm_async.errors import CallerError
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.report.write import Report
+from pycrorm_async.report.write import Overview, Report, overview
 from pycrorm_async.report.write import report as write_report
 
 __all__ = ["report"]
 
 
 def report(
-    episode: Annotated[str, typer.Argument(help="The episode's number, its id or first digits of the id, or `last`.")],
+    episode: Annotated[
+        str | None, typer.Argument(help="The episode's number, its id or first digits of the id, or `last`.")
+    ] = None,
+    every: Annotated[
+        bool, typer.Option("--all", help="Write a table of the episodes, and pages of the newest 200 behind it.")
+    ] = False,
+    tag: Annotated[
+        list[str] | None, typer.Option(metavar="TAG", help="With --all: only episodes with this tag; repeatable.")
+    ] = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", metavar="FILE.html", help="The file to write; default: episode-NUMBER.html."),
+        typer.Option(
+            "--out", metavar="FILE.html", help="The file to write; default: episode-NUMBER.html, episodes.html."
+        ),
     ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace the file if it exists.")] = False,
     first: Annotated[
@@ -36,6 +47,44 @@ def report(
     as_json: JsonOption = False,
 ) -> None:
     """Write an episode as one HTML page that opens offline: task tree, Gantt chart, 3D scene, failures."""
+    if every == (episode is not None):
+        raise CallerError("name an episode, for example `pycrorm report last`, or write all of them with --all")
+    if not every and tag:
+        raise CallerError("--tag chooses among all episodes: add --all")
+    if every and (first is not None or last is not None):
+        raise CallerError("--from and --to choose events of one episode: name it instead of --all")
+    if episode is None:
+        _write_overview(out or Path("episodes.html"), tag or [], url, spool, force=force, as_json=as_json)
+    else:
+        _write_episode(episode, out, (first, last), url, spool, force=force, as_json=as_json)
+
+
+def _write_overview(out: Path, tags: list[str], url: str, spool: Path | None, *, force: bool, as_json: bool) -> None:
+    async def write() -> Overview:
+        async with Reading.open(url) as reading:
+            return await overview(reading, out, tags=tags, force=force)
+
+    written = asyncio.run(write())
+    note_pending_events(url, spool)
+    if as_json:
+        counts = {"episodes": written.episodes, "pages": written.pages, "left_out": written.left_out}
+        print_json({"file": written.path, **counts})
+        return
+    stdout.print(str(written.path), markup=False, highlight=False, soft_wrap=True)
+    note(f"It has {written.episodes} episodes; pages of {written.pages} are in {out.stem}.pages beside it.")
+
+
+def _write_episode(
+    episode: str,
+    out: Path | None,
+    window: tuple[int | None, int | None],
+    url: str,
+    spool: Path | None,
+    *,
+    force: bool,
+    as_json: bool,
+) -> None:
+    first, last = window
 
     async def write() -> Report:
         async with Reading.open(url) as reading:

@@ -12,7 +12,7 @@ import html
 import os
 import re
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib import resources
 from pathlib import Path
@@ -22,9 +22,11 @@ import msgspec
 
 from pycrorm_async.errors import CallerError
 
-__all__ = ["page_of", "write_page", "refuse_existing"]
+__all__ = ["page_of", "overview_page_of", "write_page", "refuse_existing"]
 
-_MODULES = "dom episode bodies scene_view map_view tree_view gantt_view panels main".split()
+_EPISODE = "dom episode bodies scene_view map_view tree_view gantt_view panels main".split()
+_OVERVIEW = "dom episode overview".split()
+"""The modules of each page's program, every one behind those that it imports."""
 _TITLE_MAX = 200
 """Bounds the characters of the description in title and heading."""
 _ESCAPES = {
@@ -41,21 +43,29 @@ _EXPORT = re.compile(r"^export (?=(const|class|function) )", re.MULTILINE)
 def page_of(document: Mapping[str, Any]) -> str:
     """Return the page of a document from `episode_document`."""
     episode = document["episode"]
-    heading = episode["description"][:_TITLE_MAX] or f"Episode {episode['number']}"
-    three, program, style = _asset("assets/three.bundle.js"), _program(), _asset("web/page.css")
+    heading = episode["description"] or f"Episode {episode['number']}"
+    scripts = (_asset("assets/three.bundle.js"), _program(*_EPISODE))
+    return _page(document, heading, f" · episode {episode['number']}", _asset("web/episode_body.html"), scripts)
+
+
+def overview_page_of(document: Mapping[str, Any]) -> str:
+    """Return the page of a document from `overview_document`."""
+    return _page(document, document["title"], "", _asset("web/overview_body.html"), (_program(*_OVERVIEW),))
+
+
+def _page(document: Mapping[str, Any], heading: str, suffix: str, body: str, scripts: Sequence[str]) -> str:
+    heading, style = heading[:_TITLE_MAX], _asset("web/page.css")
     policy = (
-        f"default-src 'none'; script-src {_hash(three)} {_hash(program)}; style-src {_hash(style)};"
+        f"default-src 'none'; script-src {' '.join(map(_hash, scripts))}; style-src {_hash(style)};"
         " img-src data:; base-uri 'none'; form-action 'none'"
     )
     parts = {
         "policy": policy,
-        "generator": html.escape(f"pycrorm {episode['software']}"),
-        "title": html.escape(f"{heading} · episode {episode['number']}"),
-        "heading": html.escape(heading),
+        "title": html.escape(heading + suffix),
         "style": style,
+        "body": body.replace("{heading}", html.escape(heading)),
         "document": _safe_json(document),
-        "three": three,
-        "program": program,
+        "scripts": "\n".join(f"<script>{each}</script>" for each in scripts),
     }
     return re.sub(r"\{(\w+)\}", lambda match: parts[match[1]], _asset("web/page.html"))
 
@@ -104,9 +114,10 @@ def _safe_json(document: Mapping[str, Any]) -> str:
 
 
 @cache
-def _program() -> str:
-    """Return the page's modules as one, in the order of their imports, without the imports among them."""
-    return "\n".join(_EXPORT.sub("", _IMPORT.sub("", _asset(f"web/{name}.js"))) for name in _MODULES)
+def _program(*modules: str) -> str:
+    """Return modules of the page as one, without the imports among them."""
+    text = "\n".join(_EXPORT.sub("", _IMPORT.sub("", _asset(f"web/{name}.js"))) for name in modules)
+    return f'"use strict";\n{{\n{text}}}\n'
 
 
 @cache

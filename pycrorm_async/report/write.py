@@ -1,4 +1,4 @@
-"""Write the report of an episode: read its events, make the page, and give the file its name when it is complete.
+"""Write the report of an episode, or of many: read, make the page, and give the file its name when it is complete.
 
 >>> await report(reading, "last", "breakfast.html")
 Report(path=PosixPath('breakfast.html'), first=1, last=188, events=188)
@@ -7,17 +7,24 @@ Report(path=PosixPath('breakfast.html'), first=1, last=188, events=188)
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Collection
 from os import PathLike
 from pathlib import Path
 from typing import NamedTuple
+from urllib.parse import quote
 
+from pycrorm_async.errors import CallerError
 from pycrorm_async.query.as_of import AnyEpisode
 from pycrorm_async.query.named_queries import EpisodeSummary
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.report.episode_data import episode_document
-from pycrorm_async.report.html_page import page_of, refuse_existing, write_page
+from pycrorm_async.report.html_page import overview_page_of, page_of, refuse_existing, write_page
+from pycrorm_async.report.overview_data import newest_episodes, overview_document
 
-__all__ = ["Report", "report"]
+__all__ = ["Overview", "Report", "overview", "report"]
+
+_PAGES_MAX = 200
+"""Bounds the pages behind an overview: one has about 0.7 MB."""
 
 
 class Report(NamedTuple):
@@ -27,6 +34,15 @@ class Report(NamedTuple):
     first: int
     last: int
     events: int
+
+
+class Overview(NamedTuple):
+    """A written overview: its file, and how many episodes it counts, has pages for, and leaves out."""
+
+    path: Path
+    episodes: int
+    pages: int
+    left_out: int
 
 
 async def report(
@@ -58,3 +74,31 @@ async def report(
     await asyncio.to_thread(lambda: write_page(page_of(document), file, force=force))
     shown = document["episode"]
     return Report(file, shown["first"], shown["last"], shown["head"])
+
+
+async def overview(
+    reading: Reading, path: str | PathLike[str], *, tags: Collection[str] = (), force: bool = False
+) -> Overview:
+    """Write a table of the episodes that have all these tags, and pages of the newest 200 of them behind it.
+
+    The pages are in the folder `NAME.pages` beside the file `NAME.html`. Raises `CallerError` if one of them exists,
+    without `force`, or if there is no such episode.
+    """
+    file = Path(path)
+    folder = file.with_name(f"{file.stem}.pages")
+    refuse_existing(file, force=force)
+    if folder.exists() and not (force and folder.is_dir()):
+        raise CallerError(f"{folder} exists: add --force to write pages into it, or give another name")
+    episodes, total = await newest_episodes(reading, tags)
+    if not episodes:
+        raise CallerError(f"no episode has the tags {', '.join(tags)}" if tags else "this memory has no episode yet")
+    folder.mkdir(exist_ok=True)
+    pages: dict[int, str] = {}
+    for each in episodes[-_PAGES_MAX:]:
+        name = f"episode-{each.number}.html"
+        await report(reading, each, folder / name, force=force)
+        pages[each.number] = f"{quote(folder.name)}/{name}"
+    title = f"Episodes with the tags {', '.join(tags)}" if tags else "Episodes"
+    document = await overview_document(reading, title, episodes, total, pages)
+    await asyncio.to_thread(lambda: write_page(overview_page_of(document), file, force=force))
+    return Overview(file, len(episodes), len(pages), total - len(episodes))

@@ -60,7 +60,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for function, code in (("plan", 0), ("dies", -9), ("drives", 0)):
         done = pycrorm("run", f"breakfast.py:{function}", "--sample-interval-ms", "1", cwd=folder)
         assert done.returncode == code, done.stderr
-    pycrorm("writer", "--once", cwd=folder)
+        assert pycrorm("writer", "--once", cwd=folder).returncode == 0  # the dead one gets its number before the next
     return folder
 
 

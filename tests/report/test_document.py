@@ -86,8 +86,8 @@ async def test_hostile_text_ends_no_script_and_survives_the_way_into_the_page(ur
     page = page_of(document)
     assert page.count("</script>") == 3
     assert page.count("<script") == 3
-    assert "\u2028" not in page.partition('id="episode">')[2]
-    encoded = page.partition('id="episode">')[2].partition("</script>")[0]
+    assert "\u2028" not in page.partition('id="document">')[2]
+    encoded = page.partition('id="document">')[2].partition("</script>")[0]
     assert msgspec.json.decode(encoded) == msgspec.json.decode(msgspec.json.encode(document))
     assert msgspec.json.decode(encoded)["episode"]["description"] == HOSTILE
 

@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 
+from tests.commands import pycrorm
 from tests.report.browser import Browser, Tab
 
 pytestmark = pytest.mark.slow
@@ -160,3 +161,25 @@ def test_the_policy_lets_no_other_script_run(chrome: Browser, pages: dict[str, P
         tab.ask(added)
         assert tab.ask("window.ran") is None
         assert any("Content Security Policy" in each for each in tab.problems())
+
+
+@pytest.mark.parametrize("width", [420, 1400])
+def test_a_table_of_episodes_counts_failures_by_reason_and_leads_to_the_pages(
+    chrome: Browser, recorded: Path, tmp_path: Path, width: int
+) -> None:
+    done = pycrorm("report", "--all", "--out", tmp_path / "all of them.html", cwd=recorded)
+    assert done.returncode == 0, done.stderr
+    with chrome.open(tmp_path / "all of them.html", width=width) as tab:
+        rows = "[...document.querySelectorAll('{} tr')].map((each) => each.children[{}].textContent)"
+        assert tab.ask(rows.format("#episodes tbody", 0)) == ["3", "2", "1"]
+        assert tab.ask(rows.format("#episodes tbody", 2)) == ["✓ SUCCEEDED", "? LOST", "✓ SUCCEEDED"]
+        assert tab.ask(rows.format("#reasons", 0)) == ["4"]
+        assert tab.ask(rows.format("#reasons", 1)) == ["IKError"]
+        assert "67 % succeeded" in tab.ask("document.getElementById('facts').textContent")
+        tab.ask("document.querySelector('th button').click()")
+        assert tab.ask(rows.format("#episodes tbody", 0)) == ["1", "2", "3"]
+        assert tab.ask("document.documentElement.scrollWidth") == width
+        assert tab.ask("document.querySelectorAll('b, script:not([type])').length") == 1
+        assert_quiet(tab, tmp_path / "all of them.html")
+        tab.ask("document.querySelector('td a').click()")
+        tab.wait_for("globalThis.pycrormPage?.episode.number === 1")

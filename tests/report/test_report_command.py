@@ -40,6 +40,14 @@ def test_a_file_that_exists_is_replaced_only_when_asked(recorded: Path, tmp_path
     ("arguments", "message"),
     [
         (("77",), "pycrorm: there is no episode '77' (`pycrorm episodes` lists the 3 there are)"),
+        ((), "pycrorm: name an episode, for example `pycrorm report last`, or write all of them with --all"),
+        (
+            ("1", "--all"),
+            "pycrorm: name an episode, for example `pycrorm report last`, or write all of them with --all",
+        ),
+        (("1", "--tag", "x"), "pycrorm: --tag chooses among all episodes: add --all"),
+        (("--all", "--from", "3"), "pycrorm: --from and --to choose events of one episode: name it instead of --all"),
+        (("--all", "--tag", "none"), "pycrorm: no episode has the tags none"),
         (("1", "--out", "none/page.html"), "pycrorm: the folder none does not exist: create it first"),
         (("1", "--from", "9999", "--out", "window.html"), "and none from event 9999 to"),
     ],
@@ -57,6 +65,17 @@ def test_a_memory_that_does_not_exist_is_one_line(tmp_path: Path) -> None:
     assert done.returncode == 3
     assert "pycrorm.db" in one_line_of(done)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_all_episodes_are_a_table_with_pages_behind_it(recorded: Path, tmp_path: Path) -> None:
+    out = tmp_path / "my robots.html"
+    done = pycrorm("report", "--all", "--out", out, "--json", cwd=recorded)
+    assert json.loads(done.stdout) == {"file": str(out), "episodes": 3, "pages": 3, "left_out": 0}
+    names = [each.name for each in sorted((tmp_path / "my robots.pages").iterdir())]
+    assert names == ["episode-1.html", "episode-2.html", "episode-3.html"]
+    again = pycrorm("report", "--all", "--out", out, cwd=recorded)
+    assert one_line_of(again) == f"pycrorm: {out} exists: add --force to replace it, or give another name"
+    assert pycrorm("report", "--all", "--out", out, "--force", cwd=recorded).returncode == 0
 
 
 def test_a_disk_that_fills_leaves_no_partial_file(tmp_path: Path) -> None:

@@ -204,6 +204,6 @@ class Page {
   }
 }
 
-const page = new Page(new Episode(JSON.parse(part("episode").textContent)));
+const page = new Page(new Episode(JSON.parse(part("document").textContent)));
 document.documentElement.dataset.ready = "yes";
 globalThis.pycrormPage = page;

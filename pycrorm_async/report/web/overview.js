@@ -1,0 +1,126 @@
+// Shows many episodes: how often they succeed and for how long, why they fail, and a table that leads to their pages.
+
+import { duration, element, recorded, svg } from "./dom.js";
+import { signOf } from "./episode.js";
+
+const BINS_MAX = 12;
+const REASONS_MAX = 20;
+const ROWS_MAX = 2000;
+
+const part = (name) => document.getElementById(name);
+const ended = (episodes) => episodes.filter((each) => each.status !== "RUNNING");
+const rateOf = (episodes) => {
+  const all = ended(episodes);
+  return all.length === 0 ? null : all.filter((each) => each.status === "SUCCEEDED").length / all.length;
+};
+const percent = (rate) => (rate === null ? "none ended" : `${(rate * 100).toFixed(0)} %`);
+
+function median(numbers) {
+  const sorted = numbers.filter((each) => each !== null).sort((one, other) => one - other);
+  return sorted.length === 0 ? null : sorted[Math.floor(sorted.length / 2)];
+}
+
+/** The episodes in their order, in parts of equal size. */
+function binsOf(episodes) {
+  const count = Math.min(BINS_MAX, episodes.length);
+  const edge = (index) => Math.round((index * episodes.length) / count);
+  return Array.from({ length: count }, (_, index) => episodes.slice(edge(index), edge(index + 1)));
+}
+
+/** Bars from 0 to `most`, each with the text of its value below it. */
+function bars(values, most, label, textOf) {
+  const [wide, high] = [40, 60];
+  const picture = svg("svg", { viewBox: `0 0 ${values.length * wide} ${high + 16}`, class: "bars", role: "img", "aria-label": label });
+  values.forEach((value, index) => {
+    const height = most > 0 ? ((value ?? 0) / most) * high : 0;
+    picture.append(svg("rect", { x: index * wide + 3, y: high - height, width: wide - 6, height: Math.max(height, 0.5) }));
+    const text = svg("text", { x: index * wide + wide / 2, y: high + 12, "text-anchor": "middle", "font-size": 11 });
+    text.textContent = value === null ? "–" : textOf(value);
+    picture.append(text);
+  });
+  return picture;
+}
+
+class Overview {
+  constructor({ title, total, episodes }) {
+    Object.assign(this, { title, total, episodes, by: "number", down: true });
+    const facts = [
+      `${episodes.length} episodes`,
+      `${percent(rateOf(episodes))} succeeded`,
+      `median ${duration(median(episodes.map((each) => each.seconds)) ?? 0)}`,
+      total > episodes.length ? `the newest of ${total}` : null,
+    ];
+    part("facts").replaceChildren(...facts.filter((each) => each !== null).map((each) => recorded(each)));
+    this.bins = binsOf(episodes);
+    this.#trend();
+    this.#reasons();
+    this.#table();
+  }
+
+  #trend() {
+    if (this.bins.length < 2) return;
+    const picture = bars(this.bins.map(rateOf), 1, "share of successful episodes, the oldest first", percent);
+    part("trend").append(element("h2", {}, "Success, the oldest episodes first"), picture);
+  }
+
+  #reasons() {
+    const counts = new Map();
+    for (const { reasons } of this.episodes) {
+      for (const [reason, count] of Object.entries(reasons)) counts.set(reason, (counts.get(reason) ?? 0) + count);
+    }
+    const sorted = [...counts].sort(([, one], [, other]) => other - one);
+    const rows = sorted.slice(0, REASONS_MAX).map(([reason, count]) => {
+      const trend = this.bins.map((bin) => bin.reduce((sum, each) => sum + (each.reasons[reason] ?? 0), 0));
+      const picture = this.bins.length > 1 ? bars(trend, Math.max(...trend), `${reason} over time`, String) : "";
+      const cells = [element("td", { class: "number" }, String(count)), element("td", {}, recorded(reason, { class: "reason" }))];
+      return element("tr", {}, ...cells, element("td", {}, picture));
+    });
+    const left = sorted.length - rows.length;
+    const content = rows.length > 0 ? element("table", {}, ...rows) : element("p", { class: "quiet" }, "Nothing failed.");
+    part("reasons").append(element("h2", {}, "Failures by reason"), content);
+    if (left > 0) part("reasons").append(element("p", { class: "quiet" }, `${left} other reasons`));
+  }
+
+  #table() {
+    const columns = { number: "episode", started: "started", status: "status", seconds: "took", nodes: "nodes", failed: "failed", description: "description" };
+    const heads = Object.entries(columns).map(([key, title]) => {
+      const sign = this.by === key ? (this.down ? " ▾" : " ▴") : "";
+      const sort = { type: "button", onclick: () => this.#sortBy(key) };
+      return element("th", { scope: "col" }, element("button", sort, `${title}${sign}`));
+    });
+    const order = this.down ? -1 : 1;
+    const sorted = this.episodes.slice().sort((one, other) => {
+      const [a, b] = [one[this.by] ?? -1, other[this.by] ?? -1];
+      return (a < b ? -1 : a > b ? 1 : 0) * order;
+    });
+    const rows = sorted.slice(0, ROWS_MAX).map((each) => this.#row(each));
+    const table = element("table", {}, element("thead", {}, element("tr", {}, ...heads)), element("tbody", {}, ...rows));
+    const left = sorted.length - rows.length;
+    const note = left > 0 ? element("p", { class: "quiet" }, `${left} more episodes are counted above and not listed.`) : "";
+    part("episodes").replaceChildren(element("h2", {}, "Episodes"), table, note);
+  }
+
+  #row(each) {
+    const name = String(each.number);
+    return element(
+      "tr",
+      {},
+      element("td", { class: "number" }, each.page ? element("a", { href: each.page }, name) : name),
+      element("td", {}, each.started),
+      element("td", { class: `is-${each.status.toLowerCase()}` }, element("span", { class: "sign" }, signOf(each.status)), ` ${each.status}`),
+      element("td", { class: "number" }, each.seconds === null ? "" : duration(each.seconds)),
+      element("td", { class: "number" }, String(each.nodes)),
+      element("td", { class: "number" }, String(each.failed)),
+      element("td", {}, recorded(each.description)),
+    );
+  }
+
+  #sortBy(key) {
+    this.down = this.by === key ? !this.down : true;
+    this.by = key;
+    this.#table();
+  }
+}
+
+globalThis.pycrormOverview = new Overview(JSON.parse(part("document").textContent));
+document.documentElement.dataset.ready = "yes";
