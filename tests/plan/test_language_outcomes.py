@@ -464,6 +464,7 @@ async def test_an_abandoned_plan_cancels_its_branches() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.every_python
 async def test_failed_expressions_leave_nothing_for_the_garbage_collector() -> None:
     async def plan() -> None:
         fails = [Step("x", fails=ObjectLost("gone")), Step("y", fails=PlanFailure("no"))]
