@@ -129,12 +129,17 @@ def _conflict(
     return None
 
 
+_built_in_declarations: dict[str, DesignatorTypeDeclared] = {}
+"""Those that were asked for, by dtype: deriving one takes a millisecond."""
+
+
 def built_in_declaration(dtype: str) -> DesignatorTypeDeclared | None:
     """Return the declaration of the plan layer's own type with this dtype; None if it has none."""
-    for designator in _built_in_classes(dtype):
-        if not inspect.isabstract(designator):
-            return declared_type(designator, strict=False).declaration
-    return None
+    if dtype not in _built_in_declarations:
+        for designator in _built_in_classes(dtype):
+            if not inspect.isabstract(designator):
+                _built_in_declarations[dtype] = declared_type(designator, strict=False).declaration
+    return _built_in_declarations.get(dtype)
 
 
 def _descendants(root: type) -> typing.Iterator[Any]:
