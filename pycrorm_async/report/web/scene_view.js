@@ -1,5 +1,6 @@
 // Draws the world after an event with WebGL: bodies, the paths of the current action, names.
 
+import { pathsOf } from "./bodies.js";
 import { colorOf, element } from "./dom.js";
 
 export class SceneView {
@@ -75,12 +76,15 @@ export class SceneView {
     const box = new THREE.Box3();
     for (const each of this.bodies.at(this.episode.opens)) box.expandByObject(each.group);
     if (this.event !== undefined) this.bodies.at(this.event);
+    for (const { points } of pathsOf(this.episode, this.episode.actionAt(this.episode.opens))) {
+      for (const [x, y, z] of points) box.expandByPoint(new THREE.Vector3(x, y, z));
+    }
     if (box.isEmpty()) box.expandByPoint(new THREE.Vector3(-1, -1, 0)).expandByPoint(new THREE.Vector3(1, 1, 1));
     const middle = box.getCenter(new THREE.Vector3());
     const reach = Math.max(box.getSize(new THREE.Vector3()).length() / 2, 0.6);
     const upright = (this.camera.fov * Math.PI) / 360;
     const narrowest = Math.min(upright, Math.atan(Math.tan(upright) * this.camera.aspect));
-    const away = new THREE.Vector3(-1.3, -1.1, 1.05).setLength((0.9 * reach) / Math.sin(narrowest));
+    const away = new THREE.Vector3(-1.3, -1.1, 1.05).setLength(reach / Math.sin(narrowest));
     this.controls.target.copy(middle);
     this.camera.position.copy(middle).add(away);
     this.controls.update();
