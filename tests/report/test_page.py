@@ -5,6 +5,8 @@ from typing import Any
 
 import pytest
 
+from pycrorm_async import world_of
+from pycrorm_async.query.reading import Reading
 from tests.commands import pycrorm
 from tests.report.browser import Browser, Tab
 
@@ -183,3 +185,24 @@ def test_a_table_of_episodes_counts_failures_by_reason_and_leads_to_the_pages(
         assert_quiet(tab, tmp_path / "all of them.html")
         tab.ask("document.querySelector('td a').click()")
         tab.wait_for("globalThis.pycrormPage?.episode.number === 1")
+
+
+@pytest.mark.parametrize(
+    ("page", "number", "name"), [("plan", 1, "pr2"), ("drives", 3, "courier"), ("drives", 3, "other")]
+)
+async def test_every_link_is_where_bullet_has_it(
+    chrome: Browser, pages: dict[str, Path], recorded: Path, page: str, number: int, name: str
+) -> None:
+    body = f"pycrormPage.bodies.of(pycrormPage.episode.objects.find((each) => each.name === '{name}'))"
+    point = "new THREE.Vector3().setFromMatrixPosition(link.matrixWorld).toArray()"
+    with chrome.open(pages[page]) as tab:
+        drawn = tab.ask(f"Object.fromEntries([...{body}.links].map(([name, link]) => [name, {point}]))")
+        event = tab.ask("pycrormPage.event")
+    async with Reading.open(f"sqlite:///{recorded / 'pycrorm.db'}") as reading:
+        then = await reading.as_of(number, sequence=event)
+    assert then.world.object(name).base_link == ("forearm_link" if name == "other" else None)
+    with world_of(then) as world:
+        robot = world.object(name)
+        assert drawn.keys() == set(robot.links)
+        for link, position in drawn.items():
+            assert position == pytest.approx(list(robot.link_pose(link).position), abs=2e-3), link
