@@ -146,8 +146,8 @@ class Recording:
             simulated: whether the robot only imagines it; ordinary queries leave such an episode out.
             thought_by: the node that imagines it, from `RecordedEpisode.node_reference`.
             convert: converts each parameter, result and observed value, and each item of one, to a scalar, a text, a
-                list or dict, a `PoseValue`, an `ObjectReference`, or the key of an object. What it raises is recorded
-                as the reason why the value is missing.
+                list or dict, a `PoseValue`, an `ObjectReference`, or, for a field of the type `object`, the key of an
+                object. What it raises is recorded as the reason why the value is missing.
 
         Raises:
             CallerError: an argument has the wrong type. What else goes wrong is counted, and the episode stays empty.
