@@ -104,7 +104,7 @@ class RecordedValues:
         """Copy a failure: an exception, a `FailureValue`, or a text. Raises `CallerError` for anything else."""
         if isinstance(failure, BaseException):
             return failure_value(failure, self._references)
-        return FailureValue("str", clean(failure)) if isinstance(failure, str) else struct_of(failure, FailureValue)
+        return FailureValue("Failure", clean(failure)) if isinstance(failure, str) else struct_of(failure, FailureValue)
 
     def _checked(self, value: msgspec.Struct) -> Any:
         """Return a value of an event if it is whole, and its rows are those of this episode."""
