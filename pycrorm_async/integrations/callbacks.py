@@ -15,15 +15,19 @@ from types import TracebackType
 from typing import Any, Final, Self
 from uuid import UUID
 
-from langchain_core.callbacks import BaseCallbackHandler
-from langchain_core.messages import BaseMessage, get_buffer_string
-from langchain_core.outputs import LLMResult
-from langchain_core.version import VERSION
-from pydantic import BaseModel
-
+from pycrorm_async.errors import MissingExtra
 from pycrorm_async.recording.declarations.recorded_type import FieldSpec, RecordedKind
 from pycrorm_async.recording.recording import Recording
 from pycrorm_async.recording.writing.episode_opening import end_statuses
+
+try:
+    from langchain_core.callbacks import BaseCallbackHandler
+    from langchain_core.messages import BaseMessage, get_buffer_string
+    from langchain_core.outputs import LLMResult
+    from langchain_core.version import VERSION
+    from pydantic import BaseModel
+except ModuleNotFoundError as missing:
+    raise MissingExtra(f"langchain-core is not installed ({missing}): pip install 'pycrorm-async[langchain]'") from None
 
 __all__ = ["RememberedRuns"]
 

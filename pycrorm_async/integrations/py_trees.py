@@ -19,16 +19,7 @@ from time import perf_counter
 from types import TracebackType
 from typing import Any, Final
 
-from py_trees.behaviour import Behaviour
-from py_trees.blackboard import Blackboard
-from py_trees.common import Status
-from py_trees.composites import Composite
-from py_trees.decorators import Decorator
-from py_trees.trees import BehaviourTree
-from py_trees.version import __version__
-from py_trees.visitors import VisitorBase
-
-from pycrorm_async.errors import CallerError
+from pycrorm_async.errors import CallerError, MissingExtra
 from pycrorm_async.events.values import NodeStatus
 from pycrorm_async.recording.declarations.recorded_type import FieldSpec, RecordedKind
 from pycrorm_async.recording.recorded_episode import RecordedEpisode
@@ -36,6 +27,18 @@ from pycrorm_async.recording.recording import Recording
 from pycrorm_async.recording.values.texts import reading_fault
 from pycrorm_async.recording.values.value_snapshot import RefusedValue
 from pycrorm_async.recording.writing.episode_opening import end_statuses
+
+try:
+    from py_trees.behaviour import Behaviour
+    from py_trees.blackboard import Blackboard
+    from py_trees.common import Status
+    from py_trees.composites import Composite
+    from py_trees.decorators import Decorator
+    from py_trees.trees import BehaviourTree
+    from py_trees.version import __version__
+    from py_trees.visitors import VisitorBase
+except ModuleNotFoundError as missing:
+    raise MissingExtra(f"py_trees is not installed ({missing}): pip install 'pycrorm-async[py_trees]'") from None
 
 __all__ = ["RememberedTree"]
 

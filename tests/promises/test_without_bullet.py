@@ -137,3 +137,16 @@ def test_a_failed_plan_says_in_one_line_what_to_install(tmp_path: Path) -> None:
     done = run(f"{ABSENT} from pycrorm_async.cli.main import main; sys.argv = {words}; main()", tmp_path)
     assert done.returncode == 1
     assert one_line_of(done).startswith(f"pycrorm: the plan sweep.py:plan failed: BulletMissing: {LINE}")
+
+
+@pytest.mark.parametrize(
+    ("module", "absent", "extra"),
+    [("py_trees", "py_trees", "py_trees"), ("callbacks", "langchain_core", "langchain")],
+)
+def test_an_integration_without_its_package_names_the_extra(module: str, absent: str, extra: str) -> None:
+    script = f"{WITHOUT_EXTRAS}\nEXTRAS.add({absent!r})\nimport pycrorm_async.integrations.{module}"
+    done = subprocess.run(
+        [sys.executable, "-c", script], env=environment(), capture_output=True, text=True, timeout=60, check=False
+    )
+    assert done.stderr.splitlines()[-1].startswith("pycrorm_async.errors.MissingExtra: ")
+    assert f"pip install 'pycrorm-async[{extra}]'" in done.stderr
