@@ -92,7 +92,7 @@ class RecordedNodes(EpisodeWriter[_Node]):
 
     def _close(self, failure: BaseException | None, status: EpisodeStatus | None) -> None:
         if self._nodes and failure is None and not self.closed:
-            self._note("EpisodeEnded", f"{len(self._nodes)} nodes were open at the end of episode {self}")
+            self._note("EpisodeEnded", f"nodes open at the end of episode {self}, which end LOST: {len(self._nodes)}")
         if status in get_args(EpisodeStatus):
             self._end_status = status
         self._episodes.close(self, failure)

@@ -157,7 +157,8 @@ class Recording:
         check_arguments(description=world, plan=None, seed=None, strict=False)
         if thought_by is not None and not _is_whole(thought_by):
             raise CallerError(f"thought_by must be from `node_reference` of an episode, not {thought_by!r:.100}")
-        if repr(simulated) not in ("True", "False") or isinstance(seed, bool):
+        given: tuple[object, object] = (simulated, seed)
+        if not isinstance(given[0], bool) or isinstance(given[1], bool):
             raise CallerError("simulated must be a bool, and seed an int")
         if convert is not None and not callable(convert):
             raise CallerError(f"convert must be a function, not {convert!r:.100}")

@@ -108,7 +108,7 @@ def test_no_parameter_stops_the_episode(tmp_path: Path, kind: Any) -> None:
 
 def test_a_faulty_part_costs_no_node_and_no_object(tmp_path: Path) -> None:
     broken: Any = RobotValue("here", "R")  # type: ignore[arg-type]
-    robots: tuple[Any, ...] = ([1], broken, RobotValue(AT, "R", None, ObjectReference(0, 0)), "nobody", Faulty())
+    robots: tuple[Any, ...] = ([1], broken, RobotValue(AT, "R", None, ObjectReference(0, 0)), "never added", Faulty())
 
     def write(recording: Recording, episode: RecordedEpisode) -> None:
         declared = recording.type("action", "Step", {"x": float})
@@ -215,8 +215,8 @@ def test_arguments_of_an_episode_that_would_stop_it_are_refused(tmp_path: Path) 
         (("PickUpAction", {}), ("PickUpAction", {"Arm": "real"})),
     ],
 )
-@pytest.mark.parametrize("anew", [False, True], ids=["one process", "a second run"])
-def test_contradicting_declarations_are_kept_apart(tmp_path: Path, first: Any, second: Any, *, anew: bool) -> None:
+@pytest.mark.parametrize("runs", [1, 2])
+def test_contradicting_declarations_are_kept_apart(tmp_path: Path, first: Any, second: Any, runs: int) -> None:
     value = {"real": 1.0, "text": "one", "pose": HERE}
 
     def write(recording: Recording, episode: RecordedEpisode, *, declared: Any) -> None:
@@ -224,7 +224,7 @@ def test_contradicting_declarations_are_kept_apart(tmp_path: Path, first: Any, s
         episode.start(1, recording.type("action", dtype, fields), {name: value[kind] for name, kind in fields.items()})
         episode.end(1)
 
-    if anew:
+    if runs == 2:
         record(tmp_path, lambda recording, episode: write(recording, episode, declared=first))
         record(tmp_path, lambda recording, episode: write(recording, episode, declared=second))
     else:

@@ -226,7 +226,7 @@ def test_nodes_open_at_the_end_are_lost_and_counted_once(tmp_path: Path) -> None
     total, last = faults_of(tmp_path, write)
     assert total == 1
     assert last is not None
-    assert "3 nodes were open" in last
+    assert last.endswith("which end LOST: 3")
     assert [row[2] for row in nodes(tmp_path)] == ["LOST"] * 3
     assert_verified(tmp_path)
 

@@ -158,5 +158,5 @@ class Emitter:
         self._fault_count += 1
         self._last_fault = f"{where}: {type(error).__name__}: {cut(clean(message_of(error)), _REASON_MAX)}"
         if self._fault_count & (self._fault_count - 1) == 0:
-            _log.error("an event was not recorded (%d so far): %s", self._fault_count, self._last_fault)
-            _log.debug("traceback of the event that was not recorded", exc_info=error)
+            _log.error("a fault of recording (%d so far): %s", self._fault_count, self._last_fault)
+            _log.debug("traceback of the fault of recording", exc_info=error)
