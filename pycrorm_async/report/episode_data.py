@@ -30,7 +30,7 @@ from pycrorm_async.projections.fold.fold import CannotFold, happening_of
 from pycrorm_async.query.as_of import unreadable
 from pycrorm_async.query.parameter_text import parameters_text
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.report.object_model import assumed_model, object_model, point_model
+from pycrorm_async.query.scene.object_model import assumed_model, object_model, point_model
 from pycrorm_async.report.recorded_objects import WorldFold
 from pycrorm_async.report.tracks import Texts, Track, rounded
 from pycrorm_async.store.episode_lookup import episode_named

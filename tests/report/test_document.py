@@ -12,11 +12,11 @@ from pycrorm_async.errors import CallerError, UnknownEpisode
 from pycrorm_async.events.types import DescriptionDeclared
 from pycrorm_async.memory import Memory
 from pycrorm_async.query.reading import Reading
+from pycrorm_async.query.scene.object_model import object_model
 from pycrorm_async.recording.recorded_episode import RecordedEpisode
 from pycrorm_async.report import episode_data
 from pycrorm_async.report.episode_data import episode_document
 from pycrorm_async.report.html_page import page_of
-from pycrorm_async.report.object_model import object_model
 from pycrorm_async.report.tracks import Texts, Track
 from pycrorm_async.report.write import Report
 from pycrorm_async.world import Pose

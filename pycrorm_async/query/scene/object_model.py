@@ -1,4 +1,4 @@
-"""Read the links, joints and shapes of a URDF as plain values, for forward kinematics in the page.
+"""Read the links, joints and shapes of a URDF as plain values, for forward kinematics where they are drawn.
 
 A mesh is drawn as the box around its link's collision shapes. A link without a visual shape has its collision shapes.
 """
