@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
-from pycrorm_async.cli.output import note, print_json, stdout
+from pycrorm_async.cli.output import note, print_json, problem, stdout
 from pycrorm_async.cli.pending_events import note_pending_events
 from pycrorm_async.errors import CallerError
 from pycrorm_async.query.reading import Reading
@@ -45,8 +45,11 @@ def report(
     url: UrlOption = DEFAULT_URL,
     spool: SpoolOption = None,
     as_json: JsonOption = False,
-) -> None:
-    """Write an episode as one HTML page that opens offline: task tree, Gantt chart, 3D scene, failures."""
+) -> int:
+    """Write an episode as one HTML page that opens offline: task tree, Gantt chart, 3D scene, failures.
+
+    Exit code 1 if --all met an episode whose events cannot be read; its row says so, and all others have their pages.
+    """
     if every == (episode is not None):
         raise CallerError("name an episode, for example `pycrorm report last`, or write all of them with --all")
     if not every and tag:
@@ -54,12 +57,12 @@ def report(
     if every and (first is not None or last is not None):
         raise CallerError("--from and --to choose events of one episode: name it instead of --all")
     if episode is None:
-        _write_overview(out or Path("episodes.html"), tag or [], url, spool, force=force, as_json=as_json)
-    else:
-        _write_episode(episode, out, (first, last), url, spool, force=force, as_json=as_json)
+        return _write_overview(out or Path("episodes.html"), tag or [], url, spool, force=force, as_json=as_json)
+    _write_episode(episode, out, (first, last), url, spool, force=force, as_json=as_json)
+    return 0
 
 
-def _write_overview(out: Path, tags: list[str], url: str, spool: Path | None, *, force: bool, as_json: bool) -> None:
+def _write_overview(out: Path, tags: list[str], url: str, spool: Path | None, *, force: bool, as_json: bool) -> int:
     async def write() -> Overview:
         async with Reading.open(url) as reading:
             return await overview(reading, out, tags=tags, force=force)
@@ -68,10 +71,13 @@ def _write_overview(out: Path, tags: list[str], url: str, spool: Path | None, *,
     note_pending_events(url, spool)
     if as_json:
         counts = {"episodes": written.episodes, "pages": written.pages, "left_out": written.left_out}
-        print_json({"file": written.path, **counts})
-        return
-    stdout.print(str(written.path), markup=False, highlight=False, soft_wrap=True)
-    note(f"It has {written.episodes} episodes; pages of {written.pages} are in {out.stem}.pages beside it.")
+        print_json({"file": written.path, **counts, "unreadable": written.unreadable})
+    else:
+        stdout.print(str(written.path), markup=False, highlight=False, soft_wrap=True)
+        note(f"It has {written.episodes} episodes; pages of {written.pages} are in {out.stem}.pages beside it.")
+    for number, reason in written.unreadable.items():
+        problem(f"episode {number} has no page: {reason}")
+    return 1 if written.unreadable else 0
 
 
 def _write_episode(

@@ -18,6 +18,7 @@ __all__ = ["overview_document", "newest_episodes"]
 _EPISODES_MAX = 20_000
 """Bounds the episodes of an overview: it then has about 5 MB."""
 _DESCRIPTION_MAX = 200
+_REASON_MAX = 500
 _FAILED = (TaskStatus.FAILED, TaskStatus.ERROR)
 
 
@@ -28,9 +29,17 @@ async def newest_episodes(reading: Reading, tags: Collection[str] = ()) -> tuple
 
 
 async def overview_document(
-    reading: Reading, title: str, episodes: Collection[EpisodeSummary], total: int, pages: Mapping[int, str]
+    reading: Reading,
+    title: str,
+    episodes: Collection[EpisodeSummary],
+    total: int,
+    pages: Mapping[int, str],
+    unreadable: Mapping[int, str],
 ) -> dict[str, Any]:
-    """Return the document of an overview of these episodes. `pages` are the addresses of their pages, by number."""
+    """Return the document of an overview of these episodes.
+
+    `pages` are the addresses of their pages, `unreadable` the reasons why others have none, both by number.
+    """
     reasons = await _reasons(reading)
     return {
         "title": title,
@@ -46,6 +55,7 @@ async def overview_document(
                 "failed": each.failed,
                 "reasons": reasons.get(each.number, {}),
                 "page": pages.get(each.number),
+                "unreadable": unreadable.get(each.number, "")[:_REASON_MAX],
             }
             for each in episodes
         ],

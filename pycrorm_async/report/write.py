@@ -7,13 +7,13 @@ Report(path=PosixPath('breakfast.html'), first=1, last=188, events=188)
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from os import PathLike
 from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import quote
 
-from pycrorm_async.errors import CallerError
+from pycrorm_async.errors import CallerError, DatabaseForeign, LogDamaged
 from pycrorm_async.query.as_of import AnyEpisode
 from pycrorm_async.query.named_queries import EpisodeSummary
 from pycrorm_async.query.reading import Reading
@@ -37,12 +37,16 @@ class Report(NamedTuple):
 
 
 class Overview(NamedTuple):
-    """A written overview: its file, and how many episodes it counts, has pages for, and leaves out."""
+    """A written overview: its file, and how many episodes it counts, has pages for, and leaves out.
+
+    `unreadable` are the reasons why episodes have no page, by number: damaged ones, and those of a newer version.
+    """
 
     path: Path
     episodes: int
     pages: int
     left_out: int
+    unreadable: Mapping[int, str]
 
 
 async def report(
@@ -81,8 +85,9 @@ async def overview(
 ) -> Overview:
     """Write a table of the episodes that have all these tags, and pages of the newest 200 of them behind it.
 
-    The pages are in the folder `NAME.pages` beside the file `NAME.html`. Raises `CallerError` if one of them exists,
-    without `force`, or if there is no such episode.
+    The pages are in the folder `NAME.pages` beside the file `NAME.html`. An episode whose events cannot be read has the
+    reason in its row and no page. Raises `CallerError` if one of the files exists, without `force`, or if there is no
+    such episode.
     """
     file = Path(path)
     folder = file.with_name(f"{file.stem}.pages")
@@ -94,11 +99,16 @@ async def overview(
         raise CallerError(f"no episode has the tags {', '.join(tags)}" if tags else "this memory has no episode yet")
     folder.mkdir(exist_ok=True)
     pages: dict[int, str] = {}
+    unreadable: dict[int, str] = {}
     for each in episodes[-_PAGES_MAX:]:
         name = f"episode-{each.number}.html"
-        await report(reading, each, folder / name, force=force)
-        pages[each.number] = f"{quote(folder.name)}/{name}"
+        try:
+            await report(reading, each, folder / name, force=force)
+        except (LogDamaged, DatabaseForeign) as error:
+            unreadable[each.number] = str(error)
+        else:
+            pages[each.number] = f"{quote(folder.name)}/{name}"
     title = f"Episodes with the tags {', '.join(tags)}" if tags else "Episodes"
-    document = await overview_document(reading, title, episodes, total, pages)
+    document = await overview_document(reading, title, episodes, total, pages, unreadable)
     await asyncio.to_thread(lambda: write_page(overview_page_of(document), file, force=force))
-    return Overview(file, len(episodes), len(pages), total - len(episodes))
+    return Overview(file, len(episodes), len(pages), total - len(episodes), unreadable)

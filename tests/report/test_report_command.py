@@ -2,8 +2,11 @@
 
 import json
 import resource
+import shutil
+import sqlite3
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from pycrorm_async.report.html_page import write_page
@@ -70,12 +73,40 @@ def test_a_memory_that_does_not_exist_is_one_line(tmp_path: Path) -> None:
 def test_all_episodes_are_a_table_with_pages_behind_it(recorded: Path, tmp_path: Path) -> None:
     out = tmp_path / "my robots.html"
     done = pycrorm("report", "--all", "--out", out, "--json", cwd=recorded)
-    assert json.loads(done.stdout) == {"file": str(out), "episodes": 3, "pages": 3, "left_out": 0}
+    assert json.loads(done.stdout) == {
+        "file": str(out),
+        "episodes": 3,
+        "pages": 3,
+        "left_out": 0,
+        "unreadable": {},
+    }
     names = [each.name for each in sorted((tmp_path / "my robots.pages").iterdir())]
     assert names == ["episode-1.html", "episode-2.html", "episode-3.html"]
     again = pycrorm("report", "--all", "--out", out, cwd=recorded)
     assert one_line_of(again) == f"pycrorm: {out} exists: add --force to replace it, or give another name"
     assert pycrorm("report", "--all", "--out", out, "--force", cwd=recorded).returncode == 0
+
+
+def test_a_damaged_episode_has_a_row_with_the_reason_and_the_others_their_pages(recorded: Path, tmp_path: Path) -> None:
+    shutil.copy(recorded / "pycrorm.db", tmp_path / "copy.db")
+    with sqlite3.connect(tmp_path / "copy.db") as database:
+        for (trigger,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'trigger'").fetchall():
+            database.execute(f"DROP TRIGGER {trigger}")
+        database.execute("UPDATE event SET payload = '{' WHERE episode = 2 AND sequence = 5")
+    database.close()
+    out = tmp_path / "all.html"
+    done = pycrorm("report", "--all", "--out", out, "--json", "--url", f"sqlite:///{tmp_path}/copy.db", cwd=tmp_path)
+    answer = json.loads(done.stdout)
+    assert (done.returncode, answer["pages"], list(answer["unreadable"])) == (1, 2, ["2"])
+    assert one_line_of(done).startswith("pycrorm: episode 2 has no page: episode ")
+    assert "event 5: " in one_line_of(done)
+    assert [each.name for each in sorted((tmp_path / "all.pages").iterdir())] == ["episode-1.html", "episode-3.html"]
+    rows = msgspec.json.decode(out.read_text().partition('id="document">')[2].partition("</script>")[0])["episodes"]
+    assert [(each["page"] is None, "event 5: " in each["unreadable"]) for each in rows] == [
+        (False, False),
+        (True, True),
+        (False, False),
+    ]
 
 
 def test_a_disk_that_fills_leaves_no_partial_file(tmp_path: Path) -> None:

@@ -41,6 +41,9 @@ function bars(values, most, label, textOf) {
   return picture;
 }
 
+/** Says why an episode has no page. */
+const unreadable = (reason) => element("p", { class: "reason" }, "✗ No page: ", recorded(reason));
+
 class Overview {
   constructor({ title, total, episodes }) {
     Object.assign(this, { title, total, episodes, by: "number", down: true });
@@ -111,7 +114,7 @@ class Overview {
       element("td", { class: "number" }, each.seconds === null ? "" : duration(each.seconds)),
       element("td", { class: "number" }, String(each.nodes)),
       element("td", { class: "number" }, String(each.failed)),
-      element("td", {}, recorded(each.description)),
+      element("td", {}, recorded(each.description), each.unreadable ? unreadable(each.unreadable) : null),
     );
   }
 
