@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections.abc import Iterable
+from itertools import islice
 from typing import Any
 
-__all__ = ["Track", "Texts", "rounded"]
+__all__ = ["Track", "Texts", "differences", "rounded"]
 
 _DIGITS = 4
 """Rounds lengths to 0.1 mm and angles to 0.006 degrees, which the page cannot show finer."""
@@ -39,32 +41,52 @@ class Track:
         self.at.append(sequence)
         self.values.append(value)
 
-    def columns(self, points_max: int | None = None) -> list[Any]:
-        """Return the differences of the sequences, and the values; of more than `points_max` values evenly some."""
-        at, values = self.at, self.values
+    def columns(self, points_max: int | None = None, *, after: int = 0) -> list[Any]:
+        """Return the differences of the sequences, and the values, of the entries behind event `after`.
+
+        Of more than `points_max` entries evenly some are returned.
+        """
+        begin = bisect_right(self.at, after)
+        at, values = self.at[begin:], self.values[begin:]
         if points_max is not None and len(at) > points_max:
             step = -(-len(at) // points_max)
             at, values = at[::step], values[::step]
-        return [[here - before for before, here in zip([0, *at], at, strict=False)], values]
+        return [differences(at), values]
+
+
+def differences(values: Iterable[int]) -> list[int]:
+    """Return the first value and the difference of each other one to the value before it."""
+    before, result = 0, []
+    for each in values:
+        result.append(each - before)
+        before = each
+    return result
 
 
 class Texts:
     """Texts by number, each once: most nodes of a long episode share theirs with others."""
 
     def __init__(self) -> None:
+        self.sequence = 0
+        """Of the event that is being read."""
         self._numbers: dict[str, int] = {"": 0}
+        self._first_used: list[int] = [0]
 
     def number(self, text: str) -> int:
         """Return the number of a text; that of the empty text is 0."""
-        return self._numbers.setdefault(text, len(self._numbers))
+        number = self._numbers.setdefault(text, len(self._numbers))
+        if number == len(self._first_used):
+            self._first_used.append(self.sequence)
+        return number
 
-    def cut(self, total_characters: int, *, shortest: int, longest: int) -> list[str]:
-        """Return the texts by number, each cut to an equal share of `total_characters` within the bounds.
+    def cut(self, total_characters: int, *, shortest: int, longest: int, after: int = -1) -> list[str]:
+        """Return the texts that events behind `after` were the first to use, by number, each cut to an equal share.
 
-        A cut text ends with the number of characters that were left out.
+        All texts share `total_characters`, within the bounds. A cut text ends with the number of characters left out.
         """
         limit = max(shortest, min(longest, total_characters // len(self._numbers)))
+        begin = bisect_right(self._first_used, after)
         return [
             each if len(each) <= limit else f"{each[:limit]}… ({len(each) - limit:,} more characters)"
-            for each in self._numbers
+            for each in islice(self._numbers, begin, None)
         ]

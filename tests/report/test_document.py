@@ -14,7 +14,7 @@ from pycrorm_async.memory import Memory
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.scene.object_model import object_model
 from pycrorm_async.recording.recorded_episode import RecordedEpisode
-from pycrorm_async.report import episode_data
+from pycrorm_async.report import episode_fold
 from pycrorm_async.report.episode_data import episode_document
 from pycrorm_async.report.html_page import page_of
 from pycrorm_async.report.tracks import Texts, Track
@@ -140,7 +140,7 @@ def test_of_a_long_curve_a_part_of_the_values_is_kept() -> None:
 
 
 async def test_a_page_ends_where_it_can_hold_no_further_node(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(episode_data, "_NODES_MAX", 2)
+    monkeypatch.setattr(episode_fold, "_NODES_MAX", 2)
     document = await document_of(url)
     assert names_of(document, 6) == ["RUNNING", "RUNNING"]
     assert document["episode"]["last"] == document["nodes"][0][1]

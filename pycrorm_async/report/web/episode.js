@@ -1,4 +1,5 @@
-// Reads the document of `episode_data.py` into nodes, objects and tracks, and answers questions about one event.
+// Reads the document of `episode_fold.py` into nodes, objects and tracks, and answers questions about one event.
+// A document is the part of an episode behind an event: a file has one, a stream more and more of them.
 
 export const FAILED = new Set(["FAILED", "ERROR"]);
 const END = { SUCCEEDED: "✓", FAILED: "✗", ERROR: "✗", RUNNING: "▶", LOST: "?", CANCELLED: "⊘", INTERRUPTED: "⊘" };
@@ -24,11 +25,24 @@ export function lastUpTo(sorted, value) {
   return low - 1;
 }
 
+/** Append without the limit that a call has on its arguments. */
+function append(target, values) {
+  for (const each of values) target.push(each);
+}
+
 /** How one value changed: `valueAt(event)` is the value after that event. */
 export class Track {
-  constructor([at, values]) {
-    this.at = sums(at);
-    this.values = values;
+  constructor() {
+    this.at = [];
+    this.values = [];
+  }
+
+  extend([at, values], pointsMax = Infinity) {
+    append(this.at, sums(at));
+    append(this.values, values);
+    if (this.at.length <= 2 * pointsMax) return;
+    this.at = this.at.filter((_, index) => index % 2 === 0);
+    this.values = this.values.filter((_, index) => index % 2 === 0);
   }
 
   valueAt(event) {
@@ -36,28 +50,93 @@ export class Track {
   }
 }
 
-const tracksOf = (columns) => new Map(Object.entries(columns).map(([name, each]) => [name, new Track(each)]));
+const CURVE_POINTS_MAX = 2000;
+
+function extendTracks(tracks, columns, pointsMax) {
+  for (const [name, each] of Object.entries(columns)) {
+    if (!tracks.has(name)) tracks.set(name, new Track());
+    tracks.get(name).extend(each, pointsMax);
+  }
+}
+
+/** Keys of which the entries of a part follow those before it. */
+const LISTS = ["detections", "observations", "locations"];
 
 export class Episode {
   constructor(document) {
-    Object.assign(this, document.episode);
-    this.times = sums(document.times);
-    this.nodes = nodesOf(document);
-    this.models = document.models;
-    this.objects = document.objects.map((each) => ({
-      ...each,
-      poses: new Track(each.poses),
-      joints: tracksOf(each.joints),
-    }));
-    this.objectById = new Map(this.objects.map((each) => [each.id, each]));
-    this.attachments = document.attachments;
-    this.detections = document.detections;
-    this.observations = document.observations;
-    this.locations = document.locations;
-    this.series = tracksOf(document.series);
-    this.samples = Object.entries(document.samples).map(([id, each]) => [Number(id), tracksOf(each)]);
-    this.nodeAt = new Map(this.nodes.map((each) => [each.start, each]));
-    this.rootFailures = this.nodes.filter((each) => each.isRootFailure);
+    Object.assign(this, { times: [], texts: [], models: {}, nodes: [], roots: [], rootFailures: [], objects: [] });
+    Object.assign(this, { attachments: [], detections: [], observations: [], locations: [] });
+    Object.assign(this, { series: new Map(), samples: new Map(), nodeAt: new Map(), objectById: new Map() });
+    this.extend(document);
+  }
+
+  /** Add a part: what the events behind the last one added and changed. */
+  extend(part) {
+    Object.assign(this, part.episode);
+    append(this.times, sums(part.times));
+    append(this.texts, part.texts);
+    Object.assign(this.models, part.models);
+    this.#extendNodes(part);
+    for (const each of part.objects) this.#extendObject(each);
+    this.#extendAttachments(part.attachments);
+    for (const each of LISTS) append(this[each], part[each]);
+    extendTracks(this.series, part.series, CURVE_POINTS_MAX);
+    for (const [id, tracks] of Object.entries(part.samples)) {
+      if (!this.samples.has(Number(id))) this.samples.set(Number(id), new Map());
+      extendTracks(this.samples.get(Number(id)), tracks, CURVE_POINTS_MAX);
+    }
+  }
+
+  #extendNodes({ nodes: columns, ended }) {
+    const [starts, ends, parents, kinds, types, parameters, statuses, reasons, messages] = columns;
+    const { texts } = this;
+    starts.forEach((start, index) => {
+      const node = new Node(this, start, this.nodeAt.get(parents[index]) ?? null, texts[kinds[index]], texts[types[index]]);
+      node.parameters = texts[parameters[index]];
+      node.became(ends[index], texts[statuses[index]], texts[reasons[index]], texts[messages[index]]);
+      this.nodes.push(node);
+      this.nodeAt.set(start, node);
+      (node.parent?.children ?? this.roots).push(node);
+    });
+    ended[0].forEach((start, index) => {
+      const [end, status, reason, message] = ended.slice(1).map((column) => column[index]);
+      this.nodeAt.get(start)?.became(end, texts[status], texts[reason], texts[message]);
+    });
+    this.#findRootFailures();
+  }
+
+  /** Judge all nodes again if a failure was added: it may be the cause of one above it. */
+  #findRootFailures() {
+    const failed = this.nodes.reduce((sum, each) => sum + each.failed, 0);
+    if (failed === this.failedCount) return;
+    this.failedCount = failed;
+    this.rootFailures = this.nodes.filter((each) => each.failed && !each.children.some((child) => child.failed));
+    for (const each of this.nodes) each.isRootFailure = false;
+    for (const failure of this.rootFailures) {
+      failure.isRootFailure = true;
+      for (let each = failure; each !== null && !each.holdsFailure; each = each.parent) each.holdsFailure = true;
+    }
+  }
+
+  #extendObject({ poses, joints, ...rest }) {
+    let object = this.objectById.get(rest.id);
+    if (object === undefined) {
+      object = { poses: new Track(), joints: new Map() };
+      this.objects.push(object);
+      this.objectById.set(rest.id, object);
+    }
+    Object.assign(object, rest);
+    object.poses.extend(poses);
+    extendTracks(object.joints, joints);
+  }
+
+  /** Add attachments, and replace those that ended; an attachment begins with an event of its own. */
+  #extendAttachments(attachments) {
+    for (const each of attachments) {
+      const index = this.attachments.findLastIndex((other) => other[3] === each[3]);
+      if (index < 0) this.attachments.push(each);
+      else this.attachments[index] = each;
+    }
   }
 
   /** Seconds from the episode's start to an event. */
@@ -83,7 +162,7 @@ export class Episode {
         } else if (each.end === event) running.push(each);
       }
     };
-    visit(this.nodes.filter((each) => each.parent === null));
+    visit(this.roots);
     return running;
   }
 
@@ -106,41 +185,25 @@ export class Episode {
   }
 }
 
-function nodesOf({ nodes: columns, texts, episode }) {
-  const [starts, ends, parents, kinds, types, parameters, statuses, reasons, messages] = columns;
-  const byStart = new Map();
-  const nodes = starts.map((start, index) => {
-    const parent = byStart.get(parents[index]) ?? null;
-    const node = {
-      index,
-      start,
-      end: ends[index],
-      lastEvent: ends[index] || episode.last,
-      parent,
-      depth: parent === null ? 0 : parent.depth + 1,
-      children: [],
-      kind: texts[kinds[index]],
-      type: texts[types[index]],
-      parameters: texts[parameters[index]],
-      status: texts[statuses[index]],
-      reason: texts[reasons[index]],
-      message: texts[messages[index]],
-    };
-    node.name = node.type || (node.kind === "root" ? "plan" : node.kind);
-    node.failed = FAILED.has(node.status) || node.status === "LOST";
-    byStart.set(start, node);
-    parent?.children.push(node);
-    return node;
-  });
-  for (const node of nodes) {
-    node.isRootFailure = node.failed && !node.children.some((each) => each.failed);
-    node.holdsFailure = node.failed;
+export class Node {
+  constructor(episode, start, parent, kind, type) {
+    Object.assign(this, { episode, start, parent, kind, type, children: [], isRootFailure: false, holdsFailure: false });
+    this.depth = parent === null ? 0 : parent.depth + 1;
+    this.name = type || (kind === "root" ? "plan" : kind);
   }
-  for (let index = nodes.length - 1; index >= 0; index--) {
-    const { parent, holdsFailure } = nodes[index];
-    if (parent !== null && holdsFailure) parent.holdsFailure = true;
+
+  became(end, status, reason, message) {
+    Object.assign(this, { end, status, reason, message });
   }
-  return nodes;
+
+  get failed() {
+    return FAILED.has(this.status) || this.status === "LOST";
+  }
+
+  /** The event that ended the node, or the last one so far. */
+  get lastEvent() {
+    return this.end || this.episode.last;
+  }
 }
 
 /** Failures by reason, the most frequent first, and in each the messages that differ in more than their numbers. */

@@ -16,8 +16,9 @@ export class GanttView {
     this.canvas.setAttribute("aria-label", "Gantt chart of the nodes");
     holder.append(this.canvas);
     this.byTime = false;
-    this.lanes = lanesOf(episode.nodes);
-    this.window = this.#all();
+    this.lanes = new Lanes();
+    this.lanes.extend(episode.nodes);
+    this.window = this.extent = this.#all();
     let dragging = false;
     const seek = (pointed) => onSeek(this.#eventAt(pointed.offsetX));
     this.canvas.addEventListener("pointerdown", (pointed) => {
@@ -40,7 +41,16 @@ export class GanttView {
 
   setAxis(byTime) {
     this.byTime = byTime;
-    this.#showWindow(this.#all());
+    this.extent = this.#all();
+    this.#showWindow(this.extent);
+  }
+
+  /** Take in the nodes that the episode has by now; `show` draws them. */
+  grow() {
+    const whole = this.window.every((each, index) => each === this.extent[index]);
+    this.lanes.extend(this.episode.nodes);
+    this.extent = this.#all();
+    if (whole) this.window = this.extent;
   }
 
   show(event, selected) {
@@ -204,17 +214,22 @@ export class GanttView {
   }
 }
 
-/** Give each node the first free lane below its parent's, so that concurrent branches do not cover each other. */
-function lanesOf(nodes) {
-  const lanes = { nodes: [], of: new Map() };
-  const busyUntil = [];
-  for (const node of nodes) {
-    let lane = node.parent === null ? 0 : lanes.of.get(node.parent) + 1;
-    while ((busyUntil[lane] ?? 0) > node.start) lane++;
-    busyUntil[lane] = node.lastEvent;
-    lanes.of.set(node, lane);
-    while (lanes.nodes.length <= lane) lanes.nodes.push([]);
-    lanes.nodes[lane].push(node);
+/** Gives each node the first free lane below its parent's, so that concurrent branches do not cover each other. */
+class Lanes {
+  constructor() {
+    this.nodes = [];
+    this.of = new Map();
   }
-  return lanes;
+
+  /** Give lanes to the nodes that have none yet, of all nodes in the order in which they started. */
+  extend(nodes) {
+    for (let index = this.of.size; index < nodes.length; index++) {
+      const node = nodes[index];
+      let lane = node.parent === null ? 0 : this.of.get(node.parent) + 1;
+      while ((this.nodes[lane]?.at(-1)?.lastEvent ?? 0) > node.start) lane++;
+      while (this.nodes.length <= lane) this.nodes.push([]);
+      this.of.set(node, lane);
+      this.nodes[lane].push(node);
+    }
+  }
 }

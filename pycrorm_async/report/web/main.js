@@ -19,6 +19,7 @@ class Page {
     this.event = this.#eventInAddress() ?? episode.opens;
     this.selected = null;
     this.playing = null;
+    this.following = false;
     const seek = (event) => this.seek(event);
     const select = (node, options) => this.select(node, options);
     this.bodies = new Bodies(episode);
@@ -54,7 +55,7 @@ class Page {
     const { episode } = this;
     part("status").textContent = `${signOf(episode.status)} ${episode.status}`;
     part("status").className = `badge is-${episode.status.toLowerCase()}`;
-    const failed = episode.nodes.filter((each) => each.failed).length;
+    const failed = episode.failedCount;
     const roots = episode.rootFailures.length;
     const whole = episode.first === 1 && episode.last === episode.head;
     const facts = [
@@ -135,7 +136,27 @@ class Page {
     if (next !== undefined) this.select(next);
   }
 
+  /** Add a part to the episode, and go on to its last moment if the page follows it. */
+  extend(part) {
+    const { episode } = this;
+    episode.extend(part);
+    for (const each of [this.view, this.tree, this.gantt, this.panels]) each.grow();
+    this.slider.max = episode.last;
+    this.#head();
+    if (this.following) this.event = episode.opens;
+    this.show();
+  }
+
+  /** Follow the last moment of an episode that grows, or stay. */
+  follow(following) {
+    this.following = following;
+    if (following) Object.assign(this, { event: this.episode.opens, selected: null });
+    this.show();
+    this.onFollow?.(following);
+  }
+
   seek(event) {
+    if (this.following) this.follow(false);
     const { first, last } = this.episode;
     this.event = Math.min(Math.max(Math.round(event), first), last);
     this.selected = null;
@@ -144,6 +165,7 @@ class Page {
 
   /** Show a node and the moment at which it ended, or its last one. */
   select(node, { seek = true } = {}) {
+    if (this.following) this.follow(false);
     this.selected = node;
     if (seek) {
       this.event = node.lastEvent;
@@ -185,6 +207,7 @@ class Page {
     const action = this.selected ?? running.filter((each) => each.kind === "action").at(-1) ?? null;
     this.action = action;
     this.view.show(event, action, pathsOf(episode, action));
+    if (this.following) this.tree.follow(running);
     this.tree.show(event, running, { scroll: this.selected === null });
     this.tree.select(this.selected);
     this.gantt.show(event, this.selected);
@@ -194,7 +217,8 @@ class Page {
     this.clock.textContent = `${duration(episode.secondsAt(event))} · event ${event} of ${episode.last}`;
     if (matchMedia("print").matches) this.#print();
     clearTimeout(this.writing);
-    this.writing = setTimeout(() => history.replaceState(null, "", `#e${this.event}`), 250);
+    const address = this.following ? location.pathname : `#e${this.event}`;
+    this.writing = setTimeout(() => history.replaceState(null, "", address), 250);
   }
 
   #print() {

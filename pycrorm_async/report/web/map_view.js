@@ -15,6 +15,9 @@ export class MapView {
     if (this.event !== undefined) this.show(this.event, null, this.paths);
   }
 
+  /** The map has nothing to take in: `show` draws the episode as it is. */
+  grow() {}
+
   show(event, _node, paths) {
     Object.assign(this, { event, paths });
     const present = this.bodies.at(event).map((body) => ({ body, outlines: outlinesOf(body) }));

@@ -10,9 +10,17 @@ const LINKS_MAX = 12;
 export class Panels {
   constructor(holder, episode, { onSeek, onSelect }) {
     Object.assign(this, { holder, episode, onSeek, onSelect });
-    const { rootFailures, detections, observations, attachments, samples, series } = episode;
-    const curves = series.size + samples.reduce((sum, [, each]) => sum + each.size, 0);
-    this.tabs = [
+    this.bar = element("div", { class: "tabs", role: "tablist" });
+    this.body = element("div", { class: "panel", role: "tabpanel", tabindex: 0 });
+    holder.append(this.bar, this.body);
+    this.current = episode.rootFailures.length > 0 ? "failures" : "details";
+    this.#drawBar();
+  }
+
+  get tabs() {
+    const { rootFailures, detections, observations, attachments, samples, series } = this.episode;
+    const curves = [...samples.values()].reduce((sum, each) => sum + each.size, series.size);
+    return [
       ["details", "Details", null, () => this.#details()],
       ["failures", "Failures", rootFailures.length, () => this.#failures()],
       ["detections", "Percepts", detections.length, () => this.#detections()],
@@ -20,11 +28,13 @@ export class Panels {
       ["observations", "Observations", observations.length, () => this.#observations()],
       ["states", "Curves", curves, () => this.#curves()],
     ].filter(([name, , count]) => count === null || count > 0 || name === "failures");
-    this.bar = element("div", { class: "tabs", role: "tablist" });
-    this.body = element("div", { class: "panel", role: "tabpanel", tabindex: 0 });
-    holder.append(this.bar, this.body);
-    this.current = rootFailures.length > 0 ? "failures" : "details";
-    this.#drawBar();
+  }
+
+  /** Show the counts of what the episode has by now; `show` draws the panel. */
+  grow() {
+    const counts = this.tabs.map(([name, , count]) => `${name} ${count}`).join();
+    if (counts !== this.counts) this.#drawBar();
+    this.counts = counts;
   }
 
   #drawBar() {

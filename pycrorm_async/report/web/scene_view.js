@@ -23,6 +23,7 @@ export class SceneView {
     this.camera.up.set(0, 0, 1);
     this.controls = new THREE.OrbitControls(this.camera, this.renderer.domElement);
     this.controls.addEventListener("change", () => this.#render());
+    this.controls.addEventListener("start", () => (this.touched = true));
     this.scene.add(new THREE.HemisphereLight(0xffffff, 0x9a9488, 2.1));
     const sun = new THREE.DirectionalLight(0xffffff, 1.9);
     sun.position.set(-4, -3, 8);
@@ -45,6 +46,13 @@ export class SceneView {
     this.scene.add(this.grid);
     this.drawnNode = undefined;
     if (this.event !== undefined) this.show(this.event, this.node, this.pathList);
+  }
+
+  /** Take in what the episode has by now; `show` draws it. */
+  grow() {
+    this.drawnNode = undefined;
+    const { length } = this.episode.objects;
+    if (length !== this.framedObjects && this.framed && !this.touched) this.#frame();
   }
 
   show(event, node, paths) {
@@ -73,6 +81,7 @@ export class SceneView {
 
   /** Look at everything that is there when the page opens, from the side of the robot. */
   #frame() {
+    this.framedObjects = this.episode.objects.length;
     const box = new THREE.Box3();
     for (const each of this.bodies.at(this.episode.opens)) box.expandByObject(each.group);
     if (this.event !== undefined) this.bodies.at(this.event);

@@ -13,6 +13,8 @@ export class TreeView {
     this.episode = episode;
     this.onSelect = onSelect;
     this.open = new Set();
+    this.passing = new Set();
+    this.size = 0;
     this.selected = null;
     this.event = episode.opens;
     this.spacer = element("div", { class: "rows", role: "presentation" });
@@ -26,12 +28,13 @@ export class TreeView {
 
   /** Open all of a small tree; of a large one the ways to the first failures, or the first level. */
   #openAtFailures() {
-    const { nodes } = this.episode;
+    const { nodes, roots } = this.episode;
+    this.size = nodes.length;
     if (nodes.length <= OPEN_MAX) {
       for (const each of nodes) this.open.add(each);
       return;
     }
-    for (const each of nodes) if (each.parent === null) this.open.add(each);
+    for (const each of roots) this.open.add(each);
     let rows = 0;
     for (const failure of this.episode.rootFailures) {
       for (let each = failure.parent; each !== null && !this.open.has(each); each = each.parent) {
@@ -42,14 +45,32 @@ export class TreeView {
     }
   }
 
+  /** Take in the nodes that the episode has by now; `show` draws them. */
+  grow() {
+    const { nodes } = this.episode;
+    if (nodes.length <= OPEN_MAX) for (const each of nodes.slice(this.size)) this.open.add(each);
+    this.size = nodes.length;
+    this.#list();
+  }
+
+  /** Open the running nodes of a large tree as long as they run. */
+  follow(running) {
+    this.passing = new Set(running);
+    this.#list();
+  }
+
+  #isOpen(node) {
+    return this.open.has(node) || this.passing.has(node);
+  }
+
   #list() {
     this.rows = [];
     const visit = (node) => {
       this.rows.push({ node });
       if (node.isRootFailure && node.message) this.rows.push({ node, message: true });
-      if (this.open.has(node)) node.children.forEach(visit);
+      if (this.#isOpen(node)) node.children.forEach(visit);
     };
-    this.episode.nodes.filter((each) => each.parent === null).forEach(visit);
+    this.episode.roots.forEach(visit);
     this.rowOf = new Map();
     this.rows.forEach(({ node, message }, index) => message || this.rowOf.set(node, index));
     this.#draw();
@@ -105,7 +126,8 @@ export class TreeView {
     this.onSelect(node);
   }
 
-  #toggle(node, open = !this.open.has(node)) {
+  #toggle(node, open = !this.#isOpen(node)) {
+    this.passing.delete(node);
     if (open) this.open.add(node);
     else this.open.delete(node);
     this.#list();
@@ -149,7 +171,7 @@ export class TreeView {
   }
 
   #nodeRow(node) {
-    const open = this.open.has(node);
+    const open = this.#isOpen(node);
     const classes = ["row", `is-${node.status.toLowerCase()}`];
     if (this.running?.has(node)) classes.push("lit");
     if (node.start > this.event) classes.push("later");
