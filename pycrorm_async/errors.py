@@ -17,6 +17,7 @@ __all__ = [
     "DeclarationRefused",
     "EpisodeRefused",
     "UnknownEpisode",
+    "QueryRefused",
     "MissingExtra",
     "ImpossibleCondition",
     "NotEnoughExperience",
@@ -85,6 +86,10 @@ class EpisodeRefused(CallerError):
 
 class UnknownEpisode(CallerError):
     """The database holds no episode of that number or id."""
+
+
+class QueryRefused(CallerError):
+    """A query in SQL would do more than read, is wrong, or took longer or returned more than it may."""
 
 
 class MissingExtra(CallerError):

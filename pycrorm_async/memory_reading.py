@@ -19,6 +19,7 @@ from pycrorm_async.plan.task_tree import TaskTreeNode
 from pycrorm_async.query.as_of import AnyEpisode
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.snapshot import Moment
+from pycrorm_async.query.sql.read_only import DEFAULT_LIMITS, SqlLimits, SqlResult
 from pycrorm_async.recording.recording import Recording
 from pycrorm_async.recording.writing.event_feed import BUFFER_EVENTS, EventStream, RecordedEvent, Subscription
 from pycrorm_async.report.write import Report
@@ -48,6 +49,10 @@ class ReadableMemory(PartsHolder):
     async def dataframe(self, statement: Select[*tuple[Any, ...]], *, simulated: bool = False) -> DataFrame:
         """Return the rows as a pandas DataFrame (extra `learning`); with `simulated`, those of simulations too."""
         return await self._open_parts.reading.dataframe(statement, simulated=simulated)
+
+    async def query(self, sql: str, limits: SqlLimits = DEFAULT_LIMITS) -> SqlResult:
+        """Return the rows of one query in SQL that can only read, up to the last flush; see `Reading.query`."""
+        return await self._open_parts.reading.query(sql, limits)
 
     def mapped(self, designator: str | type) -> Any:
         """Return the mapped class of a designator type, by its dtype or its class, after one of it was flushed.

@@ -32,6 +32,7 @@ from pycrorm_async.query.dataframes import dataframe
 from pycrorm_async.query.episode_session import EpisodeSession
 from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary
 from pycrorm_async.query.snapshot import Moment
+from pycrorm_async.query.sql.read_only import DEFAULT_LIMITS, ReadOnlySql, SqlLimits, SqlResult
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 
@@ -125,6 +126,16 @@ class Reading:
         with self._log.translated():
             async with self._connection(simulated=simulated) as connection:
                 return await dataframe(connection, statement)
+
+    async def query(self, sql: str, limits: SqlLimits = DEFAULT_LIMITS) -> SqlResult:
+        """Return the rows of one query in SQL that can only read; see `pycrorm_async.query.sql.read_only`.
+
+        >>> await reading.query("SELECT dtype, count(*) AS nodes FROM task_tree_node GROUP BY dtype")
+
+        Raises `QueryRefused`, on PostgreSQL also for a login with more rights than `pycrorm_reader`.
+        """
+        await self._ready()
+        return await ReadOnlySql(self._log).query(sql, limits)
 
     def mapped(self, designator: str | type) -> type[Designator]:
         """Return the mapped class of a dtype, a table or a designator class, as of the last `refresh`.

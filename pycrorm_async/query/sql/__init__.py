@@ -1,0 +1,1 @@
+"""Run SQL that people or programs wrote by hand, and let it only read."""

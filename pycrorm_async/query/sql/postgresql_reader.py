@@ -1,0 +1,191 @@
+"""Run one query on a PostgreSQL server, on a connection that can only read.
+
+**Theory of operation.** A read-only transaction is not enough: as a superuser, `pg_read_file` reads files of the server
+and COPY … TO PROGRAM runs programs in it. So four walls stand behind each other:
+
+1. The login has no more rights than `pycrorm_reader` (`_RIGHTS`). SET ROLE then leads nowhere.
+2. The text is prepared, so it is one statement, and becomes the query of a cursor: PostgreSQL takes nothing but SELECT,
+   VALUES and TABLE there, no SET, COPY, DO, CALL or SELECT INTO.
+3. The transaction is READ ONLY and always rolled back, and the connection is closed after it.
+4. A function that PostgreSQL declares VOLATILE may have effects that no rollback undoes: it ends other sessions, takes
+   locks, changes settings, runs a text as SQL. A text with the name of one, as a word anywhere, is refused. The words
+   of strings and comments count too, because leaving them out would need PostgreSQL's own lexer.
+
+The cursor returns with each row the sum of the bytes up to it, and empty values from the bound on, because one value
+can have a gigabyte.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import re
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from typing import Any
+
+import asyncpg
+from sqlalchemy.ext.asyncio import AsyncEngine
+
+from pycrorm_async.errors import QueryRefused
+from pycrorm_async.query.sql.refusals import NOT_ONE, ONLY_READS, missing_relation, stopped
+from pycrorm_async.store.postgresql.search_path import LOG_SCHEMA, TABLES_SCHEMA, VIEWS_SCHEMA
+
+__all__ = ["postgresql_cursor"]
+
+READER = "pycrorm_reader"
+
+_BEGIN = (
+    "BEGIN TRANSACTION READ ONLY",
+    "SET LOCAL standard_conforming_strings = on",
+    "SET LOCAL idle_in_transaction_session_timeout = '10min'",  # a pager stops reading for minutes
+)
+_SCHEMAS = f"'{LOG_SCHEMA}', '{TABLES_SCHEMA}', '{VIEWS_SCHEMA}'"
+_RIGHTS = f"""
+SELECT session_user::text AS login, to_regrole('{READER}') IS NOT NULL AS has_roles, CASE
+    WHEN login.rolsuper THEN 'is a superuser'
+    WHEN pg_has_role(session_user, datdba, 'MEMBER') THEN 'owns the database'
+    WHEN login.rolcreaterole OR login.rolcreatedb OR login.rolreplication OR login.rolbypassrls
+        THEN 'may create roles or databases, replicate, or read what is hidden from its role'
+    WHEN other.name IS NOT NULL THEN 'is a member of ' || other.name
+    WHEN has_database_privilege(session_user, pg_database.oid, 'CREATE') THEN 'may create schemas in the database'
+    WHEN EXISTS (
+        SELECT FROM pg_namespace WHERE nspname IN ({_SCHEMAS}) AND has_schema_privilege(session_user, oid, 'CREATE')
+    ) THEN 'may create tables in the memory'
+    WHEN EXISTS (
+        SELECT FROM pg_class JOIN pg_namespace ON pg_namespace.oid = relnamespace
+        WHERE nspname IN ({_SCHEMAS}) AND relkind IN ('r', 'v', 'm', 'p') AND (
+            has_any_column_privilege(session_user, pg_class.oid, 'INSERT, UPDATE')
+            OR has_table_privilege(session_user, pg_class.oid, 'DELETE, TRUNCATE, TRIGGER')
+        )
+    ) THEN 'may change the memory'
+END AS excess
+FROM pg_roles AS login CROSS JOIN pg_database LEFT JOIN LATERAL (
+    SELECT min(rolname::text) AS name FROM pg_roles
+    WHERE rolname NOT IN (session_user, '{READER}') AND pg_has_role(session_user, oid, 'MEMBER')
+) AS other ON true
+WHERE login.rolname = session_user AND datname = current_database()"""  # noqa: S608  our own names only
+"""Selects the rights of the login that `pycrorm_reader` has not; null if there are none."""
+
+_VOLATILE = """
+SELECT proname FROM pg_proc JOIN pg_namespace ON pg_namespace.oid = pronamespace
+WHERE provolatile = 'v' AND lower(proname) = ANY($1) AND proname <> ALL($2)
+AND (nspname = ANY(current_schemas(true)) OR lower(nspname) = ANY($1))
+ORDER BY proname LIMIT 1"""
+"""Selects a function of these names that may have effects. One of another schema is only called with its schema."""
+_HARMLESS = (
+    "random", "random_normal", "gen_random_uuid", "clock_timestamp", "timeofday", "pg_sleep", "pg_relation_size",
+    "pg_table_size", "pg_indexes_size", "pg_total_relation_size", "pg_database_size",
+)  # fmt: skip
+"""Volatile functions without effects."""
+_RELATIONS = f"""
+SELECT relname::text FROM pg_class JOIN pg_namespace ON pg_namespace.oid = relnamespace
+WHERE nspname IN ('{LOG_SCHEMA}', '{VIEWS_SCHEMA}') AND relkind IN ('r', 'v')"""  # noqa: S608  our own names only
+_DATABASE_FAULTS = ("08", "40", "53", "55", "57", "58", "XX")
+"""Classes of errors that are the database's; all others are the query's own."""
+_CANCELLED = "57014"
+_UNDEFINED_TABLE = "42P01"
+
+
+class _Cursor:
+    def __init__(self, connection: asyncpg.Connection[Any], bytes_max: int) -> None:
+        self.columns: tuple[str, ...] = ()
+        self._connection = connection
+        self._bytes_max = bytes_max
+        self._is_first = True
+
+    async def start(self, sql: str, seconds: float) -> None:
+        for statement in (*_BEGIN, f"SET LOCAL statement_timeout = {max(int(seconds * 1000), 1)}"):
+            await self._connection.execute(statement)
+        await self._check_login()
+        await self._check_functions(sql)
+        query = sql.rstrip().rstrip(";")
+        async with self._bounded(seconds):
+            # `execute` would send several statements as they are; preparing refuses them.
+            prepared = await self._connection.prepare(query)
+            if prepared.get_parameters():
+                raise QueryRefused("a query has no parameters such as $1: write the value")
+            attributes = prepared.get_attributes()
+            if not attributes:
+                raise QueryRefused(ONLY_READS)
+            await (await self._connection.prepare(_declaration(query, len(attributes), self._bytes_max))).fetch()
+        self.columns = tuple(each.name for each in attributes)
+
+    async def fetch(self, rows: int, seconds: float) -> tuple[list[tuple[Any, ...]], bool]:
+        async with self._bounded(seconds):
+            records = await self._connection.fetch(f"FETCH {rows} FROM pycrorm_query")
+        within = [each for each in records if each[-1] <= self._bytes_max]
+        if self._is_first and records and not within:
+            size = f"{records[0][-1]} bytes, and the limit is {self._bytes_max}"
+            raise QueryRefused(f"the first row of the query has {size}: select fewer columns, or parts of them")
+        self._is_first = False
+        return [tuple(each)[:-1] for each in within], len(within) < len(records)
+
+    async def _check_login(self) -> None:
+        rights = await self._connection.fetchrow(_RIGHTS)
+        if rights is None or rights["excess"] is None:
+            return
+        first = "" if rights["has_roles"] else " (first make the roles: operations/README.md, PostgreSQL)"
+        raise QueryRefused(
+            f"a query in SQL needs a login that can only read, and {rights['login']} {rights['excess']}; make one:"
+            f" CREATE ROLE pycrorm_query LOGIN PASSWORD '…' IN ROLE {READER}{first}, and use it in the URL"
+        )
+
+    async def _check_functions(self, sql: str) -> None:
+        lowered = sql.lower()
+        if 'u&"' in lowered:
+            raise QueryRefused('a query writes names as they are, not as U&"…"')
+        words = sorted(set(re.findall(r"[\w$]+", lowered)))
+        name = await self._connection.fetchval(_VOLATILE, words, _HARMLESS)
+        if name is not None:
+            raise QueryRefused(f"{ONLY_READS}; the function {name} can do more and is not allowed")
+
+    @asynccontextmanager
+    async def _bounded(self, seconds: float) -> AsyncIterator[None]:
+        """Stop what runs inside after this time, and raise its own errors as `QueryRefused`."""
+        try:
+            async with asyncio.timeout(seconds):  # cancels it on the server, too
+                yield
+        except TimeoutError:
+            raise QueryRefused(stopped(seconds)) from None
+        except asyncpg.PostgresError as error:
+            code, text = error.sqlstate or "", " ".join(str(error).split())
+            if code == _CANCELLED:
+                raise QueryRefused(stopped(seconds)) from None
+            if code.startswith(_DATABASE_FAULTS):
+                raise
+            if code == _UNDEFINED_TABLE:
+                raise await self._missing(text) from None
+            if "multiple commands" in text:
+                raise QueryRefused(NOT_ONE) from None
+            hint = f" ({error.hint})" if getattr(error, "hint", None) else ""
+            raise QueryRefused(f"the query is refused: {text}{hint}") from None
+
+    async def _missing(self, text: str) -> QueryRefused:
+        name = re.search(r'"(.+)"', text)
+        await self._connection.execute("ROLLBACK")
+        names = [row[0] for row in await self._connection.fetch(_RELATIONS)]
+        return missing_relation(name.group(1) if name else text, names)
+
+
+def _declaration(query: str, columns: int, bytes_max: int) -> str:
+    names = [f"c{number}" for number in range(columns)]
+    sized = f"SELECT q.*, sum(octet_length(q::text)) OVER (ROWS UNBOUNDED PRECEDING) AS size FROM ({query}\n)"  # noqa: S608
+    bounded = ", ".join(f"CASE WHEN size <= {bytes_max} THEN {name} END" for name in names)
+    return (
+        f"DECLARE pycrorm_query NO SCROLL CURSOR FOR SELECT {bounded}, size FROM"  # noqa: S608
+        f" ({sized} AS q ({', '.join(names)})) AS sized"
+    )
+
+
+@asynccontextmanager
+async def postgresql_cursor(engine: AsyncEngine, sql: str, *, bytes_max: int, seconds: float) -> AsyncIterator[_Cursor]:
+    """Run one query on a connection of its own, which is closed at the end."""
+    async with engine.connect() as connection:
+        try:
+            driver = (await connection.get_raw_connection()).driver_connection
+            assert isinstance(driver, asyncpg.Connection)
+            cursor = _Cursor(driver, bytes_max)
+            await cursor.start(sql, seconds)
+            yield cursor
+        finally:
+            await connection.invalidate()  # ends the transaction too: nothing was committed

@@ -1,0 +1,354 @@
+"""Queries in SQL on real databases: rows and bounds, and attacks, which the database itself must refuse."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import pytest
+
+from pycrorm_async.errors import DatabaseUnavailable, QueryRefused
+from pycrorm_async.query.reading import Reading
+from pycrorm_async.query.sql.read_only import DEFAULT_LIMITS, ReadOnlySql, SqlLimits
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.postgresql.roles import GRANTS
+from tests.databases import Server, ask_each, change_each, run_in_own_loop
+from tests.projections.event_script import NAVIGATE, PICK_UP, SAYING, declarations
+from tests.projections.factories import append_and_fold
+from tests.query.test_reading import episode
+
+pytestmark = pytest.mark.slow
+
+RECORDS = [*declarations(NAVIGATE, PICK_UP, SAYING), *episode(1).records, *episode(2).records]
+ENDLESS = "WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM n) SELECT "
+QUICK = SqlLimits(seconds=0.3)
+
+
+@pytest.fixture(scope="module")
+def owner_url(module_database_url: str) -> str:
+    """The URL of the owner of a memory with two episodes, on PostgreSQL a superuser who has made the roles."""
+    run_in_own_loop(append_and_fold(module_database_url, RECORDS))
+    if not is_sqlite(module_database_url):
+        change_each(module_database_url, GRANTS)
+    return module_database_url
+
+
+@pytest.fixture(scope="module")
+def reader_url(owner_url: str) -> str:
+    """The URL of a login that can only read."""
+    return owner_url if is_sqlite(owner_url) else login(owner_url, "IN ROLE pycrorm_reader")
+
+
+@pytest.fixture
+async def sql(reader_url: str) -> AsyncIterator[_Sql]:
+    async with _opened(reader_url) as opened:
+        yield opened
+
+
+class _Sql:
+    """Runs queries on an open log."""
+
+    def __init__(self, log: EventLog) -> None:
+        self.is_sqlite = log.address.is_sqlite
+        self.stream = ReadOnlySql(log).stream
+        self._query = ReadOnlySql(log).query
+
+    async def query(self, text: str, limits: SqlLimits = DEFAULT_LIMITS) -> tuple[tuple[str, ...], list[Any], bool]:
+        result = await self._query(text, limits)
+        return result.columns, result.rows, result.more
+
+
+@asynccontextmanager
+async def _opened(url: str) -> AsyncIterator[_Sql]:
+    log = await EventLog.open(DatabaseAddress.parse(url), create=False)
+    yield _Sql(log)
+    await log.close()
+
+
+def is_sqlite(url: str) -> bool:
+    return url.startswith("sqlite")
+
+
+def login(url: str, attributes: str, *after: str) -> str:
+    """Return the URL of a new login with these attributes."""
+    name = f"login_{next(_NUMBERS)}_of_{urlsplit(url).path.removeprefix('/')}"
+    change_each(url, [f"CREATE ROLE {name} LOGIN {attributes}", *(each.format(name=name) for each in after)])
+    return url.replace("postgres@", f"{name}@")
+
+
+_NUMBERS = iter(range(1, 1_000))
+
+
+# --- reading --------------------------------------------------------------------------------------------------
+
+
+async def test_a_query_returns_its_columns_and_rows(sql: _Sql) -> None:
+    text = "SELECT id, status, status FROM process_metadata ORDER BY id DESC; "
+    columns, rows, more = await sql.query(text)
+    assert columns == ("id", "status", "status")
+    assert rows == [(2, "SUCCEEDED", "SUCCEEDED"), (1, "RUNNING", "RUNNING")]
+    assert not more
+    assert await sql.query("WITH one AS (SELECT 1 AS x) SELECT x FROM one -- the end") == (("x",), [(1,)], False)
+    assert (await sql.query("SELECT sequence FROM event WHERE episode = -1"))[1] == []
+    assert (await sql.query("VALUES (1), (2)"))[1] == [(1,), (2,)]
+    text = "SELECT count(*) FROM event, json_each(payload) AS member"
+    if not sql.is_sqlite:
+        text = "SELECT count(*) FROM event, jsonb_each(payload::jsonb) AS member"
+    assert (await sql.query(text))[1][0] > (20,)
+
+
+async def test_more_rows_than_the_limit_are_reported(sql: _Sql) -> None:
+    text = "SELECT sequence FROM event WHERE episode = 2 ORDER BY sequence"
+    assert await sql.query(text, SqlLimits(rows=3)) == (("sequence",), [(1,), (2,), (3,)], True)
+    assert (await sql.query(text, SqlLimits(rows=11)))[1:] == ([(each,) for each in range(1, 12)], False)
+    assert (await sql.query(text, SqlLimits(rows=10)))[2] is True
+    long = "SELECT a.sequence FROM event a, event b, event c ORDER BY 1"
+    _, rows, more = await sql.query(long, SqlLimits(rows=None))
+    assert len(rows) == (len(RECORDS) - 3) ** 3
+    assert not more
+
+
+async def test_a_query_ends_at_its_limit_on_bytes(sql: _Sql) -> None:
+    ones = "'" + "1" * 1_000 + "'"
+    text = f"{ENDLESS} {ones} FROM n"
+    _, rows, more = await sql.query(text, SqlLimits(rows=None, bytes=50_000))
+    assert 40 <= len(rows) <= 50
+    assert more
+
+
+async def test_a_huge_value_does_not_reach_this_process(sql: _Sql) -> None:
+    huge = "SELECT zeroblob(900000000)" if sql.is_sqlite else "SELECT repeat('x', 20000000)"
+    with pytest.raises(QueryRefused, match="too big" if sql.is_sqlite else "has 200000\\d+ bytes, and the limit is"):
+        await sql.query(huge)
+
+
+async def test_a_text_that_is_no_query_is_refused(sql: _Sql) -> None:
+    for text in ("", ";", "-- nothing", "SELEC 1", "SELECT", "SELECT $1", "SELECT 'a", "SELECT \0", "SELECT '\ud800'"):
+        with pytest.raises(QueryRefused):
+            pytest.fail(f"{text!r} was answered with {await sql.query(text)}")
+
+
+async def test_an_open_memory_for_reading_takes_queries(reader_url: str) -> None:
+    async with Reading.open(reader_url) as reading:
+        assert (await reading.query("SELECT count(*) AS episodes FROM process_metadata")).rows == [(2,)]
+        with pytest.raises(QueryRefused):
+            await reading.query("DELETE FROM event", SqlLimits(rows=1))
+
+
+async def test_a_wrong_name_is_answered_with_the_nearest_one(sql: _Sql) -> None:
+    with pytest.raises(QueryRefused, match=r"no table or view root_failures; did you mean root_failure\?"):
+        await sql.query("SELECT * FROM root_failures")
+    with pytest.raises(QueryRefused, match="no table or view weather; the README of `query` lists them"):
+        await sql.query("SELECT * FROM weather")
+    with pytest.raises(QueryRefused, match="statu"):
+        await sql.query("SELECT statu FROM process_metadata")
+
+
+async def test_a_cancelled_query_stops_in_the_database(sql: _Sql) -> None:
+    task = asyncio.create_task(sql.query(f"{ENDLESS} count(*) FROM n", SqlLimits(seconds=60)))
+    await asyncio.sleep(0.3)
+    task.cancel()
+    started_s = time.monotonic()
+    with pytest.raises(asyncio.CancelledError):
+        await task
+    assert time.monotonic() - started_s < 20
+
+
+async def test_a_query_on_a_file_that_is_gone_is_unavailable(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path / 'memory.db'}"
+    await append_and_fold(url, RECORDS)
+    log = await EventLog.open(DatabaseAddress.parse(url), create=False)
+    for each in tmp_path.glob("memory.db*"):
+        each.unlink()
+    with pytest.raises(DatabaseUnavailable):
+        await ReadOnlySql(log).query("SELECT 1")
+    await log.close()
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("limits", [{"rows": 0}, {"bytes": -1}, {"seconds": 0.0}])
+def test_a_limit_of_nothing_is_refused(limits: dict[str, int]) -> None:
+    with pytest.raises(QueryRefused, match="must be > 0"):
+        SqlLimits(**limits)
+
+
+# --- attacks --------------------------------------------------------------------------------------------------
+
+ON_BOTH = {
+    "an insertion": "INSERT INTO event SELECT * FROM event",
+    "an insertion that returns": "INSERT INTO episode (number) VALUES (77) RETURNING number",
+    "an update": "UPDATE event SET payload = NULL",
+    "a deletion": "DELETE FROM event",
+    "a deletion that returns": "DELETE FROM event RETURNING sequence",
+    "a change in WITH": "WITH gone AS (DELETE FROM event RETURNING *) SELECT * FROM gone",
+    "a new table": "CREATE TABLE planted (x integer)",
+    "a new table from a query": "CREATE TABLE planted AS SELECT 1",
+    "a temporary table": "CREATE TEMP TABLE planted (x integer)",
+    "a new view": "CREATE VIEW planted AS SELECT 1",
+    "an index": "CREATE INDEX planted ON event (type)",
+    "a dropped table": "DROP TABLE event",
+    "a changed table": "ALTER TABLE event RENAME TO planted",
+    "two statements": "SELECT 1; DELETE FROM event",
+    "two statements behind a comment": "SELECT 1 /* ; */ ; DROP TABLE event --",
+    "a parenthesis that closes early": "SELECT 1) AS q (c0)) AS sized; DELETE FROM event; --",
+    "the end of the transaction": "COMMIT",
+    "a transaction that writes": "BEGIN IMMEDIATE",
+    "VACUUM": "VACUUM",
+    "ANALYZE": "ANALYZE",
+    "REINDEX": "REINDEX event",
+}
+ON_SQLITE = {
+    "ATTACH": "ATTACH '{folder}/planted' AS planted",
+    "VACUUM INTO": "VACUUM INTO '{folder}/planted'",
+    "DETACH": "DETACH main",
+    "a pragma that writes": "PRAGMA user_version = 7",
+    "a pragma that makes the schema writable": "PRAGMA writable_schema = on",
+    "a pragma that allows writing": "PRAGMA query_only = off",
+    "a pragma as a table": "SELECT * FROM pragma_journal_mode('delete')",
+    "load_extension": "SELECT load_extension('{folder}/planted.so')",
+    "a pointer": "SELECT fts3_tokenizer('simple')",
+    "a virtual table": "CREATE VIRTUAL TABLE temp.planted USING fts4(x)",
+    "a savepoint": "SAVEPOINT planted",
+    "REPLACE": "REPLACE INTO pycrorm_log VALUES (1, 2, 3)",
+}
+ON_POSTGRESQL = {
+    "a file of the server": "SELECT pg_read_file('/etc/hostname')",
+    "a folder of the server": "SELECT pg_ls_dir('/')",
+    "a program": "COPY (SELECT 1) TO PROGRAM 'touch {folder}/planted'",
+    "a file that is written": "COPY (SELECT 1) TO '{folder}/planted'",
+    "a file that is read": "COPY event FROM '/etc/passwd'",
+    "the end of another session": "SELECT pg_terminate_backend(pid) FROM pg_stat_activity",
+    "the end, with its schema": 'SELECT "pg_catalog" . "pg_terminate_backend" /**/ (pid) FROM pg_stat_activity',
+    "the end, in escaped letters": 'SELECT U&"pg\\005fterminate\\005fbackend"(pid) FROM pg_stat_activity',
+    "the end, as a text that is run": "SELECT query_to_xml('SELECT pg_' || 'terminate_backend(1)', true, true, '')",
+    "a cancelled statement": "SELECT pg_cancel_backend(pid) FROM pg_stat_activity",
+    "SET ROLE": "SET ROLE pycrorm_folder",
+    "RESET ROLE": "RESET ROLE",
+    "SET SESSION AUTHORIZATION": "SET SESSION AUTHORIZATION postgres",
+    "a transaction that may write": "SET TRANSACTION READ WRITE",
+    "a setting": "SELECT set_config('transaction_read_only', 'off', false)",
+    "no time limit": "SET statement_timeout = 0",
+    "no time limit by a function": "SELECT set_config('statement_timeout', '0', false)",
+    "nextval": "SELECT nextval('pycrorm.episode_number')",
+    "setval": "SELECT setval('pycrorm.episode_number', 4000000)",
+    "lo_import": "SELECT lo_import('/etc/passwd')",
+    "lo_create": "SELECT lo_create(0)",
+    "a lock": "SELECT pg_advisory_lock(7266203370152417862)",
+    "rows that are locked": "SELECT * FROM pycrorm.event FOR UPDATE",
+    "LOCK TABLE": "LOCK TABLE pycrorm.event",
+    "NOTIFY": "NOTIFY planted",
+    "pg_notify": "SELECT pg_notify('planted', '')",
+    "SELECT INTO": "SELECT 1 INTO planted",
+    "DO": "DO $$ BEGIN PERFORM pg_sleep(0); END $$",
+    "CALL": "CALL planted()",
+    "PREPARE": "PREPARE planted AS SELECT 1",
+    "a cursor": "DECLARE planted CURSOR WITH HOLD FOR SELECT 1",
+    "a password": "SELECT rolpassword FROM pg_authid",
+    "a server setting": "SELECT pg_reload_conf()",
+    "a function with the rights of its owner": "SELECT public.planted_by_the_owner()",
+    "a connection by dblink": "SELECT public.dblink_exec('dbname=postgres', 'DROP TABLE event')",
+}
+
+
+async def test_every_attack_is_refused_and_changes_nothing(owner_url: str, sql: _Sql, tmp_path: Path) -> None:
+    before = _state(owner_url)
+    for attack, text in {**ON_BOTH, **(ON_SQLITE if sql.is_sqlite else ON_POSTGRESQL)}.items():
+        with pytest.raises(QueryRefused):
+            pytest.fail(f"{attack} was answered with {await sql.query(text.format(folder=tmp_path))}")
+        assert list(tmp_path.iterdir()) == [], attack
+        assert _state(owner_url) == before, attack
+
+
+def _state(url: str) -> list[list[Any]]:
+    """Return the schema, the log and a sequence, which a transaction that is rolled back would still change."""
+    if is_sqlite(url):
+        statements = ["SELECT name, sql FROM sqlite_master", "PRAGMA user_version", "PRAGMA journal_mode"]
+    else:
+        statements = [
+            "SELECT relname::text FROM pg_class WHERE relnamespace >= 16384 AND relkind <> 't' ORDER BY 1",
+            "SELECT last_value, is_called FROM pycrorm.episode_number",
+            "SELECT count(*) FROM pg_largeobject_metadata",
+            "SELECT count(*) FROM pg_locks WHERE locktype = 'advisory'",
+        ]
+    statements.append("SELECT episode, sequence, type, payload FROM event ORDER BY 1, 2")
+    return ask_each(url, statements)
+
+
+@pytest.mark.parametrize(
+    "endless",
+    [
+        ENDLESS + "count(*) FROM n",
+        ENDLESS + "x FROM n WHERE x < 0",
+        "SELECT count(*) FROM event a, event b, event c, event d, event e, event f, event g, event h",
+    ],
+)
+async def test_an_endless_query_is_stopped(endless: str, sql: _Sql) -> None:
+    started_s = time.monotonic()
+    with pytest.raises(QueryRefused, match=r"was stopped after 0[.]3 s: select less, or allow it more time"):
+        await sql.query(endless, QUICK)
+    assert time.monotonic() - started_s < 15
+
+
+async def test_time_at_which_the_rows_are_not_read_does_not_count(sql: _Sql) -> None:
+    async with sql.stream(ENDLESS + "x FROM n", SqlLimits(rows=1_500, seconds=1)) as rows:
+        count = 0
+        async for _ in rows:
+            count += 1
+            if count == 1:
+                await asyncio.sleep(1.1)
+    assert (count, rows.more) == (1_500, True)
+
+
+# --- logins ---------------------------------------------------------------------------------------------------
+
+MORE_RIGHTS = {
+    "is a superuser": ("SUPERUSER",),
+    "may create roles or databases": ("CREATEDB IN ROLE pycrorm_reader",),
+    "is a member of pycrorm_folder": ("IN ROLE pycrorm_folder",),
+    "is a member of pycrorm_recorder": ("IN ROLE pycrorm_recorder, pycrorm_reader",),
+    "is a member of pg_read_server_files": ("IN ROLE pycrorm_reader, pg_read_server_files",),
+    "is a member of pg_execute_server_program": ("IN ROLE pycrorm_reader, pg_execute_server_program",),
+    "is a member of pg_signal_backend": ("IN ROLE pg_signal_backend, pycrorm_reader",),
+    "owns the database": ("IN ROLE pycrorm_reader", "ALTER DATABASE {database} OWNER TO {name}"),
+    "may create schemas": ("IN ROLE pycrorm_reader", "GRANT CREATE ON DATABASE {database} TO {name}"),
+    "may create tables": ("IN ROLE pycrorm_reader", "GRANT CREATE ON SCHEMA memory_tables TO {name}"),
+    "may change the memory": ("IN ROLE pycrorm_reader", "GRANT UPDATE (head) ON pycrorm.episode TO {name}"),
+}
+
+
+async def test_a_login_with_more_rights_than_a_reader_is_refused(server: Server) -> None:
+    owner_url = await _with_roles(server)
+    database = urlsplit(owner_url).path.removeprefix("/")
+    for right, (attributes, *after) in MORE_RIGHTS.items():
+        url = login(owner_url, attributes, *(each.format(database=database, name="{name}") for each in after))
+        async with _opened(url) as sql:
+            with pytest.raises(QueryRefused) as refused:
+                await sql.query("SELECT 1")
+        assert right in str(refused.value)
+        assert "CREATE ROLE pycrorm_query LOGIN PASSWORD '…' IN ROLE pycrorm_reader" in str(refused.value)
+
+
+async def test_a_function_with_effects_is_refused_although_every_login_may_call_it(server: Server) -> None:
+    owner_url = await _with_roles(server)
+    effect = "SELECT pg_catalog.pg_logical_emit_message(false, 'planted', '') IS NULL; SELECT 1"
+    change_each(
+        owner_url,
+        [f"CREATE FUNCTION public.effect() RETURNS integer LANGUAGE sql SECURITY DEFINER AS $$ {effect} $$"],
+    )
+    async with _opened(login(owner_url, "IN ROLE pycrorm_reader")) as sql:
+        with pytest.raises(QueryRefused, match="the function effect can do more and is not allowed"):
+            await sql.query("SELECT public.effect()")
+        assert (await sql.query("SELECT 1 AS effect"))[0] == ("effect",)  # a name alone calls nothing
+
+
+async def _with_roles(server: Server) -> str:
+    url = server.new_database()
+    await append_and_fold(url, RECORDS)
+    change_each(url, GRANTS)
+    return url
