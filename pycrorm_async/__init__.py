@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from pycrorm_async.events.blobs import Blob
     from pycrorm_async.memory import Memory, MemoryStatus
     from pycrorm_async.operations.recovery import recover
-    from pycrorm_async.projections.custom.projection import Projection
+    from pycrorm_async.projections.custom.projection import EpisodeProjection, Projection
     from pycrorm_async.projections.schema.user_views import UserView
     from pycrorm_async.query.reading import Reading
     from pycrorm_async.query.recorded_designator import performable_of
@@ -31,6 +31,7 @@ __version__ = "0.1.0"
 
 __all__ = [
     "Blob",
+    "EpisodeProjection",
     "Memory",
     "MemoryStatus",
     "Projection",
@@ -45,6 +46,7 @@ __all__ = [
 
 _MODULES = {
     "Blob": "events.blobs",
+    "EpisodeProjection": "projections.custom.projection",
     "Memory": "memory",
     "MemoryStatus": "memory",
     "Projection": "projections.custom.projection",

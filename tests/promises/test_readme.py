@@ -37,7 +37,7 @@ def python_of(page: str) -> list[str]:
 
 PLAN, QUESTIONS, EXECUTIVE = python_of("README.md")
 TIDY, LIFTER, STEREO, CELLS = python_of("pycrorm_async/plan/README.md")
-COURSE, AROUND, ROBOTS, BEGAN, TAGGED, SEEN, THEN, AGAIN, RATE = python_of("pycrorm_async/query/README.md")
+COURSE, AROUND, ROBOTS, BEGAN, TAGGED, SEEN, THEN, AGAIN, RATE, TRIES = python_of("pycrorm_async/query/README.md")
 BETTER, ORIGINS = python_of("pycrorm_async/learning/README.md")
 
 
@@ -177,15 +177,20 @@ async def test_a_perform_after_a_memory_and_a_world_were_connected_is_recorded(
     assert performed == [(None, "SUCCEEDED"), ("NavigateAction", "SUCCEEDED"), ("MoveMotion", "SUCCEEDED")]
 
 
-def test_the_users_projection_counts_the_attempts(tmp_path: Path) -> None:
+def test_the_users_projections_count_the_attempts(tmp_path: Path) -> None:
     (tmp_path / "tidy.py").write_text(TIDY)
-    (tmp_path / "rates.py").write_text(RATE)
-    done = pycrorm("run", "tidy.py", "--projection", "rates:GraspRate", cwd=tmp_path)
+    (tmp_path / "rates.py").write_text(RATE + TRIES)
+    given = ("--projection", "rates:GraspRate", "--projection", "rates:Attempts")
+    done = pycrorm("run", "tidy.py", *given, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     with contextlib.closing(sqlite3.connect(tmp_path / "pycrorm.db")) as plain:
         tried = plain.execute("SELECT id, arm, grasp, status FROM grasp_try").fetchall()
         question = "SELECT id, arm, grasp, status FROM pick_up_action JOIN task_tree_node USING (id)"
         assert tried == plain.execute(question).fetchall()
+        question = "SELECT dtype FROM task_tree_node WHERE dtype IS NOT NULL ORDER BY id"
+        performed = [dtype for (dtype,) in plain.execute(question)]
+        attempts = plain.execute("SELECT dtype, number FROM attempt ORDER BY id").fetchall()
+    assert attempts == [(dtype, performed[: index + 1].count(dtype)) for index, dtype in enumerate(performed)]
     assert [status for *_, status in tried] == ["SUCCEEDED"]
 
 

@@ -17,8 +17,8 @@ from __future__ import annotations
 
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias, get_args
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias, final, get_args
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.fields import is_reserved
@@ -27,7 +27,16 @@ from pycrorm_async.projections.fold.column_values import in_slot, row
 from pycrorm_async.projections.schema.core_columns import Storage
 from pycrorm_async.projections.schema.user_views import UserView
 
-__all__ = ["Projection", "Event", "Changes", "Column", "OF_EVERY_TABLE", "columns_of"]
+__all__ = [
+    "Projection",
+    "EpisodeProjection",
+    "EpisodeFold",
+    "Event",
+    "Changes",
+    "Column",
+    "OF_EVERY_TABLE",
+    "columns_of",
+]
 
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,39}")
 Column: TypeAlias = Literal["row", "integer", "real", "text", "boolean", "time", "json"]
@@ -103,6 +112,42 @@ class Projection(ABC):
 
         An exception parks the episode in this projection until a rebuild; `pycrorm status` shows the reason.
         """
+
+
+EpisodeFold: TypeAlias = Callable[[Event, Changes], None]
+"""Folds the events of one episode, in order. It may have state."""
+
+
+class EpisodeProjection(Projection):
+    """The base class of custom projections whose fold has a state, that of the event's own episode.
+
+    >>> class Attempts(EpisodeProjection):
+    ...     name, version = "attempts", 1
+    ...     tables = {"attempt": {"dtype": "text", "number": "integer"}}
+    ...
+    ...     def episode(self):
+    ...         counts = Counter()
+    ...
+    ...         def fold(event, rows):
+    ...             if event.dtype is not None:
+    ...                 counts[event.dtype] += 1
+    ...                 rows.insert("attempt", event.id, dtype=event.dtype, number=counts[event.dtype])
+    ...
+    ...         return fold
+    """
+
+    @abstractmethod
+    def episode(self) -> EpisodeFold:
+        """Return a function that folds the events of one episode from its first, as `Projection.fold` folds an event.
+
+        It gets every event once and in order. After a restart, and where a batch could not be written, a new function
+        gets the episode's events from the first again, and the rows of those that are in the tables are discarded. So
+        its state must depend on the events alone. It is dropped at the end of the episode.
+        """
+
+    @final
+    def fold(self, event: Event, rows: Changes) -> None:  # noqa: ARG002 - of the base class
+        raise TypeError(f"{self.name} folds events with what `episode()` returns")
 
 
 def columns_of(projection: Projection) -> dict[str, dict[str, Storage]]:

@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.events.codec import unwritable
 from pycrorm_async.events.types import DesignatorTypeDeclared, NodeStarted
-from pycrorm_async.projections.custom.projection import OF_EVERY_TABLE, Changes, Event, Projection, columns_of
+from pycrorm_async.projections.custom.episode_folds import BatchOfFolds, EpisodeFolds
+from pycrorm_async.projections.custom.projection import (
+    OF_EVERY_TABLE,
+    Changes,
+    EpisodeProjection,
+    Event,
+    Projection,
+    columns_of,
+)
 from pycrorm_async.projections.fold.column_values import is_missing, json_text, microseconds
 from pycrorm_async.projections.fold.fold import CannotFold, happening_of
 from pycrorm_async.projections.fold.row_batch import Row
@@ -19,7 +27,8 @@ from pycrorm_async.projections.schema.tables import column_type
 from pycrorm_async.projections.table_names import physical_name
 from pycrorm_async.store.dialect import Insertion
 from pycrorm_async.store.dialects import dialect_of
-from pycrorm_async.store.stored import StoredEvent
+from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.stored import Span, StoredEvent
 
 __all__ = ["CustomRows"]
 
@@ -27,21 +36,49 @@ _INTEGER_MAX = 2**63 - 1
 
 
 class CustomRows:
-    """Rows to insert, and changes of rows that an earlier batch inserted, by table and id. Implements `Batch`."""
+    """Rows to insert, and changes of rows that an earlier batch inserted, by table and id. Implements `Batch`.
 
-    def __init__(self, projection: Projection, declared: Mapping[str, DesignatorTypeDeclared]) -> None:
+    Args:
+        projection: to fold with.
+        declared: designator types by fingerprint.
+        folds: of an `EpisodeProjection`, those of the episodes that earlier batches began.
+    """
+
+    def __init__(
+        self,
+        projection: Projection,
+        declared: Mapping[str, DesignatorTypeDeclared],
+        folds: EpisodeFolds | None = None,
+    ) -> None:
         self._projection = projection
+        self._folds: BatchOfFolds | None = None
+        if isinstance(projection, EpisodeProjection):
+            self._folds = BatchOfFolds(EpisodeFolds(projection) if folds is None else folds)
+        self._fold = projection.fold if self._folds is None else self._folds.fold
         self._declared = declared
         self._columns = columns_of(projection)
         self._inserts: dict[str, dict[int, dict[str, Any]]] = {name: {} for name in self._columns}
         self._updates: dict[str, dict[int, dict[str, Any]]] = {name: {} for name in self._columns}
         self._insertion: Insertion = None
 
+    async def restore(self, log: EventLog, spans: Sequence[Span]) -> None:
+        """Restore the folds of the episodes that this batch continues."""
+        if self._folds is not None:
+            await self._folds.restore(log, spans, self._event)
+
     def fold(self, event: StoredEvent) -> None:
         """Add the projection's changes for this event. Raises `CannotFold`, and then has added none."""
+        try:
+            self._add(event)
+        except CannotFold:
+            if self._folds is not None:
+                self._folds.discard(event.number)
+            raise
+
+    def _add(self, event: StoredEvent) -> None:
         changes = Changes()
         try:
-            self._projection.fold(self._event(event), changes)
+            self._fold(self._event(event), changes)
         except CannotFold:
             raise
         except Exception as error:
@@ -73,7 +110,9 @@ class CustomRows:
         return rows_by_table
 
     async def ready(self, engine: AsyncEngine, generation: int) -> None:
-        """Prepare the statements that insert the rows."""
+        """Prepare the statements that insert the rows, and leave the folds of the episodes to the next batch."""
+        if self._folds is not None:
+            self._folds.give_back()
         self._insertion = await dialect_of(engine).insertion(stored_rows(engine, self.to_insert(), generation))
 
     async def write(self, connection: AsyncConnection, generation: int) -> None:

@@ -18,7 +18,8 @@ from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.errors import CallerError, DatabaseForeign, DatabaseUnavailable, PycrormError
 from pycrorm_async.events.codec import declaration_of, fingerprint
-from pycrorm_async.projections.custom.projection import Projection, columns_of
+from pycrorm_async.projections.custom.episode_folds import EpisodeFolds
+from pycrorm_async.projections.custom.projection import EpisodeProjection, Projection, columns_of
 from pycrorm_async.projections.custom.projection_rows import CustomRows
 from pycrorm_async.projections.run import checkpoints
 from pycrorm_async.projections.run.batch_fold import Batch, BatchFold
@@ -62,6 +63,7 @@ class CustomFoldDefinition:
 
     def __init__(self, projection: Projection) -> None:
         self._projection = projection
+        self._folds = EpisodeFolds(projection) if isinstance(projection, EpisodeProjection) else None
 
     def learn(self, layout: Layout, payloads: Sequence[bytes]) -> tuple[Layout, Callable[[], Batch]]:
         declared = {}
@@ -70,7 +72,7 @@ class CustomFoldDefinition:
                 declared[fingerprint(payload)] = declaration_of(payload)
             except ValueError:  # from a newer version: its nodes cannot be folded
                 continue
-        return layout, lambda: CustomRows(self._projection, declared)
+        return layout, lambda: CustomRows(self._projection, declared, self._folds)
 
 
 def layout_of(projection: Projection, dialect: Dialect) -> Layout:

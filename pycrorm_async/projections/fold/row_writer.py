@@ -6,6 +6,8 @@ because it releases the GIL at every row: next to a busy plan it wrote 872 rows/
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from sqlalchemy import text
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
@@ -18,7 +20,8 @@ from pycrorm_async.projections.schema.tables import column_type
 from pycrorm_async.projections.table_names import physical_name
 from pycrorm_async.store.dialect import Insertion, RowsByTable
 from pycrorm_async.store.dialects import dialect_of
-from pycrorm_async.store.stored import StoredEvent
+from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.stored import Span, StoredEvent
 
 __all__ = ["TableRows", "stored_rows"]
 
@@ -38,6 +41,9 @@ class TableRows:
         self._designators = designators
         self._rows = Rows()
         self._insertion: Insertion = None
+
+    async def restore(self, log: EventLog, spans: Sequence[Span]) -> None:
+        """Do nothing: this fold needs no earlier events."""
 
     def fold(self, event: StoredEvent) -> None:
         fold(event, self._designators, self._rows)

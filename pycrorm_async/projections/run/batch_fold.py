@@ -79,6 +79,10 @@ class FoldTarget(GrowthTarget, Protocol):
 class Batch(Protocol):
     """The rows of a batch of events."""
 
+    async def restore(self, log: EventLog, spans: Sequence[Span]) -> None:
+        """Prepare for folding these spans, by reading what the fold needs of the events before them."""
+        ...
+
     def fold(self, event: StoredEvent) -> None:
         """Add the rows of an event. Raises `CannotFold`, and then has added none."""
         ...
@@ -205,6 +209,7 @@ class BatchFold:
     async def _folded(self, spans: Sequence[Span], events: Sequence[StoredEvent]) -> _PreparedBatch:
         types = await self._types_now()
         rows, number = types.batch(), self.generation.number
+        await rows.restore(self._log, spans)
         steps, parked = await _fold_all(spans, events, rows)
         await rows.ready(self._log.engine, number)
         return _PreparedBatch(spans, events, types, rows, number, steps, parked)

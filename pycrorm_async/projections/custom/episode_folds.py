@@ -1,0 +1,131 @@
+"""Keep the folds of open episodes between batches, so that each event of an episode is folded with its state.
+
+Theory of operation. An `EpisodeProjection` has one fold for each episode, and its state is a function of the episode's
+events up to one sequence. That sequence is kept beside it. A batch takes the folds of its episodes out of the cache and
+gives them back when it is folded, before it is written. If the batch is then not written, because another process
+folded its events first or the database refused a row, the kept sequence is ahead of the checkpoint, and if another
+process folded events in the meantime it is behind. So nothing relies on the cache: a batch compares the sequence with
+the checkpoint that it continues. A fold that is behind reads the events in between, and one that is ahead or missing,
+as after a restart, is replaced by a new one that reads the episode from its start. The rows of events that are read in
+this way are discarded, because the transaction that moved the checkpoint wrote them.
+
+Two batches may be folded at a time, one while the other is written in parts. They never share a fold, because a fold is
+in the cache or in one batch.
+"""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from pycrorm_async.events.types import EpisodeEnded
+from pycrorm_async.projections.custom.projection import Changes, EpisodeFold, EpisodeProjection, Event
+from pycrorm_async.projections.fold.fold import CannotFold
+from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.stored import Span, StoredEvent
+
+__all__ = ["EpisodeFolds", "BatchOfFolds"]
+
+_EPISODES_MAX: Final = 1_000
+"""Bounds the folds of open episodes that are kept, and with it the memory. It is above the episodes of one batch (400).
+With more open episodes than this, those that were not folded for the longest time are read from their start again."""
+_PAGE_EVENTS: Final = 2_000
+"""Bounds the events that are read at once to restore a fold."""
+
+
+@dataclass(slots=True)
+class _OpenFold:
+    """The fold of one episode after its event `reached`; `fault` is the reason why it could not be restored."""
+
+    fold: EpisodeFold
+    reached: int = 0
+    has_ended: bool = False
+    fault: str | None = None
+
+    def read(self, event: Event, rows: Changes) -> None:
+        if self.fault is not None:
+            raise CannotFold(self.fault)
+        self.fold(event, rows)
+        self.reached = event.sequence
+        self.has_ended = self.has_ended or isinstance(event.happening, EpisodeEnded)
+
+
+class EpisodeFolds:
+    """The folds of the open episodes of one projection in this process."""
+
+    def __init__(self, projection: EpisodeProjection) -> None:
+        self.projection = projection
+        self._open: OrderedDict[int, _OpenFold] = OrderedDict()
+
+    def take(self, number: int) -> _OpenFold | None:
+        """Return the fold of this episode and remove it; None if there is none."""
+        return self._open.pop(number, None)
+
+    def keep(self, number: int, fold: _OpenFold) -> None:
+        """Keep the fold of an episode that has not ended, and drop the one that was not folded for the longest time.
+
+        After its end an episode can only be tagged, for which its fold is restored.
+        """
+        if fold.has_ended or fold.fault is not None:
+            return
+        self._open[number] = fold
+        self._open.move_to_end(number)
+        if len(self._open) > _EPISODES_MAX:
+            self._open.popitem(last=False)
+
+    def __len__(self) -> int:
+        return len(self._open)
+
+
+class BatchOfFolds:
+    """The folds of the episodes of one batch."""
+
+    def __init__(self, folds: EpisodeFolds) -> None:
+        self._folds = folds
+        self._taken: dict[int, _OpenFold] = {}
+
+    async def restore(self, log: EventLog, spans: Sequence[Span], event_of: Callable[[StoredEvent], Event]) -> None:
+        """Bring the fold of each episode to the event before its span."""
+        for span in spans:
+            fold = self._folds.take(span.number)
+            if fold is None or fold.reached > span.after:
+                fold = _OpenFold(self._folds.projection.episode())
+            self._taken[span.number] = fold
+            while fold.reached < span.after and fold.fault is None:
+                page = Span(span.number, fold.reached, min(fold.reached + _PAGE_EVENTS, span.after))
+                events = await log.spans([page])
+                fold.fault = _read(fold, events, event_of)
+                if fold.fault is None and fold.reached < page.last:
+                    fold.fault = f"event {fold.reached + 1} is missing in the log"
+
+    def fold(self, event: Event, rows: Changes) -> None:
+        """Fold an event with the fold of its episode. After an exception the episode's fold is not kept."""
+        if event.number not in self._taken:
+            assert event.sequence == 1, "a batch that continues an episode restores its fold first"
+            self._taken[event.number] = _OpenFold(self._folds.projection.episode())
+        self._taken[event.number].read(event, rows)
+
+    def discard(self, number: int) -> None:
+        """Drop the fold of an episode, because one of its events could not be folded."""
+        self._taken.pop(number, None)
+
+    def give_back(self) -> None:
+        """Keep the folds for the next batch."""
+        while self._taken:
+            self._folds.keep(*self._taken.popitem())
+
+
+def _read(fold: _OpenFold, events: Sequence[StoredEvent], event_of: Callable[[StoredEvent], Event]) -> str | None:
+    """Fold events whose rows are written already; return the reason if one cannot be folded."""
+    for stored in events:
+        if stored.sequence != fold.reached + 1:
+            return None
+        try:
+            fold.read(event_of(stored), Changes())
+        except CannotFold as reason:
+            return f"event {stored.sequence}, read again: {reason}"
+        except Exception as error:  # noqa: BLE001 - user code; the reason parks the episode
+            return f"event {stored.sequence}, read again: {type(error).__name__}: {error}"
+    return None

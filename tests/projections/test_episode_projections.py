@@ -1,0 +1,288 @@
+"""Episode-scoped projections: each event is folded once with the state of its own episode, whatever the batches are."""
+
+from __future__ import annotations
+
+import asyncio
+import multiprocessing
+import os
+import signal
+from collections import Counter
+from collections.abc import Sequence
+from random import Random
+from typing import Any, ClassVar
+
+import pytest
+from sqlalchemy.ext.asyncio import AsyncConnection
+
+from pycrorm_async.events.types import EpisodeEnded, EpisodeStarted, EpisodeTagged, NodeEnded, NodeStarted
+from pycrorm_async.projections.custom import episode_folds
+from pycrorm_async.projections.custom.episode_folds import EpisodeFolds
+from pycrorm_async.projections.custom.projection import Changes, EpisodeFold, EpisodeProjection, Event
+from pycrorm_async.projections.custom.projection_rows import CustomRows
+from pycrorm_async.projections.custom.projection_tables import states
+from pycrorm_async.projections.projector import Projector
+from pycrorm_async.projections.rebuild import Rebuild, claimed
+from pycrorm_async.projections.replaced_tables import clear
+from pycrorm_async.projections.verify.verify import verify
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.log import EventLog
+from tests.projections.event_script import PICK_UP, Script, declarations, mixed, name_of, row
+from tests.projections.sql_queries import ask
+
+pytestmark = [pytest.mark.soak_on("postgresql"), pytest.mark.slow]
+"""As in `test_custom_projections`."""
+
+
+class Attempts(EpisodeProjection):
+    """The number of each try with an arm within its episode, and the outcome of the try before it."""
+
+    name, version = "attempts", 1
+    tables = {"attempt": {"arm": "text", "number": "integer", "before": "text"}}  # noqa: RUF012 - a common form in user code
+    read: ClassVar = Counter[str]()
+    """Counts the reads of each event, by episode and sequence."""
+
+    def episode(self) -> EpisodeFold:
+        counts, arms, outcomes = Counter[str](), dict[int, str](), dict[str, str]()
+
+        def fold(event: Event, rows: Changes) -> None:
+            self.read[f"{event.number}/{event.sequence}"] += 1
+            match event.happening:
+                case NodeStarted(parameters=parameters) if event.dtype == "PickUpAction":
+                    arm = arms[event.sequence] = parameters["arm"]
+                    counts[arm] += 1
+                    rows.insert("attempt", event.id, arm=arm, number=counts[arm], before=outcomes.get(arm))
+                case NodeEnded(node=node, status=status) if node in arms:
+                    outcomes[arms[node]] = status
+                case EpisodeTagged(added=(tag, *_)):
+                    rows.insert("attempt", event.id, arm=tag, number=sum(counts.values()))
+
+        return fold
+
+
+def episode(number: int, tries: Sequence[tuple[str, str]], *, ends: bool = True) -> Script:
+    script = Script(number)
+    script.put(EpisodeStarted("", "me", "host", "", "3.11"))
+    root = script.put(NodeStarted("root"))
+    for arm, status in tries:
+        parameters = {"object_designator": {"row": 1, "object": 1}, "arm": arm, "grasp": "TOP"}
+        node = script.put(NodeStarted("action", root, designator=name_of(PICK_UP), parameters=parameters))
+        script.put(NodeEnded(node, status))  # type: ignore[arg-type]
+    if ends:
+        script.put(EpisodeEnded("SUCCEEDED"))
+        script.put(EpisodeTagged(("late",)))
+    return script
+
+
+def expected(number: int, tries: Sequence[tuple[str, str]], *, ends: bool = True) -> list[tuple[Any, ...]]:
+    """Compute the rows from the list, without a fold."""
+    rows: list[tuple[Any, ...]] = []
+    for index, (arm, _) in enumerate(tries):
+        before = [status for other, status in tries[:index] if other == arm]
+        rows.append((row(3 + 2 * index, number=number), number, arm, len(before) + 1, before[-1] if before else None))
+    if ends:
+        rows.append((row(4 + 2 * len(tries), number=number), number, "late", len(tries), None))
+    return rows
+
+
+def random_episodes(random: Random, count: int, *, tries_max: int = 6) -> list[list[tuple[str, str]]]:
+    return [
+        [
+            (random.choice(["LEFT", "RIGHT"]), random.choice(["SUCCEEDED", "FAILED"]))
+            for _ in range(random.randint(0, tries_max))
+        ]
+        for _ in range(count)
+    ]
+
+
+async def projector_of(log: EventLog, projection: EpisodeProjection | None = None, **options: Any) -> Projector:
+    projector = Projector(log, projections=[projection or Attempts()], **options)
+    await projector.open()
+    return projector
+
+
+async def rows_in(log: EventLog) -> list[tuple[Any, ...]]:
+    return await ask(log, "SELECT * FROM attempt ORDER BY id")
+
+
+async def rebuilt(log: EventLog) -> None:
+    async with claimed(log):
+        rebuild = await Rebuild.begin(log, projection=Attempts())
+        await rebuild.show()
+        await clear(log)
+
+
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.soak), pytest.param(3, marks=pytest.mark.soak)])
+async def test_rows_do_not_depend_on_batches_restarts_and_other_processes(
+    log: EventLog, monkeypatch: pytest.MonkeyPatch, seed: int, *, in_turn: bool
+) -> None:
+    monkeypatch.setattr(episode_folds, "_EPISODES_MAX", 3)
+    monkeypatch.setattr(episode_folds, "_PAGE_EVENTS", 4)
+    random = Random(seed)
+    episodes = random_episodes(random, 24 if seed == 1 or in_turn else 200)
+    scripts = [episode(number, tries, ends=number % 3 != 0) for number, tries in enumerate(episodes, 1)]
+    records = [each for first in range(0, len(scripts), 5) for each in mixed(*scripts[first : first + 5])]
+    await log.append([*declarations(PICK_UP), *records[:1]])
+    projectors = [await projector_of(log, batch_events=3)]
+    del records[:1]
+    while records:
+        size = random.randint(1, 25)
+        await log.append(records[:size])
+        del records[:size]
+        if random.random() < 0.2:  # a restart, or another process beside the first
+            kept = projectors[: random.randint(0, 1)]
+            projectors = [*kept, await projector_of(log, batch_events=random.randint(1, 12))]
+        if random.random() < 0.7:
+            await random.choice(projectors).catch_up()
+    await asyncio.gather(*(each.catch_up() for each in projectors))
+    rows = [each for number, tries in enumerate(episodes, 1) for each in expected(number, tries, ends=number % 3 != 0)]
+    assert await rows_in(log) == rows
+    result = await verify(log, projections=[Attempts()])
+    assert (result.drift, result.damage) == (0, 0)
+    await rebuilt(log)
+    assert await rows_in(log) == rows
+
+
+async def test_after_a_restart_only_open_episodes_are_read_again(log: EventLog) -> None:
+    tries = [("LEFT", "FAILED"), ("LEFT", "SUCCEEDED")]
+    await log.append([*declarations(PICK_UP), *episode(1, tries).records, *episode(2, tries).records[:5]])
+    await (await projector_of(log)).catch_up()
+    await log.append(episode(2, tries).records)
+    Attempts.read.clear()
+    await (await projector_of(log)).catch_up()
+    assert await rows_in(log) == [*expected(1, tries), *expected(2, tries)]
+    assert Attempts.read == Counter({f"2/{sequence}": 1 for sequence in range(1, 9)})
+
+
+async def test_a_process_reads_an_event_of_an_open_episode_once(log: EventLog) -> None:
+    tries = [("LEFT", "FAILED"), ("RIGHT", "SUCCEEDED"), ("LEFT", "SUCCEEDED")]
+    await log.append(declarations(PICK_UP))
+    projector = await projector_of(log)
+    Attempts.read.clear()
+    for each in episode(1, tries, ends=False).records:
+        await log.append([each])
+        await projector.catch_up()
+    assert await rows_in(log) == expected(1, tries, ends=False)
+    assert Attempts.read == Counter({f"1/{sequence}": 1 for sequence in range(1, 9)})
+
+
+async def test_the_folds_that_are_kept_are_bounded_and_end_with_their_episode(
+    log: EventLog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept: list[EpisodeFolds] = []
+    make = EpisodeFolds.__init__
+
+    def noted(self: EpisodeFolds, projection: EpisodeProjection) -> None:
+        make(self, projection)
+        kept.append(self)
+
+    monkeypatch.setattr(EpisodeFolds, "__init__", noted)
+    monkeypatch.setattr(episode_folds, "_EPISODES_MAX", 4)
+    tries = [("LEFT", "FAILED"), ("LEFT", "SUCCEEDED")]
+    scripts = [episode(number, tries) for number in range(1, 8)]
+    await log.append([*declarations(PICK_UP), *(each for script in scripts for each in script.records[:4])])
+    projector = await projector_of(log)
+    await projector.catch_up()
+    assert list(map(len, kept)) == [4]
+    await log.append([each for script in scripts for each in script.records])
+    await projector.catch_up()
+    assert list(map(len, kept)) == [0]
+    assert await rows_in(log) == [each for number in range(1, 8) for each in expected(number, tries)]
+
+
+class Moody(Attempts):
+    """A fold that depends on more than the events: it refuses to read an episode a second time."""
+
+    is_strict = False
+
+    def episode(self) -> EpisodeFold:
+        fold, strict = super().episode(), self.is_strict
+
+        def strict_fold(event: Event, rows: Changes) -> None:
+            if strict and event.sequence == 3:
+                raise ZeroDivisionError("not again")
+            fold(event, rows)
+
+        return strict_fold
+
+
+async def test_a_fold_that_fails_stops_its_episode_also_where_it_is_read_again(
+    log: EventLog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tries = [("LEFT", "FAILED"), ("LEFT", "SUCCEEDED")]
+    await log.append([*declarations(PICK_UP), *episode(1, tries).records[:5]])
+    await (await projector_of(log, Moody())).catch_up()
+    monkeypatch.setattr(Moody, "is_strict", True)
+    await log.append([*episode(1, tries).records, *episode(2, tries).records])
+    await (await projector_of(log, Moody())).catch_up()
+    assert await rows_in(log) == expected(1, tries)[:2]  # of both nodes that started among the first five events
+    (state,) = await states(log, [Moody()])
+    assert state.parked == {
+        1: "event 6: event 3, read again: ZeroDivisionError: not again",
+        2: "event 3: attempts raised ZeroDivisionError: not again",
+    }
+    await rebuilt(log)
+    assert await rows_in(log) == [*expected(1, tries), *expected(2, tries)]
+
+
+async def test_a_row_that_the_database_refuses_stops_its_episode_alone(log: EventLog) -> None:
+    tries = [("LEFT", "FAILED"), ("LEFT", "SUCCEEDED")]
+    scripts = [episode(number, tries, ends=False) for number in (1, 2)]
+    await log.append([*declarations(PICK_UP), *mixed(*scripts)])
+    projector = await projector_of(log)
+    async with log.engine.begin() as connection:
+        table = "zz_pycrorm_own_attempt__1001"
+        await connection.exec_driver_sql(f"INSERT INTO {table} (id, process_metadata_id) VALUES ({row(5)}, 1)")
+    await projector.catch_up()
+    (state,) = await states(log, [])
+    assert state.parked.keys() == {1}
+    refused = (row(5), 1, None, None, None)
+    assert await rows_in(log) == [expected(1, tries)[0], refused, *expected(2, tries, ends=False)]
+
+
+def _die_in_second_batch(url: str) -> None:
+    write, count = CustomRows.write, 0
+
+    async def counted_write(self: CustomRows, connection: AsyncConnection, generation: int) -> None:
+        nonlocal count
+        await write(self, connection, generation)
+        count += 1
+        if count == 2:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    async def fold() -> None:
+        log = await EventLog.open(DatabaseAddress.parse(url), create=True)
+        await (await projector_of(log, batch_events=6)).catch_up()
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(CustomRows, "write", counted_write)
+        asyncio.run(fold())
+
+
+async def test_a_killed_fold_continues_with_the_state_of_its_episodes(log: EventLog, database_url: str) -> None:
+    tries = [("LEFT", "FAILED"), ("LEFT", "SUCCEEDED"), ("RIGHT", "FAILED"), ("LEFT", "FAILED")]
+    records = [*declarations(PICK_UP), *mixed(episode(1, tries), episode(2, tries))]
+    await log.append(records)
+    await projector_of(log)
+    await Projector(log).open()
+    plain = Projector(log)
+    await plain.open()
+    await plain.catch_up()
+    process = multiprocessing.get_context("spawn").Process(target=_die_in_second_batch, args=(database_url,))
+    process.start()
+    await asyncio.to_thread(process.join)
+    assert process.exitcode == -signal.SIGKILL
+    assert len(await rows_in(log)) == 2
+    await (await projector_of(log)).catch_up()
+    assert await rows_in(log) == [*expected(1, tries), *expected(2, tries)]
+    assert (await verify(log, projections=[Attempts()])).drift == 0
+
+
+def test_an_episode_projection_without_a_fold_is_refused() -> None:
+    class Nothing(EpisodeProjection):
+        name = "nothing"
+        tables = {"nothing": {"n": "integer"}}  # noqa: RUF012 - a common form in user code
+
+    with pytest.raises(TypeError, match="abstract"):
+        Nothing()  # type: ignore[abstract]
+    with pytest.raises(TypeError, match="attempts folds events with what `episode\\(\\)` returns"):
+        Attempts().fold(None, Changes())  # type: ignore[arg-type]
