@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import random
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from itertools import pairwise
 from pathlib import Path
@@ -465,6 +465,8 @@ async def test_a_foreign_table_in_the_schema_of_the_views_is_reported_in_one_lin
 
 async def test_a_batch_yields_to_the_loop_even_when_all_its_episodes_are_short() -> None:
     class NothingToDo:
+        async def restore(self, log: EventLog, spans: Sequence[Span]) -> None: ...
+
         def fold(self, event: StoredEvent) -> None: ...
 
         async def ready(self, engine: AsyncEngine, generation: int) -> None: ...
