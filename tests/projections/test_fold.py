@@ -105,7 +105,7 @@ def test_an_episode_is_one_row_from_its_start_to_its_end() -> None:
     assert rows_of(script, number=7) == {
         "process_metadata": [
             (
-                7, time_us(1), "me", "why", "1.2", "host", "3.11.7", "breakfast", "a kitchen", 42,
+                7, None, time_us(1), "me", "why", "1.2", "host", "3.11.7", "breakfast", "a kitchen", 42,
                 "FAILED", time_us(2), 2, "plans.IKError", "too far", True, "018bcfe5-6800-7000-8000-000000000001", 12,
                 former, rest, "f3d6", "702b", True, '{"numpy":"2.4.6"}', '{"writer":"daemon"}', True, 250, "a fridge",
                 '{"n":1}',

@@ -67,6 +67,10 @@ EPISODES, PARTITIONS, ASKED = 12, 4, 7
 EPISODE = "process_metadata_id"
 OF_DIVIDED = f"""SELECT relname FROM pg_class JOIN pg_attribute ON attrelid = pg_class.oid
 WHERE relnamespace = 'memory_tables'::regnamespace AND relkind = 'r' AND attname = '{EPISODE}' ORDER BY relname"""
+OF_THE_LOG = """SELECT DISTINCT of_log.relname FROM pg_rewrite
+JOIN pg_depend ON pg_depend.objid = pg_rewrite.oid JOIN pg_class of_log ON of_log.oid = pg_depend.refobjid
+JOIN pg_class view ON view.oid = pg_rewrite.ev_class
+WHERE of_log.relnamespace = 'pycrorm'::regnamespace AND view.relnamespace = 'memory'::regnamespace"""
 SETS = declared("SetAction", "set_action", field("things", "list", 2, item="object"))
 
 
@@ -263,3 +267,8 @@ def test_the_episode_is_part_of_every_primary_key(divided: str) -> None:
             f""" WHERE indisprimary AND indrelid = 'memory_tables."{table}"'::regclass""",
         )
         assert (EPISODE,) in keys, table
+
+
+def test_no_view_reads_rows_of_the_log(divided: str) -> None:
+    """Declarations are not rows of an episode: each database of a divided memory has all of them."""
+    assert {name for (name,) in ask(divided, OF_THE_LOG)} == {"pycrorm_declaration"}

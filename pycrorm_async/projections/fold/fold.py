@@ -105,6 +105,7 @@ def _episode_started(event: StoredEvent, started: EpisodeStarted, _designators: 
     by = started.thought_by
     rows.episodes[event.number] = {
         "id": event.number,
+        "uuid": None,  # `name_episodes` sets it
         "created_at": microseconds(event.wall_ns),
         "created_by": started.created_by,
         "description": started.description,

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from sqlalchemy import text
+import sqlalchemy
+from sqlalchemy import column, select, text
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.projections.fold.fold import fold
@@ -23,7 +24,9 @@ from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import Span, StoredEvent
 
-__all__ = ["TableRows", "stored_rows"]
+__all__ = ["TableRows", "name_episodes", "stored_rows"]
+
+_episode = sqlalchemy.table("episode", column("number"), column("id"))
 
 
 def stored_rows(engine: AsyncEngine, rows: RowsByTable, generation: int) -> RowsByTable:
@@ -32,6 +35,13 @@ def stored_rows(engine: AsyncEngine, rows: RowsByTable, generation: int) -> Rows
     return {
         (physical_name(table, generation), (*map(stored, columns),)): some for (table, columns), some in rows.items()
     }
+
+
+async def name_episodes(connection: AsyncConnection, rows: Rows) -> None:
+    """Set the UUID of the episodes that start in these rows: their events contain only the number."""
+    some = select(_episode.c.number, _episode.c.id).where(_episode.c.number.in_(rows.episodes))
+    for number, uuid in await connection.execute(some):
+        rows.episodes[number]["uuid"] = uuid
 
 
 class TableRows:
@@ -49,6 +59,9 @@ class TableRows:
         fold(event, self._designators, self._rows)
 
     async def ready(self, engine: AsyncEngine, generation: int) -> None:
+        if self._rows.episodes:
+            async with engine.connect() as connection:
+                await name_episodes(connection, self._rows)
         self._insertion = await dialect_of(engine).insertion(stored_rows(engine, self._rows.to_insert(), generation))
 
     async def write(self, connection: AsyncConnection, generation: int) -> None:

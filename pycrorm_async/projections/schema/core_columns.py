@@ -34,6 +34,7 @@ _ITEM: dict[str, Storage] = {"id": "key", "position": "key", "process_metadata_i
 CORE: dict[str, dict[str, Storage]] = {
     "process_metadata": {
         "id": "key",
+        "uuid": "text",
         "created_at": "time",
         "created_by": "text",
         "description": "text",

@@ -65,7 +65,6 @@ _OF_PICK_UPS = ("task_tree_node", "object", "pose", "process_metadata")
 _OF_RELATIONS = ("task_tree_node", "object", "object_removal", "pose", "joint_change")
 """The tables of `PickUpWithContextView` and of `spatial_relation`."""
 
-_episode = table("episode", column("number"), column("id"))
 _declaration = table("pycrorm_declaration", column("fingerprint"), column("payload"))
 _is_description = func.substr(_declaration.c.fingerprint, 1, len(DESCRIPTION_PREFIX)) == DESCRIPTION_PREFIX
 
@@ -191,9 +190,7 @@ def _process_metadata(core: dict[str, Table], _layout: Layout) -> Select[Any]:
     world = func.coalesce(episodes.c.world, episodes.c.entered_world, line).label("world")
     columns = columns_in_order(episodes)
     first, *others = (world if each.name == "world" else each for each in columns if each.name != "entered_world")
-    return select(first, _episode.c.id.label("uuid"), *others).join_from(
-        episodes, _episode, _episode.c.number == episodes.c.id
-    )
+    return select(first, *others)
 
 
 def _episode_tag(core: dict[str, Table], _layout: Layout) -> Select[Any]:
