@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import AsyncGenerator, Callable
 from contextlib import AbstractAsyncContextManager
 from datetime import datetime
 from os import PathLike
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal, overload
 
 from sqlalchemy import Select
 from sqlalchemy.ext.asyncio import AsyncSession
@@ -17,6 +17,8 @@ from pycrorm_async.hooks.episode import Episode
 from pycrorm_async.memory_parts import PartsHolder
 from pycrorm_async.plan.task_tree import TaskTreeNode
 from pycrorm_async.query.as_of import AnyEpisode
+from pycrorm_async.query.frames.arrow_batches import BATCH_ROWS
+from pycrorm_async.query.frames.dataframe import Library
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.snapshot import Moment
 from pycrorm_async.query.sql.read_only import DEFAULT_LIMITS, SqlLimits, SqlResult
@@ -26,7 +28,8 @@ from pycrorm_async.report.write import Report
 from pycrorm_async.report.write import report as write_report
 
 if TYPE_CHECKING:
-    from pandas import DataFrame
+    import pandas as pd
+    import pyarrow as pa
 
 __all__ = ["ObservingMemory", "ReadableMemory"]
 
@@ -46,9 +49,54 @@ class ReadableMemory(PartsHolder):
         """
         return self._open_parts.reading.session(simulated=simulated)
 
-    async def dataframe(self, statement: Select[*tuple[Any, ...]], *, simulated: bool = False) -> DataFrame:
-        """Return the rows as a pandas DataFrame (extra `learning`); with `simulated`, those of simulations too."""
-        return await self._open_parts.reading.dataframe(statement, simulated=simulated)
+    @overload
+    async def dataframe(
+        self,
+        statement: Select[*tuple[Any, ...]],
+        *,
+        to: Literal["pandas"] = "pandas",
+        simulated: bool = False,
+        deferred: bool = False,
+    ) -> pd.DataFrame: ...
+
+    @overload
+    async def dataframe(
+        self,
+        statement: Select[*tuple[Any, ...]],
+        *,
+        to: Library,
+        simulated: bool = False,
+        deferred: bool = False,
+    ) -> Any: ...
+
+    async def dataframe(
+        self,
+        statement: Select[*tuple[Any, ...]],
+        *,
+        to: Library = "pandas",
+        simulated: bool = False,
+        deferred: bool = False,
+    ) -> Any:
+        """Return the rows as a frame of pandas, polars or Arrow (extra `frames`), typed as the columns are declared.
+
+        Args:
+            to: the library: `pandas`, `polars` or `arrow`.
+            simulated: include the rows of simulations.
+            deferred: include the columns of mapped classes that their objects load on request.
+        """
+        return await self._open_parts.reading.dataframe(statement, to=to, simulated=simulated, deferred=deferred)
+
+    def batches(
+        self,
+        statement: Select[*tuple[Any, ...]],
+        *,
+        rows: int = BATCH_ROWS,
+        simulated: bool = False,
+        deferred: bool = False,
+    ) -> AsyncGenerator[pa.RecordBatch]:
+        """Return the rows as a stream of Arrow record batches of at most `rows` rows; see `Reading.batches`."""
+        reading = self._open_parts.reading
+        return reading.batches(statement, rows=rows, simulated=simulated, deferred=deferred)
 
     async def query(self, sql: str, limits: SqlLimits = DEFAULT_LIMITS) -> SqlResult:
         """Return the rows of one query in SQL that can only read, up to the last flush; see `Reading.query`."""

@@ -16,16 +16,17 @@ import threading
 from collections.abc import Coroutine
 from concurrent.futures import Future
 from types import TracebackType
-from typing import TYPE_CHECKING, Any, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar, overload
 
 from sqlalchemy import Select
 
 from pycrorm_async.errors import CallerError, FlushTimeout
 from pycrorm_async.memory_status import MemoryStatus
+from pycrorm_async.query.frames.dataframe import Library
 from pycrorm_async.recording.recording import Recording
 
 if TYPE_CHECKING:
-    from pandas import DataFrame
+    import pandas as pd
 
     from pycrorm_async.memory import Memory
 
@@ -129,6 +130,33 @@ class SyncMemory:
                 f"not finished after {timeout_s:g} s; everything recorded is safe in the spool"
             ) from error
 
-    def dataframe(self, statement: Select[*tuple[Any, ...]], *, simulated: bool = False) -> DataFrame:
-        """Return the rows as a pandas DataFrame (extra `learning`); with `simulated`, those of simulations too."""
-        return self._await(self._memory.dataframe(statement, simulated=simulated))
+    @overload
+    def dataframe(
+        self,
+        statement: Select[*tuple[Any, ...]],
+        *,
+        to: Literal["pandas"] = "pandas",
+        simulated: bool = False,
+        deferred: bool = False,
+    ) -> pd.DataFrame: ...
+
+    @overload
+    def dataframe(
+        self,
+        statement: Select[*tuple[Any, ...]],
+        *,
+        to: Library,
+        simulated: bool = False,
+        deferred: bool = False,
+    ) -> Any: ...
+
+    def dataframe(
+        self,
+        statement: Select[*tuple[Any, ...]],
+        *,
+        to: Library = "pandas",
+        simulated: bool = False,
+        deferred: bool = False,
+    ) -> Any:
+        """Return the rows as a frame of pandas, polars or Arrow; see `Memory.dataframe`."""
+        return self._await(self._memory.reading.dataframe(statement, to=to, simulated=simulated, deferred=deferred))

@@ -9,11 +9,11 @@ async with Reading.open("sqlite:///memory.db") as reading:
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
+from collections.abc import AsyncGenerator, AsyncIterator
+from contextlib import aclosing, asynccontextmanager
 from dataclasses import replace
 from datetime import datetime
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Literal, Self, overload
 
 from sqlalchemy import Select
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncSession, async_sessionmaker
@@ -28,8 +28,9 @@ from pycrorm_async.projections.schema.layout import unite
 from pycrorm_async.projections.schema.session_views import all_views, with_views
 from pycrorm_async.query import named_queries
 from pycrorm_async.query.as_of import AnyEpisode, as_of
-from pycrorm_async.query.dataframes import dataframe
 from pycrorm_async.query.episode_session import EpisodeSession
+from pycrorm_async.query.frames.arrow_batches import BATCH_ROWS, arrow_batches
+from pycrorm_async.query.frames.dataframe import Library, dataframe
 from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary
 from pycrorm_async.query.snapshot import Moment
 from pycrorm_async.query.sql.read_only import DEFAULT_LIMITS, ReadOnlySql, SqlLimits, SqlResult
@@ -38,6 +39,7 @@ from pycrorm_async.store.log import EventLog
 
 if TYPE_CHECKING:
     import pandas as pd
+    import pyarrow as pa
 
 __all__ = ["Reading"]
 
@@ -120,12 +122,67 @@ class Reading:
         ):
             yield session
 
-    async def dataframe(self, statement: Select[*tuple[Any, ...]], *, simulated: bool = False) -> pd.DataFrame:
-        """Return the rows as a pandas DataFrame, see `pycrorm_async.query.dataframes`. Raises `MissingExtra`."""
+    @overload
+    async def dataframe(
+        self,
+        statement: Select[*tuple[Any, ...]],
+        *,
+        to: Literal["pandas"] = "pandas",
+        simulated: bool = False,
+        deferred: bool = False,
+    ) -> pd.DataFrame: ...
+
+    @overload
+    async def dataframe(
+        self,
+        statement: Select[*tuple[Any, ...]],
+        *,
+        to: Library,
+        simulated: bool = False,
+        deferred: bool = False,
+    ) -> Any: ...
+
+    async def dataframe(
+        self,
+        statement: Select[*tuple[Any, ...]],
+        *,
+        to: Library = "pandas",
+        simulated: bool = False,
+        deferred: bool = False,
+    ) -> Any:
+        """Return the rows as a frame of pandas, polars or Arrow, typed as the columns are declared.
+
+        `pycrorm_async.query.frames` lists the types. With `deferred` a mapped class contributes the columns too that
+        its objects load on request. Raises `MissingExtra` where the library is not installed.
+        """
         await self._ready()
         with self._log.translated():
             async with self._connection(simulated=simulated) as connection:
-                return await dataframe(connection, statement)
+                return await dataframe(connection, statement, to=to, deferred=deferred)
+
+    async def batches(
+        self,
+        statement: Select[*tuple[Any, ...]],
+        *,
+        rows: int = BATCH_ROWS,
+        simulated: bool = False,
+        deferred: bool = False,
+    ) -> AsyncGenerator[pa.RecordBatch]:
+        """Yield the rows as Arrow record batches of one schema, so that a large answer needs no memory of its size.
+
+        >>> async for batch in reading.batches(select(PickUpWithContextView)):
+        ...     writer.write_batch(batch)
+
+        An answer without rows is one empty batch. Arguments and errors are those of `dataframe`.
+        """
+        await self._ready()
+        with self._log.translated():
+            async with (
+                self._connection(simulated=simulated) as connection,
+                aclosing(arrow_batches(connection, statement, rows=rows, deferred=deferred)) as batches,
+            ):
+                async for batch in batches:
+                    yield batch
 
     async def query(self, sql: str, limits: SqlLimits = DEFAULT_LIMITS) -> SqlResult:
         """Return the rows of one query in SQL that can only read; see `pycrorm_async.query.sql.read_only`.

@@ -37,7 +37,9 @@ def python_of(page: str) -> list[str]:
 
 PLAN, QUESTIONS, EXECUTIVE = python_of("README.md")
 TIDY, LIFTER, STEREO, CELLS = python_of("pycrorm_async/plan/README.md")
-COURSE, AROUND, ROBOTS, BEGAN, TAGGED, SEEN, THEN, AGAIN, RATE, TRIES = python_of("pycrorm_async/query/README.md")
+COURSE, AROUND, ROBOTS, BEGAN, FRAMES, TAGGED, SEEN, THEN, AGAIN, RATE, TRIES = python_of(
+    "pycrorm_async/query/README.md"
+)
 BETTER, ORIGINS = python_of("pycrorm_async/learning/README.md")
 
 
@@ -237,7 +239,14 @@ async def test_failures_are_counted_where_they_began(tmp_path: Path) -> None:
     assert frame.drop(columns="object").to_dict("records") == [
         {"path": "root > Parallel > KnockAction", "reason": "PlanFailure", "times": 2}
     ]
-    assert frame.object.tolist() == [None]
+    assert frame.object.isna().tolist() == [True]
+
+
+async def test_frames_and_batches_have_the_declared_types(tidied: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    table = await run_block(FRAMES, tidied, "table")
+    assert table.num_rows > 0
+    type_ = "dictionary<values=string, indices=int32, ordered=0>"
+    assert capsys.readouterr().out == f"pyarrow.Field<obj_type: {type_}> {table.num_rows}\n"
 
 
 async def test_tags_are_given_changed_and_queried(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

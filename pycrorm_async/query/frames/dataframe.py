@@ -1,0 +1,73 @@
+"""Make one data frame of the rows of a select."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, get_args
+
+import msgspec
+from sqlalchemy import Select
+from sqlalchemy.ext.asyncio import AsyncConnection
+
+from pycrorm_async.errors import CallerError, MissingExtra
+from pycrorm_async.query.frames.arrow_batches import arrow_batches, needed_pyarrow
+from pycrorm_async.query.frames.columns import columns_of
+
+if TYPE_CHECKING:
+    import pandas as pd
+    import pyarrow as pa
+
+__all__ = ["Library", "dataframe"]
+
+Library: TypeAlias = Literal["pandas", "polars", "arrow"]
+"""The library of a frame: `pandas.DataFrame`, `polars.DataFrame` or `pyarrow.Table`."""
+
+
+async def dataframe(
+    connection: AsyncConnection, statement: Select[*tuple[Any, ...]], *, to: Library = "pandas", deferred: bool = False
+) -> Any:
+    """Return the rows of a select over columns, mapped classes, views, or a mix.
+
+    >>> frame = await dataframe(connection, select(PickUpWithContextView), to="polars")
+
+    Raises `MissingExtra` where the library is not installed; `CallerError` for another library.
+    """
+    if to not in get_args(Library):
+        raise CallerError(f"a frame can be of {', '.join(get_args(Library))}, not of {to!r}")
+    library = _imported(to)
+    batches = arrow_batches(connection, statement, deferred=deferred, enums_as_text=to == "pandas")
+    table = needed_pyarrow().Table.from_batches([each async for each in batches])
+    match to:
+        case "pandas":
+            return _pandas(library, table, [each.name for each in columns_of(statement) if each.kind == "json"])
+        case "polars":
+            return library.from_arrow(table)
+        case "arrow":
+            return table.unify_dictionaries()
+
+
+def _imported(to: Library) -> Any:
+    needed_pyarrow()
+    try:
+        return import_module("pyarrow" if to == "arrow" else to)
+    except ImportError:
+        extra = "frames" if to == "pandas" else to
+        raise MissingExtra(f"frames of {to} need {to}: pip install 'pycrorm-async[{extra}]'") from None
+
+
+def _pandas(pd: Any, table: pa.Table, json_columns: list[str]) -> pd.DataFrame:
+    pa = needed_pyarrow()
+    # Without these types pandas would turn integers with a missing value into floats and lose digits.
+    with_missing = {pa.int64(): pd.Int64Dtype(), pa.bool_(): pd.BooleanDtype()}
+    columns = {}
+    for name, column in zip(table.column_names, table.columns, strict=True):
+        type_ = with_missing.get(column.type)
+        if type_ is not None and (column.null_count or not len(column)):
+            columns[name] = pd.Series(type_.__from_arrow__(column))
+        else:
+            columns[name] = column.to_pandas()
+        if name in json_columns:
+            columns[name] = pd.Series(
+                [None if each is None else msgspec.json.decode(each) for each in column.to_pylist()]
+            )
+    return pd.DataFrame(columns, index=pd.RangeIndex(len(table)))
