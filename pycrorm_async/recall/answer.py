@@ -1,0 +1,309 @@
+"""The answer to a cue: the cases most like it, why each is, and what they say together.
+
+>>> answer = await memory.recall(type=PickUpAction, has={"object_type": "MILK"}, near={"height": 0.93})
+>>> answer.success
+Rate(share=0.55, low=0.34, high=0.74, successes=11, tries=20)
+>>> answer.reasons
+[('IKError', 9)]
+>>> print(answer[0].why())
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from html import escape
+from typing import Any, NamedTuple, overload
+
+from pycrorm_async.recall.case import Case, is_angle
+from pycrorm_async.recall.cue import Cue
+from pycrorm_async.recall.library import CaseLibrary
+from pycrorm_async.recall.search import Weights, search, weights_of
+
+__all__ = ["Answer", "Compared", "Rate", "RecalledCase", "Typical", "answer", "compare", "success_of"]
+
+_TRIED = ("SUCCEEDED", "FAILED", "ERROR")
+"""The statuses of an action that ran to its end. Of one that was cancelled, interrupted or lost nothing is known."""
+_Z = 1.959964
+"""The quantile of the normal distribution for an interval of 95 %."""
+
+
+class Rate(NamedTuple):
+    """How many of some cases succeeded, with the interval of Wilson that contains their true share in 95 of 100."""
+
+    share: float
+    low: float
+    high: float
+    successes: int
+    tries: int
+
+    def __str__(self) -> str:
+        """Return it as `11 of 20 succeeded (34-74 %)`."""
+        return f"{self.successes} of {self.tries} succeeded ({100 * self.low:.0f}-{100 * self.high:.0f} %)"
+
+
+class Compared(NamedTuple):
+    """One feature of a cue beside that of a case.
+
+    Attributes:
+        wanted, found: words or numbers; `found` is None where the case does not have the feature.
+        difference: the distance of two numbers; None for words, and where the case has no number.
+        tolerance: the distance from which on numbers are not alike; None for words.
+        similarity, weight: 0 to 1, and its share in the score.
+    """
+
+    feature: str
+    wanted: str | float
+    found: str | tuple[str, ...] | float | None
+    difference: float | None
+    tolerance: float | None
+    similarity: float
+    weight: float
+
+    def __str__(self) -> str:
+        """Return it as `height: wanted 0.93, was 0.9 (0.03 off, tolerance 0.1)`."""
+        found = "not known" if self.found is None else f"was {_text(self.found)}"
+        off = "" if self.difference is None else f" ({self.difference:.3g} off, tolerance {self.tolerance:.3g})"
+        return f"{self.feature}: wanted {_text(self.wanted)}, {found}{off}"
+
+
+class Typical(NamedTuple):
+    """What a feature was like in the cases of an answer, each counted by its score.
+
+    Attributes:
+        value: the mean of numbers, the commonest word.
+        spread: the standard deviation of numbers; None for words.
+        share: the part of the cases, by score, that have a number or the commonest word.
+    """
+
+    value: float | str
+    spread: float | None
+    share: float
+
+
+@dataclass(frozen=True)
+class RecalledCase:
+    """One case of an answer.
+
+    Attributes:
+        case: the action: its situation, its outcome, its place in the memory.
+        score: its likeness to the cue, 0 to 1.
+        compared: each feature of the cue beside that of the case.
+    """
+
+    case: Case
+    score: float
+    compared: tuple[Compared, ...]
+
+    @property
+    def matched(self) -> tuple[Compared, ...]:
+        """The features that are alike, at least in part."""
+        return tuple(each for each in self.compared if each.similarity > 0)
+
+    @property
+    def missed(self) -> tuple[Compared, ...]:
+        """The features that differ, that are further off than their tolerance, or that the case does not have."""
+        return tuple(each for each in self.compared if each.similarity == 0)
+
+    def why(self) -> str:
+        """Return why the case was found, as lines of text."""
+        case = self.case
+        reason = f" ({case.reason})" if case.reason else ""
+        lines = [f"{case.type} in episode {case.episode}, event {case.sequence}: {case.status}{reason}"]
+        lines.append(f"  score {self.score:.3f}")
+        lines += [f"  alike   {each}" for each in self.matched]
+        lines += [f"  differs {each}" for each in self.missed]
+        return "\n".join(lines)
+
+
+class Answer(Sequence[RecalledCase]):
+    """The cases most like a cue, the best first.
+
+    Attributes:
+        cue: what was asked.
+        cases: each with its score; fewer than `cue.k` where the memory has no more that share anything with the cue.
+        considered: the number of cases of the type, among which words were counted.
+        never_seen: pairs of feature and word of the cue that none of them has.
+    """
+
+    def __init__(self, cue: Cue, cases: Sequence[RecalledCase], considered: int, weights: Weights) -> None:
+        self.cue = cue
+        self.cases = tuple(cases)
+        self.considered = considered
+        self.never_seen = weights.never_seen
+
+    def __len__(self) -> int:
+        """Return the number of cases."""
+        return len(self.cases)
+
+    @overload
+    def __getitem__(self, index: int) -> RecalledCase: ...
+    @overload
+    def __getitem__(self, index: slice) -> Sequence[RecalledCase]: ...
+    def __getitem__(self, index: int | slice) -> RecalledCase | Sequence[RecalledCase]:
+        """Return a case, the most similar at 0."""
+        return self.cases[index]
+
+    @property
+    def success(self) -> Rate | None:
+        """How many of the cases succeeded; None if none of them ran to its end."""
+        return success_of(each.case for each in self.cases)
+
+    @property
+    def reasons(self) -> list[tuple[str, int]]:
+        """The reasons of the failures among the cases, the commonest first, with their numbers."""
+        counts = Counter(each.case.reason for each in self.cases if each.case.reason)
+        return sorted(counts.items(), key=lambda item: (-item[1], item[0]))
+
+    def typical(self, feature: str, *, status: str | None = None) -> Typical | None:
+        """Return what a feature was like, each case counted by its score (blending, in the terms of ACT-R).
+
+        Args:
+            feature: a name, as `height`, or `duration`.
+            status: of the cases to count, as SUCCEEDED; by default all.
+
+        Returns None if no case has the feature.
+        """
+        chosen = [each for each in self.cases if status in (None, each.case.status)]
+        whole = math.fsum(each.score for each in chosen)
+        numbers = [(found, each.score) for each in chosen if isinstance(found := _found(each.case, feature), float)]
+        if numbers:
+            return _blended(numbers, whole, angle=is_angle(feature))
+        words: dict[str, float] = {}
+        for each in chosen:
+            value = _found(each.case, feature)
+            for word in (value,) if isinstance(value, str) else value if isinstance(value, tuple) else ():
+                words[word] = words.get(word, 0.0) + each.score
+        if not words:
+            return None
+        value, score = min(words.items(), key=lambda item: (-item[1], item[0]))
+        return Typical(value, None, score / whole if whole else 0.0)
+
+    def why(self) -> str:
+        """Return what the answer says, as lines of text."""
+        head = f"{len(self)} of {self.considered:,} cases for {self.cue}"
+        lines = [head, *([f"  {self.success}"] if self.success else [])]
+        if self.reasons:
+            lines.append(f"  reasons: {', '.join(f'{name} {count}' for name, count in self.reasons)}")
+        lines += [f"  never seen: {feature}={word}" for feature, word in self.never_seen]
+        return "\n".join(lines)
+
+    __str__ = why
+
+    def table(self) -> tuple[tuple[str, ...], list[tuple[object, ...]]]:
+        """Return the header and the rows of a table for people."""
+        header = ("score", "type", "episode", "event", "started", "status", "reason", "differs")
+        rows: list[tuple[object, ...]] = [
+            (
+                each.score,
+                each.case.type,
+                each.case.episode,
+                each.case.sequence,
+                each.case.started_at.strftime("%Y-%m-%d %H:%M:%S"),
+                each.case.status,
+                each.case.reason,
+                "; ".join(_missed(compared) for compared in each.compared if compared.similarity < 1),
+            )
+            for each in self.cases
+        ]
+        return header, rows
+
+    def _repr_html_(self) -> str:
+        header, rows = self.table()
+        head = "".join(f"<th>{name}</th>" for name in header)
+        body = "".join(f"<tr>{''.join(f'<td>{_cell(value)}</td>' for value in row)}</tr>" for row in rows)
+        return f"<p>{escape(self.why())}</p><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+
+
+def answer(cue: Cue, library: CaseLibrary) -> Answer:
+    """Search the cases most like a cue, and compare each of them with it. The cue was checked by `check_cue`."""
+    weights = weights_of(cue, library)
+    cases = []
+    for found in search(cue, library, weights):
+        case = found.group.case(found.row)
+        cases.append(RecalledCase(case, found.score, compare(cue, case, weights)))
+    return Answer(cue, cases, weights.cases, weights)
+
+
+def compare(cue: Cue, case: Case, weights: Weights) -> tuple[Compared, ...]:
+    """Return each feature of the cue beside that of a case."""
+    whole = weights.total
+    words = [
+        Compared(feature, wanted, value, None, None, float(_has(value, wanted)), weight / whole)
+        for (feature, wanted), weight in zip(cue.has, weights.words, strict=True)
+        for value in [_found(case, feature)]
+    ]
+    numbers = []
+    for wanted, tolerance in zip(cue.near, weights.tolerances, strict=True):
+        value = _found(case, wanted.feature)
+        difference, similarity = None, 0.0
+        if isinstance(value, float):
+            difference = abs(value - wanted.value)
+            if is_angle(wanted.feature):
+                difference = math.fmod(difference, math.tau)
+                difference = min(difference, math.tau - difference)
+            similarity = max(1 - difference / tolerance, 0.0)
+        numbers.append(Compared(wanted.feature, wanted.value, value, difference, tolerance, similarity, 1 / whole))
+    return (*words, *numbers)
+
+
+def success_of(cases: Iterator[Case]) -> Rate | None:
+    """Return how many of these cases succeeded, among those that ran to their end; None if none did."""
+    counts = Counter(case.status for case in cases if case.status in _TRIED)
+    tries, successes = sum(counts.values()), counts["SUCCEEDED"]
+    if not tries:
+        return None
+    share = successes / tries
+    middle = (share + _Z**2 / (2 * tries)) / (1 + _Z**2 / tries)
+    half = _Z / (1 + _Z**2 / tries) * math.sqrt(share * (1 - share) / tries + _Z**2 / (4 * tries**2))
+    return Rate(share, max(0.0, middle - half), min(1.0, middle + half), successes, tries)
+
+
+def _blended(numbers: Sequence[tuple[float, float]], whole: float, *, angle: bool) -> Typical:
+    weight = math.fsum(score for _, score in numbers)
+    if angle:
+        sine = math.fsum(score * math.sin(value) for value, score in numbers) / weight
+        cosine = math.fsum(score * math.cos(value) for value, score in numbers) / weight
+        length = min(1.0, math.hypot(sine, cosine))
+        spread = math.sqrt(-2 * math.log(length)) if length > 0 else math.inf
+        return Typical(math.atan2(sine, cosine), spread, weight / whole)
+    mean = math.fsum(score * value for value, score in numbers) / weight
+    variance = math.fsum(score * (value - mean) ** 2 for value, score in numbers) / weight
+    return Typical(mean, math.sqrt(variance), weight / whole)
+
+
+def _found(case: Case, feature: str) -> str | tuple[str, ...] | float | None:
+    match feature:
+        case "status":
+            return case.status
+        case "reason":
+            return case.reason
+        case "duration":
+            return case.duration_s
+    value = case.symbols.get(feature)
+    return case.numbers.get(feature) if value is None else value
+
+
+def _has(value: object, word: str) -> bool:
+    return word in value if isinstance(value, tuple) else value == word
+
+
+def _missed(compared: Compared) -> str:
+    found = "not known" if compared.found is None else _text(compared.found)
+    off = "" if compared.difference is None else f" ({compared.difference:.3g} off)"
+    return f"{compared.feature} {found}{off}"
+
+
+def _text(value: str | tuple[str, ...] | float) -> str:
+    match value:
+        case float():
+            return f"{value:.4g}"
+        case tuple():
+            return ", ".join(value)
+    return value
+
+
+def _cell(value: Any) -> str:
+    return f"{value:.3f}" if isinstance(value, float) else escape("" if value is None else str(value))

@@ -1,0 +1,154 @@
+"""All cases that a reader holds, as blocks, with what a search counts of them: words, spreads and sizes by type."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import cached_property
+from itertools import chain
+from typing import Any
+
+import numpy as np
+
+from pycrorm_async.recall.blocks import WORDS_MAX, Block, Group
+from pycrorm_async.recall.case import RESERVED, Case, is_angle
+
+__all__ = ["ANGLE_TOLERANCE", "CaseLibrary"]
+
+ANGLE_TOLERANCE = 0.5
+"""The tolerance in rad of an angle for which the cue has none, about 30 degrees."""
+
+
+class CaseLibrary:
+    """The cases of a memory at one moment. Blocks that are added make a new library.
+
+    `type` None stands for the cases of all types in each method.
+    """
+
+    def __init__(self, blocks: Sequence[Block] = ()) -> None:
+        self.blocks = tuple(blocks)
+        self._counts: dict[tuple[str | None, str], Mapping[str, int]] = {}
+        self._spreads: dict[tuple[str | None, str], float] = {}
+        self._groups: dict[str | None, tuple[Group, ...]] = {}
+
+    def __len__(self) -> int:
+        """Return the number of cases."""
+        return sum(map(len, self.blocks))
+
+    @cached_property
+    def types(self) -> Mapping[str, int]:
+        """The number of cases of each type, in alphabetical order."""
+        sizes: dict[str, int] = {}
+        for name, group in sorted(chain.from_iterable(block.groups.items() for block in self.blocks), key=_name):
+            sizes[name] = sizes.get(name, 0) + len(group)
+        return sizes
+
+    @cached_property
+    def left_out(self) -> frozenset[str]:
+        """The features with more than `WORDS_MAX` words, which are not compared."""
+        left_out = set(chain.from_iterable(block.left_out for block in self.blocks))
+        words: dict[str, set[str]] = {}
+        for group in self.groups():
+            for name, column in group.texts.items():
+                words.setdefault(name, set()).update(column.words)
+        return frozenset(left_out.union(name for name, each in words.items() if len(each) > WORDS_MAX))
+
+    def groups(self, type: str | None = None) -> tuple[Group, ...]:  # noqa: A002  the name of the feature
+        """Return the groups of a type, that with the newest case first."""
+        groups = self._groups.get(type)
+        if groups is None:
+            named = chain.from_iterable(block.groups.items() for block in self.blocks)
+            chosen = [group for name, group in named if type in (None, name)]
+            groups = tuple(sorted(chosen, key=lambda each: (-int(each.started_us[0]), -int(each.nodes[0]))))
+            self._groups[type] = groups
+        return groups
+
+    def size(self, type: str | None = None) -> int:  # noqa: A002
+        """Return the number of cases of a type."""
+        return len(self) if type is None else self.types.get(type, 0)
+
+    def counts(self, type: str | None, feature: str) -> Mapping[str, int]:  # noqa: A002
+        """Return the number of cases of a type that have each word of a feature."""
+        counts = self._counts.get((type, feature))
+        if counts is None:
+            total: dict[str, int] = {}
+            for group in self.groups(type):
+                counts_of_group = _cached(group, ("counts", feature), lambda group: _counts(group, feature))
+                for word, count in counts_of_group.items():
+                    total[word] = total.get(word, 0) + count
+            counts = self._counts[type, feature] = total
+        return counts
+
+    def texts(self, type: str | None = None) -> frozenset[str]:  # noqa: A002
+        """Return the names of the text features of a type, those of the outcome among them."""
+        names = chain.from_iterable(group.texts for group in self.groups(type))
+        return frozenset(names) - (RESERVED - {"status", "reason"}) - self.left_out
+
+    def numbers(self, type: str | None = None) -> frozenset[str]:  # noqa: A002
+        """Return the names of the numbers of a type, the duration among them."""
+        return frozenset(chain.from_iterable(group.numbers for group in self.groups(type)))
+
+    def tolerance(self, type: str | None, feature: str) -> float:  # noqa: A002
+        """Return the tolerance of a number for which the cue has none: its standard deviation, to two digits.
+
+        It is rounded, so that it does not depend on the order in which the blocks are added up.
+        """
+        if is_angle(feature):
+            return ANGLE_TOLERANCE
+        spread = self._spreads.get((type, feature))
+        if spread is None:
+            groups = [group for group in self.groups(type) if feature in group.numbers]
+            spread = self._spreads[type, feature] = float(f"{_standard_deviation(groups, feature):.1e}")
+        return spread if spread > 0 else 1.0
+
+    def find(self, node: int) -> Case | None:
+        """Return the case of a node."""
+        for group in self.groups():
+            rows = np.flatnonzero(group.nodes == node)
+            if rows.size:
+                return group.case(int(rows[0]))
+        return None
+
+    def __iter__(self) -> Iterator[Case]:
+        """Yield every case, in no particular order."""
+        return chain.from_iterable(block.cases() for block in self.blocks)
+
+
+def _name(item: tuple[str, Any]) -> str:
+    return item[0]
+
+
+def _counts(group: Group, feature: str) -> Mapping[str, int]:
+    column = group.texts.get(feature)
+    return {} if column is None else column.counts()
+
+
+def _standard_deviation(groups: Sequence[Group], feature: str) -> float:
+    """Add up what each group has about the middle of all numbers, so that hardly anything cancels."""
+    ranges = [_cached(group, ("range", feature), lambda group: _range(group, feature)) for group in groups]
+    ranges = [each for each in ranges if each is not None]
+    if not ranges:
+        return 0.0
+    middle = (min(low for low, _ in ranges) + max(high for _, high in ranges)) / 2
+    parts = [
+        _cached(group, ("moments", feature, middle), lambda group: _moments(group, feature, middle)) for group in groups
+    ]
+    count, total, squares = (math.fsum(each) for each in zip(*parts, strict=True))
+    return math.sqrt(max(0.0, squares / count - (total / count) ** 2))
+
+
+def _range(group: Group, feature: str) -> tuple[float, float] | None:
+    values = group.numbers[feature].present()
+    return (float(values.min()), float(values.max())) if values.size else None
+
+
+def _moments(group: Group, feature: str, middle: float) -> tuple[float, float, float]:
+    """Return the count, the sum and the sum of squares of the distances from the middle."""
+    distances = group.numbers[feature].present() - middle
+    return float(distances.size), float(distances.sum()), float(np.square(distances).sum())
+
+
+def _cached(group: Group, key: object, computed: Callable[[Group], Any]) -> Any:
+    if key not in group.caches:
+        group.caches[key] = computed(group)
+    return group.caches[key]

@@ -1,0 +1,102 @@
+"""A cue that cannot be answered is refused in one line that names the nearest known feature."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from pycrorm_async.errors import CallerError
+from pycrorm_async.events.ids import row_id
+from pycrorm_async.recall.blocks import WORDS_MAX, Block
+from pycrorm_async.recall.case import Case
+from pycrorm_async.recall.cue import K_MAX, Cue, Wanted, check_cue, numbers_of, symbols_of
+from pycrorm_async.recall.library import CaseLibrary
+from pycrorm_async.world.enums import Arms, ObjectType
+from tests.recall.random_cases import random_cases
+
+LIBRARY = CaseLibrary([Block.of(random_cases(50, seed=1))])
+TYPE = "PickUpAction"
+
+BAD_CUES: dict[str, tuple[Cue, str]] = {
+    "empty": (Cue(), "the cue is empty"),
+    "a feature no case has": (Cue(type=TYPE, has=(("amr", "LEFT"),)), "'amr'; the nearest is arm"),
+    "a number no case has": (Cue(type=TYPE, near=(Wanted("heigth", 1.0),)), "'heigth'; the nearest is height"),
+    "nothing near": (Cue(has=(("qqqq", "x"),)), "'qqqq'; known are arm, near, object_type, reason, status"),
+    "in lacks": (Cue(type=TYPE, lacks=(("amr", "LEFT"),)), "the nearest is arm"),
+    "a text for a number": (Cue(type=TYPE, has=(("height", "high"),)), "height is a number: ask for it with `near`"),
+    "a number for a text": (Cue(type=TYPE, near=(Wanted("arm", 1.0),)), "arm is a text: ask for it with `has`"),
+    "k 0": (Cue(type=TYPE, k=0), "k must be 1 to 10,000, got 0"),
+    "k too large": (Cue(type=TYPE, k=K_MAX + 1), "k must be 1 to 10,000"),
+    "minimum": (Cue(type=TYPE, minimum=1.5), "minimum must be a score from 0 to 1"),
+    "minimum NaN": (Cue(type=TYPE, minimum=float("nan")), "minimum must be a score from 0 to 1"),
+    "before is not later": (Cue(type=TYPE, before_us=5, after_us=5), "`before` is not later than `after`"),
+    "during ends early": (Cue(type=TYPE, during_us=(5, 4)), "`during` ends before it starts"),
+    "contradiction": (
+        Cue(type=TYPE, has=(("arm", "LEFT"),), lacks=(("arm", "LEFT"),)),
+        "arm=LEFT is both in `has` and in `lacks`",
+    ),
+    "10,000 features": (
+        Cue(type=TYPE, has=tuple((f"f{number}", "x") for number in range(10_000))),
+        "the cue has 10,000 features, and at most 256 are compared",
+    ),
+}
+
+
+@pytest.mark.parametrize(("cue", "line"), BAD_CUES.values(), ids=BAD_CUES.keys())
+def test_a_cue_that_cannot_be_answered_is_refused_in_one_line(cue: Cue, line: str) -> None:
+    with pytest.raises(CallerError) as error:
+        check_cue(cue, LIBRARY)
+    assert line in str(error.value)
+    assert "\n" not in str(error.value)
+    assert len(str(error.value)) < 200
+
+
+BAD_VALUES: dict[str, tuple[dict[str, Any], dict[str, Any], str]] = {
+    "1 MB": ({"arm": "x" * 1_000_000}, {}, "arm is a text of 1,000,000 characters; cases have at most 120"),
+    "empty": ({"arm": ""}, {}, "arm is an empty text"),
+    "number": ({"height": 0.9}, {}, "height is given as the number 0.9: ask for numbers with `near`"),
+    "text": ({}, {"height": "high"}, "height is given as 'high', which is not a number"),
+    "long text": ({}, {"height": "x" * 1_000_000}, "(1,000,002 characters), which is not a number"),
+    "yes": ({}, {"height": True}, "height is given as True, which is not a number"),
+    "tolerance 0": ({}, {"height": (0.9, 0)}, "the tolerance of height must be greater than 0, got 0"),
+    "tolerance -1": ({}, {"height": (0.9, -1)}, "the tolerance of height must be greater than 0, got -1"),
+    "tolerance NaN": ({}, {"height": (0.9, float("nan"))}, "height must be a finite number, got nan"),
+    "infinite": ({}, {"height": float("inf")}, "height must be a finite number, got inf"),
+    "three": ({}, {"height": (1, 2, 3)}, "height is given as 3 values"),
+}
+
+
+@pytest.mark.parametrize(("has", "near", "line"), BAD_VALUES.values(), ids=BAD_VALUES.keys())
+def test_a_value_that_no_case_can_have_is_refused(has: dict[str, Any], near: dict[str, Any], line: str) -> None:
+    with pytest.raises(CallerError) as error:
+        symbols_of(has), numbers_of(near)
+    assert line in str(error.value)
+    assert len(str(error.value)) < 200
+
+
+def test_enums_classes_and_lists_are_words() -> None:
+    pairs = symbols_of({"arm": Arms.LEFT, "near": [ObjectType.BOWL, "CUP"], "reason": ValueError, "fragile": True})
+    assert pairs == (
+        ("arm", "LEFT"), ("near", "BOWL"), ("near", "CUP"), ("reason", "ValueError"), ("fragile", "yes"),
+    )  # fmt: skip
+
+
+def test_a_type_or_a_word_that_never_occurred_is_no_error() -> None:
+    check_cue(Cue(type="FlyAction", has=(("amr", "LEFT"),)), LIBRARY)
+    check_cue(Cue(type=TYPE, has=(("arm", "THIRD"),)), LIBRARY)
+    check_cue(Cue(type=TYPE, has=(("amr", "LEFT"),)), CaseLibrary())
+
+
+def test_a_feature_with_too_many_words_is_refused_by_its_name() -> None:
+    cases = [Case(row_id(1, n, 0), n, "A", {"id": f"{n}"}, {}, "FAILED") for n in range(1, WORDS_MAX + 2)]
+    half = len(cases) // 2
+    library = CaseLibrary([Block.of(cases[:half]), Block.of(cases[half:])])
+    assert library.left_out == {"id"}
+    with pytest.raises(CallerError, match="id has more than 16,384 different values"):
+        check_cue(Cue(type="A", has=(("id", "5"),)), library)
+
+
+def test_a_cue_reads_as_the_command_takes_it() -> None:
+    cue = Cue(type=TYPE, has=(("arm", "LEFT"),), near=(Wanted("height", 0.93, 0.1),), lacks=(("near", "BOWL"),))
+    assert str(cue) == "PickUpAction arm=LEFT height~0.93±0.1 not:near=BOWL"
