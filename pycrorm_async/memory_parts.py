@@ -19,6 +19,7 @@ from pycrorm_async.queue.live.delegated_writer import DelegatedWriter
 from pycrorm_async.queue.live.recorder_queue import RecorderQueue
 from pycrorm_async.recording.recording import Recording
 from pycrorm_async.recording.writing.emitter import Emitter
+from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.world.observers import watcher
 from pycrorm_async.writer.writer_thread import WriterThread
 
@@ -69,6 +70,8 @@ class PartsHolder:
     """A memory as its methods see it: with parts while it is open."""
 
     _parts: Parts | None
+    _address: DatabaseAddress
+    _located: DatabaseAddress
 
     @property
     def _open_parts(self) -> Parts:

@@ -19,6 +19,8 @@ from pycrorm_async.plan.task_tree import TaskTreeNode
 from pycrorm_async.query.as_of import AnyEpisode
 from pycrorm_async.query.frames.arrow_batches import BATCH_ROWS
 from pycrorm_async.query.frames.dataframe import Library
+from pycrorm_async.query.notebook.listings import Episodes, TaskTree
+from pycrorm_async.query.notebook.memory_view import memory_html
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.snapshot import Moment
 from pycrorm_async.query.sql.read_only import DEFAULT_LIMITS, SqlLimits, SqlResult
@@ -36,6 +38,12 @@ __all__ = ["ObservingMemory", "ReadableMemory"]
 
 class ReadableMemory(PartsHolder):
     """The queries of a memory. Each raises `CallerError` while the memory is not open."""
+
+    def __repr__(self) -> str:
+        return f"<Memory {self._address}, {'open' if self._parts is not None else 'not open'}>"
+
+    def _repr_html_(self) -> str:
+        return memory_html(self._address, self._located if self._parts is not None else None)
 
     @property
     def reading(self) -> Reading:
@@ -111,6 +119,18 @@ class ReadableMemory(PartsHolder):
         if not reading.is_open:
             raise CallerError("this memory has not read its types yet: open a session first")
         return reading.mapped(designator)
+
+    async def episodes(self, *, simulated: bool = False) -> Episodes:
+        """Return every episode, the oldest first, up to the last flush, as a list that a notebook draws as a table."""
+        return await self._open_parts.reading.episodes(simulated=simulated)
+
+    async def tree(self, episode: AnyEpisode) -> TaskTree:
+        """Return the task tree of an episode up to the last flush, as a list that a notebook draws; see `Reading.tree`.
+
+        >>> tree = await memory.tree("last")
+        >>> [node.dtype for node in tree if node.status == "FAILED"]
+        """
+        return await self._open_parts.reading.tree(episode)
 
     async def as_of(
         self,

@@ -45,6 +45,12 @@ class SyncMemory:
         self._closing: asyncio.Future[BaseException | None] | None = None
         self._closed: Future[None] = Future()
 
+    def __repr__(self) -> str:
+        return f"<Sync{repr(self._memory)[1:]}"
+
+    def _repr_html_(self) -> str:
+        return self._memory._repr_html_()
+
     def __enter__(self) -> Self:
         if self._thread is not None:
             raise CallerError("a memory can be entered once: call Memory.sync again")

@@ -15,6 +15,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from pycrorm_async.progress_bar import stderr
+from pycrorm_async.query.parameter_text import duration
 
 __all__ = [
     "stdout",
@@ -80,21 +81,6 @@ def print_facts(title: str, facts: Mapping[str, object]) -> None:
     for name, value in facts.items():
         if value not in (None, ""):
             stdout.print(f"  [dim]{name:<9}[/] {_cell(value)}")
-
-
-def duration(nanoseconds: int | None) -> str:
-    """Format a duration as 12 µs, 3.4 ms or 1.20 s; None as an empty string.
-
-    >>> duration(1_204_000_000), duration(3_400_000), duration(12_000), duration(None)
-    ('1.20 s', '3.4 ms', '12 µs', '')
-    """
-    if nanoseconds is None:
-        return ""
-    if nanoseconds >= 10**9:
-        return f"{nanoseconds / 1e9:.2f} s"
-    if nanoseconds >= 10**6:
-        return f"{nanoseconds / 1e6:.1f} ms"
-    return f"{nanoseconds / 1e3:.0f} µs"
 
 
 def moment(when: datetime) -> str:

@@ -124,6 +124,11 @@ class EpisodeSummary:
     tags: tuple[str, ...] = ()
     metadata: dict[str, Any] | None = None
 
+    def _repr_html_(self) -> str:
+        from pycrorm_async.query.notebook.episode_view import episode_html
+
+        return episode_html(self)
+
 
 @dataclass(frozen=True)
 class NodeSummary:

@@ -1,4 +1,4 @@
-"""Format recorded parameters on one line, for the terminal and for the report."""
+"""Format recorded parameters and durations on one line, for the terminal, notebooks and the report."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import msgspec
 
 from pycrorm_async.events.blobs import BLOB_KEY
 
-__all__ = ["parameters_text", "one_line"]
+__all__ = ["parameters_text", "one_line", "duration"]
 
 _TEXT_MAX = 60
 """Bounds the characters of a text parameter, so that a node fits on one line."""
@@ -44,3 +44,18 @@ def one_line(text: object, characters_max: int | None) -> str:
     """Format a text on one line; an ellipsis marks the cut."""
     line = " ".join(str(text).split())
     return line if characters_max is None or len(line) <= characters_max else f"{line[:characters_max]}…"
+
+
+def duration(nanoseconds: int | None) -> str:
+    """Format a duration as 12 µs, 3.4 ms or 1.20 s; None as an empty string.
+
+    >>> duration(1_204_000_000), duration(3_400_000), duration(12_000), duration(None)
+    ('1.20 s', '3.4 ms', '12 µs', '')
+    """
+    if nanoseconds is None:
+        return ""
+    if nanoseconds >= 10**9:
+        return f"{nanoseconds / 1e9:.2f} s"
+    if nanoseconds >= 10**6:
+        return f"{nanoseconds / 1e6:.1f} ms"
+    return f"{nanoseconds / 1e3:.0f} µs"

@@ -31,7 +31,8 @@ from pycrorm_async.query.as_of import AnyEpisode, as_of
 from pycrorm_async.query.episode_session import EpisodeSession
 from pycrorm_async.query.frames.arrow_batches import BATCH_ROWS, arrow_batches
 from pycrorm_async.query.frames.dataframe import Library, dataframe
-from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary
+from pycrorm_async.query.named_queries import EpisodeSummary
+from pycrorm_async.query.notebook.listings import Episodes, TaskTree
 from pycrorm_async.query.snapshot import Moment
 from pycrorm_async.query.sql.read_only import DEFAULT_LIMITS, ReadOnlySql, SqlLimits, SqlResult
 from pycrorm_async.store.address import DatabaseAddress
@@ -203,19 +204,19 @@ class Reading:
 
     # --- named queries ----------------------------------------------------------------------------------------
 
-    async def episodes(self, *, simulated: bool = False) -> list[EpisodeSummary]:
-        """Return every episode, the oldest first."""
+    async def episodes(self, *, simulated: bool = False) -> Episodes:
+        """Return every episode, the oldest first, as a list that a notebook draws as a table."""
         await self._ready()
         with self._log.translated():
             digests = await self._log.last_digests()
             async with self._connection(simulated=simulated) as connection:
                 summaries = await named_queries.episodes(connection)
-        return [
+        return Episodes(
             replace(each, digest_sequence=digest.sequence, digest=digest.digest)
             if (digest := digests.get(each.number)) is not None
             else each
             for each in summaries
-        ]
+        )
 
     async def episode(self, name: str) -> EpisodeSummary:
         """Return the episode with this number, id, or first digits of its id, simulations included.
@@ -227,12 +228,22 @@ class Reading:
             async with self._connection(simulated=True) as connection:
                 return await named_queries.episode_named(connection, name)
 
-    async def tree(self, number: int) -> list[NodeSummary]:
-        """Return the task tree of an episode, simulations included; each node comes before its children."""
+    async def tree(self, episode: AnyEpisode) -> TaskTree:
+        """Return the task tree of an episode, simulations included, as a list: each node comes before its children.
+
+        A notebook draws it. Raises `UnknownEpisode` for a name that no episode has; for an unknown number it is empty.
+        """
         await self._ready()
         with self._log.translated():
             async with self._connection(simulated=True) as connection:
-                return await named_queries.task_tree(connection, number)
+                if isinstance(episode, int):
+                    summary = next(iter(await named_queries.episodes(connection, episode)), None)
+                elif isinstance(episode, EpisodeSummary):
+                    summary = episode
+                else:
+                    summary = await named_queries.episode_named(connection, str(episode))
+                nodes = await named_queries.task_tree(connection, summary.number) if summary is not None else []
+                return TaskTree(nodes, summary)
 
     async def as_of(
         self,

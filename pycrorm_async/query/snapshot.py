@@ -13,13 +13,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import datetime
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.types import DescriptionDeclared
 from pycrorm_async.query.named_queries import NodeSummary
 from pycrorm_async.world.pose import Pose
 from pycrorm_async.world.state import ObjectState, WorldState
+
+if TYPE_CHECKING:
+    from pycrorm_async.query.notebook.markup import Drawing
 
 __all__ = ["Moment", "ObservationThen", "NodeThen", "WorldThen", "ObjectThen", "RobotThen", "AttachmentThen"]
 
@@ -123,6 +126,17 @@ class WorldThen:
         """The world's state for `BulletWorld.restore_state`."""
         return WorldState({each.name: ObjectState(each.pose, each.joints, each.attached_to) for each in self.objects})
 
+    def map(self) -> Drawing:
+        """Return the world from above, as SVG that a notebook draws."""
+        from pycrorm_async.query.notebook.world_map import world_map
+
+        return world_map(self)
+
+    def _repr_html_(self) -> str:
+        from pycrorm_async.query.notebook.moment_view import world_html
+
+        return world_html(self)
+
 
 @dataclass(frozen=True)
 class ObservationThen:
@@ -143,7 +157,7 @@ class ObservationThen:
     missing: Mapping[str, str] = field(default_factory=dict)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Moment:
     """The state of an episode after one of its events, until the next one.
 
@@ -184,3 +198,14 @@ class Moment:
         lines += [f"{'  ' * (each.depth + 1)}{each.dtype or each.kind} {each.status}" for each in self.tree]
         lines += [f"{each.name} {each.pose!r}" for each in self.world.objects]
         return "\n".join(lines)
+
+    __repr__ = __str__
+
+    def map(self) -> Drawing:
+        """Return the world from above, as SVG that a notebook draws."""
+        return self.world.map()
+
+    def _repr_html_(self) -> str:
+        from pycrorm_async.query.notebook.moment_view import moment_html
+
+        return moment_html(self)

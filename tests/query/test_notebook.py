@@ -1,0 +1,268 @@
+"""A notebook draws what queries return: without scripts and requests, escaped, capped, opened at failures."""
+
+from __future__ import annotations
+
+import re
+import zlib
+from base64 import b64encode
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
+from html.parser import HTMLParser
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from pycrorm_async import Memory, world_of
+from pycrorm_async.errors import CallerError
+from pycrorm_async.events.types import DescriptionDeclared
+from pycrorm_async.plan import NavigateAction, simulated_robot
+from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary, RobotSummary
+from pycrorm_async.query.notebook.listings import Episodes, TaskTree
+from pycrorm_async.query.notebook.memory_view import memory_html
+from pycrorm_async.query.scene.link_frames import link_frames
+from pycrorm_async.query.scene.object_model import object_model
+from pycrorm_async.query.scene.outlines import outlines
+from pycrorm_async.query.snapshot import Moment, ObjectThen, ObservationThen, WorldThen
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
+from pycrorm_async.world.models.courier import courier_urdf
+
+START = datetime(2026, 3, 1, 12, tzinfo=UTC)
+HOSTILE = "</details></script><script>alert(1)</script>\u202e\"'& <img src=x onerror=alert(1)>"
+ELEMENTS = set("div span b bdi details summary table thead tbody tr th td svg g title rect path text polygon".split())
+ATTRIBUTES = set("style open title scope role aria-label xmlns viewbox d x y width height rx points".split())
+ATTRIBUTES |= set("fill fill-opacity stroke stroke-width stroke-opacity stroke-dasharray opacity".split())
+ATTRIBUTES |= set("font-family font-size text-anchor paint-order".split())
+
+
+def node(number: int, parent: int | None = None, status: str = "SUCCEEDED", **fields: object) -> NodeSummary:
+    plain = NodeSummary(
+        id=number,
+        parent_id=parent,
+        depth=0,
+        dtype=f"Step{number}Action",
+        kind="action",
+        parameters={},
+        status=status,
+        started_at=START + timedelta(milliseconds=number),
+        duration_ns=5_000_000,
+        reason=None,
+        failure_message=None,
+        simulated=False,
+        sequence=number,
+        end_sequence=number + 1,
+    )
+    return replace(plain, **fields)  # type: ignore[arg-type]
+
+
+def episode(number: int, description: str = "Set the table", **fields: object) -> EpisodeSummary:
+    plain = EpisodeSummary(
+        number, f"id {number}", START, None, 321_000_000, "SUCCEEDED", description, "ada", nodes=2, failed=1
+    )
+    return replace(plain, **fields)  # type: ignore[arg-type]
+
+
+class Page(HTMLParser):
+    """The elements and the text of a view, whose elements all end."""
+
+    def __init__(self, view: str) -> None:
+        super().__init__()
+        self.elements: list[tuple[str, dict[str, str | None]]] = []
+        self.text = ""
+        self._open: list[str] = []
+        self.feed(view)
+        self.close()
+        assert self._open == []
+
+    def handle_starttag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
+        self.elements.append((tag, dict(attributes)))
+        self._open.append(tag)
+
+    def handle_startendtag(self, tag: str, attributes: list[tuple[str, str | None]]) -> None:
+        self.elements.append((tag, dict(attributes)))
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self._open.pop() == tag
+
+    def handle_data(self, text: str) -> None:
+        self.text += text
+
+    def count(self, tag: str) -> int:
+        return sum(each == tag for each, _ in self.elements)
+
+
+def harmless(view: str) -> Page:
+    """Return the page of a view after a check that it can neither run a script nor send a request."""
+    page = Page(view)
+    assert {tag for tag, _ in page.elements} <= ELEMENTS
+    assert {name for _, attributes in page.elements for name in attributes} <= ATTRIBUTES
+    for _, attributes in page.elements:
+        assert not re.search(r"url\(|import|expression", attributes.get("style") or "")
+    return page
+
+
+def described(urdf: str) -> DescriptionDeclared:
+    return DescriptionDeclared(urdf=b64encode(zlib.compress(urdf.encode())).decode())
+
+
+def moment(*objects: ObjectThen, **fields: object) -> Moment:
+    world = WorldThen(objects, None, {"described": described(courier_urdf())})
+    plain = Moment(1, "id", "Set the table", "ada", START, False, 7, 1.5, START, "RUNNING", (), world)
+    return replace(plain, **fields)  # type: ignore[arg-type]
+
+
+def test_everything_recorded_is_escaped_and_nothing_runs_or_is_requested() -> None:
+    failed = node(2, 1, "FAILED", dtype=HOSTILE, parameters={HOSTILE: HOSTILE}, reason=HOSTILE, failure_message=HOSTILE)
+    hostile = episode(1, HOSTILE, tags=(HOSTILE,), metadata={HOSTILE: HOSTILE}, plan=HOSTILE, world=HOSTILE)
+    hostile = replace(
+        hostile, robots=(RobotSummary(HOSTILE, HOSTILE, None, None),), git_commit=HOSTILE, created_by=HOSTILE
+    )
+    seen = {HOSTILE: ObservationThen({HOSTILE: HOSTILE}, 5, 1.0, None)}
+    body = ObjectThen(1, 1, HOSTILE, HOSTILE, Pose([1, 2, 0]), {HOSTILE: 1.0}, (HOSTILE, HOSTILE))
+    then = moment(body, description=HOSTILE, observations=seen, tree=())
+    tree = TaskTree([node(1, kind=HOSTILE, dtype=None), failed], hostile)
+    views = [Episodes([hostile])._repr_html_(), hostile._repr_html_(), tree._repr_html_(), then._repr_html_()]
+    views += [then.world._repr_html_(), then.map()._repr_html_(), tree.gantt("time")._repr_html_()]
+    for view in views:
+        assert "</script><script>" in harmless(view).text
+
+
+def test_a_tree_is_opened_at_its_failures_and_closed_elsewhere() -> None:
+    steps = [node(1, kind="root", dtype=None)]
+    for branch in (2, 6):
+        steps += [node(branch, 1), node(branch + 1, branch), node(branch + 2, branch + 1), node(branch + 3, branch + 2)]
+    steps[-1] = replace(steps[-1], status="FAILED", reason="IKError", failure_message="too far")
+    page = harmless(TaskTree(steps)._repr_html_())
+    branches = [("open" in attributes) for tag, attributes in page.elements if tag == "details"]
+    assert branches == [True, True, False, False, True, True, True]
+    assert "✗ Step9Action" in page.text
+    assert "IKError: too far" in page.text
+
+
+def test_a_large_tree_shows_five_hundred_nodes_with_the_failures_among_them_and_counts_the_others() -> None:
+    steps = [node(1)]
+    for branch in range(2, 5_002, 2):
+        steps += [node(branch, 1), node(branch + 1, branch)]
+    steps[4_000] = replace(steps[4_000], status="FAILED", reason="IKError")
+    tree = TaskTree(steps)
+    page = harmless(tree._repr_html_())
+    assert page.count("g") == 500  # a bar for each
+    assert page.count("b") == 500 + 2  # a name for each, the title and the reason
+    assert "IKError" in page.text
+    left_out = [int(each.replace(",", "")) for each in re.findall(r"… ([\d,]+) more(?! nodes)", page.text)]
+    assert sum(left_out) == 4_501
+    assert "… 4,501 more nodes than drawn" in page.text
+    assert len(tree._repr_html_()) < 500_000
+    assert len(repr(tree).splitlines()) == 201
+    assert repr(tree).endswith("… 4,801 more")
+
+
+def test_a_chart_has_events_or_time_as_its_axis() -> None:
+    tree = TaskTree([node(1, end_sequence=9), node(2, 1, end_sequence=3), node(3, 1, "RUNNING", end_sequence=None)])
+    events, time = Page(tree.gantt().svg), Page(tree.gantt("time").svg)
+    assert "e1" in events.text
+    assert "e9" in events.text
+    assert "7.0 ms" in time.text
+    bars = [each for tag, each in events.elements if tag == "rect"]
+    assert [each.get("stroke-dasharray") for each in bars] == [None, None, "4 2"]
+    assert len({each["y"] for each in bars}) == 2
+    assert events.text.count("▶") == 2  # in its name and in its hint
+    with pytest.raises(CallerError, match="the axis 'events' or 'time', not 'days'"):
+        tree.gantt("days")  # type: ignore[arg-type]
+
+
+def test_concurrent_nodes_have_lanes_of_their_own() -> None:
+    tree = TaskTree([node(1, end_sequence=9), node(2, 1, end_sequence=7), node(3, 1, end_sequence=8)])
+    lanes = [each["y"] for tag, each in Page(tree.gantt().svg).elements if tag == "rect"]
+    assert len(set(lanes)) == 3
+
+
+def test_lists_of_episodes_and_nodes_are_lists_whose_parts_are_drawn_too() -> None:
+    both = Episodes([episode(1), episode(2, "Later")])
+    assert both == [episode(1), episode(2, "Later")]
+    assert isinstance(both, list)
+    assert isinstance(both[1:], Episodes)
+    assert "Later" in harmless(both[1:]._repr_html_()).text
+    assert repr(both).splitlines()[1] == "2 2026-03-01 12:00:00 SUCCEEDED Later (2 nodes, 1 failed)"
+    tree = TaskTree([node(1), node(2, 1)], episode(1))
+    assert (tree[1:], tree[1:].episode, tree[0].id) == ([node(2, 1)], episode(1), 1)
+    assert (repr(Episodes()), repr(TaskTree())) == ("[]", "[]")
+    assert "No episodes" in harmless(Episodes()._repr_html_()).text
+    assert "0 nodes" in harmless(TaskTree()._repr_html_()).text
+
+
+def test_a_long_list_of_episodes_shows_the_newest_and_counts_the_others() -> None:
+    page = harmless(Episodes(episode(number) for number in range(1, 1_151))._repr_html_())
+    assert "1,150 episodes" in page.text
+    assert "… 1,050 more before these" in page.text
+    assert page.count("tr") == 101
+
+
+def test_a_moment_shows_what_runs_where_everything_is_and_what_was_observed() -> None:
+    milk = ObjectThen(1, 1, "milk", "MILK", Pose([1, 2, 0.9]), {}, ("pr2", "hand"))
+    seen = {"force": ObservationThen({"x": 1.5}, 5, 1.0, None)}
+    page = harmless(moment(milk, observations=seen)._repr_html_())
+    for text in ("Set the table", "at 1.500 s, event 7", "▶ RUNNING", "pr2 hand", "0.900", '{"x":1.5}'):
+        assert text in page.text
+    assert page.count("polygon") == 1
+    empty = harmless(moment()._repr_html_())
+    assert "the world was empty at this moment" in empty.text
+    assert repr(moment(milk)).startswith("episode 1 at 1.500 s, event 7: RUNNING\nmilk Pose(")
+
+
+def test_links_are_drawn_where_bullet_has_them() -> None:
+    pose, link = Pose([0.3, 0.2, 0.8], [0, 0, 0.6, 0.8]), "forearm_link"
+    with BulletWorld():
+        courier = Object("courier", ObjectType.ROBOT, courier_urdf())
+        joints = {each: 0.03 * (index + 1) for index, each in enumerate(courier.joints)}
+    then = moment(ObjectThen(1, 1, "courier", "ROBOT", pose, joints, None, "described", base_link=link))
+    frames = link_frames(object_model(then.world.descriptions["described"]), pose, joints, link)
+    with world_of(then) as world:
+        robot = world.object("courier")
+        for name in robot.links:
+            assert np.allclose(frames[name][:3, 3], robot.link_pose(name).position, atol=1e-5)
+    drawn = outlines(then.world)
+    assert [each.top for each in drawn] == sorted(each.top for each in drawn)
+    for each in drawn:
+        turns = [
+            (b[0] - a[0]) * (c[1] - b[1]) - (b[1] - a[1]) * (c[0] - b[0])
+            for (a, b), c in zip(pairwise(each.corners), each.corners[2:], strict=False)
+        ]
+        assert min(turns) > 0  # counterclockwise and convex
+
+
+def test_a_map_of_a_world_of_any_size_is_bounded() -> None:
+    far = [ObjectThen(n, n, f"far {n}", "MILK", Pose([10.0**n, 0, 0]), {}, None) for n in range(9)]
+    page = harmless(moment(*far).map().svg)
+    assert len(page.elements) < 300
+    assert "grid of 1e+07 m" in page.text
+
+
+@pytest.mark.slow
+async def test_a_memory_shows_its_episodes_and_says_when_it_is_closed() -> None:
+    memory = Memory.open("sqlite://")
+    assert "not open" in harmless(memory._repr_html_()).text
+    async with memory:
+        with BulletWorld(), simulated_robot:
+            Object("courier", ObjectType.ROBOT)
+            await NavigateAction([Pose([1, 0.5, 0])]).resolve().perform()
+        await memory.flush()
+        page = harmless(memory._repr_html_())
+        for text in ("sqlite:// · open", "1 episode", "NavigateAction", "courier"):
+            assert text in page.text
+        assert await memory.episodes() == await memory.reading.episodes()
+        tree = await memory.tree("last")
+        assert [each.dtype for each in tree] == [None, "NavigateAction", "MoveMotion"]
+        assert tree == await memory.reading.tree(1)
+        assert "Episode 1 · NavigateAction" in harmless(tree._repr_html_()).text
+        assert repr(memory) == "<Memory sqlite://, open>"
+    assert "not open" in harmless(memory._repr_html_()).text
+    assert repr(memory) == "<Memory sqlite://, not open>"
+
+
+def test_a_database_that_cannot_be_read_is_one_line_without_its_password(tmp_path: object) -> None:
+    gone = DatabaseAddress.parse(f"sqlite:///{tmp_path}/gone.db")
+    assert "gone.db" in harmless(memory_html(gone, gone)).text
+    server = DatabaseAddress.parse("postgresql://ada:secret@localhost:1/memory")
+    assert "secret" not in memory_html(server, server)
