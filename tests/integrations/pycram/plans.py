@@ -1,4 +1,4 @@
-"""Plans for PyCRAM, each performed inside `remember`: `python -m tests.integrations.pycram.plans FOLDER [endless]`.
+"""Plans for PyCRAM inside `remember`: `python -m tests.integrations.pycram.plans FOLDER [endless WRITER]`.
 
 Each function is one episode in the database of its name below the folder, which also holds `facts.json`: what PyCRAM
 itself knows about the run. With `endless` only that plan is performed, until the process is killed or interrupted.
@@ -15,7 +15,7 @@ import threading
 import traceback
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from tests.integrations.pycram.headless import leave_out_mesh_checks, start_pycram
 
@@ -57,6 +57,7 @@ from pycram.world_concepts.world_object import Object  # noqa: E402
 from pycrap.ontologies import Milk, Robot  # noqa: E402
 
 from pycrorm_async.integrations.pycram import remember  # noqa: E402
+from pycrorm_async.settings import Writer  # noqa: E402
 
 leave_out_mesh_checks()
 FRONT = GraspDescription(Grasp.FRONT, None, False)
@@ -354,10 +355,10 @@ def seams() -> list[str]:
     return replaced + called
 
 
-def endless() -> None:
+def endless(writer: Writer) -> None:
     """Open and close a gripper without end; print the number of each action that has ended."""
     try:
-        with remember(url("endless"), description="Endless"):
+        with remember(url("endless"), description="Endless", writer=writer):
             for number in itertools.count(1):
                 state = GripperState.CLOSE if number % 2 else GripperState.OPEN
                 SetGripperActionDescription(Arms.LEFT, state).perform()
@@ -411,8 +412,8 @@ def world() -> Iterator[None]:
 def main() -> None:
     facts = {}
     with world():
-        if sys.argv[2:] == ["endless"]:
-            endless()
+        if sys.argv[2:3] == ["endless"]:
+            endless(cast("Writer", sys.argv[3]))
         for perform in PLANS:
             try:
                 facts[perform.__name__] = perform()

@@ -9,6 +9,7 @@ import signal
 import sqlite3
 import subprocess
 import textwrap
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +20,7 @@ from sqlalchemy import text as sql
 from pycrorm_async import Reading
 from pycrorm_async.orm import PickUpWithContextView, TaskTreeNode
 from pycrorm_async.world import ObjectType
-from tests.commands import pycrorm
+from tests.commands import Started, pycrorm
 from tests.integrations.pycram.environment import ROOT, make_environment
 
 pytestmark = pytest.mark.slow
@@ -396,8 +397,8 @@ def test_a_world_made_inside_the_block_is_seen_from_its_first_object_to_its_end(
     assert removed == [("milk",), ("floor",), ("pr2",)]
 
 
-def start_endless(folder: Path) -> subprocess.Popen[str]:
-    command = [str(make_environment()), *PLANS, str(folder), "endless"]
+def start_endless(folder: Path, writer: str = "thread") -> subprocess.Popen[str]:
+    command = [str(make_environment()), *PLANS, str(folder), "endless", writer]
     return subprocess.Popen(
         command, cwd=ROOT, env=environment(folder), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
     )
@@ -412,12 +413,19 @@ def read_until(process: subprocess.Popen[str], number: int) -> int:
     raise AssertionError("the plan ended by itself")
 
 
-def test_a_killed_plan_of_pycram_loses_no_action_that_it_has_announced(tmp_path: Path) -> None:
-    process = start_endless(tmp_path)
-    try:
-        read_until(process, 25)
-    finally:
-        process.kill()
+@pytest.mark.soak_on("daemon")
+@pytest.mark.parametrize("writer", ["thread", "daemon"])
+def test_a_killed_plan_of_pycram_loses_no_action_that_it_has_announced(tmp_path: Path, writer: str) -> None:
+    with ExitStack() as running:
+        if writer == "daemon":
+            daemon = Started("writer", "--url", f"sqlite:///{tmp_path}/endless.db", cwd=tmp_path)
+            running.callback(daemon.communicate)
+            running.callback(daemon.send_signal, signal.SIGTERM)
+        process = start_endless(tmp_path, writer)
+        try:
+            read_until(process, 25)
+        finally:
+            process.kill()
     assert process.stdout is not None
     announced = max([25, *(int(line) for line in process.stdout if line.strip().isdigit())])
     process.wait()
