@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import Any, NamedTuple, overload
@@ -22,7 +22,7 @@ from pycrorm_async.recall.cue import Cue
 from pycrorm_async.recall.library import CaseLibrary
 from pycrorm_async.recall.search import Weights, search, weights_of
 
-__all__ = ["Answer", "Compared", "Rate", "RecalledCase", "Typical", "answer", "compare", "success_of"]
+__all__ = ["Answer", "Compared", "Rate", "RecalledCase", "Typical", "answer", "compare", "rate_of", "success_of"]
 
 _TRIED = ("SUCCEEDED", "FAILED", "ERROR")
 """The statuses of an action that ran to its end. Of one that was cancelled, interrupted or lost nothing is known."""
@@ -249,10 +249,14 @@ def compare(cue: Cue, case: Case, weights: Weights) -> tuple[Compared, ...]:
     return (*words, *numbers)
 
 
-def success_of(cases: Iterator[Case]) -> Rate | None:
+def success_of(cases: Iterable[Case]) -> Rate | None:
     """Return how many of these cases succeeded, among those that ran to their end; None if none did."""
-    counts = Counter(case.status for case in cases if case.status in _TRIED)
-    tries, successes = sum(counts.values()), counts["SUCCEEDED"]
+    return rate_of(Counter(case.status for case in cases))
+
+
+def rate_of(statuses: Mapping[str, int]) -> Rate | None:
+    """Return how many succeeded, from the number of cases with each status; None if none ran to its end."""
+    tries, successes = sum(statuses.get(each, 0) for each in _TRIED), statuses.get("SUCCEEDED", 0)
     if not tries:
         return None
     share = successes / tries

@@ -18,7 +18,7 @@ from pycrorm_async.events.ids import row_id, row_key
 from pycrorm_async.recall.case import Case, bounded_case
 from pycrorm_async.recall.columns import Numbers, Sets, Symbols, joined_numbers, joined_words, taken
 
-__all__ = ["Block", "Group", "WORDS_MAX", "merge"]
+__all__ = ["Block", "Group", "WORDS_MAX", "merge", "merged_group"]
 
 WORDS_MAX: Final = 16_384
 """Bounds the words of a feature in a memory. A feature with more of them names single cases and likens none."""
@@ -108,7 +108,7 @@ def merge(blocks: Sequence[Block]) -> Block:
     """Return one block with the cases of all."""
     groups: dict[str, Group] = {}
     for name in sorted({name for block in blocks for name in block.groups}):
-        groups[name] = _merged([block.groups[name] for block in blocks if name in block.groups])
+        groups[name] = merged_group([block.groups[name] for block in blocks if name in block.groups])
     return _without_long_dictionaries(groups, frozenset().union(*(block.left_out for block in blocks)))
 
 
@@ -146,7 +146,8 @@ def _group(name: str, cases: list[Case]) -> Group:
     )
 
 
-def _merged(groups: Sequence[Group]) -> Group:
+def merged_group(groups: Sequence[Group]) -> Group:
+    """Return one group with the cases of all, which are of one type."""
     if len(groups) == 1:
         return replace(groups[0], caches={})
     nodes = np.concatenate([each.nodes for each in groups])

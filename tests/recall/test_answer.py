@@ -83,15 +83,15 @@ def test_an_answer_says_how_its_cases_ended_and_what_was_never_seen() -> None:
 )
 def test_the_interval_of_the_success_is_that_of_wilson(successes: int, tries: int, low: float, high: float) -> None:
     cases = [pick_up(n + 1, height=1.0, reason=None if n < successes else "IKError") for n in range(tries)]
-    rate = success_of(iter(cases))
+    rate = success_of(cases)
     assert rate is not None
     assert (rate.share, rate.low, rate.high) == pytest.approx((successes / tries, low, high), abs=1e-3)
 
 
 def test_an_action_that_was_cancelled_or_lost_says_nothing_about_success() -> None:
     cases = [CASES[0]._replace(status=status) for status in ("CANCELLED", "LOST", "INTERRUPTED")]
-    assert success_of(iter(cases)) is None
-    rate = success_of(iter([*cases, CASES[0]]))
+    assert success_of(cases) is None
+    rate = success_of([*cases, CASES[0]])
     assert rate is not None
     assert rate.tries == 1
 

@@ -1,0 +1,214 @@
+"""Find the actions beside and around an action, and those in a temporal relation with it; count what follows what.
+
+The next action of a case is the one that started after it under the same parent. The relations are those of Allen
+between the intervals from start to end; moments that differ by less than a millisecond count as one.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from enum import Enum
+from functools import cached_property
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from pycrorm_async.events.ids import SEQUENCE_MAX, row_id
+from pycrorm_async.recall.answer import Rate, rate_of
+from pycrorm_async.recall.blocks import Group
+from pycrorm_async.recall.case import Case
+from pycrorm_async.recall.columns import Mask, Symbols, joined_words
+from pycrorm_async.recall.library import CaseLibrary
+
+__all__ = ["Follower", "Following", "Relation", "Sequences", "relation"]
+
+_SAME_US: Final = 1_000
+"""Moments nearer to each other than this, in µs, count as one: durations are kept to seven digits."""
+
+
+class Relation(Enum):
+    """The relations of Allen: how one interval lies to another."""
+
+    BEFORE = "before"
+    MEETS = "meets"
+    OVERLAPS = "overlaps"
+    STARTS = "starts"
+    DURING = "during"
+    FINISHES = "finishes"
+    EQUALS = "equals"
+    FINISHED_BY = "finished by"
+    CONTAINS = "contains"
+    STARTED_BY = "started by"
+    OVERLAPPED_BY = "overlapped by"
+    MET_BY = "met by"
+    AFTER = "after"
+
+
+_EPISODE_SHIFT: Final = row_id(1, 0, 0).bit_length() - 1
+_NONE: Final = np.zeros(0, np.int64)
+_BY_ENDS: Final = {
+    (-1, -1): Relation.OVERLAPS,
+    (-1, 0): Relation.FINISHED_BY,
+    (-1, 1): Relation.CONTAINS,
+    (0, -1): Relation.STARTS,
+    (0, 0): Relation.EQUALS,
+    (0, 1): Relation.STARTED_BY,
+    (1, -1): Relation.DURING,
+    (1, 0): Relation.FINISHES,
+    (1, 1): Relation.OVERLAPPED_BY,
+}
+"""The relations of two intervals that share some time, by how their starts and their ends compare."""
+
+
+class Follower(NamedTuple):
+    """One type of action that came next.
+
+    Attributes:
+        type: None where nothing came next under the same parent.
+        cases: how often.
+        share: of all cases that were asked about.
+        success: how it ended; None if none of these ran to its end.
+    """
+
+    type: str | None
+    cases: int
+    share: float
+    success: Rate | None
+
+
+class Following(NamedTuple):
+    """The actions that came next after some cases, the commonest first."""
+
+    cases: int
+    followers: tuple[Follower, ...]
+
+
+def relation(first: Case, second: Case) -> Relation | None:
+    """Return how the interval of the first case lies to that of the second; None if one has no end, as a lost one."""
+    if first.duration_s is None or second.duration_s is None:
+        return None
+    starts, ends = first.started_us, first.started_us + first.duration_s * 1e6
+    other_starts, other_ends = second.started_us, second.started_us + second.duration_s * 1e6
+    by_starts, by_ends = _order(starts, other_starts), _order(ends, other_ends)
+    if by_starts and by_ends:  # neither a common start nor a common end, so that an action of no length meets none
+        gap, other_gap = _order(ends, other_starts), _order(other_ends, starts)
+        if gap <= 0:
+            return Relation.MEETS if gap == 0 else Relation.BEFORE
+        if other_gap <= 0:
+            return Relation.MET_BY if other_gap == 0 else Relation.AFTER
+    return _BY_ENDS[by_starts, by_ends]
+
+
+class Sequences:
+    """The cases of a library in the order in which they happened under each parent."""
+
+    def __init__(self, library: CaseLibrary) -> None:
+        self._groups = library.groups()
+        sizes = [len(group) for group in self._groups]
+        self._group_numbers = np.repeat(np.arange(len(sizes)), sizes)
+        self._rows = np.concatenate([np.arange(size, dtype=np.int64) for size in sizes] or [_NONE])
+        nodes = np.concatenate([group.nodes for group in self._groups] or [_NONE])
+        parents = np.concatenate([group.parents.astype(np.int64) for group in self._groups] or [_NONE])
+        keys = (nodes >> _EPISODE_SHIFT) * (SEQUENCE_MAX + 1) + parents
+        self._by_node = np.argsort(nodes)
+        self._nodes = nodes[self._by_node]
+        self._by_parent = np.lexsort((nodes, keys))
+        self._places = np.empty_like(self._by_parent)
+        self._places[self._by_parent] = np.arange(nodes.size)
+        self._keys = keys[self._by_parent]
+
+    def case(self, node: int) -> Case | None:
+        """Return the case of a node; None if it has none, because it is no action or still runs."""
+        index = self._index(node)
+        return None if index is None else self._case(index)
+
+    def next(self, case: Case) -> Case | None:
+        """Return the action that started next under the same parent."""
+        return self._sibling(case, 1)
+
+    def previous(self, case: Case) -> Case | None:
+        """Return the action that started before it under the same parent."""
+        return self._sibling(case, -1)
+
+    def parent(self, case: Case) -> Case | None:
+        """Return the nearest action around it; None outside any, and while that runs."""
+        return None if case.parent is None else self.case(case.parent)
+
+    def related(self, case: Case, wanted: Relation) -> list[Case]:
+        """Return the other cases of its episode that lie in this relation to it, as in "they happened during it"."""
+        ends = np.searchsorted(self._nodes, [row_id(case.episode, 0, 0), row_id(case.episode + 1, 0, 0)])
+        others = (self._case(int(index)) for index in self._by_node[ends[0] : ends[1]])
+        related = [each for each in others if each.node != case.node and relation(each, case) is wanted]
+        return sorted(related, key=lambda each: (each.started_us, each.node))
+
+    def follows(self, dtype: str, *, status: str | None = None, reason: str | None = None) -> Following:
+        """Return what came next after the actions of a type, how often, and how that ended, without simulations.
+
+        Args:
+            dtype: of the cases to ask about.
+            status, reason: likewise; by default any.
+        """
+        chosen = np.concatenate([_chosen(group, dtype, status, reason) for group in self._groups] or [_NONE > 0])
+        places = self._places[np.flatnonzero(chosen)]
+        if not places.size:
+            return Following(0, ())
+        after = np.minimum(places + 1, self._keys.size - 1)
+        is_next = (self._keys[after] == self._keys[places]) & (after > places)
+        following = self._by_parent[after[is_next]]
+        types = [group.type for group in self._groups]
+        counts: dict[str, Counter[str]] = {}
+        statuses = self._statuses
+        for number, code in zip(
+            self._group_numbers[following].tolist(), statuses.codes[following].tolist(), strict=True
+        ):
+            counts.setdefault(types[number], Counter())[statuses.words[code - 1]] += 1
+        followers = [
+            Follower(name, each.total(), each.total() / places.size, rate_of(each)) for name, each in counts.items()
+        ]
+        last = places.size - following.size
+        if last:
+            followers.append(Follower(None, last, last / places.size, None))
+        order = sorted(followers, key=lambda each: (-each.cases, each.type or ""))
+        return Following(int(places.size), tuple(order))
+
+    @cached_property
+    def _statuses(self) -> Symbols:
+        columns = [(group.texts.get("status"), len(group)) for group in self._groups]
+        joined = joined_words(columns)
+        assert isinstance(joined, Symbols)
+        return joined
+
+    def _sibling(self, case: Case, step: int) -> Case | None:
+        index = self._index(case.node)
+        if index is None:
+            return None
+        place = int(self._places[index])
+        other = place + step
+        if not 0 <= other < self._keys.size or self._keys[other] != self._keys[place]:
+            return None
+        return self._case(int(self._by_parent[other]))
+
+    def _index(self, node: int) -> int | None:
+        place = int(np.searchsorted(self._nodes, node))
+        return int(self._by_node[place]) if place < self._nodes.size and int(self._nodes[place]) == node else None
+
+    def _case(self, index: int) -> Case:
+        return self._groups[int(self._group_numbers[index])].case(int(self._rows[index]))
+
+
+def _chosen(group: Group, name: str, status: str | None, reason: str | None) -> Mask:
+    if group.type != name:
+        return np.zeros(len(group), np.bool_)
+    chosen = np.ones(len(group), np.bool_)
+    for feature, word in (("status", status), ("reason", reason)):
+        if word is not None:
+            column = group.texts.get(feature)
+            chosen &= column is not None and column.equal_to(word, slice(None))
+    if "simulated" in group.texts:
+        chosen &= ~group.texts["simulated"].equal_to("yes", slice(None))
+    return chosen
+
+
+def _order(first: float, second: float) -> int:
+    """Compare two moments in µs: -1, 0 or 1."""
+    return 0 if abs(first - second) < _SAME_US else -1 if first < second else 1
