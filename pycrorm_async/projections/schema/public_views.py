@@ -61,7 +61,7 @@ _UNITED_MAX = 400
 
 _PICKED = "pick_up_action"
 _PLACED = "place_action"
-_OF_PICK_UPS = ("task_tree_node", "object", "pose", "process_metadata")
+_OF_PICK_UPS = ("task_tree_node", "object", "object_removal", "pose", "process_metadata")
 _OF_RELATIONS = ("task_tree_node", "object", "object_removal", "pose", "joint_change")
 """The tables of `PickUpWithContextView` and of `spatial_relation`."""
 
@@ -147,9 +147,9 @@ def public_views(
     }
     views |= {name: _leaf(name, layout, leaves, shown) for name in layout.leaves}
     if _PICKED in layout.leaves:
-        node, object_, pose, episode = (core[name] for name in _OF_PICK_UPS)
+        node, object_, removal, pose, episode = (core[name] for name in _OF_PICK_UPS)
         picked = _leaf(_PICKED, layout, leaves, lambda view, _: view).subquery("picked")
-        view = pick_ups_with_context(picked, node, object_, pose, episode, layout.dtypes(_PICKED))
+        view = pick_ups_with_context(picked, node, object_, removal, pose, episode, layout.dtypes(_PICKED))
         views["PickUpWithContextView"] = shown(view, node)
         if _PLACED in layout.leaves:
             placed = _leaf(_PLACED, layout, leaves, lambda view, _: view).subquery("placed")

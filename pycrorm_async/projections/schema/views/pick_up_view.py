@@ -16,6 +16,7 @@ from sqlalchemy import Boolean, ColumnElement, FromClause, ScalarSelect, Select,
 from sqlalchemy.ext.compiler import compiles
 
 from pycrorm_async.projections.schema.views.joins import numbers, present, same_episode
+from pycrorm_async.projections.schema.views.world_line import world_line
 
 __all__ = ["pick_ups_with_context"]
 
@@ -52,7 +53,13 @@ def _fact(element: _PlannerHint, compiler: Any, **options: Any) -> str:
 
 
 def pick_ups_with_context(
-    picked: FromClause, node: Table, object_: Table, pose: Table, episode: Table, dtypes: Sequence[str]
+    picked: FromClause,
+    node: Table,
+    object_: Table,
+    removal: Table,
+    pose: Table,
+    episode: Table,
+    dtypes: Sequence[str],
 ) -> Select[*tuple[Any, ...]]:
     """Return the view's query. A node, its designator and its leaf row have the same id, so they join without a key
     column. `dtypes` are all dtypes that a node with a row in `picked` may have."""
@@ -63,7 +70,8 @@ def pick_ups_with_context(
         # A subquery, which costs nothing where the column is not selected.
         return select(value).where(episode.c.id == node.c.process_metadata_id).scalar_subquery()
 
-    world = func.coalesce(episode.c.world, episode.c.entered_world)
+    in_world = world_line(object_, removal, episode.c.id)  # of an episode that has not ended, or was LOST
+    world = func.coalesce(episode.c.world, episode.c.entered_world, in_world)
 
     return (
         select(
