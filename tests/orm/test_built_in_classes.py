@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
+
 import pytest
 from sqlalchemy import Table, inspect
 
@@ -11,7 +14,8 @@ from pycrorm_async.orm import Action, Designator, Motion
 from pycrorm_async.plan.actions import basic, manipulation, transport
 from pycrorm_async.plan.motions import motions
 from pycrorm_async.projections.schema.layout import Layout
-from pycrorm_async.projections.schema.mapped_tables import mapped_leaves
+from pycrorm_async.projections.schema.mapped_tables import built_in_leaves, leaves_of, mapped_leaves
+from tests.commands import environment
 
 MODULES = (basic, manipulation, transport, motions)
 PERFORMABLES = [getattr(module, name) for module in MODULES for name in module.__all__]
@@ -45,6 +49,24 @@ def test_every_declaration_of_a_plan_fits_into_the_tables_of_the_classes(designa
     layout = Layout().with_leaves(mapped_leaves())
     declaration = declared_type(designator).declaration
     assert layout.with_declaration(declaration) == layout
+
+
+def test_the_listed_tables_are_those_of_the_classes() -> None:
+    assert built_in_leaves() == [each for each in leaves_of(Designator) if each.dtype is not None]
+
+
+_LIGHT = """
+import sys
+import pycrorm_async.cli.copy, pycrorm_async.cli.rebuild, pycrorm_async.cli.verify, pycrorm_async.cli.writer
+raise SystemExit("the mapped classes are imported" if "pycrorm_async.orm" in sys.modules else 0)
+"""
+
+
+@pytest.mark.slow
+def test_commands_that_query_no_mapped_class_import_none() -> None:
+    command = [sys.executable, "-c", _LIGHT]
+    done = subprocess.run(command, env=environment(), capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
 
 
 def test_every_name_of_the_thesis_exists() -> None:

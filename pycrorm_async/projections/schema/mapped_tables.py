@@ -2,43 +2,135 @@
 
 A built-in class has the dtype of its name. A class that a user declared (`class ORMSaying(Action)`) has only a table
 until a designator is declared for it. Classes that exist in one memory only are derived from its declarations.
+
+The tables of the built-in classes are listed here once more, because mapping the classes takes 0.3 s: a process that
+queries none of them, such as the daemon or a fold worker, never imports them.
 """
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any, Final
 
 from sqlalchemy import Boolean, Column, Double, Float, Integer, Table
-from sqlalchemy.orm import Mapper
 from sqlalchemy.types import TypeEngine
 
-from pycrorm_async.orm import Action, Designator, Language, Motion
-from pycrorm_async.orm.types import Moment
+from pycrorm_async.events.fields import table_name
 from pycrorm_async.projections.schema.core_columns import EPISODE, Storage
 from pycrorm_async.projections.schema.layout import Leaf
 
-__all__ = ["mapped_leaves", "storage_of"]
+if TYPE_CHECKING:
+    from pycrorm_async.orm import Designator
 
-_KINDS = {Action: "action", Motion: "motion", Language: "language"}
-_ROOTS = (Designator, *_KINDS)
+__all__ = ["built_in_leaves", "mapped_leaves", "leaves_of", "storage_of"]
+
+_Columns = dict[str, Storage]
+_ARM: Final[_Columns] = {"arm": "text"}
+_GRIPPER: Final[_Columns] = {"gripper": "text"}
+_OBJECT: Final[_Columns] = {"object_designator_id": "object"}
+_TARGET: Final[_Columns] = {"target_id": "pose"}
+_LOCATION: Final[_Columns] = {"target_location_id": "pose"}
+_UNCHECKED: Final[_Columns] = {"allow_gripper_collision": "boolean"}
+_BUILT_IN: Final[dict[str, dict[str, _Columns]]] = {
+    "action": {
+        "NavigateAction": _LOCATION,
+        "ParkArmsAction": _ARM,
+        "MoveTorsoAction": {"position": "real"},
+        "SetGripperAction": {**_GRIPPER, "motion": "text"},
+        "ReleaseAction": {**_GRIPPER, **_OBJECT},
+        "GripAction": {**_GRIPPER, **_OBJECT, "effort": "real"},
+        "PickUpAction": {**_OBJECT, **_ARM, "grasp": "text"},
+        "PlaceAction": {**_OBJECT, **_ARM, **_LOCATION},
+        "TransportAction": {**_OBJECT, **_ARM, **_LOCATION},
+        "LookAtAction": _TARGET,
+        "DetectAction": _OBJECT,
+        "OpenAction": {**_OBJECT, **_ARM},
+        "CloseAction": {**_OBJECT, **_ARM},
+        "GraspingAction": {**_ARM, "object_desig_id": "object"},
+        "FaceAtAction": {"pose_id": "pose"},
+        "MoveAndPickUpAction": {"standing_position_id": "pose", **_OBJECT, **_ARM, "grasp": "text"},
+        "BatchRolloutAction": {
+            "policy": "text",
+            "scene": "text",
+            "seed": "integer",
+            "first": "integer",
+            "count": "integer",
+        },
+        "LearnPolicyAction": {
+            "policy": "text",
+            "successes": "integer",
+            "min_samples_leaf": "integer",
+            "rollouts": "integer",
+            "scene": "text",
+            "episode_count": "integer",
+        },
+    },
+    "motion": {
+        "MoveMotion": _TARGET,
+        "MoveTCPMotion": {**_TARGET, **_ARM, **_UNCHECKED},
+        "LookingMotion": _TARGET,
+        "MoveGripperMotion": {"motion": "text", **_GRIPPER, **_UNCHECKED},
+        "MoveArmJointsMotion": {},
+        "MoveJointsMotion": {},
+        "DetectingMotion": {"object_type": "text"},
+        "OpeningMotion": {"object_part_id": "object", **_ARM},
+        "ClosingMotion": {"object_part_id": "object", **_ARM},
+        "WorldStateDetectingMotion": {"object_type": "text"},
+        "AccessingMotion": {
+            "part_of_id": "object",
+            **_ARM,
+            **_GRIPPER,
+            "drawer_joint": "text",
+            "drawer_handle": "text",
+            "distance": "real",
+        },
+    },
+    "language": {
+        "Sequential": {},
+        "TryInOrder": {},
+        "Parallel": {},
+        "TryAll": {},
+        "Repeat": {"times": "integer"},
+        "Monitor": {"condition": "text", "interval_s": "real"},
+        "Code": {"function": "text"},
+        "Retry": {"max_tries": "integer"},
+    },
+}
+"""The columns of the built-in classes below `Designator`, by kind and class."""
 
 
 def mapped_leaves() -> list[Leaf]:
     """Return the tables of all classes below `Designator` that every memory of this process shares."""
-    return list(_leaves(Designator.__mapper__))
+    orm = sys.modules.get("pycrorm_async.orm")
+    declared = [] if orm is None else [each for each in leaves_of(orm.Designator) if each.dtype is None]
+    return [*built_in_leaves(), *declared]
 
 
-def _leaves(root: Mapper[Designator]) -> Iterator[Leaf]:
-    for mapper in root.self_and_descendants:
+def built_in_leaves() -> list[Leaf]:
+    """Return the tables of the built-in classes, without importing them."""
+    return [
+        Leaf(table_name(name), columns, name, kind)
+        for kind, classes in _BUILT_IN.items()
+        for name, columns in classes.items()
+    ]
+
+
+def leaves_of(root: type[Designator]) -> Iterator[Leaf]:
+    """Yield the tables of the classes below `root` and of itself, built-in or declared by a user."""
+    from pycrorm_async.orm import Action, Designator, Language, Motion
+
+    kinds = {Action: "action", Motion: "motion", Language: "language"}
+    roots = (Designator, *kinds)
+    for mapper in root.__mapper__.self_and_descendants:
         table = mapper.local_table
-        if mapper.class_ in _ROOTS or mapper.class_.metadata is not Designator.metadata or not isinstance(table, Table):
+        if mapper.class_ in roots or mapper.class_.metadata is not root.metadata or not isinstance(table, Table):
             continue
-        if table.metadata is not Designator.metadata:
+        if table.metadata is not root.metadata:
             continue
         columns = {str(each.name): _storage(each) for each in table.columns if each.name not in ("id", EPISODE)}
         built_in = mapper.class_.__module__.startswith("pycrorm_async.orm.")
-        kind = next((kind for root, kind in _KINDS.items() if issubclass(mapper.class_, root)), None)
+        kind = next((kind for root, kind in kinds.items() if issubclass(mapper.class_, root)), None)
         yield Leaf(str(table.name), columns, mapper.class_.__name__ if built_in else None, kind if built_in else None)
 
 
@@ -52,8 +144,10 @@ def _storage(column: Column[object]) -> Storage:
 
 def storage_of(type_: TypeEngine[Any]) -> Storage:
     """Return the storage of a SQLAlchemy type."""
+    own: Storage | None = getattr(type_, "storage", None)  # of `orm.types`, which need not be imported
+    if own is not None:
+        return own
     kinds: tuple[tuple[type, Storage], ...] = (
-        (Moment, "time"),
         (Boolean, "boolean"),
         (Integer, "integer"),
         (Float, "real"),
