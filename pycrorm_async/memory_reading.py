@@ -22,6 +22,7 @@ from pycrorm_async.query.frames.dataframe import Library
 from pycrorm_async.query.notebook.listings import Episodes, TaskTree
 from pycrorm_async.query.notebook.memory_view import memory_html
 from pycrorm_async.query.reading import Reading
+from pycrorm_async.query.scene.picture import When, picture
 from pycrorm_async.query.snapshot import Moment
 from pycrorm_async.query.sql.read_only import DEFAULT_LIMITS, SqlLimits, SqlResult
 from pycrorm_async.recording.recording import Recording
@@ -155,6 +156,15 @@ class ReadableMemory(PartsHolder):
         """Write an episode, up to the last flush, as one HTML file; see `pycrorm_async.report.write.report`."""
         reading = self._open_parts.reading
         return await write_report(reading, episode, path, force=force, first=first, last=last)
+
+    async def picture(self, episode: AnyEpisode, *, at: When = None, **view: Any) -> bytes:
+        """Return the scene of an episode at a moment as PNG, up to the last flush.
+
+        >>> Path("scene.png").write_bytes(await memory.picture("last", at="e115"))
+
+        `view` are the size and the camera, see `pycrorm_async.query.scene.picture.picture`. It needs the extra `world`.
+        """
+        return await picture(self._open_parts.reading, episode, at=at, **view)
 
     async def blob(self, name: str) -> Blob | None:
         """Return the blob with this SHA-256, up to the last flush; None if it is not stored."""

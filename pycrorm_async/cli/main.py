@@ -89,6 +89,7 @@ _VERBS = (
     "episodes",
     "show",
     "report",
+    "picture",
     "events",
     "tag",
     "copy",

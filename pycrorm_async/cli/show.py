@@ -12,8 +12,9 @@ import typer
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
 from pycrorm_async.cli.output import duration, moment, print_facts, print_json
 from pycrorm_async.cli.pending_events import note_pending_events
-from pycrorm_async.cli.snapshot_view import parse_moment, print_snapshot
+from pycrorm_async.cli.snapshot_view import print_snapshot
 from pycrorm_async.cli.tree import print_tree, simulated_by
+from pycrorm_async.query.as_of import parse_moment
 from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.snapshot import Moment
@@ -100,7 +101,7 @@ def _pairs(values: Mapping[str, object] | None) -> str | None:
 def _show_moment(
     episode: str, at: str, url: str, spool: Path | None, *, events: bool, full: bool, as_json: bool
 ) -> None:
-    time, sequence = parse_moment(at)
+    time, sequence = parse_moment(at, "--at")
 
     async def query() -> Moment:
         async with Reading.open(url) as reading:

@@ -7,29 +7,14 @@ import math
 from pycrorm_async.cli.output import moment as wall_clock
 from pycrorm_async.cli.output import print_facts, print_table
 from pycrorm_async.cli.tree import print_tree
-from pycrorm_async.errors import CallerError
 from pycrorm_async.events.blobs import BLOB_KEY
 from pycrorm_async.query.parameter_text import parameters_text
 from pycrorm_async.query.snapshot import Moment, ObjectThen, ObservationThen, RobotThen
 
-__all__ = ["print_snapshot", "parse_moment"]
+__all__ = ["print_snapshot"]
 
 _JOINTS_MAX = 3
 """Bounds the joints listed for an object, so that its row stays short."""
-
-
-def parse_moment(text: str) -> tuple[float | None, int | None]:
-    """Parse the value of `--at` as seconds or as the sequence of an event. Raises `CallerError`.
-
-    >>> parse_moment("12.5"), parse_moment("e300"), parse_moment("#300")
-    ((12.5, None), (None, 300), (None, 300))
-    """
-    try:
-        return (None, int(text[1:])) if text[:1] in ("e", "#") else (float(text), None)
-    except ValueError:
-        raise CallerError(
-            f"--at takes seconds since the episode's start, or an event such as e300, got {text!r}"
-        ) from None
 
 
 def print_snapshot(snapshot: Moment, requested: str, *, events: bool = False, full: bool = False) -> None:

@@ -27,7 +27,7 @@ from pycrorm_async.store.stored import StoredEvent
 if TYPE_CHECKING:
     from pycrorm_async.hooks.episode import Episode
 
-__all__ = ["AnyEpisode", "as_of", "unreadable"]
+__all__ = ["AnyEpisode", "as_of", "parse_moment", "unreadable"]
 
 AnyEpisode: TypeAlias = "int | str | Episode | EpisodeSummary"
 """An episode by its number, its id or the first digits of it, `last`, or as an `Episode` or `EpisodeSummary`."""
@@ -117,6 +117,20 @@ def _limit(time: float | datetime | None, sequence: int | None) -> tuple[str, _W
         raise CallerError(f"time must be seconds since the episode's start or a datetime, got {time!r}")
     since_ns = round(seconds * 1e9)
     return f"{seconds:g} s", lambda first, event: event.monotonic_ns - first.monotonic_ns <= since_ns
+
+
+def parse_moment(text: str, option: str = "at") -> tuple[float | None, int | None]:
+    """Parse the text of a moment as seconds or as the sequence of an event. Raises `CallerError`.
+
+    >>> parse_moment("12.5"), parse_moment("e300"), parse_moment("#300")
+    ((12.5, None), (None, 300), (None, 300))
+    """
+    try:
+        return (None, int(text[1:])) if text[:1] in ("e", "#") else (float(text), None)
+    except ValueError:
+        raise CallerError(
+            f"{option} takes seconds since the episode's start, or an event such as e300, got {text!r}"
+        ) from None
 
 
 def _number(value: Any, kind: type) -> float | None:

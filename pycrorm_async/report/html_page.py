@@ -9,9 +9,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import html
-import os
 import re
-import tempfile
 from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib import resources
@@ -20,9 +18,9 @@ from typing import Any
 
 import msgspec
 
-from pycrorm_async.errors import CallerError
+from pycrorm_async.report.output_file import write_file
 
-__all__ = ["page_of", "overview_page_of", "write_page", "refuse_existing"]
+__all__ = ["page_of", "overview_page_of", "write_page"]
 
 _EPISODE = "dom episode bodies scene_view map_view tree_view gantt_view panels main".split()
 _OVERVIEW = "dom episode overview".split()
@@ -70,39 +68,9 @@ def _page(document: Mapping[str, Any], heading: str, suffix: str, body: str, scr
     return re.sub(r"\{(\w+)\}", lambda match: parts[match[1]], _asset("web/page.html"))
 
 
-def refuse_existing(path: Path, *, force: bool) -> None:
-    """Raise `CallerError` for a path that a page cannot have: that of a file, without `force`, or of a folder."""
-    if path.is_dir():
-        raise CallerError(f"{path} is a folder: give the name of a file in it, for example {path / 'report.html'}")
-    if path.exists() and not force:
-        raise CallerError(f"{path} exists: add --force to replace it, or give another name")
-    if not path.parent.is_dir():
-        raise CallerError(f"the folder {path.parent} does not exist: create it first")
-
-
 def write_page(page: str, path: Path, *, force: bool = False) -> None:
     """Write a page to a file that is complete as soon as it has its name. Raises `CallerError`, `OSError`."""
-    refuse_existing(path, force=force)
-    descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name[:100]}.", suffix=".part")
-    written = Path(name)
-    try:
-        with os.fdopen(descriptor, "w", encoding="utf-8") as file:
-            file.write(page)
-        written.chmod(0o666 & ~_umask())
-        if force:
-            written.replace(path)
-        else:
-            path.hardlink_to(written)  # fails, unlike a renaming, if another process made the file meanwhile
-    except FileExistsError:
-        raise CallerError(f"{path} exists: add --force to replace it, or give another name") from None
-    finally:
-        written.unlink(missing_ok=True)
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
+    write_file(page.encode(), path, force=force)
 
 
 def _safe_json(document: Mapping[str, Any]) -> str:

@@ -1,0 +1,79 @@
+"""`pycrorm picture EPISODE` writes the scene of an episode at a moment as a PNG file."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
+from pycrorm_async.cli.output import print_json, stdout
+from pycrorm_async.cli.pending_events import note_pending_events
+from pycrorm_async.errors import CallerError
+from pycrorm_async.query.as_of import parse_moment
+from pycrorm_async.query.reading import Reading
+from pycrorm_async.query.scene.picture import picture as draw
+from pycrorm_async.report.output_file import refuse_existing, write_file
+
+__all__ = ["picture"]
+
+
+def picture(
+    episode: Annotated[str, typer.Argument(help="The episode's number, its id or first digits of the id, or `last`.")],
+    at: Annotated[
+        str | None,
+        typer.Option(
+            help="The moment: seconds since the start (12.5), or after an event (e300);"
+            " default: before the world is emptied.",
+            metavar="WHEN",
+        ),
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="FILE.png", help="The file to write; default: episode-NUMBER.png.")
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace the file if it exists.")] = False,
+    size: Annotated[str, typer.Option(metavar="WIDTHxHEIGHT", help="In pixels.")] = "640x480",
+    focus: Annotated[
+        str | None, typer.Option(metavar="OBJECT", help="Frame this object instead of those that move.")
+    ] = None,
+    yaw: Annotated[
+        float | None,
+        typer.Option(metavar="DEGREES", help="Look from this side, 0 from +x, 90 from +y; default: the best view."),
+    ] = None,
+    pitch: Annotated[float, typer.Option(metavar="DEGREES", help="Look from this angle above the scene.")] = 32.0,
+    url: UrlOption = DEFAULT_URL,
+    spool: SpoolOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Write the scene at a moment as PNG, drawn from the recorded geometry without a display."""
+    width, height = _size(size)
+    if at is not None:
+        parse_moment(at, "--at")
+    if out is not None:
+        refuse_existing(out, force=force)
+
+    async def write() -> Path:
+        async with Reading.open(url) as reading:
+            number = (await reading.episode(episode)).number
+            png = await draw(
+                reading, number, at=at, width=width, height=height, yaw_deg=yaw, pitch_deg=pitch, focus=focus
+            )
+            path = out if out is not None else Path(f"episode-{number}.png")
+            write_file(png, path, force=force)
+            return path
+
+    path = asyncio.run(write())
+    note_pending_events(url, spool)
+    if as_json:
+        print_json({"file": path, "bytes": path.stat().st_size, "width": width, "height": height})
+    else:
+        stdout.print(str(path), markup=False, highlight=False, soft_wrap=True)
+
+
+def _size(text: str) -> tuple[int, int]:
+    width, _, height = text.lower().partition("x")
+    if not (width.isdecimal() and height.isdecimal()):
+        raise CallerError(f"--size takes width and height in pixels, such as 640x480, got {text!r}")
+    return int(width), int(height)

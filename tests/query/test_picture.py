@@ -1,0 +1,123 @@
+"""Pictures of a scene are made from recorded shapes, frame what moves, and are not recorded themselves."""
+
+from __future__ import annotations
+
+import asyncio
+import io
+import json
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib import image
+from numpy.typing import NDArray
+from typer.testing import CliRunner
+
+from pycrorm_async import Memory
+from pycrorm_async.cli.main import app
+from pycrorm_async.errors import CallerError, UnknownEpisode
+from pycrorm_async.plan import NavigateAction, simulated_robot
+from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
+from pycrorm_async.world.models.primitives import box_urdf
+
+pytestmark = pytest.mark.slow
+
+RED = (0.9, 0.1, 0.1, 1.0)
+CUBE = box_urdf("cube", x=(-0.2, 0.2), y=(-0.2, 0.2), z=(0, 0.4))
+
+
+async def record(url: str) -> None:
+    async with Memory.open(url) as memory:
+        async with memory.episode(description="Push the cube"):
+            with BulletWorld() as world, simulated_robot:
+                Object("courier", ObjectType.ROBOT)
+                cube = Object("cube", ObjectType.GENERIC_OBJECT, CUBE, Pose([3, 0, 0]), color=RED)
+                memory.observe("before", 1)
+                await NavigateAction([Pose([1, 0.5, 0])]).resolve().perform()
+                cube.set_pose(Pose([3, 1, 0]))
+                assert world.entered
+        async with memory.episode(description="Nothing there"):
+            memory.observe("alone", 1)
+        with memory.recording.episode(description="Another executive") as episode:
+            episode.object_added("base", "turtle", "ROBOT", Pose([0, 0, 0]))
+        await memory.flush()
+
+
+@pytest.fixture(scope="module")
+def url(tmp_path_factory: pytest.TempPathFactory) -> str:
+    address = f"sqlite:///{tmp_path_factory.mktemp('pictures')}/memory.db"
+    asyncio.run(record(address))
+    return address
+
+
+def pixels(png: bytes) -> NDArray[np.float64]:
+    assert struct.unpack(">II", png[16:24]) == image.imread(io.BytesIO(png)).shape[1::-1]
+    return image.imread(io.BytesIO(png))[:, :, :3]
+
+
+def redness(png: bytes) -> float:
+    """Return the share of red pixels."""
+    colors = pixels(png)
+    return float(((colors[..., 0] > 0.3) & (colors[..., 0] > 3 * colors[..., 1])).mean())
+
+
+async def test_a_picture_frames_what_moves_and_a_focus_one_object(url: str) -> None:
+    memory = await Memory.connect(url)
+    try:
+        default = await memory.picture("1")
+        assert pixels(default).shape == (480, 640, 3)
+        assert redness(default) > 0.005
+        assert redness(await memory.picture(1, focus="cube", width=160, height=120)) > 0.1
+        assert redness(await memory.picture(1, focus="courier", yaw_deg=180, pitch_deg=5, width=90, height=120)) < 0.05
+        small = {"width": 64, "height": 48, "yaw_deg": 0.0}
+        same = [await memory.picture(1, at=when, **small) for when in ("e6", "e6")]
+        assert same[0] == same[1]
+        async with memory.episode(description="Looking"):
+            await memory.picture(1, **small)
+        await memory.flush()
+        assert (await memory.as_of("last", sequence=99)).sequence == 2  # its start and its end
+    finally:
+        await memory.close()
+
+
+@pytest.mark.parametrize(
+    ("episode", "options", "message"),
+    [
+        ("2", {}, "episode 2 has no objects to draw: no world was recorded"),
+        (
+            "1",
+            {"at": "e1"},
+            "episode 1 was empty at event 1, so nothing is drawn; its first object was added at event",
+        ),
+        ("3", {"at": "e3"}, "episode 3 has no shapes to draw: of turtle, its description was not recorded"),
+        ("1", {"focus": "milk"}, "had no object 'milk' at this moment; its objects: courier, cube"),
+        ("1", {"at": "noon"}, "at takes seconds since the episode's start, or an event such as e300, got 'noon'"),
+        ("1", {"width": 3}, "at least 16 x 16 and at most 4,000,000 pixels, not 3 x 480"),
+        ("1", {"pitch_deg": 90.0}, "pitch is between -89 and 89 degrees, not 90"),
+    ],
+)
+async def test_what_cannot_be_drawn_is_one_line(
+    url: str, episode: str, options: dict[str, object], message: str
+) -> None:
+    async with Memory.open(url) as memory:
+        with pytest.raises(CallerError, match=message):
+            await memory.picture(episode, **options)  # type: ignore[arg-type]
+        with pytest.raises(UnknownEpisode):
+            await memory.picture("9")
+
+
+def test_the_command_writes_a_file_and_replaces_none(url: str, tmp_path: Path) -> None:
+    out = tmp_path / "scene.png"
+    command = ["picture", "1", "--url", url, "--size", "64x48", "--out", str(out)]
+    done = CliRunner().invoke(app(), [*command, "--json"])
+    assert done.exit_code == 0, done.output
+    assert json.loads(done.stdout) == {"file": str(out), "bytes": out.stat().st_size, "width": 64, "height": 48}
+    assert pixels(out.read_bytes()).shape == (48, 64, 3)
+    refused = CliRunner().invoke(app(), command)
+    assert refused.exit_code == 2
+    assert "exists: add --force" in refused.stderr
+    assert CliRunner().invoke(app(), [*command, "--force"]).exit_code == 0
+    wrong = CliRunner().invoke(app(), [*command[:-1], str(tmp_path / "other.png"), "--at", "noon"])
+    assert (wrong.exit_code, "--at takes seconds" in wrong.stderr) == (2, True)
+    assert [each.name for each in tmp_path.iterdir()] == ["scene.png"]
