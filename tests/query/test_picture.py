@@ -76,7 +76,7 @@ async def test_a_picture_frames_what_moves_and_a_focus_one_object(url: str) -> N
         async with memory.episode(description="Looking"):
             await memory.picture(1, **small)
         await memory.flush()
-        assert (await memory.as_of("last", sequence=99)).sequence == 2  # its start and its end
+        assert (await memory.as_of("last", sequence=99)).sequence == 4  # starts and ends of the episode and its root
     finally:
         await memory.close()
 

@@ -1,6 +1,6 @@
 """Draw the scene of an episode at a moment as PNG: a world made from the recorded geometry, photographed by Bullet.
 
-The world is made in a thread without a watcher, so that no memory records it.
+The world is made in a thread with an empty context, so that it belongs to no open episode and is not recorded.
 """
 
 from __future__ import annotations
@@ -26,9 +26,7 @@ from pycrorm_async.query.as_of import AnyEpisode, parse_moment
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.recorded_world import RecordedWorld, world_of
 from pycrorm_async.query.snapshot import Moment
-from pycrorm_async.world.bullet import BulletWorld
 from pycrorm_async.world.objects import Object
-from pycrorm_async.world.observers import watcher
 from pycrorm_async.world.pose import Vector
 from pycrorm_async.world.queries.photograph import Camera, photograph
 
@@ -124,20 +122,9 @@ def _moving(number: int) -> Select[Any]:
     )
 
 
-class _NoWatcher:
-    """Watches the worlds of pictures, which are not recorded."""
-
-    def world_entered(self, world: BulletWorld) -> None:
-        """Ignore the world."""
-
-    def world_left(self, world: BulletWorld) -> None:
-        """Ignore it."""
-
-
 def _drawn(
     then: Moment, moved: Collection[str], size: tuple[int, int], yaw_deg: float | None, pitch_deg: float
 ) -> bytes:
-    watcher.set(_NoWatcher())
     with world_of(then) as world:
         points = [name for name, shape in world.assumed.items() if shape.startswith("a point")]
         if len(points) == len(world.objects):
