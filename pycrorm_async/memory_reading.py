@@ -17,6 +17,8 @@ from pycrorm_async.hooks.episode import Episode
 from pycrorm_async.memory_parts import PartsHolder
 from pycrorm_async.plan.task_tree import TaskTreeNode
 from pycrorm_async.query.as_of import AnyEpisode
+from pycrorm_async.query.asking.ask import Ask
+from pycrorm_async.query.asking.question import Question
 from pycrorm_async.query.frames.arrow_batches import BATCH_ROWS
 from pycrorm_async.query.frames.dataframe import Library
 from pycrorm_async.query.notebook.listings import Episodes, TaskTree
@@ -106,6 +108,11 @@ class ReadableMemory(PartsHolder):
         """Return the rows as a stream of Arrow record batches of at most `rows` rows; see `Reading.batches`."""
         reading = self._open_parts.reading
         return reading.batches(statement, rows=rows, simulated=simulated, deferred=deferred)
+
+    @property
+    def ask(self) -> Ask[Question]:
+        """The named questions: `await memory.ask.root_failures(object="milk")` is a frame, up to the last flush."""
+        return self._open_parts.reading.ask
 
     async def query(self, sql: str, limits: SqlLimits = DEFAULT_LIMITS) -> SqlResult:
         """Return the rows of one query in SQL that can only read, up to the last flush; see `Reading.query`."""

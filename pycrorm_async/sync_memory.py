@@ -22,7 +22,10 @@ from sqlalchemy import Select
 
 from pycrorm_async.errors import CallerError, FlushTimeout
 from pycrorm_async.memory_status import MemoryStatus
+from pycrorm_async.query.asking.ask import Ask
+from pycrorm_async.query.asking.question import Question, SyncQuestion
 from pycrorm_async.query.frames.dataframe import Library
+from pycrorm_async.query.sql.read_only import DEFAULT_LIMITS, SqlLimits, SqlResult
 from pycrorm_async.recording.recording import Recording
 
 if TYPE_CHECKING:
@@ -135,6 +138,16 @@ class SyncMemory:
             raise FlushTimeout(
                 f"not finished after {timeout_s:g} s; everything recorded is safe in the spool"
             ) from error
+
+    @property
+    def ask(self) -> Ask[SyncQuestion]:
+        """The named questions: `memory.ask.root_failures(object="milk").frame()`."""
+        reading = self._memory.reading
+        return Ask(lambda plan: SyncQuestion(Question(reading, plan), self._await))
+
+    def query(self, sql: str, limits: SqlLimits = DEFAULT_LIMITS) -> SqlResult:
+        """Return the rows of one query in SQL that can only read; see `Reading.query`."""
+        return self._await(self._memory.query(sql, limits))
 
     @overload
     def dataframe(

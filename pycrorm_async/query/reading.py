@@ -13,9 +13,11 @@ from collections.abc import AsyncGenerator, AsyncIterator
 from contextlib import aclosing, asynccontextmanager
 from dataclasses import replace
 from datetime import datetime
+from functools import partial
 from typing import TYPE_CHECKING, Any, Literal, Self, overload
 
-from sqlalchemy import Select
+from sqlalchemy import Dialect, Row, Select
+from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncSession, async_sessionmaker
 
 from pycrorm_async.errors import DatabaseUnavailable, UnknownEpisode
@@ -28,6 +30,8 @@ from pycrorm_async.projections.schema.layout import unite
 from pycrorm_async.projections.schema.session_views import all_views, with_views
 from pycrorm_async.query import named_queries
 from pycrorm_async.query.as_of import AnyEpisode, as_of
+from pycrorm_async.query.asking.ask import Ask
+from pycrorm_async.query.asking.question import Question
 from pycrorm_async.query.episode_session import EpisodeSession
 from pycrorm_async.query.frames.arrow_batches import BATCH_ROWS, arrow_batches
 from pycrorm_async.query.frames.dataframe import Library, dataframe
@@ -194,6 +198,25 @@ class Reading:
         """
         await self._ready()
         return await ReadOnlySql(self._log).query(sql, limits)
+
+    @property
+    def ask(self) -> Ask[Question]:
+        """The named questions: `await reading.ask.root_failures(object="milk")` is a frame."""
+        return Ask(partial(Question, self))
+
+    @property
+    def dialect(self) -> Dialect:
+        """The dialect of the database, to write a statement in its SQL."""
+        return sqlite.dialect() if self._address.is_sqlite else postgresql.dialect()  # type: ignore[no-untyped-call]
+
+    async def rows(
+        self, statement: Select[*tuple[Any, ...]], *, simulated: bool = False
+    ) -> list[Row[*tuple[Any, ...]]]:
+        """Return the rows of a select over columns as named tuples."""
+        await self._ready()
+        with self._log.translated():
+            async with self._connection(simulated=simulated) as connection:
+                return list((await connection.execute(statement)).all())
 
     def mapped(self, designator: str | type) -> type[Designator]:
         """Return the mapped class of a dtype, a table or a designator class, as of the last `refresh`.

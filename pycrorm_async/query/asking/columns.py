@@ -1,0 +1,103 @@
+"""Expressions that several questions select or filter by."""
+
+from __future__ import annotations
+
+import math
+from enum import Enum
+from typing import Any, TypeVar
+
+from sqlalchemy import ColumnElement, Double, Integer, Select, Text, case, cast, func, literal_column, or_
+from sqlalchemy.ext.compiler import compiles
+from sqlalchemy.sql.functions import FunctionElement
+
+from pycrorm_async.errors import CallerError
+from pycrorm_async.query.suggestions import nearest
+from pycrorm_async.task_status import TaskStatus
+
+__all__ = [
+    "FAILED",
+    "checked_count",
+    "checked_metres",
+    "containing",
+    "json_text",
+    "limited",
+    "member_of",
+    "share_succeeded",
+    "times_with",
+]
+
+E = TypeVar("E", bound=Enum)
+_STATEMENT = TypeVar("_STATEMENT", bound=Select[Any])
+
+FAILED = (TaskStatus.FAILED, TaskStatus.ERROR, TaskStatus.LOST)
+
+
+class _JsonText(FunctionElement[str]):
+    """A member of a JSON document as text; NULL if the document has none."""
+
+    name = "json_text"
+    type = Text()
+    inherit_cache = True
+
+
+@compiles(_JsonText)
+def _of_sqlite(element: _JsonText, compiler: Any, **options: Any) -> str:
+    document, name = (compiler.process(each, **options) for each in element.clauses)
+    return f"json_extract({document}, '$.' || {name})"
+
+
+@compiles(_JsonText, "postgresql")
+def _of_postgresql(element: _JsonText, compiler: Any, **options: Any) -> str:
+    document, name = (compiler.process(each, **options) for each in element.clauses)
+    return f"(CAST({document} AS json) ->> {name})"
+
+
+def json_text(document: Any, name: str) -> ColumnElement[str]:
+    """Return the member of this name of a column of JSON, as text."""
+    assert name.isidentifier(), name
+    return _JsonText(document, literal_column(f"'{name}'"))
+
+
+def times_with(condition: Any) -> ColumnElement[int]:
+    """Return the number of rows of a group that meet the condition."""
+    return cast(func.coalesce(func.sum(case((condition, 1), else_=0)), 0), Integer)
+
+
+def share_succeeded(status: Any) -> ColumnElement[float]:
+    """Return the share of the rows of a group that succeeded."""
+    return cast(func.avg(case((status == TaskStatus.SUCCEEDED, 1.0), else_=0.0)), Double)
+
+
+def containing(text: str, *columns: Any) -> ColumnElement[bool]:
+    """Return the condition that one of the columns has the text, whatever its case."""
+    return or_(*(func.lower(cast(each, Text)).contains(text.lower(), autoescape=True) for each in columns))
+
+
+def limited(statement: _STATEMENT, limit: int | None) -> _STATEMENT:
+    """Return the select with at most this many rows. Raises `CallerError` for a number below 1."""
+    return statement if limit is None else statement.limit(checked_count("limit", limit))
+
+
+def checked_count(name: str, value: Any, most: int = 2**31) -> int:
+    """Return the value. Raises `CallerError` unless it is a whole number from 1 to `most`."""
+    if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= most:
+        raise CallerError(f"{name} must be a whole number from 1 to {most}, got {value!r}")
+    return value
+
+
+def checked_metres(name: str, value: Any) -> float:
+    """Return the value. Raises `CallerError` unless it is a finite number."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise CallerError(f"{name} must be a number of metres, got {value!r}")
+    return value
+
+
+def member_of(enum: type[E], value: E | str, what: str) -> str:
+    """Return the name of an enum's member. Raises `CallerError` with the nearest name for another text."""
+    name = value.name if isinstance(value, Enum) else value
+    if not isinstance(name, str):
+        raise CallerError(f"{what} must be a name or a member of {enum.__name__}, got {value!r}")
+    if name.upper() not in enum.__members__:
+        valid = ", ".join(enum.__members__)
+        raise CallerError(f"there is no {what} {name!r}{nearest(name, enum.__members__)} ({valid})")
+    return name.upper()

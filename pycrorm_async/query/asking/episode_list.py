@@ -1,0 +1,87 @@
+"""Choose episodes by status, start, tags, robot, text: for `memory.ask.episodes` and `pycrorm episodes` alike."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any
+
+from sqlalchemy import ColumnElement, Select, exists, or_, select
+
+from pycrorm_async.errors import CallerError
+from pycrorm_async.orm import EpisodeRobot, EpisodeTag, ProcessMetaData
+from pycrorm_async.query.asking.columns import containing, limited, member_of
+from pycrorm_async.task_status import TaskStatus
+
+__all__ = ["EpisodeChoice", "episode_list"]
+
+
+@dataclass(frozen=True)
+class EpisodeChoice:
+    """Conditions on episodes; those that are None do not count.
+
+    Attributes:
+        status: the name of a `TaskStatus`.
+        since: the earliest start, with a time zone.
+        tags: an episode has all of them.
+        robot: name or model of a robot that took part.
+        text: a part of the description, the plan's name or a tag.
+        limit: the newest of those that remain, at most this many.
+    """
+
+    status: str | None = None
+    since: datetime | None = None
+    tags: tuple[str, ...] = ()
+    robot: str | None = None
+    text: str | None = None
+    limit: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.since is not None and self.since.tzinfo is None:
+            raise CallerError(f"since has no time zone: {self.since.isoformat()}")
+        self.conditions()
+        limited(select(), self.limit)
+
+    def conditions(self) -> list[ColumnElement[bool]]:
+        """Return the conditions on `ProcessMetaData`, without the limit. Raises `CallerError` for a wrong status."""
+        episode, conditions = ProcessMetaData, []
+        if self.status is not None:
+            conditions.append(episode.status == member_of(TaskStatus, self.status, "status"))
+        if self.since is not None:
+            conditions.append(episode.created_at >= self.since)
+        conditions += [
+            exists().where(EpisodeTag.process_metadata_id == episode.id, EpisodeTag.tag == each) for each in self.tags
+        ]
+        if self.robot is not None:
+            robot = EpisodeRobot
+            named = or_(robot.name == self.robot, robot.model == self.robot)
+            conditions.append(exists().where(robot.process_metadata_id == episode.id, named))
+        if self.text is not None:
+            tagged = exists().where(EpisodeTag.process_metadata_id == episode.id, containing(self.text, EpisodeTag.tag))
+            conditions.append(or_(containing(self.text, episode.description, episode.plan), tagged))
+        return conditions
+
+    def newest(self) -> Select[*tuple[int]]:
+        """Return the select of the numbers of the chosen episodes."""
+        return limited(
+            select(ProcessMetaData.id).where(*self.conditions()).order_by(ProcessMetaData.id.desc()), self.limit
+        )
+
+
+def episode_list(choice: EpisodeChoice) -> Select[*tuple[Any, ...]]:
+    episode = ProcessMetaData
+    statement = select(
+        episode.id.label("episode"),
+        episode.uuid.label("id"),
+        episode.created_at.label("started_at"),
+        episode.ended_at,
+        episode.status,
+        episode.description,
+        episode.plan,
+        episode.created_by,
+        episode.world,
+        episode.failure_type,
+        episode.failure_message,
+        episode.continues,
+    )
+    return limited(statement.where(*choice.conditions()).order_by(episode.id.desc()), choice.limit)

@@ -1,0 +1,130 @@
+"""Selects about failures: where they began, their causes, and what was done before."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sqlalchemy import BigInteger, ColumnElement, Select, func, or_, select, type_coerce
+from sqlalchemy.orm import aliased
+
+from pycrorm_async.orm import RootFailure, TaskTreeNode
+from pycrorm_async.query.asking.columns import checked_count, containing, limited, times_with
+from pycrorm_async.query.asking.failure_words import classes_meant_by
+from pycrorm_async.query.asking.question import EpisodeNumber
+
+__all__ = ["failures_by_cause", "root_failures", "steps_before_failures"]
+
+
+def matching(
+    episode: EpisodeNumber | None,
+    *,
+    object: str | None,  # noqa: A002  the column's name
+    arm: str | None,
+    reason: str | None,
+    message: str | None,
+    text: str | None,
+    recovered: bool | None,
+) -> list[ColumnElement[bool]]:
+    """Return the conditions on `RootFailure`."""
+    failure = RootFailure
+    conditions: list[ColumnElement[bool]] = []
+    if episode is not None:
+        conditions.append(failure.process_metadata_id == episode)
+    if object is not None:
+        conditions.append(containing(object, failure.object))
+    if arm is not None:
+        conditions.append(failure.arm == arm.upper())
+    if reason is not None:
+        conditions.append(_is_reason(reason))
+    if message is not None:
+        conditions.append(containing(message, failure.message))
+    if text is not None:
+        columns = failure.object, failure.arm, failure.message, failure.dtype
+        # Words that mean a class together, as in "out of reach", count together.
+        words = [text] if classes_meant_by(text) else text.split()
+        conditions += [or_(containing(each, *columns), _is_reason(each)) for each in words]
+    if recovered is not None:
+        conditions.append(failure.recovered == recovered)
+    return conditions
+
+
+def _is_reason(words: str) -> ColumnElement[bool]:
+    classes = classes_meant_by(words)
+    named = containing(words, RootFailure.reason)
+    return or_(named, RootFailure.reason.in_(classes)) if classes else named
+
+
+def root_failures(episode: EpisodeNumber | None, limit: int | None, **search: Any) -> Select[*tuple[Any, ...]]:
+    failure = RootFailure
+    statement = select(
+        failure.process_metadata_id.label("episode"),
+        failure.sequence.label("sequence"),
+        failure.dtype,
+        failure.object,
+        failure.arm,
+        failure.reason,
+        failure.message,
+        failure.recovered,
+        failure.path,
+        failure.start_time.label("time"),
+        failure.id.label("node_id"),
+    )
+    return limited(statement.where(*matching(episode, **search)).order_by(failure.id), limit)
+
+
+def failures_by_cause(episode: EpisodeNumber | None, limit: int | None, **search: Any) -> Select[*tuple[Any, ...]]:
+    failure = RootFailure
+    causes = failure.reason, failure.dtype, failure.object
+    statement = (
+        select(
+            *causes,
+            func.count().label("times"),
+            times_with(failure.recovered).label("recovered"),
+            func.count(failure.process_metadata_id.distinct()).label("episodes"),
+            func.max(failure.start_time).label("last_time"),
+            func.min(failure.message).label("a_message"),
+        )
+        .where(*matching(episode, **search))
+        .group_by(*causes)
+        .order_by(func.count().desc(), *causes)
+    )
+    return limited(statement, limit)
+
+
+def steps_before_failures(
+    episode: EpisodeNumber | None, steps: int, limit: int | None, **search: Any
+) -> Select[*tuple[Any, ...]]:
+    failure, step, earlier = RootFailure, TaskTreeNode, aliased(TaskTreeNode)
+    # The nodes that had ended when the failed node started. Their ids are read backwards from that of the failed node.
+    latest = (
+        select(earlier.id)
+        .where(
+            earlier.process_metadata_id == failure.process_metadata_id,
+            earlier.id < failure.id,
+            earlier.kind.in_(("action", "motion")),
+            earlier.end_sequence < failure.sequence,
+        )
+        .order_by(earlier.id.desc())
+        .limit(checked_count("steps", steps, 100))
+        .correlate(failure)
+    )
+    number = func.row_number().over(partition_by=failure.id, order_by=step.id.desc())
+    statement = (
+        select(
+            failure.process_metadata_id.label("episode"),
+            failure.sequence.label("failure_sequence"),
+            failure.dtype.label("failed"),
+            failure.reason,
+            type_coerce(number, BigInteger).label("steps_before"),
+            step.sequence.label("sequence"),
+            step.dtype,
+            step.kind,
+            step.status,
+            step.duration.label("duration_s"),
+            step.id.label("node_id"),
+        )
+        .join(step, step.id.in_(latest))
+        .where(step.process_metadata_id == failure.process_metadata_id, *matching(episode, **search))
+        .order_by(failure.id, step.id.desc())
+    )
+    return limited(statement, limit)

@@ -1,0 +1,155 @@
+"""Selects about one object: all that happened to it, and the actions that moved it."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sqlalchemy import ColumnElement, Float, Select, Text, and_, case, cast, func, literal, null, select, union_all
+
+from pycrorm_async.orm import Attachment, Detection, JointChange, Object, ObjectRemoval, Pose, RootFailure, TaskTreeNode
+from pycrorm_async.query.asking.columns import limited
+from pycrorm_async.query.asking.question import EpisodeNumber
+
+__all__ = ["moves_of", "object_history"]
+
+_OBJECT, _POSE, _NODE = Object.__table__, Pose.__table__, TaskTreeNode.__table__
+
+
+def _is_named(column: Any, name: str) -> ColumnElement[bool]:
+    return func.lower(column) == name.lower()
+
+
+def _course(
+    table: Any,
+    sequence: Any,
+    what: Any,
+    *,
+    other: Any = None,
+    detail: Any = None,
+    value: Any = None,
+    place: Any = None,
+    node_id: Any = None,
+    time: Any = None,
+) -> Select[*tuple[Any, ...]]:
+    return select(
+        table.c.process_metadata_id.label("episode"),
+        sequence.label("sequence"),
+        (table.c.time if time is None else time).label("time"),
+        (literal(what, Text) if isinstance(what, str) else what).label("what"),
+        cast(null() if other is None else other, Text).label("other"),
+        cast(null() if detail is None else detail, Text).label("detail"),
+        cast(null() if value is None else value, Float).label("value"),
+        *(cast(null() if place is None else place.c[axis], Float).label(axis) for axis in "xyz"),
+        (table.c.node_id if node_id is None else node_id).label("node_id"),
+    )
+
+
+def _same(table: Any, id_: Any, other: Any) -> ColumnElement[bool]:
+    return and_(other.c.id == id_, other.c.process_metadata_id == table.c.process_metadata_id)
+
+
+def object_history(name: str, episode: EpisodeNumber | None, limit: int | None) -> Select[*tuple[Any, ...]]:
+    """Return what happened to the objects of this name, in the order of the events."""
+    attached, removed, joints = Attachment.__table__, ObjectRemoval.__table__, JointChange.__table__
+    seen, failed, other = Detection.__table__, RootFailure.__table__, _OBJECT.alias("other")
+    is_added = _OBJECT.c.id == _OBJECT.c.identity_id
+    begins = Attachment.kind == "attached"
+    courses = [
+        _course(_OBJECT, Object.sequence, case((is_added, "added"), else_="moved"), place=_POSE)
+        .outerjoin(_POSE, _same(_OBJECT, _OBJECT.c.pose_id, _POSE))
+        .where(_is_named(_OBJECT.c.name, name), _OBJECT.c.identity_id.is_not(None), _OBJECT.c.dtype == "Object"),
+        _course(attached, Attachment.sequence, attached.c.kind, other=other.c.name, detail=attached.c.link)
+        .join(_OBJECT, _same(attached, attached.c.child_id, _OBJECT))
+        .join(other, _same(attached, attached.c.parent_id, other))
+        .where(_is_named(_OBJECT.c.name, name)),
+        _course(
+            attached,
+            Attachment.sequence,
+            case((begins, "holds"), else_="releases"),
+            other=other.c.name,
+            detail=attached.c.link,
+        )
+        .join(_OBJECT, _same(attached, attached.c.parent_id, _OBJECT))
+        .join(other, _same(attached, attached.c.child_id, other))
+        .where(_is_named(_OBJECT.c.name, name)),
+        _course(removed, ObjectRemoval.sequence, "removed")
+        .join(_OBJECT, _same(removed, removed.c.object_id, _OBJECT))
+        .where(_is_named(_OBJECT.c.name, name)),
+        _course(joints, JointChange.sequence, "joint moved", detail=joints.c.joint, value=joints.c.position)
+        .join(_OBJECT, _same(joints, joints.c.object_id, _OBJECT))
+        .where(_is_named(_OBJECT.c.name, name)),
+        _course(seen, Detection.sequence, "detected", detail=seen.c.source, value=seen.c.confidence, place=seen).where(
+            _is_named(seen.c.name, name)
+        ),
+        _course(
+            failed,
+            RootFailure.sequence,
+            "an action failed",
+            detail=failed.c.reason,
+            node_id=failed.c.id,
+            time=failed.c.start_time,
+        ).where(_is_named(failed.c.object, name)),
+    ]
+    if episode is not None:
+        courses = [each.where(each.selected_columns.episode == episode) for each in courses]
+    course = union_all(*courses).subquery("course")
+    statement = (
+        select(*course.c[:-1], _NODE.c.dtype.label("by"), _NODE.c.status.label("status"), course.c.node_id)
+        .outerjoin(_NODE, and_(_NODE.c.id == course.c.node_id, _NODE.c.process_metadata_id == course.c.episode))
+        .order_by(course.c.episode, course.c.sequence, course.c.what, course.c.detail)
+    )
+    return limited(statement, limit)
+
+
+def moves_of(name: str, episode: EpisodeNumber | None, limit: int | None) -> Select[*tuple[Any, ...]]:
+    """Return each move of the objects of this name, the node that moved it, and the nearest action around that."""
+    by = _NODE.alias("by")
+    moved = select(
+        _OBJECT.c.id,
+        _OBJECT.c.process_metadata_id,
+        Object.sequence.label("sequence"),
+        _OBJECT.c.time,
+        _OBJECT.c.name,
+        _OBJECT.c.pose_id,
+        _OBJECT.c.node_id,
+    ).where(
+        _is_named(_OBJECT.c.name, name),
+        _OBJECT.c.id != _OBJECT.c.identity_id,
+        _OBJECT.c.dtype == "Object",
+    )
+    if episode is not None:
+        moved = moved.where(_OBJECT.c.process_metadata_id == episode)
+    moves = moved.cte("moves")
+    columns = ("id", "parent_id", "process_metadata_id", "kind", "dtype", "status")
+    up = (
+        select(moves.c.id.label("move"), *(by.c[each] for each in columns))
+        .join(by, and_(by.c.id == moves.c.node_id, by.c.process_metadata_id == moves.c.process_metadata_id))
+        .cte("up", recursive=True)
+    )
+    above = _NODE.alias("above")
+    up = up.union_all(
+        select(up.c.move, *(above.c[each] for each in columns)).where(
+            up.c.kind != "action",
+            above.c.id == up.c.parent_id,
+            above.c.process_metadata_id == up.c.process_metadata_id,
+        )
+    )
+    mover = _NODE.alias("mover")
+    statement = (
+        select(
+            moves.c.process_metadata_id.label("episode"),
+            moves.c.sequence,
+            moves.c.time,
+            moves.c.name.label("object"),
+            *(_POSE.c[axis] for axis in "xyz"),
+            mover.c.dtype.label("moved_by"),
+            up.c.dtype.label("action"),
+            up.c.status.label("action_status"),
+            up.c.id.label("action_id"),
+        )
+        .outerjoin(up, and_(up.c.move == moves.c.id, up.c.kind == "action"))
+        .outerjoin(mover, _same(moves, moves.c.node_id, mover))
+        .outerjoin(_POSE, _same(moves, moves.c.pose_id, _POSE))
+        .order_by(moves.c.id)
+    )
+    return limited(statement, limit)

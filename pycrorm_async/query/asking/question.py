@@ -1,0 +1,149 @@
+"""A named question: its select, its SQL, and its answer as a frame or as rows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Coroutine, Generator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
+
+from sqlalchemy import ColumnElement, Row, Select, func, select
+
+from pycrorm_async.errors import CallerError
+from pycrorm_async.hooks.episode import Episode
+from pycrorm_async.orm import ProcessMetaData
+from pycrorm_async.query.named_queries import EpisodeSummary
+
+if TYPE_CHECKING:
+    from pycrorm_async.query.frames.dataframe import Library
+    from pycrorm_async.query.reading import Reading
+
+__all__ = ["AskedEpisode", "EpisodeNumber", "Question", "QuestionPlan", "SyncQuestion"]
+
+T = TypeVar("T")
+
+AskedEpisode: TypeAlias = "int | str | Episode | EpisodeSummary"
+"""An episode by its number, its id or the first digits of it, `last`, or as an `Episode` or `EpisodeSummary`."""
+EpisodeNumber: TypeAlias = "int | ColumnElement[int]"
+"""The number of an episode, or an expression that finds it."""
+
+
+@dataclass(frozen=True)
+class QuestionPlan:
+    """What a question asks: its name, the episodes that it names, and how its select is made of their numbers."""
+
+    name: str
+    episodes: tuple[AskedEpisode, ...]
+    select_of: Callable[..., Select[*tuple[Any, ...]]]
+
+
+class Question:
+    """One question to a memory. Nothing is read until it is awaited.
+
+    >>> question = memory.ask.root_failures(object="milk", episode="last")
+    >>> print(question.sql)
+    >>> frame = await question
+    >>> polars = await question.frame(to="polars")
+    >>> for row in await question.rows():
+    ...     print(row.path, row.message)
+
+    Attributes:
+        name: of the method that made it.
+    """
+
+    def __init__(self, reading: Reading, plan: QuestionPlan) -> None:
+        self.name = plan.name
+        self._reading = reading
+        self._plan = plan
+
+    @property
+    def statement(self) -> Select[*tuple[Any, ...]]:
+        """The select, to change or to join: it finds the episodes that the question names by itself."""
+        return self._plan.select_of(*(_number_by_query(each) for each in self._plan.episodes))
+
+    @property
+    def sql(self) -> str:
+        """The statement in the SQL of this memory's database, with all values written out."""
+        dialect = self._reading.dialect
+        return str(self.statement.compile(dialect=dialect, compile_kwargs={"literal_binds": True}))
+
+    async def frame(self, *, to: Library = "pandas", simulated: bool = False) -> Any:
+        """Return the answer as a frame; see `Reading.dataframe`. Raises `UnknownEpisode`, `MissingExtra`."""
+        return await self._reading.dataframe(await self._resolved(), to=to, simulated=simulated)
+
+    async def rows(self, *, simulated: bool = False) -> list[Row[*tuple[Any, ...]]]:
+        """Return the answer as named tuples, which needs no extra. Raises `UnknownEpisode`."""
+        return await self._reading.rows(await self._resolved(), simulated=simulated)
+
+    def __await__(self) -> Generator[Any, Any, Any]:
+        return self.frame().__await__()
+
+    async def _resolved(self) -> Select[*tuple[Any, ...]]:
+        """Return the select for the numbers of the episodes, with which both databases plan better."""
+        numbers = [(await self._reading.episode(_named(each))).number for each in self._plan.episodes]
+        return self._plan.select_of(*numbers)
+
+    def __str__(self) -> str:
+        return self.sql
+
+    def __repr__(self) -> str:
+        return f"<question {self.name}: await it for a frame, print it for its SQL>"
+
+
+class SyncQuestion:
+    """One question to a memory of `Memory.sync`. Its methods may be called from any thread.
+
+    >>> frame = memory.ask.durations().frame()
+    """
+
+    def __init__(self, question: Question, run: Callable[[Coroutine[Any, Any, Any]], Any]) -> None:
+        self.name = question.name
+        self._question = question
+        self._run = run
+
+    @property
+    def statement(self) -> Select[*tuple[Any, ...]]:
+        """The select; see `Question.statement`."""
+        return self._question.statement
+
+    @property
+    def sql(self) -> str:
+        """The statement in the SQL of this memory's database, with all values written out."""
+        return self._question.sql
+
+    def frame(self, *, to: Library = "pandas", simulated: bool = False) -> Any:
+        """Return the answer as a frame; see `Question.frame`."""
+        return self._run(self._question.frame(to=to, simulated=simulated))
+
+    def rows(self, *, simulated: bool = False) -> list[Row[*tuple[Any, ...]]]:
+        """Return the answer as named tuples, which needs no extra."""
+        rows: list[Row[*tuple[Any, ...]]] = self._run(self._question.rows(simulated=simulated))
+        return rows
+
+    def __str__(self) -> str:
+        return self.sql
+
+    def __repr__(self) -> str:
+        return f"<question {self.name}: call frame() or rows(), print it for its SQL>"
+
+
+def _named(episode: AskedEpisode) -> str:
+    """Return the name by which `Reading.episode` finds it. Raises `CallerError` for another type."""
+    match episode:
+        case bool():
+            pass
+        case int() | str():
+            return str(episode)
+        case EpisodeSummary():
+            return episode.id
+        case Episode():
+            return str(episode)
+    raise CallerError(f"an episode is a number, an id, 'last', an Episode or an EpisodeSummary, not {episode!r}")
+
+
+def _number_by_query(episode: AskedEpisode) -> EpisodeNumber:
+    name, numbered = _named(episode), ProcessMetaData
+    if name == "last":
+        return select(func.max(numbered.id)).where(~numbered.simulated).scalar_subquery()
+    if name.isdecimal() and name.isascii():
+        return int(name)
+    return select(numbered.id).where(numbered.uuid.startswith(name.lower(), autoescape=True)).scalar_subquery()
