@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncGenerator, Callable
+from collections.abc import AsyncGenerator, Callable, Sequence
 from contextlib import AbstractAsyncContextManager
 from datetime import datetime
 from os import PathLike
@@ -13,6 +13,9 @@ from sqlalchemy.ext.asyncio import AsyncSession
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.blobs import Blob
+from pycrorm_async.export.export import Exported, FileFormat, Remade, export_again
+from pycrorm_async.export.export import export as write_export
+from pycrorm_async.export.selection import Exportable
 from pycrorm_async.hooks.episode import Episode
 from pycrorm_async.memory_parts import PartsHolder
 from pycrorm_async.plan.task_tree import TaskTreeNode
@@ -104,10 +107,13 @@ class ReadableMemory(PartsHolder):
         rows: int = BATCH_ROWS,
         simulated: bool = False,
         deferred: bool = False,
+        enums_as_text: bool = False,
     ) -> AsyncGenerator[pa.RecordBatch]:
         """Return the rows as a stream of Arrow record batches of at most `rows` rows; see `Reading.batches`."""
         reading = self._open_parts.reading
-        return reading.batches(statement, rows=rows, simulated=simulated, deferred=deferred)
+        return reading.batches(
+            statement, rows=rows, simulated=simulated, deferred=deferred, enums_as_text=enums_as_text
+        )
 
     @property
     def ask(self) -> Ask[Question]:
@@ -172,6 +178,30 @@ class ReadableMemory(PartsHolder):
         `view` are the size and the camera, see `pycrorm_async.query.scene.picture.picture`. It needs the extra `world`.
         """
         return await picture(self._open_parts.reading, episode, at=at, **view)
+
+    async def export(
+        self,
+        what: Exportable,
+        path: str | PathLike[str],
+        *,
+        file_format: FileFormat | None = None,
+        episodes: Sequence[str | int] = (),
+        force: bool = False,
+    ) -> Exported:
+        """Write episodes or rows to a file, up to the last flush; see `pycrorm_async.export.export.export`."""
+        reading = self._open_parts.reading
+        return await write_export(reading, what, path, file_format=file_format, episodes=episodes, force=force)
+
+    async def export_again(
+        self,
+        manifest: str | PathLike[str],
+        path: str | PathLike[str] | None = None,
+        *,
+        statement: Select[*tuple[Any, ...]] | None = None,
+        force: bool = False,
+    ) -> Remade:
+        """Make an export again from its manifest and compare; see `pycrorm_async.export.export.export_again`."""
+        return await export_again(self._open_parts.reading, manifest, path, statement=statement, force=force)
 
     async def blob(self, name: str) -> Blob | None:
         """Return the blob with this SHA-256, up to the last flush; None if it is not stored."""

@@ -90,6 +90,7 @@ _VERBS = (
     "show",
     "report",
     "picture",
+    "export",
     "events",
     "tag",
     "copy",

@@ -172,19 +172,23 @@ class Reading:
         rows: int = BATCH_ROWS,
         simulated: bool = False,
         deferred: bool = False,
+        enums_as_text: bool = False,
     ) -> AsyncGenerator[pa.RecordBatch]:
         """Yield the rows as Arrow record batches of one schema, so that a large answer needs no memory of its size.
 
         >>> async for batch in reading.batches(select(PickUpWithContextView)):
         ...     writer.write_batch(batch)
 
-        An answer without rows is one empty batch. Arguments and errors are those of `dataframe`.
+        An answer without rows is one empty batch. `enums_as_text` makes enum members plain text. Other arguments and
+        errors are those of `dataframe`.
         """
         await self._ready()
         with self._log.translated():
             async with (
                 self._connection(simulated=simulated) as connection,
-                aclosing(arrow_batches(connection, statement, rows=rows, deferred=deferred)) as batches,
+                aclosing(
+                    arrow_batches(connection, statement, rows=rows, deferred=deferred, enums_as_text=enums_as_text)
+                ) as batches,
             ):
                 async for batch in batches:
                     yield batch

@@ -40,6 +40,7 @@ TIDY, LIFTER, STEREO, CELLS = python_of("pycrorm_async/plan/README.md")
 COURSE, AROUND, ROBOTS, BEGAN, FRAMES, TAGGED, SEEN, THEN, AGAIN, RATE, TRIES = python_of(
     "pycrorm_async/query/README.md"
 )
+(EXPORTED,) = python_of("pycrorm_async/export/README.md")
 BETTER, ORIGINS = python_of("pycrorm_async/learning/README.md")
 
 
@@ -247,6 +248,15 @@ async def test_frames_and_batches_have_the_declared_types(tidied: Path, capsys: 
     assert table.num_rows > 0
     type_ = "dictionary<values=string, indices=int32, ordered=0>"
     assert capsys.readouterr().out == f"pyarrow.Field<obj_type: {type_}> {table.num_rows}\n"
+
+
+async def test_rows_are_exported_and_made_again(
+    tidied: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    await run_block(EXPORTED, tidied)
+    assert capsys.readouterr().out == "True ()\n"
+    assert (tmp_path / "mine.csv").read_text().startswith('"arm","relative_x"\n"')
 
 
 async def test_tags_are_given_changed_and_queried(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

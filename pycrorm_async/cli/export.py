@@ -1,0 +1,102 @@
+"""`pycrorm export` writes episodes and views to files in the formats of other programs."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
+from pycrorm_async.cli.output import note, print_json, stderr, stdout
+from pycrorm_async.cli.pending_events import note_pending_events
+from pycrorm_async.errors import CallerError
+from pycrorm_async.export.export import Exported, Remade, export_again
+from pycrorm_async.export.export import export as write_export
+from pycrorm_async.progress_bar import ProgressCallback, watched
+from pycrorm_async.query.reading import Reading
+
+__all__ = ["export"]
+
+
+def export(
+    what: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="EPISODE...|VIEW",
+            help="Episodes by number, id or `last`; or a view or table by name, such as PickUpWithContextView.",
+        ),
+    ] = None,
+    file_format: Annotated[
+        str | None, typer.Option("--format", help="parquet, csv or jsonl; default: the suffix of the file.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", metavar="PATH", help="The file to write.")] = None,
+    episode: Annotated[
+        list[str] | None,
+        typer.Option("--episode", metavar="EPISODE", help="Of a view: only the rows of this episode; repeatable."),
+    ] = None,
+    again: Annotated[
+        Path | None,
+        typer.Option(
+            "--again",
+            metavar="MANIFEST",
+            help="Make the export of this manifest again and compare; with --out, also write it there.",
+        ),
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace the file if it exists.")] = False,
+    url: UrlOption = DEFAULT_URL,
+    spool: SpoolOption = None,
+    as_json: JsonOption = False,
+) -> int:
+    """Write episodes, or the rows of a view, to a file, with a manifest from which it can be made again."""
+    if (again is None) == (not what):
+        raise CallerError("name what to export, for example `pycrorm export last --out last.parquet`, or --again")
+    if again is not None:
+        if file_format is not None or episode:
+            raise CallerError("--again takes format and episodes from the manifest: leave --format and --episode out")
+        return _again(again, out, url, spool, force=force, as_json=as_json)
+    assert what, "checked above"
+    target = out if out is not None else Path(f"{'-'.join(what)[:100]}.{file_format or 'parquet'}")
+    chosen: Any = file_format
+
+    async def write(progress: ProgressCallback | None) -> Exported:
+        async with Reading.open(url) as reading:
+            return await write_export(
+                reading, what, target, file_format=chosen, episodes=episode or (), force=force, progress=progress
+            )
+
+    with watched("exporting", unit="rows") as progress:
+        exported = asyncio.run(write(progress if stderr.is_terminal else None))
+    note_pending_events(url, spool)
+    _print(exported, as_json=as_json)
+    return 0
+
+
+def _again(manifest: Path, out: Path | None, url: str, spool: Path | None, *, force: bool, as_json: bool) -> int:
+    async def write(progress: ProgressCallback | None) -> Remade:
+        async with Reading.open(url) as reading:
+            return await export_again(reading, manifest, out, force=force, progress=progress)
+
+    with watched("exporting", unit="rows") as progress:
+        remade = asyncio.run(write(progress if stderr.is_terminal else None))
+    note_pending_events(url, spool)
+    if as_json:
+        print_json({"same": remade.same, "differences": remade.differences, "file": remade.exported and out})
+    else:
+        stdout.print("the same bytes" if remade.same else "not the same", markup=False)
+        for each in remade.differences:
+            stdout.print(f"  {each}", markup=False, highlight=False, soft_wrap=True)
+    return 0 if remade.same else 1
+
+
+def _print(exported: Exported, *, as_json: bool) -> None:
+    manifest = exported.manifest
+    if as_json:
+        counts = {"rows": exported.rows, "episodes": exported.episodes, "left_out": exported.left_out}
+        print_json({"file": exported.path, "format": manifest.file_format, **counts, "files": manifest.files})
+        return
+    stdout.print(str(exported.path), markup=False, highlight=False, soft_wrap=True)
+    note(f"It has {exported.rows:,} rows of {exported.episodes} episodes; {exported.path}.manifest.json describes it.")
+    if exported.left_out:
+        note(f"{exported.left_out} episodes are left out, because they run or are not in the tables yet.")

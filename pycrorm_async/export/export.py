@@ -1,0 +1,226 @@
+"""Export rows and episodes of a memory to a file, and make an export again from its manifest.
+
+>>> await export(reading, "PickUpWithContextView", "picks.parquet")
+Exported(path=PosixPath('picks.parquet'), rows=1204, episodes=30, left_out=0, manifest=...)
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Sequence
+from contextlib import aclosing
+from os import PathLike
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias, get_args
+
+import msgspec
+from sqlalchemy import Select, func, select
+from sqlalchemy.exc import CompileError
+
+from pycrorm_async.errors import CallerError
+from pycrorm_async.export.files import checksums, new_file, refuse_existing
+from pycrorm_async.export.manifest import Manifest, episode_differences, manifest_path, read_manifest, versions_of
+from pycrorm_async.export.row_files import RowFormat, write_rows
+from pycrorm_async.export.selection import CoveredEpisode, Exportable, Selection, select_rows
+from pycrorm_async.projections.schema.generations import PROJECTION_VERSION
+from pycrorm_async.query.frames.columns import columns_of
+from pycrorm_async.query.reading import Reading
+from pycrorm_async.query.suggestions import nearest
+
+if TYPE_CHECKING:
+    from pycrorm_async.progress_bar import ProgressCallback
+
+__all__ = ["Exported", "FileFormat", "Remade", "export", "export_again", "format_of"]
+
+FileFormat: TypeAlias = Literal["parquet", "csv", "jsonl"]
+
+
+class Exported(NamedTuple):
+    """A written export.
+
+    Attributes:
+        path: of the file.
+        rows: number of rows.
+        episodes: number of episodes that it covers.
+        left_out: number of episodes that run, or are not in the tables yet, and of which it therefore has no rows.
+        manifest: the description, which is in the file `PATH.manifest.json`.
+    """
+
+    path: Path
+    rows: int
+    episodes: int
+    left_out: int
+    manifest: Manifest
+
+
+class Remade(NamedTuple):
+    """An export that was made again: whether its files have the same bytes, and one line for each other difference."""
+
+    same: bool
+    differences: tuple[str, ...]
+    exported: Exported | None
+
+
+def format_of(path: Path) -> FileFormat:
+    """Return the format that the suffix of a file names. Raises `CallerError`."""
+    suffix = path.suffix.removeprefix(".").lower()
+    for each in get_args(FileFormat):
+        if suffix == each:
+            return each  # type: ignore[no-any-return]
+    raise CallerError(f"the suffix of {path} names no format: add --format (file_format=), one of {_listed()}")
+
+
+def _listed() -> str:
+    return ", ".join(get_args(FileFormat))
+
+
+async def export(
+    reading: Reading,
+    what: Exportable,
+    path: str | PathLike[str],
+    *,
+    file_format: FileFormat | None = None,
+    episodes: Sequence[str | int] = (),
+    force: bool = False,
+    progress: ProgressCallback | None = None,
+) -> Exported:
+    """Write rows to a file that has its name only when it is complete, and its manifest beside it.
+
+    Args:
+        what: an episode or several (a row for each node), by number, id or `last`; a view or table by name, or a mapped
+            class, of all episodes that have ended; or a select.
+        path: of the file.
+        file_format: `parquet`, `csv` or `jsonl`; by default that of the suffix.
+        episodes: limit a view to these.
+        force: replace the file if it exists.
+        progress: gets the number of rows done and of all.
+
+    Raises `CallerError` if the file exists, if nothing has this name, or for a running episode; `UnknownEpisode`;
+    `MissingExtra`; `OSError` if the disk is full, and then leaves no file.
+    """
+    target = Path(path)
+    refuse_existing(target, force=force)
+    chosen = file_format or format_of(target)
+    if chosen not in get_args(FileFormat):
+        raise CallerError(f"there is no format {chosen!r}{nearest(chosen, get_args(FileFormat))}; formats: {_listed()}")
+    selection = await select_rows(reading, what, episodes)
+    with new_file(manifest_path(target), force=True) as described, new_file(target, force=force) as written:
+        manifest = await _write_rows(reading, selection, written, chosen, progress)
+        manifest = msgspec.structs.replace(manifest, files={target.name: checksums(written)[written.name]})
+        described.write_bytes(msgspec.json.format(msgspec.json.encode(manifest), indent=1) + b"\n")
+    return Exported(target, manifest.rows, len(manifest.episodes), selection.left_out, manifest)
+
+
+async def export_again(
+    reading: Reading,
+    manifest: str | PathLike[str],
+    path: str | PathLike[str] | None = None,
+    *,
+    statement: Select[*tuple[Any, ...]] | None = None,
+    force: bool = False,
+    progress: ProgressCallback | None = None,
+) -> Remade:
+    """Make an export again from the episodes that its manifest names, and compare.
+
+    Args:
+        manifest: the file `PATH.manifest.json`.
+        path: of the new file; by default the export is only compared.
+        statement: the select, for an export of one.
+
+    If episodes are missing, nothing is made and `differences` says so. Raises as `export` does.
+    """
+    before = read_manifest(Path(manifest))
+    log = await reading.log()
+    rows, digests = await log.episodes(), await log.last_digests()
+    present = {
+        each.id: CoveredEpisode(
+            each.number, each.id, "", each.head, digests[each.number].digest if each.number in digests else None
+        )
+        for each in rows
+    }
+    differences = episode_differences(before.episodes, present)
+    if any(each.id not in present for each in before.episodes):
+        return Remade(same=False, differences=tuple(differences), exported=None)
+    what, episodes = _named_by(before, statement)
+    with tempfile.TemporaryDirectory(prefix="pycrorm-export-") as folder:
+        target = Path(path) if path is not None else Path(folder, next(iter(before.files)))
+        file_format: Any = before.file_format
+        made = await export(
+            reading, what, target, file_format=file_format, episodes=episodes, force=force, progress=progress
+        )
+    now = made.manifest
+    differences += _changes("version of", before.versions, now.versions)
+    differences += _changes("type of the column", before.columns, now.columns)
+    if before.tables != now.tables:
+        differences.append(f"version of the tables: {now.tables} instead of {before.tables}")
+    if before.rows != now.rows:
+        differences.append(f"rows: {now.rows} instead of {before.rows}")
+    same = [*before.files.values()] == [*now.files.values()]
+    return Remade(same, tuple(differences), made if path is not None else None)
+
+
+def _named_by(manifest: Manifest, statement: Select[*tuple[Any, ...]] | None) -> tuple[Exportable, tuple[str, ...]]:
+    """Return what the manifest names, and the episodes to limit it to."""
+    ids = tuple(each.id for each in manifest.episodes)
+    match manifest.kind:
+        case "episodes":
+            return ids, ()
+        case "view":
+            return manifest.names[0], ids
+    if statement is None:
+        raise CallerError(
+            "this is the export of a program's own select: call `await memory.export_again(manifest, statement=...)`"
+        )
+    return statement, ()
+
+
+def _changes(what: str, before: dict[str, str], now: dict[str, str]) -> list[str]:
+    names = [name for name in before | now if before.get(name) != now.get(name)]
+    return [f"{what} {name}: {now.get(name, 'none')} instead of {before.get(name, 'none')}" for name in names]
+
+
+async def _write_rows(
+    reading: Reading, selection: Selection, path: Path, file_format: RowFormat, progress: ProgressCallback | None
+) -> Manifest:
+    log = await reading.log()
+    columns = columns_of(selection.statement, deferred=True)
+    plain = selection.statement.with_only_columns(*(each.expression for each in columns))
+    total = 0
+    if progress is not None:
+        counted = await reading.dataframe(
+            select(func.count().label("rows")).select_from(plain.order_by(None).subquery()),
+            to="arrow",
+            simulated=selection.simulated,
+        )
+        total = counted.column("rows")[0].as_py()
+    stream = reading.batches(
+        selection.statement, simulated=selection.simulated, deferred=True, enums_as_text=file_format == "csv"
+    )
+    async with aclosing(stream) as batches:
+        json_columns = frozenset(each.name for each in columns if each.kind == "json")
+        rows, schema = await write_rows(batches, path, file_format, json_columns, _reporting(progress, total))
+    return Manifest(
+        kind=selection.kind,
+        names=(selection.name,) if selection.name else tuple(each.id for each in selection.episodes),
+        file_format=file_format,
+        query=_sql(plain, log.engine.dialect),
+        columns={each.name: str(each.type) for each in schema},
+        rows=rows,
+        versions=versions_of(("pyarrow",)),
+        tables=PROJECTION_VERSION,
+        memory=log.log_id,
+        episodes=selection.episodes,
+        files={},
+    )
+
+
+def _reporting(progress: ProgressCallback | None, total: int) -> Callable[[int], object]:
+    return lambda rows: progress(rows, total) if progress is not None else None
+
+
+def _sql(statement: Select[*tuple[Any, ...]], dialect: Any) -> str:
+    """Return the SQL, with the parameters as literals if they have a literal form."""
+    try:
+        return str(statement.compile(dialect=dialect, compile_kwargs={"literal_binds": True}))
+    except (CompileError, NotImplementedError):
+        return str(statement.compile(dialect=dialect))

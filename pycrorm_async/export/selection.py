@@ -1,0 +1,205 @@
+"""Resolve what to export: episodes, a view or table of the memory, or a select; and which episodes it covers.
+
+Rows come from episodes that have ended and are visible in the tables to their last event, so that the same export can
+be made again. Those of a view are ordered by its key.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, TypeAlias
+
+import msgspec
+from sqlalchemy import ColumnElement, Select, column, inspect, or_, select, table
+from sqlalchemy.orm import Mapper
+
+from pycrorm_async.errors import CallerError
+from pycrorm_async.orm import Base, Designator, ProcessMetaData, TaskTreeNode
+from pycrorm_async.orm.base import EPISODE, same_row
+from pycrorm_async.query.reading import Reading
+from pycrorm_async.query.suggestions import nearest
+
+__all__ = ["CoveredEpisode", "Exportable", "Selection", "episodes_named", "select_rows"]
+
+Exportable: TypeAlias = "str | int | type | Sequence[str | int] | Select[*tuple[Any, ...]]"
+"""An episode or several, by number, id or `last`; a view or table by name; a mapped class; a select."""
+
+_ID_DIGITS = frozenset("0123456789abcdef-")
+
+
+class CoveredEpisode(msgspec.Struct, frozen=True):
+    """An episode whose events an export covers: number and id, events, and the digest of them if the log keeps it."""
+
+    number: int
+    id: str
+    status: str
+    events: int
+    digest: str | None
+
+
+@dataclass(frozen=True)
+class Selection:
+    """The rows to export.
+
+    Attributes:
+        kind, name: `episodes`, `view` or `select`; of a view its name.
+        statement: the select.
+        episodes: those that it covers, by number; of an own select all that the memory has.
+        simulated: whether simulations are among them.
+        left_out: the number of episodes without all their rows yet.
+    """
+
+    kind: str
+    name: str
+    statement: Select[*tuple[Any, ...]]
+    episodes: tuple[CoveredEpisode, ...]
+    simulated: bool = False
+    left_out: int = 0
+
+
+class _Covered(NamedTuple):
+    episodes: tuple[CoveredEpisode, ...]
+    simulated: bool
+
+
+async def episodes_named(
+    reading: Reading, names: Iterable[str], *, running: bool = False
+) -> tuple[CoveredEpisode, ...]:
+    """Return these episodes, each once, by number.
+
+    Raises `UnknownEpisode`; `CallerError` for one that has not ended, without `running`.
+    """
+    return (await _named(reading, names, running=running)).episodes
+
+
+async def select_rows(reading: Reading, what: Exportable, episodes: Sequence[str | int] = ()) -> Selection:
+    """Return the selection that `what` names; `episodes` limits a view to these.
+
+    Raises `CallerError` for a name that nothing has, with the nearest ones, for `episodes` beside something that is not
+    a view, and for an episode that has not ended; `UnknownEpisode`.
+    """
+    await reading.refresh()
+    chosen = [str(each) for each in episodes]
+    if isinstance(what, Select):
+        if chosen:
+            raise CallerError("a select of your own chooses its episodes itself: add a condition to it")
+        covered, left_out = await _complete(reading)
+        return Selection("select", "", what, covered, left_out=left_out)
+    if isinstance(what, type):
+        what = what.__name__
+    names = [str(what)] if isinstance(what, str | int) else [str(each) for each in what]
+    views = await _views(reading)
+    if len(names) == 1 and names[0] in views:
+        return await _view(reading, names[0], views[names[0]], chosen)
+    for each in names:
+        if not _may_be_episode(each):
+            raise CallerError(f"the memory has no episode, view or table {each!r}{nearest(each, views)}")
+    if chosen:
+        raise CallerError("episodes are exported whole: name them all instead of choosing among them")
+    of_names = await _named(reading, names)
+    node, designator = TaskTreeNode, Designator.__table__.alias("performed")
+    statement = (
+        select(node, designator.c.parameters)
+        .outerjoin(designator, same_row(designator, node.__table__))
+        .where(_among(node.process_metadata_id, of_names.episodes))
+        .order_by(node.id)
+    )
+    return Selection("episodes", "", statement, of_names.episodes, of_names.simulated)
+
+
+async def _view(reading: Reading, name: str, mapper: Mapper[Any] | None, chosen: Sequence[str]) -> Selection:
+    """Return the rows of a view, of a mapped class if it has one."""
+    statement: Select[*tuple[Any, ...]]
+    if mapper is not None:
+        class_ = mapper.class_
+        keys = [getattr(class_, mapper.get_property_by_column(each).key) for each in mapper.primary_key]
+        statement = select(class_).order_by(*keys)
+        episode = class_.id if class_ is ProcessMetaData else getattr(class_, EPISODE, None)
+    else:
+        log = await reading.log()
+        async with log.reading() as connection:
+            columns = await connection.run_sync(lambda each: inspect(each).get_columns(name))
+        rows = table(name, *(column(each["name"], each["type"]) for each in columns))
+        statement, episode = select(rows).order_by(*rows.c), rows.c.get(EPISODE)
+    if episode is None:
+        if chosen:
+            raise CallerError(f"the rows of {name} are of no episode: export all of them")
+        return Selection("view", name, statement, ())
+    if chosen:
+        of_names = await _named(reading, chosen)
+        condition = _among(episode, of_names.episodes)
+        return Selection("view", name, statement.where(condition), of_names.episodes, of_names.simulated)
+    covered, left_out = await _complete(reading)
+    return Selection("view", name, statement.where(_among(episode, covered)), covered, left_out=left_out)
+
+
+async def _views(reading: Reading) -> dict[str, Mapper[Any] | None]:
+    """Return the mapper of each view by the view's and the class's name; None for a view that no class maps."""
+    log = await reading.log()
+    async with log.reading() as connection:
+        names = await connection.run_sync(lambda each: inspect(each).get_view_names())
+    mappers: dict[str, Mapper[Any] | None] = dict.fromkeys(names)
+    built_in = {each.local_table.description: each for each in Base.registry.mappers}
+    for name in names:
+        mapper = built_in.get(name)
+        if mapper is None:
+            try:
+                mapper = inspect(reading.mapped(name))
+            except CallerError:
+                continue
+        mappers[name] = mappers[mapper.class_.__name__] = mapper
+    return mappers
+
+
+async def _complete(reading: Reading) -> tuple[tuple[CoveredEpisode, ...], int]:
+    """Return the episodes that have ended and are in the tables to their last event; and the number of others."""
+    log = await reading.log()
+    rows = {each.number: each for each in await log.episodes() if each.head}
+    episode = ProcessMetaData
+    async with reading.session() as session:
+        statuses = (await session.execute(select(episode.id, episode.status))).all()
+    ended = {
+        number: status
+        for number, status in statuses
+        if number in rows and rows[number].ended_wall_ns is not None and rows[number].folded == rows[number].head
+    }
+    return await _covered(reading, ended), len(statuses) - len(ended)
+
+
+async def _named(reading: Reading, names: Iterable[str], *, running: bool = False) -> _Covered:
+    summaries = {each.number: each for each in [await reading.episode(name) for name in names]}
+    for number, each in summaries.items():
+        if each.status == "RUNNING" and not running:
+            raise CallerError(f"episode {number} is still running, so its rows change: export it when it has ended")
+    covered = await _covered(reading, {number: each.status for number, each in summaries.items()})
+    return _Covered(covered, any(each.simulated for each in summaries.values()))
+
+
+async def _covered(reading: Reading, statuses: dict[int, str]) -> tuple[CoveredEpisode, ...]:
+    log = await reading.log()
+    rows = {each.number: each for each in await log.episodes()}
+    digests = {
+        number: each for number, each in (await log.last_digests()).items() if each.sequence == rows[number].head
+    }
+    return tuple(
+        CoveredEpisode(
+            number, rows[number].id, status, rows[number].head, digests[number].digest if number in digests else None
+        )
+        for number, status in sorted(statuses.items())
+    )
+
+
+def _among(episode: Any, covered: Sequence[CoveredEpisode]) -> ColumnElement[bool]:
+    """Return the condition that a row is of one of these episodes, as ranges, because most numbers have no gaps."""
+    ranges: list[list[int]] = []
+    for each in covered:
+        if ranges and ranges[-1][1] == each.number - 1:
+            ranges[-1][1] = each.number
+        else:
+            ranges.append([each.number, each.number])
+    return or_(*(episode.between(*each) for each in ranges)) if ranges else episode < 0
+
+
+def _may_be_episode(name: str) -> bool:
+    return name == "last" or name.isdigit() or (len(name) >= 4 and set(name.lower()) <= _ID_DIGITS)

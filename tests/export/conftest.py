@@ -1,0 +1,83 @@
+"""Fixtures of the export's tests: one memory with real episodes, which the tests only read."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import pytest
+from sqlalchemy import func, select
+
+from pycrorm_async import Memory, Reading, UserView
+from pycrorm_async.cli.demo import kitchen_world
+from pycrorm_async.orm import TaskTreeNode
+from pycrorm_async.plan import (
+    NavigateAction,
+    ObjectDesignatorDescription,
+    ParkArmsAction,
+    PickUpAction,
+    PlanFailure,
+    TransportAction,
+    simulated_robot,
+)
+from pycrorm_async.settings import Settings
+from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose
+
+LONGEST = UserView(
+    "longest", select(TaskTreeNode.dtype, func.max(TaskTreeNode.duration).label("s")).group_by(TaskTreeNode.dtype)
+)
+
+
+async def breakfast(*, fails: bool) -> None:
+    """Bring the milk, after two pick-ups that fail, or without them."""
+    with BulletWorld(), simulated_robot:
+        kitchen_world()
+        milk = ObjectDesignatorDescription(names=["milk"])
+        await ParkArmsAction([Arms.BOTH]).resolve().perform()
+        for arm in (Arms.RIGHT, Arms.LEFT) if fails else ():
+            try:
+                await PickUpAction(milk, [arm], [Grasp.FRONT]).resolve().perform()
+            except PlanFailure:
+                continue
+        await TransportAction(milk, [Arms.LEFT], [Pose([1.3, 0.45, 0.9])]).resolve().perform()
+
+
+async def drive() -> None:
+    """Drive the courier, whose joints are not those of the PR2."""
+    with BulletWorld(), simulated_robot:
+        Object("courier", ObjectType.ROBOT)
+        await NavigateAction([Pose([1, 0.5, 0])]).resolve().perform()
+
+
+async def nothing() -> None:
+    """Move an object without a robot."""
+    with BulletWorld():
+        Object("milk", ObjectType.MILK, pose=Pose([1, 0, 1])).set_pose(Pose([2, 0, 1]))
+
+
+async def _record(url: str) -> None:
+    async with Memory.open(url, settings=Settings(sample_interval_ms=1), views=[LONGEST]) as memory:
+        for name, plan in (
+            ("fails", breakfast(fails=True)),
+            ("succeeds", breakfast(fails=False)),
+            ("courier", drive()),
+            ("no robot", nothing()),
+        ):
+            async with memory.episode(description=name):
+                await plan
+        await memory.flush()
+
+
+@pytest.fixture(scope="session")
+def kitchen(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the folder of a memory: episode 1 has failures, 2 has none, 3 is a courier's, 4 has no robot."""
+    folder = tmp_path_factory.mktemp("kitchen")
+    asyncio.run(_record(f"sqlite:///{folder}/pycrorm.db"))
+    return folder
+
+
+@pytest.fixture
+async def reading(kitchen: Path) -> AsyncIterator[Reading]:
+    async with Reading.open(f"sqlite:///{kitchen}/pycrorm.db") as opened:
+        yield opened

@@ -1,0 +1,239 @@
+"""Exports of rows as Parquet, CSV and JSON lines, and their manifests."""
+
+from __future__ import annotations
+
+import csv
+import json
+import resource
+import sys
+from collections.abc import AsyncIterator, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pandas as pd
+import pyarrow as pa
+import pytest
+from pyarrow import parquet
+from sqlalchemy import Integer, func, select, true, type_coerce
+from sqlalchemy.orm import aliased
+
+from pycrorm_async import Memory, Reading
+from pycrorm_async.errors import CallerError, MissingExtra, UnknownEpisode
+from pycrorm_async.export.export import export, export_again
+from pycrorm_async.export.manifest import read_manifest
+from pycrorm_async.orm import PickUpWithContextView, RootFailure, TaskTreeNode
+from tests.commands import one_line_of, pycrorm
+from tests.databases import run_in_own_loop
+from tests.projections.event_script import NAVIGATE, PICK_UP, SAYING, declarations
+from tests.projections.factories import append_and_fold
+from tests.query.test_reading import episode
+
+ID = "00000000-0000-7000-8000-000000000002"
+DISK_BYTES = 40_000
+"""More than SQLite's own files need."""
+ONE, OTHER = aliased(TaskTreeNode), aliased(TaskTreeNode)
+NOISE = type_coerce(func.random(), Integer())
+LARGE = select(ONE.dtype, *(NOISE.label(f"noise{n}") for n in range(4))).join(OTHER, true())
+
+
+@pytest.fixture(scope="module")
+def scripted(module_database_url: str) -> str:
+    """Return the URL of a memory in which episode 1 still runs and episode 2 has ended."""
+    records = [*declarations(NAVIGATE, PICK_UP, SAYING), *episode(1).records, *episode(2).records]
+    run_in_own_loop(append_and_fold(module_database_url, records))
+    return module_database_url
+
+
+@pytest.fixture
+async def either(scripted: str) -> AsyncIterator[Reading]:
+    async with Reading.open(scripted) as opened:
+        yield opened
+
+
+@contextmanager
+def files_of_at_most(size: int) -> Iterator[None]:
+    """Let every file of this process that grows beyond `size` bytes fail, as a full disk does."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+async def test_files_of_an_episode_with_failures_and_of_one_without_have_one_schema(
+    reading: Reading, tmp_path: Path
+) -> None:
+    for name in ("1", "2", "4"):
+        await export(reading, name, tmp_path / f"{name}.parquet")
+        await export(reading, RootFailure, tmp_path / f"{name}.failures.parquet", episodes=[name])
+    for suffix in ("parquet", "failures.parquet"):
+        first, *others = [parquet.read_schema(tmp_path / f"{name}.{suffix}") for name in ("1", "2", "4")]
+        assert all(each.equals(first, check_metadata=True) for each in others)
+    reasons = pd.read_parquet([tmp_path / "1.parquet", tmp_path / "2.parquet"]).groupby("process_metadata_id").reason
+    assert reasons.count().to_dict()[2] == 0 < reasons.count().to_dict()[1]
+    assert parquet.read_metadata(tmp_path / "2.failures.parquet").num_rows == 0
+
+
+async def test_every_format_has_the_rows_of_the_frame(either: Reading, tmp_path: Path) -> None:
+    view = PickUpWithContextView
+    condition = view.process_metadata_id == 2
+    frame = await either.dataframe(select(view).where(condition), deferred=True)
+    for name in ("rows.parquet", "rows.csv", "rows.jsonl"):
+        exported = await export(either, "PickUpWithContextView", tmp_path / name)
+        assert (exported.rows, exported.episodes, exported.left_out) == (1, 1, 1)
+    table = parquet.read_table(tmp_path / "rows.parquet")
+    assert table.schema.field("arm").type == pa.dictionary(pa.int32(), pa.string())
+    enums = dict.fromkeys(("arm", "grasp", "obj_type", "status"), "str")
+    pd.testing.assert_frame_equal(table.to_pandas().astype(enums), frame)
+    pd.testing.assert_frame_equal(pd.read_csv(tmp_path / "rows.csv"), frame, check_dtype=False)
+    with (tmp_path / "rows.csv").open(newline="") as file:
+        (row,) = csv.DictReader(file)
+    assert {name: row[name] for name in ("arm", "relative_x", "description")} == {
+        "arm": "LEFT", "relative_x": "-0.5", "description": "episode 2",
+    }  # fmt: skip
+    (line,) = (tmp_path / "rows.jsonl").read_text().splitlines()
+    assert {name: each for name, each in json.loads(line).items() if each is not None} == frame.loc[
+        0
+    ].dropna().to_dict()
+
+
+async def test_json_columns_are_values_in_json_lines_and_text_elsewhere(either: Reading, tmp_path: Path) -> None:
+    await export(either, "2", tmp_path / "episode.jsonl")
+    nodes = [json.loads(line) for line in (tmp_path / "episode.jsonl").read_text().splitlines()]
+    assert [(each["dtype"], each["status"]) for each in nodes] == [
+        (None, "SUCCEEDED"), ("NavigateAction", "SUCCEEDED"), ("SayingAction", "SUCCEEDED"), ("PickUpAction", "FAILED"),
+    ]  # fmt: skip
+    assert nodes[2]["parameters"] == {"text": "hi"}
+    assert nodes[0]["start_time"] == "2023-11-14T22:13:22Z"
+    await export(either, "2", tmp_path / "episode.csv")
+    assert pd.read_csv(tmp_path / "episode.csv").parameters[2] == '{"text":"hi"}'
+
+
+async def test_the_manifest_makes_the_same_bytes_again(reading: Reading, tmp_path: Path) -> None:
+    for name, what in (("view.parquet", "PickUpWithContextView"), ("nodes.jsonl", ["2", "1"]), ("all.csv", "action")):
+        exported = await export(reading, what, tmp_path / name)
+        remade = await export_again(reading, tmp_path / f"{name}.manifest.json", tmp_path / f"again-{name}")
+        assert (remade.same, remade.differences) == (True, ())
+        assert (tmp_path / name).read_bytes() == (tmp_path / f"again-{name}").read_bytes()
+        assert exported.manifest == read_manifest(tmp_path / f"{name}.manifest.json")
+        compared = await export_again(reading, tmp_path / f"{name}.manifest.json")
+        assert (compared.same, compared.exported) == (True, None)
+    assert len(list(tmp_path.iterdir())) == 12
+    own = select(TaskTreeNode.dtype).order_by(TaskTreeNode.id)
+    await export(reading, own, tmp_path / "own.csv")
+    with pytest.raises(CallerError, match="a program's own select"):
+        await export_again(reading, tmp_path / "own.csv.manifest.json")
+    assert (await export_again(reading, tmp_path / "own.csv.manifest.json", statement=own)).same
+
+
+async def test_what_differs_from_the_manifest_is_named(either: Reading, tmp_path: Path) -> None:
+    await export(either, "2", tmp_path / "nodes.csv")
+    file = tmp_path / "nodes.csv.manifest.json"
+    text = file.read_text()
+    cases = {
+        '"events": 11': (
+            '"events": 12',
+            f"episode 2 ({ID}) has 11 events instead of 12",
+        ),
+        '"pyarrow": "': ('"pyarrow": "0.', f"version of pyarrow: {pa.__version__} instead of 0.{pa.__version__}"),
+        '"kind": "string"': ('"kind": "int64"', "type of the column kind: string instead of int64"),
+    }
+    for old, (new, line) in cases.items():
+        file.write_text(text.replace(old, new))
+        assert (await export_again(either, file)).differences == (line,)
+    file.write_text(text.replace("8000-000000000002", "8000-000000000009"))
+    remade = await export_again(either, file)
+    assert not remade.same
+    assert remade.differences == (f"episode 2 ({ID[:-1]}9) is not in this memory",)
+    for broken in ("{}", "not json"):
+        file.write_text(broken)
+        with pytest.raises(CallerError, match="is no manifest of an export"):
+            await export_again(either, file)
+
+
+async def test_a_view_of_a_user_and_a_select_are_exported(reading: Reading, tmp_path: Path) -> None:
+    assert (await export(reading, "longest", tmp_path / "longest.csv")).rows > 5
+    assert [*pd.read_csv(tmp_path / "longest.csv")] == ["dtype", "s"]
+    await export(reading, "concept", tmp_path / "concepts.parquet")
+    assert {"name", "parent"} <= {*parquet.read_schema(tmp_path / "concepts.parquet").names}
+
+
+async def test_a_full_disk_leaves_no_file(reading: Reading, tmp_path: Path) -> None:
+    for name in ("a.parquet", "a.csv", "a.jsonl"):
+        with files_of_at_most(DISK_BYTES), pytest.raises(OSError, match="File too large"):
+            await export(reading, LARGE, tmp_path / name)
+    assert list(tmp_path.iterdir()) == []
+
+
+async def test_a_file_is_replaced_only_when_asked(reading: Reading, tmp_path: Path) -> None:
+    file = tmp_path / "mine.csv"
+    file.write_text("mine")
+    with pytest.raises(CallerError, match=r"mine.csv exists: add --force"):
+        await export(reading, "1", file)
+    assert [each.name for each in tmp_path.iterdir()] == ["mine.csv"]
+    with files_of_at_most(DISK_BYTES), pytest.raises(OSError, match="File too large"):
+        await export(reading, LARGE, file, force=True)
+    assert file.read_text() == "mine"
+    await export(reading, "1", file, force=True)
+    assert file.read_text().startswith('"id"')
+
+
+async def test_a_running_episode_is_refused_by_name_and_left_out_of_a_view(either: Reading, tmp_path: Path) -> None:
+    with pytest.raises(CallerError, match="episode 1 is still running, so its rows change"):
+        await export(either, "1", tmp_path / "a.csv")
+    exported = await export(either, "task_tree_node", tmp_path / "a.csv")
+    assert (exported.rows, exported.left_out) == (4, 1)
+
+
+@pytest.mark.parametrize(
+    ("what", "episodes", "name", "error", "message"),
+    [
+        ("PickUpWithContextVeiw", (), "a.csv", CallerError, "did you mean PickUpWithContextView?"),
+        ("99", (), "a.csv", UnknownEpisode, "there is no episode '99'"),
+        ("PickUpWithContextView", ("99",), "a.csv", UnknownEpisode, "there is no episode '99'"),
+        ("concept", ("2",), "a.csv", CallerError, "the rows of concept are of no episode"),
+        ("2", ("2",), "a.csv", CallerError, "episodes are exported whole"),
+        ("2", (), "a.xlsx", CallerError, r"names no format: add --format .* one of parquet, csv, jsonl"),
+        ("2", (), "none/a.csv", CallerError, "none does not exist: create it first"),
+    ],
+)
+async def test_mistakes_are_named_and_leave_no_file(
+    either: Reading, tmp_path: Path, what: str, episodes: tuple[str, ...], name: str, error: type, message: str
+) -> None:
+    with pytest.raises(error, match=message):
+        await export(either, what, tmp_path / name, episodes=episodes)
+    assert list(tmp_path.iterdir()) == []
+
+
+async def test_without_pyarrow_the_error_names_the_extra(
+    either: Reading, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(MissingExtra, match=r"pip install 'pycrorm-async\[frames\]'"):
+        await export(either, "2", tmp_path / "a.csv")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.slow
+def test_the_command_writes_compares_and_names_mistakes_in_one_line(kitchen: Path, tmp_path: Path) -> None:
+    done = pycrorm("export", "1", "2", "--out", tmp_path / "both.parquet", "--json", cwd=kitchen)
+    assert done.returncode == 0, done.stderr
+    answer = json.loads(done.stdout)
+    assert (answer["format"], answer["episodes"], [*answer["files"]]) == ("parquet", 2, ["both.parquet"])
+    done = pycrorm("export", "--again", tmp_path / "both.parquet.manifest.json", cwd=kitchen)
+    assert (done.returncode, done.stdout) == (0, "the same bytes\n")
+    done = pycrorm("export", "1", "--out", tmp_path / "both.parquet", cwd=kitchen)
+    assert (done.returncode, "exists: add --force" in one_line_of(done)) == (2, True)
+    done = pycrorm("export", cwd=kitchen)
+    assert (done.returncode, one_line_of(done)[:32]) == (2, "pycrorm: name what to export, fo")
+
+
+async def test_an_empty_memory_has_views_without_rows_and_no_episode(tmp_path: Path) -> None:
+    async with Memory.open(f"sqlite:///{tmp_path}/empty.db") as memory:
+        await memory.flush()
+        exported = await memory.export(RootFailure, tmp_path / "none.parquet")
+        assert (exported.rows, exported.episodes) == (0, 0)
+        assert parquet.read_schema(tmp_path / "none.parquet").field("reason").type == pa.string()
+        with pytest.raises(UnknownEpisode, match="there is no episode 'last'"):
+            await memory.export("last", tmp_path / "last.parquet")
