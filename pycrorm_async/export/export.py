@@ -206,7 +206,7 @@ async def _write_rows(
         query=_sql(plain, log.engine.dialect),
         columns={each.name: str(each.type) for each in schema},
         rows=rows,
-        versions=versions_of(("pyarrow",)),
+        versions=versions_of("pyarrow"),
         tables=PROJECTION_VERSION,
         memory=log.log_id,
         episodes=selection.episodes,

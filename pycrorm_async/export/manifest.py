@@ -12,7 +12,6 @@ from typing import Any
 
 import msgspec
 
-from pycrorm_async import __version__
 from pycrorm_async.errors import CallerError
 from pycrorm_async.export.selection import CoveredEpisode
 
@@ -67,10 +66,10 @@ def read_manifest(path: Path) -> Manifest:
     return manifest
 
 
-def versions_of(packages: tuple[str, ...]) -> dict[str, str]:
+def versions_of(*packages: str) -> dict[str, str]:
     """Return the versions of this package and of these others, as far as they are installed."""
-    versions = {"pycrorm-async": __version__}
-    for name in packages:
+    versions = {}
+    for name in ("pycrorm-async", *packages):
         try:
             versions[name] = version(name)
         except PackageNotFoundError:
