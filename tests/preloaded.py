@@ -13,6 +13,13 @@ from typer.testing import CliRunner
 import pycrorm_async.orm  # noqa: F401
 from pycrorm_async.cli.main import app
 from pycrorm_async.clock import SYSTEM_CLOCK
+from pycrorm_async.projections.schema.core_columns import CORE, OF_NO_EPISODE
+from pycrorm_async.projections.schema.generations import built_in_texts, table_texts
+from pycrorm_async.projections.schema.layout import Layout
+from pycrorm_async.projections.schema.mapped_tables import mapped_leaves
+from pycrorm_async.projections.schema.public_views import Tables
+from pycrorm_async.projections.schema.tables import leaf_columns
+from pycrorm_async.projections.table_names import next_number
 from pycrorm_async.recording.writing.provenance import Provenance
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
@@ -21,8 +28,16 @@ from pycrorm_async.world.bullet_loader import engine
 from pycrorm_async.world.errors import BulletMissing
 
 configure_mappers()
+FIRST = next_number(())
+LAYOUT = Layout().with_leaves(mapped_leaves())
+# The statements that make a new memory and the next generation of its tables, 0.1 s each.
 for url in ("sqlite:///memory.db", "postgresql://nobody@/memory"):
-    dialect_of(DatabaseAddress.parse(url).engine(read_only=True))  # the engine connects to nothing
+    connectionless = DatabaseAddress.parse(url).engine(read_only=True)
+    stored = dialect_of(connectionless).stored_column
+    for generation in (FIRST, FIRST + 1):
+        built_in_texts(LAYOUT, Tables(generation, stored), connectionless.dialect)
+        tables = {name: leaf_columns(columns) for name, columns in LAYOUT.leaves.items()}
+        table_texts(CORE | OF_NO_EPISODE | tables, generation, stored, connectionless.dialect)
 CliRunner().invoke(app("status"), ["status", "--url", "nothing"])
 Provenance.of(None, Settings(), SYSTEM_CLOCK)
 with suppress(BulletMissing):

@@ -53,6 +53,7 @@ from pycrorm_async.projections.schema.generations import (
     PROJECTION_VERSION,
     SHOWN,
     Generation,
+    built_in_texts,
     current_generation,
     delete_generation,
     grow_tables,
@@ -66,9 +67,9 @@ from pycrorm_async.projections.schema.generations import (
 from pycrorm_async.projections.schema.growth import grow
 from pycrorm_async.projections.schema.mapped_tables import mapped_leaves
 from pycrorm_async.projections.schema.materialised_views import refresh_some
-from pycrorm_async.projections.schema.public_views import public_views
+from pycrorm_async.projections.schema.public_views import Tables
 from pycrorm_async.projections.schema.session_views import with_views
-from pycrorm_async.projections.schema.user_views import UserView, view_text, with_user_views
+from pycrorm_async.projections.schema.user_views import UserView, with_user_views
 from pycrorm_async.projections.table_names import next_number, physical_name
 from pycrorm_async.store.dialect import RowRefused
 from pycrorm_async.store.dialects import dialect_of
@@ -232,9 +233,8 @@ class Rebuild:
         if not making.layout.kept:
             return
         engine = self._log.engine
-        selects = public_views(making.layout, self.number, dialect_of(engine).stored_column)
-        views = {name: view_text(each, engine.dialect) for name, each in selects.items()}
         layout = making.layout
+        views = built_in_texts(layout, Tables(self.number, dialect_of(engine).stored_column), engine.dialect)
         users = {name: each for name, each in layout.user_views.items() if name not in layout.failed_views}
         async with with_views(self._log.engine, views | users) as connection:
             more = True

@@ -9,6 +9,7 @@ from msgspec.structs import replace
 
 from pycrorm_async.events.types import DesignatorTypeDeclared
 from pycrorm_async.projections.schema.layout import Layout, LayoutConflict, Leaf
+from pycrorm_async.projections.schema.public_views import public_views
 from tests.projections.event_script import PICK_UP, SAYING, declared, field
 
 pytestmark = pytest.mark.slow
@@ -180,3 +181,16 @@ def test_tables_that_become_one_type_must_all_agree() -> None:
     layout = layout_of(GREET, declared("WelcomeAction", "welcome_action", field("loud", "text", 2)))
     with pytest.raises(LayoutConflict, match="loud"):
         layout.with_declaration(own)
+
+
+def test_a_new_type_changes_only_the_views_that_show_its_rows() -> None:
+    shouting = declared("ShoutingAction", "shouting_action", field("volume", "real", 2), bases=("SayingAction",))
+    telling = declared("TellingAction", "telling_action", field("text", "text", 2))
+    before = layout_of(SAYING, PICK_UP)
+
+    def changed(after: Layout) -> set[str]:
+        present = public_views(before)
+        return {name for name, view in public_views(after).items() if present.get(name) != view}
+
+    assert changed(before.with_declaration(telling)) == {"telling_action"}
+    assert changed(before.with_declaration(shouting)) == {"shouting_action", "saying_action", "designator"}

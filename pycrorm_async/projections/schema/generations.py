@@ -38,7 +38,7 @@ from pycrorm_async.projections.schema.core_columns import CORE, OF_NO_EPISODE, O
 from pycrorm_async.projections.schema.estimates import expected
 from pycrorm_async.projections.schema.layout import Layout
 from pycrorm_async.projections.schema.materialised_views import make_materialised, materialised_tables, shown_texts
-from pycrorm_async.projections.schema.public_views import projection_views, public_views
+from pycrorm_async.projections.schema.public_views import Tables, ViewDefinition, projection_views, public_views
 from pycrorm_async.projections.schema.tables import indexed, leaf_columns, make_table
 from pycrorm_async.projections.schema.user_views import view_text
 from pycrorm_async.projections.table_names import index_name, physical_name
@@ -57,6 +57,8 @@ __all__ = [
     "read_generations",
     "projections_in",
     "view_texts_of",
+    "built_in_texts",
+    "table_texts",
     "write_generation",
     "delete_generation",
     "make_generation",
@@ -95,8 +97,9 @@ ON CONFLICT (projection) DO UPDATE SET version = excluded.version, generation = 
 _Stored: TypeAlias = Callable[[str], str]
 """Maps a column to its name in a database."""
 
-_LAYOUTS_KEPT = 32
-"""Layouts whose views' texts are kept for the next memory: the views of one take 70 ms to write and 0.1 MB to keep."""
+_VIEWS_KEPT = 1_024
+"""Bounds the views whose texts are kept for the next memory and the next type: the 75 of a new memory take 70 ms to
+write and 0.1 MB to keep."""
 _TEXTS_KEPT = 512
 """Bounds the tables whose statements are kept: a new memory has 62. A process that opens many memories, as tests do,
 otherwise spends half of the time of opening on compiling the same statements again."""
@@ -284,7 +287,8 @@ def view_texts_of(
     """
     layout, number = generation.layout, generation.number
     stored = dialect_of(connection).stored_column
-    built_in = _built_in_views(msgspec.json.encode(layout), number, stored, _syntax_of(connection), simulated=simulated)
+    tables = Tables(number, stored, simulated)
+    built_in = built_in_texts(layout, tables, connection.dialect)
     texts = dict(layout.user_views) if simulated else shown_texts(layout, number, stored)
     # A name registered for a user's view may have become built-in since; the built-in definition wins.
     users = {name: each for name, each in texts.items() if name not in built_in}
@@ -298,7 +302,7 @@ def view_texts_of(
             _log.warning("the projection %s has no views: the names %s belong to the memory", name, names_taken)
             continue
         taken |= names
-        selects = projection_views(each.layout, each.number, number, stored, simulated=simulated)
+        selects = projection_views(each.layout, each.number, tables)
         custom |= {view: view_text(select_, connection.dialect) for view, select_ in selects.items()}
         own |= each.layout.user_views
     users = {name: each for name, each in (users | own).items() if name not in layout.failed_views}
@@ -315,30 +319,39 @@ class _Syntax:
     """As a literal. PostgreSQL has a setting by which it is doubled."""
 
 
-def _syntax_of(connection: AsyncConnection) -> _Syntax:
-    dialect = connection.dialect
+def _syntax_of(dialect: Dialect) -> _Syntax:
     return _Syntax(dialect, dialect.name, view_text(literal("\\", Text()), dialect))
 
 
-@lru_cache(maxsize=_LAYOUTS_KEPT)
-def _built_in_views(
-    layout: bytes, number: int, stored: _Stored, syntax: _Syntax, *, simulated: bool
-) -> Mapping[str, str]:
-    selects = public_views(msgspec.json.decode(layout, type=Layout), number, stored, simulated=simulated)
-    return {name: view_text(each, syntax.dialect) for name, each in selects.items()}
+def built_in_texts(layout: Layout, tables: Tables, dialect: Dialect) -> dict[str, str]:
+    """Return name and SQL of every view in front of these tables, except users' views and those of projections."""
+    syntax = _syntax_of(dialect)
+    return {name: _text_of(each, tables, syntax) for name, each in public_views(layout).items()}
+
+
+@lru_cache(maxsize=_VIEWS_KEPT)
+def _text_of(view: ViewDefinition, tables: Tables, syntax: _Syntax) -> str:
+    return view_text(view.select(tables), syntax.dialect)
 
 
 async def make_empty(connection: AsyncConnection, tables: Mapping[str, Mapping[str, Storage]], generation: int) -> None:
     """Create these tables of a generation, given by name and columns, with their indexes."""
-    statements: list[str] = []
-    stored, syntax = dialect_of(connection).stored_column, _syntax_of(connection)
-    for name, columns in tables.items():
-        statements += _definitions(name, tuple(columns.items()), generation, stored, syntax)
-    if statements:
-        await dialect_of(connection).execute_all(connection, statements)
-        await dialect_of(connection).expect(
-            connection, [expected(name, dict(columns), generation) for name, columns in tables.items()]
-        )
+    dialect = dialect_of(connection)
+    if statements := table_texts(tables, generation, dialect.stored_column, connection.dialect):
+        await dialect.execute_all(connection, statements)
+        await dialect.expect(connection, [expected(name, dict(each), generation) for name, each in tables.items()])
+
+
+def table_texts(
+    tables: Mapping[str, Mapping[str, Storage]], generation: int, stored: _Stored, dialect: Dialect
+) -> list[str]:
+    """Return the statements that create these tables and their indexes."""
+    syntax = _syntax_of(dialect)
+    return [
+        statement
+        for name, columns in tables.items()
+        for statement in _definitions(name, tuple(columns.items()), generation, stored, syntax)
+    ]
 
 
 @lru_cache(maxsize=_TEXTS_KEPT)

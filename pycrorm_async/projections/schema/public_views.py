@@ -9,24 +9,22 @@ one connection, by views of the same names that include simulations.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Self, TypeAlias
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple, TypeAlias
 
 from sqlalchemy import (
-    Boolean,
     Column,
     ColumnElement,
     Double,
     Select,
     Table,
-    Text,
     TextualSelect,
     and_,
     case,
     cast,
     column,
     func,
-    literal_column,
     not_,
     null,
     or_,
@@ -34,27 +32,26 @@ from sqlalchemy import (
     table,
     union_all,
 )
-from sqlalchemy.ext.compiler import compiles
-from sqlalchemy.sql.functions import FunctionElement
 from sqlalchemy.sql.selectable import CompoundSelect
 
 from pycrorm_async.events.codec import DESCRIPTION_PREFIX
 from pycrorm_async.events.fields import table_name
 from pycrorm_async.events.ids import SEQUENCE_MAX, SLOT_MAX
-from pycrorm_async.projections.schema.core_columns import CORE, EPISODE, LINK_BOX, OF_NO_EPISODE, OWN
+from pycrorm_async.projections.schema.core_columns import CORE, EPISODE, LINK_BOX, OF_NO_EPISODE, OWN, Storage
 from pycrorm_async.projections.schema.layout import Layout
 from pycrorm_async.projections.schema.tables import column_type, columns_in_order, leaf_columns, make_table
-from pycrorm_async.projections.schema.views.concept_views import concept_views
+from pycrorm_async.projections.schema.views.concept_views import CONCEPT_VIEWS
 from pycrorm_async.projections.schema.views.pick_up_view import pick_ups_with_context
+from pycrorm_async.projections.schema.views.portable_expressions import Absent, member
 from pycrorm_async.projections.schema.views.root_failure_view import root_failures
 from pycrorm_async.projections.schema.views.spatial_relation_view import SpatialTables, spatial_relations
 from pycrorm_async.projections.schema.views.world_line import world_line
 from pycrorm_async.world.enums import ObjectType
 
-__all__ = ["public_views", "projection_views", "View"]
+__all__ = ["public_views", "projection_views", "Tables", "View", "ViewDefinition"]
 
 View: TypeAlias = Select[Any] | CompoundSelect[Any] | TextualSelect
-_Cut: TypeAlias = Callable[[dict[str, Table], Layout], Select[Any]]
+_Columns: TypeAlias = tuple[tuple[str, Storage], ...]
 
 _UNITED_MAX = 400
 """Bounds the selects in one UNION, because SQLite allows 500. More are united in groups."""
@@ -69,133 +66,137 @@ _declaration = table("pycrorm_declaration", column("fingerprint"), column("paylo
 _is_description = func.substr(_declaration.c.fingerprint, 1, len(DESCRIPTION_PREFIX)) == DESCRIPTION_PREFIX
 
 
-class _Member(FunctionElement[str]):
-    """A member of a JSON object stored as text: a string as text, an object or a list as JSON."""
+@dataclass(frozen=True)
+class Tables:
+    """The tables behind the views.
 
-    name = "json_member"
-    type = Text()
-    inherit_cache = True
-
-
-@compiles(_Member)
-def _of_text(element: _Member, compiler: Any, **options: Any) -> str:
-    document, name = (compiler.process(each, **options) for each in element.clauses)
-    return f"json_extract({document}, {name})"
-
-
-@compiles(_Member, "postgresql")
-def _of_json(element: _Member, compiler: Any, **options: Any) -> str:
-    document, path = (compiler.process(each, **options) for each in element.clauses)
-    return f"({document}::json ->> {path.replace('$.', '')})"
-
-
-def _member(document: ColumnElement[Any], name: str) -> ColumnElement[str]:
-    return _Member(document, literal_column(f"'$.{name}'"))
-
-
-class _Absent(ColumnElement[bool]):
-    """The condition that a number is not in a table of keys, evaluated by one index lookup for each row.
-
-    With 20,000 simulations in the table, a query for one episode and a query for all pick-ups take as long as without
-    any. PostgreSQL evaluates NOT IN by listing all simulations first, which takes 10 to 80 ms, and NOT EXISTS by one
-    more join for each view in a query. SQLite uses the index for NOT IN and is slower with any other form.
-    """
-
-    inherit_cache = False
-    type = Boolean()
-
-    def __init__(self, number: ColumnElement[int], key: ColumnElement[int]) -> None:
-        self.listed = number.not_in(select(key))
-        self.looked_up = select(key).where(key == number).scalar_subquery().is_(None)
-
-    def self_group(self, against: Any = None) -> Self:  # noqa: ARG002  SQLAlchemy's signature
-        return self
-
-
-@compiles(_Absent)
-def _not_in(element: _Absent, compiler: Any, **options: Any) -> str:
-    return str(compiler.process(element.listed, **options))
-
-
-@compiles(_Absent, "postgresql")
-def _is_null(element: _Absent, compiler: Any, **options: Any) -> str:
-    return str(compiler.process(element.looked_up, **options))
-
-
-def public_views(
-    layout: Layout, generation: int, stored: Callable[[str], str], *, simulated: bool = False
-) -> dict[str, View]:
-    """Return name and select of every view in front of this generation, except users' views.
-
-    Args:
-        layout, generation: of the tables behind the views.
+    Attributes:
+        generation: their number.
         stored: maps a column to its name in this database.
         simulated: the views include simulations.
     """
-    core = {name: make_table(name, columns, generation, stored) for name, columns in CORE.items()}
-    simulations = core.pop("simulated_episode")
 
-    def shown(view: Select[Any], rows: Table) -> Select[Any]:
-        return view if simulated else view.where(_happened(rows, simulations))
+    generation: int
+    stored: Callable[[str], str]
+    simulated: bool = False
 
-    views: dict[str, View] = {
-        name: shown(select(*columns_in_order(each), *_sequence(each)), each) for name, each in core.items()
-    }
-    views |= {name: shown(make(core, layout), core[home]) for name, (home, make) in _CUT.items()}
-    leaves = {
-        name: make_table(name, leaf_columns(columns), generation, stored) for name, columns in layout.leaves.items()
-    }
-    views |= {name: _leaf(name, layout, leaves, shown) for name in layout.leaves}
-    if _PICKED in layout.leaves:
-        node, object_, removal, pose, episode = (core[name] for name in _OF_PICK_UPS)
-        picked = _leaf(_PICKED, layout, leaves, lambda view, _: view).subquery("picked")
-        view = pick_ups_with_context(picked, node, object_, removal, pose, episode, layout.dtypes(_PICKED))
-        views["PickUpWithContextView"] = shown(view, node)
-        if _PLACED in layout.leaves:
-            placed = _leaf(_PLACED, layout, leaves, lambda view, _: view).subquery("placed")
-            link_box = make_table(LINK_BOX, OF_NO_EPISODE[LINK_BOX], generation, stored)
-            tables = SpatialTables(*(core[name] for name in _OF_RELATIONS))
-            views["spatial_relation"] = spatial_relations(tables, link_box, picked, placed, simulated=simulated)
-    views["designator_type"] = _designator_type(layout)
-    views["object_description"] = select(_declaration).where(_is_description)
-    return {**views, **concept_views()}
+    def __getitem__(self, name: str) -> Table:
+        """Return a table that every memory has."""
+        return make_table(name, CORE.get(name) or OF_NO_EPISODE[name], self.generation, self.stored)
+
+    def leaf(self, name: str, columns: _Columns) -> Table:
+        return make_table(name, leaf_columns(dict(columns)), self.generation, self.stored)
+
+    def shown(self, view: Select[Any], rows: Table) -> Select[Any]:
+        """Return the view without the rows of simulations, unless these views include them."""
+        return view if self.simulated else view.where(_happened(rows, self["simulated_episode"]))
 
 
-def projection_views(
-    layout: Layout, number: int, generation: int, stored: Callable[[str], str], *, simulated: bool = False
-) -> dict[str, View]:
-    """Return the views of a custom projection.
+class _Leaf(NamedTuple):
+    """The facts of a layout that a leaf's view depends on: its columns, and the tables it unites with theirs."""
 
-    `number` is the generation of its own tables, `generation` that of the built-in tables.
+    columns: _Columns
+    members: tuple[tuple[str, _Columns], ...]
+
+    @classmethod
+    def of(cls, name: str, layout: Layout) -> _Leaf:
+        members = ((each, tuple(layout.leaves[each].items())) for each in layout.members(name))
+        return cls(tuple(layout.columns(name).items()), tuple(members))
+
+
+class ViewDefinition(NamedTuple):
+    """The function that makes a view's select, and all the facts of a layout that it depends on.
+
+    Two layouts with the same facts have the same view, so its text is compiled once (`generations`).
     """
-    simulations = make_table("simulated_episode", CORE["simulated_episode"], generation, stored)
+
+    function: Callable[..., View]
+    facts: tuple[Hashable, ...] = ()
+
+    def select(self, tables: Tables) -> View:
+        return self.function(tables, *self.facts)
+
+
+def public_views(layout: Layout) -> dict[str, ViewDefinition]:
+    """Return name and definition of every view of this layout, except users' views."""
+    views = {name: ViewDefinition(_whole, (name,)) for name in CORE if name != "simulated_episode"}
+    views |= {name: ViewDefinition(_cut, (name,)) for name in _CUT}
+    views["designator"] = ViewDefinition(_designator, (_unusual_lineages(layout),))
+    leaves = {name: _Leaf.of(name, layout) for name in layout.leaves}
+    views |= {name: ViewDefinition(_united_rows, (leaf,)) for name, leaf in leaves.items()}
+    if _PICKED in leaves:
+        dtypes = layout.dtypes(_PICKED)
+        views["PickUpWithContextView"] = ViewDefinition(_pick_ups_with_context, (leaves[_PICKED], dtypes))
+        if _PLACED in leaves:
+            views["spatial_relation"] = ViewDefinition(_spatial_relations, (leaves[_PICKED], leaves[_PLACED]))
+    views["designator_type"] = ViewDefinition(_designator_type, (layout.unreadable,))
+    views["object_description"] = ViewDefinition(_object_description)
+    return {**views, **{name: ViewDefinition(_of_concepts, (name,)) for name in CONCEPT_VIEWS}}
+
+
+def projection_views(layout: Layout, number: int, tables: Tables) -> dict[str, View]:
+    """Return the views of a custom projection. `number` is the generation of its tables, `tables` are the built-in."""
     views: dict[str, View] = {}
     for name, columns in layout.leaves.items():
-        rows = make_table(name, leaf_columns(columns), number, stored)
-        view = select(*map(_labelled, columns_in_order(rows)))
-        views[name.removeprefix(OWN)] = view if simulated else view.where(_happened(rows, simulations))
+        rows = make_table(name, leaf_columns(columns), number, tables.stored)
+        views[name.removeprefix(OWN)] = tables.shown(select(*map(_labelled, columns_in_order(rows))), rows)
     return views
+
+
+def _whole(tables: Tables, name: str) -> View:
+    """Return the view that shows a table unchanged."""
+    rows = tables[name]
+    return tables.shown(select(*columns_in_order(rows), *_sequence(rows)), rows)
+
+
+def _cut(tables: Tables, name: str) -> View:
+    home, function = _CUT[name]
+    return tables.shown(function(tables), tables[home])
+
+
+def _pick_ups_with_context(tables: Tables, picked: _Leaf, dtypes: tuple[str, ...]) -> View:
+    node, object_, removal, pose, episode = (tables[name] for name in _OF_PICK_UPS)
+    rows = _with_simulations(tables, picked).subquery("picked")
+    return tables.shown(pick_ups_with_context(rows, node, object_, removal, pose, episode, dtypes), node)
+
+
+def _spatial_relations(tables: Tables, picked: _Leaf, placed: _Leaf) -> View:
+    rows = [_with_simulations(tables, each).subquery(name) for each, name in ((picked, "picked"), (placed, "placed"))]
+    read = SpatialTables(*(tables[name] for name in _OF_RELATIONS))
+    return spatial_relations(read, tables[LINK_BOX], *rows, simulated=tables.simulated)
+
+
+def _with_simulations(tables: Tables, leaf: _Leaf) -> View:
+    return _united_rows(replace(tables, simulated=True), leaf)
+
+
+def _object_description(_tables: Tables) -> View:
+    return select(_declaration).where(_is_description)
+
+
+def _of_concepts(_tables: Tables, name: str) -> View:
+    return CONCEPT_VIEWS[name]()
 
 
 def _happened(rows: Table, simulations: Table) -> ColumnElement[bool]:
     """Return the condition that a row does not belong to a simulation."""
     if "simulated" in rows.c:
         return ~rows.c.simulated
-    return _Absent(rows.c[EPISODE], simulations.c.id)
+    return Absent(rows.c[EPISODE], simulations.c.id)
 
 
-def _process_metadata(core: dict[str, Table], _layout: Layout) -> Select[Any]:
-    episodes = core["process_metadata"]
-    line = world_line(core["object"], core["object_removal"], episodes.c.id)
+def _process_metadata(tables: Tables) -> Select[Any]:
+    episodes = tables["process_metadata"]
+    line = world_line(tables["object"], tables["object_removal"], episodes.c.id)
     world = func.coalesce(episodes.c.world, episodes.c.entered_world, line).label("world")
     columns = columns_in_order(episodes)
     first, *others = (world if each.name == "world" else each for each in columns if each.name != "entered_world")
     return select(first, *others)
 
 
-def _episode_tag(core: dict[str, Table], _layout: Layout) -> Select[Any]:
+def _episode_tag(tables: Tables) -> Select[Any]:
     """Return the tags that episodes have now: those whose last change added them."""
-    changes = core["episode_tagging"]
+    changes = tables["episode_tagging"]
     later = changes.alias("later")
     is_later = and_(
         later.c.process_metadata_id == changes.c.process_metadata_id,
@@ -206,39 +207,39 @@ def _episode_tag(core: dict[str, Table], _layout: Layout) -> Select[Any]:
     return select(*columns).where(changes.c.added, not_(select(later.c.id).where(is_later).exists()))
 
 
-def _episode_robot(core: dict[str, Table], _layout: Layout) -> Select[Any]:
+def _episode_robot(tables: Tables) -> Select[Any]:
     """Return the robots of episodes, each once, however often it was added: with the row of the first time."""
-    rows = core["object"]
+    rows = tables["object"]
     robot = rows.c.process_metadata_id, rows.c.name, rows.c.model, rows.c.serial, rows.c.description_fingerprint
     first = func.min(rows.c.id)
     robots = select(first.label("id"), *robot, _event_of(first).label("sequence")).group_by(*robot)
     return robots.where(rows.c.obj_type == ObjectType.ROBOT.name, rows.c.id == rows.c.identity_id)
 
 
-def _designator_type(layout: Layout) -> View:
+def _designator_type(_tables: Tables, unreadable_declarations: tuple[str, ...]) -> View:
     """Return the view of declarations. It never parses one that is not JSON, whichever column a query reads."""
     payload: ColumnElement[Any] = _declaration.c.payload
-    if layout.unreadable:
-        unreadable = _declaration.c.fingerprint.in_(layout.unreadable)
+    if unreadable_declarations:
+        unreadable = _declaration.c.fingerprint.in_(unreadable_declarations)
         payload = case((unreadable, "{}"), else_=payload)
 
-    def member(name: str) -> ColumnElement[Any]:
-        return _member(payload, name)
+    def of_payload(name: str) -> ColumnElement[Any]:
+        return member(payload, name)
 
     view = select(
         _declaration.c.fingerprint,
-        member("dtype").label("dtype"),
-        member("kind").label("kind"),
-        member("table").label("leaf"),
-        member("concept").label("concept"),
-        func.coalesce(member("fields"), "[]").label("fields"),
+        of_payload("dtype").label("dtype"),
+        of_payload("kind").label("kind"),
+        of_payload("table").label("leaf"),
+        of_payload("concept").label("concept"),
+        func.coalesce(of_payload("fields"), "[]").label("fields"),
     )
     view = view.where(~_is_description)
-    return view.where(~unreadable) if layout.unreadable else view
+    return view.where(~unreadable) if unreadable_declarations else view
 
 
-def _task_tree_node(core: dict[str, Table], _layout: Layout) -> Select[Any]:
-    nodes = core["task_tree_node"]
+def _task_tree_node(tables: Tables) -> Select[Any]:
+    nodes = tables["task_tree_node"]
     action_id = case((nodes.c.dtype.is_not(None), nodes.c.id), else_=null())
     columns = (each for each in columns_in_order(nodes) if each.key != "parameters")
     return select(*columns, *_sequence(nodes), action_id.label("action_id"), _duration(nodes))
@@ -266,36 +267,35 @@ def _course(nodes: Table) -> tuple[ColumnElement[Any], ...]:
     return nodes.c.status, *times, *ended, *_sequence(nodes), nodes.c.end_sequence, nodes.c.robot, nodes.c.parent_id
 
 
-def _designator(core: dict[str, Table], layout: Layout) -> Select[Any]:
-    nodes = core["task_tree_node"]
+def _designator(tables: Tables, unusual_lineages: tuple[tuple[str, str], ...]) -> View:
+    nodes = tables["task_tree_node"]
     robot_state_id = case((nodes.c.robot_pose_id.is_not(None), nodes.c.id), else_=null())
-    return select(
+    kind = case({"action": " Action", "motion": " Motion", "language": " Language"}, value=nodes.c.kind)
+    lineage: ColumnElement[str] = nodes.c.dtype.concat(kind)
+    if unusual_lineages:
+        lineage = case(dict(unusual_lineages), value=nodes.c.dtype, else_=lineage)
+    view = select(
         nodes.c.id,
         nodes.c.process_metadata_id,
         nodes.c.dtype,
         nodes.c.kind,
         robot_state_id.label("robot_state_id"),
         func.coalesce(nodes.c.parameters, "{}").label("parameters"),
-        _lineage(nodes, layout).label("lineage"),
+        lineage.label("lineage"),
         *_course(nodes),
     ).where(nodes.c.dtype.is_not(None))
+    return tables.shown(view, nodes)
 
 
-def _lineage(nodes: Table, layout: Layout) -> ColumnElement[str]:
-    """Return the lineage of a node's type. Only types with bases or with another table name need their own case."""
-    kind = case({"action": " Action", "motion": " Motion", "language": " Language"}, value=nodes.c.kind)
-    ordinary: ColumnElement[str] = nodes.c.dtype.concat(kind)
-    exceptions = {
-        dtype: layout.lineage(dtype)
-        for dtype, each in layout.types.items()
-        if each.bases or each.tables != (table_name(dtype),)
-    } | {dtype: layout.lineage(dtype) for dtype in layout.renamed}
-    return case(exceptions, value=nodes.c.dtype, else_=ordinary) if exceptions else ordinary
+def _unusual_lineages(layout: Layout) -> tuple[tuple[str, str], ...]:
+    """Return the lineages of the types with bases or with another table name, and of former names."""
+    unusual = (dtype for dtype, each in layout.types.items() if each.bases or each.tables != (table_name(dtype),))
+    return tuple((dtype, layout.lineage(dtype)) for dtype in dict.fromkeys((*unusual, *layout.renamed)))
 
 
-def _of_kind(kind: str) -> _Cut:
-    def view(core: dict[str, Table], _layout: Layout) -> Select[Any]:
-        nodes = core["task_tree_node"]
+def _of_kind(kind: str) -> Callable[[Tables], Select[Any]]:
+    def view(tables: Tables) -> Select[Any]:
+        nodes = tables["task_tree_node"]
         parameters = func.coalesce(nodes.c.parameters, "{}").label("parameters")
         columns = nodes.c.id, nodes.c.process_metadata_id, nodes.c.dtype, *_course(nodes), parameters
         return select(*columns).where(nodes.c.kind == kind, nodes.c.dtype.is_not(None))
@@ -303,8 +303,8 @@ def _of_kind(kind: str) -> _Cut:
     return view
 
 
-def _robot_state(core: dict[str, Table], _layout: Layout) -> Select[Any]:
-    nodes = core["task_tree_node"]
+def _robot_state(tables: Tables) -> Select[Any]:
+    nodes = tables["task_tree_node"]
     return select(
         nodes.c.id,
         nodes.c.process_metadata_id,
@@ -315,34 +315,33 @@ def _robot_state(core: dict[str, Table], _layout: Layout) -> Select[Any]:
     ).where(nodes.c.robot_pose_id.is_not(None))
 
 
-def _root_failure(core: dict[str, Table], _layout: Layout) -> Select[Any]:
-    return root_failures(core["task_tree_node"], core["object"])
+def _root_failure(tables: Tables) -> Select[Any]:
+    return root_failures(tables["task_tree_node"], tables["object"])
 
 
-def _pose(core: dict[str, Table], _layout: Layout) -> Select[Any]:
-    poses = core["pose"]
+def _pose(tables: Tables) -> Select[Any]:
+    poses = tables["pose"]
     return select(
         *columns_in_order(poses), *_sequence(poses), poses.c.id.label("position_id"), poses.c.id.label("orientation_id")
     )
 
 
-def _position(core: dict[str, Table], _layout: Layout) -> Select[Any]:
-    poses = core["pose"]
+def _position(tables: Tables) -> Select[Any]:
+    poses = tables["pose"]
     return select(poses.c.id, poses.c.process_metadata_id, poses.c.x, poses.c.y, poses.c.z)
 
 
-def _quaternion(core: dict[str, Table], _layout: Layout) -> Select[Any]:
-    poses = core["pose"]
+def _quaternion(tables: Tables) -> Select[Any]:
+    poses = tables["pose"]
     parts = (poses.c[f"q{axis}"].label(axis) for axis in "xyzw")
     return select(poses.c.id, poses.c.process_metadata_id, *parts)
 
 
-_CUT: dict[str, tuple[str, _Cut]] = {
+_CUT: dict[str, tuple[str, Callable[[Tables], Select[Any]]]] = {
     "process_metadata": ("process_metadata", _process_metadata),
     "episode_tag": ("episode_tagging", _episode_tag),
     "episode_robot": ("object", _episode_robot),
     "task_tree_node": ("task_tree_node", _task_tree_node),
-    "designator": ("task_tree_node", _designator),
     "action": ("task_tree_node", _of_kind("action")),
     "motion": ("task_tree_node", _of_kind("motion")),
     "language": ("task_tree_node", _of_kind("language")),
@@ -355,22 +354,16 @@ _CUT: dict[str, tuple[str, _Cut]] = {
 """Views that differ from their table: by name, the table their rows come from and the function that selects them."""
 
 
-def _leaf(
-    name: str,
-    layout: Layout,
-    leaves: Mapping[str, Table],
-    shown: Callable[[Select[Any], Table], Select[Any]],
-) -> View:
+def _united_rows(tables: Tables, leaf: _Leaf) -> View:
     """Return the rows of a leaf table and of its members; a column that a member lacks is null."""
     parts = []
-    united_columns = layout.columns(name)
-    for member in layout.members(name):
-        rows = leaves[member]
+    for member_name, member_columns in leaf.members:
+        rows, own = tables.leaf(member_name, member_columns), dict(member_columns)
         columns: list[ColumnElement[Any]] = [rows.c.id]
-        for each, storage in united_columns.items():
-            same = layout.leaves[member].get(each) == storage
+        for each, storage in leaf.columns:
+            same = own.get(each) == storage
             columns.append(_labelled(rows.c[each]) if same else cast(null(), column_type(storage)).label(each))
-        parts.append(shown(select(*columns, rows.c[EPISODE]), rows))
+        parts.append(tables.shown(select(*columns, rows.c[EPISODE]), rows))
     return _united(parts)
 
 

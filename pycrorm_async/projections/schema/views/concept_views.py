@@ -6,22 +6,36 @@ table, fold or rebuild.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Final
+
 from sqlalchemy import Text, TextualSelect
 
 from pycrorm_async.events.concepts import CONCEPT_OF_OBJECT_TYPE, CONCEPTS, ancestors
 from pycrorm_async.projections.schema.views.constants import constants
 
-__all__ = ["concept_views"]
+__all__ = ["CONCEPT_VIEWS"]
 
 
-def concept_views() -> dict[str, TextualSelect]:
-    """Return name and select of each view."""
+def _concepts() -> TextualSelect:
     parents = (
         (name, parent, each.source) for name, each in sorted(CONCEPTS.items()) for parent in each.parents or (None,)
     )
+    return constants({"name": Text(), "parent": Text(), "source": Text()}, parents)
+
+
+def _ancestors() -> TextualSelect:
     pairs = ((name, ancestor) for name in sorted(CONCEPTS) for ancestor in ancestors(name))
-    return {
-        "concept": constants({"name": Text(), "parent": Text(), "source": Text()}, parents),
-        "concept_ancestor": constants({"concept": Text(), "ancestor": Text()}, pairs),
-        "object_concept": constants({"obj_type": Text(), "concept": Text()}, sorted(CONCEPT_OF_OBJECT_TYPE.items())),
-    }
+    return constants({"concept": Text(), "ancestor": Text()}, pairs)
+
+
+def _of_objects() -> TextualSelect:
+    return constants({"obj_type": Text(), "concept": Text()}, sorted(CONCEPT_OF_OBJECT_TYPE.items()))
+
+
+CONCEPT_VIEWS: Final[dict[str, Callable[[], TextualSelect]]] = {
+    "concept": _concepts,
+    "concept_ancestor": _ancestors,
+    "object_concept": _of_objects,
+}
+"""The functions that make the selects, by name of the view."""
