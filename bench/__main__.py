@@ -56,6 +56,7 @@ RUNS = (
     Run("daemon postgresql", ("--postgresql",)),
     Run("behaviour_trees"),
     Run("digests"),
+    Run("recall"),
     Run("thesis"),
     Run("thesis postgresql", ("--postgresql",), quick=False),
     Run("size"),

@@ -10,14 +10,15 @@ between the oldest and the third. The error was at most 0.15 in a million cases,
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pycrorm_async.recall.blocks import Group, merged_group
+from pycrorm_async.recall.blocks import Group
 from pycrorm_async.recall.case import OUTCOME
-from pycrorm_async.recall.columns import Sets, Symbols
+from pycrorm_async.recall.columns import Symbols, joined_words
 from pycrorm_async.recall.library import CaseLibrary
 
 __all__ = ["Forgotten", "activation", "activation_by_node", "forgotten"]
@@ -81,11 +82,12 @@ def _of_type(
     name: str, library: CaseLibrary, now_us: int
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]:
     """Return the nodes of a type, the activation of the way of each, and the number of that way."""
-    group = merged_group(library.groups(name))
-    ways = _ways(group, library.left_out)
-    ages: NDArray[np.float64] = np.maximum(
-        (now_us - group.started_us) / 1e6, _AGE_S_MIN
-    )  # ascending: the newest case comes first
+    groups = library.groups(name)
+    started_us = np.concatenate([each.started_us for each in groups])
+    newest_first = np.argsort(-started_us, kind="stable")
+    nodes = np.concatenate([each.nodes for each in groups])[newest_first]
+    ways = _ways(groups, library.left_out)[newest_first]
+    ages: NDArray[np.float64] = np.maximum((now_us - started_us[newest_first]) / 1e6, _AGE_S_MIN)
     by_way = np.argsort(ways, kind="stable")
     ages_by_way = ages[by_way]
     firsts: NDArray[np.int64] = np.flatnonzero(np.r_[True, np.diff(ways[by_way]) != 0])
@@ -95,17 +97,17 @@ def _of_type(
     long = sizes > _EXACT
     third, oldest = ages_by_way[(firsts + _EXACT - 1)[long]], ages_by_way[(firsts + sizes - 1)[long]]
     totals[long] += _spread_evenly_all(sizes[long] - _EXACT, third, oldest)
-    return group.nodes, np.log(totals)[ways], ways
+    return nodes, np.log(totals)[ways], ways
 
 
-def _ways(group: Group, left_out: frozenset[str]) -> NDArray[np.int64]:
+def _ways(groups: Sequence[Group], left_out: frozenset[str]) -> NDArray[np.int64]:
     """Return the number of the way of each case, 0, 1, 2 and so on."""
-    ways = np.zeros(len(group), np.int64)
-    for name, column in group.texts.items():
-        if name in (*OUTCOME, "simulated") or name in left_out or isinstance(column, Sets):
-            continue
-        assert isinstance(column, Symbols)
-        ways = np.unique(ways * (len(column.words) + 1) + column.codes, return_inverse=True)[1].astype(np.int64)
+    sizes = [*map(len, groups)]
+    ways = np.zeros(sum(sizes), np.int64)
+    for name in {name for group in groups for name in group.texts} - {*OUTCOME, "simulated"} - left_out:
+        column = joined_words([group.texts.get(name) for group in groups], sizes)
+        if isinstance(column, Symbols):
+            ways = np.unique(ways * (len(column.words) + 1) + column.codes, return_inverse=True)[1].astype(np.int64)
     return ways
 
 

@@ -14,13 +14,14 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from html import escape
 from typing import Any, NamedTuple, overload
 
 from pycrorm_async.recall.case import Case, is_angle
 from pycrorm_async.recall.cue import Cue
 from pycrorm_async.recall.library import CaseLibrary
-from pycrorm_async.recall.search import Weights, search, weights_of
+from pycrorm_async.recall.search import Found, Weights, search, weights_of
 
 __all__ = ["Answer", "Compared", "Rate", "RecalledCase", "Typical", "answer", "compare", "rate_of", "success_of"]
 
@@ -85,17 +86,31 @@ class Typical(NamedTuple):
 
 @dataclass(frozen=True)
 class RecalledCase:
-    """One case of an answer.
+    """One case of an answer. It is read from the columns when it is asked for.
 
     Attributes:
-        case: the action: its situation, its outcome, its place in the memory.
-        score: its likeness to the cue, 0 to 1.
-        compared: each feature of the cue beside that of the case.
+        found: its place in the columns, with its score.
+        cue, weights: what it is compared with.
     """
 
-    case: Case
-    score: float
-    compared: tuple[Compared, ...]
+    found: Found
+    cue: Cue
+    weights: Weights
+
+    @property
+    def score(self) -> float:
+        """Its likeness to the cue, 0 to 1."""
+        return self.found.score
+
+    @cached_property
+    def case(self) -> Case:
+        """The action: its situation, its outcome, its place in the memory."""
+        return self.found.group.case(self.found.row)
+
+    @cached_property
+    def compared(self) -> tuple[Compared, ...]:
+        """Each feature of the cue beside that of the case."""
+        return compare(self.cue, self.case, self.weights)
 
     @property
     def matched(self) -> tuple[Compared, ...]:
@@ -128,10 +143,10 @@ class Answer(Sequence[RecalledCase]):
         never_seen: pairs of feature and word of the cue that none of them has.
     """
 
-    def __init__(self, cue: Cue, cases: Sequence[RecalledCase], considered: int, weights: Weights) -> None:
+    def __init__(self, cue: Cue, cases: Sequence[RecalledCase], weights: Weights) -> None:
         self.cue = cue
         self.cases = tuple(cases)
-        self.considered = considered
+        self.considered = weights.cases
         self.never_seen = weights.never_seen
 
     def __len__(self) -> int:
@@ -220,11 +235,7 @@ class Answer(Sequence[RecalledCase]):
 def answer(cue: Cue, library: CaseLibrary) -> Answer:
     """Search the cases most like a cue, and compare each of them with it. The cue was checked by `check_cue`."""
     weights = weights_of(cue, library)
-    cases = []
-    for found in search(cue, library, weights):
-        case = found.group.case(found.row)
-        cases.append(RecalledCase(case, found.score, compare(cue, case, weights)))
-    return Answer(cue, cases, weights.cases, weights)
+    return Answer(cue, [RecalledCase(each, cue, weights) for each in search(cue, library, weights)], weights)
 
 
 def compare(cue: Cue, case: Case, weights: Weights) -> tuple[Compared, ...]:

@@ -19,15 +19,15 @@ their order. The words of a column are in alphabetical order.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from pycrorm_async.recall.blocks import Block, Group
-from pycrorm_async.recall.columns import Numbers, Sets, Symbols, Words, joined_numbers, joined_words
+from pycrorm_async.recall.blocks import Block, Spread
+from pycrorm_async.recall.columns import Numbers, Sets, Symbols, Words
 
 __all__ = ["BlockRow", "decode", "encode"]
 
@@ -45,26 +45,17 @@ class BlockRow(NamedTuple):
 
 def encode(block: Block) -> list[BlockRow]:
     """Return the rows of a block. Raises `ValueError` for a block without a case."""
-    groups = list(block.groups.values())
-    if not groups:
+    if not block.sizes:
         raise ValueError("a block without a case has no rows")
-    sizes = np.array([len(each) for each in groups], "<u4")
-    rows = [
-        BlockRow("type", "groups", _json([each.type for each in groups]), sizes.tobytes()),
-        BlockRow("node", "integer64", None, _bytes([each.nodes for each in groups], "<i8")),
-        BlockRow("started", "integer64", None, _bytes([each.started_us for each in groups], "<i8")),
-        BlockRow("parent", "integer32", None, _bytes([each.parents for each in groups], "<i4")),
+    return [
+        BlockRow("type", "groups", _json(list(block.sizes)), np.array([*block.sizes.values()], "<u4").tobytes()),
+        BlockRow("node", "integer64", None, block.nodes.astype("<i8").tobytes()),
+        BlockRow("started", "integer64", None, block.started_us.astype("<i8").tobytes()),
+        BlockRow("parent", "integer32", None, block.parents.astype("<i4").tobytes()),
+        *(_text_row(name, each) for name, each in block.texts.items()),
+        *(_number_row(name, each) for name, each in block.numbers.items()),
+        *(BlockRow(name, "left_out", None, b"") for name in sorted(block.left_out)),
     ]
-    for name in sorted({name for each in groups for name in each.texts}):
-        owners = [each for each in groups if name in each.texts]
-        rows.append(_text_row(name, owners, joined_words([(each.texts[name], len(each)) for each in owners])))
-    for name in sorted({name for each in groups for name in each.numbers}):
-        owners = [each for each in groups if name in each.numbers]
-        values = joined_numbers([(each.numbers[name], len(each)) for each in owners]).values
-        types = _json({"types": [each.type for each in owners]})
-        width = values.itemsize
-        rows.append(BlockRow(name, f"number{8 * width}", types, values.astype(f"<f{width}").tobytes()))
-    return [*rows, *(BlockRow(name, "left_out", None, b"") for name in sorted(block.left_out))]
 
 
 def decode(rows: Iterable[tuple[str, str, str | None, bytes]]) -> Block:
@@ -77,28 +68,22 @@ def decode(rows: Iterable[tuple[str, str, str | None, bytes]]) -> Block:
         )
     except KeyError as error:
         raise ValueError(f"the block has no row {error}") from None
-    spans = _spans(_decoded(names, list[str]), _array(sizes, "<u4"))
-    texts: dict[str, dict[str, Symbols | Sets]] = {name: {} for name in spans}
-    numbers: dict[str, dict[str, Numbers]] = {name: {} for name in spans}
+    groups = _sizes(_decoded(names, list[str]), _array(sizes, "<u4"))
+    texts: dict[str, Spread[Symbols | Sets]] = {}
+    numbers: dict[str, Spread[Numbers]] = {}
     left_out = set()
-    for (feature, kind), (words, data) in by_key.items():
+    for (feature, kind), (words, data) in sorted(by_key.items()):
         if kind == "left_out":
             left_out.add(feature)
         elif kind in ("number32", "number64"):
-            for name, column in _number_columns(feature, kind, words, data, spans):
-                numbers[name][feature] = column
+            numbers[feature] = _numbers(feature, kind, words, data, groups)
         else:
-            for name, text in _text_columns(feature, kind, words, data, spans):
-                texts[name][feature] = text
-    count = sum(span.stop - span.start for span in spans.values())
+            texts[feature] = _texts(feature, kind, words, data, groups)
+    count = sum(groups.values())
     node, start, parent = _array(nodes, "<i8", count), _array(started, "<i8", count), _array(parents, "<i4", count)
-    groups = {
-        name: Group(name, node[span], start[span], parent[span], texts[name], numbers[name])
-        for name, span in spans.items()
-    }
-    for group in groups.values():
-        _validate(group)
-    return Block(groups, frozenset(left_out))
+    block = Block(groups, node, start, parent, texts, numbers, frozenset(left_out))
+    _validate_order(block)
+    return block
 
 
 # --- rows of columns ------------------------------------------------------------------------------------------
@@ -112,8 +97,9 @@ class _Dictionary(_Types):
     words: list[str]
 
 
-def _text_row(name: str, owners: Sequence[Group], column: Symbols | Sets) -> BlockRow:
-    words = _json({"types": [each.type for each in owners], "words": list(column.words)})
+def _text_row(name: str, spread: Spread[Symbols | Sets]) -> BlockRow:
+    column = spread.column
+    words = _json({"types": spread.types, "words": tuple(column.words)})
     width = 1 if len(column.words) < 256 else 2
     codes = column.codes.astype(f"<u{width}").tobytes()
     if isinstance(column, Sets):
@@ -121,37 +107,35 @@ def _text_row(name: str, owners: Sequence[Group], column: Symbols | Sets) -> Blo
     return BlockRow(name, f"symbol{8 * width}", words, codes)
 
 
-def _number_columns(
-    feature: str, kind: str, words: str | None, data: bytes, spans: Mapping[str, slice]
-) -> Iterator[tuple[str, Numbers]]:
-    owners, count = _owners(feature, _decoded(words, _Types).types, spans)
-    values = _array(data, "<f4" if kind == "number32" else "<f8", count)
-    return ((name, Numbers(values[span])) for name, span in owners)
+def _number_row(name: str, spread: Spread[Numbers]) -> BlockRow:
+    values = spread.column.values
+    data = values.astype(f"<f{values.itemsize}").tobytes()
+    return BlockRow(name, f"number{8 * values.itemsize}", _json({"types": spread.types}), data)
 
 
-def _text_columns(
-    feature: str, kind: str, words: str | None, data: bytes, spans: Mapping[str, slice]
-) -> Iterator[tuple[str, Symbols | Sets]]:
+def _numbers(feature: str, kind: str, words: str | None, data: bytes, groups: Mapping[str, int]) -> Spread[Numbers]:
+    types = _decoded(words, _Types).types
+    count = _count(feature, types, groups)
+    return Spread(tuple(types), Numbers(_array(data, "<f4" if kind == "number32" else "<f8", count)))
+
+
+def _texts(
+    feature: str, kind: str, words: str | None, data: bytes, groups: Mapping[str, int]
+) -> Spread[Symbols | Sets]:
     if kind not in ("symbol8", "symbol16", "set8", "set16"):
         raise ValueError(f"feature {feature!r} has the unknown kind {kind!r}")
     dictionary = _decoded(words, _Dictionary)
-    known = Words(dictionary.words)
-    owners, count = _owners(feature, dictionary.types, spans)
+    known, types = Words(dictionary.words), tuple(dictionary.types)
+    count = _count(feature, dictionary.types, groups)
     dtype = "<u1" if kind.endswith("8") else "<u2"
     if kind.startswith("symbol"):
         codes = _array(data, dtype, count)
         _validate_codes(feature, codes, known)
-        for name, span in owners:
-            yield name, Symbols(known, codes[span])
-        return
+        return Spread(types, Symbols(known, codes))
     sizes = _array(data[:count], "<u1", count)
     codes = _array(data[count:], dtype, int(sizes.sum(dtype=np.int64)))
     _validate_codes(feature, codes, known)
-    first = 0
-    for name, span in owners:
-        last = first + int(sizes[span].sum(dtype=np.int64))
-        yield name, Sets(known, sizes[span], codes[first:last])
-        first = last
+    return Spread(types, Sets(known, sizes, codes))
 
 
 def _validate_codes(feature: str, codes: NDArray[Any], words: Words) -> None:
@@ -159,24 +143,18 @@ def _validate_codes(feature: str, codes: NDArray[Any], words: Words) -> None:
         raise ValueError(f"feature {feature!r} has the code {int(codes.max())} and {len(words)} words")
 
 
-def _spans(types: Sequence[str], sizes: NDArray[Any]) -> dict[str, slice]:
+def _sizes(types: Sequence[str], sizes: NDArray[Any]) -> dict[str, int]:
     if len(types) != sizes.size or len(set(types)) != len(types):
         raise ValueError(f"the block has {len(types)} types and {sizes.size} sizes of groups")
-    ends = np.cumsum(sizes, dtype=np.int64).tolist()
-    return {name: slice(end - size, end) for name, end, size in zip(types, ends, sizes.tolist(), strict=True)}
+    return dict(zip(types, sizes.tolist(), strict=True))
 
 
-def _owners(feature: str, types: Sequence[str], spans: Mapping[str, slice]) -> tuple[list[tuple[str, slice]], int]:
-    """Return the span of each type in a column that has only these types, and the length of the column."""
-    strange = [name for name in types if name not in spans]
-    if strange or len(set(types)) != len(types):
-        raise ValueError(f"feature {feature!r} has the types {types!r}, the block {list(spans)!r}")
-    owners, first = [], 0
-    for name in types:
-        last = first + spans[name].stop - spans[name].start
-        owners.append((name, slice(first, last)))
-        first = last
-    return owners, first
+def _count(feature: str, types: Sequence[str], groups: Mapping[str, int]) -> int:
+    """Return the length of a column that has these types only."""
+    owners = set(types)
+    if list(types) != [name for name in groups if name in owners]:
+        raise ValueError(f"feature {feature!r} has the types {types!r}, the block {list(groups)!r}")
+    return sum(groups[name] for name in types)
 
 
 def _array(data: bytes, dtype: str, count: int | None = None) -> NDArray[Any]:
@@ -184,10 +162,6 @@ def _array(data: bytes, dtype: str, count: int | None = None) -> NDArray[Any]:
     if len(data) % np.dtype(dtype).itemsize or count not in (None, len(data) // np.dtype(dtype).itemsize):
         raise ValueError(f"{len(data)} bytes are not {count} values of {np.dtype(dtype).name}")
     return np.frombuffer(data, dtype)
-
-
-def _bytes(parts: Sequence[NDArray[Any]], dtype: str) -> bytes:
-    return np.concatenate(parts).astype(dtype).tobytes()
 
 
 def _json(value: object) -> str:
@@ -201,8 +175,10 @@ def _decoded(text: str | None, shape: type[_Shape]) -> _Shape:
         raise ValueError(f"the words of a column cannot be read: {error}") from None
 
 
-def _validate(group: Group) -> None:
-    """Raise `ValueError` for cases that are not in order."""
-    ages = np.diff(group.started_us)
-    if ((ages > 0) | ((ages == 0) & (np.diff(group.nodes) >= 0))).any():
-        raise ValueError(f"the cases of {group.type} are not in the order of their starts")
+def _validate_order(block: Block) -> None:
+    """Raise `ValueError` for cases of one type that are not in order."""
+    ages = np.diff(block.started_us)
+    wrong = (ages > 0) | ((ages == 0) & (np.diff(block.nodes) >= 0))
+    wrong[np.cumsum([*block.sizes.values()])[:-1] - 1] = False
+    if wrong.any():
+        raise ValueError("the cases of a type are not in the order of their starts")

@@ -1,29 +1,33 @@
 """A block holds many cases as columns; `block_rows` encodes it as rows of a table.
 
-The cases of one type form a group, the newest first: by the time of their start, then by their node. A group has the
-columns of those features that its cases have, so types whose parameters differ take no space from each other.
+The cases of one type form a group, the newest first: by the time of their start, then by their node. Groups follow each
+other in the alphabetical order of their types. A column has the cases of those types that have its feature, so types
+whose parameters differ take no space from each other. Equal cases make equal columns, in any order and by any merges.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Final
+from typing import Any, Final, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pycrorm_async.events.ids import row_id, row_key
-from pycrorm_async.recall.case import Case, bounded_case
-from pycrorm_async.recall.columns import Numbers, Sets, Symbols, joined_numbers, joined_words, taken
+from pycrorm_async.recall.case import FEATURES_MAX, RESERVED, Case, bounded_case
+from pycrorm_async.recall.columns import Numbers, Sets, Symbols, joined_numbers, joined_words
 
-__all__ = ["Block", "Group", "WORDS_MAX", "merge", "merged_group"]
+__all__ = ["Block", "EPISODE_SHIFT", "Group", "Spread", "WORDS_MAX", "merge"]
 
 WORDS_MAX: Final = 16_384
 """Bounds the words of a feature in a memory. A feature with more of them names single cases and likens none."""
+EPISODE_SHIFT: Final = row_id(1, 0, 0).bit_length() - 1
+"""The bits of a node's id below its episode's number."""
 
-_EPISODE_SHIFT: Final = row_id(1, 0, 0).bit_length() - 1
+_Column = TypeVar("_Column", Numbers, Symbols | Sets)
+Rows = slice | NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +55,7 @@ class Group:
     @cached_property
     def episodes(self) -> NDArray[np.int64]:
         """The episode's number of each case."""
-        return self.nodes >> _EPISODE_SHIFT
+        return self.nodes >> EPISODE_SHIFT
 
     def case(self, row: int) -> Case:
         """Return one case; row 0 is the newest."""
@@ -76,106 +80,217 @@ class Group:
 
 
 @dataclass(frozen=True, eq=False)
+class Spread(Generic[_Column]):
+    """A column over the groups of some types of a block, in their order."""
+
+    types: tuple[str, ...]
+    column: _Column
+
+
+@dataclass(frozen=True, eq=False)
 class Block:
     """Many cases, grouped by type.
 
     Attributes:
-        groups: by type, in alphabetical order.
+        sizes: the number of cases of each type, in alphabetical order.
+        nodes, started_us, parents: as in `Group`, group after group.
+        texts, numbers: the columns by feature, those of the outcome among them.
         left_out: features that are not kept because they have too many words.
     """
 
-    groups: Mapping[str, Group]
+    sizes: Mapping[str, int]
+    nodes: NDArray[np.int64]
+    started_us: NDArray[np.int64]
+    parents: NDArray[np.int32]
+    texts: Mapping[str, Spread[Symbols | Sets]]
+    numbers: Mapping[str, Spread[Numbers]]
     left_out: frozenset[str] = frozenset()
 
     @classmethod
     def of(cls, cases: Iterable[Case]) -> Block:
-        """Make a block of cases, each bounded by `bounded_case`."""
+        """Make a block of cases, each as `bounded_case` returns it."""
         by_type: dict[str, list[Case]] = {}
-        for case in cases:
-            by_type.setdefault(case.type, []).append(bounded_case(case))
-        return _without_long_dictionaries({name: _group(name, by_type[name]) for name in sorted(by_type)}, frozenset())
+        for case in sorted(map(_with_few_features, cases), key=_age, reverse=True):
+            by_type.setdefault(case.type, []).append(case)
+        by_type = dict(sorted(by_type.items()))
+        every = [case for each in by_type.values() for case in each]
+        sizes = {name: len(each) for name, each in by_type.items()}
+        texts: dict[str, Spread[Symbols | Sets]] = {
+            "status": _spread(sizes, _texts, [case.status for case in every]),
+            "reason": _spread(sizes, _texts, [case.reason for case in every]),
+            "simulated": _spread(sizes, _texts, ["yes" if case.simulated else None for case in every]),
+            **_spreads(sizes, _texts, [case.symbols for case in every]),
+        }
+        numbers: dict[str, Spread[Numbers]] = {
+            "duration": _spread(sizes, Numbers.of, [case.duration_s for case in every]),
+            **_spreads(sizes, Numbers.of, [case.numbers for case in every]),
+        }
+        return _without_long_dictionaries(
+            cls(
+                sizes,
+                np.array([case.node for case in every], np.int64),
+                np.array([case.started_us for case in every], np.int64),
+                np.array([row_key(case.parent).sequence if case.parent else 0 for case in every], np.int32),
+                {name: each for name, each in sorted(texts.items()) if each.types},
+                {name: each for name, each in sorted(numbers.items()) if each.types},
+            )
+        )
 
     def __len__(self) -> int:
         """Return the number of cases."""
-        return sum(map(len, self.groups.values()))
+        return int(self.nodes.size)
 
     def cases(self) -> Iterator[Case]:
         """Yield the cases, group after group, the newest of each group first."""
         return (group.case(row) for group in self.groups.values() for row in range(len(group)))
 
+    @cached_property
+    def spans(self) -> dict[str, slice]:
+        """The places of the cases of each type."""
+        spans, first = {}, 0
+        for name, size in self.sizes.items():
+            spans[name] = slice(first, first + size)
+            first += size
+        return spans
+
+    @cached_property
+    def groups(self) -> dict[str, Group]:
+        """The groups by type, in alphabetical order."""
+        return {name: self.group(name) for name in self.sizes}
+
+    def group(self, name: str) -> Group:
+        """Return the cases of a type, always the same object; the columns share the memory of the block."""
+        if name not in self._made:
+            self._made[name] = self._group(name)
+        return self._made[name]
+
+    @cached_property
+    def _made(self) -> dict[str, Group]:
+        return {}
+
+    def _group(self, name: str) -> Group:
+        span = self.spans[name]
+        return Group(
+            name,
+            self.nodes[span],
+            self.started_us[span],
+            self.parents[span],
+            {feature: self._part(each, name) for feature, each in self.texts.items() if name in each.types},
+            {feature: self._part(each, name) for feature, each in self.numbers.items() if name in each.types},
+        )
+
+    def rows_of(self, types: tuple[str, ...]) -> Rows:
+        """Return the places of the cases of these types."""
+        if len(types) == len(self.sizes):
+            return slice(None)
+        return np.concatenate([np.arange(self.spans[name].start, self.spans[name].stop) for name in types])
+
+    def _part(self, spread: Spread[_Column], name: str) -> _Column:
+        first = sum(self.sizes[each] for each in spread.types[: spread.types.index(name)])
+        return spread.column.part(first, first + self.sizes[name])
+
 
 def merge(blocks: Sequence[Block]) -> Block:
     """Return one block with the cases of all."""
-    groups: dict[str, Group] = {}
-    for name in sorted({name for block in blocks for name in block.groups}):
-        groups[name] = merged_group([block.groups[name] for block in blocks if name in block.groups])
-    return _without_long_dictionaries(groups, frozenset().union(*(block.left_out for block in blocks)))
+    names = sorted({name for block in blocks for name in block.sizes})
+    codes = {name: code for code, name in enumerate(names)}
+    types = np.concatenate([np.repeat([codes[name] for name in each.sizes], [*each.sizes.values()]) for each in blocks])
+    nodes = np.concatenate([each.nodes for each in blocks])
+    started = np.concatenate([each.started_us for each in blocks])
+    order = np.lexsort((-nodes, -started, types))
+    sizes = dict(zip(names, np.bincount(types, minlength=len(names)).tolist(), strict=True))
+    parents = np.concatenate([each.parents for each in blocks])[order]
+    left_out = frozenset[str]().union(*(each.left_out for each in blocks))
+    merged = Block(sizes, nodes[order], started[order], parents, {}, {}, left_out)
+    rows: dict[tuple[Block, tuple[str, ...]], Rows] = {}
 
+    def places(block: Block, owners: tuple[str, ...]) -> Rows:
+        if (block, owners) not in rows:
+            rows[block, owners] = block.rows_of(owners)
+        return rows[block, owners]
 
-# --- groups ---------------------------------------------------------------------------------------------------
-
-
-def _group(name: str, cases: list[Case]) -> Group:
-    cases.sort(key=lambda case: (case.started_us, case.node), reverse=True)
-    texts: dict[str, Symbols | Sets] = {"status": Symbols.of([case.status for case in cases])}
-    for optional, values in (
-        ("reason", [case.reason for case in cases]),
-        ("simulated", ["yes" if case.simulated else None for case in cases]),
-    ):
-        if any(values):
-            texts[optional] = Symbols.of(values)
-    for feature in dict.fromkeys(feature for case in cases for feature in case.symbols):
-        column = [case.symbols.get(feature) for case in cases]
-        many = any(isinstance(each, tuple) for each in column)
-        texts[feature] = (
-            Sets.of(column) if many else Symbols.of([each for each in column if not isinstance(each, tuple)])
+    def joined(spreads: Sequence[Spread[_Column] | None], join: Callable[..., _Column]) -> Spread[_Column]:
+        owned = {name for each in spreads if each is not None for name in each.types}
+        owners = tuple(name for name in names if name in owned)
+        whole = join(
+            [
+                None if each is None else each.column.placed(places(block, each.types), len(block))
+                for block, each in zip(blocks, spreads, strict=True)
+            ],
+            [len(block) for block in blocks],
         )
-    numbers = {
-        feature: Numbers.of([case.numbers.get(feature) for case in cases])
-        for feature in dict.fromkeys(feature for case in cases for feature in case.numbers)
+        return Spread(owners, whole.taken(order).taken(places(merged, owners)))
+
+    texts = {
+        name: joined([block.texts.get(name) for block in blocks], joined_words)
+        for name in sorted({name for block in blocks for name in block.texts} - left_out)
     }
-    if any(case.duration_s is not None for case in cases):
-        numbers["duration"] = Numbers.of([case.duration_s for case in cases])
-    return Group(
-        name,
-        np.array([case.node for case in cases], np.int64),
-        np.array([case.started_us for case in cases], np.int64),
-        np.array([row_key(case.parent).sequence if case.parent else 0 for case in cases], np.int32),
-        dict(sorted(texts.items())),
-        dict(sorted(numbers.items())),
+    numbers = {
+        name: joined([block.numbers.get(name) for block in blocks], joined_numbers)
+        for name in sorted({name for block in blocks for name in block.numbers})
+    }
+    return _without_long_dictionaries(
+        Block(sizes, merged.nodes, merged.started_us, merged.parents, texts, numbers, left_out)
     )
 
 
-def merged_group(groups: Sequence[Group]) -> Group:
-    """Return one group with the cases of all, which are of one type."""
-    if len(groups) == 1:
-        return replace(groups[0], caches={})
-    nodes = np.concatenate([each.nodes for each in groups])
-    started = np.concatenate([each.started_us for each in groups])
-    order = np.lexsort((nodes, started))[::-1]
-    texts: dict[str, Symbols | Sets] = {}
-    for name in sorted({name for each in groups for name in each.texts}):
-        column = taken(joined_words([(each.texts.get(name), len(each)) for each in groups]), order)
-        assert not isinstance(column, Numbers)
-        texts[name] = column
-    numbers: dict[str, Numbers] = {}
-    for name in sorted({name for each in groups for name in each.numbers}):
-        column = taken(joined_numbers([(each.numbers.get(name), len(each)) for each in groups]), order)
-        assert isinstance(column, Numbers)
-        numbers[name] = column
-    parents = np.concatenate([each.parents for each in groups])[order]
-    return Group(groups[0].type, nodes[order], started[order], parents, texts, numbers)
+# --- columns of cases -----------------------------------------------------------------------------------------
 
 
-def _without_long_dictionaries(groups: Mapping[str, Group], left_out: frozenset[str]) -> Block:
-    words: dict[str, set[str]] = {}
-    for group in groups.values():
-        for name, column in group.texts.items():
-            words.setdefault(name, set()).update(column.words)
-    left_out |= {name for name, each in words.items() if len(each) > WORDS_MAX}
-    if left_out:
-        groups = {
-            name: replace(group, texts={key: each for key, each in group.texts.items() if key not in left_out})
-            for name, group in groups.items()
-        }
-    return Block(groups, left_out)
+def _spreads(
+    sizes: Mapping[str, int], column: Callable[[Sequence[Any]], _Column], situations: Sequence[Mapping[str, Any]]
+) -> dict[str, Spread[_Column]]:
+    """Make the column of each feature of the situations, each over the types that have it."""
+    by_type, first = {}, 0
+    for name, size in sizes.items():
+        by_type[name] = situations[first : first + size]
+        first += size
+    owners: dict[str, list[str]] = {}
+    for name, each in by_type.items():
+        for feature in frozenset[str]().union(*each):
+            owners.setdefault(feature, []).append(name)
+    reserved = RESERVED.intersection(owners)
+    assert not reserved, f"features of a situation cannot be named {', '.join(sorted(reserved))}"
+    spreads = {}
+    for feature, types in owners.items():
+        chosen = situations if len(types) == len(sizes) else [each for name in types for each in by_type[name]]
+        spreads[feature] = _spread(
+            {name: sizes[name] for name in types}, column, [each.get(feature) for each in chosen]
+        )
+    return spreads
+
+
+def _spread(
+    sizes: Mapping[str, int], column: Callable[[Sequence[Any]], _Column], values: Sequence[Any]
+) -> Spread[_Column]:
+    """Make the column of a feature, without the types of which no case has a value that is kept."""
+    spread = Spread(tuple(sizes), column(values))
+    present = spread.column.present()
+    if present.all():
+        return spread
+    firsts = np.cumsum([0, *sizes.values()])[:-1]
+    having = np.logical_or.reduceat(present, firsts).tolist()
+    types = tuple(name for name, each in zip(sizes, having, strict=True) if each)
+    kept = np.repeat(having, [*sizes.values()])
+    return spread if all(having) else Spread(types, spread.column.taken(np.flatnonzero(kept)))
+
+
+def _texts(values: Sequence[Any]) -> Symbols | Sets:
+    return Sets.of(values) if tuple in {*map(type, values)} else Symbols.of(values)
+
+
+def _without_long_dictionaries(block: Block) -> Block:
+    long = {name for name, each in block.texts.items() if len(each.column.words) > WORDS_MAX}
+    if not long:
+        return block
+    texts = {name: each for name, each in block.texts.items() if name not in long}
+    columns = block.nodes, block.started_us, block.parents
+    return Block(block.sizes, *columns, texts, block.numbers, block.left_out | long)
+
+
+def _with_few_features(case: Case) -> Case:
+    return case if len(case.symbols) + len(case.numbers) <= FEATURES_MAX else bounded_case(case)
+
+
+def _age(case: Case) -> tuple[int, int]:
+    return case.started_us, case.node

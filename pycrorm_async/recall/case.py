@@ -15,7 +15,17 @@ import numpy as np
 
 from pycrorm_async.events.ids import row_key
 
-__all__ = ["Case", "FEATURES_MAX", "OUTCOME", "RESERVED", "SYMBOLS_MAX", "TEXT_MAX", "bounded_case", "is_angle"]
+__all__ = [
+    "Case",
+    "FEATURES_MAX",
+    "OUTCOME",
+    "RESERVED",
+    "SINGLE_MAX",
+    "SYMBOLS_MAX",
+    "TEXT_MAX",
+    "bounded_case",
+    "is_angle",
+]
 
 OUTCOME = ("status", "reason", "duration")
 """The features of the outcome. They are found by name like others, but only if a cue names them."""
@@ -27,7 +37,7 @@ SYMBOLS_MAX = 255
 """Bounds the symbols of one feature, as the objects nearby; beyond them the last ones in order are left out."""
 TEXT_MAX = 120
 """The longest symbol in characters. A longer text is prose, which hardly ever recurs, and is left out."""
-_EXACT = 2.0**24
+SINGLE_MAX = 2.0**24
 """Up to this magnitude a number is kept as float32, which here is exact to 1 or better; beyond it as float64."""
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
@@ -76,9 +86,9 @@ class Case(NamedTuple):
 
 
 def bounded_case(case: Case) -> Case:
-    """Return the case as a memory keeps it: without what is not finite, too long or too much, numbers as stored.
+    """Return the case as blocks keep it: without what is not finite, too long or too much, numbers as stored.
 
-    Blocks keep every case in this form, so the same action gives the same case wherever the blocks begin and end.
+    It depends on the case alone, so the same action is the same case wherever blocks begin and end.
     """
     symbols = {name: kept for name, value in case.symbols.items() if (kept := _bounded(value))}
     numbers = {name: _stored(value) for name, value in case.numbers.items() if math.isfinite(value)}
@@ -88,7 +98,6 @@ def bounded_case(case: Case) -> Case:
         kept_names = set(sorted({*symbols, *numbers})[:FEATURES_MAX])
         symbols = {name: value for name, value in symbols.items() if name in kept_names}
         numbers = {name: value for name, value in numbers.items() if name in kept_names}
-    numbers = {name: value for name, value in numbers.items() if name not in symbols}
     duration_s = case.duration_s
     if duration_s is not None:
         duration_s = _stored(duration_s) if math.isfinite(duration_s) else None
@@ -108,4 +117,4 @@ def _bounded(value: str | tuple[str, ...]) -> str | tuple[str, ...]:
 
 
 def _stored(value: Any) -> float:
-    return float(value) if abs(value) > _EXACT else float(np.float32(value))
+    return float(value) if abs(value) > SINGLE_MAX else float(np.float32(value))

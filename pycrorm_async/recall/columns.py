@@ -1,4 +1,4 @@
-"""The columns of a block: one feature of many cases of one type, as NumPy arrays.
+"""The columns of a block: one feature of many cases, as NumPy arrays.
 
 `Symbols` holds at most one word a case, `Sets` several, `Numbers` a float. Words are kept once, in a dictionary of the
 column; code 0 means that a case does not have the feature, code i the word i - 1, and NaN that it has no number.
@@ -6,30 +6,35 @@ column; code 0 means that a case does not have the feature, code i the word i - 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cached_property
+from itertools import chain
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Column", "Mask", "Numbers", "Sets", "Symbols", "Words", "joined_numbers", "joined_words", "smallest_codes"]
+from pycrorm_async.recall.case import SINGLE_MAX, SYMBOLS_MAX, TEXT_MAX
+
+__all__ = ["Mask", "Numbers", "Sets", "Symbols", "Words", "joined_numbers", "joined_words", "smallest_codes"]
 
 Mask: TypeAlias = NDArray[np.bool_]
 Codes: TypeAlias = "NDArray[np.unsignedinteger[Any]]"
 Floats: TypeAlias = NDArray[np.floating[Any]]
+Rows: TypeAlias = "slice | NDArray[np.int64]"
 
 
 class Words(tuple[str, ...]):
     """The dictionary of a column: different words, in alphabetical order."""
 
     @cached_property
-    def _codes(self) -> Mapping[str, int]:
+    def codes(self) -> Mapping[str, int]:
+        """The code of each word."""
         return {word: code for code, word in enumerate(self, 1)}
 
     def code(self, word: str) -> int:
         """Return the code of a word; 0 if no case has it."""
-        return self._codes.get(word, 0)
+        return self.codes.get(word, 0)
 
 
 class Symbols:
@@ -41,10 +46,10 @@ class Symbols:
 
     @classmethod
     def of(cls, values: Sequence[Any]) -> Symbols:
-        """Make the column of these values, None where a case does not have the feature."""
-        words = Words(sorted({each for each in values if each}))
-        codes = {word: code for code, word in enumerate(words, 1)}
-        return cls(words, smallest_codes([codes.get(each, 0) if each else 0 for each in values], len(words)))
+        """Make the column of these texts, None where a case does not have the feature. Long ones are left out."""
+        words = Words(sorted(each for each in {*values} if each and len(each) <= TEXT_MAX))
+        codes = words.codes
+        return cls(words, smallest_codes([codes.get(each, 0) for each in values], len(words)))
 
     def equal_to(self, word: str, rows: slice) -> Mask:
         """Return which of these rows have the word."""
@@ -58,12 +63,29 @@ class Symbols:
 
     def counts(self) -> dict[str, int]:
         """Return the number of cases that have each word."""
-        sizes = np.bincount(self.codes, minlength=len(self.words) + 1)[1:].tolist()
-        return dict(zip(self.words, sizes, strict=True))
+        return _counts(self.words, self.codes)
+
+    def present(self) -> Mask:
+        """Return which cases have the feature."""
+        return self.codes > 0
+
+    def part(self, first: int, last: int) -> Symbols:
+        """Return the column of some cases, with the same dictionary."""
+        return Symbols(self.words, self.codes[first:last])
+
+    def placed(self, rows: Rows, count: int) -> Symbols:
+        """Return the column of more cases, of which these rows are its own and the others have no value."""
+        codes = np.zeros(count, self.codes.dtype)
+        codes[rows] = self.codes
+        return Symbols(self.words, codes)
+
+    def taken(self, rows: Rows) -> Symbols:
+        """Return the column with some of its cases, in their order."""
+        return Symbols(self.words, self.codes[rows])
 
     def recoded(self, words: Words) -> Symbols:
         """Return the column with a dictionary that contains its own."""
-        return Symbols(words, _translation(self.words, words)[self.codes])
+        return self if words is self.words else Symbols(words, _translation(self.words, words)[self.codes])
 
 
 class Sets:
@@ -75,13 +97,14 @@ class Sets:
         self.codes = codes
 
     @classmethod
-    def of(cls, values: Sequence[str | tuple[str, ...] | None]) -> Sets:
-        """Make the column of these values, None or an empty tuple where a case does not have the feature."""
-        rows = [(each,) if isinstance(each, str) else each or () for each in values]
-        words = Words(sorted({each for row in rows for each in row}))
-        codes = {word: code for code, word in enumerate(words, 1)}
+    def of(cls, values: Sequence[Any]) -> Sets:
+        """Make the column of these texts and tuples of texts, None where a case does not have the feature."""
+        kept = {each: _bounded_set(each) for each in {*values}}
+        words = Words(sorted({*chain.from_iterable(kept.values())}))
+        codes = {each: [words.codes[word] for word in row] for each, row in kept.items()}
+        rows = [codes[each] for each in values]
         sizes = np.array([len(row) for row in rows], np.uint8)
-        return cls(words, sizes, smallest_codes([codes[each] for row in rows for each in row], len(words)))
+        return cls(words, sizes, smallest_codes([*chain.from_iterable(rows)], len(words)))
 
     @cached_property
     def _ends(self) -> NDArray[np.int64]:
@@ -110,60 +133,97 @@ class Sets:
 
     def counts(self) -> dict[str, int]:
         """Return the number of cases that have each word."""
-        sizes = np.bincount(self.codes, minlength=len(self.words) + 1)[1:].tolist()
-        return dict(zip(self.words, sizes, strict=True))
+        return _counts(self.words, self.codes)
+
+    def present(self) -> Mask:
+        """Return which cases have the feature."""
+        return self.sizes > 0
+
+    def part(self, first: int, last: int) -> Sets:
+        """Return the column of some cases, with the same dictionary."""
+        start = int(self._ends[first - 1]) if first else 0
+        stop = int(self._ends[last - 1]) if last else 0
+        return Sets(self.words, self.sizes[first:last], self.codes[start:stop])
+
+    def placed(self, rows: Rows, count: int) -> Sets:
+        """Return the column of more cases, of which these rows are its own and the others have no value."""
+        sizes = np.zeros(count, np.uint8)
+        sizes[rows] = self.sizes
+        return Sets(self.words, sizes, self.codes)
+
+    def taken(self, rows: Rows) -> Sets:
+        """Return the column with some of its cases, in their order."""
+        sizes = self.sizes[rows]
+        starts = (self._ends - self.sizes)[rows]
+        firsts = np.cumsum(sizes, dtype=np.int64) - sizes
+        places = np.repeat(starts - firsts, sizes) + np.arange(int(sizes.sum(dtype=np.int64)))
+        return Sets(self.words, sizes, self.codes[places])
 
     def recoded(self, words: Words) -> Sets:
         """Return the column with a dictionary that contains its own."""
-        return Sets(words, self.sizes, _translation(self.words, words)[self.codes])
+        return self if words is self.words else Sets(words, self.sizes, _translation(self.words, words)[self.codes])
 
 
 class Numbers:
-    """A number, as float32 where that is how its cases have it, otherwise as float64."""
+    """A number, as float32 unless a case has a larger one than `SINGLE_MAX`, which are kept as float64."""
 
     def __init__(self, values: Floats) -> None:
         self.values = values
 
     @classmethod
-    def of(cls, values: Iterable[float | None]) -> Numbers:
-        """Make the column of these values, None where a case does not have the feature."""
+    def of(cls, values: Sequence[float | None]) -> Numbers:
+        """Make the column of these numbers, None where a case does not have the feature, without what is not finite."""
         wide = np.array([np.nan if each is None else each for each in values], np.float64)
-        with np.errstate(over="ignore"):
-            narrow = wide.astype(np.float32)
-        return cls(narrow if np.array_equal(narrow, wide, equal_nan=True) else wide)
+        wide[np.isinf(wide)] = np.nan
+        large = np.abs(wide) > SINGLE_MAX
+        narrow = np.where(large, np.nan, wide).astype(np.float32)
+        return cls(np.where(large, wide, narrow) if large.any() else narrow)
 
     def value(self, row: int) -> float | None:
         """Return the value of a case; None if it has none."""
         value = float(self.values[row])
         return value if value == value else None
 
-    def present(self) -> Floats:
-        """Return the numbers of the cases that have one, as float64."""
-        wide = self.values.astype(np.float64)
-        return wide[~np.isnan(wide)]
+    def present(self) -> Mask:
+        """Return which cases have the number."""
+        return ~np.isnan(self.values)
+
+    def part(self, first: int, last: int) -> Numbers:
+        """Return the column of some cases."""
+        return Numbers(self.values[first:last])
+
+    def placed(self, rows: Rows, count: int) -> Numbers:
+        """Return the column of more cases, of which these rows are its own and the others have no number."""
+        values = np.full(count, np.nan, self.values.dtype)
+        values[rows] = self.values
+        return Numbers(values)
+
+    def taken(self, rows: Rows) -> Numbers:
+        """Return the column with some of its cases, in their order."""
+        return Numbers(self.values[rows])
 
 
-Column: TypeAlias = Symbols | Sets | Numbers
-
-
-def joined_words(parts: Sequence[tuple[Symbols | Sets | None, int]]) -> Symbols | Sets:
-    """Put columns of one feature below each other; None and a count stand for cases without the feature."""
-    words = Words(sorted({word for column, _ in parts if column is not None for word in column.words}))
-    if any(isinstance(column, Sets) for column, _ in parts):
-        sets = [_as_sets(column, count).recoded(words) for column, count in parts]
+def joined_words(columns: Sequence[Symbols | Sets | None], sizes: Sequence[int]) -> Symbols | Sets:
+    """Put columns of one feature below each other; where there is none, that many cases do not have the feature."""
+    words = _joined([column.words for column in columns if column is not None])
+    parts = list(zip(columns, sizes, strict=True))
+    if any(isinstance(column, Sets) for column in columns):
+        sets = [_as_sets(column, size).recoded(words) for column, size in parts]
         codes = np.concatenate([each.codes for each in sets])
         return Sets(words, np.concatenate([each.sizes for each in sets]), codes)
-    empty = np.uint8
     symbols = [
-        column.recoded(words).codes if isinstance(column, Symbols) else np.zeros(count, empty)
-        for column, count in parts
+        column.recoded(words).codes if isinstance(column, Symbols) else np.zeros(size, np.uint8)
+        for column, size in parts
     ]
-    return Symbols(words, np.concatenate(symbols))
+    return Symbols(words, np.concatenate(symbols) if symbols else np.zeros(0, np.uint8))
 
 
-def joined_numbers(parts: Sequence[tuple[Numbers | None, int]]) -> Numbers:
-    """Put columns of one number below each other; None and a count stand for cases without it."""
-    values = [np.full(count, np.nan, np.float32) if column is None else column.values for column, count in parts]
+def joined_numbers(columns: Sequence[Numbers | None], sizes: Sequence[int]) -> Numbers:
+    """Put columns of one number below each other; where there is none, that many cases do not have it."""
+    values = [
+        np.full(size, np.nan, np.float32) if column is None else column.values
+        for column, size in zip(columns, sizes, strict=True)
+    ]
     return Numbers(np.concatenate(values))
 
 
@@ -173,20 +233,21 @@ def smallest_codes(codes: Any, largest: int) -> Codes:
     return smallest
 
 
-def taken(column: Column, order: NDArray[np.int64]) -> Column:
-    """Return the column with its cases in another order."""
-    match column:
-        case Symbols(words=words, codes=codes):
-            return Symbols(words, codes[order])
-        case Numbers(values=values):
-            return Numbers(values[order])
-        case Sets():
-            ends = np.cumsum(column.sizes, dtype=np.int64)
-            sizes = column.sizes[order]
-            starts = (ends - column.sizes)[order]
-            firsts = np.cumsum(sizes, dtype=np.int64) - sizes
-            places = np.repeat(starts - firsts, sizes) + np.arange(int(sizes.sum(dtype=np.int64)))
-            return Sets(column.words, sizes, column.codes[places])
+def _counts(words: Words, codes: Codes) -> dict[str, int]:
+    sizes = np.bincount(codes, minlength=len(words) + 1)[1:].tolist()
+    return dict(zip(words, sizes, strict=True))
+
+
+def _joined(dictionaries: Sequence[Words]) -> Words:
+    first = dictionaries[0] if dictionaries else Words()
+    if all(each is first for each in dictionaries):
+        return first
+    return Words(sorted({*chain.from_iterable(dictionaries)}))
+
+
+def _bounded_set(value: str | tuple[str, ...] | None) -> tuple[str, ...]:
+    words = (value,) if isinstance(value, str) else value or ()
+    return tuple(sorted({each for each in words if each and len(each) <= TEXT_MAX}))[:SYMBOLS_MAX]
 
 
 def _as_sets(column: Symbols | Sets | None, count: int) -> Sets:
@@ -200,4 +261,5 @@ def _as_sets(column: Symbols | Sets | None, count: int) -> Sets:
 
 
 def _translation(old: Words, new: Words) -> Codes:
-    return smallest_codes([0, *(new.code(word) for word in old)], len(new))
+    codes = new.codes
+    return smallest_codes([0, *(codes[word] for word in old)], len(new))

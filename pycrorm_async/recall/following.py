@@ -15,7 +15,7 @@ import numpy as np
 
 from pycrorm_async.events.ids import SEQUENCE_MAX, row_id
 from pycrorm_async.recall.answer import Rate, rate_of
-from pycrorm_async.recall.blocks import Group
+from pycrorm_async.recall.blocks import EPISODE_SHIFT, Group
 from pycrorm_async.recall.case import Case
 from pycrorm_async.recall.columns import Mask, Symbols, joined_words
 from pycrorm_async.recall.library import CaseLibrary
@@ -44,7 +44,6 @@ class Relation(Enum):
     AFTER = "after"
 
 
-_EPISODE_SHIFT: Final = row_id(1, 0, 0).bit_length() - 1
 _NONE: Final = np.zeros(0, np.int64)
 _BY_ENDS: Final = {
     (-1, -1): Relation.OVERLAPS,
@@ -109,7 +108,7 @@ class Sequences:
         self._rows = np.concatenate([np.arange(size, dtype=np.int64) for size in sizes] or [_NONE])
         nodes = np.concatenate([group.nodes for group in self._groups] or [_NONE])
         parents = np.concatenate([group.parents.astype(np.int64) for group in self._groups] or [_NONE])
-        keys = (nodes >> _EPISODE_SHIFT) * (SEQUENCE_MAX + 1) + parents
+        keys = (nodes >> EPISODE_SHIFT) * (SEQUENCE_MAX + 1) + parents
         self._by_node = np.argsort(nodes)
         self._nodes = nodes[self._by_node]
         self._by_parent = np.lexsort((nodes, keys))
@@ -173,8 +172,7 @@ class Sequences:
 
     @cached_property
     def _statuses(self) -> Symbols:
-        columns = [(group.texts.get("status"), len(group)) for group in self._groups]
-        joined = joined_words(columns)
+        joined = joined_words([group.texts.get("status") for group in self._groups], [*map(len, self._groups)])
         assert isinstance(joined, Symbols)
         return joined
 

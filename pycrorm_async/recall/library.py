@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property
 from itertools import chain
@@ -38,27 +39,26 @@ class CaseLibrary:
     @cached_property
     def types(self) -> Mapping[str, int]:
         """The number of cases of each type, in alphabetical order."""
-        sizes: dict[str, int] = {}
-        for name, group in sorted(chain.from_iterable(block.groups.items() for block in self.blocks), key=_name):
-            sizes[name] = sizes.get(name, 0) + len(group)
-        return sizes
+        sizes: Counter[str] = Counter()
+        for block in self.blocks:
+            sizes.update(block.sizes)
+        return dict(sorted(sizes.items()))
 
     @cached_property
     def left_out(self) -> frozenset[str]:
         """The features with more than `WORDS_MAX` words, which are not compared."""
-        left_out = set(chain.from_iterable(block.left_out for block in self.blocks))
         words: dict[str, set[str]] = {}
-        for group in self.groups():
-            for name, column in group.texts.items():
-                words.setdefault(name, set()).update(column.words)
-        return frozenset(left_out.union(name for name, each in words.items() if len(each) > WORDS_MAX))
+        for block in self.blocks:
+            for name, spread in block.texts.items():
+                words.setdefault(name, set()).update(spread.column.words)
+        long = (name for name, each in words.items() if len(each) > WORDS_MAX)
+        return frozenset(chain(long, *(block.left_out for block in self.blocks)))
 
     def groups(self, type: str | None = None) -> tuple[Group, ...]:  # noqa: A002  the name of the feature
         """Return the groups of a type, that with the newest case first."""
         groups = self._groups.get(type)
         if groups is None:
-            named = chain.from_iterable(block.groups.items() for block in self.blocks)
-            chosen = [group for name, group in named if type in (None, name)]
+            chosen = [block.group(name) for block in self.blocks for name in block.sizes if type in (None, name)]
             groups = tuple(sorted(chosen, key=lambda each: (-int(each.started_us[0]), -int(each.nodes[0]))))
             self._groups[type] = groups
         return groups
@@ -114,10 +114,6 @@ class CaseLibrary:
         return chain.from_iterable(block.cases() for block in self.blocks)
 
 
-def _name(item: tuple[str, Any]) -> str:
-    return item[0]
-
-
 def _counts(group: Group, feature: str) -> Mapping[str, int]:
     column = group.texts.get(feature)
     return {} if column is None else column.counts()
@@ -138,13 +134,15 @@ def _standard_deviation(groups: Sequence[Group], feature: str) -> float:
 
 
 def _range(group: Group, feature: str) -> tuple[float, float] | None:
-    values = group.numbers[feature].present()
+    column = group.numbers[feature]
+    values = column.values[column.present()]
     return (float(values.min()), float(values.max())) if values.size else None
 
 
 def _moments(group: Group, feature: str, middle: float) -> tuple[float, float, float]:
     """Return the count, the sum and the sum of squares of the distances from the middle."""
-    distances = group.numbers[feature].present() - middle
+    column = group.numbers[feature]
+    distances = column.values[column.present()].astype(np.float64) - middle
     return float(distances.size), float(distances.sum()), float(np.square(distances).sum())
 
 

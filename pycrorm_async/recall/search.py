@@ -47,12 +47,13 @@ class Weights(NamedTuple):
     """What each feature of a cue weighs in one library.
 
     Attributes:
-        words: of each pair in `has`.
+        pairs, words: the pairs in `has`, and the weight of each.
         cases: the cases among which words were counted.
         tolerances: of each number in `near`.
         never_seen: the pairs of `has` that no case has.
     """
 
+    pairs: tuple[tuple[str, str], ...]
     words: tuple[float, ...]
     cases: int
     tolerances: tuple[float, ...]
@@ -65,6 +66,16 @@ class Weights(NamedTuple):
         for weight in self.words:
             total += weight
         return total + len(self.tolerances) or 1.0
+
+    @property
+    def reachable(self) -> float:
+        """The highest weighted similarity that a case can have: without words that no case has."""
+        total, unseen = 0.0, set(self.never_seen)
+        for pair, weight in zip(self.pairs, self.words, strict=True):
+            total += 0.0 if pair in unseen else weight
+        for _ in self.tolerances:
+            total += 1
+        return total or float(not self.pairs)
 
 
 class Found(NamedTuple):
@@ -96,26 +107,29 @@ def weights_of(cue: Cue, library: CaseLibrary) -> Weights:
     words = tuple(min(WEIGHT_MAX, math.log((cases + 1) / (count + 1)) + 0.1) for count in seen)
     tolerances = tuple(each.tolerance or library.tolerance(cue.type, each.feature) for each in cue.near)
     never_seen = tuple(pair for pair, count in zip(cue.has, seen, strict=True) if count == 0)
-    return Weights(words, cases, tolerances, never_seen)
+    return Weights(cue.has, words, cases, tolerances, never_seen)
 
 
 def search(cue: Cue, library: CaseLibrary, weights: Weights) -> list[Found]:
     """Return the `k` cases most like the cue, the best first."""
-    total, lowest = weights.total, max(round(cue.minimum * _STEPS), 1 if cue.has or cue.near else 0)
+    lowest = max(round(cue.minimum * _STEPS), 1 if cue.has or cue.near else 0)
+    limit = _bound(weights.reachable, weights.total)
     best: list[Found] = []
     for group in library.groups(cue.type):
-        bound = _steps(np.array([_reachable(group, cue, weights)]), total)[0]
-        if bound < lowest:
-            continue
-        if len(best) == cue.k and (bound, int(group.started_us[0]), int(group.nodes[0])) <= best[-1][:3]:
+        newest = int(group.started_us[0]), int(group.nodes[0])
+        if len(best) == cue.k and (limit, *newest) <= best[-1][:3]:
+            break  # the groups after this one are older still
+        bound = _bound(_reachable(group, cue, weights), weights.total)
+        if bound < lowest or (len(best) == cue.k and (bound, *newest) <= best[-1][:3]):
             continue
         for rows in _parts(group, cue):
             last = best[-1] if len(best) == cue.k else None
             if last is not None and (bound, int(group.started_us[rows.start])) < last[:2]:
                 break
-            found = _found(group, rows, cue, weights, max(lowest, last.steps if last is not None else 0))
-            if found:
-                best = heapq.nlargest(cue.k, [*best, *found], key=_order)
+            found = _found(group, rows, cue, weights, max(lowest, last.steps if last is not None else 0), bound)
+            best = (
+                heapq.nlargest(cue.k, [*best, *found], key=_order) if best else sorted(found, key=_order, reverse=True)
+            )
     return best
 
 
@@ -131,23 +145,22 @@ def _parts(group: Group, cue: Cue) -> Iterator[slice]:
     return (rows for rows in (slice(first, middle), slice(middle, last)) if rows.start < rows.stop)
 
 
-def _found(group: Group, rows: slice, cue: Cue, weights: Weights, lowest: int) -> list[Found]:
-    """Return the best `k` cases of these rows from a score on, in the order of their rows."""
-    steps = _steps(_similarity(group, rows, cue, weights), weights.total)
-    candidates = steps >= lowest
+def _found(group: Group, rows: slice, cue: Cue, weights: Weights, lowest: int, bound: int) -> list[Found]:
+    """Return the best `k` cases of these rows from a score on; none has a score above `bound`."""
+    steps = np.rint(_similarity(group, rows, cue, weights) / weights.total * _STEPS).astype(np.int64)
     for condition in _conditions(group, rows, cue):
-        candidates &= condition
-    chosen = np.flatnonzero(candidates)
-    if chosen.size > cue.k:
-        scores = steps[chosen]
-        limit = np.partition(scores, scores.size - cue.k)[scores.size - cue.k]
-        above, equal = chosen[scores > limit], chosen[scores == limit]  # the newest of the equal ones come first
-        chosen = np.concatenate([above, equal[: cue.k - above.size]])
-    first = rows.start
-    return [
-        Found(int(steps[row]), int(group.started_us[first + row]), int(group.nodes[first + row]), group, first + row)
-        for row in chosen.tolist()
-    ]
+        steps[~condition] = -1
+    chosen = np.flatnonzero(steps == bound)[: cue.k]  # the newest of equal ones come first
+    if chosen.size < cue.k:
+        chosen = np.flatnonzero(steps >= lowest)
+        if chosen.size > cue.k:
+            scores = steps[chosen]
+            limit = np.partition(scores, scores.size - cue.k)[scores.size - cue.k]
+            above, equal = chosen[scores > limit], chosen[scores == limit]
+            chosen = np.concatenate([above, equal[: cue.k - above.size]])
+    places = rows.start + chosen
+    columns = steps[chosen].tolist(), group.started_us[places].tolist(), group.nodes[places].tolist(), places.tolist()
+    return [Found(score, started, node, group, row) for score, started, node, row in zip(*columns, strict=True)]
 
 
 def _similarity(group: Group, rows: slice, cue: Cue, weights: Weights) -> NDArray[np.float64]:
@@ -221,5 +234,5 @@ def _ended_by(group: Group, moment_us: int, rows: slice = slice(None)) -> Mask:
     return ended
 
 
-def _steps(similarity: NDArray[np.float64], total: float) -> NDArray[np.int64]:
-    return np.rint(similarity / total * _STEPS).astype(np.int64)
+def _bound(similarity: float, total: float) -> int:
+    return round(similarity / total * _STEPS)

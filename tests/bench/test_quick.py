@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[2]
 BUT = {"busy", "faults", "hook", "__main__", "concurrent_processes"}
 OTHERS = sorted({path.stem for path in (ROOT / "bench").glob("*.py")} - BUT)
 """Scripts without a test of their own."""
-SHORT = {"behaviour_trees", "digests", "plan"}
+SHORT = {"behaviour_trees", "digests", "plan", "recall"}
 """Scripts that start no other process. The others run in turns, because most take ten seconds and more."""
 
 

@@ -180,9 +180,9 @@ def test_a_common_cue_ends_in_the_newest_rows(monkeypatch: pytest.MonkeyPatch) -
     compared = []
     compare = searching._found
 
-    def counted(group: Group, rows: slice, cue: Cue, weights: Weights, lowest: int) -> list[Found]:
+    def counted(group: Group, rows: slice, cue: Cue, weights: Weights, lowest: int, bound: int) -> list[Found]:
         compared.append(rows)
-        return compare(group, rows, cue, weights, lowest)
+        return compare(group, rows, cue, weights, lowest, bound)
 
     monkeypatch.setattr(searching, "_found", counted)
     cases = [Case(row_id(1, n, 0), n, "A", {"arm": "LEFT"}, {}, "FAILED") for n in range(1, 10_001)]

@@ -1,0 +1,146 @@
+"""Measure how long it takes to recall the cases most like a cue, beside the episodic memory of Soar.
+
+    python -m bench.recall                         100,000 and 1,000,000 actions; some minutes, most of them for Soar
+    python -m bench.recall --actions 100000        one size
+    python -m bench.recall --quick                 2,000 actions, few cues
+
+Each action has a type, 12 texts and 6 numbers. The cues of a kind take turns with those of the other kinds, and each is
+asked once. `recall` measures the answer with the best 10 cases, and reads the best one. Soar returns one episode; its
+own timer measures the query. An episode of Soar has ten of the elements. It compares numbers for equality only, so they
+are stored in decimetres, and a cue asks for those features that the episodes have. The script prints one JSON line: by
+number of actions and kind of cue the ms (median, p99, p99.9, maximum); the bytes and the µs of storing an action, and
+the ms of loading all blocks. Soar is missing if `soar-sml` is not installed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import importlib
+import json
+import tempfile
+import time
+from itertools import pairwise
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from bench.material.actions import BLOCK_CASES, CUES, Actions
+from bench.material.soar_memory import SoarMemory
+from bench.reporting.figures import MISSING, console, percentiles, spread
+from pycrorm_async.recall.activation import forgotten
+from pycrorm_async.recall.answer import answer
+from pycrorm_async.recall.block_rows import decode, encode
+from pycrorm_async.recall.blocks import Block, merge
+from pycrorm_async.recall.following import Sequences
+from pycrorm_async.recall.library import CaseLibrary
+
+_SEED = 69
+_LOADS = 5
+"""The number of times that all blocks are loaded."""
+_FLUSHED = 64
+"""The cases of a block that a flush writes."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true")
+    parser.add_argument("--actions", type=int, nargs="+")
+    parser.add_argument("--cues", type=int, help="of each kind; 200 by default")
+    arguments = parser.parse_args()
+    sizes = arguments.actions or ([2_000] if arguments.quick else [100_000, 1_000_000])
+    cues = arguments.cues or (5 if arguments.quick else 200)
+    line = {"bench": "recall", "cues": cues, **{f"{size:,}": measure(size, cues) for size in sizes}}
+    print(json.dumps(line))
+
+
+def measure(size: int, cues: int) -> dict[str, Any]:
+    """Measure one memory of this many actions."""
+    console().print(f"{size:,} actions")
+    actions = Actions(size, seed=_SEED)
+    rows = [encode(block) for block in actions.blocks()]
+    count_bytes = sum(
+        len(row.data) + len((row.words or "").encode()) + len(row.feature) for each in rows for row in each
+    )
+    loads_ms = []
+    for _ in range(_LOADS):
+        began_s = time.perf_counter()
+        library = CaseLibrary([decode(each) for each in rows])
+        loads_ms.append(1_000 * (time.perf_counter() - began_s))
+    asked = [(kind, make(actions)) for _ in range(cues) for kind, make in CUES.items()]
+    took_ms: dict[str, list[float]] = {kind: [] for kind in CUES}
+    for _, cue in asked[: len(CUES)]:
+        answer(cue, library)  # the first answer of a kind counts words, and is not measured
+    gc.collect()
+    gc.freeze()
+    for kind, cue in asked:
+        began_s = time.perf_counter()
+        found = answer(cue, library)
+        assert not found or found[0].case.type == cue.type
+        took_ms[kind].append(1_000 * (time.perf_counter() - began_s))
+    return {
+        "bytes_an_action": round(count_bytes / size, 1),
+        "load_ms": spread(loads_ms),
+        "store_us_an_action": _stored(library),
+        "recall_ms": {kind: percentiles(each) for kind, each in took_ms.items()},
+        "sequences_ms": _sequences(library),
+        "soar": _soar(actions, cues),
+    }
+
+
+def _stored(library: CaseLibrary) -> dict[str, float]:
+    """Return the CPU time of making small blocks of cases, and of merging 16 of them into one."""
+    cases = list(library.blocks[0].cases())[: 16 * _FLUSHED]
+    began_s = time.process_time()
+    blocks = [Block.of(cases[first : first + _FLUSHED]) for first in range(0, len(cases), _FLUSHED)]
+    encoded = [encode(block) for block in blocks]
+    flushed_s = time.process_time()
+    encode(merge([decode(each) for each in encoded]))
+    merged_s = time.process_time()
+    return {
+        f"blocks of {_FLUSHED}": round(1e6 * (flushed_s - began_s) / len(cases), 2),
+        "merge of 16": round(1e6 * (merged_s - flushed_s) / len(cases), 2),
+    }
+
+
+def _sequences(library: CaseLibrary) -> dict[str, float]:
+    """Return the time of sorting all cases by parent, of counting followers, and of the activation of all ways."""
+    marks = [time.perf_counter()]
+    sequences = Sequences(library)
+    marks.append(time.perf_counter())
+    for name in library.types:
+        sequences.follows(name, status="FAILED")
+    marks.append(time.perf_counter())
+    forgotten(library, threshold=-2.0, now_us=2 * BLOCK_CASES * 10**6 * len(library.blocks))
+    marks.append(time.perf_counter())
+    sorted_ms, followed_ms, activation_ms = (1_000 * (after - before) for before, after in pairwise(marks))
+    return {
+        "sorted once": round(sorted_ms, 1),
+        "what follows a type": round(followed_ms / len(library.types), 3),
+        "activation of all": round(activation_ms, 1),
+    }
+
+
+def _soar(actions: Actions, cues: int) -> dict[str, Any] | str:
+    try:
+        sml: ModuleType = importlib.import_module("soar_sml")
+    except ImportError:
+        return MISSING
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "soar.db"
+        memory = SoarMemory(sml, path)
+        took_s = memory.store(actions)
+        took_ms = {
+            kind: [memory.query(memory.askable(make(actions))) for _ in range(cues)] for kind, make in CUES.items()
+        }
+        result = {
+            "bytes_an_action": round(path.stat().st_size / len(actions), 1),
+            "store_us_an_action": round(1e6 * took_s / len(actions), 1),
+            "recall_ms": {kind: percentiles(each) for kind, each in took_ms.items()},
+        }
+        memory.close()
+    return result
+
+
+if __name__ == "__main__":
+    main()
