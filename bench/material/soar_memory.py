@@ -15,8 +15,8 @@ __all__ = ["SoarMemory"]
 
 _STORED_TEXTS = ("object_type", "arm", "grasp", "robot", "surface", "plan")
 _STORED_NUMBERS = ("height", "torso", "stand_x")
-"""The features of an episode: with the type, ten elements of working memory. A number is stored in decimetres, because Soar compares
-numbers for equality only.
+"""The features of an episode: with the type, ten elements of working memory. A number is stored in decimetres, because
+Soar compares numbers for equality only.
 """
 _SETTINGS = (
     "watch 0",

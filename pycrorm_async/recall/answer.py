@@ -107,6 +107,26 @@ class RecalledCase:
         """The action: its situation, its outcome, its place in the memory."""
         return self.found.group.case(self.found.row)
 
+    @property
+    def node(self) -> int:
+        """The id of its task-tree node."""
+        return self.found.node
+
+    @property
+    def symbols(self) -> Mapping[str, str | tuple[str, ...]]:
+        """The texts of its situation."""
+        return self.case.symbols
+
+    @property
+    def numbers(self) -> Mapping[str, float]:
+        """The numbers of its situation."""
+        return self.case.numbers
+
+    @property
+    def status(self) -> str:
+        """The name of the status with which it ended."""
+        return self.case.status
+
     @cached_property
     def compared(self) -> tuple[Compared, ...]:
         """Each feature of the cue beside that of the case."""

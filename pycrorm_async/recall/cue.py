@@ -88,14 +88,12 @@ def numbers_of(near: Mapping[str, Any]) -> tuple[Wanted, ...]:
 
 
 def word(value: object) -> str:
-    """Return a value as cases have it: the name of an enum's member or a class, yes and no, text.
+    """Return a value as cases have it: the name of an enum's member or of a class, or its text.
 
-    >>> word(True), word("MILK")
-    ('yes', 'MILK')
+    >>> word(Arms.LEFT), word(True), word("MILK")
+    ('LEFT', 'True', 'MILK')
     """
     match value:
-        case bool():
-            return "yes" if value else "no"
         case Enum():
             return value.name
         case type():

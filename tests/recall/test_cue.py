@@ -78,7 +78,7 @@ def test_a_value_that_no_case_can_have_is_refused(has: dict[str, Any], near: dic
 def test_enums_classes_and_lists_are_words() -> None:
     pairs = symbols_of({"arm": Arms.LEFT, "near": [ObjectType.BOWL, "CUP"], "reason": ValueError, "fragile": True})
     assert pairs == (
-        ("arm", "LEFT"), ("near", "BOWL"), ("near", "CUP"), ("reason", "ValueError"), ("fragile", "yes"),
+        ("arm", "LEFT"), ("near", "BOWL"), ("near", "CUP"), ("reason", "ValueError"), ("fragile", "True"),
     )  # fmt: skip
 
 
