@@ -15,6 +15,7 @@ from pycrorm_async.errors import CallerError
 from pycrorm_async.events.blobs import Blob
 from pycrorm_async.export.export import Exported, FileFormat, Remade, export_again
 from pycrorm_async.export.export import export as write_export
+from pycrorm_async.export.lerobot.states import Clock
 from pycrorm_async.export.selection import Exportable
 from pycrorm_async.hooks.episode import Episode
 from pycrorm_async.memory_parts import PartsHolder
@@ -187,10 +188,14 @@ class ReadableMemory(PartsHolder):
         file_format: FileFormat | None = None,
         episodes: Sequence[str | int] = (),
         force: bool = False,
+        clock: Clock | None = None,
+        fps: int | None = None,
     ) -> Exported:
         """Write episodes or rows to a file, up to the last flush; see `pycrorm_async.export.export.export`."""
         reading = self._open_parts.reading
-        return await write_export(reading, what, path, file_format=file_format, episodes=episodes, force=force)
+        return await write_export(
+            reading, what, path, file_format=file_format, episodes=episodes, force=force, clock=clock, fps=fps
+        )
 
     async def export_again(
         self,

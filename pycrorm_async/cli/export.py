@@ -29,9 +29,9 @@ def export(
         ),
     ] = None,
     file_format: Annotated[
-        str | None, typer.Option("--format", help="parquet, csv or jsonl; default: the suffix of the file.")
+        str | None, typer.Option("--format", help="parquet, csv, jsonl or lerobot; default: the suffix of the file.")
     ] = None,
-    out: Annotated[Path | None, typer.Option("--out", metavar="PATH", help="The file to write.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", metavar="PATH", help="The file or folder to write.")] = None,
     episode: Annotated[
         list[str] | None,
         typer.Option("--episode", metavar="EPISODE", help="Of a view: only the rows of this episode; repeatable."),
@@ -44,6 +44,11 @@ def export(
             help="Make the export of this manifest again and compare; with --out, also write it there.",
         ),
     ] = None,
+    clock: Annotated[
+        str | None,
+        typer.Option(help="Of lerobot: a frame for each event that changed the robot's state (event), or --fps."),
+    ] = None,
+    fps: Annotated[int | None, typer.Option(help="Of lerobot: frames per second; by event they are nominal.")] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace the file if it exists.")] = False,
     url: UrlOption = DEFAULT_URL,
     spool: SpoolOption = None,
@@ -53,17 +58,17 @@ def export(
     if (again is None) == (not what):
         raise CallerError("name what to export, for example `pycrorm export last --out last.parquet`, or --again")
     if again is not None:
-        if file_format is not None or episode:
-            raise CallerError("--again takes format and episodes from the manifest: leave --format and --episode out")
+        if file_format is not None or episode or clock is not None or fps is not None:
+            raise CallerError("--again takes all but --out and --force from the manifest: leave the other options out")
         return _again(again, out, url, spool, force=force, as_json=as_json)
     assert what, "checked above"
     target = out if out is not None else Path(f"{'-'.join(what)[:100]}.{file_format or 'parquet'}")
-    chosen: Any = file_format
+    options: dict[str, Any] = {"file_format": file_format, "clock": clock, "fps": fps}
 
     async def write(progress: ProgressCallback | None) -> Exported:
         async with Reading.open(url) as reading:
             return await write_export(
-                reading, what, target, file_format=chosen, episodes=episode or (), force=force, progress=progress
+                reading, what, target, episodes=episode or (), force=force, progress=progress, **options
             )
 
     with watched("exporting", unit="rows") as progress:

@@ -18,7 +18,10 @@ from sqlalchemy import Select, func, select
 from sqlalchemy.exc import CompileError
 
 from pycrorm_async.errors import CallerError
-from pycrorm_async.export.files import checksums, new_file, refuse_existing
+from pycrorm_async.export.episode_files import EpisodeOptions, write_episodes
+from pycrorm_async.export.files import checksums, new_file, new_folder, refuse_existing
+from pycrorm_async.export.lerobot.dataset import DEFAULT_FPS, MARKER
+from pycrorm_async.export.lerobot.states import Clock
 from pycrorm_async.export.manifest import Manifest, episode_differences, manifest_path, read_manifest, versions_of
 from pycrorm_async.export.row_files import RowFormat, write_rows
 from pycrorm_async.export.selection import CoveredEpisode, Exportable, Selection, select_rows
@@ -32,7 +35,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Exported", "FileFormat", "Remade", "export", "export_again", "format_of"]
 
-FileFormat: TypeAlias = Literal["parquet", "csv", "jsonl"]
+FileFormat: TypeAlias = Literal["parquet", "csv", "jsonl", "lerobot"]
 
 
 class Exported(NamedTuple):
@@ -65,7 +68,7 @@ def format_of(path: Path) -> FileFormat:
     """Return the format that the suffix of a file names. Raises `CallerError`."""
     suffix = path.suffix.removeprefix(".").lower()
     for each in get_args(FileFormat):
-        if suffix == each:
+        if suffix == each and each != "lerobot":
             return each  # type: ignore[no-any-return]
     raise CallerError(f"the suffix of {path} names no format: add --format (file_format=), one of {_listed()}")
 
@@ -82,18 +85,23 @@ async def export(
     file_format: FileFormat | None = None,
     episodes: Sequence[str | int] = (),
     force: bool = False,
+    clock: Clock | None = None,
+    fps: int | None = None,
     progress: ProgressCallback | None = None,
 ) -> Exported:
-    """Write rows to a file that has its name only when it is complete, and its manifest beside it.
+    """Write rows or episodes to a file that has its name only when it is complete, and its manifest beside it.
 
     Args:
         what: an episode or several (a row for each node), by number, id or `last`; a view or table by name, or a mapped
             class, of all episodes that have ended; or a select.
         path: of the file.
-        file_format: `parquet`, `csv` or `jsonl`; by default that of the suffix.
+        file_format: `parquet`, `csv` or `jsonl` for rows; `lerobot` for episodes, into a folder; by default that of the
+            suffix.
         episodes: limit a view to these.
-        force: replace the file if it exists.
-        progress: gets the number of rows done and of all.
+        force: replace the file if it exists; a folder only if it is such a data set.
+        clock, fps: of LeRobot: a frame for each event that changed the robot's state (`event`, the default), or `fps`
+            frames each second (`time`).
+        progress: gets the number of rows, or events, done and of all.
 
     Raises `CallerError` if the file exists, if nothing has this name, or for a running episode; `UnknownEpisode`;
     `MissingExtra`; `OSError` if the disk is full, and then leaves no file.
@@ -103,12 +111,26 @@ async def export(
     chosen = file_format or format_of(target)
     if chosen not in get_args(FileFormat):
         raise CallerError(f"there is no format {chosen!r}{nearest(chosen, get_args(FileFormat))}; formats: {_listed()}")
-    selection = await select_rows(reading, what, episodes)
-    with new_file(manifest_path(target), force=True) as described, new_file(target, force=force) as written:
-        manifest = await _write_rows(reading, selection, written, chosen, progress)
-        manifest = msgspec.structs.replace(manifest, files={target.name: checksums(written)[written.name]})
+    if chosen != "lerobot" and (clock, fps) != (None, None):
+        raise CallerError("clock and fps are options of the format lerobot")
+    left_out = 0
+    with new_file(manifest_path(target), force=True) as described:
+        match chosen:
+            case "parquet" | "csv" | "jsonl":
+                selection = await select_rows(reading, what, episodes)
+                left_out = selection.left_out
+                with new_file(target, force=force) as written:
+                    manifest = await _write_rows(reading, selection, written, chosen, progress)
+                    files = {target.name: checksums(written)[written.name]}
+            case "lerobot":
+                options = EpisodeOptions(clock or "event", DEFAULT_FPS if fps is None else fps)
+                covered = await _episodes(reading, what, episodes, chosen)
+                with new_folder(target, force=force, marker=MARKER) as written:
+                    manifest = await _write_episodes(reading, covered, written, chosen, options, progress)
+                    files = checksums(written)
+        manifest = msgspec.structs.replace(manifest, files=files)
         described.write_bytes(msgspec.json.format(msgspec.json.encode(manifest), indent=1) + b"\n")
-    return Exported(target, manifest.rows, len(manifest.episodes), selection.left_out, manifest)
+    return Exported(target, manifest.rows, len(manifest.episodes), left_out, manifest)
 
 
 async def export_again(
@@ -143,10 +165,17 @@ async def export_again(
         return Remade(same=False, differences=tuple(differences), exported=None)
     what, episodes = _named_by(before, statement)
     with tempfile.TemporaryDirectory(prefix="pycrorm-export-") as folder:
-        target = Path(path) if path is not None else Path(folder, next(iter(before.files)))
+        target = Path(path) if path is not None else Path(folder, "export")
         file_format: Any = before.file_format
         made = await export(
-            reading, what, target, file_format=file_format, episodes=episodes, force=force, progress=progress
+            reading,
+            what,
+            target,
+            file_format=file_format,
+            episodes=episodes,
+            force=force,
+            progress=progress,
+            **before.options,
         )
     now = made.manifest
     differences += _changes("version of", before.versions, now.versions)
@@ -210,6 +239,42 @@ async def _write_rows(
         tables=PROJECTION_VERSION,
         memory=log.log_id,
         episodes=selection.episodes,
+        files={},
+    )
+
+
+async def _episodes(
+    reading: Reading, what: Exportable, limited: Sequence[str | int], file_format: str
+) -> tuple[CoveredEpisode, ...]:
+    """Return the episodes that `what` names. Raises `CallerError` for anything else."""
+    if limited or isinstance(what, type | Select):
+        raise CallerError(f"the format {file_format} holds whole episodes: name them by number, id or `last`")
+    selection = await select_rows(reading, what)
+    if selection.kind != "episodes":
+        raise CallerError(f"the format {file_format} holds whole episodes, and {selection.name} is a view")
+    return selection.episodes
+
+
+async def _write_episodes(
+    reading: Reading,
+    covered: tuple[CoveredEpisode, ...],
+    path: Path,
+    file_format: FileFormat,
+    options: EpisodeOptions,
+    progress: ProgressCallback | None,
+) -> Manifest:
+    rows = await write_episodes(reading, covered, path, options, progress)
+    log = await reading.log()
+    return Manifest(
+        kind="episodes",
+        names=tuple(each.id for each in covered),
+        file_format=file_format,
+        options=options._asdict(),
+        rows=rows,
+        versions=versions_of("pyarrow", "pandas"),
+        tables=PROJECTION_VERSION,
+        memory=log.log_id,
+        episodes=covered,
         files={},
     )
 

@@ -1,0 +1,236 @@
+"""Write the files of a LeRobot data set: `meta/` and `data/`, in version 3.0, with pyarrow and pandas alone.
+
+Each frame has `observation.state` and `action`, the state of the next frame (the last one repeats its own), the event
+and the time behind it, and the subtask. `meta/plan.parquet` is ours: every node of the plans, with its first and last
+frame. LeRobot ignores it.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from pycrorm_async.errors import CallerError
+from pycrorm_async.export.lerobot.states import Frames
+from pycrorm_async.export.lerobot.statistics import Statistics, joined, statistics_of
+from pycrorm_async.export.recorded_episode import RecordedEpisode
+from pycrorm_async.query.frames.arrow_batches import needed_pyarrow
+
+__all__ = ["DEFAULT_FPS", "LeRobotFolder", "MARKER"]
+
+MARKER = "meta/info.json"
+DEFAULT_FPS = 10
+"""Of frames by event it is nominal: LeRobot needs one."""
+_CHUNK_FILES = 1000
+_FILE_MEGABYTES = 100
+_VECTORS = ("observation.state", "action")
+_NUMBERS = {
+    "timestamp": "float32",
+    "time_s": "float64",
+    "event": "int64",
+    "frame_index": "int64",
+    "episode_index": "int64",
+    "index": "int64",
+    "task_index": "int64",
+    "subtask_index": "int64",
+}
+"""The columns of one number; the first and those from `frame_index` to `task_index` are LeRobot's own."""
+
+
+class LeRobotFolder:
+    """Writes a data set into an empty folder: `add` for each episode, then `finish`."""
+
+    def __init__(self, folder: Path, *, fps: int) -> None:
+        needed_pyarrow()
+        self._folder = folder
+        self._fps = fps
+        self._first: tuple[int, Frames] | None = None
+        self._frames = 0
+        self._tasks: dict[str, int] = {}
+        self._subtasks: dict[str, int] = {}
+        self._episodes: list[dict[str, Any]] = []
+        self._statistics: list[dict[str, Statistics]] = []
+        self._plan: list[dict[str, Any]] = []
+        self._file = 0
+        self._file_frames = 0
+        self._writer: Any = None
+
+    @property
+    def frames(self) -> int:
+        """The number of frames added so far."""
+        return self._frames
+
+    def add(self, episode: RecordedEpisode, frames: Frames) -> None:
+        """Write the frames of an episode. Raises `CallerError` if its robot has other joints than that of the first."""
+        self._check_channels(episode, frames)
+        number, count = len(self._episodes), len(frames.at)
+        task = episode.description or f"episode {episode.number}"
+        columns = self._columns(frames, number, task)
+        statistics = {name: statistics_of(values) for name, values in columns.items()}
+        chunk, file = self._write(columns, len(frames.channels))
+        self._episodes.append(
+            {
+                "episode_index": number,
+                "tasks": [task],
+                "length": count,
+                "data/chunk_index": chunk,
+                "data/file_index": file,
+                "dataset_from_index": self._frames,
+                "dataset_to_index": self._frames + count,
+                **{
+                    f"stats/{name}/{key}": values.tolist()
+                    for name, each in statistics.items()
+                    for key, values in each.items()
+                },
+                "meta/episodes/chunk_index": 0,
+                "meta/episodes/file_index": 0,
+            }
+        )
+        self._statistics.append(statistics)
+        self._add_plan(episode, frames, number)
+        self._frames += count
+
+    def finish(self) -> None:
+        """Write what describes the episodes."""
+        if self._writer is not None:
+            self._writer.close()
+        assert self._first is not None, "an episode was added"
+        _, frames = self._first
+        meta = self._folder / "meta"
+        (meta / "episodes" / "chunk-000").mkdir(parents=True)
+        _write_json(meta / "info.json", self._info(frames))
+        totals = {name: joined([each[name] for each in self._statistics]) for name in self._statistics[0]}
+        _write_json(
+            meta / "stats.json",
+            {name: {key: values.tolist() for key, values in each.items()} for name, each in totals.items()},
+        )
+        _write_names(meta / "tasks.parquet", "task", self._tasks)
+        _write_names(meta / "subtasks.parquet", "subtask", self._subtasks)
+        _write_rows(meta / "episodes" / "chunk-000" / "file-000.parquet", self._episodes)
+        _write_rows(meta / "plan.parquet", self._plan)
+
+    def _check_channels(self, episode: RecordedEpisode, frames: Frames) -> None:
+        if self._first is None:
+            self._first = episode.number, frames
+        first, (robot, channels, *_) = self._first
+        if channels == frames.channels:
+            return
+        differing = sorted(set(channels) ^ set(frames.channels))
+        raise CallerError(
+            f"episode {episode.number} has the robot {frames.robot} with other joints than {robot} of episode {first}"
+            f" ({', '.join(differing[:3])}{' …' if len(differing) > 3 else ''}): export them into two data sets"
+        )
+
+    def _columns(self, frames: Frames, number: int, task: str) -> dict[str, NDArray[Any]]:
+        count = len(frames.at)
+        index = np.arange(count, dtype=np.int64)
+        task_index = self._tasks.setdefault(task, len(self._tasks))
+        subtasks = [self._subtasks.setdefault(each, len(self._subtasks)) for each in frames.subtasks]
+        return {
+            "observation.state": frames.states,
+            "action": np.concatenate([frames.states[1:], frames.states[-1:]]),
+            "timestamp": (index / self._fps).astype(np.float32),
+            "time_s": np.array([each.since_ns / 1e9 for each in frames.at]),
+            "event": np.array([each.sequence for each in frames.at], dtype=np.int64),
+            "frame_index": index,
+            "episode_index": np.full(count, number, dtype=np.int64),
+            "index": index + self._frames,
+            "task_index": np.full(count, task_index, dtype=np.int64),
+            "subtask_index": np.array(subtasks, dtype=np.int64),
+        }
+
+    def _write(self, columns: dict[str, NDArray[Any]], width: int) -> tuple[int, int]:
+        """Write the frames of an episode as one row group; return the numbers of the chunk and the file."""
+        pa = needed_pyarrow()
+        from pyarrow import parquet
+
+        arrays = {
+            name: pa.FixedSizeListArray.from_arrays(pa.array(values.ravel(), pa.float32()), width)
+            if name in _VECTORS
+            else pa.array(values)
+            for name, values in columns.items()
+        }
+        table = pa.table(arrays)
+        if self._writer is not None and self._file_frames * width * 8 > _FILE_MEGABYTES * 2**20:
+            self._writer.close()
+            self._writer, self._file, self._file_frames = None, self._file + 1, 0
+        chunk, file = divmod(self._file, _CHUNK_FILES)
+        if self._writer is None:
+            path = self._folder / "data" / f"chunk-{chunk:03d}" / f"file-{file:03d}.parquet"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._writer = parquet.ParquetWriter(path, table.schema)
+        self._writer.write_table(table)
+        self._file_frames += len(table)
+        return chunk, file
+
+    def _add_plan(self, episode: RecordedEpisode, frames: Frames, number: int) -> None:
+        """Note every node with the frames from its start to its end; `to_index` is behind the last one."""
+        sequences = np.array([each.sequence for each in frames.at])
+        for node in episode.nodes:
+            begin = int(np.searchsorted(sequences, node.sequence, side="left"))
+            end = len(sequences)
+            if node.end is not None:
+                end = int(np.searchsorted(sequences, node.end.sequence, side="right"))
+            self._plan.append(
+                {
+                    "episode_index": number,
+                    "node": node.sequence,
+                    "parent": node.parent,
+                    "kind": node.kind,
+                    "dtype": node.dtype,
+                    "label": node.label,
+                    "parameters": node.parameters,
+                    "status": node.status,
+                    "reason": node.reason,
+                    "message": node.message,
+                    "dataset_from_index": self._frames + begin,
+                    "dataset_to_index": self._frames + end,
+                }
+            )
+
+    def _info(self, frames: Frames) -> dict[str, Any]:
+        vector = {"dtype": "float32", "shape": [len(frames.channels)], "names": list(frames.channels)}
+        numbers = {name: {"dtype": dtype, "shape": [1], "names": None} for name, dtype in _NUMBERS.items()}
+        return {
+            "codebase_version": "v3.0",
+            "robot_type": frames.robot,
+            "total_episodes": len(self._episodes),
+            "total_frames": self._frames,
+            "total_tasks": len(self._tasks),
+            "chunks_size": _CHUNK_FILES,
+            "data_files_size_in_mb": _FILE_MEGABYTES,
+            "video_files_size_in_mb": 200,
+            "fps": self._fps,
+            "splits": {"train": f"0:{len(self._episodes)}"},
+            "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
+            "video_path": None,
+            "features": {**dict.fromkeys(_VECTORS, vector), **numbers},
+        }
+
+
+def _write_json(path: Path, document: Any) -> None:
+    path.write_bytes(msgspec.json.format(msgspec.json.encode(document), indent=4) + b"\n")
+
+
+def _write_names(path: Path, name: str, numbers: dict[str, int]) -> None:
+    """Write names and their numbers as pandas does, with the names as index, because LeRobot reads them so."""
+    import pandas as pd
+
+    frame = pd.DataFrame({f"{name}_index": list(numbers.values())}, index=pd.Index(list(numbers), name=name))
+    frame.to_parquet(path, engine="pyarrow")
+
+
+def _write_rows(path: Path, rows: list[dict[str, Any]]) -> None:
+    pa = needed_pyarrow()
+    from pyarrow import parquet
+
+    table = pa.Table.from_pylist(rows)
+    missing = [each for each in table.schema if pa.types.is_null(each.type)]  # such as the reasons without a failure
+    for each in missing:
+        at, type_ = table.column_names.index(each.name), pa.int64() if each.name == "parent" else pa.string()
+        table = table.set_column(at, each.name, table.column(each.name).cast(type_))
+    parquet.write_table(table, path)

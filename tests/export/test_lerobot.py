@@ -1,0 +1,167 @@
+"""LeRobot data sets: their schema, their frames against the recorded events, and LeRobot's own loader if it is there."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+from pyarrow import parquet
+
+from pycrorm_async import Reading
+from pycrorm_async.errors import CallerError
+from pycrorm_async.export.export import export, export_again
+
+SCHEMA = json.loads(Path(__file__).with_name("lerobot_v3.json").read_text())
+
+
+@pytest.fixture
+async def dataset(reading: Reading, tmp_path: Path) -> Path:
+    """Return a data set of the episodes 1 and 2, by event."""
+    exported = await export(reading, ["1", "2"], tmp_path / "kitchen", file_format="lerobot")
+    assert exported.rows == parquet.read_metadata(tmp_path / "kitchen/data/chunk-000/file-000.parquet").num_rows
+    return tmp_path / "kitchen"
+
+
+def types_of(path: Path) -> dict[str, str]:
+    return {each.name: str(each.type) for each in parquet.read_schema(path)}
+
+
+def test_files_columns_and_keys_are_those_of_the_committed_description(dataset: Path) -> None:
+    assert sorted(str(each.relative_to(dataset)) for each in dataset.rglob("*.*")) == sorted(SCHEMA["files"])
+    info = json.loads((dataset / "meta/info.json").read_text())
+    assert {*info} == {*SCHEMA["info"]}
+    assert {name: info[name] for name, value in SCHEMA["info"].items() if value is not None} == {
+        name: value for name, value in SCHEMA["info"].items() if value is not None
+    }
+    width = info["features"]["action"]["shape"][0]
+    assert len(info["features"]["action"]["names"]) == width
+    expected = {name: type_.replace("WIDTH", str(width)) for name, type_ in SCHEMA["data"].items()}
+    assert types_of(dataset / "data/chunk-000/file-000.parquet") == expected
+    assert {name: each["dtype"] for name, each in info["features"].items()} == SCHEMA["features"]
+    episodes = types_of(dataset / "meta/episodes/chunk-000/file-000.parquet")
+    assert {name: each for name, each in episodes.items() if not name.startswith("stats/")} == SCHEMA["episodes"]
+    statistics = json.loads((dataset / "meta/stats.json").read_text())
+    assert {*statistics} == {*SCHEMA["features"]}
+    assert all([*each] == SCHEMA["statistics"] for each in statistics.values())
+    assert {name for name in episodes if name.startswith("stats/")} == {
+        f"stats/{name}/{key}" for name in SCHEMA["features"] for key in SCHEMA["statistics"]
+    }
+
+
+async def test_the_frames_are_the_recorded_states_with_task_and_subtask(dataset: Path, reading: Reading) -> None:
+    frames = pd.read_parquet(dataset / "data")
+    info = json.loads((dataset / "meta/info.json").read_text())
+    names = info["features"]["observation.state"]["names"]
+    tasks, subtasks = (pd.read_parquet(dataset / f"meta/{name}.parquet") for name in ("tasks", "subtasks"))
+    assert tasks.index.tolist() == ["fails", "succeeds"]
+    for number, part in frames.groupby("episode_index"):
+        assert part.frame_index.tolist() == [*range(len(part))]
+        np.testing.assert_allclose(part.timestamp, part.frame_index / info["fps"], rtol=1e-6)
+        states = np.stack(part["observation.state"].tolist())
+        np.testing.assert_array_equal(np.stack(part.action.tolist())[:-1], states[1:])
+        assert (np.diff(states, axis=0) != 0).any(axis=1).all()
+        assert {*tasks.index[part.task_index]} == {("fails", "succeeds")[number]}
+        for _, frame in part.iloc[[1, len(part) // 2, -1]].iterrows():
+            then = await reading.as_of(number + 1, sequence=frame.event)
+            assert then.world.robot is not None
+            robot = then.world.object(then.world.robot.name)
+            state = dict(zip(names, frame["observation.state"], strict=True))
+            assert [state["base.x"], state["base.y"]] == pytest.approx([robot.pose.position.x, robot.pose.position.y])
+            assert {name: state[name] for name in robot.joints} == pytest.approx(dict(robot.joints), abs=1e-6)
+            running = [each for each in then.running if each.kind == "action"]
+            label = subtasks.index[frame.subtask_index]
+            assert label.split(" ")[0] == (running[-1].dtype if running else "idle")
+    assert "PickUpAction milk" in subtasks.index
+
+
+def test_the_plan_has_every_node_with_its_frames_and_failure(dataset: Path) -> None:
+    plan = pd.read_parquet(dataset / "meta/plan.parquet")
+    failed = plan[plan.reason.notna()]
+    assert {*failed.episode_index} == {0}
+    assert {*failed.status} == {"FAILED"}
+    roots = plan[plan.kind == "root"]
+    assert (roots.dataset_to_index - roots.dataset_from_index).sum() == len(pd.read_parquet(dataset / "data"))
+
+
+def test_the_statistics_are_those_of_all_frames(dataset: Path) -> None:
+    states = np.stack(pd.read_parquet(dataset / "data")["observation.state"].tolist()).astype(float)
+    statistics = json.loads((dataset / "meta/stats.json").read_text())["observation.state"]
+    for name, expected in {
+        "min": states.min(0),
+        "max": states.max(0),
+        "mean": states.mean(0),
+        "std": states.std(0),
+    }.items():
+        np.testing.assert_allclose(statistics[name], expected, rtol=1e-5, atol=1e-7)
+    assert statistics["count"] == [len(states)]
+
+
+async def test_by_time_a_frame_holds_the_state_in_force(reading: Reading, tmp_path: Path) -> None:
+    await export(reading, 1, tmp_path / "time", file_format="lerobot", clock="time", fps=200)
+    frames = pd.read_parquet(tmp_path / "time/data")
+    np.testing.assert_allclose(np.diff(frames.time_s), 1 / 200, atol=1e-6)
+    assert frames.event.is_monotonic_increasing
+    info = json.loads((tmp_path / "time/meta/info.json").read_text())
+    assert info["fps"] == 200
+    assert (await export_again(reading, tmp_path / "time.manifest.json")).same
+
+
+async def test_a_data_set_is_replaced_only_when_asked_and_only_by_its_kind(dataset: Path, reading: Reading) -> None:
+    with pytest.raises(CallerError, match="kitchen exists: add --force"):
+        await export(reading, 1, dataset, file_format="lerobot")
+    await export(reading, 1, dataset, file_format="lerobot", force=True)
+    assert len(pd.read_parquet(dataset / "meta/tasks.parquet")) == 1
+    other = dataset.with_name("other")
+    other.mkdir()
+    (other / "mine").touch()
+    with pytest.raises(CallerError, match="is not such a data set"):
+        await export(reading, 1, other, file_format="lerobot", force=True)
+    assert (other / "mine").exists()
+
+
+@pytest.mark.parametrize(
+    ("what", "options", "message"),
+    [
+        ([1, 4], {}, "episode 4 has no robot"),
+        (
+            [1, 3],
+            {},
+            r"episode 3 has the robot courier with other joints than pr2 of episode 1 \(.* …\): export them into",
+        ),
+        ([3], {"clock": "time", "fps": 1}, r"episode 3 has 1 frames by time, and LeRobot needs two: a higher --fps"),
+        ([1], {"clock": "sun"}, "the clock of frames is event or time, not 'sun'"),
+        ([1], {"fps": 0}, "frames per second are between 1 and 1000, not 0"),
+        ("root_failure", {}, "the format lerobot holds whole episodes, and root_failure is a view"),
+        ([99], {}, "there is no episode '99'"),
+    ],
+)
+async def test_what_the_format_cannot_hold_is_named_and_leaves_no_folder(
+    reading: Reading, tmp_path: Path, what: Any, options: Any, message: str
+) -> None:
+    with pytest.raises(CallerError, match=message):
+        await export(reading, what, tmp_path / "set", file_format="lerobot", **options)
+    assert list(tmp_path.iterdir()) == []
+
+
+async def test_options_of_lerobot_are_refused_for_rows(reading: Reading, tmp_path: Path) -> None:
+    with pytest.raises(CallerError, match="clock and fps are options of the format lerobot"):
+        await export(reading, 1, tmp_path / "a.csv", fps=3)
+
+
+def test_lerobots_own_loader_reads_it(dataset: Path) -> None:
+    pytest.importorskip("lerobot", reason="lerobot brings torch, 6 GB: run this test in an environment that has both")
+    from lerobot.datasets.lerobot_dataset import LeRobotDataset
+
+    loaded = LeRobotDataset("local/kitchen", root=dataset, delta_timestamps={"action": [0.0, 0.1]})
+    frames = pd.read_parquet(dataset / "data")
+    assert (loaded.num_episodes, loaded.num_frames) == (2, len(frames))
+    subtasks = pd.read_parquet(dataset / "meta/subtasks.parquet").index
+    for index in (0, len(frames) - 1):
+        item = loaded[index]
+        assert item["observation.state"].tolist() == frames["observation.state"][index].tolist()
+        assert (item["task"], item["action"].shape[0]) == (("fails", "succeeds")[index > 0], 2)
+        assert item.get("subtask", subtasks[frames.subtask_index[index]]) == subtasks[frames.subtask_index[index]]
