@@ -1,4 +1,4 @@
-"""LeRobot data sets: their schema, their frames against the recorded events, and LeRobot's own loader if it is there."""
+"""LeRobot data sets: their schema, their frames against the recorded events, and LeRobot's own loader."""
 
 from __future__ import annotations
 
@@ -90,13 +90,8 @@ def test_the_plan_has_every_node_with_its_frames_and_failure(dataset: Path) -> N
 def test_the_statistics_are_those_of_all_frames(dataset: Path) -> None:
     states = np.stack(pd.read_parquet(dataset / "data")["observation.state"].tolist()).astype(float)
     statistics = json.loads((dataset / "meta/stats.json").read_text())["observation.state"]
-    for name, expected in {
-        "min": states.min(0),
-        "max": states.max(0),
-        "mean": states.mean(0),
-        "std": states.std(0),
-    }.items():
-        np.testing.assert_allclose(statistics[name], expected, rtol=1e-5, atol=1e-7)
+    for name in ("min", "max", "mean", "std"):
+        np.testing.assert_allclose(statistics[name], getattr(states, name)(axis=0), rtol=1e-5, atol=1e-7)
     assert statistics["count"] == [len(states)]
 
 
