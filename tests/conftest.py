@@ -16,6 +16,7 @@ from hypothesis import HealthCheck, settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.databases import Server, server_in_memory
+from tests.report.browser import Browser, browser, chromium
 from tests.soak_turns import current_commit, place_of, turn_of
 
 # A busy machine must not fail a test by its time; Hypothesis measures its deadline on the wall clock.
@@ -27,6 +28,15 @@ settings.load_profile("untimed")
 def server() -> Iterator[Server]:
     """A server whose paths are short enough for a socket."""
     with server_in_memory() as running:
+        yield running
+
+
+@pytest.fixture(scope="session")
+def chrome(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    """Return a running browser, one for each test process; skip the test without one."""
+    if chromium() is None:
+        pytest.skip("no Chromium is installed")
+    with browser(tmp_path_factory.mktemp("chromium")) as running:
         yield running
 
 

@@ -91,6 +91,7 @@ _VERBS = (
     "report",
     "picture",
     "export",
+    "watch",
     "events",
     "tag",
     "copy",

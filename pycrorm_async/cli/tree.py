@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from rich.markup import escape
 from rich.text import Text
@@ -12,7 +12,7 @@ from pycrorm_async.cli.output import duration, stdout
 from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary
 from pycrorm_async.query.parameter_text import one_line, parameters_text
 
-__all__ = ["print_tree", "simulated_by"]
+__all__ = ["print_tree", "tree_of", "simulated_by"]
 
 _MESSAGE_MAX = 100
 """Bounds the characters of a failure's message, so that a failed node takes few lines."""
@@ -28,6 +28,13 @@ def print_tree(nodes: Sequence[NodeSummary], *, events: bool = False, full: bool
     With `events` each line has the events of the node's start and end. An ellipsis marks each text that is cut; with
     `full` none is.
     """
+    root = tree_of(nodes, events=events, full=full)
+    if root is not None:
+        stdout.print(root)
+
+
+def tree_of(nodes: Iterable[NodeSummary], *, events: bool = False, full: bool = False) -> Tree | None:
+    """Return the tree that `print_tree` prints; None without nodes."""
     drawn: dict[int, Tree] = {}
     root: Tree | None = None
     for node in nodes:
@@ -37,8 +44,7 @@ def print_tree(nodes: Sequence[NodeSummary], *, events: bool = False, full: bool
             drawn[node.id] = parent.add(line)
         else:
             drawn[node.id] = root = Tree(line)
-    if root is not None:
-        stdout.print(root)
+    return root
 
 
 def _line(node: NodeSummary, *, events: bool, full: bool) -> Text:

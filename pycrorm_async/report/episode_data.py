@@ -18,7 +18,7 @@ from pycrorm_async.store.episode_lookup import episode_named
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import StoredEvent
 
-__all__ = ["episode_document", "document_behind", "read_into"]
+__all__ = ["episode_document", "designators_of", "document_behind", "read_into"]
 
 
 async def episode_document(
@@ -48,8 +48,7 @@ async def read_into(fold: EpisodeFold, log: EventLog, pages: AsyncIterable[Seque
 
     Raises `LogDamaged` or `DatabaseForeign` for an event that cannot be read.
     """
-    declarations = await log.declarations()
-    designators = {fingerprint(each): msgspec.json.decode(each, type=_DtypeOnly).dtype for each in declarations}
+    designators = await designators_of(log)
     async for page in pages:
         for event in page:
             if fold.is_full:
@@ -58,6 +57,12 @@ async def read_into(fold: EpisodeFold, log: EventLog, pages: AsyncIterable[Seque
                 fold.read(event, designators)
             except CannotFold as reason:
                 raise unreadable(fold.row.id, event, str(reason), log) from None
+
+
+async def designators_of(log: EventLog) -> dict[str, str]:
+    """Return the dtype of each declared designator type, by its fingerprint."""
+    declarations = await log.declarations()
+    return {fingerprint(each): msgspec.json.decode(each, type=_DtypeOnly).dtype for each in declarations}
 
 
 async def document_behind(fold: EpisodeFold, log: EventLog, after: int = 0) -> dict[str, Any]:

@@ -219,6 +219,7 @@ class EpisodeFold:
             "first": self._first,
             "last": self.last,
             "head": max(self.row.head, self.last),
+            "full": self.is_full,
             "opens": min(max(opens, self._first), self.last),
         }
 

@@ -2,6 +2,9 @@
 
 The Content-Security-Policy allows the page's own style and scripts by their hashes, and nothing else. Recorded text is
 in the page only as JSON in which `<` is escaped, and in its title; the scripts set it as text.
+
+A document with a `live` entry becomes a live page, which has one more module, `stream.js`, and may connect to its own
+server for the parts of the document that follow.
 """
 
 from __future__ import annotations
@@ -25,6 +28,8 @@ __all__ = ["page_of", "overview_page_of", "write_page"]
 _EPISODE = "dom episode bodies scene_view map_view tree_view gantt_view panels main".split()
 _OVERVIEW = "dom episode overview".split()
 """The modules of each page's program, every one behind those that it imports."""
+_STREAM = ("stream",)
+_SELF = "'self'"
 _TITLE_MAX = 200
 """Bounds the characters of the description in title and heading."""
 _ESCAPES = {
@@ -42,20 +47,25 @@ def page_of(document: Mapping[str, Any]) -> str:
     """Return the page of a document from `episode_document`."""
     episode = document["episode"]
     heading = episode["description"] or f"Episode {episode['number']}"
-    scripts = (_asset("assets/three.bundle.js"), _program(*_EPISODE))
+    scripts = (_asset("assets/three.bundle.js"), _program(*_EPISODE, *_stream_of(document)))
     return _page(document, heading, f" · episode {episode['number']}", _asset("web/episode_body.html"), scripts)
 
 
 def overview_page_of(document: Mapping[str, Any]) -> str:
     """Return the page of a document from `overview_document`."""
-    return _page(document, document["title"], "", _asset("web/overview_body.html"), (_program(*_OVERVIEW),))
+    scripts = (_program(*_OVERVIEW, *_stream_of(document)),)
+    return _page(document, document["title"], "", _asset("web/overview_body.html"), scripts)
+
+
+def _stream_of(document: Mapping[str, Any]) -> tuple[str, ...]:
+    return _STREAM if "live" in document else ()
 
 
 def _page(document: Mapping[str, Any], heading: str, suffix: str, body: str, scripts: Sequence[str]) -> str:
     heading, style = heading[:_TITLE_MAX], _asset("web/page.css")
     policy = (
         f"default-src 'none'; script-src {' '.join(map(_hash, scripts))}; style-src {_hash(style)};"
-        " img-src data:; base-uri 'none'; form-action 'none'"
+        f" img-src data:; base-uri 'none'; form-action 'none'{'; connect-src ' + _SELF if 'live' in document else ''}"
     )
     parts = {
         "policy": policy,

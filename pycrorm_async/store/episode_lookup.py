@@ -5,16 +5,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import msgspec
-from sqlalchemy import text
+from sqlalchemy import bindparam, text
 
 from pycrorm_async.errors import UnknownEpisode
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import EpisodeRow
 
-__all__ = ["number_named", "episode_named", "tags_of"]
+__all__ = ["number_named", "episode_named", "grown_episodes", "is_simulated", "tags_of"]
 
 
 def number_named(name: str, ids: Mapping[int, str], *, listed: int) -> int:
@@ -39,9 +39,22 @@ async def episode_named(log: EventLog, name: str) -> EpisodeRow:
     rows = {row.number: row for row in await log.episodes()}
     if name == "last":
         for row in reversed(rows.values()):
-            if not await _is_simulated(log, row):
+            if not await is_simulated(log, row):
                 return row
     return rows[number_named(name, {number: row.id for number, row in rows.items()}, listed=len(rows))]
+
+
+_GROWN = text(
+    "SELECT number, id, head, folded, started_wall_ns, ended_wall_ns, refused, parked FROM episode"
+    " WHERE number > :above OR ended_wall_ns IS NULL OR number IN :numbers ORDER BY number"
+).bindparams(bindparam("numbers", expanding=True))
+
+
+async def grown_episodes(log: EventLog, *, above: int, numbers: Collection[int]) -> list[EpisodeRow]:
+    """Read the episodes that may have grown: with a number above `above`, not ended, or with one of these numbers."""
+    async with log.reading() as connection:
+        rows = await connection.execute(_GROWN, {"above": above, "numbers": sorted(numbers)})
+        return [EpisodeRow(*row) for row in rows]
 
 
 async def tags_of(log: EventLog, number: int) -> tuple[str, ...]:
@@ -71,7 +84,8 @@ class _Started(msgspec.Struct):
     simulated: bool = False
 
 
-async def _is_simulated(log: EventLog, row: EpisodeRow) -> bool:
+async def is_simulated(log: EventLog, row: EpisodeRow) -> bool:
+    """Return whether the episode is a simulation, according to its first event."""
     first = await log.events(row.number, limit=1)
     try:
         return bool(first) and msgspec.json.decode(first[0].payload, type=_Started).simulated

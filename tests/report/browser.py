@@ -62,7 +62,7 @@ class Browser:
     @contextmanager
     def open(
         self,
-        path: Path,
+        page: Path | str,
         *,
         width: int = 1400,
         height: int = 900,
@@ -71,7 +71,7 @@ class Browser:
         dark: bool = False,
         script: str = "",
     ) -> Iterator["Tab"]:
-        """Open a page and wait until it is ready. `script` runs before the page's own scripts."""
+        """Open a file or an address and wait until it is ready. `script` runs before the page's own scripts."""
         target = self.call("Target.createTarget", url="about:blank")["targetId"]
         session = self.call("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
         tab = Tab(self, session)
@@ -84,7 +84,8 @@ class Browser:
             tab.call("Emulation.setEmulatedMedia", media=media, features=[scheme])
             if script:
                 tab.call("Page.addScriptToEvaluateOnNewDocument", source=script)
-            tab.call("Page.navigate", url=f"{path.resolve().as_uri()}{fragment}")
+            address = page if isinstance(page, str) else page.resolve().as_uri()
+            tab.call("Page.navigate", url=f"{address}{fragment}")
             tab.wait_for("document.documentElement?.dataset.ready === 'yes'")
             yield tab
         finally:

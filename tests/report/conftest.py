@@ -1,12 +1,10 @@
-"""Fixtures of the report's tests: one browser for each test process, and memories with episodes to show."""
+"""Fixtures of the report's tests: memories with episodes to show, and their pages."""
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from tests.commands import pycrorm
-from tests.report.browser import Browser, browser, chromium
 
 BREAKFAST = '''
 import os, signal
@@ -46,15 +44,6 @@ async def drives():
         arm = Object("other", ObjectType.ROBOT, courier_urdf(), Pose([3, 1, 0.8], [0, 0, 0.6, 0.8]), base_link=LINK)
         arm.set_joint_positions(dict.fromkeys(arm.joints, 0.02))
 '''
-
-
-@pytest.fixture(scope="session")
-def chrome(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    """Return a running browser; skip the test without one."""
-    if chromium() is None:
-        pytest.skip("no Chromium is installed")
-    with browser(tmp_path_factory.mktemp("chromium")) as running:
-        yield running
 
 
 @pytest.fixture(scope="session")

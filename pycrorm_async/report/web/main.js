@@ -136,10 +136,10 @@ class Page {
     if (next !== undefined) this.select(next);
   }
 
-  /** Add a part to the episode, and go on to its last moment if the page follows it. */
-  extend(part) {
+  /** Add parts to the episode, and move to its last moment if the page follows it. */
+  extend(...parts) {
     const { episode } = this;
-    episode.extend(part);
+    for (const each of parts) episode.extend(each);
     for (const each of [this.view, this.tree, this.gantt, this.panels]) each.grow();
     this.slider.max = episode.last;
     this.#head();

@@ -13,7 +13,7 @@ const rateOf = (episodes) => {
   const all = ended(episodes);
   return all.length === 0 ? null : all.filter((each) => each.status === "SUCCEEDED").length / all.length;
 };
-const percent = (rate) => (rate === null ? "none ended" : `${(rate * 100).toFixed(0)} %`);
+const percent = (rate) => `${(rate * 100).toFixed(0)} %`;
 
 function median(numbers) {
   const sorted = numbers.filter((each) => each !== null).sort((one, other) => one - other);
@@ -47,23 +47,59 @@ const unreadable = (reason) => element("p", { class: "reason" }, "✗ No page: "
 class Overview {
   constructor({ title, total, episodes }) {
     Object.assign(this, { title, total, episodes, by: "number", down: true });
+    this.#draw();
+  }
+
+  /** Take in the entries of episodes that are new or have changed. */
+  extend(...parts) {
+    const entries = new Map(this.episodes.map((each) => [each.number, each]));
+    for (const { episodes } of parts) for (const each of episodes) entries.set(each.number, each);
+    this.total += entries.size - this.episodes.length;
+    this.episodes = [...entries.values()].sort((one, other) => one.number - other.number);
+    this.#draw();
+  }
+
+  #draw() {
+    const { episodes, total } = this;
+    const middle = median(episodes.map((each) => each.seconds));
     const facts = [
-      `${episodes.length} episodes`,
-      `${percent(rateOf(episodes))} succeeded`,
-      `median ${duration(median(episodes.map((each) => each.seconds)) ?? 0)}`,
+      `${episodes.length} episode${episodes.length === 1 ? "" : "s"}`,
+      ended(episodes).length > 0 ? `${percent(rateOf(episodes))} succeeded` : null,
+      middle === null ? null : `median ${duration(middle)}`,
       total > episodes.length ? `the newest of ${total}` : null,
     ];
     part("facts").replaceChildren(...facts.filter((each) => each !== null).map((each) => recorded(each)));
     this.bins = binsOf(episodes);
+    this.#running();
     this.#trend();
     this.#reasons();
     this.#table();
   }
 
+  /** What each running episode does now; a file has none, because it cannot follow them. */
+  #running() {
+    const running = this.episodes.filter((each) => each.status === "RUNNING" && each.now !== undefined);
+    const rows = running.map((each) =>
+      element(
+        "li",
+        {},
+        element("a", { href: each.page }, recorded(each.robots.join(", ") || `episode ${each.number}`)),
+        " ",
+        recorded(each.description, { class: "quiet" }),
+        element("ol", { class: "now" }, ...each.now.map((node) => element("li", {}, recorded(node)))),
+        each.after ? element("p", { class: "after" }, "after ", recorded(each.after)) : null,
+        element("span", { class: "quiet" }, `${each.nodes} nodes${each.failed ? `, ${each.failed} failed` : ""}`),
+        each.unreadable ? element("p", { class: "reason" }, recorded(each.unreadable)) : null,
+      ),
+    );
+    const content = rows.length > 0 ? [element("h2", {}, "Running now"), element("ul", { class: "running" }, ...rows)] : [];
+    part("running").replaceChildren(...content);
+  }
+
   #trend() {
-    if (this.bins.length < 2) return;
+    if (this.bins.length < 2) return part("trend").replaceChildren();
     const picture = bars(this.bins.map(rateOf), 1, "share of successful episodes, the oldest first", percent);
-    part("trend").append(element("h2", {}, "Success, the oldest episodes first"), picture);
+    return part("trend").replaceChildren(element("h2", {}, "Success, the oldest episodes first"), picture);
   }
 
   #reasons() {
@@ -80,7 +116,7 @@ class Overview {
     });
     const left = sorted.length - rows.length;
     const content = rows.length > 0 ? element("table", {}, ...rows) : element("p", { class: "quiet" }, "Nothing failed.");
-    part("reasons").append(element("h2", {}, "Failures by reason"), content);
+    part("reasons").replaceChildren(element("h2", {}, "Failures by reason"), content);
     if (left > 0) part("reasons").append(element("p", { class: "quiet" }, `${left} other reasons`));
   }
 

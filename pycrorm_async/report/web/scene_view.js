@@ -130,10 +130,22 @@ export class SceneView {
       top.project(this.camera);
       if (Math.abs(top.z) > 1) continue;
       const label = element("span", {}, element("bdi", {}, object.name));
-      label.style.left = `${((top.x + 1) / 2) * width}px`;
-      label.style.top = `${((1 - top.y) / 2) * height - 4}px`;
-      labels.push(label);
+      labels.push({ label, x: ((top.x + 1) / 2) * width, y: ((1 - top.y) / 2) * height - 4 });
     }
-    this.names.replaceChildren(...labels);
+    this.names.replaceChildren(...labels.map((each) => each.label));
+    stack(labels);
+  }
+}
+
+/** Place labels, each above those that it would cover. */
+function stack(labels) {
+  const placed = [];
+  for (const each of labels.sort((one, other) => other.y - one.y)) {
+    const { offsetWidth: width, offsetHeight: height } = each.label;
+    const covers = (other) => Math.abs(each.x - other.x) < (width + other.width) / 2 && Math.abs(each.y - other.y) < height;
+    while (placed.some(covers)) each.y -= height / 2;
+    each.label.style.left = `${each.x}px`;
+    each.label.style.top = `${each.y}px`;
+    placed.push({ ...each, width });
   }
 }

@@ -1,0 +1,179 @@
+"""`pycrorm watch`: which requests it answers, what it prints, and one line for each mistake."""
+
+import builtins
+import os
+import signal
+import socket
+import sqlite3
+import stat
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from unittest import mock
+
+import pytest
+
+from pycrorm_async.errors import CallerError, MissingExtra
+from pycrorm_async.live.access import kept_token, refusal
+from pycrorm_async.live.server import PORT, listen
+from tests.commands import COMMAND, Started, environment, one_line_of, pycrorm
+from tests.live.conftest import Watch, robot_in
+
+HOST = {"host": "127.0.0.1:8137"}
+
+
+@pytest.mark.parametrize(
+    ("path", "headers", "refused"),
+    [
+        ("/secret/", HOST, None),
+        ("/secret/", {"host": "localhost:9000"}, None),
+        ("/secret/", {"host": "[::1]:9000"}, None),
+        ("/secret/", HOST | {"origin": "http://127.0.0.1:8137"}, None),
+        ("/secret/", HOST | {"sec-fetch-site": "same-origin", "sec-fetch-mode": "cors"}, None),
+        ("/secret/", HOST | {"sec-fetch-site": "cross-site", "sec-fetch-mode": "navigate"}, None),
+        ("/secret/", {}, "answers only under"),
+        ("/secret/", {"host": "evil.example:8137"}, "answers only under"),
+        ("/secret/", {"host": "127.0.0.1.evil.example"}, "answers only under"),
+        ("/secret/", {"host": "[::1"}, "answers only under"),
+        ("/secret/", HOST | {"origin": "http://127.0.0.1:9999"}, "only its own pages"),
+        ("/secret/", HOST | {"origin": "null"}, "only its own pages"),
+        ("/secret/", HOST | {"sec-fetch-site": "cross-site", "sec-fetch-mode": "no-cors"}, "only its own pages"),
+        ("/secret/", HOST | {"sec-fetch-site": "same-site", "sec-fetch-mode": "cors"}, "only its own pages"),
+        ("/", HOST, "the token in the address is wrong"),
+        ("/secre", HOST, "the token in the address is wrong"),
+        ("/secrét/", HOST, "the token in the address is wrong"),
+        ("//secret/", HOST, "the token in the address is wrong"),
+    ],
+)
+def test_a_request_is_answered_only_from_this_machine_with_the_token(
+    path: str, headers: dict[str, str], refused: str | None
+) -> None:
+    reason = refusal(path, headers, "secret")
+    assert (reason is None) if refused is None else (reason is not None and refused in reason)
+
+
+def test_the_token_is_kept_for_the_user_alone(tmp_path: Path) -> None:
+    token = kept_token(tmp_path / "new")
+    kept = tmp_path / "new" / "watch.token"
+    assert len(token) == 43
+    assert kept_token(tmp_path / "new") == token
+    assert stat.S_IMODE(kept.stat().st_mode) == 0o600
+    kept.chmod(0o644)  # others may have read it
+    assert kept_token(tmp_path / "new") != token
+    kept.write_text("short")
+    assert len(kept_token(tmp_path / "new")) == 43
+    (tmp_path / "file").write_text("")
+    assert len(kept_token(tmp_path / "file")) == 43  # no such folder can be made
+
+
+def test_a_port_in_use_is_refused_if_it_was_asked_for() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(CallerError, match=f"port {port} cannot be used \\(another process uses it\\)"):
+            listen(port)
+        with mock.patch("pycrorm_async.live.server.PORT", port), listen(None) as other:
+            assert other.getsockname()[1] not in (port, PORT)
+
+
+def test_a_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "uvicorn", None)
+    monkeypatch.delitem(sys.modules, "pycrorm_async.live.server")
+    with pytest.raises(MissingExtra, match="pip install 'pycrorm-async\\[live\\]'"):
+        builtins.__import__("pycrorm_async.live.server")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with a memory: one episode that has ended."""
+    made = tmp_path_factory.mktemp("watched")
+    with robot_in(made) as robot:
+        robot.start("one")
+        robot.end("one", "FAILED", "the wheel slipped")
+    return made
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "message"),
+    [
+        (("77",), 2, "there is no episode '77' (`pycrorm episodes` lists the 1 there are)"),
+        (("1", "--terminal", "--json"), 2, "--terminal serves no page: leave out --port, --open and --json"),
+        (("--url", "mysql://host/name"), 2, "mysql:// is not a supported database"),
+        (("--url", "sqlite://"), 2, "sqlite:// exists only in its own process"),
+        (("--url", "sqlite:///watched.txt"), 3, "watched.txt"),
+    ],
+)
+def test_mistakes_are_one_line(folder: Path, arguments: tuple[str, ...], code: int, message: str) -> None:
+    (folder / "watched.txt").write_text("this is no database, but it is long enough to be read as one" * 20)
+    done = pycrorm("watch", *arguments, cwd=folder, timeout_s=30)
+    assert done.returncode == code
+    assert message in one_line_of(done)
+
+
+def test_the_server_answers_its_own_pages_and_no_others(watch: Callable[..., Watch], folder: Path) -> None:
+    server = watch("--port", "0", "1", folder=folder)
+    assert server.printed.keys() == {"address", "port", "database"}
+    status, page = server.get()
+    assert (status, "connect-src 'self'" in page) == (200, True)
+    root = "/".join(server.address.split("/")[3:4])
+    assert server.get(f"/{root}/episode/77") == (
+        404,
+        "there is no episode '77' (`pycrorm episodes` lists the 1 there are)",
+    )
+    assert server.get(f"/{root}/episode/1", origin="http://127.0.0.1:1")[0] == 403
+    assert server.get(f"/{root}/episode/1", host="evil.example")[0] == 403
+    assert server.get(f"/{root[:-1]}x/episode/1")[0] == 403
+    assert server.get("/")[0] == 403
+    assert server.get(f"/{root}/../episode/1")[0] in (403, 404)
+    server.process.send_signal(signal.SIGINT)
+    assert server.process.wait(20) == 0
+    assert "Traceback" not in server.process.stderr.read()
+
+
+def test_a_damaged_episode_is_said_to_be_so(watch: Callable[..., Watch], folder: Path, tmp_path: Path) -> None:
+    with robot_in(tmp_path) as robot:
+        robot.start("one")
+    with sqlite3.connect(tmp_path / "pycrorm.db") as database:
+        for (trigger,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'trigger'").fetchall():
+            database.execute(f"DROP TRIGGER {trigger}")
+        database.execute("UPDATE event SET payload = '{' WHERE episode = 1 AND sequence = 1")
+    database.close()
+    status, text = watch("--port", "0", "1", folder=tmp_path).get()
+    assert (status, "event 1: " in text) == (500, True)
+
+
+def test_a_terminal_shows_the_tree_of_an_episode_to_its_end(folder: Path) -> None:
+    done = pycrorm("watch", "1", "--terminal", cwd=folder)
+    assert done.returncode == 0, done.stderr
+    assert "Episode 1: a drive  SUCCEEDED" in done.stdout
+    assert "1 failed · turtle at (0.00, 0.00)" in done.stdout
+    assert "DriveAction  target=(1.00, 2.00, 0.00)  FAILED" in done.stdout
+
+
+def test_a_terminal_waits_for_the_first_episode_and_follows_it(tmp_path: Path) -> None:
+    drawing = Started("watch", "last", "--terminal", cwd=tmp_path)
+    assert "waiting: " in drawing.stderr.readline()
+    with robot_in(tmp_path) as robot:
+        robot.start("one")
+        robot.end("one")
+    out, _ = drawing.communicate(30)
+    assert drawing.returncode == 0
+    assert "DriveAction  target=(1.00, 2.00, 0.00)  SUCCEEDED" in out
+
+
+def test_a_terminal_shows_what_each_robot_does_until_it_is_interrupted(tmp_path: Path) -> None:
+    screen, terminal = os.openpty()
+    with robot_in(tmp_path) as robot, os.fdopen(screen, "rb", buffering=0) as output:
+        robot.start("one")
+        command = [*COMMAND, "watch", "--terminal"]
+        surroundings = environment() | {"TERM": "xterm"}
+        drawing = subprocess.Popen(command, cwd=tmp_path, stdout=terminal, stderr=terminal, env=surroundings)
+        drawn = b""
+        while b"DriveAction target=(1.00, 2.00, 0.00)" not in drawn:
+            drawn += output.read(2**16)
+        robot.end("one")
+        while b"after DriveAction" not in drawn:
+            drawn += output.read(2**16)
+        drawing.terminate()
+        assert drawing.wait(20) == 0
+    os.close(terminal)
