@@ -19,6 +19,7 @@ from pycrorm_async.export.lerobot.states import Clock
 from pycrorm_async.export.selection import Exportable
 from pycrorm_async.hooks.episode import Episode
 from pycrorm_async.memory_parts import PartsHolder
+from pycrorm_async.orm import PickUpWithContextView
 from pycrorm_async.plan.task_tree import TaskTreeNode
 from pycrorm_async.query.as_of import AnyEpisode
 from pycrorm_async.query.asking.ask import Ask
@@ -31,6 +32,8 @@ from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.scene.picture import When, picture
 from pycrorm_async.query.snapshot import Moment
 from pycrorm_async.query.sql.read_only import DEFAULT_LIMITS, SqlLimits, SqlResult
+from pycrorm_async.query.success.figure import Kind, success_figure
+from pycrorm_async.query.success.samples import Source, success_samples
 from pycrorm_async.recording.recording import Recording
 from pycrorm_async.recording.writing.event_feed import BUFFER_EVENTS, EventStream, RecordedEvent, Subscription
 from pycrorm_async.report.write import Report
@@ -39,6 +42,8 @@ from pycrorm_async.report.write import report as write_report
 if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 __all__ = ["ObservingMemory", "ReadableMemory"]
 
@@ -207,6 +212,36 @@ class ReadableMemory(PartsHolder):
     ) -> Remade:
         """Make an export again from its manifest and compare; see `pycrorm_async.export.export.export_again`."""
         return await export_again(self._open_parts.reading, manifest, path, statement=statement, force=force)
+
+    async def plot_success(
+        self,
+        x: str,
+        y: str,
+        *,
+        of: Source = PickUpWithContextView,
+        kind: Kind = "auto",
+        bins: int | None = None,
+        axes: Axes | None = None,
+    ) -> Figure:
+        """Draw how often the actions of a view succeeded over two of its columns, up to the last flush.
+
+        >>> figure = await memory.plot_success("relative_x", "relative_y")  # pick-ups, as in the thesis' figure 5.1
+        >>> figure.savefig("pick-ups.svg")
+        >>> await memory.plot_success("arm", "duration", of=PickUpAction, axes=axes)
+
+        Args:
+            x, y: names of columns: numbers, times, texts, enums or bools.
+            of: the view: a mapped class, the name of one or of a view or designator type, or a select with a column
+                `status`.
+            kind: `heatmap` of the share of successes, with the number of rows and the 95 % interval where they find
+                room; `scatter` of the rows; by default a scatter of up to 500 rows with two numbers.
+            bins: ranges of a numeric column at most; by default the finer the more rows there are.
+            axes: draw into these instead of a new figure.
+
+        It needs the extra `pictures`. Raises `CallerError` for an unknown view or column, and if no row is left.
+        """
+        samples = await success_samples(self._open_parts.reading, x, y, of)
+        return success_figure(samples, kind=kind, bins=bins, axes=axes)
 
     async def blob(self, name: str) -> Blob | None:
         """Return the blob with this SHA-256, up to the last flush; None if it is not stored."""

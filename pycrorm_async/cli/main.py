@@ -92,6 +92,7 @@ _VERBS = (
     "picture",
     "export",
     "watch",
+    "plot",
     "events",
     "tag",
     "copy",

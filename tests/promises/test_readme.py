@@ -37,7 +37,7 @@ def python_of(page: str) -> list[str]:
 
 PLAN, QUESTIONS, EXECUTIVE = python_of("README.md")
 TIDY, LIFTER, STEREO, CELLS = python_of("pycrorm_async/plan/README.md")
-COURSE, AROUND, ROBOTS, BEGAN, FRAMES, TAGGED, SEEN, THEN, AGAIN, RATE, TRIES = python_of(
+COURSE, PLOTTED, AROUND, ROBOTS, BEGAN, FRAMES, TAGGED, SEEN, THEN, AGAIN, RATE, TRIES = python_of(
     "pycrorm_async/query/README.md"
 )
 (EXPORTED,) = python_of("pycrorm_async/export/README.md")
@@ -241,6 +241,13 @@ async def test_failures_are_counted_where_they_began(tmp_path: Path) -> None:
         {"path": "root > Parallel > KnockAction", "reason": "PlanFailure", "times": 2}
     ]
     assert frame.object.isna().tolist() == [True]
+
+
+async def test_successes_are_drawn(tidied: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    figure = await run_block(PLOTTED, tidied, "figure")
+    assert figure.axes[0].get_title(loc="left").startswith("PickUpWithContextView: success over relative_x and")
+    assert "<svg" in (tmp_path / "pick-ups.svg").read_text()
 
 
 async def test_frames_and_batches_have_the_declared_types(tidied: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,0 +1,85 @@
+"""`pycrorm plot X Y` draws how often actions succeeded over two columns of a view."""
+
+from __future__ import annotations
+
+import asyncio
+import io
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
+from pycrorm_async.cli.output import note, print_json, stdout
+from pycrorm_async.cli.pending_events import note_pending_events
+from pycrorm_async.errors import CallerError
+from pycrorm_async.query.reading import Reading
+from pycrorm_async.query.success.figure import Kind, success_figure
+from pycrorm_async.query.success.samples import Samples, success_samples
+from pycrorm_async.query.success.success_table import SuccessTable, success_table
+from pycrorm_async.report.output_file import refuse_existing, write_file
+
+__all__ = ["plot"]
+
+_SUFFIXES = (".png", ".svg", ".pdf")
+
+
+def plot(
+    x: Annotated[str, typer.Argument(help="The column along the bottom: numbers, times, texts or enums.")],
+    y: Annotated[str, typer.Argument(help="The column along the side.")],
+    of: Annotated[
+        str, typer.Option(metavar="VIEW", help="The view, mapped class or designator type that has both and a status.")
+    ] = "PickUpWithContextView",
+    kind: Annotated[
+        Kind,
+        typer.Option(help="Shares of successes in cells, or each row as a point; auto: points for up to 500 rows."),
+    ] = "auto",
+    bins: Annotated[
+        int | None, typer.Option(min=1, max=200, help="Ranges of a numeric column at most; default: by the rows.")
+    ] = None,
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The file to write: .png, .svg or .pdf.")] = Path(
+        "success.png"
+    ),
+    force: Annotated[bool, typer.Option("--force", help="Replace the file if it exists.")] = False,
+    url: UrlOption = DEFAULT_URL,
+    spool: SpoolOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Draw how often actions succeeded over two columns of a view: where, with which arm, how long.
+
+    Needs the extra 'pictures'. With --json the counts of all cells are printed too.
+    """
+    if out.suffix not in _SUFFIXES:
+        raise CallerError(f"--out {out} must end in one of {', '.join(_SUFFIXES)}")
+    refuse_existing(out, force=force)
+
+    async def read() -> Samples:
+        async with Reading.open(url) as reading:
+            return await success_samples(reading, x, y, of)
+
+    samples = asyncio.run(read())
+    buffer = io.BytesIO()
+    success_figure(samples, kind=kind, bins=bins).savefig(buffer, format=out.suffix[1:], dpi=120)
+    write_file(buffer.getvalue(), out, force=force)
+    table = success_table(samples, bins=bins)
+    note_pending_events(url, spool)
+    if as_json:
+        print_json({"file": out, **_document(table)})
+        return
+    stdout.print(str(out), markup=False, highlight=False, soft_wrap=True)
+    note(f"{table.succeeded:,} of {table.rows:,} rows succeeded.")
+
+
+def _document(table: SuccessTable) -> dict[str, Any]:
+    cells = [
+        {
+            table.x.name: table.x.cell_text(each.x),
+            table.y.name: table.y.cell_text(each.y),
+            "succeeded": each.succeeded,
+            "rows": each.rows,
+            "interval": each.interval,
+        }
+        for each in table.cells
+    ]
+    counts = {"succeeded": table.succeeded, "rows": table.rows, "missing": table.missing, "running": table.running}
+    return {"view": table.source, **counts, "cells": cells}

@@ -1,0 +1,1 @@
+"""Count and draw how often actions succeeded, over any two columns of a view."""

@@ -1,0 +1,147 @@
+"""Count successes in the cells of two axes: ranges of a numeric column, categories of another one."""
+
+from __future__ import annotations
+
+import math
+from datetime import UTC, datetime
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pycrorm_async.errors import CallerError
+from pycrorm_async.query.success.samples import Samples, Values
+
+__all__ = ["Axis", "Cell", "SuccessTable", "interval", "success_table"]
+
+_BINS_MAX = 200
+_BINS_LEAST, _BINS_USUAL = 4, 16
+_ROWS_A_CELL = 5
+"""By default there are so few ranges that a cell has this many rows on average."""
+_DAY_S, _MINUTE_S = 86_400, 60
+_Z_95 = 1.959964
+"""95 % of a normal distribution are within this many standard deviations."""
+
+
+class Axis(NamedTuple):
+    """One axis.
+
+    Attributes:
+        labels: of the categories; empty for a numeric column.
+        edges: of the ranges, one more than there are cells; empty for categories.
+    """
+
+    name: str
+    labels: tuple[str, ...] = ()
+    edges: tuple[float, ...] = ()
+    is_time: bool = False
+
+    @property
+    def cells(self) -> int:
+        """The number of cells along it."""
+        return len(self.labels) or len(self.edges) - 1
+
+    @property
+    def step(self) -> float:
+        """The width of a range."""
+        return self.edges[1] - self.edges[0]
+
+    def text(self, edge: float) -> str:
+        """Format an edge."""
+        if not self.is_time:
+            return f"{edge + 0.0:.6g}"
+        when = datetime.fromtimestamp(edge, UTC)
+        if self.step >= _DAY_S:
+            return f"{when:%Y-%m-%d}"
+        return f"{when:%m-%d %H:%M}" if self.step >= _MINUTE_S else f"{when:%H:%M:%S.%f}"[:-4]
+
+    def cell_text(self, cell: int) -> str:
+        """Format a cell: its category, or its range."""
+        if self.labels:
+            return self.labels[cell]
+        return f"{self.text(self.edges[cell])} to {self.text(self.edges[cell + 1])}"
+
+
+class Cell(NamedTuple):
+    """A cell with at least one row: its place along both axes, and how many of its rows succeeded."""
+
+    x: int
+    y: int
+    succeeded: int
+    rows: int
+
+    @property
+    def rate(self) -> float:
+        """The share of successes."""
+        return self.succeeded / self.rows
+
+    @property
+    def interval(self) -> tuple[float, float]:
+        """The 95 % interval of the rate; see `interval`."""
+        return interval(self.succeeded, self.rows)
+
+
+class SuccessTable(NamedTuple):
+    """The successes over two axes; `missing` and `running` are those of `Samples`."""
+
+    source: str
+    x: Axis
+    y: Axis
+    cells: tuple[Cell, ...]
+    succeeded: int
+    rows: int
+    missing: int
+    running: int
+
+
+def interval(succeeded: int, count: int) -> tuple[float, float]:
+    """Return the 95 % interval of a rate by Wilson's score, which also holds for few rows and for rates near 0 and 1.
+
+    >>> interval(5, 5)
+    (0.566, 1.0)
+    """
+    center = (succeeded + _Z_95**2 / 2) / (count + _Z_95**2)
+    half = _Z_95 * math.sqrt(succeeded * (count - succeeded) / count + _Z_95**2 / 4) / (count + _Z_95**2)
+    return round(max(0.0, center - half), 3), round(min(1.0, center + half), 3)
+
+
+def success_table(samples: Samples, *, bins: int | None = None) -> SuccessTable:
+    """Count the samples in at most about `bins` ranges of each numeric column, with round edges.
+
+    By default the ranges are the finer the more rows there are. Raises `CallerError`.
+    """
+    if bins is None:
+        usual = round(math.sqrt(len(samples.succeeded) / _ROWS_A_CELL))
+        bins = min(max(usual, _BINS_LEAST), _BINS_USUAL)
+    if not 1 <= bins <= _BINS_MAX:
+        raise CallerError(f"an axis has 1 to {_BINS_MAX} bins, not {bins}")
+    x, columns = _axis(samples.x, bins)
+    y, rows = _axis(samples.y, bins)
+    counts = np.zeros((2, x.cells, y.cells), dtype=int)
+    np.add.at(counts, (samples.succeeded.astype(int), columns, rows), 1)
+    failed, succeeded = counts
+    cells = tuple(
+        Cell(int(i), int(j), int(succeeded[i, j]), int(succeeded[i, j] + failed[i, j]))
+        for i, j in np.argwhere(succeeded + failed)
+    )
+    total = int(samples.succeeded.sum())
+    return SuccessTable(samples.source, x, y, cells, total, len(samples.succeeded), samples.missing, samples.running)
+
+
+def _axis(values: Values, bins: int) -> tuple[Axis, NDArray[np.int64]]:
+    """Return the axis of a column, and the cell of each value along it."""
+    if values.categories:
+        return Axis(values.name, values.categories), values.numbers.astype(np.int64)
+    low, high = float(values.numbers.min()), float(values.numbers.max())
+    step = _round_step((high - low) / bins) if high > low else max(abs(low) * 1e-3, 1.0)
+    first = math.floor(low / step)
+    last = max(math.ceil(high / step), first + 1)
+    edges = tuple(index * step for index in range(first, last + 1))
+    cells = np.clip(np.floor(values.numbers / step).astype(np.int64) - first, 0, last - first - 1)
+    return Axis(values.name, edges=edges, is_time=values.is_time), cells
+
+
+def _round_step(width: float) -> float:
+    """Return the least of 1, 2, 2.5, 5 and 10, times a power of ten, that is not below the width."""
+    power = 10.0 ** math.floor(math.log10(width))
+    return next((factor * power for factor in (1, 2, 2.5, 5) if factor * power >= width * (1 - 1e-9)), 10 * power)
