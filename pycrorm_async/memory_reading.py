@@ -23,7 +23,8 @@ from pycrorm_async.orm import PickUpWithContextView
 from pycrorm_async.plan.task_tree import TaskTreeNode
 from pycrorm_async.query.as_of import AnyEpisode
 from pycrorm_async.query.asking.ask import Ask
-from pycrorm_async.query.asking.question import Question
+from pycrorm_async.query.asking.episode_diff import EpisodeDiff
+from pycrorm_async.query.asking.question import AskedEpisode, Question
 from pycrorm_async.query.frames.arrow_batches import BATCH_ROWS
 from pycrorm_async.query.frames.dataframe import Library
 from pycrorm_async.query.notebook.listings import Episodes, TaskTree
@@ -125,6 +126,10 @@ class ReadableMemory(PartsHolder):
     def ask(self) -> Ask[Question]:
         """The named questions: `await memory.ask.root_failures(object="milk")` is a frame, up to the last flush."""
         return self._open_parts.reading.ask
+
+    async def diff(self, first: AskedEpisode, second: AskedEpisode) -> EpisodeDiff:
+        """Compare two episodes, up to the last flush; see `Reading.diff`."""
+        return await self._open_parts.reading.diff(first, second)
 
     async def query(self, sql: str, limits: SqlLimits = DEFAULT_LIMITS) -> SqlResult:
         """Return the rows of one query in SQL that can only read, up to the last flush; see `Reading.query`."""

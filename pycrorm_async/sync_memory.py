@@ -23,7 +23,8 @@ from sqlalchemy import Select
 from pycrorm_async.errors import CallerError, FlushTimeout
 from pycrorm_async.memory_status import MemoryStatus
 from pycrorm_async.query.asking.ask import Ask
-from pycrorm_async.query.asking.question import Question, SyncQuestion
+from pycrorm_async.query.asking.episode_diff import EpisodeDiff
+from pycrorm_async.query.asking.question import AskedEpisode, Question, SyncQuestion
 from pycrorm_async.query.frames.dataframe import Library
 from pycrorm_async.query.sql.read_only import DEFAULT_LIMITS, SqlLimits, SqlResult
 from pycrorm_async.recording.recording import Recording
@@ -144,6 +145,10 @@ class SyncMemory:
         """The named questions: `memory.ask.root_failures(object="milk").frame()`."""
         reading = self._memory.reading
         return Ask(lambda plan: SyncQuestion(Question(reading, plan), self._await))
+
+    def diff(self, first: AskedEpisode, second: AskedEpisode) -> EpisodeDiff:
+        """Compare two episodes; see `Reading.diff`."""
+        return self._await(self._memory.diff(first, second))
 
     def query(self, sql: str, limits: SqlLimits = DEFAULT_LIMITS) -> SqlResult:
         """Return the rows of one query in SQL that can only read; see `Reading.query`."""

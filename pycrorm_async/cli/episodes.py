@@ -11,7 +11,9 @@ import typer
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
 from pycrorm_async.cli.output import duration, moment, print_json, print_table, stdout
 from pycrorm_async.cli.pending_events import note_pending_events
+from pycrorm_async.cli.since import parse_since
 from pycrorm_async.cli.tree import simulated_by
+from pycrorm_async.query.asking.episode_list import EpisodeChoice
 from pycrorm_async.query.named_queries import EpisodeSummary
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.store.address import DatabaseAddress
@@ -29,18 +31,38 @@ def episodes(
     simulated: Annotated[
         bool, typer.Option("--simulated", help="Also list simulated episodes (SimulatedTaskTree).")
     ] = False,
+    status: Annotated[
+        str | None, typer.Option(metavar="STATUS", help="List only episodes of this status: RUNNING, SUCCEEDED, …")
+    ] = None,
+    since: Annotated[
+        str | None,
+        typer.Option(
+            metavar="WHEN",
+            help="List only episodes that started then or later: 2026-11-23, 2026-11-23T14:30, 90min, 7d.",
+        ),
+    ] = None,
     tag: Annotated[
         list[str] | None, typer.Option(metavar="TAG", help="List only episodes with this tag; repeatable: with all.")
     ] = None,
+    robot: Annotated[
+        str | None, typer.Option(metavar="ROBOT", help="List only episodes with a robot of this name or model.")
+    ] = None,
+    text: Annotated[
+        str | None,
+        typer.Option(metavar="TEXT", help="List only episodes whose description, plan or a tag has this text."),
+    ] = None,
+    limit: Annotated[int | None, typer.Option(metavar="N", min=1, help="List only the newest N of them.")] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """List the recorded episodes."""
+    """List the recorded episodes, the oldest first."""
+    earliest = None if since is None else parse_since(since)
+    choice = EpisodeChoice(status, earliest, tuple(tag or ()), robot, text, limit)
 
     async def query() -> list[EpisodeSummary]:
         async with Reading.open(url) as reading:
-            return await reading.episodes(simulated=simulated)
+            return await reading.episodes(choice, simulated=simulated)
 
-    summaries = [each for each in asyncio.run(query()) if set(tag or ()) <= set(each.tags)]
+    summaries = asyncio.run(query())
     note_pending_events(url, spool)
     if as_json:
         print_json(summaries)

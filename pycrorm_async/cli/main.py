@@ -93,6 +93,8 @@ _VERBS = (
     "export",
     "watch",
     "plot",
+    "diff",
+    "query",
     "events",
     "tag",
     "copy",
@@ -103,6 +105,7 @@ _VERBS = (
     "learn",
 )
 _GROUPS: Mapping[str, tuple[str, tuple[str, ...]]] = {
+    "ask": ("Answer a named question; `pycrorm ask NAME --help` lists its options.", ()),
     "spool": (
         "The write-ahead queue's files: inspect, repair, or store them in another database.",
         ("inspect", "repair", "rebind"),
@@ -131,7 +134,7 @@ def app(requested: str | None = None) -> typer.Typer:
     for group, (text, verbs) in _GROUPS.items():
         if group in chosen:
             subcommand = typer.Typer(help=text, no_args_is_help=True)
-            for verb in verbs:
+            for verb in verbs or import_module(f"pycrorm_async.cli.{group}").verbs():
                 subcommand.command(verb)(_load_verb(group, verb))
             command.add_typer(subcommand, name=group)
     return command

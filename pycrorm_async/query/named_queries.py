@@ -14,6 +14,7 @@ from sqlalchemy.orm import aliased
 from pycrorm_async.events.ids import SLOT_NODE, row_id, row_key
 from pycrorm_async.orm import Designator, EpisodeRobot, EpisodeTag, Object, Observation, ProcessMetaData, TaskTreeNode
 from pycrorm_async.orm.base import same_row
+from pycrorm_async.query.asking.episode_list import EpisodeChoice
 from pycrorm_async.store.episode_lookup import number_named
 from pycrorm_async.task_status import TaskStatus
 
@@ -164,16 +165,17 @@ class NodeSummary:
     observations: int = 0
 
 
-async def episodes(connection: AsyncConnection, number: int | None = None) -> list[EpisodeSummary]:
-    """Return every episode that the connection sees, the oldest first; or only the one with this number."""
+async def episodes(connection: AsyncConnection, chosen: int | EpisodeChoice | None = None) -> list[EpisodeSummary]:
+    """Return every episode that the connection sees, the oldest first; or one by its number, or a choice."""
     query = _overview()
-    if number is not None:
-        query = query.where(ProcessMetaData.id == number)
-    robots = await _robots(connection, None if number is None else [number])
+    numbers = chosen.newest() if isinstance(chosen, EpisodeChoice) else None if chosen is None else [chosen]
+    if numbers is not None:
+        query = query.where(ProcessMetaData.id.in_(numbers))
+    robots = await _robots(connection, numbers)
     tags: dict[int, list[str]] = {}
     tagged = select(EpisodeTag.process_metadata_id, EpisodeTag.tag).order_by(EpisodeTag.tag)
-    if number is not None:
-        tagged = tagged.where(EpisodeTag.process_metadata_id == number)
+    if numbers is not None:
+        tagged = tagged.where(EpisodeTag.process_metadata_id.in_(numbers))
     for episode, tag in await connection.execute(tagged):
         tags.setdefault(episode, []).append(tag)
     return [
@@ -227,7 +229,9 @@ async def running_episodes(connection: AsyncConnection, limit: int) -> tuple[lis
     return episodes, rows[0].total if rows else 0
 
 
-async def _robots(connection: AsyncConnection, numbers: Collection[int] | None) -> dict[int, list[RobotSummary]]:
+async def _robots(
+    connection: AsyncConnection, numbers: Collection[int] | Select[*tuple[int]] | None
+) -> dict[int, list[RobotSummary]]:
     """Return the robots of every episode, or of those with these numbers, by episode."""
     robot = EpisodeRobot
     query = select(robot.__table__).order_by(robot.id)

@@ -31,14 +31,16 @@ from pycrorm_async.projections.schema.session_views import all_views, with_views
 from pycrorm_async.query import named_queries
 from pycrorm_async.query.as_of import AnyEpisode, as_of
 from pycrorm_async.query.asking.ask import Ask
-from pycrorm_async.query.asking.question import Question
+from pycrorm_async.query.asking.episode_diff import EpisodeDiff, diff_episodes
+from pycrorm_async.query.asking.episode_list import EpisodeChoice
+from pycrorm_async.query.asking.question import AskedEpisode, Question
 from pycrorm_async.query.episode_session import EpisodeSession
 from pycrorm_async.query.frames.arrow_batches import BATCH_ROWS, arrow_batches
 from pycrorm_async.query.frames.dataframe import Library, dataframe
 from pycrorm_async.query.named_queries import EpisodeSummary
 from pycrorm_async.query.notebook.listings import Episodes, TaskTree
 from pycrorm_async.query.snapshot import Moment
-from pycrorm_async.query.sql.read_only import DEFAULT_LIMITS, ReadOnlySql, SqlLimits, SqlResult
+from pycrorm_async.query.sql.read_only import DEFAULT_LIMITS, ReadOnlySql, SqlLimits, SqlResult, SqlRows
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 
@@ -203,6 +205,13 @@ class Reading:
         await self._ready()
         return await ReadOnlySql(self._log).query(sql, limits)
 
+    @asynccontextmanager
+    async def stream(self, sql: str, limits: SqlLimits = DEFAULT_LIMITS) -> AsyncIterator[SqlRows]:
+        """Run such a query and read its rows, with `async for`, while it runs; see `query`."""
+        await self._ready()
+        async with ReadOnlySql(self._log).stream(sql, limits) as rows:
+            yield rows
+
     @property
     def ask(self) -> Ask[Question]:
         """The named questions: `await reading.ask.root_failures(object="milk")` is a frame."""
@@ -231,19 +240,23 @@ class Reading:
 
     # --- named queries ----------------------------------------------------------------------------------------
 
-    async def episodes(self, *, simulated: bool = False) -> Episodes:
-        """Return every episode, the oldest first, as a list that a notebook draws as a table."""
+    async def episodes(self, choice: EpisodeChoice | None = None, *, simulated: bool = False) -> Episodes:
+        """Return the episodes, all or a choice, the oldest first, as a list that a notebook draws as a table."""
         await self._ready()
         with self._log.translated():
             digests = await self._log.last_digests()
             async with self._connection(simulated=simulated) as connection:
-                summaries = await named_queries.episodes(connection)
+                summaries = await named_queries.episodes(connection, choice)
         return Episodes(
             replace(each, digest_sequence=digest.sequence, digest=digest.digest)
             if (digest := digests.get(each.number)) is not None
             else each
             for each in summaries
         )
+
+    async def diff(self, first: AskedEpisode, second: AskedEpisode) -> EpisodeDiff:
+        """Compare two episodes: facts, task trees, and the last places of objects. Raises `UnknownEpisode`."""
+        return await diff_episodes(self, first, second)
 
     async def episode(self, name: str) -> EpisodeSummary:
         """Return the episode with this number, id, or first digits of its id, simulations included.

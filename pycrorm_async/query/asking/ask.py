@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from datetime import datetime
 from functools import partial
 from typing import TYPE_CHECKING, Any, Generic, Literal, NoReturn, TypeVar
 
@@ -13,9 +14,6 @@ from pycrorm_async.query.asking.question import AskedEpisode, QuestionPlan
 from pycrorm_async.query.suggestions import nearest
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.enums import Arms, Grasp, ObjectType
-
-if TYPE_CHECKING:
-    from datetime import datetime
 
 __all__ = ["Ask", "QUESTIONS"]
 

@@ -17,11 +17,11 @@ if TYPE_CHECKING:
     from pycrorm_async.query.frames.dataframe import Library
     from pycrorm_async.query.reading import Reading
 
-__all__ = ["AskedEpisode", "EpisodeNumber", "Question", "QuestionPlan", "SyncQuestion"]
+__all__ = ["AskedEpisode", "EpisodeNumber", "Question", "QuestionPlan", "SyncQuestion", "episode_name"]
 
 T = TypeVar("T")
 
-AskedEpisode: TypeAlias = "int | str | Episode | EpisodeSummary"
+AskedEpisode: TypeAlias = int | str | Episode | EpisodeSummary
 """An episode by its number, its id or the first digits of it, `last`, or as an `Episode` or `EpisodeSummary`."""
 EpisodeNumber: TypeAlias = "int | ColumnElement[int]"
 """The number of an episode, or an expression that finds it."""
@@ -79,7 +79,7 @@ class Question:
 
     async def _resolved(self) -> Select[*tuple[Any, ...]]:
         """Return the select for the numbers of the episodes, with which both databases plan better."""
-        numbers = [(await self._reading.episode(_named(each))).number for each in self._plan.episodes]
+        numbers = [(await self._reading.episode(episode_name(each))).number for each in self._plan.episodes]
         return self._plan.select_of(*numbers)
 
     def __str__(self) -> str:
@@ -126,7 +126,7 @@ class SyncQuestion:
         return f"<question {self.name}: call frame() or rows(), print it for its SQL>"
 
 
-def _named(episode: AskedEpisode) -> str:
+def episode_name(episode: AskedEpisode) -> str:
     """Return the name by which `Reading.episode` finds it. Raises `CallerError` for another type."""
     match episode:
         case bool():
@@ -141,7 +141,7 @@ def _named(episode: AskedEpisode) -> str:
 
 
 def _number_by_query(episode: AskedEpisode) -> EpisodeNumber:
-    name, numbered = _named(episode), ProcessMetaData
+    name, numbered = episode_name(episode), ProcessMetaData
     if name == "last":
         return select(func.max(numbered.id)).where(~numbered.simulated).scalar_subquery()
     if name.isdecimal() and name.isascii():

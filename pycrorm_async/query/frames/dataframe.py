@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
 
-__all__ = ["Library", "dataframe"]
+__all__ = ["Library", "dataframe", "imported"]
 
 Library: TypeAlias = Literal["pandas", "polars", "arrow"]
 """The library of a frame: `pandas.DataFrame`, `polars.DataFrame` or `pyarrow.Table`."""
@@ -34,7 +34,7 @@ async def dataframe(
     """
     if to not in get_args(Library):
         raise CallerError(f"a frame can be of {', '.join(get_args(Library))}, not of {to!r}")
-    library = _imported(to)
+    library = imported(to)
     batches = arrow_batches(connection, statement, deferred=deferred, enums_as_text=to == "pandas")
     table = needed_pyarrow().Table.from_batches([each async for each in batches])
     match to:
@@ -46,7 +46,8 @@ async def dataframe(
             return table.unify_dictionaries()
 
 
-def _imported(to: Library) -> Any:
+def imported(to: Library) -> Any:
+    """Import the library. Raises `MissingExtra`."""
     needed_pyarrow()
     try:
         return import_module("pyarrow" if to == "arrow" else to)

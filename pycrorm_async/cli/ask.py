@@ -1,0 +1,155 @@
+"""`pycrorm ask NAME` answers a named question: each of `memory.ask` is a verb with its arguments as options."""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+from collections.abc import Callable
+from datetime import datetime
+from enum import Enum
+from pathlib import Path
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+
+import typer
+
+from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
+from pycrorm_async.cli.output import duration, moment, note, print_json, print_table, stdout
+from pycrorm_async.cli.pending_events import note_pending_events
+from pycrorm_async.cli.since import parse_since
+from pycrorm_async.query.asking.ask import QUESTIONS, Ask
+from pycrorm_async.query.asking.question import Question
+from pycrorm_async.query.reading import Reading
+from pycrorm_async.store.address import DatabaseAddress
+
+__all__ = ["verbs"]
+
+_SqlOption = Annotated[bool, typer.Option("--sql", help="Print the question's SQL instead of asking it.")]
+_SimulatedOption = Annotated[bool, typer.Option("--simulated", help="Include simulated episodes.")]
+_HELP = {
+    "arm": "Name of the arm, such as LEFT.",
+    "dtype": "Only this type, such as PickUpAction.",
+    "episode": "Only this episode: its number, its id or first digits of the id, or `last`.",
+    "grasp": "Name of the grasp, such as TOP.",
+    "kind": "Kind of the nodes.",
+    "limit": "Rows at most.",
+    "message": "A part of the failure's message.",
+    "name": "Name of the object.",
+    "object": "Name of the object, or a part of it.",
+    "object_type": "Type of the object, such as MILK.",
+    "radius_m": "Distance from the place, m.",
+    "reason": "Class of the failure or a part of it, or words for it, such as unreachable.",
+    "recovered": "Only failures around which a node succeeded all the same, or only others.",
+    "robot": "Name of the robot; for episodes also its model.",
+    "since": "Started then or later: 2026-11-23, 2026-11-23T14:30, 90min, 7d.",
+    "status": "Status, such as SUCCEEDED or FAILED.",
+    "steps": "Steps before each failure.",
+    "tag": "With this tag.",
+    "text": "Words that are all there, as in 'milk unreachable'.",
+    "x": "Place in the map, m.",
+    "y": "Place in the map, m.",
+}
+
+
+def __getattr__(name: str) -> Callable[..., None]:
+    """Return the verb of a question, by its name."""
+    if name not in QUESTIONS:
+        raise AttributeError(name)
+    return _verb(name)
+
+
+def verbs() -> tuple[str, ...]:
+    return QUESTIONS
+
+
+def _verb(name: str) -> Callable[..., None]:
+    question = getattr(Ask, name)
+    hints = get_type_hints(question)
+    given = [each for each in inspect.signature(question).parameters.values() if each.name != "self"]
+
+    def run(
+        *,
+        url: str,
+        spool: Path | None,
+        sql: bool,
+        simulated: bool,
+        as_json: bool,
+        **options: Any,
+    ) -> None:
+        arguments = {
+            key: parse_since(value) if key == "since" else value for key, value in options.items() if value is not None
+        }
+        if sql:
+            stdout.print(
+                getattr(Reading(DatabaseAddress.parse(url)).ask, name)(**arguments).sql, markup=False, soft_wrap=True
+            )
+            return
+        _answer(name, arguments, url, spool, simulated=simulated, as_json=as_json)
+
+    parameters = [
+        each.replace(
+            kind=inspect.Parameter.KEYWORD_ONLY, annotation=_option(each, hints[each.name]), default=each.default
+        )
+        for each in given
+    ]
+    shared = {
+        "sql": (_SqlOption, False),
+        "simulated": (_SimulatedOption, False),
+        "url": (UrlOption, DEFAULT_URL),
+        "spool": (SpoolOption, None),
+        "as_json": (JsonOption, False),
+    }
+    parameters += [
+        inspect.Parameter(key, inspect.Parameter.KEYWORD_ONLY, annotation=annotation, default=default)
+        for key, (annotation, default) in shared.items()
+    ]
+    run.__doc__ = (inspect.getdoc(question) or "").partition("\n\n")[0]
+    run.__name__ = name
+    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]  # typer reads it
+    run.__annotations__ = {each.name: each.annotation for each in parameters}
+    return run
+
+
+def _option(parameter: inspect.Parameter, hint: Any) -> Any:
+    """Return the annotation of the option, or of the argument `name`."""
+    is_required = parameter.default is inspect.Parameter.empty
+    types = [each for each in get_args(hint) if each is not type(None)] if get_origin(hint) is not Literal else []
+    type_: Any = next((each for each in (bool, float, int) if each in (types or [hint])), str)
+    if str in types or datetime in types:  # an episode may be a number, and an enum's member has a name
+        type_ = str
+    if get_origin(hint) is Literal:
+        type_ = hint
+    text = _HELP[parameter.name]
+    if parameter.name == "name":
+        return Annotated[str, typer.Argument(help=text)]
+    flags = ("--recovered/--not-recovered",) if type_ is bool else ()
+    return Annotated[type_ if is_required else type_ | None, typer.Option(*flags, help=text)]
+
+
+def _answer(
+    name: str, arguments: dict[str, Any], url: str, spool: Path | None, *, simulated: bool, as_json: bool
+) -> None:
+    async def ask() -> tuple[list[str], list[tuple[Any, ...]]]:
+        async with Reading.open(url) as reading:
+            question: Question = getattr(reading.ask, name)(**arguments)
+            columns = list(question.statement.selected_columns.keys())
+            return columns, [tuple(row) for row in await question.rows(simulated=simulated)]
+
+    columns, rows = asyncio.run(ask())
+    note_pending_events(url, spool)
+    if as_json:
+        print_json([dict(zip(columns, map(_plain, row), strict=True)) for row in rows])
+        return
+    headings = [each.removesuffix("_s") for each in columns]
+    print_table(name, headings, ([*map(_cell, columns, row)] for row in rows))
+    if not rows:
+        note("no row answers; `--sql` shows the question.")
+
+
+def _plain(value: Any) -> Any:
+    return value.name if isinstance(value, Enum) else value
+
+
+def _cell(column: str, value: Any) -> Any:
+    if column.endswith("_s") and value is not None:
+        return duration(round(value * 1e9))
+    return moment(value) if isinstance(value, datetime) else _plain(value)

@@ -1,0 +1,62 @@
+"""`pycrorm diff A B` compares two episodes: facts, task trees, last places of objects."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Annotated
+
+import typer
+
+from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
+from pycrorm_async.cli.output import duration, note, print_json, print_table, stdout
+from pycrorm_async.cli.pending_events import note_pending_events
+from pycrorm_async.query.asking.episode_diff import EpisodeDiff
+from pycrorm_async.query.named_queries import EpisodeSummary
+from pycrorm_async.query.reading import Reading
+
+__all__ = ["diff"]
+
+_HELP = "The episode's number, its id or first digits of the id, or `last`."
+
+
+def diff(
+    first: Annotated[str, typer.Argument(metavar="A", help=_HELP)],
+    second: Annotated[str, typer.Argument(metavar="B", help=_HELP)],
+    url: UrlOption = DEFAULT_URL,
+    spool: SpoolOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Compare two episodes: what surrounded them, their task trees, and the last places of their objects.
+
+    Nodes correspond by the types from the root down. A node that only one of them has stands for the nodes below it.
+    """
+
+    async def compare() -> EpisodeDiff:
+        async with Reading.open(url) as reading:
+            return await reading.diff(first, second)
+
+    compared = asyncio.run(compare())
+    note_pending_events(url, spool)
+    if as_json:
+        print_json(compared)
+        return
+    for letter, episode in (("A", compared.first), ("B", compared.second)):
+        stdout.print(f"{letter}: {_line(episode)}", markup=False)
+    rows = [
+        (
+            each.of,
+            each.where,
+            f"{each.what}, with {each.below} below" if each.below else each.what,
+            each.first,
+            each.second,
+        )
+        for each in compared.differences
+    ]
+    if rows:
+        print_table("Differences", ("of", "where", "what", "A", "B"), rows)
+    note(f"{len(rows)} differences; {compared.same_nodes} nodes are the same")
+
+
+def _line(episode: EpisodeSummary) -> str:
+    took = duration(episode.duration_ns) or "not ended"
+    return f"episode {episode.number}, {episode.description}: {episode.status}, {took}, {episode.nodes} nodes"

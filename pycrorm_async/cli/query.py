@@ -1,0 +1,99 @@
+"""`pycrorm query "SELECT …"` runs SQL by hand; the database lets it only read."""
+
+from __future__ import annotations
+
+import asyncio
+import csv
+import sys
+from collections.abc import Iterable
+from typing import Annotated, Any, Literal
+
+import typer
+
+from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
+from pycrorm_async.cli.output import note, print_json, print_table
+from pycrorm_async.cli.pending_events import note_pending_events
+from pycrorm_async.errors import CallerError
+from pycrorm_async.query.reading import Reading
+from pycrorm_async.query.sql.read_only import SqlLimits, SqlResult
+
+__all__ = ["query"]
+
+_ROWS = 1_000
+_MEGABYTE = 1_000_000
+
+
+def query(
+    sql: Annotated[str, typer.Argument(metavar="SQL", help="One SELECT; `-` reads it from stdin.")],
+    form: Annotated[
+        Literal["table", "csv", "json"], typer.Option("--format", help="csv prints the rows while the query runs.")
+    ] = "table",
+    limit: Annotated[int, typer.Option(metavar="ROWS", min=0, help="Rows at most; 0: any number.")] = _ROWS,
+    megabytes: Annotated[float, typer.Option(metavar="MB", help="Size of the rows at most.")] = 16.0,
+    seconds: Annotated[float, typer.Option(metavar="S", help="Time that the database may take.")] = 10.0,
+    url: UrlOption = DEFAULT_URL,
+    spool: SpoolOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Run one query in SQL that can only read: nothing it says can change the memory or the machine.
+
+    On PostgreSQL the login in the URL must have no more rights than the role pycrorm_reader. Times are integers, µs
+    since 1970-01-01 UTC; columns that end in _ns are ns of the robot's monotonic clock.
+    """
+    text = sys.stdin.read() if sql == "-" else sql
+    limits = SqlLimits(rows=limit or None, bytes=int(megabytes * _MEGABYTE), seconds=seconds)
+    if as_json and form == "csv":
+        raise CallerError("--json and --format csv exclude each other")
+    if form == "csv":
+        more = asyncio.run(_write_csv(url, text, limits))
+    else:
+        result = asyncio.run(_run(url, text, limits))
+        more = result.more
+        if as_json or form == "json":
+            print_json(_document(result))
+        else:
+            print_table(f"{len(result.rows)} rows", result.columns, ([*map(_cell, row)] for row in result.rows))
+    note_pending_events(url, spool)
+    if more:
+        note(
+            f"the query has more rows: these are the first, up to {limit or 'any number of'} rows and {megabytes:g} MB;"
+            " --limit and --megabytes raise the limits."
+        )
+
+
+async def _run(url: str, sql: str, limits: SqlLimits) -> SqlResult:
+    async with Reading.open(url) as reading:
+        return await reading.query(sql, limits)
+
+
+async def _write_csv(url: str, sql: str, limits: SqlLimits) -> bool:
+    async with Reading.open(url) as reading, reading.stream(sql, limits) as rows:
+        lines = csv.writer(sys.stdout)
+        lines.writerow(rows.columns)
+        async for row in rows:
+            lines.writerow(_cell(each) for each in row)
+        sys.stdout.flush()
+        return rows.more
+
+
+def _document(result: SqlResult) -> dict[str, Any]:
+    names = list(_distinct(result.columns))
+    rows = [dict(zip(names, map(_value, row), strict=True)) for row in result.rows]
+    return {"columns": names, "rows": rows, "more": result.more}
+
+
+def _distinct(columns: Iterable[str]) -> Iterable[str]:
+    """Yield the names, the second `x` as `x_1`, as frames have them."""
+    times: dict[str, int] = {}
+    for name in columns:
+        times[name] = times.get(name, -1) + 1
+        yield f"{name}_{times[name]}" if times[name] else name
+
+
+def _value(value: Any) -> Any:
+    return value.hex() if isinstance(value, bytes | memoryview) else value
+
+
+def _cell(value: Any) -> Any:
+    """Return a value of the table: numbers with all their digits, bytes in hexadecimal digits."""
+    return repr(value) if isinstance(value, float) else "" if value is None else _value(value)

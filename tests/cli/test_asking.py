@@ -1,0 +1,166 @@
+"""`pycrorm ask`, `query`, `diff` and the choices of `episodes`, as a user types them."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from pathlib import Path
+
+import pytest
+
+from pycrorm_async.cli.main import app
+from pycrorm_async.cli.since import parse_since
+from pycrorm_async.errors import CallerError
+from pycrorm_async.query.asking.ask import QUESTIONS
+from tests.commands import answer, one_line_of, pycrorm
+from tests.databases import Server, run_in_own_loop
+from tests.projections.factories import append_and_fold
+from tests.query.random_memory import TYPES, RandomEpisode, root_failures_of
+
+pytestmark = pytest.mark.slow
+
+EPISODES = [RandomEpisode(number, seed=number) for number in range(1, 8)]
+RECORDS = [*TYPES, *(record for each in EPISODES for record in each.records)]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a memory as `pycrorm.db`."""
+    folder = tmp_path_factory.mktemp("asking")
+    run_in_own_loop(append_and_fold(f"sqlite:///{folder / 'pycrorm.db'}", RECORDS))
+    return folder
+
+
+# --- ask ------------------------------------------------------------------------------------------------------
+
+
+def test_a_question_is_answered_as_a_table_and_as_json(folder: Path) -> None:
+    document = answer("ask", "root_failures", "--object", "milk", "--recovered", cwd=folder)
+    failures = [each for each in root_failures_of(EPISODES) if "milk" in (each.object or "") and each.recovered]
+    assert failures
+    assert [(each["episode"], each["sequence"], each["reason"]) for each in document] == [
+        (each.episode, each.sequence, each.reason) for each in failures
+    ]
+    shown = pycrorm("ask", "durations", "--episode", "last", "--kind", "motion", cwd=folder)
+    assert shown.returncode == 0
+    assert "longest" in shown.stdout
+    assert "MoveMotion" in shown.stdout
+
+
+def test_without_a_name_the_questions_are_listed_and_with_sql_the_statement(folder: Path) -> None:
+    listed = pycrorm("ask", cwd=folder)
+    assert all(each in listed.stdout for each in QUESTIONS)
+    shown = pycrorm("ask", "moves_of", "milk", "--sql", "--limit", "3", cwd=folder)
+    assert shown.stdout.startswith("WITH RECURSIVE")
+    assert "lower(object.name) = 'milk'" in shown.stdout
+    assert pycrorm("query", shown.stdout, cwd=folder).returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["root_failure"], "root_failures"),
+        (["root_failures", "--objekt", "milk"], "--object"),
+        (["root_failures", "--limit", "many"], "'--limit': Input should be a valid integer"),
+        (["longest_actions", "--status", "SUCEEDED"], "did you mean SUCCEEDED?"),
+        (["durations", "--episode", "77"], "there is no episode '77' (`pycrorm episodes` lists the 7 there are)"),
+        (["durations", "--episode", "00000000"], "7 episodes have an id that begins with '00000000': give more of it"),
+        (["episodes", "--since", "yesterday"], "'yesterday' is no time: write 2026-11-23"),
+        (["moves_of"], "missing argument 'name'"),
+        (["experience_at", "--x", "1"], "missing option '--y'"),
+    ],
+)
+def test_a_wrong_name_option_or_value_is_answered_with_one_line(words: list[str], says: str, folder: Path) -> None:
+    result = pycrorm("ask", *words, cwd=folder)
+    assert result.returncode == 2
+    assert says in one_line_of(result)
+
+
+def test_each_question_is_a_verb_whose_options_have_a_help() -> None:
+    group = app("ask").registered_groups[0].typer_instance
+    assert group is not None
+    assert tuple(each.name for each in group.registered_commands) == QUESTIONS
+
+
+# --- query ----------------------------------------------------------------------------------------------------
+
+
+def test_a_query_is_printed_as_a_table_as_csv_and_as_json(folder: Path) -> None:
+    sql = "SELECT id AS n, status, NULL AS empty, 0.1 + 0.2 AS sum, x'ff00' AS bytes, 1 AS n FROM process_metadata"
+    lines = list(csv.reader(io.StringIO(pycrorm("query", sql, "--format", "csv", cwd=folder).stdout)))
+    assert lines[0] == ["n", "status", "empty", "sum", "bytes", "n"]
+    assert lines[1] == ["1", lines[1][1], "", "0.30000000000000004", "ff00", "1"]
+    assert len(lines) == 8
+    document = answer("query", sql, cwd=folder)
+    assert document["columns"] == ["n", "status", "empty", "sum", "bytes", "n_1"]
+    assert document["rows"][0]["sum"] == 0.1 + 0.2
+    assert not document["more"]
+    assert json.loads(pycrorm("query", sql, "--format", "json", cwd=folder).stdout) == document
+    shown = pycrorm("query", sql, "--limit", "2", cwd=folder)
+    assert "0.30000000000000004" in shown.stdout
+    assert "the query has more rows: these are the first, up to 2 rows and 16 MB" in shown.stderr
+    assert "more" not in pycrorm("query", sql, "--limit", "0", cwd=folder).stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["DELETE FROM event"], "a query may only read: it is one SELECT, or WITH … SELECT; DELETE is not allowed"),
+        (["ATTACH 'planted.db' AS planted"], "ATTACH is not allowed"),
+        (["SELECT * FROM root_failures"], "there is no table or view root_failures; did you mean root_failure?"),
+        (["SELECT 1; SELECT 2"], "a query is one statement: this text has several"),
+        (["SELECT 1", "--seconds", "-1"], "the limit on seconds of a query must be > 0, got -1.0"),
+        (["SELECT 1", "--format", "xml"], "xml"),
+        (["SELECT 1", "--json", "--format", "csv"], "exclude each other"),
+    ],
+)
+def test_a_query_that_is_refused_is_answered_with_one_line(words: list[str], says: str, folder: Path) -> None:
+    result = pycrorm("query", *words, cwd=folder)
+    assert result.returncode == 2
+    assert says in one_line_of(result)
+    assert not (folder / "planted.db").exists()
+
+
+def test_on_a_server_a_login_with_more_rights_is_shown_how_to_make_another(server: Server, tmp_path: Path) -> None:
+    url = server.new_database()
+    run_in_own_loop(append_and_fold(url, RECORDS[:20]))
+    result = pycrorm("query", "SELECT 1", "--url", url, cwd=tmp_path)
+    assert result.returncode == 2
+    assert "postgres is a superuser; make one: CREATE ROLE pycrorm_query LOGIN" in one_line_of(result)
+    server.drop(url)
+
+
+# --- diff and episodes ----------------------------------------------------------------------------------------
+
+
+def test_two_episodes_are_compared(folder: Path) -> None:
+    shown = pycrorm("diff", "1", "last", cwd=folder)
+    assert shown.returncode == 0
+    assert "A: episode 1, run 1 of milk" in shown.stdout
+    assert "B: episode 7, run 7 of milk" in shown.stdout
+    assert "differences; " in shown.stderr
+    document = answer("diff", "1", "7", cwd=folder)
+    assert document["first"]["number"] == 1
+    assert {each["of"] for each in document["differences"]} == {"episode", "node", "object"}
+    assert "there is no episode '70'" in one_line_of(pycrorm("diff", "1", "70", cwd=folder))
+
+
+def test_episodes_are_chosen_by_status_text_start_and_number(folder: Path) -> None:
+    def numbers(*words: str) -> list[int]:
+        return [each["number"] for each in answer("episodes", *words, cwd=folder)]
+
+    assert numbers("--status", "running") == [5]
+    assert numbers("--text", "RUN 3") == [3]
+    assert numbers("--limit", "2") == [6, 7]
+    assert numbers("--since", "2023-11-14") == list(range(1, 8))
+    assert numbers("--since", "1d") == []
+    assert numbers("--robot", "pr2") == []
+    assert "did you mean RUNNING?" in one_line_of(pycrorm("episodes", "--status", "runing", cwd=folder))
+    assert "is no time" in one_line_of(pycrorm("episodes", "--since", "monday", cwd=folder))
+
+
+@pytest.mark.parametrize("text", ["", "7", "7 years", "2026-13-01", "9999999d"])
+def test_an_impossible_start_is_refused(text: str) -> None:
+    with pytest.raises(CallerError, match="is no time"):
+        parse_since(text)

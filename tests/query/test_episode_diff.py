@@ -1,0 +1,122 @@
+"""The differences between two episodes, on both databases."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from functools import partial
+
+import pytest
+
+from pycrorm_async.errors import CallerError, UnknownEpisode
+from pycrorm_async.events.types import (
+    EpisodeEnded,
+    EpisodeStarted,
+    NodeEnded,
+    NodeStarted,
+    ObjectAdded,
+    ObjectMoved,
+    ObjectRemoved,
+)
+from pycrorm_async.events.values import FailureValue, ObjectReference
+from pycrorm_async.query.asking.episode_diff import Difference
+from pycrorm_async.query.reading import Reading
+from tests.databases import run_in_own_loop
+from tests.projections.event_script import NAVIGATE, PICK_UP, SAYING, Script, name_of, pose, row
+from tests.projections.factories import append_and_fold
+from tests.query.random_memory import TYPES, RandomEpisode
+
+pytestmark = pytest.mark.slow
+
+RANDOM = [RandomEpisode(number, seed=8) for number in (3, 4)]
+
+
+def trip(number: int, *, arm: str, x: float, fails: bool) -> Script:
+    """Return an episode that drives, picks up the milk, and with `fails` fails and says so at its end."""
+    script = Script(number)
+    put = script.put
+    libraries = {"numpy": "2.0", "scipy": "1.0"} if fails else {"numpy": "2.1"}
+    put(EpisodeStarted("tidy", "me", "host", "1", "3.11", plan="tidy", libraries=libraries))
+    for _ in range(number):  # so that the sequences of the two episodes differ
+        put(ObjectAdded(f"cup {_}", "CUP", pose(0)))
+    root = put(NodeStarted("root"))
+    milk = put(ObjectAdded("milk", "MILK", pose(1)))
+    drive = put(NodeStarted("action", root, name_of(NAVIGATE), {"target_location": pose(x + 1e-9)}))
+    put(NodeEnded(drive, "SUCCEEDED"))
+    grasp = {"object_designator": ObjectReference(milk, milk), "arm": arm, "grasp": "TOP"}
+    pick = put(NodeStarted("action", root, name_of(PICK_UP), grasp))
+    moved = put(ObjectMoved(milk, "milk", "MILK", pose(x), pick))
+    put(ObjectRemoved(ObjectReference(milk, moved)))
+    if not fails:
+        put(NodeEnded(pick, "SUCCEEDED"))
+        put(NodeEnded(root, "SUCCEEDED"))
+        put(EpisodeEnded("SUCCEEDED"))
+        return script
+    put(NodeEnded(pick, "FAILED", FailureValue("a.IKError", "too far")))
+    for _ in range(2):
+        said = put(NodeStarted("action", root, name_of(SAYING), {"text": "oh"}))
+        inner = put(NodeStarted("action", said, name_of(SAYING), {"text": "no"}))
+        put(NodeEnded(inner, "SUCCEEDED"))
+        put(NodeEnded(said, "SUCCEEDED"))
+    put(NodeEnded(root, "FAILED", FailureValue("a.IKError", "too far")))
+    put(EpisodeEnded("FAILED", FailureValue("a.IKError", "too far")))
+    return script
+
+
+@pytest.fixture(scope="module")
+def filled_url(module_database_url: str) -> str:
+    scripts = [trip(1, arm="LEFT", x=2, fails=False), trip(2, arm="RIGHT", x=3, fails=True), *RANDOM]
+    records = [*TYPES, *(record for each in scripts for record in each.records)]
+    run_in_own_loop(append_and_fold(module_database_url, records))
+    return module_database_url
+
+
+@pytest.fixture
+async def reading(filled_url: str) -> AsyncIterator[Reading]:
+    async with Reading.open(filled_url) as opened:
+        yield opened
+
+
+async def test_two_runs_of_one_plan_do_not_differ_although_their_times_do(reading: Reading) -> None:
+    compared = await reading.diff(3, 4)
+    assert [(each.of, each.where) for each in compared.differences] == [("episode", "description")]
+    assert compared.same_nodes == compared.first.nodes > 5
+    assert not await reading.diff("last", 4)
+
+
+async def test_each_difference_has_its_place_and_both_values(reading: Reading) -> None:
+    compared = await reading.diff(1, (await reading.episode("2")).id)
+    assert (compared.first.number, compared.second.number) == (1, 2)
+    one, two = partial(row, number=1), partial(row, number=2)
+    where = "root > PickUpAction"
+    picks = one(7), two(8)
+    assert compared.differences == (
+        Difference("episode", "status", "value", "SUCCEEDED", "FAILED"),
+        Difference("episode", "world", "value", "cup 0 (CUP)", "cup 0 (CUP), cup 1 (CUP)"),
+        Difference("episode", "library numpy", "value", "2.1", "2.0"),
+        Difference("episode", "library scipy", "only in second", None, "1.0"),
+        Difference("node", "root", "status", "SUCCEEDED", "FAILED", one(3), two(4)),
+        Difference("node", "root", "reason", None, "IKError", one(3), two(4)),
+        Difference("node", "root", "failure message", None, "too far", one(3), two(4)),
+        Difference(
+            "node", "root > NavigateAction", "parameter target_location",
+            "(2.00, 0.00, 0.00)", "(3.00, 0.00, 0.00)", one(5), two(6),
+        ),
+        Difference("node", where, "status", "SUCCEEDED", "FAILED", *picks),
+        Difference("node", where, "reason", None, "IKError", *picks),
+        Difference("node", where, "failure message", None, "too far", *picks),
+        Difference("node", where, "parameter arm", "LEFT", "RIGHT", *picks),
+        Difference("node", "root > SayingAction", "only in second", None, "SUCCEEDED", None, two(12), below=1),
+        Difference("node", "root > SayingAction 2", "only in second", None, "SUCCEEDED", None, two(16), below=1),
+        Difference("object", "milk", "place", "(2.000, 0.000, 0.000)", "(3.000, 0.000, 0.000)"),
+        Difference("object", "cup 1", "only in second", None, "(0.000, 0.000, 0.000)"),
+    )  # fmt: skip
+    frame = compared.frame()
+    assert frame["where"].tolist() == [each.where for each in compared.differences]
+    assert compared.same_nodes == 0
+
+
+async def test_an_unknown_or_impossible_episode_is_refused(reading: Reading) -> None:
+    with pytest.raises(UnknownEpisode, match="there is no episode '9'"):
+        await reading.diff(1, 9)
+    with pytest.raises(CallerError, match="not None"):
+        await reading.diff(None, 1)  # type: ignore[arg-type]
