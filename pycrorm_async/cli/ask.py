@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import inspect
+import re
 from collections.abc import Callable
 from datetime import datetime
 from enum import Enum
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal
 
 import typer
 
@@ -48,6 +49,8 @@ _HELP = {
     "x": "Place in the map, m.",
     "y": "Place in the map, m.",
 }
+_TYPES = {"int": int, "float": float, "bool": bool}
+"""The type of an option by a word of its annotation; an episode, a time, or a member of an enum is a text."""
 
 
 def __getattr__(name: str) -> Callable[..., None]:
@@ -63,7 +66,6 @@ def verbs() -> tuple[str, ...]:
 
 def _verb(name: str) -> Callable[..., None]:
     question = getattr(Ask, name)
-    hints = get_type_hints(question)
     given = [each for each in inspect.signature(question).parameters.values() if each.name != "self"]
 
     def run(
@@ -86,9 +88,7 @@ def _verb(name: str) -> Callable[..., None]:
         _answer(name, arguments, url, spool, simulated=simulated, as_json=as_json)
 
     parameters = [
-        each.replace(
-            kind=inspect.Parameter.KEYWORD_ONLY, annotation=_option(each, hints[each.name]), default=each.default
-        )
+        each.replace(kind=inspect.Parameter.KEYWORD_ONLY, annotation=_option(each), default=each.default)
         for each in given
     ]
     shared = {
@@ -109,19 +109,16 @@ def _verb(name: str) -> Callable[..., None]:
     return run
 
 
-def _option(parameter: inspect.Parameter, hint: Any) -> Any:
-    """Return the annotation of the option, or of the argument `name`."""
-    is_required = parameter.default is inspect.Parameter.empty
-    types = [each for each in get_args(hint) if each is not type(None)] if get_origin(hint) is not Literal else []
-    type_: Any = next((each for each in (bool, float, int) if each in (types or [hint])), str)
-    if str in types or datetime in types:  # an episode may be a number, and an enum's member has a name
-        type_ = str
-    if get_origin(hint) is Literal:
-        type_ = hint
-    text = _HELP[parameter.name]
+def _option(parameter: inspect.Parameter) -> Any:
+    """Return the annotation of the option, or of the argument `name`, from the text of the parameter's annotation."""
+    text, types = _HELP[parameter.name], parameter.annotation.split(" | ")
+    type_: Any = next((_TYPES[each] for each in types if each in _TYPES), str)
+    if types[0].startswith("Literal"):
+        type_ = Literal[tuple(re.findall(r"\w+", types[0])[1:])]
     if parameter.name == "name":
         return Annotated[str, typer.Argument(help=text)]
     flags = ("--recovered/--not-recovered",) if type_ is bool else ()
+    is_required = parameter.default is inspect.Parameter.empty
     return Annotated[type_ if is_required else type_ | None, typer.Option(*flags, help=text)]
 
 

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 from sqlalchemy import ColumnElement, Row, Select, func, select
 
 from pycrorm_async.errors import CallerError
-from pycrorm_async.hooks.episode import Episode
 from pycrorm_async.orm import ProcessMetaData
 from pycrorm_async.query.named_queries import EpisodeSummary
 
 if TYPE_CHECKING:
+    from pycrorm_async.hooks.episode import Episode
     from pycrorm_async.query.frames.dataframe import Library
     from pycrorm_async.query.reading import Reading
 
@@ -21,7 +21,7 @@ __all__ = ["AskedEpisode", "EpisodeNumber", "Question", "QuestionPlan", "SyncQue
 
 T = TypeVar("T")
 
-AskedEpisode: TypeAlias = int | str | Episode | EpisodeSummary
+AskedEpisode: TypeAlias = "int | str | Episode | EpisodeSummary"
 """An episode by its number, its id or the first digits of it, `last`, or as an `Episode` or `EpisodeSummary`."""
 EpisodeNumber: TypeAlias = "int | ColumnElement[int]"
 """The number of an episode, or an expression that finds it."""
@@ -128,15 +128,14 @@ class SyncQuestion:
 
 def episode_name(episode: AskedEpisode) -> str:
     """Return the name by which `Reading.episode` finds it. Raises `CallerError` for another type."""
-    match episode:
-        case bool():
-            pass
-        case int() | str():
-            return str(episode)
-        case EpisodeSummary():
-            return episode.id
-        case Episode():
-            return str(episode)
+    if isinstance(episode, EpisodeSummary):
+        return episode.id
+    if isinstance(episode, int | str) and not isinstance(episode, bool):
+        return str(episode)
+    from pycrorm_async.hooks.episode import Episode  # here, because it loads the plan layer
+
+    if isinstance(episode, Episode):
+        return str(episode)
     raise CallerError(f"an episode is a number, an id, 'last', an Episode or an EpisodeSummary, not {episode!r}")
 
 

@@ -25,8 +25,6 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 from pycrorm_async.errors import QueryRefused
-from pycrorm_async.query.sql.postgresql_reader import postgresql_cursor
-from pycrorm_async.query.sql.sqlite_reader import sqlite_cursor
 from pycrorm_async.store.log import EventLog
 
 __all__ = ["DEFAULT_LIMITS", "ReadOnlySql", "SqlLimits", "SqlResult", "SqlRows"]
@@ -137,5 +135,10 @@ class ReadOnlySql:
         if not _CHARACTERS.fullmatch(sql):
             raise QueryRefused("a query in SQL has no character U+0000 and no half of a surrogate pair")
         if self._log.address.is_sqlite:
+            from pycrorm_async.query.sql.sqlite_reader import sqlite_cursor
+
             return sqlite_cursor(self._log.address.path, sql, bytes_max=limits.bytes, seconds=limits.seconds)
+        # Loading the driver of a server takes a tenth of a second.
+        from pycrorm_async.query.sql.postgresql_reader import postgresql_cursor
+
         return postgresql_cursor(self._log.engine, sql, bytes_max=limits.bytes, seconds=limits.seconds)
