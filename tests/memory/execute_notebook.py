@@ -1,6 +1,7 @@
-"""Execute a notebook in a kernel of this interpreter, in a process of its own: `execute_notebook.py IN FOLDER`.
+"""Execute notebooks in a kernel of this interpreter, in a process of its own: `execute_notebook.py FOLDER IN...`.
 
-The folder holds the kernel's specification, so that neither the user's kernels nor a network are needed.
+The folder holds the kernel's specification, so that neither the user's kernels nor a network are needed, and gets the
+executed notebooks. They share the kernel, whose start takes longer than most notebooks.
 """
 
 import json
@@ -11,7 +12,7 @@ from pathlib import Path
 
 
 def main() -> None:
-    source, folder = Path(sys.argv[1]), Path(sys.argv[2])
+    folder, *sources = map(Path, sys.argv[1:])
     kernel = folder / "kernels" / "this"
     kernel.mkdir(parents=True)
     argv = [sys.executable, "-m", "ipykernel_launcher", "-f", "{connection_file}"]
@@ -24,10 +25,14 @@ def main() -> None:
     manager = import_module("jupyter_client.manager").AsyncKernelManager(
         kernel_spec_manager=specifications, kernel_name="this"
     )
-    notebook = import_module("nbformat").reads(source.read_text(), as_version=4)
+    read = import_module("nbformat").reads
+    notebooks = [read(source.read_text(), as_version=4) for source in sources]
+    joined = read(sources[0].read_text(), as_version=4)
+    joined.cells = [cell for notebook in notebooks for cell in notebook.cells]
     where = {"metadata": {"path": str(folder)}}
-    import_module("nbclient").NotebookClient(notebook, km=manager, timeout=120, resources=where).execute()
-    (folder / "executed.ipynb").write_text(json.dumps(notebook))
+    import_module("nbclient").NotebookClient(joined, km=manager, timeout=120, resources=where).execute()
+    for source, notebook in zip(sources, notebooks, strict=True):
+        (folder / source.name).write_text(json.dumps(notebook))
 
 
 if __name__ == "__main__":

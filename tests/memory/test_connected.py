@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 import os
 import subprocess
 import sys
@@ -16,7 +15,7 @@ from sqlalchemy import select
 
 from pycrorm_async import Memory, Reading
 from pycrorm_async.errors import CallerError
-from pycrorm_async.orm import NavigateAction, ProcessMetaData
+from pycrorm_async.orm import ProcessMetaData
 from pycrorm_async.plan.execution.observer import recorder
 from pycrorm_async.world import BulletWorld, Object, ObjectType
 from pycrorm_async.world.errors import NoWorld, WorldClosed
@@ -124,21 +123,3 @@ async def test_a_memory_that_is_never_closed_loses_nothing_and_ends_without_a_tr
     assert stored.returncode == 0, stored.stderr
     async with Reading.open(url_of(tmp_path)) as reading:
         assert await texts(reading) == ["kept"]
-
-
-async def test_the_cells_of_a_notebook_record_into_the_memory_that_one_of_them_connected(tmp_path: Path) -> None:
-    ran = await run_python(
-        str(HERE / "execute_notebook.py"), str(HERE / "connected.ipynb"), str(tmp_path), cwd=tmp_path
-    )
-    assert ran.returncode == 0, ran.stderr
-    executed = json.loads((tmp_path / "executed.ipynb").read_text())
-    (shown,) = [output for cell in executed["cells"] for output in cell.get("outputs", ())]
-    assert "".join(shown["data"]["text/plain"]) == "[1.0, 2.0, 3.0]"
-    async with Reading.open(url_of(tmp_path)) as reading, reading.session() as session:
-        actions = (await session.scalars(select(NavigateAction).order_by(NavigateAction.id))).all()
-        assert [each.robot_state and each.robot_state.pose.x for each in actions] == [0.0, 1.0, 2.0]
-        episodes = (await session.scalars(select(ProcessMetaData).order_by(ProcessMetaData.id))).all()
-        assert [(each.description, each.status) for each in episodes] == [
-            ("NavigateAction", "SUCCEEDED"),
-            ("two ways in one cell", "SUCCEEDED"),
-        ]
