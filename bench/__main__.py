@@ -51,6 +51,7 @@ RUNS = (
     Run("busy postgresql", ("--postgresql",)),
     Run("plan"),
     Run("visible"),
+    Run("live"),
     Run("others"),
     Run("daemon"),
     Run("daemon postgresql", ("--postgresql",)),

@@ -208,8 +208,7 @@ class Page {
     this.action = action;
     this.view.show(event, action, pathsOf(episode, action));
     if (this.following) this.tree.follow(running);
-    this.tree.show(event, running, { scroll: this.selected === null });
-    this.tree.select(this.selected);
+    this.tree.show(event, running, { selected: this.selected });
     this.gantt.show(event, this.selected);
     this.panels.show(event, this.selected, running);
     this.slider.value = event;

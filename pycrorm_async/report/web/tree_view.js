@@ -53,10 +53,11 @@ export class TreeView {
     this.#list();
   }
 
-  /** Open the running nodes of a large tree as long as they run. */
+  /** Open the running nodes of a large tree as long as they run; `show` draws them. */
   follow(running) {
+    if (running.length === this.passing.size && running.every((each) => this.passing.has(each))) return;
     this.passing = new Set(running);
-    this.#list();
+    if (this.size > OPEN_MAX) this.#list();
   }
 
   #isOpen(node) {
@@ -73,15 +74,14 @@ export class TreeView {
     this.episode.roots.forEach(visit);
     this.rowOf = new Map();
     this.rows.forEach(({ node, message }, index) => message || this.rowOf.set(node, index));
-    this.#draw();
   }
 
   /** Light the nodes of the moment after an event, and bring the innermost into sight. */
-  show(event, running, { scroll = true } = {}) {
-    this.event = event;
+  show(event, running, { selected = null } = {}) {
+    Object.assign(this, { event, selected });
     this.printing = false;
     this.running = new Set(running);
-    if (scroll) {
+    if (selected === null) {
       const innermost = running.filter((each) => this.rowOf.has(each)).at(-1);
       if (innermost !== undefined) this.#bringIntoSight(innermost);
     }
@@ -92,10 +92,6 @@ export class TreeView {
     for (let each = node.parent; each !== null; each = each.parent) this.open.add(each);
     this.#list();
     this.#bringIntoSight(node);
-  }
-
-  select(node) {
-    this.selected = node;
     this.#draw();
   }
 
@@ -131,6 +127,7 @@ export class TreeView {
     if (open) this.open.add(node);
     else this.open.delete(node);
     this.#list();
+    this.#draw();
   }
 
   /** Make all rows elements for print, up to a bound. */

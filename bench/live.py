@@ -1,0 +1,164 @@
+"""Measure the time from an event until the live page has it: read from the stream, and drawn by a browser.
+
+    python -m bench.live            at 100 and 1,000 events a second, 15 s each
+    python -m bench.live --quick    at 1,000, 2 s
+
+This process records moves of a robot and nodes at a fixed rate with the default writer, `pycrorm watch` serves the
+episode, and a third process reads its stream. The lag of an event is the time from its own clock to the arrival of the
+first part that includes it. Where Chromium is installed, a second run shows the page as well, drawn without a graphics
+processor, and also measures the lag to the end of its drawing. The script prints one JSON line: lags in ms, and the
+share of one core that the server takes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import http.client
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from bisect import bisect_left
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+from bench.reporting.figures import console, cpu_s_of, percentiles
+from pycrorm_async import Memory
+from pycrorm_async.recording.recorded_episode import RecordedEpisode
+from pycrorm_async.world import Pose
+from tests.databases import ask
+from tests.report.browser import browser, chromium
+
+_RATES = (100, 1_000)
+_REST_S = 2.0
+"""Ends each run, so that the last part arrives."""
+_NOTE_DRAWN = """
+globalThis.drawn = [];
+const extend = pycrormPage.extend.bind(pycrormPage);
+pycrormPage.extend = (...parts) => {
+  extend(...parts);
+  requestAnimationFrame(() => setTimeout(() => drawn.push([Date.now() * 1e6, parts.at(-1).episode.last])));
+};
+"""
+
+
+def record(episode: RecordedEpisode, drive: Any, rate: int, seconds: float) -> int:
+    """Record moves, and every twentieth event a node, at one rate; return the rate that was reached."""
+    count, began_s = round(rate * seconds / 20) * 20, time.perf_counter()
+    for number in range(count):
+        if (ahead_s := began_s + number / rate - time.perf_counter()) > 0:
+            time.sleep(ahead_s)
+        if number % 20 == 0:
+            episode.start(number, drive, {"target": Pose([1, 2, 0])}, robot="base")
+        elif number % 20 == 19:
+            episode.end(number - 19, "SUCCEEDED")
+        else:
+            episode.object_moved("base", Pose([number / count, 0, 0]), node=number - number % 20)
+    return round(count / (time.perf_counter() - began_s))
+
+
+@contextmanager
+def served(folder: Path) -> Iterator[tuple[str, int]]:
+    """Serve the memory of a folder; return the address of its list of episodes, and the process."""
+    command = [sys.executable, "-m", "pycrorm_async", "watch", "--json", "--port", "0"]
+    server = subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+    assert server.stdout is not None
+    text = ""
+    while not text.endswith("}\n"):
+        text += server.stdout.readline()
+    try:
+        yield json.loads(text)["address"], server.pid
+    finally:
+        server.kill()
+        server.communicate()
+
+
+def read(address: str, until: float) -> None:
+    """Read the stream of the newest episode for so many seconds; print pairs of a time in ns and the last event."""
+    parts = urlsplit(f"{address}episode/last/events")
+    connection = http.client.HTTPConnection("127.0.0.1", parts.port or 80, timeout=until)
+    connection.request("GET", parts.path)
+    stream, arrivals, deadline = connection.getresponse(), [], time.monotonic() + until
+    print("reading", flush=True)
+    number = 0
+    while time.monotonic() < deadline and (line := stream.readline()):
+        if line.startswith(b"id: "):
+            number = int(line[4:])
+        elif line.startswith(b"data: ") and number:
+            arrivals.append((time.time_ns(), number))
+            number = 0
+    print(json.dumps(arrivals))
+
+
+def start_reader(address: str, seconds: float) -> subprocess.Popen[str]:
+    """Start the process that reads the stream, and wait until it does."""
+    command = [sys.executable, "-m", "bench.live", "--read", address, "--seconds", str(seconds)]
+    reader = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    assert reader.stdout is not None
+    assert reader.stdout.readline() == "reading\n"
+    return reader
+
+
+def lags_ms(arrivals: Sequence[Sequence[int]], events: Sequence[Sequence[int]]) -> dict[str, float]:
+    """Return the lags of the events, pairs of sequence and wall time, that the arrivals include."""
+    lasts = [last for _, last in arrivals]
+    indices = [(bisect_left(lasts, sequence), wall_ns) for sequence, wall_ns in events]
+    return percentiles([(arrivals[at][0] - wall_ns) / 1e6 for at, wall_ns in indices if at < len(arrivals)])
+
+
+def measure(rate: int, seconds: float, folder: Path, *, draws: bool) -> dict[str, Any]:
+    url = f"sqlite:///{folder / 'pycrorm.db'}"
+    result: dict[str, Any] = {}
+    drawn: list[list[int]] = []
+    with ExitStack() as stack:
+        address, process = stack.enter_context(served(folder))
+        memory = stack.enter_context(Memory.sync(url))
+        drive = memory.recording.type("action", "DriveAction", {"target": Pose})
+        with memory.recording.episode(description="bench") as episode:
+            episode.object_added("base", "turtle", "ROBOT", Pose([0, 0, 0]))
+            memory.flush()
+            reader, tab = start_reader(address, seconds + _REST_S), None
+            if draws:
+                tab = stack.enter_context(stack.enter_context(browser(folder)).open(f"{address}episode/last"))
+                tab.wait_for("pycrormStream.connected")
+                tab.ask(_NOTE_DRAWN)
+            before_s = cpu_s_of(process)
+            result["events_per_s"] = record(episode, drive, rate, seconds)
+            time.sleep(_REST_S)
+            result["server_cpu_share"] = round((cpu_s_of(process) - before_s) / (seconds + _REST_S), 3)
+            drawn = tab.ask("drawn") if tab is not None else []
+        memory.flush()
+        events = ask(url, "SELECT sequence, wall_ns FROM event WHERE episode = 1 AND sequence > 3 ORDER BY sequence")
+        result["stream_ms"] = lags_ms(json.loads(reader.communicate()[0]), events)
+        if drawn:
+            result["drawn_ms"] = lags_ms(drawn, events)
+    return result
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="one rate, two seconds")
+    parser.add_argument("--seconds", type=float, default=15.0, help="duration of each rate")
+    parser.add_argument("--read", help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.read:
+        read(arguments.read, arguments.seconds)
+        return
+    rates, seconds = (_RATES[-1:], 2.0) if arguments.quick else (_RATES, arguments.seconds)
+    result: dict[str, Any] = {"bench": "live", "seconds": seconds}
+    for rate in rates:
+        for name, draws in (("read", False), ("drawn", True)):
+            if draws and chromium() is None:
+                continue
+            console().print(f"{name}, {rate:,} events/s …")
+            with tempfile.TemporaryDirectory(prefix="b") as folder:
+                result.setdefault(name, {})[str(rate)] = measure(rate, seconds, Path(folder), draws=draws)
+    print(json.dumps(result))
+
+
+if __name__ == "__main__":
+    main()
