@@ -37,7 +37,7 @@ def python_of(page: str) -> list[str]:
 
 PLAN, QUESTIONS, EXECUTIVE = python_of("README.md")
 TIDY, LIFTER, STEREO, CELLS = python_of("pycrorm_async/plan/README.md")
-COURSE, PLOTTED, AROUND, ROBOTS, BEGAN, FRAMES, TAGGED, SEEN, THEN, AGAIN, RATE, TRIES = python_of(
+COURSE, PLOTTED, AROUND, ROBOTS, BEGAN, FRAMES, ASKED, TAGGED, SEEN, THEN, AGAIN, RATE, TRIES = python_of(
     "pycrorm_async/query/README.md"
 )
 (EXPORTED,) = python_of("pycrorm_async/export/README.md")
@@ -257,6 +257,24 @@ async def test_frames_and_batches_have_the_declared_types(tidied: Path, capsys: 
     assert capsys.readouterr().out == f"pyarrow.Field<obj_type: {type_}> {table.num_rows}\n"
 
 
+async def test_questions_are_answered_by_name(tidied: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    frames = await run_block(ASKED, tidied, "[frame, causes, slowest, near]")
+    assert [len(each) for each in frames[:3]] == [0, 0, 1]
+    assert frames[3].times.sum() > 3
+    assert capsys.readouterr().out.startswith("SELECT root_failure.process_metadata_id AS episode")
+
+
+def test_the_commands_that_ask_run_in_order(tidied: Path) -> None:
+    [commands] = re.findall(r"```sh\n(pycrorm ask .*?)```", PAGES["pycrorm_async/query/README.md"], re.DOTALL)
+    verbs = set()
+    for line in commands.splitlines():
+        _, *words = shlex.split(line, comments=True)
+        verbs.add(words[0])
+        done = pycrorm(*words, cwd=tidied)
+        assert done.returncode == (2 if words == ["ask"] else 0), done.stderr
+    assert verbs == {"ask", "diff", "episodes", "query"}
+
+
 async def test_rows_are_exported_and_made_again(
     tidied: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -335,7 +353,8 @@ async def test_a_policy_is_learned_from_the_recorded_rollouts_and_used(
 
 
 def test_the_readme_names_every_verb_and_no_other(tmp_path: Path) -> None:
-    verbs = set(re.findall(r"^pycrorm (\w+)", README, re.MULTILINE))
+    lines = re.findall(r"^pycrorm ([\w|]+)", README, re.MULTILINE)
+    verbs = {verb for line in lines for verb in line.split("|")}
     command = typer.main.get_command(app())
     assert isinstance(command, TyperGroup)
     assert verbs == command.commands.keys()
@@ -343,4 +362,4 @@ def test_the_readme_names_every_verb_and_no_other(tmp_path: Path) -> None:
     for verb in sorted(verbs):
         done = CliRunner().invoke(app(), [verb, "--help"])
         assert done.exit_code == 0
-        assert {"spool": "repair", "copy": "--from"}.get(verb, "--url") in done.stdout
+        assert {"spool": "repair", "copy": "--from", "ask": "root_failures"}.get(verb, "--url") in done.stdout
