@@ -29,7 +29,8 @@ def export(
         ),
     ] = None,
     file_format: Annotated[
-        str | None, typer.Option("--format", help="parquet, csv, jsonl or lerobot; default: the suffix of the file.")
+        str | None,
+        typer.Option("--format", help="parquet, csv, jsonl, lerobot, rrd or mcap; default: the suffix."),
     ] = None,
     out: Annotated[Path | None, typer.Option("--out", metavar="PATH", help="The file or folder to write.")] = None,
     episode: Annotated[
@@ -46,9 +47,9 @@ def export(
     ] = None,
     clock: Annotated[
         str | None,
-        typer.Option(help="Of lerobot: a frame for each event that changed the robot's state (event), or --fps."),
+        typer.Option(help="Of lerobot and mcap: the axis, event or time."),
     ] = None,
-    fps: Annotated[int | None, typer.Option(help="Of lerobot: frames per second; by event they are nominal.")] = None,
+    fps: Annotated[int | None, typer.Option(help="Of lerobot: frames per second; of mcap by event: events.")] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace the file if it exists.")] = False,
     url: UrlOption = DEFAULT_URL,
     spool: SpoolOption = None,

@@ -5,52 +5,75 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.export.lerobot.dataset import DEFAULT_FPS, LeRobotFolder
 from pycrorm_async.export.lerobot.states import Clock, frames_of
+from pycrorm_async.export.mcap_file import write_mcap
 from pycrorm_async.export.recorded_episode import read_episode
+from pycrorm_async.export.rerun_file import write_rerun
+from pycrorm_async.export.scene_frames import scene_objects
 from pycrorm_async.export.selection import CoveredEpisode
 from pycrorm_async.query.reading import Reading
 
 if TYPE_CHECKING:
     from pycrorm_async.progress_bar import ProgressCallback
 
-__all__ = ["EpisodeOptions", "write_episodes"]
+__all__ = ["EpisodeOptions", "write_lerobot", "write_scene"]
 
 
 class EpisodeOptions(NamedTuple):
-    """The options of LeRobot: the axis of the frames, and frames per second, which are nominal by event."""
+    """The axis of an episode, events or time, and how many frames or events make a second of it."""
 
-    clock: Clock = "event"
+    clock: Clock
     fps: int = DEFAULT_FPS
 
+    def check(self) -> None:
+        """Raise `CallerError` for another clock, or a rate that no robot has."""
+        if self.clock not in ("event", "time"):
+            raise CallerError(f"the clock is event or time, not {self.clock!r}")
+        if not 1 <= self.fps <= 1000:
+            raise CallerError(f"frames per second are between 1 and 1000, not {self.fps}")
 
-async def write_episodes(
+
+async def write_lerobot(
     reading: Reading,
     episodes: Sequence[CoveredEpisode],
-    path: Path,
+    folder: Path,
     options: EpisodeOptions,
     progress: ProgressCallback | None,
 ) -> int:
-    """Write the episodes to a file, or into an empty folder for LeRobot; return the number of frames or messages.
+    """Write the episodes into an empty folder; return the number of frames.
 
     Raises `CallerError` for episodes that the format cannot hold; `MissingExtra`.
     """
-    if options.clock not in ("event", "time"):
-        raise CallerError(f"the clock of frames is event or time, not {options.clock!r}")
-    if not 1 <= options.fps <= 1000:
-        raise CallerError(f"frames per second are between 1 and 1000, not {options.fps}")
     total = sum(each.events for each in episodes)
     done = 0
-    folder = LeRobotFolder(path, fps=options.fps)
+    dataset = LeRobotFolder(folder, fps=options.fps)
     for each in episodes:
         episode = await read_episode(reading, each)
         frames = await asyncio.to_thread(frames_of, episode, options.clock, options.fps)
-        await asyncio.to_thread(folder.add, episode, frames)
+        await asyncio.to_thread(dataset.add, episode, frames)
         done += each.events
         if progress is not None:
             progress(done, total)
-    await asyncio.to_thread(folder.finish)
-    return folder.frames
+    await asyncio.to_thread(dataset.finish)
+    return dataset.frames
+
+
+async def write_scene(
+    reading: Reading,
+    episodes: Sequence[CoveredEpisode],
+    path: Path,
+    file_format: Literal["rrd", "mcap"],
+    options: EpisodeOptions,
+) -> int:
+    """Write one episode to a file; return the number of changes or messages. Raises as `write_lerobot` does."""
+    if len(episodes) != 1:
+        raise CallerError(f"a file of the format {file_format} holds one episode, not {len(episodes)}: name one")
+    episode = await read_episode(reading, episodes[0])
+    objects = await scene_objects(reading, episode)
+    if file_format == "rrd":
+        return await asyncio.to_thread(write_rerun, episode, objects, path)
+    return await asyncio.to_thread(lambda: write_mcap(episode, objects, path, clock=options.clock, fps=options.fps))

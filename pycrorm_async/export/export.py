@@ -18,7 +18,7 @@ from sqlalchemy import Select, func, select
 from sqlalchemy.exc import CompileError
 
 from pycrorm_async.errors import CallerError
-from pycrorm_async.export.episode_files import EpisodeOptions, write_episodes
+from pycrorm_async.export.episode_files import EpisodeOptions, write_lerobot, write_scene
 from pycrorm_async.export.files import checksums, new_file, new_folder, refuse_existing
 from pycrorm_async.export.lerobot.dataset import DEFAULT_FPS, MARKER
 from pycrorm_async.export.lerobot.states import Clock
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Exported", "FileFormat", "Remade", "export", "export_again", "format_of"]
 
-FileFormat: TypeAlias = Literal["parquet", "csv", "jsonl", "lerobot"]
+FileFormat: TypeAlias = Literal["parquet", "csv", "jsonl", "lerobot", "rrd", "mcap"]
 
 
 class Exported(NamedTuple):
@@ -95,12 +95,13 @@ async def export(
         what: an episode or several (a row for each node), by number, id or `last`; a view or table by name, or a mapped
             class, of all episodes that have ended; or a select.
         path: of the file.
-        file_format: `parquet`, `csv` or `jsonl` for rows; `lerobot` for episodes, into a folder; by default that of the
-            suffix.
+        file_format: `parquet`, `csv` or `jsonl` for rows; `lerobot` for episodes, into a folder; `rrd` or `mcap` for
+            one episode, which may be running; by default that of the suffix.
         episodes: limit a view to these.
         force: replace the file if it exists; a folder only if it is such a data set.
         clock, fps: of LeRobot: a frame for each event that changed the robot's state (`event`, the default), or `fps`
-            frames each second (`time`).
+            frames each second (`time`). Of MCAP: the wall time of the events (`time`, the default), or `fps` events in
+            each second (`event`).
         progress: gets the number of rows, or events, done and of all.
 
     Raises `CallerError` if the file exists, if nothing has this name, or for a running episode; `UnknownEpisode`;
@@ -111,8 +112,7 @@ async def export(
     chosen = file_format or format_of(target)
     if chosen not in get_args(FileFormat):
         raise CallerError(f"there is no format {chosen!r}{nearest(chosen, get_args(FileFormat))}; formats: {_listed()}")
-    if chosen != "lerobot" and (clock, fps) != (None, None):
-        raise CallerError("clock and fps are options of the format lerobot")
+    options = _options(chosen, clock, fps)
     left_out = 0
     with new_file(manifest_path(target), force=True) as described:
         match chosen:
@@ -123,11 +123,17 @@ async def export(
                     manifest = await _write_rows(reading, selection, written, chosen, progress)
                     files = {target.name: checksums(written)[written.name]}
             case "lerobot":
-                options = EpisodeOptions(clock or "event", DEFAULT_FPS if fps is None else fps)
                 covered = await _episodes(reading, what, episodes, chosen)
                 with new_folder(target, force=force, marker=MARKER) as written:
-                    manifest = await _write_episodes(reading, covered, written, chosen, options, progress)
+                    frames = await write_lerobot(reading, covered, written, options, progress)
+                    manifest = await _described(reading, covered, chosen, options, frames)
                     files = checksums(written)
+            case "rrd" | "mcap":
+                covered = await _episodes(reading, what, episodes, chosen, running=True)
+                with new_file(target, force=force) as written:
+                    changes = await write_scene(reading, covered, written, chosen, options)
+                    manifest = await _described(reading, covered, chosen, options, changes)
+                    files = {target.name: checksums(written)[written.name]}
         manifest = msgspec.structs.replace(manifest, files=files)
         described.write_bytes(msgspec.json.format(msgspec.json.encode(manifest), indent=1) + b"\n")
     return Exported(target, manifest.rows, len(manifest.episodes), left_out, manifest)
@@ -185,6 +191,8 @@ async def export_again(
     if before.rows != now.rows:
         differences.append(f"rows: {now.rows} instead of {before.rows}")
     same = [*before.files.values()] == [*now.files.values()]
+    if before.file_format == "rrd":  # whose chunks have random ids
+        same = not differences
     return Remade(same, tuple(differences), made if path is not None else None)
 
 
@@ -243,35 +251,41 @@ async def _write_rows(
     )
 
 
+def _options(file_format: FileFormat, clock: Clock | None, fps: int | None) -> EpisodeOptions:
+    """Return the options of formats with a clock. Raises `CallerError` for one that the format does not take."""
+    if file_format not in ("lerobot", "mcap") and (clock, fps) != (None, None):
+        raise CallerError("clock and fps are options of the formats lerobot and mcap")
+    options = EpisodeOptions(
+        clock or ("time" if file_format == "mcap" else "event"), DEFAULT_FPS if fps is None else fps
+    )
+    options.check()
+    return options
+
+
 async def _episodes(
-    reading: Reading, what: Exportable, limited: Sequence[str | int], file_format: str
+    reading: Reading, what: Exportable, limited: Sequence[str | int], file_format: str, *, running: bool = False
 ) -> tuple[CoveredEpisode, ...]:
     """Return the episodes that `what` names. Raises `CallerError` for anything else."""
     if limited or isinstance(what, type | Select):
         raise CallerError(f"the format {file_format} holds whole episodes: name them by number, id or `last`")
-    selection = await select_rows(reading, what)
+    selection = await select_rows(reading, what, running=running)
     if selection.kind != "episodes":
         raise CallerError(f"the format {file_format} holds whole episodes, and {selection.name} is a view")
     return selection.episodes
 
 
-async def _write_episodes(
-    reading: Reading,
-    covered: tuple[CoveredEpisode, ...],
-    path: Path,
-    file_format: FileFormat,
-    options: EpisodeOptions,
-    progress: ProgressCallback | None,
+async def _described(
+    reading: Reading, covered: tuple[CoveredEpisode, ...], file_format: FileFormat, options: EpisodeOptions, rows: int
 ) -> Manifest:
-    rows = await write_episodes(reading, covered, path, options, progress)
     log = await reading.log()
+    packages = {"lerobot": ("pyarrow", "pandas"), "mcap": ("mcap", "foxglove-sdk"), "rrd": ("rerun-sdk",)}
     return Manifest(
         kind="episodes",
         names=tuple(each.id for each in covered),
         file_format=file_format,
-        options=options._asdict(),
+        options=options._asdict() if file_format != "rrd" else {},
         rows=rows,
-        versions=versions_of("pyarrow", "pandas"),
+        versions=versions_of(*packages[file_format]),
         tables=PROJECTION_VERSION,
         memory=log.log_id,
         episodes=covered,

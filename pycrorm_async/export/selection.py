@@ -20,7 +20,7 @@ from pycrorm_async.orm.base import EPISODE, same_row
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.suggestions import nearest
 
-__all__ = ["CoveredEpisode", "Exportable", "Selection", "episodes_named", "select_rows"]
+__all__ = ["CoveredEpisode", "Exportable", "Selection", "select_rows"]
 
 Exportable: TypeAlias = "str | int | type | Sequence[str | int] | Select[*tuple[Any, ...]]"
 """An episode or several, by number, id or `last`; a view or table by name; a mapped class; a select."""
@@ -63,18 +63,10 @@ class _Covered(NamedTuple):
     simulated: bool
 
 
-async def episodes_named(
-    reading: Reading, names: Iterable[str], *, running: bool = False
-) -> tuple[CoveredEpisode, ...]:
-    """Return these episodes, each once, by number.
-
-    Raises `UnknownEpisode`; `CallerError` for one that has not ended, without `running`.
-    """
-    return (await _named(reading, names, running=running)).episodes
-
-
-async def select_rows(reading: Reading, what: Exportable, episodes: Sequence[str | int] = ()) -> Selection:
-    """Return the selection that `what` names; `episodes` limits a view to these.
+async def select_rows(
+    reading: Reading, what: Exportable, episodes: Sequence[str | int] = (), *, running: bool = False
+) -> Selection:
+    """Return the selection that `what` names; `episodes` limits a view to these, `running` admits those that run.
 
     Raises `CallerError` for a name that nothing has, with the nearest ones, for `episodes` beside something that is not
     a view, and for an episode that has not ended; `UnknownEpisode`.
@@ -97,7 +89,7 @@ async def select_rows(reading: Reading, what: Exportable, episodes: Sequence[str
             raise CallerError(f"the memory has no episode, view or table {each!r}{nearest(each, views)}")
     if chosen:
         raise CallerError("episodes are exported whole: name them all instead of choosing among them")
-    of_names = await _named(reading, names)
+    of_names = await _named(reading, names, running=running)
     node, designator = TaskTreeNode, Designator.__table__.alias("performed")
     statement = (
         select(node, designator.c.parameters)

@@ -128,7 +128,7 @@ async def test_a_data_set_is_replaced_only_when_asked_and_only_by_its_kind(datas
             r"episode 3 has the robot courier with other joints than pr2 of episode 1 \(.* …\): export them into",
         ),
         ([3], {"clock": "time", "fps": 1}, r"episode 3 has 1 frames by time, and LeRobot needs two: a higher --fps"),
-        ([1], {"clock": "sun"}, "the clock of frames is event or time, not 'sun'"),
+        ([1], {"clock": "sun"}, "the clock is event or time, not 'sun'"),
         ([1], {"fps": 0}, "frames per second are between 1 and 1000, not 0"),
         ("root_failure", {}, "the format lerobot holds whole episodes, and root_failure is a view"),
         ([99], {}, "there is no episode '99'"),
@@ -143,7 +143,7 @@ async def test_what_the_format_cannot_hold_is_named_and_leaves_no_folder(
 
 
 async def test_options_of_lerobot_are_refused_for_rows(reading: Reading, tmp_path: Path) -> None:
-    with pytest.raises(CallerError, match="clock and fps are options of the format lerobot"):
+    with pytest.raises(CallerError, match="clock and fps are options of the formats lerobot and mcap"):
         await export(reading, 1, tmp_path / "a.csv", fps=3)
 
 

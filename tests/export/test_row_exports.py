@@ -194,7 +194,13 @@ async def test_a_running_episode_is_refused_by_name_and_left_out_of_a_view(eithe
         ("PickUpWithContextView", ("99",), "a.csv", UnknownEpisode, "there is no episode '99'"),
         ("concept", ("2",), "a.csv", CallerError, "the rows of concept are of no episode"),
         ("2", ("2",), "a.csv", CallerError, "episodes are exported whole"),
-        ("2", (), "a.xlsx", CallerError, r"names no format: add --format .* one of parquet, csv, jsonl"),
+        (
+            "2",
+            (),
+            "a.xlsx",
+            CallerError,
+            r"names no format: add --format .* one of parquet, csv",
+        ),
         ("2", (), "none/a.csv", CallerError, "none does not exist: create it first"),
     ],
 )

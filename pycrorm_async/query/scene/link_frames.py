@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pycrorm_async.world.pose import Pose
 from pycrorm_async.world.queries.bounding_boxes import rotation_matrix
 
-__all__ = ["Frame", "link_frames", "placed"]
+__all__ = ["Frame", "joint_frame", "link_frames", "placed"]
 
 Frame: TypeAlias = NDArray[np.float64]
 """A pose as a matrix of 4 rows and 4 columns."""
@@ -23,14 +23,20 @@ def link_frames(
 ) -> dict[str, Frame]:
     """Return the frame of each link of a model from `object_model`; `pose` is that of `base_link`, or of the root."""
     frames = {model["root"]: np.eye(4)}
-    for name, kind, parent, child, xyz, rpy, axis, mimic in model["joints"]:
-        source, multiplier, offset = (name, 1.0, 0.0) if name in joints or mimic is None else mimic
-        position = joints.get(source, 0.0) * multiplier + offset
-        frames[child] = frames[parent] @ placed(xyz, rpy) @ _motion(kind, axis, position)
+    for joint in model["joints"]:
+        _, _, parent, child, *_ = joint
+        frames[child] = frames[parent] @ joint_frame(joint, joints)
     root = _frame(pose.position, pose.orientation)
     if base_link in frames:
         root = root @ np.linalg.inv(frames[base_link])
     return {link: root @ frame for link, frame in frames.items()}
+
+
+def joint_frame(joint: Sequence[Any], joints: Mapping[str, float]) -> Frame:
+    """Return the frame of a joint's child link in that of its parent, at these positions."""
+    name, kind, _, _, xyz, rpy, axis, mimic = joint
+    source, multiplier, offset = (name, 1.0, 0.0) if name in joints or mimic is None else mimic
+    return placed(xyz, rpy) @ _motion(kind, axis, joints.get(source, 0.0) * multiplier + offset)
 
 
 def placed(xyz: Sequence[float], rpy: Sequence[float]) -> Frame:

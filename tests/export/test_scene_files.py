@@ -1,0 +1,176 @@
+"""MCAP files and rerun recordings, read back by their own readers and compared with snapshots of the episode."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+from sqlalchemy import select
+
+from pycrorm_async import Memory, Reading
+from pycrorm_async.errors import CallerError, MissingExtra
+from pycrorm_async.export.export import export, export_again
+from pycrorm_async.orm import TaskTreeNode
+from pycrorm_async.query.scene.link_frames import link_frames
+from pycrorm_async.query.scene.object_model import object_model
+from pycrorm_async.world.queries.bounding_boxes import rotation_matrix
+
+Frames = dict[str, tuple[str, list[float], list[float]]]
+"""Each frame with its parent, translation and rotation."""
+
+
+def messages_of(path: Path) -> list[tuple[str, int, int, Any]]:
+    """Return topic, event, time in ns and content of each message."""
+    with path.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        return [
+            (channel.topic, message.sequence, message.log_time, content)
+            for _, channel, message, content in reader.iter_decoded_messages()
+        ]
+
+
+def placed(frames: Frames, frame: str) -> np.ndarray:
+    """Return the pose of a frame in the map as a matrix."""
+    result = np.eye(4)
+    while frame != "map":
+        frame, translation, rotation = frames[frame]
+        step = np.eye(4)
+        step[:3, :3], step[:3, 3] = rotation_matrix(rotation), translation
+        result = step @ result
+    return result
+
+
+async def check_frames(reading: Reading, sequence: int, frames: Frames) -> None:
+    """Compare the frames of all links with forward kinematics from the snapshot at this event."""
+    then = await reading.as_of(1, sequence=sequence)
+    assert len(then.world.objects) == 4
+    for each in then.world.objects:
+        assert each.description_fingerprint is not None
+        model = object_model(then.world.descriptions[each.description_fingerprint])
+        for link, frame in link_frames(model, each.pose, each.joints, each.base_link).items():
+            name = each.name if link == model["root"] else f"{each.name}/{link}"
+            np.testing.assert_allclose(placed(frames, name), frame, atol=2e-5)
+
+
+async def moments_of(reading: Reading) -> list[int]:
+    """Return three events of episode 1 at which all objects are there: after a pick-up, in the middle, at last."""
+    node = TaskTreeNode
+    ended = select(node.end_sequence).where(node.process_metadata_id == 1, node.dtype == "MoveTCPMotion")
+    sequences = sorted((await reading.dataframe(ended)).end_sequence.dropna().astype(int).tolist())
+    return [sequences[0], sequences[len(sequences) // 2], sequences[-1]]
+
+
+@pytest.mark.slow
+async def test_an_mcap_file_has_frames_shapes_and_the_plan_of_the_episode(reading: Reading, tmp_path: Path) -> None:
+    exported = await export(reading, 1, tmp_path / "one.mcap")
+    messages = messages_of(tmp_path / "one.mcap")
+    assert exported.rows == len(messages)
+    assert {topic for topic, *_ in messages} == {"/tf", "/scene", "/plan"}
+    for moment in await moments_of(reading):
+        frames: Frames = {}
+        for topic, sequence, _, content in messages:
+            for each in content.transforms if topic == "/tf" and sequence <= moment else ():
+                move, turn = each.translation, each.rotation
+                pose = [move.x, move.y, move.z], [turn.x, turn.y, turn.z, turn.w]
+                frames[each.child_frame_id] = (each.parent_frame_id, *pose)
+        await check_frames(reading, moment, frames)
+    scene = [content for topic, *_, content in messages if topic == "/scene"]
+    milk = [entity for content in scene for entity in content.entities if entity.frame_id == "milk"]
+    assert len(milk) == 1
+    assert len(milk[0].cubes) == 1
+    assert {each.id for content in scene for each in content.deletions} >= {"milk", "cereal"}
+    nodes = await reading.tree(1)
+    logged = [content for topic, *_, content in messages if topic == "/plan"]
+    assert len(logged) == 2 * len(nodes)
+    assert sum(each.level == 4 for each in logged) == sum(each.status == "FAILED" for each in nodes) > 0
+    assert any("IKError: r_gripper_tool_frame cannot reach" in each.message for each in logged)
+
+
+async def test_the_time_of_a_message_is_its_events_or_counts_events(reading: Reading, tmp_path: Path) -> None:
+    await export(reading, 1, tmp_path / "wall.mcap")
+    await export(reading, 1, tmp_path / "events.mcap", clock="event", fps=20)
+    walls, events = (messages_of(tmp_path / f"{name}.mcap") for name in ("wall", "events"))
+    then = await reading.as_of(1, sequence=walls[-1][1])
+    assert walls[-1][2] // 1000 == int(then.at.timestamp() * 1e6 + 0.5)
+    assert (events[-1][2] - events[0][2]) == (events[-1][1] - events[0][1]) * 50_000_000
+    remade = await export_again(reading, tmp_path / "events.mcap.manifest.json")
+    assert (remade.same, remade.differences) == (True, ())
+
+
+@pytest.mark.slow
+async def test_a_rerun_recording_has_frames_shapes_and_the_plan_on_both_timelines(
+    reading: Reading, tmp_path: Path
+) -> None:
+    from rerun.chunk import RrdReader
+
+    exported = await export(reading, 1, tmp_path / "one.rrd")
+    [store] = RrdReader(tmp_path / "one.rrd").recordings()
+    assert store.recording_id == exported.manifest.names[0]
+    chunks = list(RrdReader(tmp_path / "one.rrd").stream())
+    moves = {each.entity_path: each for each in chunks if any("Transform3D" in name for name in columns_of(each))}
+    assert {"event", "time"} <= {*moves["/world/milk"].timeline_names}
+    for moment in await moments_of(reading):
+        frames: Frames = {"world": ("map", [0, 0, 0], [0, 0, 0, 1])}
+        for path, chunk in moves.items():
+            rows = [each for each in chunk.to_record_batch().to_pylist() if each["event"] <= moment]
+            if rows:
+                _, _, *parts = path.split("/")
+                name, parent = (
+                    "/".join(each[:1] + each[-1:] if len(each) > 1 else each) for each in (parts, parts[:-1])
+                )
+                last = max(rows, key=lambda row: row["event"])
+                (translation,), (rotation,) = last["Transform3D:translation"], last["Transform3D:quaternion"]
+                frames[name] = (parent or "world", translation, rotation)
+        await check_frames(reading, moment, frames)
+    assert {"/world/milk/shape_box", "/world/cereal/shape_box"} <= {each.entity_path for each in chunks}
+    (plan,) = [each for each in chunks if each.entity_path == "/plan"]
+    assert plan.num_rows == 2 * len(await reading.tree(1))
+    assert any("IKError" in row["TextLog:text"][0] for row in plan.to_record_batch().to_pylist())
+    assert (await export_again(reading, tmp_path / "one.rrd.manifest.json")).same
+
+
+def columns_of(chunk: Any) -> list[str]:
+    return list(chunk.to_record_batch().schema.names)
+
+
+async def test_a_running_episode_is_exported_as_far_as_it_is_stored(tmp_path: Path) -> None:
+    async with Memory.open(f"sqlite:///{tmp_path}/running.db") as memory, memory.episode(description="it runs"):
+        memory.observe("volts", 24.0)
+        await memory.flush()
+        exported = await memory.export("1", tmp_path / "running.mcap")
+        assert exported.manifest.episodes[0].status == "RUNNING"
+        assert [topic for topic, *_ in messages_of(tmp_path / "running.mcap")] == ["/plan"]
+        with pytest.raises(CallerError, match="episode 1 is still running"):
+            await memory.export("1", tmp_path / "running", file_format="lerobot")
+
+
+@pytest.mark.parametrize(("suffix", "module"), [("mcap", "mcap.writer"), ("mcap", "foxglove"), ("rrd", "rerun")])
+async def test_without_its_library_the_error_names_the_extra(
+    reading: Reading, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str, module: str
+) -> None:
+    monkeypatch.setitem(sys.modules, module, None)
+    extra = {"rrd": "rerun"}.get(suffix, suffix)
+    with pytest.raises(MissingExtra, match=rf"pip install 'pycrorm-async\[{extra}\]'"):
+        await export(reading, 1, tmp_path / f"one.{suffix}")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("what", "options", "message"),
+    [
+        ([1, 2], {}, "a file of the format mcap holds one episode, not 2"),
+        ("action", {}, "the format mcap holds whole episodes, and action is a view"),
+        ([1], {"clock": "sun"}, "the clock is event or time, not 'sun'"),
+    ],
+)
+async def test_what_a_scene_file_cannot_hold_is_named(
+    reading: Reading, tmp_path: Path, what: Any, options: Any, message: str
+) -> None:
+    with pytest.raises(CallerError, match=message):
+        await export(reading, what, tmp_path / "a.mcap", **options)
+    assert list(tmp_path.iterdir()) == []
