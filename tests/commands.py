@@ -37,12 +37,18 @@ FORKED: Final = multiprocessing.get_context("forkserver")
 """Makes processes by forking one that has loaded the program. A test process has one such server, see `fork`."""
 
 
-def fork(process: ForkServerProcess) -> None:
-    """Start a process of `FORKED`, always from a server that has loaded the same modules."""
+def start_server() -> None:
+    """Start the server of `FORKED`, unless it runs; before the program starts it, which would load less."""
     with _starting:
         FORKED.set_forkserver_preload(_LOADED)
         with mock.patch.dict(os.environ, environment(), clear=True):
             forkserver.ensure_running()
+
+
+def fork(process: ForkServerProcess) -> None:
+    """Start a process of `FORKED`, always from a server that has loaded the same modules."""
+    start_server()
+    with _starting:
         process.start()
 
 

@@ -35,7 +35,8 @@ for url in ("sqlite:///memory.db", "postgresql://nobody@/memory"):
     connectionless = DatabaseAddress.parse(url).engine(read_only=True)
     stored = dialect_of(connectionless).stored_column
     for generation in (FIRST, FIRST + 1):
-        built_in_texts(LAYOUT, Tables(generation, stored), connectionless.dialect)
+        for simulated in (False, True):
+            built_in_texts(LAYOUT, Tables(generation, stored, simulated), connectionless.dialect)
         tables = {name: leaf_columns(columns) for name, columns in LAYOUT.leaves.items()}
         table_texts(CORE | OF_NO_EPISODE | tables, generation, stored, connectionless.dialect)
 CliRunner().invoke(app("status"), ["status", "--url", "nothing"])

@@ -3,11 +3,13 @@
     child = ChildProcess.start(serve_requests, "pycrorm fold worker")
     answer = child.exchange(request)
 
-Theory of operation. There are two ways to start a process. The `pycrorm writer` command forks its first fold workers
+Theory of operation. There are three ways to start a process. The `pycrorm writer` command forks its first fold workers
 before it opens anything, while it has a single thread: they have imported all modules and are ready at once, so a full
-spool is folded by several processes from the first batch on. All other processes are spawned, because a fork of a
-running program would inherit locks whose owning threads do not exist in the child. A spawned process imports the main
-module, so a script must start it below `if __name__ == "__main__":`.
+spool is folded by several processes from the first batch on. All other processes need an interpreter of their own,
+because a fork of a running program would inherit locks whose owning threads do not exist in the child. A process that
+dies with its parent is spawned. Others are forked from the fork server of multiprocessing, which has imported the
+module of the entry and has a single thread: of several, only the first waits for the imports. Both import the main
+module, so a script must start them below `if __name__ == "__main__":`.
 
 A terminal or a service manager sends SIGINT and SIGTERM to every process, but only the parent reacts, and ends its
 children. These signals could end a child before it ignores them, so they are blocked around the start and unblocked by
@@ -15,7 +17,7 @@ the child. A child ends with its connection: the end of file arrives when the pa
 `dies_with_parent` the kernel also kills it when the parent dies, even while it is stopped or busy.
 
 The parent reaps a child only in `ended` and `end`; until then the kernel cannot reuse the pid, so `kill` always hits
-this process.
+this process. The fork server reaps its children itself, so `kill` first looks whether the process has ended.
 """
 
 from __future__ import annotations
@@ -56,17 +58,22 @@ class ChildProcess(NamedTuple):
         dies_with_parent: bool = True,
         fork_beside: Iterable[ChildProcess] | None = None,
     ) -> ChildProcess:
-        """Start a process that calls `entry` with its connection and `args`, which a spawned one receives pickled.
+        """Start a process that calls `entry` with its connection and `args`, which it receives pickled unless forked.
 
-        `fork_beside`: fork, and close the child's copies of the connections to these children. The calling process must
-        have one thread.
+        Args:
+            dies_with_parent: the kernel kills the process when the calling one dies.
+            fork_beside: fork the calling process, which must have one thread, and close the child's copies of the
+                connections to these children.
 
         Raises `OSError` if the system starts no process, and in a daemonic process of multiprocessing (such as a worker
         of its `Pool`), which must not start any.
         """
         if multiprocessing.current_process().daemon:
             raise OSError("a daemonic process of multiprocessing cannot start processes")
-        context: Any = multiprocessing.get_context("spawn" if fork_beside is None else "fork")
+        method = "fork" if fork_beside is not None else "spawn" if dies_with_parent else "forkserver"
+        context: Any = multiprocessing.get_context(method)
+        if method == "forkserver":
+            context.set_forkserver_preload([entry.__module__])  # ignored if the server is running
         ours, theirs = context.Pipe()
         inherited = [] if fork_beside is None else [ours, *(each.connection for each in fork_beside)]
         if fork_beside is None:
@@ -110,11 +117,12 @@ class ChildProcess(NamedTuple):
         return self.process.exitcode
 
     def kill(self) -> None:
-        self.process.kill()
+        if self.process.is_alive():
+            self.process.kill()
 
     def end(self) -> None:
         """Kill the process if it is running, and reap it."""
-        self.process.kill()
+        self.kill()
         self.process.join()
         self.connection.close()
 

@@ -44,7 +44,8 @@ def place(database_url: str, tmp_path: Path) -> MemoryLocation:
 
 
 def workers_running() -> list[psutil.Process]:
-    return [each for each in psutil.Process().children() if "spawn_main" in " ".join(each.cmdline())]
+    servers = [each for each in psutil.Process().children() if "forkserver" in " ".join(each.cmdline())]
+    return [worker for each in servers for worker in each.children()]
 
 
 def after(rollouts: int, act: Callable[[], None]) -> Callable[[str, int, int, Tally], None]:
@@ -167,7 +168,7 @@ async def test_the_workers_end_when_their_parent_dies_and_nothing_is_lost(tmp_pa
     command = [sys.executable, "-m", "pycrorm_async", "learn", "--url", url, "--rollouts", "5000", "--workers", "2"]
     process = await asyncio.create_subprocess_exec(*command, cwd=tmp_path, stderr=asyncio.subprocess.PIPE)
     await asyncio.to_thread(await_events, tmp_path / "memory.db", 3_000)
-    spawned = psutil.Process(process.pid).children()
+    spawned = psutil.Process(process.pid).children(recursive=True)
     os.kill(process.pid, signal.SIGKILL)
     await process.wait()
     _, alive = await asyncio.to_thread(psutil.wait_procs, spawned, 30)

@@ -4,10 +4,10 @@ Theory of operation
 -------------------
 
 The caller's process holds a `Workers` object, one `_Worker` per worker process, and one task that runs the daemon. Each
-worker process is spawned and connected by one pipe. With a `MemoryLocation` each worker opens a memory with
-``writer="daemon"``: it writes to its own folder in the spool, and the daemon task drains all of them into the database.
-Without one nothing is recorded, and no daemon runs; the rollouts are the same. Seed and index alone determine a
-rollout, so it does not matter which worker performs it.
+worker process is forked from a fork server (`processes`) and connected by one pipe. With a `MemoryLocation` each worker
+opens a memory with ``writer="daemon"``: it writes to its own folder in the spool, and the daemon task drains all of
+them into the database. Without one nothing is recorded, and no daemon runs; the rollouts are the same. Seed and index
+alone determine a rollout, so it does not matter which worker performs it.
 
 The parent sends ``job`` (scene, policy, seed), ``run`` (first index, length), ``flush`` and ``stop``. A worker answers
 a run with ``so far`` messages, at most one per 0.2 s, and one ``done``; it answers a flush with ``flushed``; an
@@ -98,7 +98,7 @@ class Job:
 class Workers:
     """A pool of worker processes that perform rollouts.
 
-    The processes are spawned, so a script must use the pool below `if __name__ == "__main__":`.
+    The processes import the main module, so a script must use the pool below `if __name__ == "__main__":`.
 
     >>> async with Workers(2, MemoryLocation("sqlite:///learn.db")) as workers:
     ...     tally = await workers.roll_out(Job(Scene(), default_policy(), seed=69), [(0, 500), (500, 500)])
