@@ -54,7 +54,7 @@ async def test_the_notebooks_run_and_record_and_the_tutorial_draws_what_it_shows
     assert "polygon" in moment["text/html"]
     for each in (picture, places, arms):
         assert each["image/png"].startswith("iVBORw0KGgo")  # PNG in base64
-    assert page["text/plain"] == "True"
+    assert page["text/plain"].startswith("Report(path=PosixPath('milk.html'), first=1,")
     assert "of 300 succeeded" in tally["text/plain"]
     before, after = (int(each) for each in learned["text/plain"].replace("%", "").replace("'", "").split()[::2])
     assert before < 25 < after

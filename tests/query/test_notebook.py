@@ -140,6 +140,17 @@ def test_a_tree_is_opened_at_its_failures_and_closed_elsewhere() -> None:
     assert "IKError: too far" in page.text
 
 
+def test_the_message_of_a_failure_is_where_it_began_and_the_first_failures_are_open() -> None:
+    steps = [node(1)]
+    for branch in range(2, 202, 2):
+        for number, parent in ((branch, 1), (branch + 1, branch)):
+            steps.append(node(number, parent, "FAILED", reason="IKError", failure_message=f"too far {branch}!"))
+    page = harmless(TaskTree(steps)._repr_html_())
+    assert (page.text.count("too far 2!"), page.text.count("too far 200!")) == (1, 1)
+    assert page.text.count("IKError") == 200
+    assert sum("open" in attributes for tag, attributes in page.elements if tag == "details") == 1 + 20
+
+
 def test_a_large_tree_shows_five_hundred_nodes_with_the_failures_among_them_and_counts_the_others() -> None:
     steps = [node(1)]
     for branch in range(2, 5_002, 2):
@@ -203,7 +214,7 @@ def test_a_moment_shows_what_runs_where_everything_is_and_what_was_observed() ->
     milk = ObjectThen(1, 1, "milk", "MILK", Pose([1, 2, 0.9]), {}, ("pr2", "hand"))
     seen = {"force": ObservationThen({"x": 1.5}, 5, 1.0, None)}
     page = harmless(moment(milk, observations=seen)._repr_html_())
-    for text in ("Set the table", "at 1.500 s, event 7", "▶ RUNNING", "pr2 hand", "0.900", '{"x":1.5}'):
+    for text in ("Set the table", "at 1.500 s, event 7", "▶ RUNNING", "pr2, hand", "0.900", '{"x":1.5}'):
         assert text in page.text
     assert page.count("polygon") == 1
     empty = harmless(moment()._repr_html_())

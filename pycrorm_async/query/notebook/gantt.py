@@ -17,7 +17,7 @@ __all__ = ["Axis", "gantt"]
 Axis: TypeAlias = Literal["events", "time"]
 
 _WIDTH, _PAD, _LANE, _BAR, _AXIS = 900.0, 8.0, 20.0, 16.0, 18.0
-_CHARACTER = 6.2
+_CHARACTER = 6.8
 """Width of a character of a bar's name, so that a name is cut where its bar ends."""
 _TICKS = 6
 

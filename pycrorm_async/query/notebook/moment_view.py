@@ -46,12 +46,12 @@ def world_html(world: WorldThen) -> str:
 def _world(world: WorldThen) -> str:
     if not world.objects:
         return f"<div>{quiet('the world was empty at this moment')}</div>"
-    columns = ("object", "type", "x, m", "y, m", "z, m", "heading", "attached to", "joints")
+    columns = ("object", "type", "x, m", "y, m", "z, m", "heading", "attached to")
     rows = table(columns, map(_row, world.objects[:_ROWS_MAX]))
     return (
         '<div style="display:flex;flex-wrap:wrap;gap:16px;align-items:flex-start">'
-        f'<div style="flex:1 1 300px;max-width:460px">{world_map(world).svg}</div>'
-        f'<div style="flex:1 1 320px;min-width:0">{rows}{_more(len(world.objects), "objects")}</div></div>'
+        f'<div style="flex:1 1 300px;max-width:420px">{world_map(world).svg}</div>'
+        f'<div style="flex:1 1 440px;min-width:0">{rows}{_more(len(world.objects), "objects")}</div></div>'
     )
 
 
@@ -59,10 +59,9 @@ def _row(each: ObjectThen) -> Sequence[str]:
     attached = ""
     if each.attached_to is not None:
         name, link = each.attached_to
-        attached = recorded(name if link is None else f"{name} {link}")
+        attached = recorded(name if link is None else f"{name}, {link}")
     position = (f"{value:.3f}" for value in each.pose.position)
-    joints = str(len(each.joints)) if each.joints else ""
-    return recorded(each.name, 40), recorded(each.object_type), *position, _degrees(each.pose.yaw), attached, joints
+    return recorded(each.name, 40), recorded(each.object_type), *position, _degrees(each.pose.yaw), attached
 
 
 def _degrees(radians: float) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from collections.abc import Set as AbstractSet
 
 from pycrorm_async.query.named_queries import NodeSummary
 from pycrorm_async.query.notebook.markup import FAILED, left_out, quiet, recorded, status
@@ -12,8 +13,10 @@ __all__ = ["NODES_MAX", "shown_nodes", "tree_html"]
 
 NODES_MAX = 500
 """Bounds the nodes of a view, so that a notebook with many of them stays small."""
-_DEPTH_OPEN = 2
-"""Opens the first levels of a tree."""
+_NODES_OPEN = 100
+"""Opens the first two levels of a tree of up to this many nodes, and the first one of a larger tree."""
+_FAILURES_OPEN = 20
+"""Bounds the failures at which a tree is opened, so that a view of hundreds of them is not long."""
 _PARAMETERS_MAX = 160
 
 
@@ -55,6 +58,7 @@ def tree_html(nodes: Sequence[NodeSummary]) -> str:
         if each.id not in shown_ids:
             hidden[parents[each.id]] = hidden.get(parents[each.id], 0) + 1
     with_children = {parents[each.id] for each in nodes}
+    from_below = {(each.parent_id, each.failure_message) for each in nodes}
     opened = _opened(shown, parents)
     parts: list[str] = []
     path: list[int] = []
@@ -67,10 +71,10 @@ def tree_html(nodes: Sequence[NodeSummary]) -> str:
         close(parents[each.id])
         if each.id in with_children:
             is_open = " open" if each.id in opened else ""
-            parts.append(f'<details{is_open} style="margin-left:16px"><summary>{_line(each)}</summary>')
+            parts.append(f'<details{is_open} style="margin-left:16px"><summary>{_line(each, from_below)}</summary>')
             path.append(each.id)
         else:
-            parts.append(f'<div style="margin-left:30px">{_line(each)}</div>')
+            parts.append(f'<div style="margin-left:30px">{_line(each, from_below)}</div>')
     close(None)
     return f'<div style="margin-left:-16px">{"".join(parts)}{_more(hidden.get(None, 0))}</div>'
 
@@ -85,14 +89,17 @@ def _parents(nodes: Sequence[NodeSummary], shown: set[int]) -> dict[int, int | N
 
 
 def _opened(shown: Sequence[NodeSummary], parents: Mapping[int, int | None]) -> set[int]:
-    """Return the nodes to open: the first levels, and those with a failed or running node below."""
+    """Return the nodes to open: the first levels, and those with one of the first failed or running nodes below."""
     opened: set[int] = set()
+    levels = 2 if len(shown) <= _NODES_OPEN else 1
+    leading = _root_failures(shown)[:_FAILURES_OPEN]
+    ends = {each.id for each in (*leading, *(each for each in shown if each.status == "RUNNING"))}
     depths: dict[int | None, int] = {None: -1}
     for each in shown:
         depths[each.id] = depths[parents[each.id]] + 1
-        if depths[each.id] < _DEPTH_OPEN:
+        if depths[each.id] < levels:
             opened.add(each.id)
-        if each.status in FAILED or each.status == "RUNNING":
+        if each.id in ends:
             above = parents[each.id]
             while above is not None and above not in opened:
                 opened.add(above)
@@ -100,7 +107,8 @@ def _opened(shown: Sequence[NodeSummary], parents: Mapping[int, int | None]) -> 
     return opened
 
 
-def _line(node: NodeSummary) -> str:
+def _line(node: NodeSummary, from_below: AbstractSet[tuple[int | None, str | None]]) -> str:
+    """Return the text of a node; a failure that came from a child has its message there."""
     end = node.end_sequence if node.end_sequence is not None else ""
     name = f'<b title="events {node.sequence} to {end}">{recorded(node.dtype or node.kind)}</b>'
     parts = [status(node.status, with_name=False), name]
@@ -111,7 +119,8 @@ def _line(node: NodeSummary) -> str:
     if node.duration_ns is not None:
         parts.append(quiet(duration(node.duration_ns)))
     if node.reason:
-        message = f": {recorded(node.failure_message)}" if node.failure_message else ""
+        has_message = node.failure_message and (node.id, node.failure_message) not in from_below
+        message = f": {recorded(node.failure_message)}" if has_message else ""
         parts.append(f"<b>{recorded(node.reason)}</b>{message}")
     if node.observations:
         parts.append(quiet(f"{node.observations} observation{'s' * (node.observations > 1)}"))

@@ -151,13 +151,17 @@ def _camera(
         Camera(target, radius / math.sin(narrow), yaw, pitch_deg, view)
         for yaw in (_YAWS if yaw_deg is None else (yaw_deg,))
     ]
-    return cameras[0] if len(cameras) == 1 else max(cameras, key=lambda each: _visible(world, each, actors))
+    return cameras[0] if len(cameras) == 1 else max(cameras, key=lambda each: _visible(world, each, radius, actors))
 
 
-def _visible(world: RecordedWorld, camera: Camera, actors: Sequence[Object]) -> float:
-    """Return how well the actors are visible: the sum of the logarithms, so that small ones count as much as robots."""
-    bodies = photograph(world, camera, 80, 60, smooth=False).bodies
-    return sum(math.log1p(int((bodies == each.body.number).sum())) for each in actors)
+def _visible(world: RecordedWorld, camera: Camera, radius: float, actors: Sequence[Object]) -> float:
+    """Return how well the actors are visible: the sum of the logarithms, so that small ones count as much as robots.
+
+    What stands between the camera and the framed objects, such as a wall, costs as much as it covers.
+    """
+    picture = photograph(world, camera, 80, 60, smooth=False)
+    covered = float((picture.depths < camera.distance_m - 1.2 * radius).mean())
+    return sum(math.log1p(int((picture.bodies == each.body.number).sum())) for each in actors) * (1 - covered)
 
 
 def _png(pixels: NDArray[np.uint8]) -> bytes:

@@ -58,10 +58,12 @@ class Photograph(NamedTuple):
     Attributes:
         pixels: red, green, blue, shape (height, width, 3).
         bodies: `Object.body.number` of the object at each pixel, shape (height, width); other numbers: floor and sky.
+        depths: distance from the camera along its axis at each pixel, m, shape (height, width).
     """
 
     pixels: NDArray[np.uint8]
     bodies: NDArray[np.int32]
+    depths: Floats
 
 
 def photograph(world: BulletWorld, camera: Camera, width: int, height: int, *, smooth: bool = True) -> Photograph:
@@ -73,7 +75,7 @@ def photograph(world: BulletWorld, camera: Camera, width: int, height: int, *, s
     view = bullet.computeViewMatrix(camera.eye, camera.target, (0, 0, 1))
     near = min(_NEAR_M, camera.distance_m / 10)
     projection = bullet.computeProjectionMatrixFOV(camera.view_deg, width / height, near, _FAR_M)
-    columns, rows, colors, _depths, numbers = bullet.getCameraImage(
+    columns, rows, colors, buffer, numbers = bullet.getCameraImage(
         width * scale,
         height * scale,
         view,
@@ -91,7 +93,8 @@ def photograph(world: BulletWorld, camera: Camera, width: int, height: int, *, s
     pixels = np.reshape(colors, (rows, columns, 4))[:, :, :3].astype(np.float64)
     _repaint_ground(pixels, bodies, [each.body.number for each in world.objects])
     smoothed = pixels.reshape(height, scale, width, scale, 3).mean(axis=(1, 3))
-    return Photograph(smoothed.round().astype(np.uint8), bodies[::scale, ::scale])
+    depths = _FAR_M * near / (_FAR_M - (_FAR_M - near) * np.reshape(buffer, (rows, columns)))
+    return Photograph(smoothed.round().astype(np.uint8), bodies[::scale, ::scale], depths[::scale, ::scale])
 
 
 def _repaint_ground(pixels: Floats, bodies: NDArray[np.int32], objects: Sequence[int]) -> None:
