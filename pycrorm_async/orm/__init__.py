@@ -1,7 +1,7 @@
 """Map the public views to classes with the thesis' names, which editors can complete.
 
-`select(PickUpAction)`, `select(Action)`, `select(TaskTreeNode)` … are ordinary SQLAlchemy. Relationships are loaded
-together with their object.
+`select(PickUpAction)`, `select(Action)`, `select(TaskTreeNode)` … are ordinary SQLAlchemy. In a session of a memory the
+attributes that a query does not load are loaded when they are read (`orm.loading.batch_loads`).
 """
 
 from pycrorm_async.orm.actions import (

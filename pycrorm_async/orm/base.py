@@ -1,13 +1,12 @@
 """Define the base of the mapped classes, and the classes of episodes, poses and the robot's state.
 
-All mapped classes are read-only: they select from the public views. Relationships are loaded together with their
-object, so that reading an attribute never waits for the database.
+All mapped classes are read-only: they select from the public views. A query loads the columns of the class that it
+selects. `orm.loading.batch_loads` loads the columns of subclasses and related rows when an attribute is read.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from datetime import datetime
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, dataclass_transform
 
@@ -23,11 +22,12 @@ from sqlalchemy import (
     inspect,
     literal_column,
 )
-from sqlalchemy.exc import MissingGreenlet, StatementError
+from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.ext.asyncio import AsyncAttrs
 from sqlalchemy.ext.hybrid import hybrid_property
 from sqlalchemy.orm import (
     DeclarativeBase,
+    InstanceState,
     Mapped,
     MappedAsDataclass,
     MappedColumn,
@@ -36,14 +36,16 @@ from sqlalchemy.orm import (
     Synonym,
     foreign,
     mapped_column,
+    object_session,
     relationship,
     remote,
     synonym,
 )
-from sqlalchemy.orm.exc import DetachedInstanceError
+from sqlalchemy.util.concurrency import in_greenlet
 
-from pycrorm_async.errors import CallerError
+from pycrorm_async.errors import CallerError, PycrormError
 from pycrorm_async.events.ids import SEQUENCE_MAX, SLOT_MAX, row_key
+from pycrorm_async.orm.loading.batch_loads import load_columns
 from pycrorm_async.orm.types import EnumName, JsonText, Moment
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.enums import Arms, Grasp, GripperState, ObjectType
@@ -54,7 +56,7 @@ if TYPE_CHECKING:
 __all__ = [
     "Base",
     "RowOfEvent",
-    "named_if_unloaded",
+    "require_loaded",
     "on_request",
     "HybridOnRequest",
     "one_of",
@@ -76,9 +78,7 @@ EPISODE = "process_metadata_id"
 """The column of every table that names the episode of a row."""
 
 
-def one_of(
-    reference: Callable[[], Any], table: str, class_: Any = None, *, lazy: Any = "selectin", **options: Any
-) -> Any:
+def one_of(reference: Callable[[], Any], table: str, class_: Any = None, **options: Any) -> Any:
     """Return a read-only relationship to the row of `table` whose id the attribute `reference()` contains.
 
     It joins by id and episode, so that a database whose tables are divided by episode reads one part of them. `class_`
@@ -90,10 +90,10 @@ def one_of(
         others, own_episode = Base.metadata.tables[table].c, attribute.class_.process_metadata_id
         return and_(foreign(attribute) == remote(others.id), own_episode == remote(others.process_metadata_id))
 
-    return _by_id(relationship(class_, primaryjoin=joined, viewonly=True, lazy=lazy, **options))
+    return _by_id(relationship(class_, primaryjoin=joined, viewonly=True, **options))
 
 
-def many_of(reference: Callable[[], Any], table: str, *, lazy: Any = "selectin", **options: Any) -> Any:
+def many_of(reference: Callable[[], Any], table: str, **options: Any) -> Any:
     """Return a read-only relationship to the rows whose attribute `reference()` contains the id of a row of `table`."""
 
     def joined() -> Any:
@@ -101,7 +101,7 @@ def many_of(reference: Callable[[], Any], table: str, *, lazy: Any = "selectin",
         own, episode = Base.metadata.tables[table].c, attribute.class_.process_metadata_id
         return and_(own.id == remote(foreign(attribute)), own.process_metadata_id == remote(episode))
 
-    return _by_id(relationship(primaryjoin=joined, viewonly=True, lazy=lazy, **options))
+    return _by_id(relationship(primaryjoin=joined, viewonly=True, **options))
 
 
 def inherited_from(base: Any, table: Any) -> dict[str, Any]:
@@ -138,7 +138,7 @@ def _by_id(related: Any) -> Any:
     )
 )
 class Base(MappedAsDataclass, AsyncAttrs, DeclarativeBase, init=False, repr=False, eq=False):
-    """The root of the mapped classes. Its repr shows loaded attributes only and never queries the database."""
+    """The root of the mapped classes. The text of an object has the columns of its class and the robot's state."""
 
     type_annotation_map: ClassVar[dict[Any, Any]] = {
         int: BigInteger(),
@@ -154,13 +154,20 @@ class Base(MappedAsDataclass, AsyncAttrs, DeclarativeBase, init=False, repr=Fals
     }
 
     def __repr__(self) -> str:
-        state = inspect(self)
+        mapper = inspect(self).mapper
         names = [
-            *(each.key for each in state.mapper.column_attrs if not each.key.startswith("_")),
-            *(["robot_state"] if "robot_state" in state.mapper.relationships else []),
+            *(each.key for each in mapper.column_attrs if not each.key.startswith("_")),
+            *(["robot_state"] if "robot_state" in mapper.relationships else []),
         ]
-        shown = ", ".join(f"{name}={state.dict[name]!r}" for name in names if state.dict.get(name) is not None)
+        shown = ", ".join(f"{name}={value!r}" for name in names if (value := self._readable(name)) is not None)
         return f"{type(self).__name__}({shown})"
+
+    def _readable(self, name: str) -> Any:
+        """Return the attribute; None if it is not loaded and cannot be loaded now."""
+        try:
+            return getattr(self, name)
+        except (PycrormError, SQLAlchemyError):
+            return None
 
 
 class RowOfEvent:
@@ -182,36 +189,41 @@ class RowOfEvent:
 
 
 @event.listens_for(Base, "mapper_configured", propagate=True)
-def _read_members(mapper: Mapper[Any], class_: type[Base]) -> None:
-    """Let objects have enum members where a synchronous connection reads their columns as names."""
+def _complete_mapping(mapper: Mapper[Any], class_: type[Base]) -> None:
+    """Load columns of subclasses in batches, and enum members where a synchronous connection reads names."""
+    if mapper.inherits is not None:
+        mapper.class_manager.expired_attribute_loader = load_columns
     columns = ((each.key, each.columns[0].type) for each in mapper.column_attrs)
     enums = [(key, kind) for key, kind in columns if isinstance(kind, EnumName)]
 
-    def read_members(row: Base, *_: Any) -> None:
-        values = vars(row)
+    def read_members(state: InstanceState[Base], *_: Any) -> None:
+        values = state.dict
         for key, kind in enums:
             if type(values.get(key)) is str:
                 values[key] = kind.member(values[key])
 
     if enums:
-        event.listen(class_, "load", read_members)
-        event.listen(class_, "refresh", read_members)
+        event.listen(class_, "load", read_members, raw=True)
+        event.listen(class_, "refresh", read_members, raw=True)
 
 
-@contextmanager
-def named_if_unloaded(row: Base, name: str) -> Iterator[None]:
-    """Raise `CallerError` with the remedy where an attribute that is not loaded is read without awaiting it."""
-    try:
-        yield
-    except (StatementError, MissingGreenlet, DetachedInstanceError) as error:
-        if isinstance(error, StatementError) and not isinstance(error.orig, MissingGreenlet):
-            raise
-        state, class_ = inspect(row), type(row).__name__
-        key, option = state.identity, "undefer" if f"_{name}" in state.mapper.column_attrs else "selectinload"
-        raise CallerError(
-            f"{name} of {class_} {key} is not loaded: in its session use `await row.awaitable_attrs.{name}`,"
-            f" or select with `{option}({class_}.{name})`"
-        ) from None
+def require_loaded(row: Base, name: str, requested_by: Base | None = None, request: str | None = None) -> None:
+    """Raise `CallerError` with the remedy if this attribute is not loaded and can only be loaded by awaiting it.
+
+    `requested_by` and `request` are the object and the attribute to name, where these are others.
+    """
+    if name in vars(row):
+        return
+    session = object_session(row)
+    if session is not None and (in_greenlet() or not session.get_bind().dialect.is_async):
+        return
+    named, attribute = requested_by or row, request or name.removeprefix("_")
+    state, class_ = inspect(named), type(named).__name__
+    key, option = state.identity, "undefer" if f"_{attribute}" in state.mapper.column_attrs else "selectinload"
+    raise CallerError(
+        f"{attribute} of {class_} {key} is not loaded: in its session use `await row.awaitable_attrs.{attribute}`,"
+        f" or select with `{option}({class_}.{attribute})`"
+    )
 
 
 def on_request(name: str) -> property:
@@ -224,8 +236,8 @@ def on_request(name: str) -> property:
 
 def _reader(name: str) -> Callable[[Any], Any]:
     def value(row: Base) -> Any:
-        with named_if_unloaded(row, name):
-            return getattr(row, f"_{name}")
+        require_loaded(row, f"_{name}")
+        return getattr(row, f"_{name}")
 
     return value
 
@@ -301,9 +313,9 @@ class ProcessMetaData(Base):
     clock_error_us: Mapped[int | None]
     episode_metadata: Mapped[dict[str, Any] | None] = mapped_column("metadata", JsonText())
     """In SQL `metadata`, a name of an attribute that SQLAlchemy keeps for itself."""
-    tag_rows: Mapped[list[Any]] = relationship("EpisodeTag", viewonly=True, lazy="selectin", order_by="EpisodeTag.tag")
+    tag_rows: Mapped[list[Any]] = relationship("EpisodeTag", viewonly=True, order_by="EpisodeTag.tag")
     tags = property(lambda self: [each.tag for each in self.tag_rows], doc="The tags, in alphabetical order.")
-    _robots: Mapped[list[EpisodeRobot]] = relationship(viewonly=True, lazy="select", order_by="EpisodeRobot.id")
+    _robots: Mapped[list[EpisodeRobot]] = relationship(viewonly=True, order_by="EpisodeRobot.id")
     robots: Mapped[list[EpisodeRobot]] = synonym("_robots", descriptor=on_request("robots"))
     """The robots that took part, in the order in which they were added. Loaded on request."""
 
@@ -354,9 +366,9 @@ class Pose(RowOfEvent, Base):
     qz: Mapped[float]
     qw: Mapped[float]
 
-    position: Mapped[Position] = one_of(lambda: Pose.position_id, "position", lazy="joined", innerjoin=True)
-    orientation: Mapped[Quaternion] = one_of(lambda: Pose.orientation_id, "quaternion", lazy="joined", innerjoin=True)
-    process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True, lazy="selectin")
+    position: Mapped[Position] = one_of(lambda: Pose.position_id, "position")
+    orientation: Mapped[Quaternion] = one_of(lambda: Pose.orientation_id, "quaternion")
+    process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True)
 
 
 class RobotState(RowOfEvent, Base):
@@ -370,5 +382,5 @@ class RobotState(RowOfEvent, Base):
     type: Mapped[ObjectType]
     pose_id: Mapped[int] = mapped_column(ForeignKey("pose.id"))
 
-    pose: Mapped[Pose] = one_of(lambda: RobotState.pose_id, "pose", lazy="selectin")
-    process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True, lazy="selectin")
+    pose: Mapped[Pose] = one_of(lambda: RobotState.pose_id, "pose")
+    process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True)

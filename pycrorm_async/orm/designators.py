@@ -18,6 +18,7 @@ the class itself, as in the designator.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from datetime import datetime
 from typing import TYPE_CHECKING, Any
 
@@ -38,7 +39,7 @@ from pycrorm_async.orm.base import (
     many_of,
     one_of,
 )
-from pycrorm_async.orm.known_classes import known_classes
+from pycrorm_async.orm.loading.known_classes import known_classes
 from pycrorm_async.orm.objects import Object, is_concept
 from pycrorm_async.orm.types import JsonText
 from pycrorm_async.task_status import TaskStatus
@@ -137,8 +138,9 @@ class ClassOfRow(TypeDecorator[str]):
     impl = String
     cache_ok = True
 
-    def process_result_value(self, value: str | None, dialect: Dialect) -> str | None:
-        return None if value is None else known_classes(dialect).identity(value, Designator.__mapper__.polymorphic_map)
+    def result_processor(self, dialect: Dialect, coltype: object) -> Callable[[str | None], str | None]:  # noqa: ARG002
+        identity, mapped = known_classes(dialect).identity, Designator.__mapper__.polymorphic_map
+        return lambda lineage: None if lineage is None else identity(lineage, mapped)
 
 
 class Designator(RowOfEvent, Base):
@@ -180,8 +182,7 @@ class Designator(RowOfEvent, Base):
 
     @declared_attr.directive
     def __mapper_args__(cls) -> dict[str, Any]:
-        # "selectin" at every level: a query for a base loads the columns of all leaves without a join for each.
-        arguments = {"polymorphic_identity": cls.__name__, "polymorphic_load": "selectin"}
+        arguments = {"polymorphic_identity": cls.__name__}
         if cls.__name__ == "Designator":
             return {"polymorphic_on": "_lineage", **arguments}
         return {**arguments, **inherited_from(_mapped_base(cls), cls.__table__)}
@@ -205,8 +206,8 @@ class Designator(RowOfEvent, Base):
     items: Mapped[list[ParameterItem]] = many_of(
         lambda: ParameterItem.node_id, "designator", order_by=(ParameterItem.field, ParameterItem.position)
     )
-    process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True, lazy="selectin")
-    _node: Mapped[TaskTreeNode] = one_of(lambda: Designator.id, "task_tree_node", lazy="select")
+    process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True)
+    _node: Mapped[TaskTreeNode] = one_of(lambda: Designator.id, "task_tree_node")
 
     # Hybrids, because a subclass may map a field of such a name, which a column of the same name would collide with.
 

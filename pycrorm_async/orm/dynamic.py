@@ -9,7 +9,8 @@
 
 Enum fields are member names (text), because the enum's class may not be importable. A generated class inherits from the
 class of its nearest base type. Two memories in one process may have different `SayingAction`s: each class has a
-polymorphic identity of its own, and only the engines of its memory map rows to it.
+polymorphic identity of its own, and only the engines of its memory map rows to it. Their parameters are loaded with
+their objects, because objects may outlive the memory, which unmaps their classes when it is closed.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from pycrorm_async.events.types import DesignatorTypeDeclared
 from pycrorm_async.events.values import FieldDeclared, FieldType
 from pycrorm_async.orm.base import EPISODE, Base, Pose, inherited_from, one_of
 from pycrorm_async.orm.designators import Action, Designator, Language, Motion
-from pycrorm_async.orm.known_classes import known_classes
+from pycrorm_async.orm.loading.known_classes import known_classes
 from pycrorm_async.orm.objects import Object
 from pycrorm_async.orm.types import Moment
 
@@ -112,7 +113,6 @@ class DynamicClasses:
         for class_ in self._classes.values():
             identities.pop(class_.__mapper__.polymorphic_identity, None)
         self._classes.clear()
-        self._registry.dispose()
         # Shared mappers cache their loading paths, also those through generated classes, which keeps the classes alive.
         # The caches are rebuilt when needed; SQLAlchemy clears them in the same way when a subclass is mapped.
         for mapper in Base.registry.mappers:
@@ -219,7 +219,8 @@ class DynamicClasses:
         table.append_column(column)
         mapper.add_property(f"{field.name}_id", column)
         reference = f"{field.name}_id"
-        mapper.add_property(field.name, one_of(lambda: getattr(class_, reference), target.__tablename__, target))
+        related = one_of(lambda: getattr(class_, reference), target.__tablename__, target, lazy="selectin")
+        mapper.add_property(field.name, related)
         if not mapper.has_property(field.type):  # the first pose is also `pose`, the first object also `object`
             mapper.add_property(field.type, synonym(field.name))
             mapper.add_property(f"{field.type}_id", synonym(f"{field.name}_id"))

@@ -39,9 +39,6 @@ __all__ = [
     "JointChange",
 ]
 
-_STEPS_MAX = 6
-"""Bounds the relationships between a query's class and an `ObjectPart` with a loaded `part_of`; no class needs more."""
-
 
 class Concept(Base):
     """A class of the ontology (SOMA, DUL) and one of its superclasses: several rows if it has several.
@@ -166,11 +163,10 @@ class Object(RowOfEvent, Base):
         ),
         secondaryjoin=lambda: _ADDED.c.description_fingerprint == ObjectDescription.fingerprint,
         viewonly=True,
-        lazy="select",
         uselist=False,
     )
-    _node: Mapped[TaskTreeNode | None] = one_of(lambda: Object.node_id, "task_tree_node", lazy="select")
-    process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True, lazy="selectin")
+    _node: Mapped[TaskTreeNode | None] = one_of(lambda: Object.node_id, "task_tree_node")
+    process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True)
 
     __mapper_args__ = {"polymorphic_on": "dtype", "polymorphic_identity": "Object"}  # noqa: RUF012  SQLAlchemy's form
 
@@ -196,7 +192,7 @@ class ObjectPart(Object):
 
     part_of_id: Mapped[int | None] = mapped_column(ForeignKey("object.id"))
 
-    part_of: Mapped[Object | None] = one_of(lambda: ObjectPart.part_of_id, "object", join_depth=_STEPS_MAX)
+    part_of: Mapped[Object | None] = one_of(lambda: ObjectPart.part_of_id, "object")
 
     __mapper_args__ = {"polymorphic_identity": "ObjectPart", "polymorphic_load": "inline"}  # noqa: RUF012
 
@@ -206,7 +202,7 @@ class LocatedObject(Object):
 
     reference_id: Mapped[int | None] = mapped_column("part_of_id", ForeignKey("object.id"), use_existing_column=True)
 
-    reference: Mapped[Object | None] = one_of(lambda: LocatedObject.reference_id, "object", join_depth=_STEPS_MAX)
+    reference: Mapped[Object | None] = one_of(lambda: LocatedObject.reference_id, "object")
 
     __mapper_args__ = {"polymorphic_identity": "LocatedObject", "polymorphic_load": "inline"}  # noqa: RUF012
 
@@ -230,7 +226,7 @@ class ObjectRemoval(RowOfEvent, Base):
     node_id: Mapped[int | None] = mapped_column(ForeignKey("task_tree_node.id"))
 
     object: Mapped[Object] = one_of(lambda: ObjectRemoval.object_id, "object")
-    process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True, lazy="selectin")
+    process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True)
 
 
 class Attachment(RowOfEvent, Base):
@@ -249,7 +245,7 @@ class Attachment(RowOfEvent, Base):
 
     parent: Mapped[Object] = one_of(lambda: Attachment.parent_id, "object")
     child: Mapped[Object] = one_of(lambda: Attachment.child_id, "object")
-    process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True, lazy="selectin")
+    process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True)
 
 
 class JointChange(RowOfEvent, Base):
@@ -266,4 +262,4 @@ class JointChange(RowOfEvent, Base):
     node_id: Mapped[int | None] = mapped_column(ForeignKey("task_tree_node.id"))
 
     object: Mapped[Object] = one_of(lambda: JointChange.object_id, "object")
-    process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True, lazy="selectin")
+    process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True)

@@ -55,7 +55,7 @@ class Detection(RowOfEvent, Base):
 
     node: Mapped[TaskTreeNode | None] = one_of(lambda: Detection.node_id, "task_tree_node")
     object: Mapped[Object | None] = one_of(lambda: Detection.object_id, "object")
-    process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True, lazy="selectin")
+    process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True)
 
 
 class StateSample(RowOfEvent, Base):
@@ -103,7 +103,7 @@ class Observation(RowOfEvent, Base):
     items: Mapped[list[ObservationValue]] = many_of(
         lambda: ObservationValue.id, "observation", order_by=lambda: ObservationValue.position
     )
-    process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True, lazy="selectin")
+    process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True)
 
     @property
     def values(self) -> dict[str, float | str | bool | None]:

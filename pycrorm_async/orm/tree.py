@@ -14,9 +14,9 @@ from pycrorm_async.orm.base import (
     ProcessMetaData,
     RowOfEvent,
     many_of,
-    named_if_unloaded,
     on_request,
     one_of,
+    require_loaded,
 )
 from pycrorm_async.orm.designators import Designator
 from pycrorm_async.orm.types import JsonText
@@ -31,8 +31,7 @@ class TaskTreeNode(RowOfEvent, Base):
 
     Attributes:
         action: the performed `Action`, `Motion` or other `Designator`; None at the root of an episode.
-        parent: the node that performed it. Loaded for the nodes that a query selects; for nodes loaded through another
-            object, and for parents, use `await node.awaitable_attrs.parent`.
+        parent: the node that performed it; None at the root of an episode.
         children: the nodes that it performed, in order. Not loaded by default, because it would nearly double the time
             of a query: use `selectinload(TaskTreeNode.children)` or `await node.awaitable_attrs.children`.
         ancestors: the parent, its parent and so on to the root: `await node.awaitable_attrs.ancestors`.
@@ -73,24 +72,23 @@ class TaskTreeNode(RowOfEvent, Base):
     duration: Mapped[float | None]
 
     action: Mapped[Designator | None] = one_of(lambda: TaskTreeNode.action_id, "designator")
-    _parent: Mapped[TaskTreeNode | None] = one_of(lambda: TaskTreeNode.parent_id, "task_tree_node", join_depth=1)
+    parent: Mapped[TaskTreeNode | None] = one_of(lambda: TaskTreeNode.parent_id, "task_tree_node")
     _children: Mapped[list[TaskTreeNode]] = many_of(
-        lambda: TaskTreeNode.parent_id, "task_tree_node", lazy="select", order_by=lambda: TaskTreeNode.id
+        lambda: TaskTreeNode.parent_id, "task_tree_node", order_by=lambda: TaskTreeNode.id
     )
-    process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True, lazy="selectin")
+    process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True)
 
-    parent: Mapped[TaskTreeNode | None] = synonym("_parent", descriptor=on_request("parent"))
     children: Mapped[list[TaskTreeNode]] = synonym("_children", descriptor=on_request("children"))
 
     @property
     def ancestors(self) -> list[TaskTreeNode]:
         """Its parent, the parent of that, and so on to the root. Raises `CallerError` if one is not loaded."""
         nodes: list[TaskTreeNode] = []
-        with named_if_unloaded(self, "ancestors"):
-            node = self._parent
-            while node is not None:
-                nodes.append(node)
-                node = node._parent  # noqa: SLF001  so that an error names `ancestors`
+        node: TaskTreeNode | None = self
+        while node is not None:
+            require_loaded(node, "parent", self, "ancestors")
+            node = node.parent
+            nodes += [] if node is None else [node]
         return nodes
 
     @property
@@ -180,9 +178,8 @@ class LocationResolution(RowOfEvent, Base):
     _refusals: Mapped[list[LocationRefusal]] = many_of(
         lambda: LocationRefusal.resolution_id,
         "location_resolution",
-        lazy="select",
         order_by=LocationRefusal.position,
     )
-    process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True, lazy="selectin")
+    process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True)
 
     refusals: Mapped[list[LocationRefusal]] = synonym("_refusals", descriptor=on_request("refusals"))

@@ -9,6 +9,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from enum import Enum
 from typing import Any
@@ -23,6 +24,10 @@ __all__ = ["Moment", "EnumName", "JsonText"]
 
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _MICROSECOND = timedelta(microseconds=1)
+
+
+def _moment(value: int | None) -> datetime | None:
+    return None if value is None else _EPOCH + timedelta(0, 0, value)
 
 
 class Moment(TypeDecorator[datetime]):
@@ -40,8 +45,8 @@ class Moment(TypeDecorator[datetime]):
             raise ValueError(f"{value!r} has no time zone: write datetime(..., tzinfo=UTC)")
         return (value - _EPOCH) // _MICROSECOND
 
-    def process_result_value(self, value: int | None, dialect: Dialect) -> datetime | None:  # noqa: ARG002
-        return None if value is None else _EPOCH + value * _MICROSECOND
+    def result_processor(self, dialect: Dialect, coltype: object) -> Callable[[int | None], datetime | None]:  # noqa: ARG002
+        return _moment
 
 
 class EnumName(TypeDecorator[Any]):
@@ -57,20 +62,31 @@ class EnumName(TypeDecorator[Any]):
     def __init__(self, enum: type[Enum]) -> None:
         super().__init__()
         self.enum = enum
-        self._members = dict(enum.__members__)  # `__members__` makes a mapping at every access
+        self._members = _Members(enum)
 
     def process_bind_param(self, value: Enum | str | None, dialect: Dialect) -> str | None:  # noqa: ARG002
         return value.name if isinstance(value, Enum) else value
 
-    def process_result_value(self, value: str | None, dialect: Dialect) -> Enum | str | None:
-        return value if value is None or not dialect.is_async else self.member(value)
+    def result_processor(self, dialect: Dialect, coltype: object) -> Callable[[str | None], Any] | None:  # noqa: ARG002
+        return self._members.__getitem__ if dialect.is_async else None
 
     def member(self, name: str) -> Enum | str:
         """Return the member of this name, or the name if the enum lacks it; a further arm of a robot is one too."""
-        member = self._members.get(name)
-        if member is None and self.enum is Arms and name.isidentifier():
+        member: Enum | str = self._members[name]
+        return member
+
+
+class _Members(dict[str | None, Any]):
+    """The members of an enum by name, and the names it lacks as `EnumName.member` returns them; NULL is None."""
+
+    def __init__(self, enum: type[Enum]) -> None:
+        super().__init__(**enum.__members__)
+        self._enum = enum
+
+    def __missing__(self, name: str | None) -> Enum | str | None:
+        if name is not None and self._enum is Arms and name.isidentifier():
             return Arms.named(name)
-        return name if member is None else member
+        return name
 
 
 class JsonText(TypeDecorator[Any]):

@@ -107,7 +107,7 @@ class RootFailure(RowOfEvent, Base):
     start_time: Mapped[datetime]
     end_time: Mapped[datetime | None]
 
-    process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True, lazy="selectin")
+    process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True)
 
     @property
     def episode(self) -> ProcessMetaData:
@@ -140,9 +140,9 @@ class SpatialRelation(Base):
     other: Mapped[str]
     link: Mapped[str] = mapped_column(primary_key=True)
 
-    _node: Mapped[TaskTreeNode] = one_of(lambda: SpatialRelation.node_id, "task_tree_node", lazy="select")
+    _node: Mapped[TaskTreeNode] = one_of(lambda: SpatialRelation.node_id, "task_tree_node")
     node: Mapped[TaskTreeNode] = synonym("_node", descriptor=on_request("node"))
-    process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True, lazy="selectin")
+    process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True)
 
 
 class EpisodeTag(Base):

@@ -34,11 +34,12 @@ from pycrorm_async.query.asking.ask import Ask
 from pycrorm_async.query.asking.episode_diff import EpisodeDiff, diff_episodes
 from pycrorm_async.query.asking.episode_list import EpisodeChoice
 from pycrorm_async.query.asking.question import AskedEpisode, Question
-from pycrorm_async.query.episode_session import EpisodeSession
 from pycrorm_async.query.frames.arrow_batches import BATCH_ROWS, arrow_batches
 from pycrorm_async.query.frames.dataframe import Library, dataframe
 from pycrorm_async.query.named_queries import EpisodeSummary
 from pycrorm_async.query.notebook.listings import Episodes, TaskTree
+from pycrorm_async.query.sessions.episode_session import EpisodeSession
+from pycrorm_async.query.sessions.load_on_access import LoadOnAccess
 from pycrorm_async.query.snapshot import Moment
 from pycrorm_async.query.sql.read_only import DEFAULT_LIMITS, ReadOnlySql, SqlLimits, SqlResult, SqlRows
 from pycrorm_async.store.address import DatabaseAddress
@@ -123,11 +124,10 @@ class Reading:
             async with self._sessions() as session:
                 yield session
             return
-        async with (
-            self._connection(simulated=True) as connection,
-            AsyncSession(connection, expire_on_commit=False, sync_session_class=EpisodeSession) as session,
-        ):
-            yield session
+        async with self._connection(simulated=True) as connection:
+            connect = partial(with_views, views=self._all_views[1])
+            async with self._sessions(bind=connection, connect=connect) as session:
+                yield session
 
     @overload
     async def dataframe(
@@ -347,7 +347,11 @@ class Reading:
     def _use(self, log: EventLog) -> None:
         self._opened = log
         self._classes.use_in(log.engine)
-        self._sessions = async_sessionmaker(log.engine, expire_on_commit=False, sync_session_class=EpisodeSession)
+        on_access = LoadOnAccess(log.address.engine(read_only=True), log.translated)
+        self._classes.use_in(on_access.engine)
+        self._sessions = async_sessionmaker(
+            log.engine, expire_on_commit=False, sync_session_class=EpisodeSession, on_access=on_access
+        )
 
     @property
     def _log(self) -> EventLog:

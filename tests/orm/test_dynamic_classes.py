@@ -13,7 +13,6 @@ from typing import Any
 
 import pytest
 from sqlalchemy import ForeignKey, select
-from sqlalchemy.ext.asyncio import AsyncSession
 from sqlalchemy.orm import Mapped, mapped_column
 
 from pycrorm_async.errors import CallerError
@@ -30,6 +29,7 @@ from pycrorm_async.world.enums import Arms
 from tests.commands import environment
 from tests.projections.event_script import PICK_UP, SAYING, Script, declarations, declared, field, name_of, pose, row
 from tests.projections.sql_queries import stored_and_folded
+from tests.sessions import session_on
 
 pytestmark = [pytest.mark.soak_on("postgresql"), pytest.mark.slow]
 """These tests take long on a server, where they run in turns; other modules show that the server behaves alike."""
@@ -69,7 +69,7 @@ KINDS = declarations(CAREFUL, SAYING, DANCE, LOOP)
 
 
 async def every(log: EventLog, question: Any) -> list[Any]:
-    async with AsyncSession(log.engine, expire_on_commit=False) as session:
+    async with session_on(log) as session:
         return list((await session.scalars(question)).all())
 
 
@@ -110,7 +110,7 @@ async def test_a_type_without_a_class_is_read_as_its_nearest_class(log: EventLog
 
 async def test_its_fields_are_among_its_parameters(log: EventLog) -> None:
     await stored_and_folded(log, [*KINDS, *all_kinds().records])
-    async with AsyncSession(log.engine) as session:
+    async with session_on(log) as session:
         saying = (await session.scalars(select(Action).where(Action.dtype == "SayingAction"))).one()
         assert await saying.awaitable_attrs.parameters == {"text": "hi"}
 

@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 from sqlalchemy import func, select
-from sqlalchemy.ext.asyncio import AsyncSession
 from sqlalchemy.orm import Mapped, selectinload, undefer
 
 import pycrorm_async.orm
@@ -78,6 +77,7 @@ from tests.projections.event_script import (
     time_us,
 )
 from tests.projections.sql_queries import ask, stored_and_folded
+from tests.sessions import session_on
 
 pytestmark = pytest.mark.slow
 
@@ -160,7 +160,7 @@ async def breakfast(filled_url: str) -> AsyncIterator[EventLog]:
 
 
 async def every(log: EventLog, question: Any) -> list[Any]:
-    async with AsyncSession(log.engine, expire_on_commit=False) as session:
+    async with session_on(log) as session:
         return list((await session.scalars(question)).unique().all())
 
 
@@ -260,7 +260,7 @@ async def test_one_node_alone_has_its_parent_loaded(breakfast: EventLog) -> None
 
 
 async def test_a_node_has_children_and_ancestors(breakfast: EventLog) -> None:
-    async with AsyncSession(breakfast.engine) as session:
+    async with session_on(breakfast) as session:
         move = (await session.scalars(select(TaskTreeNode).where(TaskTreeNode.id == row(8)))).one()
         ancestors = await move.awaitable_attrs.ancestors
         assert [each.id for each in ancestors] == [row(6), row(2)]
@@ -288,7 +288,7 @@ async def test_an_attribute_that_is_not_loaded_names_the_remedy(
     breakfast: EventLog, class_: type[Base], sequence: int, name: str
 ) -> None:
     message = rf"^{name} of {class_.__name__} \(\d+,\) is not loaded: .*awaitable_attrs.{name}`"
-    async with AsyncSession(breakfast.engine, expire_on_commit=False) as session:
+    async with session_on(breakfast) as session:
         loaded = await session.get_one(class_, row(sequence))
         with pytest.raises(CallerError, match=message):
             getattr(loaded, name)
@@ -303,7 +303,7 @@ async def test_nodes_join_their_designators(breakfast: EventLog) -> None:
     question = (
         select(PickUpAction.arm, TaskTreeNode.status).join(PickUpAction.node).where(PickUpAction.arm == Arms.LEFT)
     )
-    async with AsyncSession(breakfast.engine) as session:
+    async with session_on(breakfast) as session:
         assert (await session.execute(question)).all() == [(Arms.LEFT, TaskStatus.FAILED)]
         other = select(TaskTreeNode).join(TaskTreeNode.action.of_type(PickUpAction)).where(PickUpAction.arm == "LEFT")
         assert [each.id for each in await session.scalars(other)] == [row(11)]
@@ -318,7 +318,7 @@ async def test_the_parts_of_a_pose_can_be_joined(breakfast: EventLog) -> None:
         .join(Pose.position)
         .join(Pose.orientation)
     )
-    async with AsyncSession(breakfast.engine) as session:
+    async with session_on(breakfast) as session:
         assert (await session.execute(question)).all() == [(0.5, 0.6)]
 
 
@@ -354,7 +354,7 @@ async def test_a_resolved_location_has_its_candidates(breakfast: EventLog) -> No
 
 
 async def test_the_recorded_parameters_are_loaded_on_request(breakfast: EventLog) -> None:
-    async with AsyncSession(breakfast.engine) as session:
+    async with session_on(breakfast) as session:
         pick = (await session.scalars(select(PickUpAction))).one()
         awaited_parameters = await pick.awaitable_attrs.parameters
         assert awaited_parameters == {"object_designator": {"object": 4, "row": 4}, "arm": "LEFT", "grasp": "TOP"}
@@ -363,7 +363,7 @@ async def test_the_recorded_parameters_are_loaded_on_request(breakfast: EventLog
 
 
 async def test_an_action_loads_its_node_on_request(breakfast: EventLog) -> None:
-    async with AsyncSession(breakfast.engine) as session:
+    async with session_on(breakfast) as session:
         pick = (await session.scalars(select(PickUpAction))).one()
         assert (await pick.awaitable_attrs.node).status == TaskStatus.FAILED
     (pick,) = await every(breakfast, select(PickUpAction).options(selectinload(PickUpAction.node)))
@@ -401,7 +401,7 @@ async def test_actions_are_filtered_and_ordered_by_times_and_outcome(
 
 async def test_an_action_joins_its_episode(breakfast: EventLog) -> None:
     question = select(ProcessMetaData.description, PickUpAction.duration).join(PickUpAction.episode)
-    async with AsyncSession(breakfast.engine) as session:
+    async with session_on(breakfast) as session:
         assert (await session.execute(question)).all() == [("Tutorial", 3.0)]
 
 

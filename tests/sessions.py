@@ -1,0 +1,20 @@
+"""Open a session on a log, as `Reading.session` does, but without mapping the types that are declared in it."""
+
+from __future__ import annotations
+
+from sqlalchemy.ext.asyncio import AsyncSession
+
+from pycrorm_async.orm.loading.known_classes import known_classes
+from pycrorm_async.query.sessions.episode_session import EpisodeSession
+from pycrorm_async.query.sessions.load_on_access import LoadOnAccess
+from pycrorm_async.store.log import EventLog
+
+__all__ = ["session_on"]
+
+
+def session_on(log: EventLog) -> AsyncSession:
+    """Return a session whose objects load what is read of them, with the classes that the log's engine knows."""
+    engine = log.address.engine(read_only=True)
+    vars(engine.dialect)["pycrorm_known_classes"] = known_classes(log.engine.dialect)
+    on_access = LoadOnAccess(engine, log.translated)
+    return AsyncSession(log.engine, expire_on_commit=False, sync_session_class=EpisodeSession, on_access=on_access)
