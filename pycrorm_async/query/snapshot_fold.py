@@ -7,7 +7,7 @@ sample had an exact event of its own, while the sample may be older than the eve
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
@@ -19,18 +19,13 @@ from pycrorm_async.events.types import (
     EpisodeStarted,
     EpisodeTagged,
     Happening,
-    JointsMoved,
     NodeEnded,
     NodeStarted,
-    ObjectAdded,
-    ObjectAttached,
-    ObjectDetached,
-    ObjectMoved,
-    ObjectRemoved,
     Observed,
 )
-from pycrorm_async.events.values import FailureValue, PoseValue
+from pycrorm_async.events.values import FailureValue
 from pycrorm_async.projections.fold.fold import CannotFold, happening_of
+from pycrorm_async.projections.fold.world_fold import WorldFold, WorldObject
 from pycrorm_async.query.snapshot import Moment, NodeThen, ObjectThen, ObservationThen, RobotThen, WorldThen
 from pycrorm_async.store.stored import StoredEvent
 from pycrorm_async.world.pose import MalformedPose, Pose
@@ -59,24 +54,6 @@ class _Node:
     failure: FailureValue | None = None
 
 
-@dataclass(slots=True)
-class _WorldObject:
-    """An object in the world. `row` is the sequence of the event that set its pose."""
-
-    name: str
-    object_type: str
-    pose: PoseValue
-    row: int
-    joints: dict[str, float] = field(default_factory=dict)
-    description: str | None = None
-    color: tuple[float, float, float, float] | None = None
-    model: str | None = None
-    serial: str | None = None
-    mass_kg: float | None = None
-    base_link: str | None = None
-    attached_to: tuple[int, str | None] | None = None
-
-
 class MomentFold:
     """The state of an episode after the events read so far.
 
@@ -92,9 +69,7 @@ class MomentFold:
         self._last: StoredEvent | None = None
         self._status = "RUNNING"
         self._nodes: dict[int, _Node] = {}
-        self._objects: dict[int, _WorldObject] = {}
-        self._names: dict[int, str] = {}
-        """The names of all objects, removed ones included, by identity."""
+        self._fold = WorldFold()
         self._tags: dict[str, None] = {}
         self._observed: dict[str, tuple[StoredEvent, Observed]] = {}
 
@@ -140,7 +115,7 @@ class MomentFold:
             case Observed():
                 self._observed[happening.name] = event, happening
             case _:
-                self._changed(event.sequence, happening)
+                self._fold.read(event.sequence, happening)
 
     def _ended(self, status: str) -> None:
         self._status = status
@@ -149,51 +124,12 @@ class MomentFold:
                 if node.status == "RUNNING":
                     node.status = "LOST"
 
-    def _changed(self, sequence: int, happening: Happening) -> None:
-        """Apply an event of the world. Events of a removed object have no effect."""
-        match happening:
-            case ObjectAdded(name=name):
-                self._objects[sequence] = _WorldObject(
-                    name,
-                    happening.object_type,
-                    happening.pose,
-                    sequence,
-                    dict(happening.joints),
-                    happening.description,
-                    happening.color,
-                    happening.model,
-                    happening.serial,
-                    happening.mass_kg,
-                    happening.base_link,
-                )
-                self._names[sequence] = name
-            case ObjectMoved():
-                if (moved := self._present(happening.object)) is not None:
-                    moved.pose, moved.row = happening.pose, sequence
-            case JointsMoved():
-                if (moved := self._present(happening.object.object)) is not None:
-                    moved.joints.update(happening.joints)
-            case ObjectAttached() | ObjectDetached():
-                self._present(happening.parent.object)
-                if (child := self._present(happening.child.object)) is not None:
-                    attached = isinstance(happening, ObjectAttached)
-                    child.attached_to = (happening.parent.object, happening.link) if attached else None
-            case ObjectRemoved():
-                self._present(happening.object.object)
-                self._objects.pop(happening.object.object, None)
-
-    def _present(self, identity: int) -> _WorldObject | None:
-        """Return the object, None if it was removed. Raises `CannotFold` for one that was never added."""
-        if identity not in self._names:
-            raise CannotFold(f"object {identity} was never added")
-        return self._objects.get(identity)
-
     # --- the result -------------------------------------------------------------------------------------------
 
     @property
     def descriptions(self) -> set[str]:
         """The fingerprints of the objects' descriptions."""
-        return {each.description for each in self._objects.values() if each.description is not None}
+        return {each.description for each in self._fold.objects.values() if each.description is not None}
 
     def moment(
         self,
@@ -275,15 +211,15 @@ class MomentFold:
     def _with_name(self, value: Any) -> Any:
         """Add the object's name to a reference to an object; return other values unchanged."""
         if isinstance(value, dict) and value.keys() == {"object", "row"}:
-            return {**value, "name": self._names.get(value["object"])}
+            return {**value, "name": self._fold.names.get(value["object"])}
         return value
 
     def _world(self, descriptions: Mapping[str, DescriptionDeclared], meshes: Mapping[str, bytes]) -> WorldThen:
-        objects = tuple(self._object(identity, each) for identity, each in self._objects.items())
+        objects = tuple(self._object(identity, each) for identity, each in self._fold.objects.items())
         robots = tuple(_robot(each) for each in objects if each.object_type == "ROBOT")
         return WorldThen(objects, robots[0] if robots else None, descriptions, meshes, robots)
 
-    def _object(self, identity: int, value: _WorldObject) -> ObjectThen:
+    def _object(self, identity: int, value: WorldObject) -> ObjectThen:
         at = value.pose
         try:
             pose = Pose(at.position, at.orientation, at.frame, at.time_ns)
@@ -297,8 +233,8 @@ class MomentFold:
             object_type=value.object_type,
             pose=pose,
             joints=value.joints,
-            attached_to=(self._names[parent[0]], parent[1])
-            if parent is not None and parent[0] in self._objects
+            attached_to=(self._fold.names[parent[0]], parent[1])
+            if parent is not None and parent[0] in self._fold.objects
             else None,
             description_fingerprint=value.description,
             color=value.color,
