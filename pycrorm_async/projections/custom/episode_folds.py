@@ -44,12 +44,13 @@ class _OpenFold:
     has_ended: bool = False
     fault: str | None = None
 
-    def read(self, event: Event, rows: Changes) -> None:
+    def read(self, stored: StoredEvent, event: Event | None, rows: Changes) -> None:
         if self.fault is not None:
             raise CannotFold(self.fault)
-        self.fold(event, rows)
-        self.reached = event.sequence
-        self.has_ended = self.has_ended or isinstance(event.happening, EpisodeEnded)
+        if event is not None:
+            self.fold(event, rows)
+        self.reached = stored.sequence
+        self.has_ended = self.has_ended or stored.type == EpisodeEnded.__name__
 
 
 class EpisodeFolds:
@@ -80,13 +81,19 @@ class EpisodeFolds:
 
 
 class BatchOfFolds:
-    """The folds of the episodes of one batch."""
+    """The folds of the episodes of one batch.
 
-    def __init__(self, folds: EpisodeFolds) -> None:
+    Args:
+        folds: those that earlier batches left.
+        event_of: returns the event that the fold gets; None for one that it does not read. Raises `CannotFold`.
+    """
+
+    def __init__(self, folds: EpisodeFolds, event_of: Callable[[StoredEvent], Event | None]) -> None:
         self._folds = folds
+        self._event_of = event_of
         self._taken: dict[int, _OpenFold] = {}
 
-    async def restore(self, log: EventLog, spans: Sequence[Span], event_of: Callable[[StoredEvent], Event]) -> None:
+    async def restore(self, log: EventLog, spans: Sequence[Span]) -> None:
         """Bring the fold of each episode to the event before its span."""
         for span in spans:
             fold = self._folds.take(span.number)
@@ -95,17 +102,14 @@ class BatchOfFolds:
             self._taken[span.number] = fold
             while fold.reached < span.after and fold.fault is None:
                 page = Span(span.number, fold.reached, min(fold.reached + _PAGE_EVENTS, span.after))
-                events = await log.spans([page])
-                fold.fault = _read(fold, events, event_of)
-                if fold.fault is None and fold.reached < page.last:
-                    fold.fault = f"event {fold.reached + 1} is missing in the log"
+                fold.fault = self._read_again(fold, await log.spans([page]), page.last)
 
-    def fold(self, event: Event, rows: Changes) -> None:
+    def fold(self, stored: StoredEvent, rows: Changes) -> None:
         """Fold an event with the fold of its episode. After an exception the episode's fold is not kept."""
-        if event.number not in self._taken:
-            assert event.sequence == 1, "a batch that continues an episode restores its fold first"
-            self._taken[event.number] = _OpenFold(self._folds.projection.episode())
-        self._taken[event.number].read(event, rows)
+        if stored.number not in self._taken:
+            assert stored.sequence == 1, "a batch that continues an episode restores its fold first"
+            self._taken[stored.number] = _OpenFold(self._folds.projection.episode())
+        self._taken[stored.number].read(stored, self._event_of(stored), rows)
 
     def discard(self, number: int) -> None:
         """Drop the fold of an episode, because one of its events could not be folded."""
@@ -116,16 +120,15 @@ class BatchOfFolds:
         while self._taken:
             self._folds.keep(*self._taken.popitem())
 
-
-def _read(fold: _OpenFold, events: Sequence[StoredEvent], event_of: Callable[[StoredEvent], Event]) -> str | None:
-    """Fold events whose rows are written already; return the reason if one cannot be folded."""
-    for stored in events:
-        if stored.sequence != fold.reached + 1:
-            return None
-        try:
-            fold.read(event_of(stored), Changes())
-        except CannotFold as reason:
-            return f"event {stored.sequence}, read again: {reason}"
-        except Exception as error:  # noqa: BLE001 - user code; the reason parks the episode
-            return f"event {stored.sequence}, read again: {type(error).__name__}: {error}"
-    return None
+    def _read_again(self, fold: _OpenFold, events: Sequence[StoredEvent], last: int) -> str | None:
+        """Fold events up to `last` whose rows are written already; return the reason if that is not possible."""
+        for stored in events:
+            if stored.sequence != fold.reached + 1:
+                break
+            try:
+                fold.read(stored, self._event_of(stored), Changes())
+            except CannotFold as reason:
+                return f"event {stored.sequence}, read again: {reason}"
+            except Exception as error:  # noqa: BLE001 - user code; the reason parks the episode
+                return f"event {stored.sequence}, read again: {type(error).__name__}: {error}"
+        return None if fold.reached == last else f"event {fold.reached + 1} is missing in the log"

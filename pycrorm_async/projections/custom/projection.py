@@ -17,12 +17,12 @@ from __future__ import annotations
 
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias, final, get_args
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.fields import is_reserved
-from pycrorm_async.events.types import Happening
+from pycrorm_async.events.types import DesignatorTypeDeclared, Happening
 from pycrorm_async.projections.fold.column_values import in_slot, row
 from pycrorm_async.projections.schema.core_columns import Storage
 from pycrorm_async.projections.schema.user_views import UserView
@@ -55,6 +55,7 @@ class Event(NamedTuple):
         happening: the payload, one of `pycrorm_async.events.types`.
         dtype: of a NodeStarted, its designator's type; None for others.
         parameters: of a NodeStarted, by field, as `NodeStarted.parameters`; None for one that could not be recorded.
+        declaration: of a NodeStarted, that of its designator's type; None for others.
     """
 
     number: int
@@ -64,6 +65,7 @@ class Event(NamedTuple):
     happening: Happening
     dtype: str | None
     parameters: Mapping[str, Any]
+    declaration: DesignatorTypeDeclared | None = None
 
     @property
     def id(self) -> int:
@@ -99,12 +101,14 @@ class Projection(ABC):
         tables: columns and their storage (`row` for the id of one, `integer`, `real`, `text`, `boolean`, `time` in µs
             since 1970, `json`). Every table also has `id`, and `process_metadata_id` for its episode.
         views: named queries over these tables, created beside them.
+        reads: the types of events that the fold gets. Events of other types cost it nothing; None: all types.
     """
 
     name: ClassVar[str]
     version: ClassVar[int] = 1
     tables: ClassVar[Mapping[str, Mapping[str, Column]]]
     views: ClassVar[Sequence[UserView]] = ()
+    reads: ClassVar[Collection[type[Happening]] | None] = None
 
     @abstractmethod
     def fold(self, event: Event, rows: Changes) -> None:

@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any
 
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.events.codec import unwritable
-from pycrorm_async.events.types import DesignatorTypeDeclared, NodeStarted
-from pycrorm_async.projections.custom.episode_folds import BatchOfFolds, EpisodeFolds
+from pycrorm_async.events.types import DesignatorTypeDeclared
+from pycrorm_async.projections.custom.episode_folds import EpisodeFolds
+from pycrorm_async.projections.custom.projected_batch import ProjectedBatch
 from pycrorm_async.projections.custom.projection import (
     OF_EVERY_TABLE,
     Changes,
-    EpisodeProjection,
-    Event,
     Projection,
     columns_of,
 )
-from pycrorm_async.projections.fold.column_values import is_missing, json_text, microseconds
-from pycrorm_async.projections.fold.fold import CannotFold, happening_of
+from pycrorm_async.projections.fold.column_values import json_text
+from pycrorm_async.projections.fold.fold import CannotFold
 from pycrorm_async.projections.fold.row_batch import Row
 from pycrorm_async.projections.fold.row_writer import stored_rows
 from pycrorm_async.projections.schema.core_columns import OWN, Storage
@@ -27,22 +26,15 @@ from pycrorm_async.projections.schema.tables import column_type
 from pycrorm_async.projections.table_names import physical_name
 from pycrorm_async.store.dialect import Insertion
 from pycrorm_async.store.dialects import dialect_of
-from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.stored import Span, StoredEvent
+from pycrorm_async.store.stored import StoredEvent
 
 __all__ = ["CustomRows"]
 
 _INTEGER_MAX = 2**63 - 1
 
 
-class CustomRows:
-    """Rows to insert, and changes of rows that an earlier batch inserted, by table and id. Implements `Batch`.
-
-    Args:
-        projection: to fold with.
-        declared: designator types by fingerprint.
-        folds: of an `EpisodeProjection`, those of the episodes that earlier batches began.
-    """
+class CustomRows(ProjectedBatch):
+    """Rows to insert, and changes of rows that an earlier batch inserted, by table and id. Implements `Batch`."""
 
     def __init__(
         self,
@@ -50,39 +42,14 @@ class CustomRows:
         declared: Mapping[str, DesignatorTypeDeclared],
         folds: EpisodeFolds | None = None,
     ) -> None:
-        self._projection = projection
-        self._folds: BatchOfFolds | None = None
-        if isinstance(projection, EpisodeProjection):
-            self._folds = BatchOfFolds(EpisodeFolds(projection) if folds is None else folds)
-        self._fold = projection.fold if self._folds is None else self._folds.fold
-        self._declared = declared
+        super().__init__(projection, declared, folds)
         self._columns = columns_of(projection)
         self._inserts: dict[str, dict[int, dict[str, Any]]] = {name: {} for name in self._columns}
         self._updates: dict[str, dict[int, dict[str, Any]]] = {name: {} for name in self._columns}
         self._insertion: Insertion = None
 
-    async def restore(self, log: EventLog, spans: Sequence[Span]) -> None:
-        """Restore the folds of the episodes that this batch continues."""
-        if self._folds is not None:
-            await self._folds.restore(log, spans, self._event)
-
-    def fold(self, event: StoredEvent) -> None:
-        """Add the projection's changes for this event. Raises `CannotFold`, and then has added none."""
-        try:
-            self._add(event)
-        except CannotFold:
-            if self._folds is not None:
-                self._folds.discard(event.number)
-            raise
-
-    def _add(self, event: StoredEvent) -> None:
-        changes = Changes()
-        try:
-            self._fold(self._event(event), changes)
-        except CannotFold:
-            raise
-        except Exception as error:
-            raise CannotFold(f"{self._projection.name} raised {type(error).__name__}: {error}") from error
+    def add(self, event: StoredEvent, changes: Changes) -> None:
+        """Add the changes of one event, if both databases store their values alike. Raises `CannotFold`."""
         new: set[tuple[str, int]] = set()
         checked = []
         for inserts, table, id_, columns in changes.all:
@@ -111,8 +78,7 @@ class CustomRows:
 
     async def ready(self, engine: AsyncEngine, generation: int) -> None:
         """Prepare the statements that insert the rows, and leave the folds of the episodes to the next batch."""
-        if self._folds is not None:
-            self._folds.give_back()
+        await super().ready(engine, generation)
         self._insertion = await dialect_of(engine).insertion(stored_rows(engine, self.to_insert(), generation))
 
     async def write(self, connection: AsyncConnection, generation: int) -> None:
@@ -131,17 +97,6 @@ class CustomRows:
                     for name in ("id", *columns)
                 }
                 await dialect.update_rows(connection, physical_name(f"{OWN}{table}", generation), kinds, changed)
-
-    def _event(self, stored: StoredEvent) -> Event:
-        happening = happening_of(stored)
-        dtype, parameters = None, {}
-        if isinstance(happening, NodeStarted) and happening.designator is not None:
-            if happening.designator not in self._declared:
-                raise CannotFold(f"the designator type {happening.designator} was never declared")
-            dtype = self._declared[happening.designator].dtype
-            parameters = {name: None if is_missing(each) else each for name, each in happening.parameters.items()}
-        number, sequence, _, _, wall_ns, monotonic_ns, _ = stored
-        return Event(number, sequence, microseconds(wall_ns), monotonic_ns, happening, dtype, parameters)
 
     def _checked(self, event: StoredEvent, table: str, id_: Any, values: Mapping[str, Any]) -> dict[str, Any]:
         columns = self._columns.get(table)
