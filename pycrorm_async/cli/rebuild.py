@@ -16,7 +16,7 @@ from pycrorm_async.errors import CallerError
 from pycrorm_async.operations.rebuild import RebuildSummary, projections_of, rebuild_memory, rebuild_projection
 from pycrorm_async.progress_bar import watched
 from pycrorm_async.projections.custom.discovery import installed_projections, load_projections
-from pycrorm_async.projections.custom.projection import Projection
+from pycrorm_async.projections.custom.projection import PackedProjection, Projection
 
 __all__ = ["rebuild"]
 
@@ -55,12 +55,15 @@ def rebuild(
     collect_seldom()
     chosen = asyncio.run(_choose(url, names or [], projections))
     summaries = {name: asyncio.run(_rebuild(url, workers, projections.get(name))) for name in chosen}
+    # Those of this package are made with the tables, and are only named where they were asked for.
+    built_in = {name for name, each in projections.items() if isinstance(each, PackedProjection)}
+    shown = [name for name in summaries if name not in built_in or name in (names or ())]
     if as_json:
         tables = summaries["tables"]._asdict() if "tables" in summaries else {}
-        others = {name: each._asdict() for name, each in summaries.items() if name in projections}
+        others = {name: summaries[name]._asdict() for name in shown if name in projections}
         print_json({**tables, "projections": others} if others else tables)
     for name, each in summaries.items():
-        if not as_json:
+        if not as_json and name in shown:
             rate = each.events / max(each.seconds, 1e-9)
             stdout.print(
                 f"{f'{name}, ' if name in projections else ''}generation {each.generation}: {each.events} events of"

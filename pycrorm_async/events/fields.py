@@ -53,7 +53,7 @@ _RESERVED_TABLES = frozenset(
     " quaternion object object_removal object_part believe_object parameter_item attachment joint_change"
     " location_resolution location_candidate location_refusal detection state_sample simulated_episode designator_type"
     " observation observation_value episode_tag episode_tagging episode_robot"
-    " pick_up_with_context_view pickupwithcontextview root_failure"
+    " pick_up_with_context_view pickupwithcontextview root_failure recall_block recall_column"
     " object_description concept concept_ancestor object_concept spatial_relation".split()
 )
 """The memory's own tables and views, including planned ones."""

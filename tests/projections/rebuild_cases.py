@@ -87,7 +87,7 @@ async def folded_elsewhere(url: str, folder: Path) -> Tables:
 
 def traces(url: str) -> list[str]:
     """Return what is useless after a rebuild: tables of another generation, notes, replaced views, a file beside the
-    database.
+    database. The cases have tables and a generation of their own.
     """
     at = "memory_tables." if url.startswith("postgresql:") else ""
     notes = [name for (name,) in ask(url, f"SELECT projection FROM {at}pycrorm_generation")]
@@ -98,7 +98,11 @@ def traces(url: str) -> list[str]:
         else "SELECT name FROM sqlite_master WHERE type = 'table'"
     )
     tables = [name for (name,) in ask(url, listed)]
-    traces_left = [each for each in notes if each != "tables"]
+    cases = f"SELECT generation FROM {at}pycrorm_generation WHERE projection = 'projection/recall'"
+    made = ("pycrorm_own_recall_block", "pycrorm_own_recall_column", "pycrorm_progress_recall")
+    of_cases = {f"zz_{table}__{number}" for (number,) in ask(url, cases) for table in made}
+    tables = [each for each in tables if each not in of_cases]
+    traces_left = [each for each in notes if each not in ("tables", "projection/recall")]
     traces_left += [each for each in tables if "__" in each and not each.endswith(f"__{current}")]
     traces_left += [each for each in tables if "pycrorm_progress" in each]
     if at:

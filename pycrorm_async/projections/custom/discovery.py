@@ -1,4 +1,4 @@
-"""Discover custom projections: those given by the caller and those installed as entry points.
+"""Discover custom projections: those given by the caller, those installed as entry points, and those of this package.
 
 A package declares a projection in its `pyproject.toml`:
 
@@ -23,6 +23,8 @@ from pycrorm_async.projections.custom.projection import Projection, columns_of
 __all__ = ["GROUP", "validate_projections", "load_projections", "installed_projections"]
 
 GROUP = "pycrorm.projections"
+_OF_THIS_PACKAGE = ("pycrorm_async.recall.cases.case_projection:CaseProjection",)
+"""The projections of every memory. They are loaded by name, because their folders are above this one."""
 
 _log = logging.getLogger("pycrorm_async.projections")
 
@@ -73,12 +75,14 @@ def _instance(kind: Any, reference: str) -> Projection:
 
 
 def installed_projections(projections: Sequence[Projection]) -> tuple[Projection, ...]:
-    """Return the installed projections whose names these do not have. A faulty one is logged and left out.
+    """Return the installed projections whose names these do not have, and those of this package. A faulty one is
+    logged and left out.
 
     What is installed while the process runs is not found, as a new version of a loaded module is not.
     """
     names = {each.name for each in projections}
-    installed: list[Projection] = []
+    installed = [each for each in _own() if each.name not in names]
+    names.update(each.name for each in installed)
     for entry in _entries():
         try:
             projection = _instance(entry.load(), entry.value)
@@ -90,6 +94,11 @@ def installed_projections(projections: Sequence[Projection]) -> tuple[Projection
             names.add(projection.name)
             installed.append(projection)
     return tuple(installed)
+
+
+@cache
+def _own() -> tuple[Projection, ...]:
+    return tuple(map(_load_projection, _OF_THIS_PACKAGE))
 
 
 @cache

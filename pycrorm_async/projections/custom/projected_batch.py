@@ -10,7 +10,13 @@ from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.events.types import EVENT_TYPES, DesignatorTypeDeclared, NodeStarted
 from pycrorm_async.projections.custom.episode_folds import BatchOfFolds, EpisodeFolds
-from pycrorm_async.projections.custom.projection import Changes, EpisodeProjection, Event, Projection
+from pycrorm_async.projections.custom.projection import (
+    Changes,
+    EpisodeProjection,
+    Event,
+    PackedProjection,
+    Projection,
+)
 from pycrorm_async.projections.fold.column_values import is_missing, microseconds
 from pycrorm_async.projections.fold.fold import CannotFold, happening_of
 from pycrorm_async.store.log import EventLog
@@ -88,7 +94,7 @@ class ProjectedBatch(ABC):
         parameters: Mapping[str, Any] = {}
         if isinstance(happening, NodeStarted) and happening.designator is not None:
             declaration = self._declared.get(happening.designator)
-            if declaration is None:
+            if declaration is None and not isinstance(self._projection, PackedProjection):
                 raise CannotFold(f"the designator type {happening.designator} was never declared")
             parameters = {name: None if is_missing(each) else each for name, each in happening.parameters.items()}
         number, sequence, _, _, wall_ns, monotonic_ns, _ = stored

@@ -18,7 +18,7 @@ from __future__ import annotations
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias, final, get_args
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, TypeAlias, final, get_args
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.fields import is_reserved
@@ -27,9 +27,16 @@ from pycrorm_async.projections.fold.column_values import in_slot, row
 from pycrorm_async.projections.schema.core_columns import Storage
 from pycrorm_async.projections.schema.user_views import UserView
 
+if TYPE_CHECKING:
+    from pycrorm_async.projections.custom.episode_folds import EpisodeFolds
+    from pycrorm_async.projections.custom.projected_batch import ProjectedBatch
+    from pycrorm_async.projections.verify.findings import VerifyResult
+    from pycrorm_async.projections.verify.parts import PartCheck
+
 __all__ = [
     "Projection",
     "EpisodeProjection",
+    "PackedProjection",
     "EpisodeFold",
     "Event",
     "Changes",
@@ -154,6 +161,22 @@ class EpisodeProjection(Projection):
         raise TypeError(f"{self.name} folds events with what `episode()` returns")
 
 
+class PackedProjection(EpisodeProjection):
+    """The base class of projections of this package that pack rows into other rows, as cases into blocks.
+
+    Its tables may have columns of every storage, and names that are reserved for it. A row of the fold is no row of a
+    table: `batch` collects and packs it.
+    """
+
+    @abstractmethod
+    def batch(self, declared: Mapping[str, DesignatorTypeDeclared], folds: EpisodeFolds) -> ProjectedBatch:
+        """Return an empty batch."""
+
+    @abstractmethod
+    def check(self, result: VerifyResult) -> PartCheck:
+        """Return the check that compares the tables with the log."""
+
+
 def columns_of(projection: Projection) -> dict[str, dict[str, Storage]]:
     """Return the projection's tables with all their columns. Raises `CallerError` for an invalid projection."""
     fault = _fault_in(projection)
@@ -171,16 +194,18 @@ def _fault_in(projection: Projection) -> str | None:
         return f"its version is {version!r}, and must be an integer > 0"
     if not getattr(projection, "tables", None):
         return "it has no tables: set `tables`"
+    packed = isinstance(projection, PackedProjection)
+    storages = get_args(Storage if packed else Column)
     for table, columns in projection.tables.items():
         if not _NAME.fullmatch(table):
             return f"the table name {table!r} must be lower-case letters, digits and underscores, 40 at most"
-        if is_reserved(table):
+        if is_reserved(table) and not packed:
             return f"the table name {table!r} is used by the memory itself"
         for column, storage in columns.items():
             if not _NAME.fullmatch(column) or column in OF_EVERY_TABLE:
                 return f"the column name {table}.{column} is reserved, or has other characters than a-z, 0-9 and _"
-            if storage not in get_args(Column):
-                return f"the column {table}.{column} is {storage!r}, and must be one of {', '.join(get_args(Column))}"
+            if storage not in storages:
+                return f"the column {table}.{column} is {storage!r}, and must be one of {', '.join(storages)}"
     if any(each.materialised for each in projection.views):
         return "a view of a projection cannot be materialised: its tables are stored already"
     names = [*projection.tables, *(each.name for each in projection.views)]

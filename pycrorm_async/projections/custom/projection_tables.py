@@ -10,6 +10,7 @@ import asyncio
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import msgspec
@@ -19,7 +20,12 @@ from sqlalchemy.ext.asyncio import AsyncConnection
 from pycrorm_async.errors import CallerError, DatabaseForeign, DatabaseUnavailable, PycrormError
 from pycrorm_async.events.codec import declaration_of, fingerprint
 from pycrorm_async.projections.custom.episode_folds import EpisodeFolds
-from pycrorm_async.projections.custom.projection import EpisodeProjection, Projection, columns_of
+from pycrorm_async.projections.custom.projection import (
+    EpisodeProjection,
+    PackedProjection,
+    Projection,
+    columns_of,
+)
 from pycrorm_async.projections.custom.projection_rows import CustomRows
 from pycrorm_async.projections.run import checkpoints
 from pycrorm_async.projections.run.batch_fold import Batch, BatchFold
@@ -72,7 +78,11 @@ class CustomFoldDefinition:
                 declared[fingerprint(payload)] = declaration_of(payload)
             except ValueError:  # from a newer version: its nodes cannot be folded
                 continue
-        return layout, lambda: CustomRows(self._projection, declared, self._folds)
+        projection, folds = self._projection, self._folds
+        if isinstance(projection, PackedProjection):
+            assert folds is not None, "it is an EpisodeProjection"
+            return layout, partial(projection.batch, declared, folds)
+        return layout, partial(CustomRows, projection, declared, folds)
 
 
 def layout_of(projection: Projection, dialect: Dialect) -> Layout:

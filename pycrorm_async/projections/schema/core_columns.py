@@ -7,10 +7,10 @@ from typing import Literal, TypeAlias
 __all__ = ["Storage", "EPISODE", "OWN", "CORE", "LINK_BOX", "OF_NO_EPISODE", "COLUMNS"]
 
 Storage: TypeAlias = Literal[
-    "key", "row", "pose", "object", "integer", "real", "text", "boolean", "time", "json", "number"
+    "key", "row", "pose", "object", "integer", "real", "text", "boolean", "time", "json", "bytes", "number"
 ]
-"""The storage of a column: part of the key, the id of a row (of `pose`, of `object`), a scalar, µs since 1970, JSON, or
-the number of an episode or of an event, which 32 bits hold."""
+"""The storage of a column: part of the key, the id of a row (of `pose`, of `object`), a scalar, µs since 1970, JSON,
+bytes, or the number of an episode or of an event, which 32 bits hold."""
 
 OWN = "pycrorm_own_"
 """The prefix of the tables of custom projections, so that they never collide with the table of a designator."""

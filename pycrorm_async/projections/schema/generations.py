@@ -29,7 +29,7 @@ from functools import lru_cache
 from typing import Any, Literal, TypeAlias
 
 import msgspec
-from sqlalchemy import Dialect, Integer, Text, column, delete, literal, select, table, text
+from sqlalchemy import Dialect, Integer, LargeBinary, Text, column, delete, literal, select, table, text
 from sqlalchemy.ext.asyncio import AsyncConnection
 from sqlalchemy.schema import CreateColumn, CreateIndex, CreateTable, ExecutableDDLElement, Index
 
@@ -39,7 +39,7 @@ from pycrorm_async.projections.schema.estimates import expected
 from pycrorm_async.projections.schema.layout import Layout
 from pycrorm_async.projections.schema.materialised_views import make_materialised, materialised_tables, shown_texts
 from pycrorm_async.projections.schema.public_views import Tables, ViewDefinition, projection_views, public_views
-from pycrorm_async.projections.schema.tables import indexed, leaf_columns, make_table
+from pycrorm_async.projections.schema.tables import columns_in_order, indexed, leaf_columns, make_table
 from pycrorm_async.projections.schema.user_views import view_text
 from pycrorm_async.projections.table_names import index_name, physical_name
 from pycrorm_async.store.dialects import dialect_of
@@ -364,7 +364,11 @@ def _definitions(
         key=lambda each: str(each.name),
     )
     definitions: list[ExecutableDDLElement] = [CreateTable(table), *map(CreateIndex, indexes)]
-    return tuple(str(each.compile(dialect=syntax.dialect)) for each in definitions)
+    statements = [str(each.compile(dialect=syntax.dialect)) for each in definitions]
+    if syntax.name == "postgresql":  # bytes are packed already, so that compressing them again only takes time
+        packed = [each.name for each in columns_in_order(table) if isinstance(each.type, LargeBinary)]
+        statements += [f"ALTER TABLE {table.name} ALTER COLUMN {each} SET STORAGE EXTERNAL" for each in packed]
+    return tuple(statements)
 
 
 async def _add_columns(

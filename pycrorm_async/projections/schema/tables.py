@@ -15,12 +15,24 @@ from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any
 
-from sqlalchemy import BigInteger, Boolean, Column, Double, Index, Integer, MetaData, PrimaryKeyConstraint, Table, Text
+from sqlalchemy import (
+    BigInteger,
+    Boolean,
+    Column,
+    Double,
+    Index,
+    Integer,
+    LargeBinary,
+    MetaData,
+    PrimaryKeyConstraint,
+    Table,
+    Text,
+)
 from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.sql.functions import FunctionElement
 from sqlalchemy.types import TypeEngine
 
-from pycrorm_async.projections.schema.core_columns import CORE, EPISODE, LINK_BOX, Storage
+from pycrorm_async.projections.schema.core_columns import CORE, EPISODE, LINK_BOX, OWN, Storage
 from pycrorm_async.projections.table_names import index_name, physical_name
 
 __all__ = [
@@ -36,6 +48,8 @@ _TEXT_KEYS = {
     ("joint_change", "joint"),
     ("state_sample", "channel"),
     (LINK_BOX, "model"),
+    (f"{OWN}recall_column", "feature"),
+    (f"{OWN}recall_column", "kind"),
 }
 
 _INDEXED = {
@@ -66,7 +80,7 @@ _PICK_UPS = "PickUpAction", ("status", "id"), (EPISODE, "robot_pose_id", "torso_
 """An index on PostgreSQL for the nodes of this type alone: its key columns, and columns without being part of the key.
 An index-only scan saves `PickUpWithContextView` reading a page for each node, half of the learning query's time."""
 
-_WIDTHS: dict[Storage, int] = {"number": 4, "boolean": 1, "text": 0, "json": 0}
+_WIDTHS: dict[Storage, int] = {"number": 4, "boolean": 1, "text": 0, "json": 0, "bytes": 0}
 """The bytes to which PostgreSQL aligns a column, 8 for the others. Columns in this order need no bytes in between."""
 
 _ORDER = "order"
@@ -185,3 +199,5 @@ def column_type(storage: Storage) -> TypeEngine[Any]:
             return Boolean()
         case "text" | "json":
             return Text()
+        case "bytes":
+            return LargeBinary()

@@ -34,7 +34,7 @@ from pycrorm_async.projections.verify.episode_check import EpisodeCheck
 from pycrorm_async.projections.verify.findings import Damage, StoppedEpisode, VerifyResult
 from pycrorm_async.projections.verify.parts import EpisodeRange, Place, Unreadable
 from pycrorm_async.projections.verify.row_comparison import Comparison, Range
-from pycrorm_async.projections.verify.verify_custom import ProjectionCheck, uncompared_projections
+from pycrorm_async.projections.verify.verify_custom import check_of, uncompared_projections
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import EpisodeRow, Span, StoredEvent
@@ -104,7 +104,7 @@ async def verify(
         for each in projections:
             if each.name not in result.not_compared:
                 try:
-                    await within.check(log, ProjectionCheck(each, result))
+                    await within.check(log, check_of(each, result))
                 except DamageError as fault:
                     result.add_damage(None, None, str(fault))
     return result

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from sqlalchemy import text
 from sqlalchemy.ext.asyncio import AsyncConnection
 
-from pycrorm_async.projections.custom.projection import Projection
+from pycrorm_async.projections.custom.projection import PackedProjection, Projection
 from pycrorm_async.projections.custom.projection_rows import CustomRows
 from pycrorm_async.projections.custom.projection_tables import CustomFoldDefinition, fault_in_version, layout_of
 from pycrorm_async.projections.fold.fold import CannotFold
@@ -16,13 +16,18 @@ from pycrorm_async.projections.run.batch_fold import Batch
 from pycrorm_async.projections.schema.core_columns import OWN
 from pycrorm_async.projections.schema.generations import Generation, projections_in, read_generations
 from pycrorm_async.projections.verify.findings import VerifyResult
-from pycrorm_async.projections.verify.parts import EpisodeRange, Place
+from pycrorm_async.projections.verify.parts import EpisodeRange, PartCheck, Place
 from pycrorm_async.projections.verify.row_comparison import Comparison, Difference, Range
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import Span
 
-__all__ = ["ProjectionCheck", "uncompared_projections"]
+__all__ = ["ProjectionCheck", "check_of", "uncompared_projections"]
+
+
+def check_of(projection: Projection, result: VerifyResult) -> PartCheck:
+    """Return the check of the tables of this projection."""
+    return projection.check(result) if isinstance(projection, PackedProjection) else ProjectionCheck(projection, result)
 
 
 async def uncompared_projections(log: EventLog, projections: Sequence[Projection]) -> dict[str, str]:
@@ -66,7 +71,6 @@ class ProjectionCheck:
         payloads = await dialect_of(connection).declarations(connection)
         _, batch = CustomFoldDefinition(self._projection).learn(comparison.generation.layout, payloads)
         rows = batch()
-        assert isinstance(rows, CustomRows)
         findings: list[Difference] = []
         count = 0
         following = within.end
@@ -86,12 +90,21 @@ class ProjectionCheck:
             if len(folded) == limit:
                 following = folded[-1][0] + 1
         lost = {each.number for each in findings}
-        made = Range(at.number << 31 or None, None if following is None else following << 31, None, None)
-        differences = await comparison.differences(connection, rows, made, carried=(), settled=())
-        self.result.rows += comparison.count
+        differences = await self.differences(connection, comparison, rows, EpisodeRange(at.number, following))
         for each in (*findings, *(each for each in differences if each.number not in lost)):
             self.result.add_difference(each._replace(table=each.table.removeprefix(OWN)))
         return None if following is None or following == within.end else Place(following)
+
+    async def differences(
+        self, connection: AsyncConnection, comparison: Comparison, rows: Batch, made: EpisodeRange
+    ) -> Sequence[Difference]:
+        """Compare the tables with the rows that the events of these episodes make; count the stored rows."""
+        assert isinstance(rows, CustomRows)
+        last = None if made.end is None else made.end << 31
+        within = Range(made.first << 31 or None, last, None, None)
+        differences = await comparison.differences(connection, rows, within, carried=(), settled=())
+        self.result.rows += comparison.count
+        return differences
 
     def _place(self, generation: Generation) -> str:
         return checkpoints.place_of(generation.number, self._projection.name)

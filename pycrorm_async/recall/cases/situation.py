@@ -1,0 +1,201 @@
+"""Describe the situation in which an action starts, as symbols and numbers by feature.
+
+| feature | |
+|---|---|
+| `robot` | name of the robot that acts |
+| `object_type`, `object_name` | of the object of its first parameter that is an object; of others `<field>_type` |
+| `near` | types of the objects within 0.5 m of this object |
+| `held` | types of the objects attached to the robot |
+| texts, enum members, booleans | by field; `True` and `False` for a boolean |
+| `stand_x`, `stand_y`, `stand_yaw` | pose of the robot in the object's frame |
+| `torso`, `object_z`, `height` | position of the torso, height of the object, and over the torso |
+| integers, reals | by field |
+| `<field>_x`, `_y`, `_z`, `_yaw` | a pose in the robot's frame |
+
+A parameter with a name that means something else, such as `status`, is the feature `status_parameter`. Times, lists
+and dicts are no features. The robot and the environment are never near.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from math import atan2
+from typing import Any, Final, NamedTuple, TypeAlias
+
+import msgspec
+
+from pycrorm_async.events.types import DesignatorTypeDeclared
+from pycrorm_async.events.values import PoseValue, RobotValue
+from pycrorm_async.projections.fold.world_fold import WorldFold, WorldObject
+from pycrorm_async.recall.case import RESERVED
+
+__all__ = ["FeatureFields", "Numbers", "Symbols", "situation"]
+
+Symbols: TypeAlias = dict[str, str | tuple[str, ...]]
+Numbers: TypeAlias = dict[str, float]
+
+_NEAR_M = 0.5
+"""The distance within which another object counts as near."""
+_OBJECTS_MAX: Final = 1_000
+"""Bounds the objects that are looked at for each action. In a world with more of them nothing is near."""
+_NUMBER_MAX: Final = 1e300
+"""Bounds the magnitude of a number. An integer may have any number of digits, and then has no float."""
+_NEVER_NEAR = frozenset({"ROBOT", "ENVIRONMENT"})
+_COMPUTED = RESERVED | frozenset(
+    "inside after after_status robot object_type object_name near held stand_x stand_y stand_yaw torso object_z"
+    " height".split()
+)
+
+
+class FeatureFields(NamedTuple):
+    """The fields of a designator type that are features, each with its feature."""
+
+    texts: tuple[tuple[str, str], ...]
+    numbers: tuple[tuple[str, str], ...]
+    poses: tuple[tuple[str, str], ...]
+    objects: tuple[str, ...]
+
+    @classmethod
+    def of(cls, declaration: DesignatorTypeDeclared) -> FeatureFields:
+        named: dict[str, list[str]] = {}
+        for each in declaration.fields:
+            named.setdefault(each.type, []).append(each.name)
+
+        def features(*types: str) -> tuple[tuple[str, str], ...]:
+            names = [name for type_ in types for name in named.get(type_, ())]
+            return tuple((name, f"{name}_parameter" if name in _COMPUTED else name) for name in names)
+
+        objects = tuple(named.get("object", ()))
+        return cls(features("text", "enum", "boolean"), features("integer", "real"), features("pose"), objects)
+
+
+def situation(
+    fields: FeatureFields, parameters: Mapping[str, Any], robot: RobotValue | None, world: WorldFold
+) -> tuple[Symbols, Numbers]:
+    """Return the features of an action that starts with these parameters, for this robot and in this world."""
+    symbols: Symbols = {}
+    numbers: Numbers = {}
+    _add_parameters(symbols, numbers, fields, parameters)
+    if robot is not None:
+        _add_robot(symbols, numbers, fields, parameters, robot)
+    identity = None
+    if fields.objects and (value := parameters.get(fields.objects[0])) is not None:
+        identity = value.get("object")
+        _add_object(symbols, numbers, _seen(value, world), robot)
+    for name in fields.objects[1:]:
+        if (value := parameters.get(name)) is not None and (type_ := _seen(value, world).type) is not None:
+            symbols[f"{name}_type"] = type_
+    if len(world.objects) <= _OBJECTS_MAX:
+        _add_surroundings(symbols, identity, robot, world.objects)
+    return symbols, numbers
+
+
+def _add_parameters(symbols: Symbols, numbers: Numbers, fields: FeatureFields, parameters: Mapping[str, Any]) -> None:
+    for name, feature in fields.texts:
+        if (value := parameters.get(name)) is not None:
+            symbols[feature] = value if isinstance(value, str) else str(value)
+    for name, feature in fields.numbers:
+        if (value := parameters.get(name)) is not None and abs(value) < _NUMBER_MAX:
+            numbers[feature] = float(value)
+
+
+def _add_robot(
+    symbols: Symbols, numbers: Numbers, fields: FeatureFields, parameters: Mapping[str, Any], robot: RobotValue
+) -> None:
+    if robot.name is not None:
+        symbols["robot"] = robot.name
+    if robot.torso_height is not None:
+        numbers["torso"] = robot.torso_height
+    for name, feature in fields.poses:
+        if (value := parameters.get(name)) is not None:
+            _add_pose(numbers, feature, value, robot.pose)
+
+
+class _Seen(NamedTuple):
+    """Name, type and pose of a parameter's object, as far as they are known."""
+
+    name: str | None
+    type: str | None
+    pose: PoseValue | None
+
+
+def _seen(value: Mapping[str, Any], world: WorldFold) -> _Seen:
+    """Return the state of a parameter's object, which may have been removed, or be outside of the recorded world."""
+    identity = value.get("object")
+    if identity is None:
+        pose = value.get("pose")
+        return _Seen(value.get("name"), value.get("object_type"), pose and msgspec.convert(pose, PoseValue))
+    present = world.objects.get(identity)
+    if present is None:
+        return _Seen(world.names.get(identity), None, None)
+    return _Seen(present.name, present.object_type, present.pose)
+
+
+def _add_object(symbols: Symbols, numbers: Numbers, seen: _Seen, robot: RobotValue | None) -> None:
+    if seen.type is not None:
+        symbols["object_type"] = seen.type
+    if seen.name is not None:
+        symbols["object_name"] = seen.name
+    if seen.pose is None:
+        return
+    height = seen.pose.position[2]
+    numbers["object_z"] = height
+    if robot is None or robot.pose.frame != seen.pose.frame:
+        return
+    if robot.torso_height is not None:
+        numbers["height"] = height - robot.pose.position[2] - robot.torso_height
+    numbers["stand_x"], numbers["stand_y"], _ = _position_in(robot.pose.position, seen.pose)
+    numbers["stand_yaw"] = _yaw_in(robot.pose.orientation, seen.pose.orientation)
+
+
+def _add_surroundings(
+    symbols: Symbols, identity: int | None, robot: RobotValue | None, objects: Mapping[int, WorldObject]
+) -> None:
+    target = objects.get(identity) if identity is not None else None
+    if target is not None:
+        near = {each.object_type for each in objects.values() if each is not target and _is_near(each, target)}
+        if near:
+            symbols["near"] = tuple(sorted(near))
+    if robot is not None and robot.object is not None:
+        holder = robot.object.object
+        attached = (each for each in objects.values() if each.attached_to is not None)
+        held = {each.object_type for each in attached if each.attached_to and each.attached_to[0] == holder}
+        if held:
+            symbols["held"] = tuple(sorted(held))
+
+
+def _is_near(each: WorldObject, target: WorldObject) -> bool:
+    if each.object_type in _NEVER_NEAR:
+        return False
+    x, y, z = each.pose.position
+    to_x, to_y, to_z = target.pose.position
+    return (x - to_x) ** 2 + (y - to_y) ** 2 + (z - to_z) ** 2 <= _NEAR_M**2
+
+
+def _add_pose(numbers: dict[str, float], feature: str, value: Any, robot: PoseValue) -> None:
+    pose = msgspec.convert(value, PoseValue)
+    if pose.frame == robot.frame:
+        x, y, z = _position_in(pose.position, robot)
+        yaw = _yaw_in(pose.orientation, robot.orientation)
+        numbers |= {f"{feature}_x": x, f"{feature}_y": y, f"{feature}_z": z, f"{feature}_yaw": yaw}
+
+
+def _position_in(position: Sequence[float], frame: PoseValue) -> tuple[float, float, float]:
+    """Return a position in the frame of a pose."""
+    (x, y, z, w), (at_x, at_y, at_z) = frame.orientation, frame.position
+    dx, dy, dz = position[0] - at_x, position[1] - at_y, position[2] - at_z
+    return (
+        (1 - 2 * (y * y + z * z)) * dx + 2 * (x * y + z * w) * dy + 2 * (x * z - y * w) * dz,
+        2 * (x * y - z * w) * dx + (1 - 2 * (x * x + z * z)) * dy + 2 * (y * z + x * w) * dz,
+        2 * (x * z + y * w) * dx + 2 * (y * z - x * w) * dy + (1 - 2 * (x * x + y * y)) * dz,
+    )
+
+
+def _yaw_in(orientation: Sequence[float], frame: Sequence[float]) -> float:
+    """Return the yaw of an orientation in the frame of another; both are quaternions xyzw."""
+    (x, y, z, w), (fx, fy, fz, fw) = orientation, frame
+    qx = fw * x - fx * w - fy * z + fz * y
+    qy = fw * y + fx * z - fy * w - fz * x
+    qz = fw * z - fx * y + fy * x - fz * w
+    qw = fw * w + fx * x + fy * y + fz * z
+    return atan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz))
