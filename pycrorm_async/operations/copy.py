@@ -23,6 +23,7 @@ from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EpisodeId, episode_text, parse_episode_id
 from pycrorm_async.events.types import EVENT_TYPES
 from pycrorm_async.operations.destination import LogAndTables, shared_address
+from pycrorm_async.projections.custom.discovery import own_projections
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
@@ -105,7 +106,7 @@ async def _open_target(address: DatabaseAddress, source: EventLog) -> AsyncItera
                 f"{source.address} and {address} are the same memory, or file copies of one memory: copy to a new URL"
             )
         log.blobs.source = source.blobs
-        projector = Projector(log)
+        projector = Projector(log, installed=own_projections())
         await retry(projector.open, backoff=BRIEF)  # another copy may be creating the tables
         yield log, LogAndTables(log, projector)
     finally:

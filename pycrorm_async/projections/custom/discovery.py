@@ -20,7 +20,7 @@ from typing import Any
 from pycrorm_async.errors import CallerError
 from pycrorm_async.projections.custom.projection import Projection, columns_of
 
-__all__ = ["GROUP", "validate_projections", "load_projections", "installed_projections"]
+__all__ = ["GROUP", "validate_projections", "load_projections", "installed_projections", "own_projections"]
 
 GROUP = "pycrorm.projections"
 _OF_THIS_PACKAGE = ("pycrorm_async.recall.cases.case_projection:CaseProjection",)
@@ -81,7 +81,7 @@ def installed_projections(projections: Sequence[Projection]) -> tuple[Projection
     What is installed while the process runs is not found, as a new version of a loaded module is not.
     """
     names = {each.name for each in projections}
-    installed = [each for each in _own() if each.name not in names]
+    installed = [each for each in own_projections() if each.name not in names]
     names.update(each.name for each in installed)
     for entry in _entries():
         try:
@@ -97,7 +97,8 @@ def installed_projections(projections: Sequence[Projection]) -> tuple[Projection
 
 
 @cache
-def _own() -> tuple[Projection, ...]:
+def own_projections() -> tuple[Projection, ...]:
+    """Return the projections of this package, which every memory has."""
     return tuple(map(_load_projection, _OF_THIS_PACKAGE))
 
 

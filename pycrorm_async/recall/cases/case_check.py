@@ -55,7 +55,7 @@ class CaseCheck(ProjectionCheck):
             for case in _without(left_out, _of_episodes(block, made.first, end)):
                 self.result.rows += 1
                 if case.node in stored:
-                    differences.append(_difference(case.node, None, "in two blocks", "in one block"))
+                    differences.append(_difference(case.node, "blocks with it", 2, 1))
                 stored[case.node] = case
         for node in sorted(expected.keys() | stored.keys()):
             differences += _compared(node, stored.get(node), expected.get(node))

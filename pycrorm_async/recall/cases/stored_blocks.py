@@ -64,9 +64,8 @@ _FORMAT: Final = 1
 _MERGED: Final = 16
 """The number of blocks of one level that are merged into one of the next level."""
 _FULL_LEVEL: Final = 4
-_FULL_CASES: Final = _MERGED**_FULL_LEVEL
-"""The cases of a block that is not merged any more. Its columns take some 4 MB, and merging it would hold the write
-lock of SQLite for 50 ms."""
+"""The level of a block that is not merged any more, with 65,536 cases. Its columns take some 4 MB, and merging several
+of them would hold the write lock of SQLite for long."""
 _NO_EPISODE: Final = 0
 """The episode of the rows of blocks, because a block has cases of many."""
 
@@ -184,11 +183,16 @@ _ADVICE = "run `pycrorm rebuild recall`"
 
 
 def _is_enough(count: int, cases: int) -> bool:
-    return count >= _MERGED or cases >= _FULL_CASES
+    return count >= _MERGED or cases >= _MERGED**_FULL_LEVEL
 
 
 def _level_of(cases: int) -> int:
-    return min(_FULL_LEVEL, (cases.bit_length() - 1) // 4)
+    """Return the greatest level whose blocks have at least so many cases.
+
+    >>> [_level_of(cases) for cases in (1, 15, 16, 4_095, 4_096, 65_535, 65_536, 131_071)]
+    [0, 0, 1, 2, 3, 3, 4, 4]
+    """
+    return max(level for level in range(_FULL_LEVEL + 1) if cases >= _MERGED**level)
 
 
 def _checksum(row: BlockRow) -> int:

@@ -1,0 +1,250 @@
+"""Stored cases are those that the log makes: in any batches, on both databases, after merges, kills and rebuilds."""
+
+from __future__ import annotations
+
+import asyncio
+import multiprocessing
+import os
+import signal
+from collections import Counter
+from random import Random
+
+import pytest
+
+from pycrorm_async.errors import DamageError
+from pycrorm_async.projections.custom.discovery import own_projections
+from pycrorm_async.projections.custom.projection_tables import states
+from pycrorm_async.projections.projector import Projector
+from pycrorm_async.projections.rebuild import Rebuild, claimed
+from pycrorm_async.projections.replaced_tables import clear
+from pycrorm_async.projections.schema.generations import PROJECTION, read_generation
+from pycrorm_async.projections.verify.verify import VerifyResult, verify
+from pycrorm_async.recall.case import Case
+from pycrorm_async.recall.cases import stored_blocks
+from pycrorm_async.recall.cases.stored_blocks import BlockHeading, read_blocks, read_headings
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.log import EventLog
+from tests.projections.event_script import mixed
+from tests.projections.sql_queries import ask
+from tests.recall.case_script import TYPES, CaseScript, cases_of, in_order, random_script
+
+
+async def projector_of(log: EventLog, *, batch_events: int = 10_000) -> Projector:
+    projector = Projector(log, installed=own_projections(), batch_events=batch_events)
+    await projector.open()
+    return projector
+
+
+async def stored(log: EventLog) -> tuple[list[BlockHeading], list[Case]]:
+    """Read all blocks; return their headings, and their cases by node."""
+    async with log.snapshot() as connection:
+        generation = await read_generation(connection, f"{PROJECTION}recall")
+        assert generation is not None
+        headings = await read_headings(connection, generation.number)
+        blocks = await read_blocks(connection, generation.number, [each.number for each in headings])
+    assert [each.cases for each in headings] == [len(blocks[each.number]) for each in headings]
+    return headings, in_order(case for each in blocks.values() for case in each.cases())
+
+
+async def verified(log: EventLog) -> VerifyResult:
+    return await verify(log, projections=own_projections())
+
+
+async def rebuilt(log: EventLog) -> None:
+    async with claimed(log):
+        rebuild = await Rebuild.begin(log, projection=own_projections()[0])
+        await rebuild.show()
+        assert await clear(log) == []
+
+
+def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Merge two blocks of a level, so that a block of 16 cases is full."""
+    monkeypatch.setattr(stored_blocks, "_MERGED", 2)
+
+
+@pytest.mark.slow
+async def test_cases_do_not_depend_on_batches_restarts_processes_or_merges(
+    log: EventLog, monkeypatch: pytest.MonkeyPatch, *, in_turn: bool
+) -> None:
+    small_blocks(monkeypatch)
+    random = Random(7)
+    scripts = [random_script(number, random, actions=40) for number in range(1, 60 if in_turn else 13)]
+    records = [each for first in range(0, len(scripts), 4) for each in mixed(*scripts[first : first + 4])]
+    await log.append(TYPES)
+    projectors = [await projector_of(log, batch_events=30)]
+    while records:
+        size = random.randint(20, 90)
+        await log.append(records[:size])
+        del records[:size]
+        if random.random() < 0.2:  # a restart, or another process beside the first
+            kept = projectors[: random.randint(0, 1)]
+            projectors = [*kept, await projector_of(log, batch_events=random.randint(5, 60))]
+        if random.random() < 0.7:
+            await random.choice(projectors).catch_up()
+    await asyncio.gather(*(each.catch_up() for each in projectors))
+    headings, cases = await stored(log)
+    expected = cases_of(*scripts)
+    assert cases == expected
+    assert len(headings) < 25
+    assert Counter(each.level for each in headings).keys() > {1}
+    result = await verified(log)
+    assert (result.drift, result.damage, result.not_compared) == (0, 0, {})
+    await rebuilt(log)
+    assert (await stored(log))[1] == expected
+
+
+async def test_blocks_are_merged_as_they_grow(log: EventLog) -> None:
+    script = CaseScript()
+    await log.append([*TYPES, *script.records])
+    projector = await projector_of(log)
+    for _ in range(40):
+        script.end(script.wait())
+        await log.append(script.records[-2:])
+        await projector.catch_up()
+    headings, cases = await stored(log)
+    assert sorted(each.level for each in headings) == [0] * 8 + [1] * 2
+    assert [each.cases for each in headings if each.level == 1] == [16, 16]
+    assert cases == cases_of(script)
+    (state,) = await states(log, own_projections())
+    assert (state.name, state.behind, state.parked, state.fault) == ("recall", 0, {}, None)
+
+
+async def filled(log: EventLog) -> list[Case]:
+    """Fold four episodes of which each gives one block; return their cases."""
+    random = Random(3)
+    scripts = [random_script(number, random, actions=30) for number in range(1, 5)]
+    await log.append(TYPES)
+    projector = await projector_of(log)
+    for script in scripts:
+        await log.append(script.records)
+        await projector.catch_up()
+    return cases_of(*scripts)
+
+
+BLOCK, COLUMN = (f"zz_pycrorm_own_recall_{each}__1001" for each in ("block", "column"))
+OF_SECOND = f"(SELECT id FROM {BLOCK} ORDER BY id LIMIT 1 OFFSET 1)"
+ARM = f"id = {OF_SECOND} AND feature = 'arm'"
+NODES = f"id = {OF_SECOND} AND feature = 'node'"
+COPIED = "process_metadata_id, feature, kind, words, data, checksum"
+HEADING = "process_metadata_id, level, cases, episode_min, episode_max, time_min, time_max, format"
+CHANGES = {
+    "a changed byte": (
+        {"sqlite": f"UPDATE {COLUMN} SET data = CAST(x'02' || substr(data, 2) AS BLOB) WHERE {ARM}",
+         "postgresql": f"UPDATE {COLUMN} SET data = set_byte(data, 0, 2) WHERE {ARM}"},
+        "is damaged: the bytes of its column 'arm' were changed",
+    ),
+    "a changed word": (f"UPDATE {COLUMN} SET words = replace(words, 'LEFT', 'BEST') WHERE {ARM}", "'arm' were changed"),
+    "a changed byte with its checksum": (
+        f"UPDATE {COLUMN} SET checksum = checksum + 1 WHERE {NODES}", "the bytes of its column 'node' were changed",
+    ),
+    "a missing column": (f"DELETE FROM {COLUMN} WHERE {ARM}", "recall_block.arm is None, and should be 'LEFT'"),
+    "a missing block": (f"DELETE FROM {BLOCK} WHERE id = {OF_SECOND}", "recall_block lacks a row: Case(node="),
+    "a block without columns": (f"DELETE FROM {COLUMN} WHERE id = {OF_SECOND}", "has 0 cases, and should have"),
+    "doubled cases": (
+        (
+            f"INSERT INTO {COLUMN} (id, {COPIED}) SELECT id + 3, {COPIED} FROM {COLUMN} WHERE id = {OF_SECOND}",
+            f"INSERT INTO {BLOCK} (id, {HEADING}) SELECT id + 3, {HEADING} FROM {BLOCK} WHERE id = {OF_SECOND}",
+        ),
+        "recall_block.blocks with it is 2, and should be 1",
+    ),
+}  # fmt: skip
+
+
+async def test_verify_finds_what_was_changed_and_a_rebuild_repairs_it(log: EventLog) -> None:
+    expected = await filled(log)
+    assert len((await stored(log))[0]) == 4
+    assert (await verified(log)).drift == 0
+    kind = log.engine.dialect.name
+    async with log.engine.begin() as connection:
+        for place in (BLOCK, COLUMN):
+            await connection.exec_driver_sql(f"CREATE TABLE kept_{place} AS SELECT * FROM {place}")
+    for change, message in CHANGES.values():
+        statements = change[kind] if isinstance(change, dict) else change
+        async with log.engine.begin() as connection:
+            for statement in [statements] if isinstance(statements, str) else statements:
+                await connection.exec_driver_sql(statement)
+        result = await verified(log)
+        assert any(message in str(each) for each in result.differences), (message, result.differences)
+        assert result.damage == 0
+        if change != list(CHANGES.values())[-1][0]:
+            async with log.engine.begin() as connection:
+                for place in (BLOCK, COLUMN):
+                    await connection.exec_driver_sql(f"DELETE FROM {place}")
+                    await connection.exec_driver_sql(f"INSERT INTO {place} SELECT * FROM kept_{place}")
+    await rebuilt(log)
+    assert (await stored(log))[1] == expected
+    assert (await verified(log)).drift == 0
+
+
+async def test_a_damaged_block_stops_the_merge_with_its_reason_and_no_other_fold(
+    log: EventLog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    await filled(log)
+    async with log.engine.begin() as connection:
+        await connection.exec_driver_sql(f"UPDATE {COLUMN} SET words = 'nonsense' WHERE {ARM}")
+    with pytest.raises(DamageError, match=r"block [0-9]+ of recall is damaged.*run `pycrorm rebuild recall`"):
+        await stored(log)
+    small_blocks(monkeypatch)
+    script = random_script(5, Random(5), actions=30)
+    await log.append(script.records)
+    await (await projector_of(log)).catch_up()
+    assert await ask(log, "SELECT count(*) FROM episode WHERE folded < head") == [(0,)]
+    (state,) = await states(log, own_projections())
+    assert state.fault is not None
+    assert "of recall is damaged" in state.fault
+    assert state.behind == len(script.records)
+    await rebuilt(log)
+    (state,) = await states(log, own_projections())
+    assert (state.fault, state.behind) == (None, 0)
+
+
+def _die(url: str, place: str, last: int) -> None:
+    """Fold twelve events at a time, and die where a function of `stored_blocks` is called for that time."""
+    count, real = 0, getattr(stored_blocks, place)
+
+    def counted(*arguments: object) -> object:
+        nonlocal count
+        count += 1
+        if count == last:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return real(*arguments)
+
+    async def fold() -> None:
+        log = await EventLog.open(DatabaseAddress.parse(url), create=True)
+        await (await projector_of(log, batch_events=12)).catch_up()
+
+    with pytest.MonkeyPatch.context() as patch:
+        small_blocks(patch)
+        patch.setattr(stored_blocks, place, counted)
+        asyncio.run(fold())
+
+
+@pytest.mark.slow
+@pytest.mark.soak_on("postgresql")
+@pytest.mark.parametrize(
+    ("place", "last"),
+    [
+        pytest.param("_full_level", 3, id="a block is written"),
+        pytest.param("_level_of", 8, id="the blocks of a merge are deleted"),
+    ],
+)
+async def test_a_fold_that_is_killed_in_a_block_or_a_merge_continues(
+    log: EventLog, database_url: str, monkeypatch: pytest.MonkeyPatch, place: str, last: int
+) -> None:
+    scripts = [random_script(number, Random(number), actions=40) for number in range(1, 4)]
+    await log.append([*TYPES, *mixed(*scripts)])
+    plain = Projector(log)
+    await plain.open()
+    await plain.catch_up()
+    process = multiprocessing.get_context("spawn").Process(target=_die, args=(database_url, place, last))
+    process.start()
+    await asyncio.to_thread(process.join)
+    assert process.exitcode == -signal.SIGKILL
+    expected = cases_of(*scripts)
+    _, before = await stored(log)
+    assert 0 < len(before) < len(expected)
+    assert before == [each for each in expected if each in before]
+    small_blocks(monkeypatch)
+    await (await projector_of(log)).catch_up()
+    assert (await stored(log))[1] == expected
+    assert (await verified(log)).drift == 0
