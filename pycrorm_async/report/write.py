@@ -21,6 +21,7 @@ from pycrorm_async.report.episode_data import episode_document
 from pycrorm_async.report.html_page import overview_page_of, page_of, write_page
 from pycrorm_async.report.output_file import refuse_existing
 from pycrorm_async.report.overview_data import newest_episodes, overview_document
+from pycrorm_async.report.success_data import success_documents
 
 __all__ = ["Overview", "Report", "overview", "report"]
 
@@ -111,5 +112,6 @@ async def overview(
             pages[each.number] = f"{quote(folder.name)}/{name}"
     title = f"Episodes with the tags {', '.join(tags)}" if tags else "Episodes"
     document = await overview_document(reading, title, episodes, total, pages, unreadable)
+    document["successes"] = await success_documents(reading, [each.number for each in episodes])
     await asyncio.to_thread(lambda: write_page(overview_page_of(document), file, force=force))
     return Overview(file, len(episodes), len(pages), total - len(episodes), unreadable)

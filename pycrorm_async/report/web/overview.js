@@ -2,6 +2,7 @@
 
 import { duration, element, recorded, svg } from "./dom.js";
 import { signOf } from "./episode.js";
+import { successMap } from "./success.js";
 
 const BINS_MAX = 12;
 const REASONS_MAX = 20;
@@ -45,8 +46,15 @@ function bars(values, most, label, textOf) {
 const unreadable = (reason) => element("p", { class: "reason" }, "✗ No page: ", recorded(reason));
 
 class Overview {
-  constructor({ title, total, episodes }) {
+  constructor({ title, total, episodes, successes = [] }) {
     Object.assign(this, { title, total, episodes, by: "number", down: true });
+    if (successes.length > 0) {
+      const { succeeded, rows } = successes[0];
+      const title = `Pick-ups: ${percent(succeeded / rows)} of ${rows} succeeded`;
+      const note = "The share of successes in per cent, by the robot's position relative to the object (m), and by arm and grasp.";
+      const maps = element("div", { class: "maps" }, ...successes.map(successMap));
+      part("success").replaceChildren(element("h2", {}, title), element("p", { class: "quiet" }, note), maps);
+    }
     this.#draw();
   }
 

@@ -1,0 +1,46 @@
+// Draws the share of successes over two columns as a heat map, with the number of rows in each cell.
+
+import { svg } from "./dom.js";
+
+const SIZE = 384;
+const TEXT_MIN = 30;
+const TICK_PX = 34;
+
+/** The map of a table: `cells` are [x, y, succeeded, rows]. */
+export function successMap({ x, y, cells, succeeded, rows }) {
+  const left = y.labels.length > 0 ? 14 + 7 * Math.max(...y.labels.map((each) => each.length)) : 46;
+  const [wide, high] = [SIZE / x.cells, Math.min(SIZE / y.cells, 64)];
+  const height = high * y.cells;
+  const label = `share of successes over ${x.name} and ${y.name}: ${succeeded} of ${rows}`;
+  const view = `0 -26 ${left + SIZE + 20} ${height + 70}`;
+  const picture = svg("svg", { viewBox: view, class: "success", role: "img", "aria-label": label });
+  for (const [column, row, good, count] of cells) {
+    const rate = good / count;
+    const [from, top] = [left + column * wide, height - (row + 1) * high];
+    const text = `${Math.round(rate * 100)} %`;
+    const cell = svg("g", { class: rate > 0.75 ? "cell lit" : "cell" });
+    const hint = `${placeOf(x, column)}, ${placeOf(y, row)}: ${text} of ${count}`;
+    const shape = { x: from, y: top, width: wide, height: high, "fill-opacity": 0.06 + 0.9 * rate };
+    cell.append(svg("title", {}, hint), svg("rect", shape));
+    const middle = { x: from + wide / 2, "text-anchor": "middle" };
+    if (wide >= TEXT_MIN && high >= TEXT_MIN) {
+      cell.append(svg("text", { ...middle, y: top + high / 2 - 2 }, text));
+      cell.append(svg("text", { ...middle, y: top + high / 2 + 12, class: "rows" }, `n = ${count}`));
+    } else cell.append(svg("text", { ...middle, y: top + high / 2 + 3, class: "small" }, String(Math.round(rate * 100))));
+    picture.append(cell);
+  }
+  for (const [at, text] of ticksOf(x, wide)) picture.append(svg("text", { x: left + at, y: height + 16, "text-anchor": "middle" }, text));
+  for (const [at, text] of ticksOf(y, high)) picture.append(svg("text", { x: left - 6, y: height - at + 4, "text-anchor": "end" }, text));
+  picture.append(svg("text", { x: left + SIZE / 2, y: height + 36, "text-anchor": "middle" }, x.name));
+  picture.append(svg("text", { x: 2, y: -14 }, y.name));
+  return picture;
+}
+
+const placeOf = (axis, cell) => axis.labels[cell] ?? `${axis.name} ${axis.edges[cell]} to ${axis.edges[cell + 1]}`;
+
+/** Positions along an axis and their texts: the middle of each category, and edges as far apart as their texts need. */
+function ticksOf(axis, width) {
+  if (axis.labels.length > 0) return axis.labels.map((text, index) => [(index + 0.5) * width, text]);
+  const step = Math.ceil(TICK_PX / width);
+  return axis.edges.map((text, index) => [index * width, text]).filter((_, index) => index % step === 0);
+}
