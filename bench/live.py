@@ -4,10 +4,10 @@
     python -m bench.live --quick    at 1,000, 2 s
 
 This process records moves of a robot and nodes at a fixed rate with the default writer, `pycrorm watch` serves the
-episode, and a third process reads its stream. The lag of an event is the time from its own clock to the arrival of the
-first part that includes it. Where Chromium is installed, a second run shows the page as well, drawn without a graphics
-processor, and also measures the lag to the end of its drawing. The script prints one JSON line: lags in ms, and the
-share of one core that the server takes.
+episode, and a third process reads its stream and polls the log. The lag of an event is the time from its own clock
+until it is in the log, and until the first part that includes it arrives. Where Chromium is installed, a second run
+shows the page as well, drawn without a graphics processor, and also measures the lag to the end of its drawing. The
+script prints one JSON line: lags in ms, and the share of one core that the server takes.
 """
 
 from __future__ import annotations
@@ -15,13 +15,16 @@ from __future__ import annotations
 import argparse
 import http.client
 import json
+import os
+import sqlite3
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 from bisect import bisect_left
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -34,6 +37,7 @@ from tests.databases import ask
 from tests.report.browser import browser, chromium
 
 _RATES = (100, 1_000)
+_POLL_S = 0.002
 _REST_S = 2.0
 """Ends each run, so that the last part arrives."""
 _NOTE_DRAWN = """
@@ -78,7 +82,12 @@ def served(folder: Path) -> Iterator[tuple[str, int]]:
 
 
 def read(address: str, until: float) -> None:
-    """Read the stream of the newest episode for so many seconds; print pairs of a time in ns and the last event."""
+    """Read the stream of the newest episode for so many seconds; print pairs of a time in ns and the last event.
+
+    Prints the pairs of the stream, and those of the log, which it polls every 2 ms.
+    """
+    stored: list[tuple[int, int]] = []
+    threading.Thread(target=_poll, args=(stored,), daemon=True).start()
     parts = urlsplit(f"{address}episode/last/events")
     connection = http.client.HTTPConnection("127.0.0.1", parts.port or 80, timeout=until)
     connection.request("GET", parts.path)
@@ -91,13 +100,23 @@ def read(address: str, until: float) -> None:
         elif line.startswith(b"data: ") and number:
             arrivals.append((time.time_ns(), number))
             number = 0
-    print(json.dumps(arrivals))
+    print(json.dumps([arrivals, stored]))
 
 
-def start_reader(address: str, seconds: float) -> subprocess.Popen[str]:
+def _poll(stored: list[tuple[int, int]]) -> None:
+    with closing(sqlite3.connect("file:pycrorm.db?mode=ro", uri=True, isolation_level=None)) as log:
+        while True:
+            [head] = log.execute("SELECT head FROM episode").fetchone()
+            if not stored or stored[-1][1] != head:
+                stored.append((time.time_ns(), head))
+            time.sleep(_POLL_S)
+
+
+def start_reader(address: str, seconds: float, folder: Path) -> subprocess.Popen[str]:
     """Start the process that reads the stream, and wait until it does."""
     command = [sys.executable, "-m", "bench.live", "--read", address, "--seconds", str(seconds)]
-    reader = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    surroundings = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
+    reader = subprocess.Popen(command, cwd=folder, env=surroundings, stdout=subprocess.PIPE, text=True)
     assert reader.stdout is not None
     assert reader.stdout.readline() == "reading\n"
     return reader
@@ -121,11 +140,12 @@ def measure(rate: int, seconds: float, folder: Path, *, draws: bool) -> dict[str
         with memory.recording.episode(description="bench") as episode:
             episode.object_added("base", "turtle", "ROBOT", Pose([0, 0, 0]))
             memory.flush()
-            reader, tab = start_reader(address, seconds + _REST_S), None
+            tab = None
             if draws:
                 tab = stack.enter_context(stack.enter_context(browser(folder)).open(f"{address}episode/last"))
                 tab.wait_for("pycrormStream.connected")
                 tab.ask(_NOTE_DRAWN)
+            reader = start_reader(address, seconds + 2 * _REST_S, folder)
             before_s = cpu_s_of(process)
             result["events_per_s"] = record(episode, drive, rate, seconds)
             time.sleep(_REST_S)
@@ -133,7 +153,8 @@ def measure(rate: int, seconds: float, folder: Path, *, draws: bool) -> dict[str
             drawn = tab.ask("drawn") if tab is not None else []
         memory.flush()
         events = ask(url, "SELECT sequence, wall_ns FROM event WHERE episode = 1 AND sequence > 3 ORDER BY sequence")
-        result["stream_ms"] = lags_ms(json.loads(reader.communicate()[0]), events)
+        arrivals, stored = json.loads(reader.communicate()[0])
+        result["stored_ms"], result["stream_ms"] = lags_ms(stored, events), lags_ms(arrivals, events)
         if drawn:
             result["drawn_ms"] = lags_ms(drawn, events)
     return result

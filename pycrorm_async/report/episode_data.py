@@ -12,8 +12,9 @@ from pycrorm_async.events.codec import description_of, fingerprint
 from pycrorm_async.projections.fold.fold import CannotFold
 from pycrorm_async.query.as_of import unreadable
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.query.scene.object_model import assumed_model, object_model, point_model
+from pycrorm_async.query.scene.object_model import assumed_model, point_model
 from pycrorm_async.report.episode_fold import EpisodeFold, model_name
+from pycrorm_async.report.mesh_data import Meshes
 from pycrorm_async.store.episode_lookup import episode_named
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import StoredEvent
@@ -81,10 +82,11 @@ async def _models(log: EventLog, fold: EpisodeFold, after: int) -> Mapping[str, 
     added = [each for identity, each in fold.world.objects.items() if identity > after]
     names = {each.added.description for each in added} - {None}
     payloads = await log.descriptions([name for name in names if name is not None])
+    meshes = Meshes(log)
     models: dict[str, Any] = {"": point_model("its description is not in the log")} if added or not after else {}
     for name, payload in payloads.items():
         try:
-            models[name] = object_model(description_of(payload))
+            models[name] = await meshes.model(description_of(payload))
         except ValueError as error:
             models[name] = point_model(f"its description cannot be read: {error}")
     for each in added:

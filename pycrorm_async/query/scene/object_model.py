@@ -1,6 +1,7 @@
 """Read the links, joints and shapes of a URDF as plain values, for forward kinematics where they are drawn.
 
-A mesh is drawn as the box around its link's collision shapes. A link without a visual shape has its collision shapes.
+A mesh is drawn with its triangles where its file is recorded and they are asked for, otherwise as the box around its
+link's collision shapes. A link without a visual shape has its collision shapes.
 """
 
 from __future__ import annotations
@@ -27,16 +28,17 @@ def point_model(reason: str) -> dict[str, Any]:
     return {**_POINT, "joints": [], "assumed": f"a point, because {reason}"}
 
 
-def object_model(description: DescriptionDeclared) -> dict[str, Any]:
+def object_model(description: DescriptionDeclared, *, drawn: frozenset[str] = frozenset()) -> dict[str, Any]:
     """Return root link, shapes by link, and joints in the order of the tree.
 
     A shape is `[kind, sizes, xyz, rpy, rgba or None]`; a joint is `[name, type, parent, child, xyz, rpy, axis, mimic]`,
-    with `mimic` as `[joint, multiplier, offset]` or None.
+    with `mimic` as `[joint, multiplier, offset]` or None. `drawn` are the references of the meshes that keep their
+    place (`MeshValue.reference`); their sizes are the reference and three factors. The others are boxes.
     """
     if description.missing is not None:
         return point_model(f"its description is missing: {description.missing}")
     try:
-        return _model(fromstring(_without_meshes(description)))  # noqa: S314  a memory has recorded it
+        return _model(fromstring(_without_meshes(description, drawn)))  # noqa: S314  a memory has recorded it
     except (ValueError, ParseError) as error:
         return point_model(f"its description cannot be read: {error}")
 
@@ -51,11 +53,11 @@ def assumed_model(name: str, object_type: str, joints: set[str]) -> dict[str, An
     return point_model(reason)
 
 
-def _without_meshes(description: DescriptionDeclared) -> str:
-    if not description.meshes:
+def _without_meshes(description: DescriptionDeclared, drawn: frozenset[str]) -> str:
+    if "<mesh" not in description.text:
         return description.text
     boxes = {link: BoundingBox(Vector(*box.min), Vector(*box.max)) for link, box in description.boxes.items()}
-    return with_boxes(description.text, boxes)
+    return with_boxes(description.text, boxes, kept=drawn)
 
 
 def _model(robot: Element) -> dict[str, Any]:
@@ -111,8 +113,10 @@ def _shapes(link: Element, colors: dict[str | None, list[float]]) -> Iterator[li
                 yield [shape.tag, sizes, xyz, rpy, color]
 
 
-def _sizes(shape: Element) -> list[float] | None:
+def _sizes(shape: Element) -> list[Any] | None:
     match shape.tag:
+        case "mesh":
+            return [shape.get("filename", ""), *_numbers(shape.get("scale", "1 1 1"), 3)]
         case "box":
             return _numbers(shape.get("size", ""), 3)
         case "cylinder" | "capsule":

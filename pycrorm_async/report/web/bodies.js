@@ -2,6 +2,7 @@
 
 import { lastUpTo } from "./episode.js";
 
+const DOUBLE_SIDE = 2; // THREE.DoubleSide, for meshes whose triangles do not all turn the same way
 const GREY = [0.62, 0.64, 0.68, 1];
 
 export class Body {
@@ -19,7 +20,7 @@ export class Body {
     }));
     this.movable = this.joints.filter((each) => each.type !== "fixed");
     for (const [link, shapes] of Object.entries(model.shapes)) {
-      for (const each of shapes) this.links.get(link)?.add(meshOf(each, object.color));
+      for (const each of shapes) this.links.get(link)?.add(meshOf(each, object.color, model));
     }
     this.base = object.base_link ? this.links.get(object.base_link) : null;
   }
@@ -64,17 +65,33 @@ function place(group, xyz, [roll, pitch, yaw]) {
   group.rotation.set(roll, pitch, yaw, "ZYX");
 }
 
-function meshOf([kind, sizes, xyz, rpy, color], override) {
+function meshOf([kind, sizes, xyz, rpy, color], override, model) {
   const [red, green, blue, opacity] = override ?? color ?? GREY;
   const material = new THREE.MeshStandardMaterial({ roughness: 0.75, metalness: 0.05 });
   material.color.setRGB(red, green, blue, "srgb");
   if (opacity < 1) Object.assign(material, { transparent: true, opacity });
-  const mesh = new THREE.Mesh(geometryOf(kind, sizes), material);
+  if (kind === "mesh") Object.assign(material, { flatShading: true, side: DOUBLE_SIDE });
+  const geometry = kind === "mesh" ? trianglesOf(model, sizes[0]) : geometryOf(kind, sizes);
+  const mesh = new THREE.Mesh(geometry, material);
+  if (kind === "mesh") mesh.scale.set(...sizes.slice(1));
   mesh.castShadow = mesh.receiveShadow = true;
   const group = new THREE.Group();
   place(group, xyz, rpy);
   group.add(mesh);
   return group;
+}
+
+/** The geometry of a recorded mesh file, made once for all links that have it. */
+function trianglesOf(model, reference) {
+  const mesh = model.meshes[reference];
+  if (mesh.geometry === undefined) {
+    const bytes = (text) => Uint8Array.from(atob(text), (each) => each.charCodeAt(0)).buffer;
+    mesh.geometry = new THREE.BufferGeometry();
+    mesh.geometry.setAttribute("position", new THREE.Float32BufferAttribute(new Float32Array(bytes(mesh.vertices)), 3));
+    mesh.geometry.setIndex([...new Uint32Array(bytes(mesh.faces))]);
+    mesh.geometry.computeVertexNormals();
+  }
+  return mesh.geometry;
 }
 
 function geometryOf(kind, sizes) {

@@ -10,6 +10,7 @@ import { SceneView } from "./scene_view.js";
 import { TreeView } from "./tree_view.js";
 
 const PLAYED_S = 20;
+const NOTES_MAX = 3;
 const HELP = "Space plays. ← → go by one event, with Shift by ten; Home and End to the ends. F goes to the next failure, A changes the axis.";
 const part = (name) => document.getElementById(name);
 
@@ -69,10 +70,12 @@ class Page {
       whole ? null : `events ${episode.first} to ${episode.last} of ${episode.head}`,
     ].filter((each) => each !== null);
     part("facts").replaceChildren(...facts.map((each) => recorded(each)));
-    const assumed = episode.objects
-      .map((each) => [each.name, (episode.models[each.model] ?? episode.models[""]).assumed])
-      .filter(([, reason]) => reason);
-    const notes = assumed.slice(0, 3).map(([name, reason]) => element("p", {}, recorded(`${name} is drawn as ${reason}`)));
+    const modelOf = (each) => episode.models[each.model] ?? episode.models[""];
+    const texts = episode.objects.flatMap((each) => {
+      const { assumed, boxes } = modelOf(each);
+      return [assumed && `${each.name} is drawn as ${assumed}`, boxes && `${each.name} has boxes instead of ${boxes}`];
+    });
+    const notes = [...new Set(texts)].filter(Boolean).slice(0, NOTES_MAX).map((each) => element("p", {}, recorded(each)));
     if (episode.objects.length === 0) notes.push(element("p", {}, "This episode recorded no objects: there is no scene to draw."));
     part("notes").replaceChildren(...notes);
   }
