@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncGenerator, Callable, Sequence
+from collections.abc import AsyncGenerator, Callable, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager
 from datetime import datetime
 from os import PathLike
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal, overload
 
 from sqlalchemy import Select
@@ -198,13 +199,22 @@ class ReadableMemory(PartsHolder):
         file_format: FileFormat | None = None,
         episodes: Sequence[str | int] = (),
         force: bool = False,
+        arguments: Mapping[str, Any] = MappingProxyType({}),
         clock: Clock | None = None,
         fps: int | None = None,
     ) -> Exported:
         """Write episodes or rows to a file, up to the last flush; see `pycrorm_async.export.export.export`."""
         reading = self._open_parts.reading
         return await write_export(
-            reading, what, path, file_format=file_format, episodes=episodes, force=force, clock=clock, fps=fps
+            reading,
+            what,
+            path,
+            file_format=file_format,
+            episodes=episodes,
+            arguments=arguments,
+            force=force,
+            clock=clock,
+            fps=fps,
         )
 
     async def export_again(
@@ -212,7 +222,7 @@ class ReadableMemory(PartsHolder):
         manifest: str | PathLike[str],
         path: str | PathLike[str] | None = None,
         *,
-        statement: Select[*tuple[Any, ...]] | None = None,
+        statement: Question | Select[*tuple[Any, ...]] | None = None,
         force: bool = False,
     ) -> Remade:
         """Make an export again from its manifest and compare; see `pycrorm_async.export.export.export_again`."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import inspect
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,21 +13,31 @@ import typer
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
 from pycrorm_async.cli.output import note, print_json, stderr, stdout
 from pycrorm_async.cli.pending_events import note_pending_events
+from pycrorm_async.cli.since import parse_since
 from pycrorm_async.errors import CallerError
 from pycrorm_async.export.export import Exported, Remade, export_again
 from pycrorm_async.export.export import export as write_export
 from pycrorm_async.progress_bar import ProgressCallback, watched
+from pycrorm_async.query.asking.ask import QUESTIONS, Ask
 from pycrorm_async.query.reading import Reading
 
 __all__ = ["export"]
+
+_READ: Mapping[str, Callable[[str], Any]] = {
+    "bool": lambda text: {"true": True, "false": False}[text.lower()],
+    "int": int,
+    "float": float,
+    "datetime": parse_since,
+}
+"""Reads an argument of this type; others are texts."""
 
 
 def export(
     what: Annotated[
         list[str] | None,
         typer.Argument(
-            metavar="EPISODE...|VIEW",
-            help="Episodes by number, id or `last`; or a view or table by name, such as PickUpWithContextView.",
+            metavar="EPISODE...|VIEW|QUESTION",
+            help="Episodes by number, id or `last`; or a view or a question of `pycrorm ask` by name.",
         ),
     ] = None,
     file_format: Annotated[
@@ -36,6 +48,10 @@ def export(
     episode: Annotated[
         list[str] | None,
         typer.Option("--episode", metavar="EPISODE", help="Of a view: only the rows of this episode; repeatable."),
+    ] = None,
+    arguments: Annotated[
+        list[str] | None,
+        typer.Option("--with", metavar="NAME=VALUE", help="Of a question: an argument, as in object=milk; repeatable."),
     ] = None,
     again: Annotated[
         Path | None,
@@ -59,12 +75,13 @@ def export(
     if (again is None) == (not what):
         raise CallerError("name what to export, for example `pycrorm export last --out last.parquet`, or --again")
     if again is not None:
-        if file_format is not None or episode or clock is not None or fps is not None:
+        if file_format is not None or episode or arguments or clock is not None or fps is not None:
             raise CallerError("--again takes all but --out and --force from the manifest: leave the other options out")
         return _again(again, out, url, spool, force=force, as_json=as_json)
     assert what, "checked above"
     target = out if out is not None else Path(f"{'-'.join(what)[:100]}.{file_format or 'parquet'}")
     options: dict[str, Any] = {"file_format": file_format, "clock": clock, "fps": fps}
+    options["arguments"] = _arguments(what[0], arguments or [])
 
     async def write(progress: ProgressCallback | None) -> Exported:
         async with Reading.open(url) as reading:
@@ -77,6 +94,22 @@ def export(
     note_pending_events(url, spool)
     _print(exported, as_json=as_json)
     return 0
+
+
+def _arguments(question: str, pairs: list[str]) -> dict[str, Any]:
+    """Return the arguments of a question by name, as the types that it declares."""
+    arguments: dict[str, Any] = {}
+    valid = inspect.signature(getattr(Ask, question)).parameters if question in QUESTIONS else {}
+    for each in pairs:
+        name, separator, text = each.partition("=")
+        if not separator:
+            raise CallerError(f"--with takes NAME=VALUE, as in object=milk, not {each!r}")
+        types = str(valid[name].annotation).split(" | ") if name in valid else []
+        try:
+            arguments[name] = next((read(text) for type_, read in _READ.items() if type_ in types), text)
+        except (KeyError, ValueError):
+            raise CallerError(f"{name} of {question} is of the type {types[0]}, not {text!r}") from None
+    return arguments
 
 
 def _again(manifest: Path, out: Path | None, url: str, spool: Path | None, *, force: bool, as_json: bool) -> int:

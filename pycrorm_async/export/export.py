@@ -7,10 +7,11 @@ Exported(path=PosixPath('picks.parquet'), rows=1204, episodes=30, left_out=0, ma
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import aclosing
 from os import PathLike
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias, get_args
 
 import msgspec
@@ -26,6 +27,7 @@ from pycrorm_async.export.manifest import Manifest, episode_differences, manifes
 from pycrorm_async.export.row_files import RowFormat, write_rows
 from pycrorm_async.export.selection import CoveredEpisode, Exportable, Selection, select_rows
 from pycrorm_async.projections.schema.generations import PROJECTION_VERSION
+from pycrorm_async.query.asking.question import Question
 from pycrorm_async.query.frames.columns import columns_of
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.suggestions import nearest
@@ -84,6 +86,7 @@ async def export(
     *,
     file_format: FileFormat | None = None,
     episodes: Sequence[str | int] = (),
+    arguments: Mapping[str, Any] = MappingProxyType({}),
     force: bool = False,
     clock: Clock | None = None,
     fps: int | None = None,
@@ -93,11 +96,12 @@ async def export(
 
     Args:
         what: an episode or several (a row for each node), by number, id or `last`; a view or table by name, or a mapped
-            class, of all episodes that have ended; or a select.
+            class, of all episodes that have ended; a question of `memory.ask` or its name; or a select.
         path: of the file.
         file_format: `parquet`, `csv` or `jsonl` for rows; `lerobot` for episodes, into a folder; `rrd` or `mcap` for
             one episode, which may be running; by default that of the suffix.
         episodes: limit a view to these.
+        arguments: of a question that is named.
         force: replace the file if it exists; a folder only if it is such a data set.
         clock, fps: of LeRobot: a frame for each event that changed the robot's state (`event`, the default), or `fps`
             frames each second (`time`). Of MCAP: the wall time of the events (`time`, the default), or `fps` events in
@@ -117,25 +121,23 @@ async def export(
     with new_file(manifest_path(target), force=True) as described:
         match chosen:
             case "parquet" | "csv" | "jsonl":
-                selection = await select_rows(reading, what, episodes)
+                selection = await select_rows(reading, what, episodes, arguments=arguments)
                 left_out = selection.left_out
                 with new_file(target, force=force) as written:
                     manifest = await _write_rows(reading, selection, written, chosen, progress)
-                    files = {target.name: checksums(written)[written.name]}
+                    manifest = _complete(manifest, {target.name: checksums(written)[written.name]}, described)
             case "lerobot":
                 covered = await _episodes(reading, what, episodes, chosen)
                 with new_folder(target, force=force, marker=MARKER) as written:
                     frames = await write_lerobot(reading, covered, written, options, progress)
                     manifest = await _described(reading, covered, chosen, options, frames)
-                    files = checksums(written)
+                    manifest = _complete(manifest, checksums(written), described)
             case "rrd" | "mcap":
                 covered = await _episodes(reading, what, episodes, chosen, running=True)
                 with new_file(target, force=force) as written:
                     changes = await write_scene(reading, covered, written, chosen, options)
                     manifest = await _described(reading, covered, chosen, options, changes)
-                    files = {target.name: checksums(written)[written.name]}
-        manifest = msgspec.structs.replace(manifest, files=files)
-        described.write_bytes(msgspec.json.format(msgspec.json.encode(manifest), indent=1) + b"\n")
+                    manifest = _complete(manifest, {target.name: checksums(written)[written.name]}, described)
     return Exported(target, manifest.rows, len(manifest.episodes), left_out, manifest)
 
 
@@ -144,7 +146,7 @@ async def export_again(
     manifest: str | PathLike[str],
     path: str | PathLike[str] | None = None,
     *,
-    statement: Select[*tuple[Any, ...]] | None = None,
+    statement: Question | Select[*tuple[Any, ...]] | None = None,
     force: bool = False,
     progress: ProgressCallback | None = None,
 ) -> Remade:
@@ -153,7 +155,7 @@ async def export_again(
     Args:
         manifest: the file `PATH.manifest.json`.
         path: of the new file; by default the export is only compared.
-        statement: the select, for an export of one.
+        statement: the select or question, for an export of one that was not named.
 
     If episodes are missing, nothing is made and `differences` says so. Raises as `export` does.
     """
@@ -196,7 +198,9 @@ async def export_again(
     return Remade(same, tuple(differences), made if path is not None else None)
 
 
-def _named_by(manifest: Manifest, statement: Select[*tuple[Any, ...]] | None) -> tuple[Exportable, tuple[str, ...]]:
+def _named_by(
+    manifest: Manifest, statement: Question | Select[*tuple[Any, ...]] | None
+) -> tuple[Exportable, tuple[str, ...]]:
     """Return what the manifest names, and the episodes to limit it to."""
     ids = tuple(each.id for each in manifest.episodes)
     match manifest.kind:
@@ -204,6 +208,8 @@ def _named_by(manifest: Manifest, statement: Select[*tuple[Any, ...]] | None) ->
             return ids, ()
         case "view":
             return manifest.names[0], ids
+        case "question":
+            return manifest.names[0], ()
     if statement is None:
         raise CallerError(
             "this is the export of a program's own select: call `await memory.export_again(manifest, statement=...)`"
@@ -240,6 +246,7 @@ async def _write_rows(
         kind=selection.kind,
         names=(selection.name,) if selection.name else tuple(each.id for each in selection.episodes),
         file_format=file_format,
+        options={"arguments": dict(selection.arguments)} if selection.arguments else {},
         query=_sql(plain, log.engine.dialect),
         columns={each.name: str(each.type) for each in schema},
         rows=rows,
@@ -249,6 +256,13 @@ async def _write_rows(
         episodes=selection.episodes,
         files={},
     )
+
+
+def _complete(manifest: Manifest, files: dict[str, str], path: Path) -> Manifest:
+    """Write the manifest with the files, before they get their names: a full disk then leaves none of both."""
+    whole = msgspec.structs.replace(manifest, files=files)
+    path.write_bytes(msgspec.json.format(msgspec.json.encode(whole), indent=1) + b"\n")
+    return whole
 
 
 def _options(file_format: FileFormat, clock: Clock | None, fps: int | None) -> EpisodeOptions:
@@ -266,11 +280,11 @@ async def _episodes(
     reading: Reading, what: Exportable, limited: Sequence[str | int], file_format: str, *, running: bool = False
 ) -> tuple[CoveredEpisode, ...]:
     """Return the episodes that `what` names. Raises `CallerError` for anything else."""
-    if limited or isinstance(what, type | Select):
+    if limited or isinstance(what, type | Select | Question):
         raise CallerError(f"the format {file_format} holds whole episodes: name them by number, id or `last`")
     selection = await select_rows(reading, what, running=running)
     if selection.kind != "episodes":
-        raise CallerError(f"the format {file_format} holds whole episodes, and {selection.name} is a view")
+        raise CallerError(f"the format {file_format} holds whole episodes, and {selection.name} is a {selection.kind}")
     return selection.episodes
 
 

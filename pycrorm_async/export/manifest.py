@@ -23,7 +23,7 @@ class Manifest(msgspec.Struct, frozen=True, kw_only=True):
 
     Attributes:
         format: version of this description.
-        kind, names: `episodes` with their ids, `view` with its name, or `select`.
+        kind, names: `episodes` with their ids, `view` or `question` with its name, or `select`.
         file_format, options: as given.
         query: the SQL of the rows; empty for a format that is made from events.
         columns: the Arrow type of each column, by name.

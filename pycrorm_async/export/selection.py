@@ -1,4 +1,4 @@
-"""Resolve what to export: episodes, a view or table of the memory, or a select; and which episodes it covers.
+"""Resolve what to export: episodes, a view or table, a named question, or a select; and which episodes it covers.
 
 Rows come from episodes that have ended and are visible in the tables to their last event, so that the same export can
 be made again. Those of a view are ordered by its key.
@@ -6,8 +6,12 @@ be made again. Those of a view are ordered by its key.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime
+from enum import Enum
+from inspect import signature as inspect_signature
+from types import MappingProxyType
 from typing import Any, NamedTuple, TypeAlias
 
 import msgspec
@@ -17,13 +21,16 @@ from sqlalchemy.orm import Mapper
 from pycrorm_async.errors import CallerError
 from pycrorm_async.orm import Base, Designator, ProcessMetaData, TaskTreeNode
 from pycrorm_async.orm.base import EPISODE, same_row
+from pycrorm_async.query.asking.ask import QUESTIONS
+from pycrorm_async.query.asking.question import Question, episode_name
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.suggestions import nearest
 
 __all__ = ["CoveredEpisode", "Exportable", "Selection", "select_rows"]
 
-Exportable: TypeAlias = "str | int | type | Sequence[str | int] | Select[*tuple[Any, ...]]"
-"""An episode or several, by number, id or `last`; a view or table by name; a mapped class; a select."""
+Exportable: TypeAlias = "str | int | type | Sequence[str | int] | Question | Select[*tuple[Any, ...]]"
+"""An episode or several, by number, id or `last`; a view, a table or a question by name; a mapped class; a question of
+`memory.ask`; a select."""
 
 _ID_DIGITS = frozenset("0123456789abcdef-")
 
@@ -43,7 +50,8 @@ class Selection:
     """The rows to export.
 
     Attributes:
-        kind, name: `episodes`, `view` or `select`; of a view its name.
+        kind, name: `episodes`, `view`, `question` or `select`; of a view and a question its name.
+        arguments: of the question.
         statement: the select.
         episodes: those that it covers, by number; of an own select all that the memory has.
         simulated: whether simulations are among them.
@@ -56,6 +64,7 @@ class Selection:
     episodes: tuple[CoveredEpisode, ...]
     simulated: bool = False
     left_out: int = 0
+    arguments: Mapping[str, Any] = field(default_factory=dict)
 
 
 class _Covered(NamedTuple):
@@ -64,12 +73,19 @@ class _Covered(NamedTuple):
 
 
 async def select_rows(
-    reading: Reading, what: Exportable, episodes: Sequence[str | int] = (), *, running: bool = False
+    reading: Reading,
+    what: Exportable,
+    episodes: Sequence[str | int] = (),
+    *,
+    arguments: Mapping[str, Any] = MappingProxyType({}),
+    running: bool = False,
 ) -> Selection:
-    """Return the selection that `what` names; `episodes` limits a view to these, `running` admits those that run.
+    """Return the selection that `what` names.
+
+    `episodes` limits a view to these, `arguments` are those of a question, and `running` admits episodes that run.
 
     Raises `CallerError` for a name that nothing has, with the nearest ones, for `episodes` beside something that is not
-    a view, and for an episode that has not ended; `UnknownEpisode`.
+    a view, for wrong arguments, and for an episode that has not ended; `UnknownEpisode`.
     """
     await reading.refresh()
     chosen = [str(each) for each in episodes]
@@ -78,15 +94,22 @@ async def select_rows(
             raise CallerError("a select of your own chooses its episodes itself: add a condition to it")
         covered, left_out = await _complete(reading)
         return Selection("select", "", what, covered, left_out=left_out)
+    if isinstance(what, Question):
+        return await _asked(reading, "select", what, {}, chosen)
     if isinstance(what, type):
         what = what.__name__
     names = [str(what)] if isinstance(what, str | int) else [str(each) for each in what]
     views = await _views(reading)
     if len(names) == 1 and names[0] in views:
+        if arguments:
+            raise CallerError(f"{names[0]} is a view, and arguments are for questions: {', '.join(QUESTIONS)}")
         return await _view(reading, names[0], views[names[0]], chosen)
+    if len(names) == 1 and names[0] in QUESTIONS:
+        return await _asked(reading, "question", _question(reading, names[0], arguments), arguments, chosen)
     for each in names:
         if not _may_be_episode(each):
-            raise CallerError(f"the memory has no episode, view or table {each!r}{nearest(each, views)}")
+            near = nearest(each, [*views, *QUESTIONS])
+            raise CallerError(f"the memory has no episode, view, table or question {each!r}{near}")
     if chosen:
         raise CallerError("episodes are exported whole: name them all instead of choosing among them")
     of_names = await _named(reading, names, running=running)
@@ -98,6 +121,46 @@ async def select_rows(
         .order_by(node.id)
     )
     return Selection("episodes", "", statement, of_names.episodes, of_names.simulated)
+
+
+def _question(reading: Reading, name: str, arguments: Mapping[str, Any]) -> Question:
+    """Return the question. Raises `CallerError` for arguments that it does not take."""
+    ask = getattr(reading.ask, name)
+    valid = inspect_signature(ask).parameters
+    for each in arguments:
+        if each not in valid:
+            raise CallerError(f"{name} has no argument {each!r}{nearest(each, valid)}; it has {', '.join(valid)}")
+    missing = [each.name for each in valid.values() if each.default is each.empty and each.name not in arguments]
+    if missing:
+        raise CallerError(f"{name} needs {', '.join(missing)}: give it as an argument (--with {missing[0]}=...)")
+    given = dict(arguments)
+    if isinstance(given.get("since"), str):  # from a manifest
+        given["since"] = datetime.fromisoformat(given["since"])
+    question: Question = ask(**given)
+    return question
+
+
+def _recorded(value: Any) -> Any:
+    """Return an argument as a manifest holds it."""
+    if isinstance(value, Enum):
+        return value.name
+    if isinstance(value, datetime):
+        return value.isoformat()
+    return value if isinstance(value, str | int | float | bool | None) else episode_name(value)
+
+
+async def _asked(
+    reading: Reading, kind: str, question: Question, arguments: Mapping[str, Any], chosen: Sequence[str]
+) -> Selection:
+    if chosen:
+        raise CallerError("a question chooses its episode itself: give it the argument `episode` (--with episode=...)")
+    if question.episodes:
+        of_names = await _named(reading, [episode_name(each) for each in question.episodes])
+        covered, simulated, left_out = *of_names, 0
+    else:
+        (covered, left_out), simulated = await _complete(reading), False
+    given = {name: _recorded(value) for name, value in arguments.items()}
+    return Selection(kind, question.name, question.statement, covered, simulated, left_out, given)
 
 
 async def _view(reading: Reading, name: str, mapper: Mapper[Any] | None, chosen: Sequence[str]) -> Selection:

@@ -8,7 +8,9 @@ import resource
 import sys
 from collections.abc import AsyncIterator, Iterator
 from contextlib import contextmanager
+from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import pyarrow as pa
@@ -22,6 +24,8 @@ from pycrorm_async.errors import CallerError, MissingExtra, UnknownEpisode
 from pycrorm_async.export.export import export, export_again
 from pycrorm_async.export.manifest import read_manifest
 from pycrorm_async.orm import PickUpWithContextView, RootFailure, TaskTreeNode
+from pycrorm_async.query.asking.ask import QUESTIONS
+from pycrorm_async.world.enums import Arms
 from tests.commands import one_line_of, pycrorm
 from tests.databases import run_in_own_loop
 from tests.projections.event_script import NAVIGATE, PICK_UP, SAYING, declarations
@@ -159,6 +163,51 @@ async def test_a_view_of_a_user_and_a_select_are_exported(reading: Reading, tmp_
     assert {"name", "parent"} <= {*parquet.read_schema(tmp_path / "concepts.parquet").names}
 
 
+async def test_a_question_is_exported_and_made_again_by_name_and_arguments(reading: Reading, tmp_path: Path) -> None:
+    arguments = {"episode": 1, "object": "milk", "arm": Arms.LEFT, "limit": 1}
+    exported = await export(reading, "root_failures", tmp_path / "failures.csv", arguments=arguments)
+    assert (exported.rows, exported.episodes) == (1, 1)
+    assert exported.manifest.options == {"arguments": {"episode": 1, "object": "milk", "arm": "LEFT", "limit": 1}}
+    frame = await reading.ask.root_failures(episode=1, object="milk", arm="LEFT", limit=1)
+    assert pd.read_csv(tmp_path / "failures.csv").message.tolist() == frame.message.tolist()
+    assert (await export_again(reading, tmp_path / "failures.csv.manifest.json")).same
+    since = {"since": datetime(2020, 1, 1, tzinfo=UTC)}
+    assert (await export(reading, "episodes", tmp_path / "episodes.parquet", arguments=since)).rows == 4
+    assert (await export_again(reading, tmp_path / "episodes.parquet.manifest.json")).same
+    question = reading.ask.durations(episode="last")
+    await export(reading, question, tmp_path / "durations.parquet")
+    again = await export_again(reading, tmp_path / "durations.parquet.manifest.json", statement=question)
+    assert (again.same, again.differences) == (True, ())
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "message"),
+    [
+        ("root_failure", {"object": "milk"}, "root_failure is a view, and arguments are for questions: root_failures"),
+        ("root_failuers", {}, "did you mean root_failures"),
+        ("root_failures", {"objct": "milk"}, r"root_failures has no argument 'objct'; did you mean object\?; it has"),
+        ("object_history", {}, "object_history needs name: give it as an argument"),
+        ("durations", {"episode": 99}, "there is no episode '99'"),
+    ],
+)
+async def test_a_question_with_a_wrong_argument_is_refused(
+    reading: Reading, tmp_path: Path, name: str, arguments: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(CallerError, match=message):
+        await export(reading, name, tmp_path / "a.csv", arguments=arguments)
+    assert list(tmp_path.iterdir()) == []
+
+
+async def test_every_question_is_exported_with_declared_types(either: Reading, tmp_path: Path) -> None:
+    arguments: dict[str, dict[str, Any]] = {
+        "object_history": {"name": "milk"}, "moves_of": {"name": "milk"}, "experience_at": {"x": 1, "y": 1},
+    }  # fmt: skip
+    for name in QUESTIONS:
+        file = tmp_path / f"{name}.parquet"
+        await export(either, name, file, arguments=arguments.get(name, {}))
+        assert pa.null() not in parquet.read_schema(file).types, name
+
+
 async def test_a_full_disk_leaves_no_file(reading: Reading, tmp_path: Path) -> None:
     for name in ("a.parquet", "a.csv", "a.jsonl"):
         with files_of_at_most(DISK_BYTES), pytest.raises(OSError, match="File too large"):
@@ -231,6 +280,11 @@ def test_the_command_writes_compares_and_names_mistakes_in_one_line(kitchen: Pat
     assert (done.returncode, done.stdout) == (0, "the same bytes\n")
     done = pycrorm("export", "1", "--out", tmp_path / "both.parquet", cwd=kitchen)
     assert (done.returncode, "exists: add --force" in one_line_of(done)) == (2, True)
+    with_milk = "--with", "object=milk", "--with", "limit=1", "--with", "recovered=true"
+    done = pycrorm("export", "root_failures", *with_milk, "--out", tmp_path / "f.csv", "--json", cwd=kitchen)
+    assert json.loads(done.stdout)["rows"] == 1
+    done = pycrorm("export", "root_failures", "--with", "limit=many", "--out", tmp_path / "g.csv", cwd=kitchen)
+    assert one_line_of(done) == "pycrorm: limit of root_failures is of the type int, not 'many'"
     done = pycrorm("export", cwd=kitchen)
     assert (done.returncode, one_line_of(done)[:32]) == (2, "pycrorm: name what to export, fo")
 

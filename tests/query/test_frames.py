@@ -118,6 +118,8 @@ async def test_an_expression_without_a_type_has_that_of_its_first_values(reading
     question = select(func.round(Pose.x).label("near"), func.avg(Pose.y).over().label("mean"), null().label("missing"))
     frame = await reading.dataframe(question.limit(2), to="arrow")
     assert frame.schema.types == [pa.float64(), pa.float64(), pa.null()]
+    without_rows = select(func.avg(Pose.y).label("mean")).where(Pose.id < 0)
+    assert (await reading.dataframe(without_rows, to="arrow")).schema.types == [pa.float64()]
     declared = select(type_coerce(null(), Text()).label("missing"))
     assert (await reading.dataframe(declared, to="arrow")).schema.types == [pa.string()]
 

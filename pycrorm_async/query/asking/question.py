@@ -61,6 +61,11 @@ class Question:
         return self._plan.select_of(*(_number_by_query(each) for each in self._plan.episodes))
 
     @property
+    def episodes(self) -> tuple[AskedEpisode, ...]:
+        """The episodes that it names; empty for one to all episodes."""
+        return self._plan.episodes
+
+    @property
     def sql(self) -> str:
         """The statement in the SQL of this memory's database, with all values written out."""
         dialect = self._reading.dialect

@@ -28,6 +28,7 @@ from sqlalchemy import (
 )
 from sqlalchemy.ext.hybrid import HybridExtensionType
 from sqlalchemy.orm import Mapper
+from sqlalchemy.sql.functions import FunctionElement
 from sqlalchemy.types import TypeEngine
 
 from pycrorm_async.orm.designators import ClassOfRow
@@ -98,12 +99,19 @@ def _attributes(mapper: Mapper[Any], *, deferred: bool) -> Iterator[tuple[str, T
 
 
 def _column(name: str, expression: Any, type_: Any) -> FrameColumn:
-    if getattr(expression, "name", None) == "avg":  # SQLAlchemy gives it no type
+    if _is_mean(expression):
         return FrameColumn(name, type_coerce(expression, Double()), "number")
     for types, kind, read_as in _KINDS:
         if isinstance(type_, types):
             return FrameColumn(name, expression if read_as is None else type_coerce(expression, read_as), kind)
     return FrameColumn(name, expression, "untyped")
+
+
+def _is_mean(expression: Any) -> bool:
+    """Return whether it is SQL's `avg`, to which SQLAlchemy gives no type, also with a label or over a window."""
+    while (inner := getattr(expression, "element", None)) is not None:
+        expression = inner
+    return isinstance(expression, FunctionElement) and getattr(expression, "name", "") == "avg"
 
 
 def _distinct(columns: Iterator[FrameColumn]) -> Iterator[FrameColumn]:
