@@ -20,7 +20,7 @@ from sqlalchemy import Dialect, Row, Select
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncSession, async_sessionmaker
 
-from pycrorm_async.errors import DatabaseUnavailable, UnknownEpisode
+from pycrorm_async.errors import CallerError, DatabaseUnavailable, UnknownEpisode
 from pycrorm_async.events.blobs import Blob
 from pycrorm_async.events.ids import parse_episode_id
 from pycrorm_async.orm.designators import Designator
@@ -63,6 +63,7 @@ class Reading:
         """Read an open log, or one at an address, which is opened at the first query and closed by `close`."""
         self._address = log if isinstance(log, DatabaseAddress) else log.address
         self._opened: EventLog | None = None
+        self._is_closed = False
         self._opening = asyncio.Lock()
         self._classes = DynamicClasses()
         self._declarations: list[bytes] = []
@@ -99,7 +100,11 @@ class Reading:
         return self._opened is not None
 
     async def close(self) -> None:
-        """Close the connections and dispose of the mapped classes. A second call has no effect."""
+        """Close the connections and dispose of the mapped classes. A second call has no effect.
+
+        Every query after it raises `CallerError`.
+        """
+        self._is_closed = True
         async with self._opening:
             log, self._opened = self._opened, None
             self._classes.dispose()
@@ -333,6 +338,8 @@ class Reading:
 
     async def _ready(self) -> None:
         """Open the log if it is not open; every query calls this first."""
+        if self._is_closed:
+            raise CallerError("this memory is closed: open it again")
         if self._opened is None:
             async with self._opening:
                 if self._opened is None:

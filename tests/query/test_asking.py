@@ -7,6 +7,7 @@ import math
 from collections import Counter
 from collections.abc import AsyncIterator
 from datetime import UTC, datetime, timedelta
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -409,7 +410,23 @@ async def test_wrong_names_and_values_are_answered_with_the_right_ones(reading: 
         await ask.durations(episode="0000").rows()
 
 
-def test_a_memory_without_asyncio_answers_with_frames_and_rows(tmp_path: Any) -> None:
+async def test_a_question_to_a_closed_memory_is_refused_and_opens_no_connection(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path}/memory.db"
+    async with Memory.open(url) as memory:
+        question = memory.ask.durations()
+        assert await question.rows() == []
+    for call in (question.rows, question.frame, lambda: memory.query("SELECT 1"), lambda: memory.diff(1, 2)):
+        with pytest.raises(CallerError, match=r"closed|not open"):
+            await call()
+    with pytest.raises(CallerError, match="this memory is not open"):
+        memory.ask  # noqa: B018
+    async with Reading.open(url) as reading:
+        pass
+    with pytest.raises(CallerError, match="this memory is closed: open it again"):
+        await reading.query("SELECT 1")
+
+
+def test_a_memory_without_asyncio_answers_with_frames_and_rows(tmp_path: Path) -> None:
     with Memory.sync(f"sqlite:///{tmp_path}/memory.db") as memory:
         note = memory.recording.type("action", "NoteAction", {"text": str})
         with memory.recording.episode(description="notes") as episode:
