@@ -17,6 +17,7 @@ from pycrorm_async import Memory, world_of
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.types import DescriptionDeclared
 from pycrorm_async.plan import NavigateAction, simulated_robot
+from pycrorm_async.query.asking.episode_diff import Difference, EpisodeDiff
 from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary, RobotSummary
 from pycrorm_async.query.notebook.listings import Episodes, TaskTree
 from pycrorm_async.query.notebook.memory_view import memory_html
@@ -24,6 +25,7 @@ from pycrorm_async.query.scene.link_frames import link_frames
 from pycrorm_async.query.scene.object_model import object_model
 from pycrorm_async.query.scene.outlines import outlines
 from pycrorm_async.query.snapshot import Moment, ObjectThen, ObservationThen, WorldThen
+from pycrorm_async.query.sql.read_only import SqlResult
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
 from pycrorm_async.world.models.courier import courier_urdf
@@ -123,6 +125,9 @@ def test_everything_recorded_is_escaped_and_nothing_runs_or_is_requested() -> No
     then = moment(body, description=HOSTILE, observations=seen, tree=())
     tree = TaskTree([node(1, kind=HOSTILE, dtype=None), failed], hostile)
     views = [Episodes([hostile])._repr_html_(), hostile._repr_html_(), tree._repr_html_(), then._repr_html_()]
+    difference = Difference("node", HOSTILE, HOSTILE, HOSTILE, None)
+    views.append(EpisodeDiff(hostile, hostile, (difference,), 1)._repr_html_())
+    views.append(SqlResult((HOSTILE,), [(HOSTILE,), (None,)], more=True)._repr_html_())
     views += [then.world._repr_html_(), then.map()._repr_html_(), tree.gantt("time")._repr_html_()]
     for view in views:
         assert "</script><script>" in harmless(view).text
@@ -268,6 +273,12 @@ async def test_a_memory_shows_its_episodes_and_says_when_it_is_closed() -> None:
         assert tree == await memory.reading.tree(1)
         assert "Episode 1 · NavigateAction" in harmless(tree._repr_html_()).text
         assert repr(memory) == "<Memory sqlite://, open>"
+        question = harmless(memory.ask.longest_actions()._repr_html_())
+        assert "Question longest_actions await it for a frame" in question.text
+        assert "SELECT" in question.text
+        rows = harmless((await memory.query("SELECT dtype, reason FROM task_tree_node ORDER BY id"))._repr_html_())
+        assert (rows.count("td"), "3 rows" in rows.text, "MoveMotion" in rows.text) == (6, True, True)
+        assert "0 differences; 3 nodes are the same" in harmless((await memory.diff(1, 1))._repr_html_()).text
     assert "not open" in harmless(memory._repr_html_()).text
     assert repr(memory) == "<Memory sqlite://, not open>"
 

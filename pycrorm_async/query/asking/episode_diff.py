@@ -69,6 +69,11 @@ class EpisodeDiff:
         """True if there is a difference."""
         return bool(self.differences)
 
+    def _repr_html_(self) -> str:
+        from pycrorm_async.query.notebook.answer_view import diff_html
+
+        return diff_html(self)
+
     def frame(self) -> Any:
         """Return the differences as a pandas DataFrame. Raises `MissingExtra` where pandas is not installed."""
         from pycrorm_async.query.frames.dataframe import imported

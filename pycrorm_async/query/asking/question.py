@@ -93,6 +93,11 @@ class Question:
     def __repr__(self) -> str:
         return f"<question {self.name}: await it for a frame, print it for its SQL>"
 
+    def _repr_html_(self) -> str:
+        from pycrorm_async.query.notebook.answer_view import question_html
+
+        return question_html(self.name, self.sql, "await it for a frame")
+
 
 class SyncQuestion:
     """One question to a memory of `Memory.sync`. Its methods may be called from any thread.
@@ -129,6 +134,11 @@ class SyncQuestion:
 
     def __repr__(self) -> str:
         return f"<question {self.name}: call frame() or rows(), print it for its SQL>"
+
+    def _repr_html_(self) -> str:
+        from pycrorm_async.query.notebook.answer_view import question_html
+
+        return question_html(self.name, self.sql, "call frame() or rows()")
 
 
 def episode_name(episode: AskedEpisode) -> str:

@@ -10,21 +10,20 @@ from pycrorm_async.query.notebook.markup import facts, left_out, moment, quiet, 
 from pycrorm_async.query.notebook.tree_view import NODES_MAX, tree_html
 from pycrorm_async.query.parameter_text import duration
 
-__all__ = ["episode_html", "episodes_html", "task_tree_html"]
+__all__ = ["EPISODES_MAX", "episode_html", "episodes_html", "task_tree_html"]
 
-_EPISODES_MAX = 100
+EPISODES_MAX = 100
 """Bounds the rows of a table of episodes."""
 _COLUMNS = ("episode", "started, UTC", "took", "status", "nodes", "failed", "description", "robots", "tags")
 
 
-def episodes_html(episodes: Sequence[EpisodeSummary]) -> str:
-    """Return a table of the newest episodes, the oldest of them first."""
+def episodes_html(episodes: Sequence[EpisodeSummary], total: int | None = None) -> str:
+    """Return a table of the newest episodes, the oldest of them first; `total` counts those that are not given too."""
     if not episodes:
         return view("No episodes")
-    shown = episodes[-_EPISODES_MAX:]
-    more = f"<div>{left_out(len(episodes) - len(shown), 'before these')}</div>" if len(shown) < len(episodes) else ""
-    count = f"<b>{len(episodes):,} episode{'s' * (len(episodes) > 1)}</b>"
-    return view(count, more, table(_COLUMNS, map(_row, shown)))
+    count, shown = len(episodes) if total is None else total, episodes[-EPISODES_MAX:]
+    more = f"<div>{left_out(count - len(shown), 'before these')}</div>" if len(shown) < count else ""
+    return view(f"<b>{count:,} episode{'s' * (count > 1)}</b>", more, table(_COLUMNS, map(_row, shown)))
 
 
 def _row(each: EpisodeSummary) -> tuple[str, ...]:

@@ -9,7 +9,13 @@ import asyncio
 import html
 import threading
 
+from sqlalchemy import func, select
+
 from pycrorm_async.errors import PycrormError
+from pycrorm_async.orm import ProcessMetaData
+from pycrorm_async.query.asking.episode_list import EpisodeChoice
+from pycrorm_async.query.named_queries import episodes
+from pycrorm_async.query.notebook.episode_view import EPISODES_MAX, episodes_html
 from pycrorm_async.query.notebook.markup import quiet, view
 from pycrorm_async.store.address import DatabaseAddress
 
@@ -39,7 +45,9 @@ async def _read(address: DatabaseAddress) -> str:
     from pycrorm_async.query.reading import Reading  # imports this package
 
     try:
-        async with Reading.open_address(address) as reading:
-            return (await reading.episodes())._repr_html_()
+        async with Reading.open_address(address) as reading, reading.session() as session:
+            total = await session.scalar(select(func.count()).select_from(ProcessMetaData))
+            newest = await episodes(await session.connection(), EpisodeChoice(limit=EPISODES_MAX))
+            return episodes_html(newest, total or 0)
     except PycrormError as error:
         return html.escape(str(error))

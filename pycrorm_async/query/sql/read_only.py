@@ -70,6 +70,11 @@ class SqlResult:
     rows: list[tuple[Any, ...]]
     more: bool
 
+    def _repr_html_(self) -> str:
+        from pycrorm_async.query.notebook.answer_view import sql_result_html
+
+        return sql_result_html(self)
+
 
 class Cursor(Protocol):
     """A running query of one database."""
