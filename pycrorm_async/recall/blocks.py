@@ -179,6 +179,20 @@ class Block:
             {feature: self._part(each, name) for feature, each in self.numbers.items() if name in each.types},
         )
 
+    def where(self, kept: NDArray[np.bool_]) -> Block:
+        """Return the block with those of its cases for which `kept` is True, in their order."""
+        sizes = {name: size for name, span in self.spans.items() if (size := int(kept[span].sum()))}
+        columns = self.nodes[kept], self.started_us[kept], self.parents[kept]
+        texts = {name: self._where(each, kept, sizes) for name, each in self.texts.items()}
+        numbers = {name: self._where(each, kept, sizes) for name, each in self.numbers.items()}
+        texts = {name: each for name, each in texts.items() if each.types}
+        numbers = {name: each for name, each in numbers.items() if each.types}
+        return Block(sizes, *columns, texts, numbers, self.left_out)
+
+    def _where(self, spread: Spread[_Column], kept: NDArray[np.bool_], sizes: Mapping[str, int]) -> Spread[_Column]:
+        column = spread.column.taken(np.flatnonzero(kept[self.rows_of(spread.types)]))
+        return Spread(tuple(name for name in spread.types if name in sizes), column)
+
     def rows_of(self, types: tuple[str, ...]) -> Rows:
         """Return the places of the cases of these types."""
         if len(types) == len(self.sizes):

@@ -9,12 +9,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from difflib import get_close_matches
 from enum import Enum
 from numbers import Real
 from typing import Any
 
 from pycrorm_async.errors import CallerError
+from pycrorm_async.query.suggestions import nearest
 from pycrorm_async.recall.blocks import WORDS_MAX
 from pycrorm_async.recall.case import FEATURES_MAX, TEXT_MAX
 from pycrorm_async.recall.library import CaseLibrary
@@ -23,6 +23,8 @@ __all__ = ["Cue", "K_MAX", "Wanted", "check_cue", "closest", "numbers_of", "symb
 
 K_MAX = 10_000
 """Bounds the cases of one answer."""
+_LISTED = 12
+"""Bounds the names that an error lists."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +44,7 @@ class Cue:
         type: a dtype; None for cases of every type.
         has: pairs of feature and word. A feature with several values may occur several times.
         near: the wanted numbers.
-        lacks: pairs of feature and word that a case must not have.
+        lacks, requires: pairs of feature and word that a case must not have, and that it must have.
         before_us, after_us: a case starts before the one, and at or after the other.
         during_us: start and end of an interval in which a case starts and ends.
         as_of_us: a case has ended by then, and what is rare is counted among those that had.
@@ -57,6 +59,7 @@ class Cue:
     has: tuple[tuple[str, str], ...] = ()
     near: tuple[Wanted, ...] = ()
     lacks: tuple[tuple[str, str], ...] = ()
+    requires: tuple[tuple[str, str], ...] = ()
     before_us: int | None = None
     after_us: int | None = None
     during_us: tuple[int, int] | None = None
@@ -101,18 +104,16 @@ def word(value: object) -> str:
     return str(value)
 
 
-def closest(name: str, known: Iterable[str]) -> str:
-    """Return the end of an error's line: the known name that is most like this one, or all names if they are few.
+def closest(name: str, valid: Iterable[str]) -> str:
+    """Return the end of an error's line: the names that are most like this one, or else some of those there are.
 
     >>> closest("graps", ["arm", "grasp", "height"])
-    '; the nearest is grasp'
+    '; did you mean grasp?'
     """
-    names = sorted(known)
-    similar = get_close_matches(name[:TEXT_MAX], names, n=1, cutoff=0.5)
-    if similar:
-        return f"; the nearest is {similar[0]}"
-    listed = ", ".join(names[:12])
-    return f"; known are {listed}{', ...' if len(names) > 12 else ''}" if names else ""
+    names = sorted(valid)
+    question = nearest(name[:TEXT_MAX], names)
+    listed = f"; there are {', '.join(names[:_LISTED])}{', ...' if len(names) > _LISTED else ''}" if names else ""
+    return question or listed
 
 
 # --- what a cue cannot be -------------------------------------------------------------------------------------
@@ -146,7 +147,7 @@ def check_cue(cue: Cue, library: CaseLibrary) -> None:
 def _check_features(cue: Cue, library: CaseLibrary) -> None:
     texts, numbers = library.texts(cue.type), library.numbers(cue.type)
     owner = f"no case of {cue.type}" if cue.type else "no case"
-    for feature, value in (*cue.has, *cue.lacks):
+    for feature, value in (*cue.has, *cue.lacks, *cue.requires):
         if feature in texts:
             continue
         if feature in library.left_out:

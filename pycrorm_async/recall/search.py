@@ -205,6 +205,8 @@ def _conditions(group: Group, rows: slice, cue: Cue) -> Iterator[Mask]:
     """Yield which rows fulfil each condition but the times of their starts."""
     for pair in cue.lacks:
         yield ~_having(group, pair, rows)
+    for pair in cue.requires:
+        yield _having(group, pair, rows)
     if cue.episodes is not None:
         yield np.isin(group.episodes[rows], list(cue.episodes))
     if cue.prohibit:

@@ -20,10 +20,10 @@ TYPE = "PickUpAction"
 
 BAD_CUES: dict[str, tuple[Cue, str]] = {
     "empty": (Cue(), "the cue is empty"),
-    "a feature no case has": (Cue(type=TYPE, has=(("amr", "LEFT"),)), "'amr'; the nearest is arm"),
-    "a number no case has": (Cue(type=TYPE, near=(Wanted("heigth", 1.0),)), "'heigth'; the nearest is height"),
-    "nothing near": (Cue(has=(("qqqq", "x"),)), "'qqqq'; known are arm, near, object_type, reason, status"),
-    "in lacks": (Cue(type=TYPE, lacks=(("amr", "LEFT"),)), "the nearest is arm"),
+    "a feature no case has": (Cue(type=TYPE, has=(("amr", "LEFT"),)), "'amr'; did you mean arm?"),
+    "a number no case has": (Cue(type=TYPE, near=(Wanted("heigth", 1.0),)), "'heigth'; did you mean height?"),
+    "nothing near": (Cue(has=(("qqqq", "x"),)), "'qqqq'; there are arm, near, object_type, reason, status"),
+    "in lacks": (Cue(type=TYPE, lacks=(("amr", "LEFT"),)), "did you mean arm?"),
     "a text for a number": (Cue(type=TYPE, has=(("height", "high"),)), "height is a number: ask for it with `near`"),
     "a number for a text": (Cue(type=TYPE, near=(Wanted("arm", 1.0),)), "arm is a text: ask for it with `has`"),
     "k 0": (Cue(type=TYPE, k=0), "k must be 1 to 10,000, got 0"),

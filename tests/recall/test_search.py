@@ -46,6 +46,7 @@ def fulfils(case: Case, cue: Cue) -> bool:
     return (
         cue.type in (None, case.type)
         and not any(has(case, *pair) for pair in cue.lacks)
+        and all(has(case, *pair) for pair in cue.requires)
         and (cue.before_us is None or case.started_us < cue.before_us)
         and (cue.after_us is None or case.started_us >= cue.after_us)
         and (cue.during_us is None or (case.started_us >= cue.during_us[0] and ended_by(case, cue.during_us[1])))
@@ -107,6 +108,7 @@ def random_cue(chance: random.Random, cases: list[Case]) -> Cue:
         has=pairs(5),
         near=tuple(chance.sample(numbers, chance.choice((0, 0, 1, 3)))),
         lacks=pairs(1),
+        requires=pairs(1) if chance.random() < 0.2 else (),
         before_us=sometimes(chance.randrange(60)),  # type: ignore[arg-type]
         after_us=sometimes(chance.randrange(60)),  # type: ignore[arg-type]
         during_us=sometimes((start, start + chance.choice((5, 600_000)))),  # type: ignore[arg-type]
