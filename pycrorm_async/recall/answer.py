@@ -13,17 +13,30 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from html import escape
-from typing import Any, NamedTuple, overload
+from typing import Any, NamedTuple, Protocol, overload
 
+from pycrorm_async.errors import CallerError
+from pycrorm_async.query.snapshot import Moment
 from pycrorm_async.recall.case import Case, is_angle
 from pycrorm_async.recall.cue import Cue
 from pycrorm_async.recall.library import CaseLibrary
 from pycrorm_async.recall.search import Found, Weights, search, weights_of
 
-__all__ = ["Answer", "Compared", "Rate", "RecalledCase", "Typical", "answer", "compare", "rate_of", "success_of"]
+__all__ = [
+    "Answer",
+    "Compared",
+    "Rate",
+    "RecalledCase",
+    "Surroundings",
+    "Typical",
+    "answer",
+    "compare",
+    "rate_of",
+    "success_of",
+]
 
 _TRIED = ("SUCCEEDED", "FAILED", "ERROR")
 """The statuses of an action that ran to its end. Of one that was cancelled, interrupted or lost nothing is known."""
@@ -84,6 +97,15 @@ class Typical(NamedTuple):
     share: float
 
 
+class Surroundings(Protocol):
+    """What happened around a case."""
+
+    async def next(self, case: Case) -> Case | None: ...
+    async def previous(self, case: Case) -> Case | None: ...
+    async def parent(self, case: Case) -> Case | None: ...
+    async def moment(self, case: Case) -> Moment: ...
+
+
 @dataclass(frozen=True)
 class RecalledCase:
     """One case of an answer. It is read from the columns when it is asked for.
@@ -91,11 +113,13 @@ class RecalledCase:
     Attributes:
         found: its place in the columns, with its score.
         cue, weights: what it is compared with.
+        memory: finds what happened around it; None for an answer of columns only.
     """
 
     found: Found
     cue: Cue
     weights: Weights
+    memory: Surroundings | None = field(default=None, repr=False)
 
     @property
     def score(self) -> float:
@@ -141,6 +165,28 @@ class RecalledCase:
     def missed(self) -> tuple[Compared, ...]:
         """The features that differ, that are further off than their tolerance, or that the case does not have."""
         return tuple(each for each in self.compared if each.similarity == 0)
+
+    async def next(self) -> Case | None:
+        """Return the action that started next under the same parent."""
+        return await self._memory.next(self.case)
+
+    async def previous(self) -> Case | None:
+        """Return the action that started before it under the same parent."""
+        return await self._memory.previous(self.case)
+
+    async def parent(self) -> Case | None:
+        """Return the nearest action around it; None outside any, and while that runs."""
+        return await self._memory.parent(self.case)
+
+    async def moment(self) -> Moment:
+        """Return the task tree and the world as they were when it started."""
+        return await self._memory.moment(self.case)
+
+    @property
+    def _memory(self) -> Surroundings:
+        if self.memory is None:
+            raise CallerError("this case was not recalled from a memory: use `memory.recall`")
+        return self.memory
 
     def why(self) -> str:
         """Return why the case was found, as lines of text."""
@@ -252,10 +298,10 @@ class Answer(Sequence[RecalledCase]):
         return f"<p>{escape(self.why())}</p><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
 
 
-def answer(cue: Cue, library: CaseLibrary) -> Answer:
+def answer(cue: Cue, library: CaseLibrary, memory: Surroundings | None = None) -> Answer:
     """Search the cases most like a cue, and compare each of them with it. The cue was checked by `check_cue`."""
     weights = weights_of(cue, library)
-    return Answer(cue, [RecalledCase(each, cue, weights) for each in search(cue, library, weights)], weights)
+    return Answer(cue, [RecalledCase(each, cue, weights, memory) for each in search(cue, library, weights)], weights)
 
 
 def compare(cue: Cue, case: Case, weights: Weights) -> tuple[Compared, ...]:

@@ -1,0 +1,225 @@
+"""Recall past actions: `memory.recall` is called with a cue, and answers with the cases most like it.
+
+>>> answer = await memory.recall(type=PickUpAction, has={"object_type": ObjectType.MILK}, near={"height": 0.93})
+>>> answer.success, answer.reasons, answer.never_seen
+>>> await answer[0].moment()                                             # the world as it was then
+>>> await memory.recall.similar_to_now(milk, PickUpAction)               # cue: the world as it is
+>>> await memory.recall.follows(PickUpAction, reason=IKError)            # what came next, and how that ended
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from importlib import import_module
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
+
+from pycrorm_async.clock import SYSTEM_CLOCK, Clock
+from pycrorm_async.errors import CallerError, MissingExtra
+from pycrorm_async.query.as_of import AnyEpisode
+from pycrorm_async.query.reading import Reading
+from pycrorm_async.query.snapshot import Moment
+from pycrorm_async.recall.activation import Forgotten
+from pycrorm_async.recall.answer import Answer, answer
+from pycrorm_async.recall.case import Case
+from pycrorm_async.recall.cue import Cue, check_cue, numbers_of, symbols_of, word
+from pycrorm_async.recall.following import Following, Relation
+from pycrorm_async.recall.library import CaseLibrary
+from pycrorm_async.recall.reading.case_reader import CaseReader
+from pycrorm_async.recall.reading.cue_arguments import (
+    AnyCase,
+    Conditions,
+    EpisodeNames,
+    When,
+    case_of,
+    cue_like,
+    dtype_of,
+    make_cue,
+)
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+__all__ = ["Recall"]
+
+_NOTHING: Mapping[str, Any] = MappingProxyType({})
+
+
+class Recall:
+    """The recall of one memory, for one event loop.
+
+    Args:
+        reader: of the cases.
+        reading: of the same memory, for episodes and past moments.
+    """
+
+    def __init__(self, reader: CaseReader, reading: Reading, clock: Clock = SYSTEM_CLOCK) -> None:
+        self._reader = reader
+        self._reading = reading
+        self._clock = clock
+
+    async def __call__(
+        self,
+        type: str | type | None = None,  # noqa: A002  the feature's name
+        *,
+        has: Mapping[str, Any] = _NOTHING,
+        near: Mapping[str, Any] = _NOTHING,
+        lacks: Mapping[str, Any] = _NOTHING,
+        only: Mapping[str, Any] = _NOTHING,
+        before: When | None = None,
+        after: When | None = None,
+        during: AnyCase | tuple[When, When] | None = None,
+        as_of: When | None = None,
+        prohibit: Iterable[AnyCase] = (),
+        episode: AnyEpisode | Iterable[AnyEpisode] | None = None,
+        robot: str | None = None,
+        tag: str | None = None,
+        simulated: bool = False,
+        k: int = 20,
+        minimum: float = 0.0,
+    ) -> Answer:
+        """Return the past actions most like a cue, the best first and among equals the newest.
+
+        `has` and `near` make actions similar. The others are conditions, which every action of the answer fulfils. What
+        has ended in this process is included at once; of other processes what is visible in the tables.
+
+        Args:
+            type: a designator class or its dtype; subclasses are types of their own. A type that never occurred gives
+                an empty answer.
+            has: values by feature, as `{"arm": Arms.LEFT, "near": ["BOWL", "CUP"]}`: enums, texts, booleans, classes.
+                `status`, `reason` and `duration` of the outcome are compared only if they are given.
+            near: numbers by feature: the wanted one, or a pair of it and the tolerance, from which on nothing is alike.
+                Without one it is the number's standard deviation among the actions of the type, 0.5 rad for angles.
+            lacks, only: values that the action must not have, and that it must have.
+            before, after: it started before this moment, or before this case; at or after it, or after its end.
+            during: it started and ended in this interval, or during this case in the same episode.
+            as_of: the answer at this moment: it had ended by then.
+            prohibit: cases that are no answer, as the one that is asked about.
+            episode, robot, tag: it belongs to this episode or one of these; the robot's name; the episode has the tag.
+            simulated: simulations are included.
+            k: the number of actions, 1 to 10,000.
+            minimum: the lowest score, 0 to 1.
+
+        Raises:
+            CallerError: for a cue that cannot be answered, in one line with the nearest name. `UnknownEpisode`.
+        """
+        conditions = Conditions(
+            before, after, during, as_of, prohibit, only, episode, robot, tag, simulated=simulated, k=k, minimum=minimum
+        )
+        library = await self._reader.library()
+        words = symbols_of(has), numbers_of(near), symbols_of(lacks)
+        cue = await make_cue(library, EpisodeNames(self._reading), dtype_of(type), *words, conditions)
+        return self._answer(cue, library)
+
+    async def like(self, case: AnyCase, *, k: int = 20, simulated: bool = False) -> Answer:
+        """Return the actions whose situation was most like that of a case, which is left out itself.
+
+        The name of its object is not compared. Raises `CallerError` for a node without a case.
+        """
+        library = await self._reader.library()
+        found = case_of(case, library)
+        has, near = cue_like(found)
+        has = tuple(pair for pair in has if pair[0] not in library.left_out)
+        conditions = Conditions(prohibit=[found], k=k, simulated=simulated or found.simulated)
+        cue = await make_cue(library, EpisodeNames(self._reading), found.type, has, near, (), conditions)
+        return self._answer(cue, library)
+
+    def _answer(self, cue: Cue, library: CaseLibrary) -> Answer:
+        check_cue(cue, library)
+        return answer(cue, library, self)
+
+    async def frame(self, type: str | type | None = None, **cue: Any) -> pd.DataFrame:  # noqa: A002
+        """Return an answer as a data frame: a row for each action, with its score and a column for each feature.
+
+        The arguments are those of the call. Raises `MissingExtra` without pandas.
+        """
+        return frame_of(await self(type, **cue))
+
+    async def forget(self, activation: float, *, dry_run: bool = False) -> Forgotten:
+        """Hide the actions in ways that were not used enough lately, from this object only; nothing is deleted.
+
+        A way is a type with all its texts, as the same object, arm and grasp. Each call replaces the one before it:
+        `forget(float("-inf"))` hides nothing.
+
+        Args:
+            activation: the lowest base-level activation in the sense of ACT-R; that of one use is 0 after 1 s, -2.3
+                after 100 s, -5.7 after a day.
+            dry_run: only count.
+        """
+        if isinstance(activation, bool) or activation != activation:
+            raise CallerError(f"activation must be a number, got {activation!r}")
+        return await self._reader.forget(activation, self._clock.wall_ns() // 1_000, dry_run=dry_run)
+
+    # --- around a case ----------------------------------------------------------------------------------------
+
+    async def case(self, case: AnyCase) -> Case:
+        """Return the case of a node. Raises `CallerError` if it has none."""
+        return case_of(case, await self._reader.library())
+
+    async def next(self, case: AnyCase) -> Case | None:
+        """Return the action that started next under the same parent."""
+        return (await self._reader.sequences()).next(await self.case(case))
+
+    async def previous(self, case: AnyCase) -> Case | None:
+        """Return the action that started before it under the same parent."""
+        return (await self._reader.sequences()).previous(await self.case(case))
+
+    async def parent(self, case: AnyCase) -> Case | None:
+        """Return the nearest action around it; None outside any, and while that runs."""
+        return (await self._reader.sequences()).parent(await self.case(case))
+
+    async def related(self, case: AnyCase, relation: Relation | str) -> list[Case]:
+        """Return the actions of its episode that lie in a relation of Allen to it, as `"during"`, by their start."""
+        try:
+            wanted = Relation(relation)
+        except ValueError:
+            names = ", ".join(each.value for each in Relation)
+            raise CallerError(f"{relation!r} is no relation; there are {names}") from None
+        return (await self._reader.sequences()).related(await self.case(case), wanted)
+
+    async def moment(self, case: AnyCase) -> Moment:
+        """Return the task tree and the world as they were when an action started; see `Reading.as_of`."""
+        found = await self.case(case)
+        return await self._reading.as_of(found.episode, sequence=found.sequence)
+
+    async def follows(
+        self,
+        type: str | type,  # noqa: A002
+        *,
+        status: object = None,
+        reason: str | type | None = None,
+    ) -> Following:
+        """Return what came next after the actions of a type, how often, and how that ended.
+
+        Args:
+            type: a designator class or its dtype.
+            status, reason: how they ended, and the class of the failure or its name; by default any.
+        """
+        dtype = dtype_of(type)
+        assert dtype is not None
+        wanted = {name: word(each) for name, each in (("status", status), ("reason", reason)) if each is not None}
+        return (await self._reader.sequences()).follows(dtype, **wanted)
+
+
+def frame_of(found: Answer) -> pd.DataFrame:
+    """Return an answer as a data frame. Raises `MissingExtra` without pandas."""
+    try:
+        pandas = import_module("pandas")
+    except ImportError:
+        raise MissingExtra("frames need pandas: pip install 'pycrorm-async[frames]'") from None
+    rows = []
+    for each in found:
+        case = each.case
+        outcome = {"status": case.status, "reason": case.reason, "duration": case.duration_s}
+        place: dict[str, Any] = {
+            "node": case.node,
+            "episode": case.episode,
+            "sequence": case.sequence,
+            "type": case.type,
+        }
+        rows.append(
+            {"score": each.score, **place, "started": case.started_at, **outcome, **case.symbols, **case.numbers}
+        )
+    columns = ["score", "node", "episode", "sequence", "type", "started", "status", "reason", "duration"]
+    frame: pd.DataFrame = pandas.DataFrame(rows) if rows else pandas.DataFrame(columns=columns)
+    return frame
