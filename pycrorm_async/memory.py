@@ -377,10 +377,8 @@ class Memory(ReadableMemory, ObservingMemory):
             FlushTimeout: nothing was stored or folded for `flush_timeout_s`. The events are safe in the spool.
         """
         parts = self._open_parts
-        position = parts.queue.written
-        await parts.queue.synced_to(position)
         try:
-            await parts.writer.flush(position)
+            await parts.flush()
         except EpisodeParked as fault:
             unreported = self._unreported(fault)
             if unreported is not None:

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from typing import Any, NamedTuple
 
+from pycrorm_async.clock import Clock
 from pycrorm_async.connected_var import ConnectedVar, set_inside
 from pycrorm_async.errors import CallerError
 from pycrorm_async.hooks.observations import Observations
@@ -37,6 +38,12 @@ class Parts(NamedTuple):
     recording: Recording
     observations: Observations
     experience: PickUpExperience
+
+    async def flush(self) -> None:
+        """Wait until all events recorded so far are stored and visible. Raises as `Memory.flush` does."""
+        position = self.queue.written
+        await self.queue.synced_to(position)
+        await self.writer.flush(position)
 
     @contextmanager
     def in_context(self) -> Iterator[None]:
@@ -70,6 +77,7 @@ class PartsHolder:
     """A memory as its methods see it: with parts while it is open."""
 
     _parts: Parts | None
+    _clock: Clock
     _address: DatabaseAddress
     _located: DatabaseAddress
 

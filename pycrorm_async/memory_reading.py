@@ -36,6 +36,10 @@ from pycrorm_async.query.snapshot import Moment
 from pycrorm_async.query.sql.read_only import DEFAULT_LIMITS, SqlLimits, SqlResult
 from pycrorm_async.query.success.figure import Kind, success_figure
 from pycrorm_async.query.success.samples import Source, success_samples
+from pycrorm_async.recall.reading.case_reader import CaseReader
+from pycrorm_async.recall.reading.database_source import DatabaseSource
+from pycrorm_async.recall.reading.recall import Recall
+from pycrorm_async.recall.reading.running_cases import ProcessCases
 from pycrorm_async.recording.recording import Recording
 from pycrorm_async.recording.writing.event_feed import BUFFER_EVENTS, EventStream, RecordedEvent, Subscription
 from pycrorm_async.report.write import Report
@@ -52,6 +56,8 @@ __all__ = ["ObservingMemory", "ReadableMemory"]
 
 class ReadableMemory(PartsHolder):
     """The queries of a memory. Each raises `CallerError` while the memory is not open."""
+
+    _recall: Recall | None = None
 
     def __repr__(self) -> str:
         return f"<Memory {self._address}, {'open' if self._parts is not None else 'not open'}>"
@@ -131,6 +137,22 @@ class ReadableMemory(PartsHolder):
     async def diff(self, first: AskedEpisode, second: AskedEpisode) -> EpisodeDiff:
         """Compare two episodes, up to the last flush; see `Reading.diff`."""
         return await self._open_parts.reading.diff(first, second)
+
+    @property
+    def recall(self) -> Recall:
+        """The past actions most like a cue: `await memory.recall(type=PickUpAction, has={"arm": Arms.LEFT})`."""
+        parts = self._open_parts
+        if self._recall is None:
+            running = ProcessCases(
+                parts.emitter,
+                open_episodes=lambda: [*parts.recorder.episodes.by_id],
+                flush=parts.flush,
+                log=parts.reading.log,
+                clock=self._clock,
+            )
+            reader = CaseReader(DatabaseSource(parts.reading), running)
+            self._recall = Recall(reader, parts.reading, self._clock)
+        return self._recall
 
     async def query(self, sql: str, limits: SqlLimits = DEFAULT_LIMITS) -> SqlResult:
         """Return the rows of one query in SQL that can only read, up to the last flush; see `Reading.query`."""

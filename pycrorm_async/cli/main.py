@@ -89,6 +89,7 @@ _VERBS = (
     "episodes",
     "show",
     "report",
+    "recall",
     "picture",
     "export",
     "watch",

@@ -166,6 +166,10 @@ class RecalledCase:
         """The features that differ, that are further off than their tolerance, or that the case does not have."""
         return tuple(each for each in self.compared if each.similarity == 0)
 
+    def difference(self) -> str:
+        """Return the features that are not quite alike, with what the case has, as text."""
+        return "; ".join(_missed(each) for each in self.compared if each.similarity < 1)
+
     async def next(self) -> Case | None:
         """Return the action that started next under the same parent."""
         return await self._memory.next(self.case)
@@ -285,7 +289,7 @@ class Answer(Sequence[RecalledCase]):
                 each.case.started_at.strftime("%Y-%m-%d %H:%M:%S"),
                 each.case.status,
                 each.case.reason,
-                "; ".join(_missed(compared) for compared in each.compared if compared.similarity < 1),
+                each.difference(),
             )
             for each in self.cases
         ]

@@ -153,13 +153,15 @@ def _check_features(cue: Cue, library: CaseLibrary) -> None:
         if feature in library.left_out:
             raise CallerError(f"{feature} has more than {WORDS_MAX:,} different values, so it is not compared")
         if feature in numbers:
-            raise CallerError(f"{feature} is a number: ask for it with `near`, got the text {value!r}")
+            raise CallerError(f"{feature} is a number: ask for it with `near` (FEATURE~NUMBER), got the text {value!r}")
         raise CallerError(f"{owner} has a feature {feature!r}{closest(feature, texts)}")
     for each in cue.near:
         if each.feature in numbers:
             continue
         if each.feature in texts:
-            raise CallerError(f"{each.feature} is a text: ask for it with `has`, got the number {each.value:g}")
+            raise CallerError(
+                f"{each.feature} is a text: ask for it with `has` (FEATURE=TEXT), got the number {each.value:g}"
+            )
         raise CallerError(f"{owner} has a number {each.feature!r}{closest(each.feature, numbers)}")
 
 

@@ -24,8 +24,14 @@ BAD_CUES: dict[str, tuple[Cue, str]] = {
     "a number no case has": (Cue(type=TYPE, near=(Wanted("heigth", 1.0),)), "'heigth'; did you mean height?"),
     "nothing near": (Cue(has=(("qqqq", "x"),)), "'qqqq'; there are arm, near, object_type, reason, status"),
     "in lacks": (Cue(type=TYPE, lacks=(("amr", "LEFT"),)), "did you mean arm?"),
-    "a text for a number": (Cue(type=TYPE, has=(("height", "high"),)), "height is a number: ask for it with `near`"),
-    "a number for a text": (Cue(type=TYPE, near=(Wanted("arm", 1.0),)), "arm is a text: ask for it with `has`"),
+    "a text for a number": (
+        Cue(type=TYPE, has=(("height", "high"),)),
+        "height is a number: ask for it with `near`",
+    ),
+    "a number for a text": (
+        Cue(type=TYPE, near=(Wanted("arm", 1.0),)),
+        "arm is a text: ask for it with `has`",
+    ),
     "k 0": (Cue(type=TYPE, k=0), "k must be 1 to 10,000, got 0"),
     "k too large": (Cue(type=TYPE, k=K_MAX + 1), "k must be 1 to 10,000"),
     "minimum": (Cue(type=TYPE, minimum=1.5), "minimum must be a score from 0 to 1"),

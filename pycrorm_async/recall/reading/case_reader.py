@@ -16,12 +16,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pycrorm_async.recall.activation import Forgotten, forgotten
-from pycrorm_async.recall.blocks import EPISODE_SHIFT, Block
+from pycrorm_async.recall.blocks import Block, merge
 from pycrorm_async.recall.case import Case
 from pycrorm_async.recall.following import Sequences
 from pycrorm_async.recall.library import CaseLibrary
 
 __all__ = ["BlockSource", "CaseReader", "NoRunningCases", "RunningCases", "StoredBlocks"]
+
+
+_UNSTORED_BLOCKS = 16
+"""Bounds the blocks of cases of this process, each of one recall; more of them are merged."""
 
 
 class StoredBlocks(NamedTuple):
@@ -49,17 +53,17 @@ class BlockSource(Protocol):
 class RunningCases(Protocol):
     """The cases of this process, stored or not."""
 
-    async def new(self) -> Sequence[Case]:
-        """Return the cases of the actions that have ended since the last call."""
+    async def new(self) -> tuple[Sequence[Case], Sequence[Case]]:
+        """Return the new cases of actions that have ended, and all cases whose episodes have no number yet."""
         ...
 
 
 class NoRunningCases:
     """The cases of a process that records nothing."""
 
-    async def new(self) -> Sequence[Case]:
+    async def new(self) -> tuple[Sequence[Case], Sequence[Case]]:
         """Return nothing."""
-        return ()
+        return (), ()
 
 
 class CaseReader:
@@ -70,7 +74,8 @@ class CaseReader:
         self._running = running if running is not None else NoRunningCases()
         self._generation = -1
         self._blocks: dict[int, Block] = {}
-        self._unstored: dict[int, Case] = {}
+        self._unstored: list[Block] = []
+        self._unnumbered: Sequence[Case] = ()
         self._hidden: NDArray[np.int64] = np.zeros(0, np.int64)
         self._library = CaseLibrary()
         self._sequences: tuple[CaseLibrary, Sequences] | None = None
@@ -99,38 +104,39 @@ class CaseReader:
             return found
 
     async def _read(self, *, changed: bool = False) -> CaseLibrary:
-        running = await self._running.new()
+        running, unnumbered = await self._running.new()
         stored = await self._source.read(self._generation, self._blocks.keys())
         if stored.generation != self._generation:
             self._generation, self._blocks, changed = stored.generation, {}, True
-        merged = self._blocks.keys() - stored.numbers
-        for number in merged:
+        for number in self._blocks.keys() - stored.numbers:
             del self._blocks[number]
         self._blocks.update(stored.added)
-        self._unstored.update((case.node, case) for case in running)
-        before = len(self._unstored)
-        looked_in = self._blocks if running else stored.added  # a new case may be in a block that was read before
-        if self._unstored:
-            for node in _nodes_in(looked_in.values(), self._unstored):
-                del self._unstored[node]
-        if changed or running or merged or stored.added or len(self._unstored) != before:
+        unstored = self._unstored
+        if stored.added:
+            unstored = _without(unstored, stored.added.values())
+        if running:
+            unstored = [*unstored, *_without([Block.of(running)], self._blocks.values())]
+        if changed or stored.added or unstored != self._unstored or [*unnumbered] != [*self._unnumbered]:
+            self._unstored = unstored if len(unstored) <= _UNSTORED_BLOCKS else [merge(unstored)]
+            self._unnumbered = unnumbered
             self._library = CaseLibrary(self._visible())
         return self._library
 
     def _visible(self) -> list[Block]:
-        blocks = [*self._blocks.values(), *([Block.of(self._unstored.values())] if self._unstored else [])]
+        blocks = [*self._blocks.values(), *self._unstored, *([Block.of(self._unnumbered)] if self._unnumbered else [])]
         if not self._hidden.size:
             return blocks
         kept = [(block, ~np.isin(block.nodes, self._hidden)) for block in blocks]
         return [block if each.all() else block.where(each) for block, each in kept if each.any()]
 
 
-def _nodes_in(blocks: Collection[Block], cases: Mapping[int, Case]) -> list[int]:
-    """Return the nodes of these cases that a block has. Only the cases of their episodes are compared."""
-    nodes = np.fromiter(cases, np.int64, len(cases))
-    first, last = int(nodes.min()) >> EPISODE_SHIFT, (int(nodes.max()) >> EPISODE_SHIFT) + 1
-    stored: list[int] = []
+def _without(blocks: Sequence[Block], stored: Collection[Block]) -> list[Block]:
+    """Return the blocks without the cases that a stored block has; a block of which none are left is left out."""
+    left: list[Block] = []
     for block in blocks:
-        near = block.nodes[(block.nodes >= first << EPISODE_SHIFT) & (block.nodes < last << EPISODE_SHIFT)]
-        stored += np.intersect1d(near, nodes).tolist()
-    return stored
+        first, last = block.nodes.min(), block.nodes.max()
+        both = [np.isin(block.nodes, each.nodes[(each.nodes >= first) & (each.nodes <= last)]) for each in stored]
+        kept = ~np.logical_or.reduce(both) if both else np.ones(len(block), np.bool_)
+        if kept.any():
+            left.append(block if kept.all() else block.where(kept))
+    return left

@@ -16,6 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
 from pycrorm_async.errors import CallerError, MissingExtra
+from pycrorm_async.plan.designator import Designator
+from pycrorm_async.plan.object_designators import ObjectDesignator
 from pycrorm_async.query.as_of import AnyEpisode
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.snapshot import Moment
@@ -36,6 +38,9 @@ from pycrorm_async.recall.reading.cue_arguments import (
     dtype_of,
     make_cue,
 )
+from pycrorm_async.recall.reading.database_source import DatabaseSource
+from pycrorm_async.recall.reading.present_situation import present_situation
+from pycrorm_async.world.objects import Object
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -57,6 +62,11 @@ class Recall:
         self._reader = reader
         self._reading = reading
         self._clock = clock
+
+    @classmethod
+    def of(cls, reading: Reading) -> Recall:
+        """Return the recall of a memory that is open for reading."""
+        return cls(CaseReader(DatabaseSource(reading)), reading)
 
     async def __call__(
         self,
@@ -124,6 +134,36 @@ class Recall:
         cue = await make_cue(library, EpisodeNames(self._reading), found.type, has, near, (), conditions)
         return self._answer(cue, library)
 
+    async def similar_to_now(
+        self,
+        target: Object | ObjectDesignator,
+        action: type[Designator],
+        *,
+        has: Mapping[str, Any] = _NOTHING,
+        near: Mapping[str, Any] = _NOTHING,
+        k: int = 50,
+        **conditions: Any,
+    ) -> Answer:
+        """Return the actions of a class whose situation was most like the present one of an object.
+
+        Compared are its type, what is near it, its height, the stand of the robot that acts, and its torso.
+
+        Args:
+            target: an object in a world, or its designator.
+            action: a designator class.
+            has, near: further features, and others than the present ones, as the arm that is to be used.
+            conditions: those of the call, as `only` and `episode`.
+        """
+        library = await self._reader.library()
+        dtype = dtype_of(action)
+        symbols, numbers = present_situation(target, action)
+        known = library.texts(dtype) | library.numbers(dtype)
+        symbols = {name: each for name, each in symbols.items() if name in known and name != "object_name"}
+        wanted = {name: each for name, each in numbers.items() if name in known}
+        words = symbols_of({**symbols, **has}), numbers_of({**wanted, **near})
+        cue = await make_cue(library, EpisodeNames(self._reading), dtype, *words, (), Conditions(k=k, **conditions))
+        return self._answer(cue, library)
+
     def _answer(self, cue: Cue, library: CaseLibrary) -> Answer:
         check_cue(cue, library)
         return answer(cue, library, self)
@@ -149,6 +189,10 @@ class Recall:
         if isinstance(activation, bool) or activation != activation:
             raise CallerError(f"activation must be a number, got {activation!r}")
         return await self._reader.forget(activation, self._clock.wall_ns() // 1_000, dry_run=dry_run)
+
+    async def types(self) -> tuple[str, ...]:
+        """Return the types of the actions that have ended."""
+        return tuple((await self._reader.library()).types)
 
     # --- around a case ----------------------------------------------------------------------------------------
 

@@ -105,7 +105,7 @@ class Emitter:
         """Append the declaration of a designator type."""
         kind = type(declared.declaration)
         self.put_payload(Heading(None, kind.__name__, kind.version), declared.payload)
-        self.feed.note_type(declared.fingerprint, declared.dtype)
+        self.feed.note_type(declared.fingerprint, declared.declaration)
 
     def offer(self, episode: EpisodeId, event: Happening) -> int:
         """Append an event without using the reserve and without waiting; raise `SpoolFull` if there is no room."""

@@ -20,14 +20,24 @@ import asyncio
 import logging
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from queue import Empty, SimpleQueue
 from types import TracebackType
 from typing import Final, NamedTuple, Self
 
+from pycrorm_async.clock import Clock
 from pycrorm_async.events.ids import EpisodeId, episode_text
-from pycrorm_async.events.types import Happening, NodeStarted
+from pycrorm_async.events.types import DesignatorTypeDeclared, Happening, NodeStarted
 
-__all__ = ["BUFFER_EVENTS", "EventFeed", "EventStream", "Subscription", "RecordedEvent"]
+__all__ = [
+    "BUFFER_EVENTS",
+    "EventBuffer",
+    "EventFeed",
+    "EventStream",
+    "RecordedEvent",
+    "Subscription",
+    "TimedEvent",
+]
 
 _log = logging.getLogger("pycrorm_async")
 BUFFER_EVENTS: Final = 10_000
@@ -57,17 +67,22 @@ class EventFeed:
 
     def __init__(self) -> None:
         self.observers: tuple[_Buffer, ...] = ()
-        self._dtypes: dict[str, str] = {}
+        self._declarations: dict[str, DesignatorTypeDeclared] = {}
         self._change = threading.Lock()
 
-    def note_type(self, fingerprint: str, dtype: str) -> None:
-        """Remember the name of a declared designator type, by which events of its nodes are published."""
-        self._dtypes[fingerprint] = dtype
+    def note_type(self, fingerprint: str, declaration: DesignatorTypeDeclared) -> None:
+        """Remember a declared designator type, by whose name events of its nodes are published."""
+        self._declarations[fingerprint] = declaration
+
+    def declaration(self, fingerprint: str | None) -> DesignatorTypeDeclared | None:
+        """Return the designator type with this fingerprint, if this memory declared it."""
+        return self._declarations.get(fingerprint) if fingerprint is not None else None
 
     def publish(self, episode: EpisodeId, sequence: int, happening: Happening) -> None:
         """Add an event to the buffer of each observer. Never waits."""
         designator = happening.designator if isinstance(happening, NodeStarted) else None
-        dtype = self._dtypes.get(designator) if designator is not None else None
+        declaration = self.declaration(designator)
+        dtype = declaration.dtype if declaration is not None else None
         event = RecordedEvent(episode_text(episode), sequence, happening, dtype)
         for each in self.observers:
             each.add(event)
@@ -84,6 +99,12 @@ class EventFeed:
         stream = EventStream(buffer, self._remove)
         self._add(stream)
         return stream
+
+    def keep(self, types: tuple[type[Happening], ...], buffer: int, clock: Clock) -> EventBuffer:
+        """Keep the events of these types until they are taken."""
+        kept = EventBuffer(types, buffer, self._remove, clock)
+        self._add(kept)
+        return kept
 
     async def close(self) -> None:
         """End all observers; wait a limited time until the callbacks have processed their buffers."""
@@ -127,6 +148,42 @@ class _Buffer:
             self._is_closed = True
             self._remove(self)
             self._events.put(None)
+
+
+class TimedEvent(NamedTuple):
+    """An event with the times at which it was published."""
+
+    event: RecordedEvent
+    wall_ns: int
+    monotonic_ns: int
+
+
+class EventBuffer(_Buffer):
+    """Events of some types, kept until they are taken, by any thread."""
+
+    def __init__(
+        self, types: tuple[type[Happening], ...], events_max: int, remove: Callable[[_Buffer], None], clock: Clock
+    ) -> None:
+        super().__init__(events_max, remove)
+        self._types = types
+        self._clock = clock
+        self._kept: SimpleQueue[TimedEvent] = SimpleQueue()
+
+    def add(self, event: RecordedEvent) -> None:
+        if not isinstance(event.happening, self._types):
+            return
+        if self._kept.qsize() >= self._events_max:
+            self.left_out += 1
+        else:
+            self._kept.put(TimedEvent(event, self._clock.wall_ns(), self._clock.monotonic_ns()))
+
+    def take(self) -> list[TimedEvent]:
+        """Return the events that were added before this call, and keep them no longer."""
+        events = []
+        with suppress(Empty):
+            for _ in range(self._kept.qsize()):
+                events.append(self._kept.get_nowait())  # noqa: PERF401  an exception may end the loop
+        return events
 
 
 class Subscription(_Buffer):

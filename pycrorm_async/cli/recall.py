@@ -1,0 +1,247 @@
+"""`pycrorm recall` lists the past actions most like a cue, and how they ended."""
+
+from __future__ import annotations
+
+import asyncio
+import re
+from pathlib import Path
+from typing import Annotated, Any, NamedTuple
+
+import typer
+
+from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
+from pycrorm_async.cli.output import note, print_json, print_table, stdout
+from pycrorm_async.cli.pending_events import note_pending_events
+from pycrorm_async.errors import CallerError
+from pycrorm_async.events.ids import SEQUENCE_MAX, row_id
+from pycrorm_async.query.reading import Reading
+from pycrorm_async.recall.answer import Answer, RecalledCase
+from pycrorm_async.recall.cue import closest
+from pycrorm_async.recall.following import Following
+from pycrorm_async.recall.reading.recall import Recall
+
+__all__ = ["recall"]
+
+_TERM = re.compile(r"(?P<how>not:|only:)?(?P<feature>[^=~]+)(?P<sign>[=~])(?P<value>.*)", re.DOTALL)
+_NODE = re.compile(r"(?P<episode>.+)/e?(?P<sequence>\d+)")
+
+
+def recall(
+    cue: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="[TYPE] [FEATURE=TEXT | FEATURE~NUMBER±TOLERANCE | not:FEATURE=TEXT | only:FEATURE=TEXT]...",
+            help="A type of action, and what is sought: object_type=MILK, height~0.93 or height~0.93±0.1 (also +-0.1).",
+            show_default=False,
+        ),
+    ] = None,
+    like: Annotated[
+        str | None,
+        typer.Option(
+            metavar="EPISODE/EVENT", help="Seek actions in a situation as that of the action that this event began."
+        ),
+    ] = None,
+    follows: Annotated[
+        bool, typer.Option("--follows", help="Count what came next after the actions of a type, and how that ended.")
+    ] = False,
+    status: Annotated[str | None, typer.Option(help="With --follows: only after actions that ended so.")] = None,
+    reason: Annotated[str | None, typer.Option(help="With --follows: only after actions that failed so.")] = None,
+    k: Annotated[int, typer.Option("--k", help="The number of actions.")] = 10,
+    before: Annotated[
+        str | None, typer.Option(metavar="MOMENT", help="Started before: 2026-11-20, with time, in UTC.")
+    ] = None,
+    after: Annotated[str | None, typer.Option(metavar="MOMENT", help="Started at this moment or later.")] = None,
+    episode: Annotated[
+        str | None, typer.Option(help="In this episode: number, id, first digits of the id, or last.")
+    ] = None,
+    tag: Annotated[str | None, typer.Option(help="In episodes with this tag.")] = None,
+    robot: Annotated[str | None, typer.Option(help="Of this robot.")] = None,
+    simulated: Annotated[bool, typer.Option("--simulated", help="Also from simulated episodes.")] = False,
+    minimum: Annotated[float, typer.Option(help="The lowest score, 0 to 1.")] = 0.0,
+    why: Annotated[
+        bool, typer.Option("--why", help="Explain each action: what is alike, what differs and by how much.")
+    ] = False,
+    url: UrlOption = DEFAULT_URL,
+    spool: SpoolOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """List the past actions most like a cue, and how they ended."""
+    parsed = _parse(cue or [])
+    conditions: dict[str, Any] = {
+        "before": before, "after": after, "episode": episode, "tag": tag, "robot": robot,
+        "simulated": simulated, "k": k, "minimum": minimum,
+    }  # fmt: skip
+    if (status or reason) and not follows:
+        raise CallerError("--status and --reason belong to --follows; to compare them write status=FAILED")
+    if follows:
+        _follows(parsed, like, url, spool, status=status, reason=reason, as_json=as_json)
+        return
+    if like is not None and cue:
+        raise CallerError("--like takes the cue from an action: leave out the type and the features")
+
+    async def query() -> tuple[Answer, tuple[str, ...]]:
+        async with Reading.open(url) as reading:
+            memory = Recall.of(reading)
+            if like is not None:
+                found = await memory.like(await _node(reading, like), k=k, simulated=simulated)
+            else:
+                found = await memory(
+                    parsed.type, has=parsed.has, near=parsed.near, lacks=parsed.lacks, only=parsed.only, **conditions
+                )
+            return found, await memory.types()
+
+    found, types = asyncio.run(query())
+    note_pending_events(url, spool)
+    _note_unknown(found.cue.type, types)
+    if as_json:
+        print_json(_document(found))
+    else:
+        _print(found, why=why)
+
+
+class _Parsed(NamedTuple):
+    """The words of a cue."""
+
+    type: str | None
+    has: dict[str, list[str]]
+    near: dict[str, tuple[float, ...]]
+    lacks: dict[str, list[str]]
+    only: dict[str, list[str]]
+
+
+def _parse(words: list[str]) -> _Parsed:
+    """Read the words of a cue. Raises `CallerError`.
+
+    >>> _parse(["PickUpAction", "arm=LEFT", "height~0.93±0.1", "not:near=BOWL"])
+    _Parsed(type='PickUpAction', has={'arm': ['LEFT']}, near={'height': (0.93, 0.1)}, lacks={'near': ['BOWL']}, only={})
+    """
+    parsed = _Parsed(None, {}, {}, {}, {})
+    for each in words:
+        match = _TERM.fullmatch(each)
+        if match is None:
+            if parsed.type is not None:
+                raise CallerError(f"{each[:60]!r} is no feature: write FEATURE=TEXT or FEATURE~NUMBER")
+            parsed = parsed._replace(type=each)
+        elif match["sign"] == "=":
+            pairs = {"not:": parsed.lacks, "only:": parsed.only}.get(match["how"] or "", parsed.has)
+            pairs.setdefault(match["feature"], []).append(match["value"])
+        elif match["how"]:
+            raise CallerError(f"{each[:60]!r}: a number can only be sought, as height~0.93")
+        elif match["feature"] in parsed.near:
+            raise CallerError(f"{match['feature']} is given twice: an action has one")
+        else:
+            parsed.near[match["feature"]] = tuple(
+                _number(part, each) for part in re.split(r"±|\+-", match["value"], maxsplit=1)
+            )
+    return parsed
+
+
+def _number(text: str, term: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise CallerError(f"{term[:60]!r}: {text[:40]!r} is no number: write FEATURE~NUMBER or FEATURE=TEXT") from None
+
+
+async def _node(reading: Reading, like: str) -> int:
+    match = _NODE.fullmatch(like)
+    if match is None or int(match["sequence"]) > SEQUENCE_MAX:
+        raise CallerError(f"--like {like[:60]!r} is no action: write EPISODE/EVENT, as in 3/115 or last/e115")
+    return row_id((await reading.episode(match["episode"])).number, int(match["sequence"]), 0)
+
+
+def _note_unknown(dtype: str | None, types: tuple[str, ...]) -> None:
+    if dtype is not None and dtype not in types:
+        note(f"no {dtype} has ended in this memory{closest(dtype, types)}")
+
+
+# --- printing -------------------------------------------------------------------------------------------------
+
+
+def _print(found: Answer, *, why: bool) -> None:
+    if why:
+        for each in found:
+            stdout.print(each.why(), markup=False, highlight=False)
+    elif found:
+        columns = ("score", "status", "reason", "started", "differs", "see")
+        rows = [
+            (
+                each.score,
+                each.status,
+                each.case.reason,
+                each.case.started_at.strftime("%Y-%m-%d %H:%M:%S"),
+                each.difference(),
+                f"pycrorm show {each.case.episode} --at e{each.case.sequence}",
+            )
+            for each in found
+        ]
+        print_table(f"Most like {found.cue}", columns, rows)
+    stdout.print(found.why(), markup=False, highlight=False)
+
+
+def _document(found: Answer) -> dict[str, Any]:
+    success = found.success
+    return {
+        "cue": str(found.cue),
+        "considered": found.considered,
+        "never_seen": [list(each) for each in found.never_seen],
+        "success": None if success is None else success._asdict(),
+        "reasons": dict(found.reasons),
+        "cases": [_case(each) for each in found],
+    }
+
+
+def _case(recalled: RecalledCase) -> dict[str, Any]:
+    case = recalled.case
+    return {
+        "score": recalled.score,
+        "node": case.node,
+        "episode": case.episode,
+        "sequence": case.sequence,
+        "type": case.type,
+        "started": case.started_at,
+        "status": case.status,
+        "reason": case.reason,
+        "duration_s": case.duration_s,
+        "simulated": case.simulated,
+        "symbols": case.symbols,
+        "numbers": case.numbers,
+        "matched": [each._asdict() for each in recalled.matched],
+        "missed": [each._asdict() for each in recalled.missed],
+    }
+
+
+def _follows(
+    parsed: _Parsed,
+    like: str | None,
+    url: str,
+    spool: Path | None,
+    *,
+    status: str | None,
+    reason: str | None,
+    as_json: bool,
+) -> None:
+    dtype = parsed.type
+    if dtype is None or like is not None or any(parsed[1:]):
+        raise CallerError("--follows takes one type, as in `pycrorm recall --follows PickUpAction --reason IKError`")
+
+    async def query() -> tuple[Following, tuple[str, ...]]:
+        async with Reading.open(url) as reading:
+            memory = Recall.of(reading)
+            return await memory.follows(dtype, status=status, reason=reason), await memory.types()
+
+    following, types = asyncio.run(query())
+    note_pending_events(url, spool)
+    _note_unknown(dtype, types)
+    if as_json:
+        followers = [
+            each._asdict() | {"success": each.success and each.success._asdict()} for each in following.followers
+        ]
+        print_json({"cases": following.cases, "followers": followers})
+        return
+    rows = [
+        (each.type or "(nothing)", each.cases, f"{100 * each.share:.0f} %", str(each.success) if each.success else "")
+        for each in following.followers
+    ]
+    after = " ".join([dtype, *([status] if status else []), *([f"({reason})"] if reason else [])])
+    print_table(f"After {following.cases:,} {after}", ("next", "times", "share", "success"), rows)

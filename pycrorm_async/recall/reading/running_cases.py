@@ -1,0 +1,177 @@
+"""Make the cases of the episodes that this process records, before their events are in the tables.
+
+Theory of operation. From the first recall on, a buffer of the event feed keeps the events of this process until the
+next recall, which folds them as those of the log are folded. The first recall flushes, and reads the earlier events of
+the open episodes from the log; so does one that finds events left out because the buffer was full. An episode to which
+the database has not given a number yet has one from the end of the numbers, and its cases get the right one as soon as
+it is known. Start and duration of such a case are those at which its events were published, some microseconds later
+than those in the log; the reader takes the stored case as soon as there is one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable, Iterable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Final
+
+from pycrorm_async.clock import Clock
+from pycrorm_async.errors import CallerError, EpisodeParked
+from pycrorm_async.events.codec import decode, encode
+from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, EpisodeId, episode_text, parse_episode_id, row_id, row_key
+from pycrorm_async.events.types import EpisodeEnded, Happening, NodeStarted
+from pycrorm_async.projections.custom.projection import Event
+from pycrorm_async.projections.fold.column_values import is_missing, microseconds
+from pycrorm_async.projections.fold.fold import CannotFold, happening_of
+from pycrorm_async.recall.case import Case
+from pycrorm_async.recall.cases.episode_cases import READS, EpisodeCases
+from pycrorm_async.recording.writing.emitter import Emitter
+from pycrorm_async.recording.writing.event_feed import EventBuffer
+from pycrorm_async.store.episode_lookup import episode_named
+from pycrorm_async.store.log import EventLog
+
+__all__ = ["ProcessCases"]
+
+_EVENTS_MAX: Final = 100_000
+"""Bounds the events between two recalls. Beyond it the open episodes are read from the log again."""
+
+
+@dataclass(slots=True)
+class _Running:
+    """An episode of this process. `number` is the database's, or its own as long as that is not known."""
+
+    id: str
+    number: int
+    is_numbered: bool
+    fold: EpisodeCases = field(default_factory=EpisodeCases)
+    reached: int = 0
+    unnumbered: list[Case] = field(default_factory=list)
+    has_ended: bool = False
+
+
+class ProcessCases:
+    """The cases of the episodes that one memory records. Implements `RunningCases`.
+
+    Args:
+        emitter: of the memory.
+        open_episodes: returns the ids of the open episodes.
+        flush: makes all events visible in the tables.
+        log: returns the memory's log.
+    """
+
+    def __init__(
+        self,
+        emitter: Emitter,
+        *,
+        open_episodes: Callable[[], Iterable[EpisodeId]],
+        flush: Callable[[], Awaitable[None]],
+        log: Callable[[], Awaitable[EventLog]],
+        clock: Clock,
+    ) -> None:
+        self._emitter = emitter
+        self._feed = emitter.feed
+        self._open_episodes = open_episodes
+        self._flush = flush
+        self._log = log
+        self._clock = clock
+        self._buffer: EventBuffer | None = None
+        self._left_out = 0
+        self._episodes: dict[str, _Running] = {}
+        self._own_numbers = 0
+
+    async def new(self) -> tuple[Sequence[Case], Sequence[Case]]:
+        """Return the new cases of episodes with a number, and all cases of those that have none yet.
+
+        Raises `CallerError` once the memory is closed.
+        """
+        if self._emitter.is_closed:
+            raise CallerError("the memory is closed, so nothing can be recalled from it: ask while it is open")
+        cases: list[Case] = []
+        if self._buffer is None:
+            self._buffer = self._feed.keep(READS, _EVENTS_MAX, self._clock)
+            cases += await self._read_open()
+        elif self._buffer.left_out > self._left_out:
+            self._left_out = self._buffer.left_out
+            self._buffer.take()
+            self._episodes.clear()
+            cases += await self._read_open()
+        for each in sorted(self._buffer.take(), key=lambda each: (each.event.episode, each.event.sequence)):
+            _, sequence, happening, dtype = each.event
+            running = self._episodes.get(each.event.episode)
+            if running is None and sequence == 1:
+                running = self._begin(each.event.episode)
+            if running is not None and sequence > running.reached:
+                wall_us = microseconds(each.wall_ns)
+                running.unnumbered += self._read(running, sequence, wall_us, each.monotonic_ns, happening, dtype)
+        cases += await self._numbered()
+        return cases, [case for each in self._episodes.values() for case in each.unnumbered]
+
+    def _begin(self, episode: str) -> _Running:
+        self._own_numbers += 1
+        running = _Running(episode, EPISODE_NUMBER_MAX + 1 - self._own_numbers, is_numbered=False)
+        self._episodes[episode] = running
+        return running
+
+    async def _read_open(self) -> list[Case]:
+        """Fold the earlier events of the open episodes; cases that are in the tables too are returned again."""
+        with suppress(EpisodeParked):  # `flush` and `status` report it; what is stored is folded here
+            await self._flush()
+        log = await self._log()
+        cases = []
+        for episode in self._open_episodes():
+            if await log.episode_number(episode) is None:
+                continue
+            row = await episode_named(log, episode_text(episode))
+            running = self._episodes[row.id] = _Running(row.id, row.number, is_numbered=True)
+            async for page in log.pages(row):
+                for stored in page:
+                    with suppress(CannotFold):
+                        happening = happening_of(stored)
+                        times = microseconds(stored.wall_ns), stored.monotonic_ns
+                        dtype = self._dtype_of(happening)
+                        cases += self._read(running, stored.sequence, *times, happening, dtype)
+        return cases
+
+    def _dtype_of(self, happening: Happening) -> str | None:
+        declared = self._feed.declaration(happening.designator) if isinstance(happening, NodeStarted) else None
+        return None if declared is None else declared.dtype
+
+    def _read(
+        self, running: _Running, sequence: int, wall_us: int, monotonic_ns: int, happening: Happening, dtype: str | None
+    ) -> list[Case]:
+        declaration, parameters = None, {}
+        if isinstance(happening, NodeStarted) and happening.designator is not None:
+            declaration = self._feed.declaration(happening.designator)
+            happening = decode(NodeStarted.__name__, encode(happening), NodeStarted.version)
+            assert isinstance(happening, NodeStarted)
+            parameters = {name: None if is_missing(each) else each for name, each in happening.parameters.items()}
+        running.reached = sequence
+        running.has_ended = running.has_ended or isinstance(happening, EpisodeEnded)
+        if not isinstance(happening, READS):
+            return []
+        event = Event(running.number, sequence, wall_us, monotonic_ns, happening, dtype, parameters, declaration)
+        try:
+            return running.fold.read(event)
+        except CannotFold:  # the fold of the tables parks the episode, with the reason
+            running.has_ended = True
+            return []
+
+    async def _numbered(self) -> list[Case]:
+        """Return the cases of the episodes that have a number by now, and drop those episodes that have ended."""
+        cases: list[Case] = []
+        for episode, running in list(self._episodes.items()):
+            if not running.is_numbered:
+                number = await (await self._log()).episode_number(parse_episode_id(episode))
+                if number is not None:
+                    running.number, running.is_numbered = number, True
+            if running.is_numbered:
+                cases += [_renumbered(case, running.number) for case in running.unnumbered]
+                running.unnumbered = []
+                if running.has_ended:
+                    del self._episodes[episode]
+        return cases
+
+
+def _renumbered(case: Case, number: int) -> Case:
+    parent = None if case.parent is None else row_id(number, row_key(case.parent).sequence, 0)
+    return case._replace(node=row_id(number, case.sequence, 0), parent=parent)

@@ -1,0 +1,143 @@
+"""`pycrorm recall` lists the actions most like a cue, explains them, and refuses a wrong cue in one line."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pycrorm_async import Memory
+from pycrorm_async.cli.recall import _parse, recall
+from pycrorm_async.errors import CallerError
+from tests.commands import answer, one_line_of, pycrorm
+from tests.recall.sliding_grips import FETCH, GRIP, record
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a memory of two episodes."""
+    folder = tmp_path_factory.mktemp("recall")
+
+    async def fill() -> None:
+        async with Memory.open(f"sqlite:///{folder / 'pycrorm.db'}") as memory:
+            await record(memory)
+
+    asyncio.run(fill())
+    return folder
+
+
+def test_the_words_of_a_cue_are_texts_numbers_and_conditions() -> None:
+    assert _parse(
+        ["PickUp", "arm=LEFT", "near=A", "near=B", "x~-1.5±0.1", "y~2+-1e-3", "z~3", "not:a=b=c", "only:d=e"]
+    ) == (
+        "PickUp",
+        {"arm": ["LEFT"], "near": ["A", "B"]},
+        {"x": (-1.5, 0.1), "y": (2.0, 0.001), "z": (3.0,)},
+        {"a": ["b=c"]},
+        {"d": ["e"]},
+    )
+
+
+def test_the_actions_most_like_a_cue_are_a_table_with_their_success(folder: Path) -> None:
+    done = pycrorm("recall", GRIP, "arm=LEFT", "level~1.1±0.3", "--k", "3", cwd=folder)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert f"Most like {GRIP} arm=LEFT level~1.1±0.3" in done.stdout
+    assert "1.000 │ FAILED" in done.stdout
+    assert "pycrorm show 1 --at e" in done.stdout
+    assert "  2 of 3 succeeded" in done.stdout or "  1 of 3 succeeded" in done.stdout
+    assert "reasons: SlipperyFailure" in done.stdout
+
+
+def test_why_explains_each_action(folder: Path) -> None:
+    done = pycrorm("recall", GRIP, "arm=LEFT", "item=cup", "level~1.2±0.3", "--k", "1", "--why", cwd=folder)
+    assert done.returncode == 0
+    assert "  alike   item: wanted cup, was cup" in done.stdout
+    assert "off, tolerance 0.3)" in done.stdout
+
+
+def test_json_has_the_cases_with_what_matched(folder: Path) -> None:
+    document = answer("recall", GRIP, "arm=LEFT", "item=plate", "--k", "2", cwd=folder)
+    assert document["cue"] == f"{GRIP} arm=LEFT item=plate"
+    assert document["considered"] == 12
+    assert document["never_seen"] == [["item", "plate"]]
+    assert document["success"]["tries"] == 2
+    first = document["cases"][0]
+    assert first["symbols"]["arm"] == "LEFT"
+    assert [each["feature"] for each in first["matched"]] == ["arm"]
+    assert [each["feature"] for each in first["missed"]] == ["item"]
+
+
+def test_what_is_like_an_action_is_asked_by_the_event_that_began_it(folder: Path) -> None:
+    first = answer("recall", GRIP, "only:status=FAILED", "--episode", "1", cwd=folder)["cases"][0]
+    place = f"{first['episode']}/e{first['sequence']}"
+    alike = answer("recall", "--like", place, cwd=folder)
+    assert len(alike["cases"]) == 10
+    assert first["node"] not in [each["node"] for each in alike["cases"]]
+
+
+def test_what_follows_is_a_table_of_types(folder: Path) -> None:
+    done = pycrorm("recall", "--follows", GRIP, "--reason", "SlipperyFailure", cwd=folder)
+    assert f"After 4 {GRIP} (SlipperyFailure)" in done.stdout
+    assert "(nothing)" in done.stdout
+    document = answer("recall", "--follows", FETCH, cwd=folder)
+    assert document["cases"] == 2
+    assert [each["type"] for each in document["followers"]] == [None, FETCH]
+
+
+def test_a_type_that_never_occurred_is_an_empty_answer_with_a_note(folder: Path) -> None:
+    done = pycrorm("recall", "GripSlidingActon", cwd=folder)
+    assert done.returncode == 0
+    assert done.stdout.splitlines() == ["0 of 0 cases for GripSlidingActon"]
+    assert (
+        done.stderr
+        == "no GripSlidingActon has ended in this memory; did you mean GripSlidingAction or FetchSlidingAction?\n"
+    )
+
+
+WRONG: dict[str, tuple[list[str], dict[str, Any]]] = {
+    "the cue is empty": ([], {}),
+    "did you mean arm?": ([GRIP, "amr=LEFT"], {}),
+    "(FEATURE~NUMBER)": ([GRIP, "level=high"], {}),
+    "'high' is no number": ([GRIP, "level~high"], {}),
+    "the tolerance of level must be greater than 0, got 0": ([GRIP, "level~1±0"], {}),
+    "the tolerance of level must be greater than 0, got -1": ([GRIP, "level~1±-1"], {}),
+    "level must be a finite number, got nan": ([GRIP, "level~1±nan"], {}),
+    "level is given twice": ([GRIP, "level~1", "level~2"], {}),
+    "a number can only be sought": ([GRIP, "not:level~1"], {}),
+    "arm=LEFT is both": ([GRIP, "arm=LEFT", "not:arm=LEFT"], {}),
+    "k must be 1 to 10,000, got 0": ([GRIP], {"k": 0}),
+    "is no feature: write FEATURE=TEXT or FEATURE~NUMBER": ([GRIP, FETCH], {}),
+    "'yesterday' is no moment": ([GRIP], {"before": "yesterday"}),
+    "is not later than": ([GRIP], {"before": "2026-01-01", "after": "2026-01-02"}),
+    "there is no episode '77'": ([GRIP], {"episode": "77"}),
+    "belong to --follows": ([GRIP], {"reason": "IKError"}),
+    "write EPISODE/EVENT": ([], {"like": "1"}),
+    "there is no case of event 1 of episode 1": ([], {"like": "1/1"}),
+    "leave out the type and the features": ([GRIP], {"like": "1/e3"}),
+    "--follows takes one type": ([GRIP, "arm=LEFT"], {"follows": True}),
+    "arm is a text of 100,000 characters": ([GRIP, f"arm={'x' * 100_000}"], {}),
+    "the cue has 300 features": ([GRIP, *(f"f{number}=x" for number in range(300))], {}),
+}
+
+
+@pytest.mark.parametrize("line", WRONG)
+def test_a_wrong_cue_is_refused_in_one_line(folder: Path, line: str) -> None:
+    words, options = WRONG[line]
+    with pytest.raises(CallerError) as refused:
+        recall(words, **options, url=f"sqlite:///{folder / 'pycrorm.db'}")
+    assert line in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_wrong_cue_ends_with_the_code_of_usage(folder: Path) -> None:
+    done = pycrorm("recall", GRIP, "amr=LEFT", cwd=folder)
+    assert done.returncode == 2
+    assert "did you mean arm?" in one_line_of(done)
+
+
+def test_a_memory_that_does_not_exist_is_named(tmp_path: Path) -> None:
+    assert pycrorm("recall", GRIP, cwd=tmp_path).returncode == 3

@@ -1,0 +1,206 @@
+"""`memory.recall` finds what has ended in the memory, also what its own process has not flushed yet."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections.abc import AsyncIterator
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import pytest
+import pytest_asyncio
+
+from pycrorm_async import Memory, Reading
+from pycrorm_async.errors import CallerError, UnknownEpisode
+from pycrorm_async.recall.answer import Answer
+from pycrorm_async.recall.case import Case
+from pycrorm_async.recall.following import Relation
+from pycrorm_async.recall.reading.recall import Recall
+from pycrorm_async.world import Arms
+from tests.recall.sliding_grips import (
+    FETCH,
+    GRIP,
+    FetchSlidingActionPerformable,
+    GripSlidingActionPerformable,
+    SlipperyFailure,
+    grip,
+    record,
+)
+
+
+@pytest.fixture(scope="module")
+def url(module_database_url: str, tmp_path_factory: pytest.TempPathFactory) -> str:
+    spool = tmp_path_factory.mktemp("recall") / "spool"
+
+    async def fill() -> None:
+        async with Memory.open(module_database_url, spool=spool) as memory:
+            await record(memory)
+
+    asyncio.run(fill())
+    return module_database_url
+
+
+@pytest_asyncio.fixture
+async def recall(url: str) -> AsyncIterator[Recall]:
+    async with Reading.open(url) as reading:
+        yield Recall.of(reading)
+
+
+def shapes(answer: Answer) -> list[tuple[float, int, int]]:
+    return [(each.score, each.case.episode, each.case.sequence) for each in answer]
+
+
+async def test_a_cue_of_enums_and_numbers_finds_the_actions_most_like_it(recall: Recall) -> None:
+    answer = await recall(GripSlidingActionPerformable, has={"arm": Arms.LEFT}, near={"level": (1.1, 0.3)}, k=3)
+    levels = [round(each.numbers["level"], 1) for each in answer]
+    assert levels[0] == 1.1
+    assert set(levels[1:]) == {0.9, 1.3}
+    assert answer[0].case.status == "FAILED"
+    assert answer[0].case.reason == "SlipperyFailure"
+    assert answer[0].score == pytest.approx(1.0)
+    assert answer.considered == 12
+
+
+async def test_conditions_hold_for_every_action_of_the_answer(recall: Recall) -> None:
+    everything = await recall(GRIP, k=100)
+    assert len(everything) == 12
+    first = everything[-1]
+    assert {each.case.episode for each in await recall(GRIP, episode=1)} == {1}
+    assert {each.case.episode for each in await recall(GRIP, episode=[1, "last"])} == {1, 2}
+    assert {each.case.episode for each in await recall(GRIP, tag="kitchen")} == {1}
+    assert {each.symbols["arm"] for each in await recall(GRIP, lacks={"arm": Arms.LEFT})} == {"RIGHT"}
+    assert {each.status for each in await recall(GRIP, only={"status": "FAILED"})} == {"FAILED"}
+    assert first.node not in {each.node for each in await recall(GRIP, prohibit=[first], k=100)}
+    assert [each.node for each in await recall(GRIP, before=everything[-2].node)] == [first.node]
+    assert len(await recall(GRIP, after=first, k=100)) == 11
+    assert len(await recall(GRIP, after=datetime(2020, 1, 1, tzinfo=UTC), before="2200-01-01")) == 12
+    assert len(await recall(GRIP, as_of="2020-01-01")) == 0
+    fetch = (await recall(FETCH))[0]
+    inside = await recall(GRIP, during=fetch)
+    assert [round(each.numbers["level"], 1) for each in inside] == [0.9, 0.7]
+    assert len(await recall(GRIP, during=("2020-01-01", "2200-01-01"))) == 12
+
+
+BAD: dict[str, tuple[dict[str, Any], type[Exception], str]] = {
+    "naive": ({"before": datetime(2026, 1, 1)}, CallerError, "has no time zone"),  # noqa: DTZ001
+    "no moment": ({"after": "yesterday"}, CallerError, "'yesterday' is no moment"),
+    "episode": ({"episode": 77}, UnknownEpisode, "there is no episode '77'"),
+    "node": ({"before": 2**40}, CallerError, "there is no case of event 0 of episode 512"),
+    "negative node": ({"before": -1}, CallerError, "there is no case of -1"),
+    "tag": ({"tag": "kitchn"}, CallerError, "no episode has the tag 'kitchn'; did you mean kitchen?"),
+    "robot": ({"robot": "pr2"}, CallerError, "has a feature 'robot'"),
+    "order": ({"before": "2026-01-01", "after": "2026-01-02"}, CallerError, "`before` is not later than `after`"),
+    "k": ({"k": 0}, CallerError, "k must be 1 to 10,000"),
+}
+
+
+@pytest.mark.parametrize(("arguments", "error", "line"), BAD.values(), ids=BAD.keys())
+async def test_a_condition_that_cannot_be_is_refused_in_one_line(
+    recall: Recall, arguments: dict[str, Any], error: type[Exception], line: str
+) -> None:
+    with pytest.raises(error) as refused:
+        await recall(GRIP, **arguments)
+    assert line in str(refused.value)
+    assert "\n" not in str(refused.value)
+
+
+async def test_a_type_that_never_occurred_has_an_empty_answer(recall: Recall) -> None:
+    assert list(await recall("FlyAction", has={"wing": "LEFT"})) == []
+
+
+async def test_from_a_case_one_gets_to_what_was_around_it(recall: Recall) -> None:
+    second, first = await recall(GRIP, during=(await recall(FETCH))[0])
+    assert await first.next() == second.case
+    assert await second.previous() == first.case
+    assert await second.next() is None
+    parent = await first.parent()
+    assert isinstance(parent, Case)
+    assert parent.type == FETCH
+    assert await recall.related(parent, "during") == await recall.related(parent.node, Relation.DURING)
+    moment = await second.moment()
+    assert [node.dtype for node in moment.running if node.dtype is not None] == [FETCH, GRIP]
+    with pytest.raises(CallerError, match="'inside' is no relation; there are before, meets"):
+        await recall.related(parent, "inside")
+
+
+async def test_what_follows_is_counted(recall: Recall) -> None:
+    after = await recall.follows(GripSlidingActionPerformable, reason=SlipperyFailure)
+    assert next((each.type, each.cases) for each in after.followers) == (GRIP, 3)
+    assert after.cases == 4
+
+
+async def test_what_is_like_a_case_does_not_contain_it(recall: Recall) -> None:
+    asked = (await recall(GRIP, only={"status": "FAILED"}))[0]
+    alike = await recall.like(asked, k=100)
+    assert asked.node not in {each.node for each in alike}
+    assert len(alike) == 11
+    assert {"arm", "item"} <= {name for name, _ in alike.cue.has}
+    assert "status" not in dict(alike.cue.has)
+    assert [each.score for each in alike] == sorted([each.score for each in alike], reverse=True)
+
+
+async def test_an_answer_is_a_frame(recall: Recall) -> None:
+    frame = await recall.frame(GRIP, has={"arm": "LEFT"}, k=3)
+    assert list(frame["score"]) == [1.0, 1.0, 1.0]
+    assert set(frame["arm"]) == {"LEFT"}
+    assert {"node", "started", "status", "reason", "duration", "level", "item"} <= set(frame.columns)
+    assert len(await recall.frame("FlyAction")) == 0
+
+
+async def test_what_is_forgotten_is_hidden_from_this_object_only(url: str, recall: Recall) -> None:
+    dry = await recall.forget(5.0, dry_run=True)
+    assert dry.cases == 14
+    assert len(await recall(GRIP)) == 12
+    await recall.forget(5.0)
+    assert list(await recall(GRIP)) == []
+    async with Reading.open(url) as reading:
+        assert len(await Recall.of(reading)(GRIP)) == 12
+    await recall.forget(-math.inf)
+    assert len(await recall(GRIP)) == 12
+    with pytest.raises(CallerError, match="activation must be a number, got nan"):
+        await recall.forget(math.nan)
+
+
+async def test_a_failure_is_recalled_before_it_is_flushed(tmp_path: Path) -> None:
+    async with Memory.open(f"sqlite:///{tmp_path / 'memory.db'}") as memory:
+        assert list(await memory.recall(GRIP)) == []
+        async with memory.episode():
+            await grip(Arms.LEFT, 0.8)
+            await grip(Arms.LEFT, 1.5)
+            answer = await memory.recall(GripSlidingActionPerformable, near={"level": (1.4, 1.0)})
+            assert [each.case.status for each in answer] == ["FAILED", "SUCCEEDED"]
+            assert answer.reasons == [("SlipperyFailure", 1)]
+            assert await answer[1].next() == answer[0].case
+            await grip(Arms.RIGHT, 0.9)
+            assert len(await memory.recall(GRIP)) == 3
+            await memory.flush()
+            stored = await memory.recall(GRIP)
+            assert len(stored) == 3, "each case is there once"
+            await grip(Arms.RIGHT, 1.2)
+            assert len(await memory.recall(GRIP)) == 4
+        await FetchSlidingActionPerformable(0.5, 0.6).perform()
+        assert len(await memory.recall(GRIP)) == 6
+        await memory.flush()
+        live = {(each.node, each.status): each for each in await memory.recall(GRIP)}
+        async with Reading.open(f"sqlite:///{tmp_path / 'memory.db'}") as reading:
+            read = {(each.node, each.status): each for each in await Recall.of(reading)(GRIP)}
+        assert live.keys() == read.keys()
+        assert [each.case for each in live.values()] == [each.case for each in read.values()]
+        recall = memory.recall
+    with pytest.raises(CallerError, match="the memory is closed"):
+        await recall(GRIP)
+    with pytest.raises(CallerError, match="not open"):
+        await memory.recall(GRIP)
+
+
+async def test_what_happened_before_the_first_recall_is_recalled_too(tmp_path: Path) -> None:
+    async with Memory.open(f"sqlite:///{tmp_path / 'memory.db'}") as memory, memory.episode():
+        await grip(Arms.LEFT, 1.5)
+        assert [each.case.status for each in await memory.recall(GRIP)] == ["FAILED"]
+        await grip(Arms.LEFT, 0.7)
+        first, second = (await memory.recall(GRIP))[::-1]
+        assert second.symbols["after"] == GRIP, "the fold of the episode goes through both"
+        assert second.symbols["after_status"] == "FAILED"
+        assert await first.next() == second.case
