@@ -41,6 +41,7 @@ COURSE, PLOTTED, AROUND, ROBOTS, BEGAN, FRAMES, ASKED, TAGGED, SEEN, THEN, AGAIN
     "pycrorm_async/query/README.md"
 )
 (EXPORTED,) = python_of("pycrorm_async/export/README.md")
+(RECALLED,) = python_of("pycrorm_async/recall/README.md")
 BETTER, ORIGINS = python_of("pycrorm_async/learning/README.md")
 
 
@@ -282,6 +283,20 @@ async def test_rows_are_exported_and_made_again(
     await run_block(EXPORTED, tidied)
     assert capsys.readouterr().out == "True ()\n"
     assert (tmp_path / "mine.csv").read_text().startswith('"arm","relative_x"\n"')
+
+
+async def test_past_actions_are_recalled(tidied: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    await run_block(RECALLED, tidied)
+    printed = capsys.readouterr().out
+    assert "1 of 1 succeeded (21-100 %)\n(('object_type', 'CACTUS'),)\nPickUpAction in episode 1" in printed
+    assert "  differs object_type: wanted CACTUS, was MILK" in printed
+
+
+def test_the_commands_that_recall_run(tidied: Path) -> None:
+    [commands] = re.findall(r"```sh\n(.*?)```", PAGES["pycrorm_async/recall/README.md"], re.DOTALL)
+    for line in commands.splitlines():
+        done = pycrorm(*shlex.split(line)[1:], cwd=tidied)
+        assert done.returncode == 0, done.stderr
 
 
 async def test_tags_are_given_changed_and_queried(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
