@@ -38,6 +38,7 @@ async def merged(new_file: New, new_url: New, fill_other: Callable[[str], Awaita
     return one, other, target
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_two_memories_merged_and_then_rebuilt_hold_row_for_row_what_both_hold(
     new_url: New, new_file: New
 ) -> None:

@@ -126,7 +126,7 @@ async def rebuild_beside_recorders(url: str, folder: Path, *, episodes: int, reb
 
 
 async def test_a_rebuild_changes_nothing_for_processes_that_record_and_read(database_url: str, tmp_path: Path) -> None:
-    await rebuild_beside_recorders(database_url, tmp_path, episodes=100, rebuilds=2, readers=2)
+    await rebuild_beside_recorders(database_url, tmp_path, episodes=100, rebuilds=2, readers=1)
 
 
 @pytest.mark.soak

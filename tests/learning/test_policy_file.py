@@ -40,25 +40,23 @@ for name in ("jpt", "pandas", "scipy", "matplotlib"):
 from pathlib import Path
 import numpy as np
 from pycrorm_async.learning.policies.policy_file import load_policy
-policy = load_policy(Path(sys.argv[1]))
-choices = policy.sample(np.random.default_rng(8), 500)
-print(policy.likelihood(choices).tolist())
+for path in sys.argv[1:]:
+    policy = load_policy(Path(path))
+    print(policy.likelihood(policy.sample(np.random.default_rng(8), 500)).tolist())
 """
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("policy", [default_policy(), LEARNED], ids=["default", "learned"])
-def test_a_policy_is_the_same_in_another_process_without_the_libraries_for_learning(
-    policy: Policy, tmp_path: Path
-) -> None:
-    path = tmp_path / "policy.json"
-    save_policy(policy, path)
-    assert load_policy(path) == policy
-    here = policy.likelihood(policy.sample(np.random.default_rng(8), 500)).tolist()
+def test_a_policy_is_the_same_in_another_process_without_the_libraries_for_learning(tmp_path: Path) -> None:
+    policies = {tmp_path / "default.json": default_policy(), tmp_path / "learned.json": LEARNED}
+    for path, policy in policies.items():
+        save_policy(policy, path)
+        assert load_policy(path) == policy
+    here = [each.likelihood(each.sample(np.random.default_rng(8), 500)).tolist() for each in policies.values()]
     other_process = subprocess.run(
-        [sys.executable, "-c", ELSEWHERE, str(path)], check=True, capture_output=True, text=True
+        [sys.executable, "-c", ELSEWHERE, *policies], check=True, capture_output=True, text=True
     ).stdout
-    assert json.loads(other_process) == here
+    assert [json.loads(line) for line in other_process.splitlines()] == here
 
 
 def test_a_saved_policy_replaces_the_one_before_and_leaves_no_other_file(tmp_path: Path) -> None:

@@ -103,6 +103,7 @@ async def test_seed_and_index_determine_a_rollout_in_any_batch_and_any_world() -
     assert (await rolled_out(120, seed=70)).successes != 0
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_records_and_counts_agree_on_the_stage_at_which_each_rollout_failed(
     database_url: str, tmp_path: Path
 ) -> None:

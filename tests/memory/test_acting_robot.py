@@ -96,6 +96,7 @@ async def test_two_tasks_move_their_own_robots_and_each_node_has_the_state_of_it
             assert sorted(await session.scalars(text(sampled))) == ["ada", "bob"]
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_every_episode_names_its_robots_with_model_serial_and_description(
     database_url: str, tmp_path: Path
 ) -> None:

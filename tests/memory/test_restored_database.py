@@ -97,6 +97,7 @@ async def incarnations(url: str) -> list[str]:
         await log.close()
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_a_plan_that_continues_stores_again_all_that_was_flushed(
     database_url: str, spool: Path, take_backup: TakeBackup
 ) -> None:
@@ -125,6 +126,7 @@ async def test_a_plan_that_continues_stores_again_all_that_was_flushed(
     assert await is_clean(database_url)
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_lost_blobs_are_stored_again_with_the_events_that_refer_to_them(
     database_url: str, spool: Path, take_backup: TakeBackup
 ) -> None:
@@ -147,6 +149,7 @@ async def test_lost_blobs_are_stored_again_with_the_events_that_refer_to_them(
     await log.close()
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_lost_episodes_get_their_own_numbers_and_new_ones_get_others(
     database_url: str, spool: Path, take_backup: TakeBackup
 ) -> None:
@@ -204,6 +207,7 @@ async def test_a_lost_episode_of_a_dead_recorder_ends_lost_again(
     assert await is_clean(database_url)
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_an_idle_daemon_stores_again_what_dead_recorders_had_stored(
     database_url: str, spool: Path, take_backup: TakeBackup
 ) -> None:
