@@ -41,6 +41,8 @@ def test_a_page_opens_by_one_request_and_is_no_wider_than_its_window(
         assert tab.ask("document.documentElement.scrollWidth") == width
         assert tab.ask("document.querySelectorAll('#tree .row').length") > 5
         assert tab.ask("document.querySelector('#scene canvas').clientWidth") > 300
+        cut = "[...document.querySelectorAll('.row, #controls')].filter((each) => each.scrollWidth > each.clientWidth)"
+        assert tab.ask(f"{cut}.map((each) => each.textContent)") == []
         assert_quiet(tab, pages["plan"])
 
 
