@@ -92,6 +92,7 @@ _VERBS = (
     "recall",
     "picture",
     "export",
+    "datasette-metadata",
     "watch",
     "plot",
     "diff",
@@ -117,8 +118,8 @@ _GROUPS: Mapping[str, tuple[str, tuple[str, ...]]] = {
 def app(requested: str | None = None) -> typer.Typer:
     """Build the command with the requested verb, or with all verbs if `requested` is not a verb.
 
-    Each verb is a function in the module of the same name (for a group, of the group's name). Only requested modules
-    are loaded, because loading all takes a second, and most single ones take half of that.
+    Each verb is a function in the module of the same name, with `_` for `-` (for a group, of the group's name). Only
+    requested modules are loaded, because loading all takes a second, and most single ones take half of that.
     """
     names = {*_VERBS, *_GROUPS}
     chosen = {requested} if requested in names else names
@@ -131,7 +132,7 @@ def app(requested: str | None = None) -> typer.Typer:
     )
     command.callback()(_options)  # without a callback, typer would make a single verb the command itself
     for verb in (each for each in _VERBS if each in chosen):
-        command.command(verb)(_load_verb(verb, verb))
+        command.command(verb)(_load_verb(verb.replace("-", "_"), verb.replace("-", "_")))
     for group, (text, verbs) in _GROUPS.items():
         if group in chosen:
             subcommand = typer.Typer(help=text, no_args_is_help=True)

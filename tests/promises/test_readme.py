@@ -368,7 +368,7 @@ async def test_a_policy_is_learned_from_the_recorded_rollouts_and_used(
 
 
 def test_the_readme_names_every_verb_and_no_other(tmp_path: Path) -> None:
-    lines = re.findall(r"^pycrorm ([\w|]+)", README, re.MULTILINE)
+    lines = re.findall(r"^pycrorm ([\w|-]+)", README, re.MULTILINE)
     verbs = {verb for line in lines for verb in line.split("|")}
     command = typer.main.get_command(app())
     assert isinstance(command, TyperGroup)

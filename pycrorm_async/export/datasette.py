@@ -1,0 +1,104 @@
+"""Describe a memory for Datasette: which tables to hide, what views mean, how they are sorted, and the named questions.
+
+    pycrorm datasette-metadata > metadata.json
+    datasette -i pycrorm.db --metadata metadata.json
+
+The names of hidden tables carry the number of a generation, so the description is made again after a rebuild.
+"""
+
+from __future__ import annotations
+
+import inspect
+import re
+from typing import Any
+
+from sqlalchemy import inspect as inspect_database
+
+from pycrorm_async.errors import CallerError
+from pycrorm_async.orm import Base
+from pycrorm_async.query.asking.ask import QUESTIONS, Ask
+from pycrorm_async.query.reading import Reading
+
+__all__ = ["datasette_metadata"]
+
+_INTERNAL = re.compile(r"zz_.*|.*__\d+|pycrorm_.*|sqlite_stat\d")
+"""The tables of a generation, the bookkeeping of the log, and the statistics of SQLite's planner."""
+_FACETS = ("dtype", "kind", "status", "reason", "arm", "grasp", "obj_type", "robot", "relation", "source", "recovered")
+_FACETS_MAX = 4
+"""Datasette counts the values of each facet at every visit."""
+_NEWEST = ("id", "node_id", "process_metadata_id", "global_position", "number")
+"""Columns by which the newest rows come first, the first that a table has."""
+_TIMES = " Times are integers, in µs since 1970-01-01 00:00 UTC, and durations are in s."
+_TEXT, _NUMBER = "pycrorm-value-", 200_000_000
+"""Stand in the SQL of a question for a text and for numbers (m) that Datasette asks for."""
+
+
+async def datasette_metadata(reading: Reading) -> dict[str, Any]:
+    """Return the metadata of a SQLite memory, for Datasette 0.65.
+
+    Raises `CallerError` for another database, which Datasette cannot open.
+    """
+    log = await reading.log()
+    if not log.address.is_sqlite:
+        raise CallerError(
+            f"Datasette opens SQLite files: copy {log.address} with `pycrorm copy --to sqlite:///copy.db`"
+        )
+    async with log.reading() as connection:
+        tables = await connection.run_sync(_columns_by_table)
+    described = {each.local_table.description: _first_sentence(each.class_) for each in Base.registry.mappers}
+    return {
+        "title": "Episodic memory of robots",
+        "description": "The views of a memory of pycrorm-async, and the questions of `pycrorm ask`." + _TIMES,
+        "databases": {
+            log.address.path.stem: {
+                "tables": {
+                    name: {"hidden": True} if _INTERNAL.fullmatch(name) else _table(columns, described.get(name))
+                    for name, columns in tables.items()
+                },
+                "queries": {name: _query(reading, name) for name in QUESTIONS},
+            }
+        },
+    }
+
+
+def _columns_by_table(connection: Any) -> dict[str, list[str]]:
+    inspector = inspect_database(connection)
+    names = sorted([*inspector.get_table_names(sqlite_include_internal=True), *inspector.get_view_names()])
+    return {name: [each["name"] for each in inspector.get_columns(name)] for name in names}
+
+
+def _table(columns: list[str], description: str | None) -> dict[str, Any]:
+    table: dict[str, Any] = {}
+    if description is not None:
+        table["description"] = description
+    newest = next((each for each in _NEWEST if each in columns), None)
+    if newest is not None:
+        table["sort_desc"] = newest
+    facets = [each for each in _FACETS if each in columns][:_FACETS_MAX]
+    if facets:
+        table["facets"] = facets
+    return table
+
+
+def _query(reading: Reading, name: str) -> dict[str, str]:
+    """Return a question as a canned query; values that it needs are parameters of the query."""
+    parameters = [*inspect.signature(getattr(Ask, name)).parameters.values()][1:]
+    needed = {each.name: str(each.annotation) for each in parameters if each.default is each.empty}
+    numbers = {each: _NUMBER * (index + 1) for index, each in enumerate(needed) if needed[each] == "float"}
+    texts = {each: f"{_TEXT}{each}" for each in needed if each not in numbers}
+    sql = getattr(reading.ask, name)(**numbers, **texts).sql
+    for each, text in texts.items():
+        sql = sql.replace(f"'{text}'", f":{each}")
+
+    def with_parameter(number: re.Match[str]) -> str:
+        for each, place in numbers.items():
+            if abs(float(number[0]) - place) < _NUMBER / 2:
+                return f"(:{each} + {float(number[0]) - place:g})"  # Datasette passes texts: the sum is a number
+        return number[0]
+
+    sql = re.sub(r"\b\d{9,}(?:\.\d+)?\b", with_parameter, sql)
+    return {"sql": sql, "title": name.replace("_", " "), "description": _first_sentence(getattr(Ask, name))}
+
+
+def _first_sentence(documented: Any) -> str:
+    return " ".join((inspect.getdoc(documented) or "").partition("\n\n")[0].split())
