@@ -20,7 +20,6 @@ from pycrorm_async.export.lerobot.states import Clock
 from pycrorm_async.export.selection import Exportable
 from pycrorm_async.hooks.episode import Episode
 from pycrorm_async.memory_parts import PartsHolder
-from pycrorm_async.orm import PickUpWithContextView
 from pycrorm_async.plan.task_tree import TaskTreeNode
 from pycrorm_async.query.as_of import AnyEpisode
 from pycrorm_async.query.asking.ask import Ask
@@ -29,13 +28,9 @@ from pycrorm_async.query.asking.question import AskedEpisode, Question
 from pycrorm_async.query.frames.arrow_batches import BATCH_ROWS
 from pycrorm_async.query.frames.dataframe import Library
 from pycrorm_async.query.notebook.listings import Episodes, TaskTree
-from pycrorm_async.query.notebook.memory_view import memory_html
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.query.scene.picture import When, picture
 from pycrorm_async.query.snapshot import Moment
 from pycrorm_async.query.sql.read_only import DEFAULT_LIMITS, SqlLimits, SqlResult
-from pycrorm_async.query.success.figure import Kind, success_figure
-from pycrorm_async.query.success.samples import Source, success_samples
 from pycrorm_async.recall.reading.case_reader import CaseReader
 from pycrorm_async.recall.reading.database_source import DatabaseSource
 from pycrorm_async.recall.reading.recall import Recall
@@ -51,6 +46,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from pycrorm_async.query.scene.picture import When
+    from pycrorm_async.query.success.figure import Kind
+    from pycrorm_async.query.success.samples import Source
+
 __all__ = ["ObservingMemory", "ReadableMemory"]
 
 
@@ -63,6 +62,8 @@ class ReadableMemory(PartsHolder):
         return f"<Memory {self._address}, {'open' if self._parts is not None else 'not open'}>"
 
     def _repr_html_(self) -> str:
+        from pycrorm_async.query.notebook.memory_view import memory_html
+
         return memory_html(self._address, self._located if self._parts is not None else None)
 
     @property
@@ -211,6 +212,8 @@ class ReadableMemory(PartsHolder):
 
         `view` are the size and the camera, see `pycrorm_async.query.scene.picture.picture`. It needs the extra `world`.
         """
+        from pycrorm_async.query.scene.picture import picture  # loads a world, which most programs have no need of
+
         return await picture(self._open_parts.reading, episode, at=at, **view)
 
     async def export(
@@ -255,7 +258,7 @@ class ReadableMemory(PartsHolder):
         x: str,
         y: str,
         *,
-        of: Source = PickUpWithContextView,
+        of: Source = "PickUpWithContextView",
         kind: Kind = "auto",
         bins: int | None = None,
         axes: Axes | None = None,
@@ -277,6 +280,9 @@ class ReadableMemory(PartsHolder):
 
         It needs the extra `pictures`. Raises `CallerError` for an unknown view or column, and if no row is left.
         """
+        from pycrorm_async.query.success.figure import success_figure
+        from pycrorm_async.query.success.samples import success_samples
+
         samples = await success_samples(self._open_parts.reading, x, y, of)
         return success_figure(samples, kind=kind, bins=bins, axes=axes)
 

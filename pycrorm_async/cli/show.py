@@ -52,7 +52,7 @@ def _show(episode: str, url: str, spool: Path | None, *, events: bool, full: boo
     async def query() -> tuple[EpisodeSummary, list[NodeSummary]]:
         async with Reading.open(url) as reading:
             summary = await reading.episode(episode)
-            return summary, await reading.tree(summary.number)
+            return summary, await reading.tree(summary)
 
     summary, tree = asyncio.run(query())
     note_pending_events(url, spool)

@@ -7,6 +7,7 @@ import io
 import json
 import struct
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -18,6 +19,7 @@ from pycrorm_async import Memory
 from pycrorm_async.cli.main import app
 from pycrorm_async.errors import CallerError, UnknownEpisode
 from pycrorm_async.plan import NavigateAction, simulated_robot
+from pycrorm_async.settings import Settings
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
 from pycrorm_async.world.models.primitives import box_urdf
 
@@ -79,6 +81,28 @@ async def test_a_picture_frames_what_moves_and_a_focus_one_object(url: str) -> N
         assert (await memory.as_of("last", sequence=99)).sequence == 4  # starts and ends of the episode and its root
     finally:
         await memory.close()
+
+
+PYRAMID = """<robot name="pyramid"><link name="base">
+<visual><geometry><mesh filename="pyramid.obj"/></geometry></visual>
+<collision><geometry><mesh filename="pyramid.obj"/></geometry></collision></link></robot>"""
+CORNERS = "v -1 -1 0\nv 1 -1 0\nv 1 1 0\nv -1 1 0\nv 0 0 2\n"
+FACES = "f 1 3 2\nf 1 4 3\nf 1 2 5\nf 2 3 5\nf 3 4 5\nf 4 1 5\n"
+
+
+@pytest.mark.parametrize("meshes", ["boxes", "files"])
+async def test_a_mesh_is_drawn_where_its_file_is_recorded_and_as_its_box_elsewhere(
+    tmp_path: Path, meshes: Literal["boxes", "files"]
+) -> None:
+    (tmp_path / "pyramid.urdf").write_text(PYRAMID)
+    (tmp_path / "pyramid.obj").write_text(CORNERS + FACES)
+    async with Memory.open("sqlite://", settings=Settings(record_meshes=meshes)) as memory:
+        async with memory.episode(description="A pyramid"):
+            with BulletWorld():
+                Object("pyramid", ObjectType.GENERIC_OBJECT, tmp_path / "pyramid.urdf", color=RED)
+        await memory.flush()
+        share = redness(await memory.picture("last", width=160, height=120, yaw_deg=0.0))
+    assert (0.1 < share < 0.2) if meshes == "files" else (0.25 < share < 0.4), share
 
 
 @pytest.mark.parametrize(

@@ -86,7 +86,7 @@ class EpisodeDiff:
 async def diff_episodes(reading: Reading, first: AskedEpisode, second: AskedEpisode) -> EpisodeDiff:
     """Compare two episodes of one memory. Raises `UnknownEpisode`."""
     one, other = [await reading.episode(episode_name(each)) for each in (first, second)]
-    trees = [await reading.tree(each.number) for each in (one, other)]
+    trees = [await reading.tree(each) for each in (one, other)]
     places = [await _last_places(reading, each) for each in (one, other)]
     nodes, same = _node_differences(*trees)
     differences = (*_fact_differences(one, other), *nodes, *_place_differences(*places))

@@ -91,10 +91,10 @@ async def picture(
 async def _moment(reading: Reading, episode: AnyEpisode, at: When) -> Moment:
     if isinstance(at, str):
         time, sequence = parse_moment(at)
-        return await reading.as_of(episode, time=time, sequence=sequence)
+        return await reading.as_of(episode, time=time, sequence=sequence, meshes=True)
     if at is not None:
-        return await reading.as_of(episode, time=at)
-    then = await reading.as_of(episode, sequence=_LAST)
+        return await reading.as_of(episode, time=at, meshes=True)
+    then = await reading.as_of(episode, sequence=_LAST, meshes=True)
     if then.world.objects:
         return then
     async with reading.session() as session:
@@ -102,7 +102,7 @@ async def _moment(reading: Reading, episode: AnyEpisode, at: When) -> Moment:
         changed = select(func.max(ObjectRow.id)).where(of_episode).scalar_subquery()
         removed = ObjectRemoval.process_metadata_id == then.number, ObjectRemoval.id > changed
         removal = await session.scalar(select(func.min(ObjectRemoval.id)).where(*removed))
-    return then if removal is None else await reading.as_of(episode, sequence=row_key(removal).sequence - 1)
+    return then if removal is None else await _moment(reading, episode, f"e{row_key(removal).sequence - 1}")
 
 
 async def _emptiness(reading: Reading, then: Moment) -> str:

@@ -120,7 +120,7 @@ def _draw_cells(axes: Axes, table: SuccessTable) -> None:
 def _hatched(cell: Cell, color: str) -> Any:
     from matplotlib.patches import Rectangle
 
-    return Rectangle((cell.x, cell.y), 1, 1, fill=False, hatch="///", edgecolor=color, linewidth=0, alpha=0.45)
+    return Rectangle((cell.x, cell.y), 1, 1, fill=False, hatch="///", edgecolor=color, linewidth=0, alpha=0.3)
 
 
 def _text(cell: Cell, cells_drawn: int) -> str:

@@ -14,7 +14,6 @@ from sqlalchemy.orm import DeclarativeBase
 
 from pycrorm_async import orm
 from pycrorm_async.errors import CallerError
-from pycrorm_async.orm import PickUpWithContextView
 from pycrorm_async.query.frames.columns import FrameColumn, columns_of
 from pycrorm_async.query.parameter_text import one_line
 from pycrorm_async.query.reading import Reading
@@ -69,7 +68,7 @@ class Samples(NamedTuple):
     running: int
 
 
-async def success_samples(reading: Reading, x: str, y: str, of: Source = PickUpWithContextView) -> Samples:
+async def success_samples(reading: Reading, x: str, y: str, of: Source = "PickUpWithContextView") -> Samples:
     """Return the samples of two columns, by name.
 
     Raises `CallerError` for an unknown view or column, one that has no status or cannot be an axis, and if no row has
