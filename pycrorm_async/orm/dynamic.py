@@ -15,9 +15,10 @@ their objects, because objects may outlive the memory, which unmaps their classe
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Final
 
 from sqlalchemy import BigInteger, Boolean, Column, Double, ForeignKey, MetaData, Table, Text
 from sqlalchemy.ext.asyncio import AsyncEngine
@@ -46,12 +47,16 @@ _TYPES: dict[FieldType, TypeEngine[Any]] = {
     "boolean": Boolean(),
     "datetime": Moment(),
 }
+_numbers: Final = itertools.count(1)
+"""Numbers the memories of this process, to tell their classes of one name apart."""
 
 
 class DynamicClasses:
     """The generated classes of one memory, until `dispose`. Not thread-safe."""
 
     def __init__(self) -> None:
+        # Not `id(self)`: it is used again when a memory that was never closed, and unmapped no class, is collected.
+        self._number = next(_numbers)
         self._registry = registry()
         self._metadata = MetaData()
         self._classes: dict[str, type[Designator]] = {}
@@ -160,7 +165,7 @@ class DynamicClasses:
             Column(EPISODE, BigInteger()),
         )
         class_ = type(dtype, (base,), {"__abstract__": True, "__doc__": f"{dtype}, as it was declared."})
-        identity = f"{dtype}@{id(self):x}"
+        identity = f"{dtype}@{self._number}"
         self._registry.map_imperatively(
             class_,
             table,

@@ -13,12 +13,12 @@ from typing import Any
 
 import pytest
 from sqlalchemy import ForeignKey, select
-from sqlalchemy.orm import Mapped, mapped_column
+from sqlalchemy.orm import Mapped, mapped_column, registry
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.types import DesignatorTypeDeclared, NodeStarted, ObjectAdded
 from pycrorm_async.events.values import ObjectReference, RobotValue
-from pycrorm_async.orm import Action, Designator, Motion, PickUpAction, TaskTreeNode
+from pycrorm_async.orm import Action, Base, Designator, Motion, PickUpAction, TaskTreeNode
 from pycrorm_async.orm.dynamic import DynamicClasses
 from pycrorm_async.plan.task_tree import TaskStatus
 from pycrorm_async.projections.projector import Projector
@@ -243,6 +243,24 @@ async def test_two_memories_with_types_of_one_name_do_not_share_classes(log: Eve
             assert names(await every(other, select(Action))) == ["SayingAction"]
     finally:
         await other.close()
+
+
+def test_classes_of_memories_that_were_never_closed_do_not_collide() -> None:
+    saying = declared("UnclosedAction", "unclosed_action", field("text", "text", 2))
+    left: list[tuple[registry, type[Designator]]] = []
+    try:
+        for _ in range(20):  # the next one may be at the address of the one before
+            classes = DynamicClasses()
+            classes.learn([saying])
+            left.append((classes._registry, classes.of("UnclosedAction")))
+            del classes
+        assert len({each.__mapper__.polymorphic_identity for _, each in left}) == 20
+    finally:
+        for mapped, each in left:
+            Designator.__mapper__.polymorphic_map.pop(each.__mapper__.polymorphic_identity, None)
+            mapped.dispose()
+        for mapper in Base.registry.mappers:
+            mapper._expire_memoizations()
 
 
 async def test_disposed_classes_leave_no_references(log: EventLog) -> None:
