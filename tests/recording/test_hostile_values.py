@@ -29,8 +29,6 @@ from pycrorm_async.world.pose import Pose
 from tests.databases import ask
 from tests.recording.recorded_memory import assert_verified, events, nodes, url_of
 
-pytestmark = pytest.mark.slow
-
 HERE = Pose([1, 2, 3])
 AT = PoseValue((1, 2, 3), (0, 0, 0, 1), "map", 0)
 SMALL = Settings(fold="at_end", episode_events_max=100)
@@ -167,6 +165,7 @@ def test_percepts_and_tags_that_do_not_fit_are_left_out(tmp_path: Path) -> None:
     assert [each.get("added") for each in events(tmp_path, "EpisodeTagged")] == [["good"]]
 
 
+@pytest.mark.slow
 def test_no_argument_of_a_type_raises(tmp_path: Path) -> None:
     hostile: tuple[Any, ...] = ([], None, 3, Faulty(), "\ud800", "x" * 2_000_000)
 
@@ -204,6 +203,7 @@ def test_arguments_of_an_episode_that_would_stop_it_are_refused(tmp_path: Path) 
                 memory.recording.episode(**each)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("first", "second"),
     [
@@ -237,6 +237,7 @@ def test_contradicting_declarations_are_kept_apart(tmp_path: Path, first: Any, s
     assert len(nodes(tmp_path)) == 2
 
 
+@pytest.mark.slow
 def test_very_many_fields_of_one_type_are_bounded(tmp_path: Path) -> None:
     def write(recording: Recording, episode: RecordedEpisode) -> None:
         for number in range(40):
@@ -314,6 +315,7 @@ def test_an_end_in_the_middle_of_a_follow_up_ends_its_own_node(tmp_path: Path) -
     assert ends == [("a", "SUCCEEDED"), ("b", "FAILED")]
 
 
+@pytest.mark.slow
 def test_objects_and_the_tree_pass_into_a_follow_up_whole(tmp_path: Path) -> None:
     def write(recording: Recording, episode: RecordedEpisode) -> None:
         kind = recording.type("action", "Step", {"name": str})
@@ -351,6 +353,7 @@ def test_objects_and_the_tree_pass_into_a_follow_up_whole(tmp_path: Path) -> Non
     assert sorted(above) == [("p",), ("q",)]
 
 
+@pytest.mark.slow
 def test_an_episode_opened_while_the_memory_closes_is_counted_and_stays_empty(tmp_path: Path) -> None:
     with Memory.sync(url_of(tmp_path), settings=SMALL) as memory:
         recording, stop = memory.recording, threading.Event()

@@ -25,8 +25,6 @@ from tests.commands import environment, pycrorm
 from tests.databases import ask
 from tests.recording.recorded_memory import assert_verified, events, nodes, url_of
 
-pytestmark = pytest.mark.slow
-
 AT_END = Settings(fold="at_end")
 HERE = Pose([1, 2, 3])
 
@@ -73,6 +71,7 @@ def test_a_tree_written_by_threads_has_the_parents_that_they_named(tmp_path: Pat
     assert_verified(tmp_path)
 
 
+@pytest.mark.slow
 def test_what_happened_is_in_the_tables_and_in_show(tmp_path: Path) -> None:
     with opened(tmp_path) as memory:
         recording = memory.recording
@@ -380,6 +379,7 @@ def test_threads_that_reach_the_limit_together_continue_the_episode_once(tmp_pat
     assert rows == [(thread, number, thread) for thread in range(4) for number in range(300)]
 
 
+@pytest.mark.slow
 def test_a_forked_child_records_nothing_and_does_not_hang(tmp_path: Path) -> None:
     script = (
         "import os, sys, threading\n"
@@ -412,6 +412,7 @@ def test_a_forked_child_records_nothing_and_does_not_hang(tmp_path: Path) -> Non
     assert nodes(tmp_path) == [("Step", None, "SUCCEEDED", None)]
 
 
+@pytest.mark.slow
 def test_what_was_written_before_a_kill_is_stored_by_the_next_memory(tmp_path: Path) -> None:
     script = (
         "import os, sys\n"

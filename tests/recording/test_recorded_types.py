@@ -18,8 +18,6 @@ from tests.commands import pycrorm
 from tests.databases import ask
 from tests.recording.recorded_memory import assert_verified, events, nodes, url_of
 
-pytestmark = pytest.mark.slow
-
 AT_END = Settings(fold="at_end")
 
 

@@ -22,8 +22,6 @@ from tests.commands import environment
 from tests.databases import ask, ask_to_change
 from tests.recording.recorded_memory import nodes, problems, url_of
 
-pytestmark = pytest.mark.slow
-
 
 def step(memory: SyncMemory) -> None:
     with memory.recording.episode(description="d") as episode:
@@ -92,6 +90,7 @@ def test_with_fold_at_the_end_no_table_is_made_before_a_flush(tmp_path: Path) ->
     assert len(nodes(tmp_path)) == 2
 
 
+@pytest.mark.slow
 def test_a_program_that_never_closes_its_memory_ends_and_loses_nothing(tmp_path: Path) -> None:
     script = (
         "import sys\n"
@@ -115,6 +114,7 @@ def test_a_program_that_never_closes_its_memory_ends_and_loses_nothing(tmp_path:
     assert len(nodes(tmp_path)) == 1
 
 
+@pytest.mark.slow
 def test_both_databases_have_the_same_tables_of_an_episode(database_url: str, tmp_path: Path) -> None:
     with Memory.sync(database_url, spool=tmp_path / "spool") as memory:
         fields: dict[str, FieldSpec] = {"object_designator": "object", "at": Pose, "words": ("list", "text")}
