@@ -224,6 +224,7 @@ def record_and_drain(url: str, spool: Path, report: Callable[..., None]) -> None
 
 @pytest.mark.parametrize("after", AFTER)
 def test_a_recorder_and_its_writer_killed_at_any_step_lose_no_event_that_was_put(tmp_path: Path, after: bool) -> None:
+    asyncio.run(_made(f"sqlite:///{tmp_path}/made.db"))
     done = False
     step = 0
     while not done:
@@ -231,7 +232,7 @@ def test_a_recorder_and_its_writer_killed_at_any_step_lose_no_event_that_was_put
         place = tmp_path / str(step)
         place.mkdir()
         url, spool = f"sqlite:///{place}/memory.db", place / "spool"
-        asyncio.run(_made(url))
+        shutil.copy(tmp_path / "made.db", place / "memory.db")
         done, output = in_a_child(partial(record_and_drain, url, spool), step, after=after)
         recover_all(url, spool)
         for number in (1, 2):

@@ -125,6 +125,7 @@ def test_values_of_fields_without_a_type_are_missing_with_the_reason(tmp_path: P
     assert started["parameters"]["number"]["missing"] == "declared as int, got a str"
 
 
+@pytest.mark.slow
 def test_a_node_of_a_type_that_cannot_be_declared_is_shown_as_its_kind(tmp_path: Path) -> None:
     assert recorded(tmp_path, "MoveTCPMotion", {}, {}) == 1  # it is a motion, not an action
     assert nodes(tmp_path) == [(None, None, "SUCCEEDED", None)]
