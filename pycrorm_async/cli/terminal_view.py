@@ -95,7 +95,7 @@ def _picture(moment: Moment, lines_max: int) -> RenderableType:
     hidden = len(moment.tree) - len(shown)
     if hidden:
         facts.append(f"{hidden} nodes that have ended are not drawn")
-    return Group(head, Text("  " + " · ".join(facts), style="dim"), tree_of(shown) or Text(""))
+    return Group(head, Text("  " + " · ".join(facts), style="dim"), tree_of(shown, no_wrap=True) or Text(""))
 
 
 def in_sight(nodes: Sequence[NodeThen], lines_max: int) -> list[NodeThen]:

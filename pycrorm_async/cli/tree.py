@@ -33,12 +33,16 @@ def print_tree(nodes: Sequence[NodeSummary], *, events: bool = False, full: bool
         stdout.print(root)
 
 
-def tree_of(nodes: Iterable[NodeSummary], *, events: bool = False, full: bool = False) -> Tree | None:
-    """Return the tree that `print_tree` prints; None without nodes."""
+def tree_of(
+    nodes: Iterable[NodeSummary], *, events: bool = False, full: bool = False, no_wrap: bool = False
+) -> Tree | None:
+    """Return the tree that `print_tree` prints; None without nodes. With `no_wrap` each node takes one line."""
     drawn: dict[int, Tree] = {}
     root: Tree | None = None
     for node in nodes:
         line = _line(node, events=events, full=full)
+        if no_wrap:
+            line.no_wrap, line.overflow = True, "ellipsis"
         parent = drawn.get(node.parent_id) if node.parent_id is not None else None
         if parent is not None:
             drawn[node.id] = parent.add(line)

@@ -120,14 +120,14 @@ class Activity:
         return [each[:_TEXT_MAX] for each in reversed(path) if each]
 
     def entry(self) -> dict[str, Any]:
-        """Return its row, with the keys of `report.overview_data`."""
+        """Return its row, with the keys of `report.overview_data`; its times are those of the tables, in µs."""
         ended = self._ended_wall_ns
         return {
             "number": self.row.number,
             "started": f"{datetime.fromtimestamp(self.row.started_wall_ns // 10**9, UTC):%Y-%m-%d %H:%M:%S}",
             "description": self._description,
             "status": self._status,
-            "seconds": None if ended is None else round((ended - self.row.started_wall_ns) / 1e9, 6),
+            "seconds": None if ended is None else (ended // 1000 - self.row.started_wall_ns // 1000) / 1e6,
             "nodes": self._nodes,
             "failed": self._failed,
             "reasons": dict(self._reasons),

@@ -1,11 +1,11 @@
 """Read new events of the log as they are stored, for any number of pages that follow one episode or all of them.
 
-Theory of operation. One task, `LogFollower.run`, asks the log every 50 ms which episodes have grown, as long as a page
-listens, and folds the new events of the episodes that are followed: each `EpisodeFeed` once, however many pages show
-it. After each turn it wakes the listeners, and each takes the part of the document behind the event that it has sent
-last. A feed has a lock, because a part must not be taken while events are folded. The log is only read. If the database
-does not exist yet or does not answer, `fault` has the reason and the task tries again; if it was replaced, the feeds
-are thrown away and `epoch` counts it, and the pages load again.
+Theory of operation. One task, `LogFollower.run`, asks the log every 50 ms (150 ms if nothing happens) which episodes
+have grown, as long as a page listens, and folds the new events of those that are followed: each `EpisodeFeed` once,
+however many pages show it. After each turn it wakes the listeners, and each takes the part of the document behind the
+event that it has sent last. A feed has a lock, because a part must not be taken while events are folded. The log is
+only read. If the database does not exist yet or does not answer, `fault` has the reason and the task tries again; if
+it was replaced, the feeds are thrown away and `epoch` counts it, and the pages load again.
 """
 
 from __future__ import annotations
@@ -27,6 +27,9 @@ from pycrorm_async.store.stored import EpisodeRow
 __all__ = ["LogFollower", "EpisodeFeed"]
 
 _INTERVAL_S = 0.05
+_IDLE_INTERVAL_S = 0.15
+_IDLE_TURNS = 40
+"""After so many turns without a change the log is asked less often, to spare the robot's processor."""
 _RETRY_S = 0.5
 """Delays the next attempt if the database does not answer."""
 _FEEDS_MAX = 8
@@ -110,6 +113,7 @@ class LogFollower:
 
     async def run(self) -> None:
         """Follow the log until cancelled; rest while nothing listens."""
+        unchanged = 0
         try:
             while True:
                 await self._wanted.wait()
@@ -119,9 +123,11 @@ class LogFollower:
                     self.fault = None
                 except (DatabaseUnavailable, DatabaseForeign) as error:
                     changed, self.fault = False, str(error)
+                unchanged = 0 if changed else unchanged + 1
                 if changed or fault != self.fault:
                     await self._wake()
-                await asyncio.sleep(_INTERVAL_S if self.fault is None else _RETRY_S)
+                interval_s = _INTERVAL_S if unchanged < _IDLE_TURNS else _IDLE_INTERVAL_S
+                await asyncio.sleep(interval_s if self.fault is None else _RETRY_S)
         finally:
             await self.close()
 

@@ -7,12 +7,14 @@ from collections.abc import Iterable
 from typing import Any
 
 from pycrorm_async.errors import DatabaseUnavailable
+from pycrorm_async.events.ids import EPISODE_NUMBER_MAX
 from pycrorm_async.live.activity import Activity
 from pycrorm_async.projections.fold.fold import CannotFold
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.report.episode_data import designators_of
 from pycrorm_async.report.overview_data import newest_episodes, overview_document
 from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.episode_lookup import grown_episodes
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import EpisodeRow
 
@@ -94,8 +96,10 @@ class LiveOverview:
         return [self._activities[each].entry() for each in numbers if not self._activities[each].simulated]
 
     async def document(self, log: EventLog) -> dict[str, Any]:
-        """Return the document of the list: the newest episodes of the tables, and all that the tables lag behind."""
-        await self.catch_up(log, await log.behind())
+        """Return the document of the list: the newest episodes of the tables, and those that run or are not folded."""
+        unended = [number for number, each in self._activities.items() if not each.has_ended]
+        running = await grown_episodes(log, above=EPISODE_NUMBER_MAX, numbers=unended)
+        await self.catch_up(log, {each.number: each for each in [*await log.behind(), *running]}.values())
         try:
             episodes, total = await newest_episodes(self._reading)
             episodes = episodes[-_LISTED_MAX:]

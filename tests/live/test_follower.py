@@ -1,0 +1,139 @@
+"""The follower of a log: parts and entries on both databases, while episodes are recorded, replaced and simulated."""
+
+import asyncio
+import shutil
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from pycrorm_async.errors import UnknownEpisode
+from pycrorm_async.live import follower as following
+from pycrorm_async.live.follower import LogFollower
+from pycrorm_async.memory import Memory
+from pycrorm_async.query.reading import Reading
+from pycrorm_async.report import episode_fold
+from pycrorm_async.report.overview_data import newest_episodes, overview_document
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.world import Pose
+from tests.live.conftest import robot_in
+
+
+@asynccontextmanager
+async def followed(url: str) -> AsyncIterator[LogFollower]:
+    follower = LogFollower(DatabaseAddress.parse(url))
+    task = asyncio.create_task(follower.run())
+    try:
+        yield follower
+    finally:
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+
+
+def url_of(folder: Path) -> str:
+    return f"sqlite:///{folder / 'pycrorm.db'}"
+
+
+async def test_a_listener_gets_each_part_once_and_the_list_what_runs(database_url: str, tmp_path: Path) -> None:
+    async with Memory.open(database_url, spool=tmp_path / "spool") as memory, followed(database_url) as follower:
+        drive = memory.recording.type("action", "DriveAction", {"target": Pose})
+        with memory.recording.episode(description="a drive") as episode:
+            episode.object_added("base", "turtle", "ROBOT", Pose([0, 0, 0]))
+            await memory.flush()
+            feed = await follower.feed("last")
+            log = await follower.log()
+            before = feed.last
+            async with follower.listening(feed), follower.listening(follower.overview):
+                assert await follower.changed_since(0, 10)
+                turn = follower.turn
+                episode.start("one", drive, {"target": Pose([1, 2, 0])}, robot="base")
+                await memory.flush()
+                assert await follower.changed_since(turn, 10)
+                part = await feed.document(log, before)
+                assert [part["texts"][-1 - at] for at in (1, 0)] == ["DriveAction", "target=(1.00, 2.00, 0.00)"]
+                [entry] = follower.overview.entries(0)
+                assert (entry["robots"], entry["now"]) == (["turtle"], ["DriveAction target=(1.00, 2.00, 0.00)"])
+                assert (await feed.document(log, feed.last))["nodes"][0] == []
+                turn = follower.turn
+                episode.end("one", "FAILED", "slipped")
+                await memory.flush()
+                assert await follower.changed_since(turn, 10)
+        await memory.flush()
+        list_of = await follower.overview.document(log)
+        async with Reading.open(database_url) as reading:
+            episodes, total = await newest_episodes(reading)
+            tables = await overview_document(reading, "Episodes", episodes, total, {}, {})
+    keys = ("number", "started", "description", "status", "seconds", "nodes", "failed", "reasons")
+    [live], [kept] = list_of["episodes"], tables["episodes"]
+    assert {key: live[key] for key in keys} == {key: kept[key] for key in keys}
+    assert (live["status"], live["failed"], live["reasons"]) == ("SUCCEEDED", 1, {"Failure": 1})
+
+
+async def test_a_replaced_database_begins_a_new_epoch(tmp_path: Path) -> None:
+    with robot_in(tmp_path) as robot:
+        robot.start("one")
+        robot.end("one")
+    async with followed(url_of(tmp_path)) as follower:
+        feed = await follower.feed("1")
+        async with follower.listening(feed):
+            turn = follower.turn
+            for each in tmp_path.glob("pycrorm.db*"):
+                shutil.rmtree(each) if each.is_dir() else each.unlink()
+            with robot_in(tmp_path, "another") as robot:
+                robot.start("one")
+                robot.end("one")
+            async with asyncio.timeout(20):
+                while follower.epoch == 0:
+                    await follower.changed_since(turn, 1)
+        assert (await follower.feed("1")).id != feed.id
+        assert follower.fault is None
+
+
+async def test_a_database_that_is_missing_is_a_fault_until_it_exists(tmp_path: Path) -> None:
+    async with followed(url_of(tmp_path)) as follower, follower.listening(follower.overview):
+        assert await follower.changed_since(0, 10)
+        assert follower.fault is not None
+        assert "does not exist" in follower.fault
+        with robot_in(tmp_path) as robot:
+            robot.start("one")
+            async with asyncio.timeout(20):
+                while follower.fault is not None or not follower.overview.entries(0):
+                    await follower.changed_since(follower.turn, 1)
+            robot.end("one")
+        with pytest.raises(UnknownEpisode):
+            await follower.feed("7")
+
+
+async def test_a_full_page_says_so_and_another_begins_behind_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(episode_fold, "_NODES_MAX", 2)
+    with robot_in(tmp_path) as robot:
+        for key in "abc":
+            robot.start(key)
+            robot.end(key)
+    follower = LogFollower(DatabaseAddress.parse(url_of(tmp_path)))
+    log = await follower.log()
+    document = await (await follower.feed("1")).document(log)
+    header = document["episode"]
+    assert (header["full"], len(document["nodes"][0])) == (True, 2)
+    rest = await (await follower.feed("1", header["last"] + 1)).document(log)
+    assert rest["episode"]["first"] == header["last"] + 1
+    assert msgspec.json.encode(rest)
+    await follower.close()
+
+
+async def test_feeds_without_listeners_are_forgotten(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(following, "_FEEDS_MAX", 1)
+    with robot_in(tmp_path):
+        pass
+    follower = LogFollower(DatabaseAddress.parse(url_of(tmp_path)))
+    one = await follower.feed("1")
+    async with follower.listening(one):
+        await follower.feed("1", 2)
+        other = await follower.feed("1", 3)
+        assert await follower.feed("1") is one
+        assert await follower.feed("1", 3) is other
+    await follower.close()
