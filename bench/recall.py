@@ -2,6 +2,7 @@
 
     python -m bench.recall                         100,000 and 1,000,000 actions; some minutes, most of them for Soar
     python -m bench.recall --actions 100000        one size
+    python -m bench.recall --no-soar               a minute
     python -m bench.recall --quick                 2,000 actions, few cues
 
 Each action has a type, 12 texts and 6 numbers. The cues of a kind take turns with those of the other kinds, and each is
@@ -46,15 +47,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--actions", type=int, nargs="+")
+    parser.add_argument("--no-soar", action="store_true")
     parser.add_argument("--cues", type=int, help="of each kind; 200 by default")
     arguments = parser.parse_args()
     sizes = arguments.actions or ([2_000] if arguments.quick else [100_000, 1_000_000])
     cues = arguments.cues or (5 if arguments.quick else 200)
-    line = {"bench": "recall", "cues": cues, **{f"{size:,}": measure(size, cues) for size in sizes}}
+    line = {
+        "bench": "recall",
+        "cues": cues,
+        **{f"{size:,}": measure(size, cues, soar=not arguments.no_soar) for size in sizes},
+    }
     print(json.dumps(line))
 
 
-def measure(size: int, cues: int) -> dict[str, Any]:
+def measure(size: int, cues: int, *, soar: bool) -> dict[str, Any]:
     """Measure one memory of this many actions."""
     console().print(f"{size:,} actions")
     actions = Actions(size, seed=_SEED)
@@ -69,22 +75,25 @@ def measure(size: int, cues: int) -> dict[str, Any]:
         loads_ms.append(1_000 * (time.perf_counter() - began_s))
     asked = [(kind, make(actions)) for _ in range(cues) for kind, make in CUES.items()]
     took_ms: dict[str, list[float]] = {kind: [] for kind in CUES}
+    cpu_ms: dict[str, list[float]] = {kind: [] for kind in CUES}
     for _, cue in asked[: len(CUES)]:
         answer(cue, library)  # the first answer of a kind counts words, and is not measured
     gc.collect()
     gc.freeze()
     for kind, cue in asked:
-        began_s = time.perf_counter()
+        began_s, began_cpu_s = time.perf_counter(), time.process_time()
         found = answer(cue, library)
         assert not found or found[0].case.type == cue.type
+        cpu_ms[kind].append(1_000 * (time.process_time() - began_cpu_s))
         took_ms[kind].append(1_000 * (time.perf_counter() - began_s))
     return {
         "bytes_an_action": round(count_bytes / size, 1),
         "load_ms": spread(loads_ms),
         "store_us_an_action": _stored(library),
         "recall_ms": {kind: percentiles(each) for kind, each in took_ms.items()},
+        "recall_cpu_ms": {kind: percentiles(each) for kind, each in cpu_ms.items()},
         "sequences_ms": _sequences(library),
-        "soar": _soar(actions, cues),
+        "soar": _soar(actions, cues) if soar else "left out",
     }
 
 
@@ -133,13 +142,12 @@ def _soar(actions: Actions, cues: int) -> dict[str, Any] | str:
         took_ms = {
             kind: [memory.query(memory.askable(make(actions))) for _ in range(cues)] for kind, make in CUES.items()
         }
-        result = {
+        memory.close()  # which writes the rest of the file
+        return {
             "bytes_an_action": round(path.stat().st_size / len(actions), 1),
             "store_us_an_action": round(1e6 * took_s / len(actions), 1),
             "recall_ms": {kind: percentiles(each) for kind, each in took_ms.items()},
         }
-        memory.close()
-    return result
 
 
 if __name__ == "__main__":

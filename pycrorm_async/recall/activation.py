@@ -27,6 +27,8 @@ _DECAY: Final = 0.5
 """The decay of ACT-R: almost all of its models leave it at this value."""
 _EXACT: Final = 3
 """The number of newest uses that are counted exactly."""
+_NUMBERS_MAX: Final = 2**62
+"""Bounds the numbers of ways while the words of more features are added."""
 _AGE_S_MIN: Final = 1e-3
 """The youngest age in s that counts, so that a use at this very moment does not outweigh all others."""
 
@@ -103,12 +105,22 @@ def _of_type(
 def _ways(groups: Sequence[Group], left_out: frozenset[str]) -> NDArray[np.int64]:
     """Return the number of the way of each case, 0, 1, 2 and so on."""
     sizes = [*map(len, groups)]
-    ways = np.zeros(sum(sizes), np.int64)
-    for name in {name for group in groups for name in group.texts} - {*OUTCOME, "simulated"} - left_out:
+    ways, count = np.zeros(sum(sizes), np.int64), 1
+    for name in sorted({name for group in groups for name in group.texts} - {*OUTCOME, "simulated"} - left_out):
         column = joined_words([group.texts.get(name) for group in groups], sizes)
-        if isinstance(column, Symbols):
-            ways = np.unique(ways * (len(column.words) + 1) + column.codes, return_inverse=True)[1].astype(np.int64)
-    return ways
+        if not isinstance(column, Symbols):
+            continue
+        if count > _NUMBERS_MAX // (len(column.words) + 1):
+            ways, count = _renumbered(ways)
+        ways = ways * (len(column.words) + 1) + column.codes
+        count *= len(column.words) + 1
+    return _renumbered(ways)[0]
+
+
+def _renumbered(ways: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
+    """Return the ways with the numbers from 0 on, and how many there are."""
+    different, numbers = np.unique(ways, return_inverse=True)
+    return numbers.astype(np.int64), int(different.size)
 
 
 def _spread_evenly(count: int, third_s: float, oldest_s: float) -> float:

@@ -104,6 +104,7 @@ class Sequences:
     def __init__(self, library: CaseLibrary) -> None:
         self._groups = library.groups()
         sizes = [len(group) for group in self._groups]
+        self._firsts = np.cumsum([0, *sizes])[:-1].tolist()
         self._group_numbers = np.repeat(np.arange(len(sizes)), sizes)
         self._rows = np.concatenate([np.arange(size, dtype=np.int64) for size in sizes] or [_NONE])
         nodes = np.concatenate([group.nodes for group in self._groups] or [_NONE])
@@ -147,20 +148,24 @@ class Sequences:
             dtype: of the cases to ask about.
             status, reason: likewise; by default any.
         """
-        chosen = np.concatenate([_chosen(group, dtype, status, reason) for group in self._groups] or [_NONE > 0])
-        places = self._places[np.flatnonzero(chosen)]
+        rows = [
+            first + np.flatnonzero(_chosen(group, status, reason))
+            for group, first in zip(self._groups, self._firsts, strict=True)
+            if group.type == dtype
+        ]
+        places = self._places[np.concatenate(rows or [_NONE])]
         if not places.size:
             return Following(0, ())
         after = np.minimum(places + 1, self._keys.size - 1)
         is_next = (self._keys[after] == self._keys[places]) & (after > places)
         following = self._by_parent[after[is_next]]
-        types = [group.type for group in self._groups]
+        types, statuses = sorted({group.type for group in self._groups}), self._statuses
+        of_group = np.array([types.index(group.type) for group in self._groups])
+        width = len(statuses.words) + 1
+        outcomes = of_group[self._group_numbers[following]] * width + statuses.codes[following]
         counts: dict[str, Counter[str]] = {}
-        statuses = self._statuses
-        for number, code in zip(
-            self._group_numbers[following].tolist(), statuses.codes[following].tolist(), strict=True
-        ):
-            counts.setdefault(types[number], Counter())[statuses.words[code - 1]] += 1
+        for outcome, count in zip(*(each.tolist() for each in np.unique(outcomes, return_counts=True)), strict=True):
+            counts.setdefault(types[outcome // width], Counter())[statuses.words[outcome % width - 1]] = count
         followers = [
             Follower(name, each.total(), each.total() / places.size, rate_of(each)) for name, each in counts.items()
         ]
@@ -194,9 +199,7 @@ class Sequences:
         return self._groups[int(self._group_numbers[index])].case(int(self._rows[index]))
 
 
-def _chosen(group: Group, name: str, status: str | None, reason: str | None) -> Mask:
-    if group.type != name:
-        return np.zeros(len(group), np.bool_)
+def _chosen(group: Group, status: str | None, reason: str | None) -> Mask:
     chosen = np.ones(len(group), np.bool_)
     for feature, word in (("status", status), ("reason", reason)):
         if word is not None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from pycrorm_async.events.ids import row_id
+from pycrorm_async.recall import activation as activations
 from pycrorm_async.recall.activation import activation, activation_by_node, forgotten
 from pycrorm_async.recall.blocks import Block
 from pycrorm_async.recall.case import Case
@@ -33,7 +34,9 @@ def use(sequence: int, age_s: float, arm: str, name: str = "A") -> Case:
     return Case(row_id(1, sequence, 0), NOW_US - round(age_s * 1e6), name, texts, {"x": age_s}, status, None, 1.0)
 
 
-def test_all_cases_of_a_way_have_its_activation() -> None:
+@pytest.mark.parametrize("numbers_max", [2**62, 3])
+def test_all_cases_of_a_way_have_its_activation(numbers_max: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(activations, "_NUMBERS_MAX", numbers_max)
     chance = random.Random(2)
     cases = [use(n, chance.uniform(1, 9_000), chance.choice("LR"), chance.choice("AB")) for n in range(1, 200)]
     library = CaseLibrary([Block.of(cases[:50]), Block.of(cases[50:])])

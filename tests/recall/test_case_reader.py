@@ -113,3 +113,13 @@ async def test_what_is_forgotten_is_hidden_from_this_reader_until_it_forgets_les
     assert len(await reader.library()) == 100 - expected.cases
     await reader.forget(float("-inf"), now_us, dry_run=False)
     assert len(await reader.library()) == 100
+
+
+async def test_nothing_is_left_of_a_memory_that_was_rebuilt_without_cases() -> None:
+    memory = Memory()
+    memory.store(random_cases(5, 1))
+    reader = CaseReader(memory)
+    assert len(await reader.library()) == 5
+    memory.blocks.clear()
+    memory.generation += 1
+    assert len(await reader.library()) == 0

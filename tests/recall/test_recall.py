@@ -13,11 +13,14 @@ import pytest
 import pytest_asyncio
 
 from pycrorm_async import Memory, Reading
+from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import CallerError, UnknownEpisode
 from pycrorm_async.recall.answer import Answer
 from pycrorm_async.recall.case import Case
 from pycrorm_async.recall.following import Relation
+from pycrorm_async.recall.reading import running_cases
 from pycrorm_async.recall.reading.recall import Recall
+from pycrorm_async.recall.reading.running_cases import ProcessCases
 from pycrorm_async.world import Arms
 from tests.recall.sliding_grips import (
     FETCH,
@@ -204,3 +207,36 @@ async def test_what_happened_before_the_first_recall_is_recalled_too(tmp_path: P
         assert second.symbols["after"] == GRIP, "the fold of the episode goes through both"
         assert second.symbols["after_status"] == "FAILED"
         assert await first.next() == second.case
+
+
+async def test_an_event_that_is_read_from_the_log_and_observed_is_folded_once(tmp_path: Path) -> None:
+    async with Memory.open(f"sqlite:///{tmp_path / 'memory.db'}") as memory, memory.episode() as episode:
+        parts = memory._open_parts
+        await grip(Arms.LEFT, 0.7)
+
+        async def flush() -> None:
+            await grip(Arms.RIGHT, 0.8)  # recorded while the first recall begins, as by another thread
+            await memory.flush()
+            await grip(Arms.RIGHT, 0.9)
+
+        running = ProcessCases(
+            parts.emitter, open_episodes=lambda: [episode.id], flush=flush, log=parts.reading.log, clock=SYSTEM_CLOCK
+        )
+        numbered, unnumbered = await running.new()
+        assert [round(case.numbers["level"], 1) for case in numbered] == [0.7, 0.8, 0.9]
+        assert list(unnumbered) == []
+        assert "after" not in numbered[0].symbols
+        assert await running.new() == ([], [])
+
+
+async def test_events_that_found_the_buffer_full_are_read_from_the_log(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(running_cases, "_EVENTS_MAX", 4)
+    async with Memory.open(f"sqlite:///{tmp_path / 'memory.db'}") as memory, memory.episode():
+        for round_ in range(1, 4):
+            for _ in range(3):
+                await grip(Arms.LEFT, 1.5)
+            answer = await memory.recall(GRIP, k=100)
+            assert len(answer) == 3 * round_
+            assert {each.status for each in answer} == {"FAILED"}

@@ -2,8 +2,8 @@
 
 Theory of operation. Before each recall the reader asks the source for the numbers of the blocks, and reads those that
 it does not have. A merge replaces blocks by one with a new number; the source returns both in one snapshot, so that no
-case is missing or doubled. A rebuild begins another generation, and the reader begins again. A case of this process is
-at hand as soon as its action has ended; when a stored block has it, the block's is taken.
+case is missing or doubled. In another generation, which a rebuild has made, all blocks are new. A case of this process
+is at hand as soon as its action has ended; when a stored block has it, the block's is taken.
 """
 
 from __future__ import annotations
@@ -106,9 +106,9 @@ class CaseReader:
     async def _read(self, *, changed: bool = False) -> CaseLibrary:
         running, unnumbered = await self._running.new()
         stored = await self._source.read(self._generation, self._blocks.keys())
-        if stored.generation != self._generation:
-            self._generation, self._blocks, changed = stored.generation, {}, True
-        for number in self._blocks.keys() - stored.numbers:
+        self._generation = stored.generation  # of another generation the source has returned all blocks
+        gone = self._blocks.keys() - stored.numbers
+        for number in gone:
             del self._blocks[number]
         self._blocks.update(stored.added)
         unstored = self._unstored
@@ -116,7 +116,7 @@ class CaseReader:
             unstored = _without(unstored, stored.added.values())
         if running:
             unstored = [*unstored, *_without([Block.of(running)], self._blocks.values())]
-        if changed or stored.added or unstored != self._unstored or [*unnumbered] != [*self._unnumbered]:
+        if changed or gone or stored.added or unstored != self._unstored or [*unnumbered] != [*self._unnumbered]:
             self._unstored = unstored if len(unstored) <= _UNSTORED_BLOCKS else [merge(unstored)]
             self._unnumbered = unnumbered
             self._library = CaseLibrary(self._visible())
