@@ -97,6 +97,7 @@ _VERBS = (
     "plot",
     "diff",
     "query",
+    "schema",
     "events",
     "tag",
     "copy",
@@ -105,6 +106,7 @@ _VERBS = (
     "rebuild",
     "verify",
     "learn",
+    "mcp",
 )
 _GROUPS: Mapping[str, tuple[str, tuple[str, ...]]] = {
     "ask": ("Answer a named question; `pycrorm ask NAME --help` lists its options.", ()),

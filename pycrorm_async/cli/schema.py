@@ -1,0 +1,44 @@
+"""`pycrorm schema` describes the views of a memory and their columns, as text or as a diagram."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from typing import Annotated, Literal
+
+import typer
+
+from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, UrlOption
+from pycrorm_async.cli.output import print_json
+from pycrorm_async.errors import CallerError
+from pycrorm_async.query.reading import Reading
+from pycrorm_async.query.schema.memory_schema import CORE_VIEWS, View, as_mermaid, as_text, read_schema
+
+__all__ = ["schema"]
+
+
+def schema(
+    views: Annotated[
+        list[str] | None, typer.Argument(metavar="VIEW...", help="Only these views; by default all of them.")
+    ] = None,
+    form: Annotated[
+        Literal["text", "mermaid"],
+        typer.Option("--format", help="mermaid: a diagram, by default of the views that most queries read."),
+    ] = "text",
+    url: UrlOption = DEFAULT_URL,
+    as_json: JsonOption = False,
+) -> None:
+    """Describe the views of a memory: what a row is, and each column with its type, its unit and what it refers to."""
+    if as_json and form == "mermaid":
+        raise CallerError("--json and --format mermaid exclude each other")
+    names = tuple(views or (CORE_VIEWS if form == "mermaid" else ()))
+
+    async def read() -> list[View]:
+        async with Reading.open(url) as reading:
+            return await read_schema(reading, names)
+
+    described = asyncio.run(read())
+    if as_json:
+        print_json(described)
+    else:
+        sys.stdout.write((as_mermaid if form == "mermaid" else as_text)(described) + "\n")

@@ -1,0 +1,155 @@
+"""Describe the views of the mapped classes and their columns, in words and with their units.
+
+A column's text comes from the docstring behind its attribute, from the section `Attributes` of its class or of a base,
+and from its type: times are integers in SQL, so their text has their unit.
+"""
+
+from __future__ import annotations
+
+import ast
+import inspect
+import re
+import textwrap
+from collections.abc import Iterable
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+from sqlalchemy import Table
+
+from pycrorm_async.orm.base import EPISODE, Base
+from pycrorm_async.orm.designators import Action, Designator, Language, Motion
+from pycrorm_async.orm.types import JsonText, Moment
+
+__all__ = ["ViewDescription", "described", "describe"]
+
+_TIME = "µs since 1970-01-01 00:00 UTC"
+_ENTRY = re.compile(r"^    (\w+(?:, \w+)*): (.*)$")
+_OF_LOADING = re.compile(r"[Ll]oaded|load them|awaitable_attrs|selectinload|undefer|[Ll]ikewise|has the field instead")
+_COURSES = (Action, Motion, Language)
+_ALIKE = ("sequence", "end_sequence", "duration", "start_ns", "end_ns")
+"""Columns that have the same text everywhere."""
+_USUAL = {
+    "id": "of the row; computed from the episode's number, its event and a slot",
+    EPISODE: "number of the episode, `process_metadata.id`",
+    "sequence": "the event that made the row: 1, 2, 3 … inside the episode",
+    "end_sequence": "the event of its end; null while it runs",
+    "dtype": "the designator's type, such as PickUpAction",
+    "lineage": "the type, its bases, and Action, Motion or Language",
+    "parameters": "the recorded parameters, as JSON",
+    "parent_id": "the node around it",
+    "node_id": "the node that did it",
+    "pose_id": "its row in `pose`",
+    "object_id": "its row in `object`, as the object was then",
+    "identity_id": "the object's first row, which all its rows share",
+    "duration": "s; null while it runs, and if it is LOST",
+    "start_ns": "ns of the robot's monotonic clock",
+    "end_ns": "ns of the robot's monotonic clock",
+    "ns": "ns of the robot's monotonic clock",
+    "torso_height": "m",
+    "frame": "the frame of the pose, such as map",
+    **dict.fromkeys("xyz", "m"),
+    **dict.fromkeys(("qx", "qy", "qz", "qw"), "of a unit quaternion"),
+}
+
+
+@dataclass(frozen=True)
+class ViewDescription:
+    """A view in words.
+
+    Attributes:
+        name: of the view.
+        mapped: name of the mapped class.
+        text: one sentence.
+        columns: text by column; a column without one is left out.
+        references: the column that a column refers to, such as `pose.id`, by column.
+    """
+
+    name: str
+    mapped: str
+    text: str
+    columns: dict[str, str]
+    references: dict[str, str]
+
+
+def described() -> dict[str, ViewDescription]:
+    """Return the description of every mapped view of this process, by name."""
+    views: dict[str, ViewDescription] = {}
+    for mapper in sorted(Base.registry.mappers, key=lambda each: str(each.class_.__name__)):
+        if mapper.inherits is None or mapper.local_table is not mapper.inherits.local_table:  # else of the same view
+            description = describe(mapper.class_)
+            views[description.name] = description
+    return dict(sorted(views.items()))
+
+
+def describe(class_: Any) -> ViewDescription:
+    """Return the description of a mapped class's view."""
+    mapper, table = class_.__mapper__, class_.__table__
+    assert isinstance(table, Table)
+    texts: dict[str, str] = {}
+    for each in reversed(class_.__mro__):
+        if issubclass(each, Base) or "__annotations__" in vars(each):
+            texts |= _documented(each)
+    columns: dict[str, str] = {}
+    for column in (*table.columns, *_unmapped(table.name)):
+        name = str(column if isinstance(column, str) else column.name)
+        kind = None if isinstance(column, str) else column.type
+        key = name if isinstance(column, str) else _key_of(mapper, column)
+        words = _of_values(texts.get(key) or texts.get(name) or "") if name not in _ALIKE else ""
+        words = words or _USUAL.get(name, "")
+        parts = [words, _TIME if isinstance(kind, Moment) else ""]
+        parts += ["JSON"] if isinstance(kind, JsonText) and "JSON" not in words else []
+        if text := "; ".join(filter(None, parts)):
+            columns[name] = text
+    if class_ in _COURSES:
+        columns = describe(Designator).columns | columns
+    references = {str(column.name): key.target_fullname for column in table.columns for key in column.foreign_keys}
+    return ViewDescription(table.name, class_.__name__, _sentence(class_.__doc__), columns, references)
+
+
+def _unmapped(view: str) -> Iterable[str]:
+    """Return the columns of a view that no attribute of its class maps."""
+    return ("sequence", "parameters", "parent_id") if view == "designator" else ("sequence",)
+
+
+def _of_values(text: str) -> str:
+    """Return the sentences that are about the values, without those about loading attributes in Python."""
+    sentences = re.split(r"(?<=[.:;]) (?=[A-Z`])", text)
+    text = " ".join(each for each in sentences if not _OF_LOADING.search(each)).rstrip(".:")
+    return re.sub(r"\bNone\b", "null", text)
+
+
+def _key_of(mapper: Any, column: Any) -> str:
+    key = mapper.get_property_by_column(column).key if column in mapper.columns.values() else column.name
+    return str(key).lstrip("_")
+
+
+def _sentence(doc: str | None) -> str:
+    """Return the first sentence of a docstring, on one line."""
+    first = inspect.cleandoc(doc or "").partition("\n\n")[0]
+    return " ".join(first.split())
+
+
+def _documented(class_: type) -> dict[str, str]:
+    """Return the texts of a class's attributes, by name."""
+    texts: dict[str, str] = {}
+    _, _, section = inspect.cleandoc(vars(class_).get("__doc__") or "").partition("Attributes:\n")
+    names: list[str] = []
+    for line in section.splitlines():
+        if entry := _ENTRY.match(line):
+            names = entry[1].split(", ")
+            texts |= dict.fromkeys(names, entry[2])
+        elif line.startswith("        ") and names:
+            texts |= {name: f"{texts[name]} {line.strip()}" for name in names}
+        elif line.strip():
+            break
+    try:
+        body = ast.parse(textwrap.dedent(inspect.getsource(class_))).body[0]
+    except (OSError, TypeError):  # a class without a source file, such as one defined in a notebook
+        return texts
+    statements = body.body if isinstance(body, ast.ClassDef) else []
+    for assigned, text in pairwise(statements):
+        match assigned, text:
+            case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(words))):
+                texts[name] = _sentence(words)
+    return texts

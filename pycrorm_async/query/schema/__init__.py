@@ -1,0 +1,1 @@
+"""Describe the views of a memory: for people and programs that write SQL."""

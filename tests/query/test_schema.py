@@ -1,0 +1,90 @@
+"""The views of a memory in words: every column of a time has its unit, and a diagram shows what refers to what."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import pytest
+
+from pycrorm_async.errors import CallerError
+from pycrorm_async.orm.base import Base
+from pycrorm_async.orm.documentation.descriptions import described
+from pycrorm_async.orm.types import Moment
+from pycrorm_async.query.reading import Reading
+from pycrorm_async.query.schema.memory_schema import CORE_VIEWS, as_mermaid, as_text, read_schema
+from tests.commands import pycrorm
+from tests.databases import run_in_own_loop
+from tests.projections.event_script import NAVIGATE, PICK_UP, SAYING, declarations
+from tests.projections.factories import append_and_fold
+from tests.query.test_reading import episode
+
+README = Path(__file__).parents[2] / "pycrorm_async/query/README.md"
+
+
+@pytest.fixture(scope="module")
+def url(module_database_url: str) -> str:
+    records = [*declarations(NAVIGATE, PICK_UP, SAYING), *episode(1).records]
+    run_in_own_loop(append_and_fold(module_database_url, records))
+    return module_database_url
+
+
+@pytest.fixture
+async def reading(url: str) -> AsyncIterator[Reading]:
+    async with Reading.open(url) as opened:
+        yield opened
+
+
+def test_every_column_of_a_time_has_its_unit_and_every_built_in_view_a_sentence() -> None:
+    views = described()
+    for name, table in Base.metadata.tables.items():
+        assert views[name].text, name
+        for column in table.columns:
+            if isinstance(column.type, Moment):
+                assert views[name].columns[column.name].endswith("µs since 1970-01-01 00:00 UTC"), (name, column.name)
+            if column.name.endswith("_ns"):
+                assert views[name].columns[column.name].startswith("ns of"), (name, column.name)
+
+
+def test_texts_of_columns_are_about_values_and_not_about_python() -> None:
+    texts = [text for view in described().values() for text in view.columns.values()]
+    assert not [each for each in texts if re.search(r"await|undefer|selectinload|\bNone\b", each)]
+
+
+async def test_a_memory_describes_all_of_its_views(reading: Reading) -> None:
+    schema = {each.name: each for each in await read_schema(reading)}
+    assert {*CORE_VIEWS, "saying_action", "PickUpWithContextView"} <= schema.keys()
+    assert schema["saying_action"].text.startswith("Parameters of SayingAction; `id` is that of its row in action")
+    assert {each.name for each in schema["saying_action"].columns} == {"id", "process_metadata_id", "text"}
+    pick_up = {each.name: each.refers_to for each in schema["pick_up_action"].columns}
+    assert (pick_up["id"], pick_up["object_designator_id"]) == ("action.id", "object.id")
+    assert not [name for name in schema if name.startswith(("zz_", "pycrorm_"))]
+    text = as_text([schema["pose"]])
+    assert text.startswith("pose (Pose): A position (m) and an orientation (unit quaternion)")
+    assert "\n  time bigint  µs since 1970-01-01 00:00 UTC" in text
+
+
+async def test_a_view_that_does_not_exist_is_answered_with_the_nearest(reading: Reading) -> None:
+    with pytest.raises(CallerError, match=r"^this memory has no view 'actions'; did you mean action"):
+        await read_schema(reading, ["pose", "actions"])
+
+
+async def test_the_readme_shows_the_diagram_of_three_views(tmp_path: Path) -> None:
+    [shown] = re.findall(r"```mermaid\n(.*?)\n```", README.read_text(), re.DOTALL)
+    url = f"sqlite:///{tmp_path}/memory.db"
+    await append_and_fold(url, [*declarations(NAVIGATE, PICK_UP), *episode(1).records[:3]])
+    async with Reading.open(url) as reading:
+        assert as_mermaid(await read_schema(reading, ["pick_up_action", "object", "pose"])) == shown
+
+
+def test_the_command_prints_text_json_and_a_diagram(url: str, tmp_path: Path) -> None:
+    done = pycrorm("schema", "pose", "--json", "--url", url, cwd=tmp_path)
+    [pose] = json.loads(done.stdout)
+    assert (pose["mapped"], pose["columns"][0]["name"]) == ("Pose", "id")
+    diagram = pycrorm("schema", "--format", "mermaid", "--url", url, cwd=tmp_path).stdout
+    assert diagram.startswith("erDiagram\n    process_metadata {\n")
+    assert "    object }o--|| pose : pose_id\n" in diagram
+    wrong = pycrorm("schema", "posse", "--url", url, cwd=tmp_path)
+    assert (wrong.returncode, wrong.stderr) == (2, "pycrorm: this memory has no view 'posse'; did you mean pose?\n")
