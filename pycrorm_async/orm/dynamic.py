@@ -48,7 +48,7 @@ _TYPES: dict[FieldType, TypeEngine[Any]] = {
     "datetime": Moment(),
 }
 _numbers: Final = itertools.count(1)
-"""Numbers the memories of this process, to tell their classes of one name apart."""
+"""Numbers the memories of this process, so that their classes of one name have different identities."""
 
 
 class DynamicClasses:
