@@ -77,7 +77,7 @@ def _document(table: SuccessTable) -> dict[str, Any]:
             table.y.name: table.y.cell_text(each.y),
             "succeeded": each.succeeded,
             "rows": each.rows,
-            "interval": each.interval,
+            "interval": [round(limit, 3) for limit in each.interval],
         }
         for each in table.cells
     ]

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple, Protocol, overload
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.query.snapshot import Moment
+from pycrorm_async.query.success.interval import interval_95
 from pycrorm_async.recall.case import Case, is_angle
 from pycrorm_async.recall.cue import Cue
 from pycrorm_async.recall.library import CaseLibrary
@@ -40,8 +41,6 @@ __all__ = [
 
 _TRIED = ("SUCCEEDED", "FAILED", "ERROR")
 """The statuses of an action that ran to its end. Of one that was cancelled, interrupted or lost nothing is known."""
-_Z = 1.959964
-"""The quantile of the normal distribution for an interval of 95 %."""
 
 
 class Rate(NamedTuple):
@@ -341,9 +340,7 @@ def rate_of(statuses: Mapping[str, int]) -> Rate | None:
     if not tries:
         return None
     share = successes / tries
-    middle = (share + _Z**2 / (2 * tries)) / (1 + _Z**2 / tries)
-    half = _Z / (1 + _Z**2 / tries) * math.sqrt(share * (1 - share) / tries + _Z**2 / (4 * tries**2))
-    return Rate(share, max(0.0, middle - half), min(1.0, middle + half), successes, tries)
+    return Rate(share, *interval_95(successes, tries), successes, tries)
 
 
 def _blended(numbers: Sequence[tuple[float, float]], whole: float, *, angle: bool) -> Typical:

@@ -22,8 +22,9 @@ from pycrorm_async.errors import CallerError, MissingExtra
 from pycrorm_async.orm import Action
 from pycrorm_async.query.success import figure as figures
 from pycrorm_async.query.success.figure import success_figure
+from pycrorm_async.query.success.interval import interval_95
 from pycrorm_async.query.success.samples import Samples, Values, success_samples
-from pycrorm_async.query.success.success_table import interval, success_table
+from pycrorm_async.query.success.success_table import success_table
 
 pytestmark = pytest.mark.slow
 
@@ -75,9 +76,10 @@ def test_every_row_is_in_a_cell_whatever_the_range(values: list[float]) -> None:
 
 
 def test_the_interval_is_that_of_wilson() -> None:
-    assert interval(5, 5) == (0.566, 1.0)
-    assert interval(0, 10) == (0.0, 0.278)
-    assert interval(7_900, 50_000) == (0.155, 0.161)  # the thesis' default policy
+    assert interval_95(5, 5) == pytest.approx((0.56551, 1.0), abs=1e-5)
+    assert interval_95(0, 10) == pytest.approx((0.0, 0.27753), abs=1e-5)
+    assert interval_95(7_900, 50_000) == pytest.approx((0.15483, 0.16122), abs=1e-5)  # the thesis' default policy
+    assert interval_95(0, 0) == (0.0, 1.0)
 
 
 async def test_rows_without_a_value_or_an_end_are_counted_and_left_out(url: str) -> None:

@@ -27,6 +27,7 @@ from pycrorm_async.plan.current_robot import require_world
 from pycrorm_async.plan.designator import ActionAbstract
 from pycrorm_async.plan.failures import PlanFailure
 from pycrorm_async.progress_bar import watched
+from pycrorm_async.query.success.interval import interval_95
 
 if TYPE_CHECKING:
     from pycrorm_async.memory import Memory
@@ -58,13 +59,7 @@ class Tally:
     @property
     def interval(self) -> tuple[float, float]:
         """Limits of the 95 % confidence interval of the success rate, by Wilson's formula."""
-        count, z = self.rollouts, 1.959964
-        if not count:
-            return 0.0, 1.0
-        rate, spread = self.success_rate, z * z / count
-        middle = (rate + spread / 2) / (1 + spread)
-        half = z * math.sqrt(rate * (1 - rate) / count + spread / (4 * count)) / (1 + spread)
-        return middle - half, middle + half
+        return interval_95(self.successes, self.rollouts)
 
     def __add__(self, other: Tally) -> Tally:
         return Tally(self.successes + other.successes, self.failures + other.failures)

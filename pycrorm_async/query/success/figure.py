@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pycrorm_async.errors import CallerError, MissingExtra
+from pycrorm_async.query.success.interval import interval_95
 from pycrorm_async.query.success.samples import Samples, Values
-from pycrorm_async.query.success.success_table import Axis, Cell, SuccessTable, interval, success_table
+from pycrorm_async.query.success.success_table import Axis, Cell, SuccessTable, success_table
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -80,7 +81,7 @@ def _figure_type() -> type[Figure]:
 
 
 def _title(table: SuccessTable) -> str:
-    low, high = interval(table.succeeded, table.rows)
+    low, high = interval_95(table.succeeded, table.rows)
     rate = f"{_percent(table.succeeded / table.rows)} of {table.rows:,} succeeded (95 %: {_percent(low, high)})"
     left_out = [f"{table.missing:,} without a value"] if table.missing else []
     left_out += [f"{table.running:,} not ended"] if table.running else []

@@ -10,17 +10,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pycrorm_async.errors import CallerError
+from pycrorm_async.query.success.interval import interval_95
 from pycrorm_async.query.success.samples import Samples, Values
 
-__all__ = ["Axis", "Cell", "SuccessTable", "interval", "success_table"]
+__all__ = ["Axis", "Cell", "SuccessTable", "success_table"]
 
 _BINS_MAX = 200
 _BINS_LEAST, _BINS_USUAL = 4, 16
 _ROWS_A_CELL = 5
 """By default there are so few ranges that a cell has this many rows on average."""
 _DAY_S, _MINUTE_S = 86_400, 60
-_Z_95 = 1.959964
-"""95 % of a normal distribution are within this many standard deviations."""
 
 
 class Axis(NamedTuple):
@@ -77,8 +76,8 @@ class Cell(NamedTuple):
 
     @property
     def interval(self) -> tuple[float, float]:
-        """The 95 % interval of the rate; see `interval`."""
-        return interval(self.succeeded, self.rows)
+        """The 95 % interval of the rate."""
+        return interval_95(self.succeeded, self.rows)
 
 
 class SuccessTable(NamedTuple):
@@ -92,17 +91,6 @@ class SuccessTable(NamedTuple):
     rows: int
     missing: int
     running: int
-
-
-def interval(succeeded: int, count: int) -> tuple[float, float]:
-    """Return the 95 % interval of a rate by Wilson's score, which also holds for few rows and for rates near 0 and 1.
-
-    >>> interval(5, 5)
-    (0.566, 1.0)
-    """
-    center = (succeeded + _Z_95**2 / 2) / (count + _Z_95**2)
-    half = _Z_95 * math.sqrt(succeeded * (count - succeeded) / count + _Z_95**2 / 4) / (count + _Z_95**2)
-    return round(max(0.0, center - half), 3), round(min(1.0, center + half), 3)
 
 
 def success_table(samples: Samples, *, bins: int | None = None) -> SuccessTable:
