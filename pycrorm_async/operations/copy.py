@@ -147,6 +147,7 @@ class _Copier:
                 self._damage[row.id] = str(damage)
         await self._append()
         await self._fold({row.id for row in rows})
+        await retry(self._destination.fold, backoff=BRIEF)  # the cases, too
         after = {row.id: row.head for row in await self._target.episodes()}
         stopped = {**await self._destination.stopped(), **self._refused}
         return tuple(

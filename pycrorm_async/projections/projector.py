@@ -107,7 +107,7 @@ class Projector:
                 count += folded
             while await self._refresh():
                 pass
-            while await self._custom.fold_next_batch(now=True):
+            while await self._custom.fold_next_batch(now=True, until_visible=True):
                 pass
         return count
 

@@ -7,11 +7,16 @@ import multiprocessing
 import os
 import signal
 from collections import Counter
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
 from random import Random
 
 import pytest
 
 from pycrorm_async.errors import DamageError
+from pycrorm_async.operations.copy import copy_episodes
+from pycrorm_async.operations.rebuild import rebuild_memory, rebuild_projection
 from pycrorm_async.projections.custom.discovery import own_projections
 from pycrorm_async.projections.custom.projection_tables import states
 from pycrorm_async.projections.projector import Projector
@@ -24,6 +29,7 @@ from pycrorm_async.recall.cases import stored_blocks
 from pycrorm_async.recall.cases.stored_blocks import BlockHeading, read_blocks, read_headings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
+from tests.golden.unpacking import unpack_memory_v1
 from tests.projections.event_script import mixed
 from tests.projections.sql_queries import ask
 from tests.recall.case_script import TYPES, CaseScript, cases_of, in_order, random_script
@@ -107,6 +113,72 @@ async def test_blocks_are_merged_as_they_grow(log: EventLog) -> None:
     assert cases == cases_of(script)
     (state,) = await states(log, own_projections())
     assert (state.name, state.behind, state.parked, state.fault) == ("recall", 0, {}, None)
+
+
+async def test_cases_are_folded_at_intervals_unless_a_caller_waits_for_them(log: EventLog) -> None:
+    script = CaseScript()
+    await log.append([*TYPES, *script.records])
+    projector = await projector_of(log)
+    for count in (1, 2, 3):
+        script.end(script.wait())
+        await log.append(script.records[-2:])
+        while await projector.fold_next_batch():
+            pass
+        assert len((await stored(log))[1]) == 1, f"the cases of the first of {count} batches are stored"
+    await projector.catch_up()
+    assert (await stored(log))[1] == cases_of(script)
+
+
+@pytest.mark.slow
+async def test_a_memory_of_an_earlier_version_has_its_cases_after_a_rebuild_and_so_has_a_copy(tmp_path: Path) -> None:
+    url = unpack_memory_v1(tmp_path)
+    await rebuild_memory(url)
+    await rebuild_projection(url, own_projections()[0])
+    query = "SELECT id, dtype, status FROM task_tree_node WHERE kind = 'action' AND status <> 'RUNNING' ORDER BY id"
+    async with opened(url) as log:
+        before = (await stored(log))[1]
+        actions = await ask(log, query)
+        assert [(each.node, each.type, each.status) for each in before if not each.simulated] == actions
+        assert [each.type for each in before if each.simulated] == ["GreetAction"]
+        assert (await verified(log)).drift == 0
+    copy = f"sqlite:///{tmp_path}/copy.db"
+    await copy_episodes(url, copy)
+    async with opened(copy) as log:
+        assert [each._replace(node=0, parent=None) for each in (await stored(log))[1]] == [
+            each._replace(node=0, parent=None) for each in before
+        ]
+
+
+@pytest.mark.soak
+async def test_processes_that_fold_and_merge_at_once_lose_and_double_nothing(
+    log: EventLog, database_url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    small_blocks(monkeypatch)
+    scripts = [random_script(number, Random(number), actions=60) for number in range(1, 41)]
+    await log.append([*TYPES, *mixed(*scripts)])
+    plain = Projector(log)
+    await plain.open()
+    await plain.catch_up()
+    logs = [await EventLog.open(DatabaseAddress.parse(database_url), create=True) for _ in range(4)]
+    try:
+        projectors = [
+            await projector_of(each, batch_events=size) for each, size in zip(logs, (7, 11, 13, 29), strict=True)
+        ]
+        await asyncio.gather(*(each.catch_up() for each in projectors))
+    finally:
+        for each in logs:
+            await each.close()
+    assert (await stored(log))[1] == cases_of(*scripts)
+    assert (await verified(log)).drift == 0
+
+
+@asynccontextmanager
+async def opened(url: str) -> AsyncIterator[EventLog]:
+    log = await EventLog.open(DatabaseAddress.parse(url), create=False)
+    try:
+        yield log
+    finally:
+        await log.close()
 
 
 async def filled(log: EventLog) -> list[Case]:

@@ -29,7 +29,7 @@ from pycrorm_async.projections.custom.projection import (
 from pycrorm_async.projections.custom.projection_rows import CustomRows
 from pycrorm_async.projections.run import checkpoints
 from pycrorm_async.projections.run.batch_fold import Batch, BatchFold
-from pycrorm_async.projections.run.pipeline import FoldPipeline
+from pycrorm_async.projections.run.pipeline import LOOKAHEAD_EVENTS_MIN, FoldPipeline
 from pycrorm_async.projections.run.targets import SideTarget
 from pycrorm_async.projections.schema.core_columns import OWN, Storage
 from pycrorm_async.projections.schema.generations import (
@@ -174,7 +174,8 @@ class CustomTables:
         self._installed = installed
         self._batch_events = batch_events
         self._folded: dict[str, tuple[BatchFold, FoldPipeline]] = {}
-        self._checked_s = 0.0
+        self._packed: set[str] = set()
+        self._checked_s = self._packed_s = 0.0
 
     async def set_up(self, connection: AsyncConnection, tables: Layout) -> bool:
         """Create missing tables; return whether the views must be created again.
@@ -194,18 +195,30 @@ class CustomTables:
             target = SideTarget(self._log, f"{PROJECTION}{each.name}", each.name, each.version)
             fold = BatchFold(self._log, target, generation, CustomFoldDefinition(each))
             local = None if self._log.address.is_sqlite else fold
+            if isinstance(each, PackedProjection):
+                self._packed.add(each.name)
             self._folded[each.name] = fold, FoldPipeline(target, batch_events=self._batch_events, local=local)
         return changed
 
-    async def fold_next_batch(self, *, now: bool) -> bool:
-        """Fold a batch of each; return False if none was behind. Without `now` it checks every `_CHECK_S` only."""
+    async def fold_next_batch(self, *, now: bool, until_visible: bool = False) -> bool:
+        """Fold a batch of each; return False if none was behind. Without `now` it checks every `_CHECK_S` only.
+
+        Those of this package are folded every `_CHECK_S` unless `until_visible` is true, because a batch of a few
+        events costs as much as one of a thousand.
+        """
         time_s = asyncio.get_running_loop().time()
         if not self._folded or (not now and time_s < self._checked_s + _CHECK_S):
             return False
+        packed = until_visible or time_s >= self._packed_s + _CHECK_S
         count = 0
         for name, (fold, pipeline) in [*self._folded.items()]:
+            if name in self._packed and not packed:
+                continue
             try:
-                count += await pipeline.fold_next([fold]) is not None
+                events = await pipeline.fold_next([fold])
+                count += events is not None
+                if name in self._packed and (events is None or events < LOOKAHEAD_EVENTS_MIN):
+                    self._packed_s = time_s
             except DatabaseUnavailable:
                 raise
             except PycrormError as fault:

@@ -152,16 +152,19 @@ def _add_surroundings(
     symbols: Symbols, identity: int | None, robot: RobotValue | None, objects: Mapping[int, WorldObject]
 ) -> None:
     target = objects.get(identity) if identity is not None else None
-    if target is not None:
-        near = {each.object_type for each in objects.values() if each is not target and _is_near(each, target)}
-        if near:
-            symbols["near"] = tuple(sorted(near))
-    if robot is not None and robot.object is not None:
-        holder = robot.object.object
-        attached = (each for each in objects.values() if each.attached_to is not None)
-        held = {each.object_type for each in attached if each.attached_to and each.attached_to[0] == holder}
-        if held:
-            symbols["held"] = tuple(sorted(held))
+    holder = robot.object.object if robot is not None and robot.object is not None else None
+    if target is None and holder is None:
+        return
+    near, held = set(), set()
+    for each in objects.values():
+        if each.attached_to is not None and each.attached_to[0] == holder:
+            held.add(each.object_type)
+        if target is not None and each is not target and _is_near(each, target):
+            near.add(each.object_type)
+    if near:
+        symbols["near"] = tuple(sorted(near))
+    if held:
+        symbols["held"] = tuple(sorted(held))
 
 
 def _is_near(each: WorldObject, target: WorldObject) -> bool:
