@@ -6,7 +6,7 @@ because it releases the GIL at every row: next to a busy plan it wrote 872 rows/
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import sqlalchemy
 from sqlalchemy import column, select, text
@@ -24,7 +24,7 @@ from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import Span, StoredEvent
 
-__all__ = ["TableRows", "name_episodes", "stored_rows"]
+__all__ = ["TableRows", "name_episodes", "stored_rows", "uuids_of"]
 
 _episode = sqlalchemy.table("episode", column("number"), column("id"))
 
@@ -37,11 +37,17 @@ def stored_rows(engine: AsyncEngine, rows: RowsByTable, generation: int) -> Rows
     }
 
 
-async def name_episodes(connection: AsyncConnection, rows: Rows) -> None:
-    """Set the UUID of the episodes that start in these rows: their events contain only the number."""
-    some = select(_episode.c.number, _episode.c.id).where(_episode.c.number.in_(rows.episodes))
-    for number, uuid in await connection.execute(some):
-        rows.episodes[number]["uuid"] = uuid
+async def uuids_of(connection: AsyncConnection, numbers: Collection[int]) -> dict[int, str]:
+    """Return the UUIDs of these episodes, by number: their events contain only the number."""
+    some = select(_episode.c.number, _episode.c.id).where(_episode.c.number.in_(numbers))
+    return {each.number: each.id for each in await connection.execute(some)}
+
+
+def name_episodes(rows: Rows, uuids: Mapping[int, str]) -> None:
+    """Set the UUID of the episodes that start in these rows."""
+    for number, row in rows.episodes.items():
+        if number in uuids:
+            row["uuid"] = uuids[number]
 
 
 class TableRows:
@@ -50,18 +56,21 @@ class TableRows:
     def __init__(self, designators: Designators) -> None:
         self._designators = designators
         self._rows = Rows()
+        self._uuids: dict[int, str] = {}
         self._insertion: Insertion = None
 
     async def restore(self, log: EventLog, spans: Sequence[Span]) -> None:
-        """Do nothing: this fold needs no earlier events."""
+        """Read the UUIDs of the episodes that start in these spans. The caller may hold the write lock of SQLite."""
+        starting = [span.number for span in spans if span.after == 0]
+        if starting:
+            async with log.reading() as connection:
+                self._uuids = await uuids_of(connection, starting)
 
     def fold(self, event: StoredEvent) -> None:
         fold(event, self._designators, self._rows)
 
     async def ready(self, engine: AsyncEngine, generation: int) -> None:
-        if self._rows.episodes:
-            async with engine.connect() as connection:
-                await name_episodes(connection, self._rows)
+        name_episodes(self._rows, self._uuids)
         self._insertion = await dialect_of(engine).insertion(stored_rows(engine, self._rows.to_insert(), generation))
 
     async def write(self, connection: AsyncConnection, generation: int) -> None:

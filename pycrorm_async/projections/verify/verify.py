@@ -19,7 +19,7 @@ from pycrorm_async.projections.custom.projection import Projection
 from pycrorm_async.projections.fold.link_boxes import boxes_of
 from pycrorm_async.projections.fold.parameters import Designators
 from pycrorm_async.projections.fold.row_batch import Rows
-from pycrorm_async.projections.fold.row_writer import name_episodes
+from pycrorm_async.projections.fold.row_writer import name_episodes, uuids_of
 from pycrorm_async.projections.schema.generations import Generation, current_generation
 from pycrorm_async.projections.schema.layout import unite
 from pycrorm_async.projections.schema.unmade_types import failed_views, unmade_types
@@ -250,7 +250,7 @@ class _TablesCheck:
             if self._unfinished.compared:
                 high = Place(place.number + 1)
         if rows.episodes:
-            await name_episodes(connection, rows)
+            name_episodes(rows, await uuids_of(connection, rows.episodes))
         made = Range(low.row or None, high and high.row, low.number or None, high and high.number)
         await self._compare(connection, comparison, rows, made, carried, settled - carried, read)
         self._report_progress(self.result.events, max(self._total, self.result.events))
