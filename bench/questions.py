@@ -33,7 +33,7 @@ from pycrorm_async import Memory, Reading, UserView
 from pycrorm_async.operations.recovery import recover
 from pycrorm_async.orm import Object, PickUpAction, PickUpWithContextView, Pose, ProcessMetaData, TaskTreeNode
 from pycrorm_async.plan.task_tree import TaskStatus
-from pycrorm_async.query.experience import PickUpExperience
+from pycrorm_async.recall.experience import PickUpExperience
 from pycrorm_async.world import ObjectType
 from tests.databases import ask, server_in
 
@@ -89,7 +89,7 @@ def queries_of(reading: Reading, pick_ups: int) -> dict[str, Query]:
         return len(await reading.tree(last))
 
     async def experience() -> int:
-        return len(await PickUpExperience(reading).successes(ObjectType.MILK, arm=None))
+        return len(await PickUpExperience.of(reading).successes(ObjectType.MILK, arm=None))
 
     async def as_of() -> int:
         return len((await reading.as_of(last, sequence=1_000)).running)

@@ -42,13 +42,13 @@ from pycrorm_async.projections.custom.discovery import validate_projections
 from pycrorm_async.projections.custom.projection import Projection
 from pycrorm_async.projections.schema.user_views import UserView
 from pycrorm_async.query.as_of import AnyEpisode
-from pycrorm_async.query.experience import PickUpExperience
 from pycrorm_async.query.named_queries import EpisodeSummary
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.queue.files.locks import call_in_forked_child
 from pycrorm_async.queue.files.spool import Spool
 from pycrorm_async.queue.live.delegated_writer import DelegatedWriter
 from pycrorm_async.queue.live.recorder_queue import RecorderQueue
+from pycrorm_async.recall.experience import PickUpExperience
 from pycrorm_async.recording.recording import Recording
 from pycrorm_async.recording.values.episode_arguments import read_labels
 from pycrorm_async.recording.writing.emitter import Emitter
@@ -240,7 +240,7 @@ class Memory(ReadableMemory, ObservingMemory):
             recorder,
             recording,
             Observations(emitter, recorder),
-            PickUpExperience(reading),
+            PickUpExperience(reading, lambda: self.recall.reader),
         )
 
     async def __aexit__(

@@ -14,10 +14,10 @@ from pycrorm_async.hooks.plan_recorder import Recorder
 from pycrorm_async.plan.execution.observer import recorder
 from pycrorm_async.plan.execution.unawaited_performs import called_performs
 from pycrorm_async.plan.experience import experience
-from pycrorm_async.query.experience import PickUpExperience
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.queue.live.delegated_writer import DelegatedWriter
 from pycrorm_async.queue.live.recorder_queue import RecorderQueue
+from pycrorm_async.recall.experience import PickUpExperience
 from pycrorm_async.recording.recording import Recording
 from pycrorm_async.recording.writing.emitter import Emitter
 from pycrorm_async.store.address import DatabaseAddress

@@ -12,12 +12,15 @@ from pycrorm_async.learning.policies.policy_plot import draw_policies
 from pycrorm_async.learning.policies.recorded_policy import read_policy, record_policy
 from pycrorm_async.learning.policies.tree import learn
 from pycrorm_async.learning.rollouts.move_and_pick_up import MoveAndPickUp
+from pycrorm_async.learning.rollouts.recalled_pick_up import RecalledPickUp, RecalledPickUpPerformable
 from pycrorm_async.learning.rollouts.recorded_rollouts import rollouts_question
 from pycrorm_async.learning.rollouts.rollouts import Tally, batch_rollout
 from pycrorm_async.learning.rollouts.scene import Scene, Stage
 
 __all__ = [
     "MoveAndPickUp",
+    "RecalledPickUp",
+    "RecalledPickUpPerformable",
     "default_policy",
     "learn",
     "Policy",

@@ -1,4 +1,4 @@
-"""Port through which location designators query a memory for past successful pick-ups.
+"""Port through which plans query a memory for past successful pick-ups.
 
 `experience` is the experience of the current context: that of the open memory, or None. The plan layer does not depend
 on its implementation.
@@ -24,8 +24,10 @@ class PastSuccess:
     Attributes:
         torso_height: m; None for a robot without a torso.
         stand: pose of the robot's base in the object's own frame.
-        score: rating that also counts the failures of this way, between 0 and 1.
+        score: the share of successes that is expected of this way, between 0 and 1; failures count.
         times: number of successes with exactly these values.
+        evidence: number of tries that the score is based on, each counted by its likeness to this way.
+        prior: the score of a way of which nothing is known.
     """
 
     arm: Arms
@@ -34,13 +36,24 @@ class PastSuccess:
     stand: Pose
     score: float
     times: int = 1
+    evidence: float = 1.0
+    prior: float = 0.0
 
 
 class Experience(Protocol):
     """A source of past successes."""
 
-    async def successes(self, object_type: ObjectType, *, arm: Arms | None) -> Sequence[PastSuccess]:
-        """Return successful pick-ups of objects of that type, best first; `arm` None means any arm."""
+    async def successes(
+        self, object_type: ObjectType, *, arm: Arms | None, height: float | None = None, torso: float | None = None
+    ) -> Sequence[PastSuccess]:
+        """Return ways in which objects of that type were picked up, each once, that with the highest score first.
+
+        Args:
+            arm: of the ways; None means any.
+            height: of the object over the robot's base, m, for which the ways are scored; None means for each way the
+                height at which it succeeded.
+            torso: height of the torso for which they are scored, m; None means for each way its own.
+        """
         ...
 
 

@@ -5,19 +5,23 @@ from __future__ import annotations
 import asyncio
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from pycrorm_async import Memory, Reading
 from pycrorm_async.errors import CallerError
+from pycrorm_async.learning import MoveAndPickUp, PickUpChoice, RecalledPickUp, Scene
 from pycrorm_async.plan import (
     DatabaseCostmapLocation,
     Location,
+    MoveTCPMotion,
     MoveTorsoActionPerformable,
     NavigateActionPerformable,
     PickUpActionPerformable,
 )
 from pycrorm_async.plan.experience import experience
-from pycrorm_async.query.experience import PickUpExperience
+from pycrorm_async.plan.failures import IKError
+from pycrorm_async.recall.experience import PickUpExperience
 from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose
 from tests.memory.test_database_resolver import STAND, TORSO, scene
 
@@ -42,12 +46,39 @@ def place_of(location: Location | None) -> tuple[float, float]:
     return location.pose.position.x, location.pose.position.y
 
 
-async def test_experience_is_visible_after_a_flush_even_in_the_same_episode(tmp_path: Path) -> None:
+async def test_a_pick_up_counts_as_soon_as_it_has_ended_also_before_it_is_stored(tmp_path: Path) -> None:
     async with Memory.open(f"sqlite:///{tmp_path}/memory.db") as memory, memory.episode(description="trying"):
         assert await resolved_location() is None
         await pick_up()
+        before = await resolved_location()
+        assert place_of(before) == pytest.approx((0.6, 0.9))
         await memory.flush()
-        assert place_of(await resolved_location()) == pytest.approx((0.6, 0.9))
+        assert await resolved_location() == before
+
+
+async def test_a_failure_is_recalled_at_once_and_the_next_try_is_elsewhere(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def fail(_motion: MoveTCPMotion) -> None:
+        raise IKError(Pose(), Arms.LEFT, "tool")
+
+    with Scene(torso_height=0.3).entered() as stage:
+        async with Memory.open(f"sqlite:///{tmp_path}/memory.db") as memory, memory.episode(description="trying"):
+            for x, y, grasp in ((-0.70, 0.0, Grasp.FRONT), (-0.72, 0.0, Grasp.FRONT), (0.0, -0.7, Grasp.RIGHT)):
+                await MoveAndPickUp(stage.target).chosen(PickUpChoice(Arms.LEFT, grasp, x, y)).perform()
+                stage.reset()
+            alternatives = aiter(RecalledPickUp(stage.target, rng=np.random.default_rng(1)))
+            first = await anext(alternatives)
+            assert (first.chosen_by, first.grasp) == ("recall", Grasp.FRONT)  # two successes beside each other
+            with monkeypatch.context() as patched, pytest.raises(IKError):
+                patched.setattr(MoveTCPMotion, "perform", fail)
+                await first.perform()
+            stage.reset()
+            second = await anext(alternatives)
+            assert (second.chosen_by, second.grasp) == ("recall", Grasp.RIGHT)  # and not the other one beside it
+            assert first.expected_success is not None
+            assert second.expected_success is not None
+            assert second.expected_success < first.expected_success
 
 
 async def test_experience_outlives_the_process_that_recorded_it(tmp_path: Path) -> None:
@@ -56,7 +87,7 @@ async def test_experience_outlives_the_process_that_recorded_it(tmp_path: Path) 
     async with Memory.open(f"sqlite:///{tmp_path}/memory.db"):
         assert place_of(await resolved_location()) == pytest.approx((0.6, 0.9))
     async with Reading.open(f"sqlite:///{tmp_path}/memory.db") as reading:
-        assert place_of(await resolved_location(PickUpExperience(reading))) == pytest.approx((0.6, 0.9))
+        assert place_of(await resolved_location(PickUpExperience.of(reading))) == pytest.approx((0.6, 0.9))
 
 
 async def test_of_two_memories_the_one_with_an_open_episode_is_queried_or_else_the_one_opened_last(

@@ -99,7 +99,7 @@ def base_collisions(robot: Object, pose: Pose) -> set[str]:
 class Successes:
     """Experience with many past successes all around the object."""
 
-    async def successes(self, object_type: ObjectType, *, arm: Arms | None) -> list[PastSuccess]:
+    async def successes(self, object_type: ObjectType, *, arm: Arms | None, **_: object) -> list[PastSuccess]:
         angles = [number * math.tau / 12 for number in range(12)]
         return [
             PastSuccess(Arms.LEFT, Grasp.FRONT, None, Pose([r * math.cos(a), r * math.sin(a), 0], yaw_quaternion(b)), 1)

@@ -95,7 +95,7 @@ async def test_its_rails_bring_it_to_an_object_and_the_object_along(milk: Object
 
 async def test_past_and_learned_places_and_those_at_a_drawer_have_the_height_of_the_base() -> None:
     class Known:
-        async def successes(self, object_type: ObjectType, *, arm: Arms | None) -> Sequence[PastSuccess]:
+        async def successes(self, object_type: ObjectType, *, arm: Arms | None, **_: object) -> Sequence[PastSuccess]:
             return [PastSuccess(Arms.LEFT, Grasp.FRONT, 0.3, Pose([-0.7, 0, -0.9]), 0.5)]
 
     with BulletWorld(), simulated_robot:

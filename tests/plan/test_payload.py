@@ -203,7 +203,7 @@ async def test_where_the_arm_is_open_one_that_lifts_the_object_is_chosen(
     assert {arm for place in places for arm in place.reachable_arms} == offered
 
     class Known:
-        async def successes(self, object_type: ObjectType, *, arm: Arms | None) -> Sequence[PastSuccess]:
+        async def successes(self, object_type: ObjectType, *, arm: Arms | None, **_: object) -> Sequence[PastSuccess]:
             return [PastSuccess(each, Grasp.FRONT, 0.3, Pose([-0.6, 0, -0.9]), 0.5) for each in arms]
 
     past = [each async for each in DatabaseCostmapLocation(milk, lopsided, experience=Known())]

@@ -40,9 +40,14 @@ class Known:
     def __init__(self, *known_poses: PastSuccess) -> None:
         self.known = known_poses
         self.asked: list[tuple[ObjectType, Arms | None]] = []
+        self.heights: list[float | None] = []
 
-    async def successes(self, object_type: ObjectType, *, arm: Arms | None) -> Sequence[PastSuccess]:
+    async def successes(
+        self, object_type: ObjectType, *, arm: Arms | None, height: float | None = None, torso: float | None = None
+    ) -> Sequence[PastSuccess]:
+        assert torso is None  # each place has the torso height of its own success
         self.asked.append((object_type, arm))
+        self.heights.append(height)
         return self.known
 
 
@@ -133,6 +138,15 @@ async def test_the_requested_arm_is_queried(scene: Scene) -> None:
     await location_from(scene, known_poses, arm=Arms.RIGHT).resolve()
     await location_from(scene, known_poses).resolve()
     assert known_poses.asked == [(ObjectType.MILK, Arms.RIGHT), (ObjectType.MILK, None)]
+
+
+async def test_places_are_queried_for_the_height_of_the_target_over_the_base(scene: Scene) -> None:
+    known_poses = Known(past())
+    scene.robot.set_pose(Pose([0, 0, 0.25]))
+    for height in (0.9, 0.7):
+        scene.milk.set_pose(Pose([1.3, 1, height]))
+        await location_from(scene, known_poses).resolve()
+    assert known_poses.heights == pytest.approx([0.65, 0.45])
 
 
 async def test_the_experience_of_the_context_is_queried_and_without_one_an_error_is_raised(scene: Scene) -> None:

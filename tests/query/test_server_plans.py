@@ -21,7 +21,7 @@ from pycrorm_async.orm import (
     SpatialRelation,
     TaskTreeNode,
 )
-from pycrorm_async.query.experience import PickUpExperience
+from pycrorm_async.recall.experience import PickUpExperience
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.world import ObjectType
@@ -70,7 +70,7 @@ def frame_of(statement: Any) -> Question:
 
 
 async def what_went_well(reading: Reading) -> None:
-    assert await PickUpExperience(reading).successes(ObjectType.MILK, arm=None)
+    assert await PickUpExperience.of(reading).successes(ObjectType.MILK, arm=None)
 
 
 async def the_tree(reading: Reading) -> None:

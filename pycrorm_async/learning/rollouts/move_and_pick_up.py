@@ -19,7 +19,7 @@ from pycrorm_async.plan.actions.descriptions import ActionDescription
 from pycrorm_async.plan.current_robot import require_robot
 from pycrorm_async.plan.failures import ObjectUnreachable
 from pycrorm_async.plan.geometry.gripper_checks import lifting_arms
-from pycrorm_async.plan.locations.base_clearance import base_clearance
+from pycrorm_async.plan.locations.base_clearance import BaseClearance, base_clearance
 from pycrorm_async.plan.locations.base_poses import base_height_m, face
 from pycrorm_async.plan.object_designators import ObjectDesignatorDescription, ObjectLike, designator_of, in_world
 from pycrorm_async.task_status import TaskStatus
@@ -142,21 +142,25 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
 
     def __iter__(self) -> Iterator[MoveAndPickUpPerformable]:
         """Yield samples that fit the scene, the likeliest first. Raises `ObjectUnreachable` if none fits."""
+        yield from map(self.chosen, self.choices())
+
+    def choices(self) -> Iterator[PickUpChoice]:
+        """Yield the choices of `__iter__`."""
         yield from self._likeliest_first(self.grounded())
 
     def from_mode(self) -> Iterator[MoveAndPickUpPerformable]:
         """Yield samples from around the mode of the grounded policy only. Raises `ObjectUnreachable`."""
-        yield from self._likeliest_first(self.grounded().mode())
+        yield from map(self.chosen, self._likeliest_first(self.grounded().mode()))
 
     def plain(self) -> Iterator[MoveAndPickUpPerformable]:
         """Yield samples in the order they are drawn, without regard to obstacles and visibility."""
         for choice in self.policy_here().sample(self._rng, self.samples):
             yield self.chosen(choice)
 
-    def _likeliest_first(self, policy: Policy) -> Iterator[MoveAndPickUpPerformable]:
+    def _likeliest_first(self, policy: Policy) -> Iterator[PickUpChoice]:
         choices = self._clear_choices(policy)
         for number in np.argsort(-policy.likelihood(choices), kind="stable"):
-            yield self.chosen(choices[number])
+            yield choices[number]
 
     def _clear_choices(self, policy: Policy) -> Sequence[PickUpChoice]:
         """Draw samples; where collisions count, only those where the base is clear before and after it turns.
@@ -168,17 +172,19 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
             return policy.sample(self._rng, self.samples)
         clear: list[PickUpChoice] = []
         for _ in range(_DRAWS_MAX):
-            for choice in policy.sample(self._rng, self.samples):
-                place = self.chosen(choice).standing_position
-                facing = face(place, self.target.pose, height_m=place.position.z)
-                if clearance.refusal(place) is None and clearance.refusal(facing) is None:
-                    clear.append(choice)
+            clear += [each for each in policy.sample(self._rng, self.samples) if self.is_clear(each, clearance)]
             if len(clear) >= self.samples:
                 break
         if not clear:
             message = f"the base would be in collision at every place to pick up {self.target.name}"
             raise ObjectUnreachable(message, self.target.name)
         return clear[: self.samples]
+
+    def is_clear(self, choice: PickUpChoice, clearance: BaseClearance) -> bool:
+        """Return whether the base is clear of obstacles at its place, before and after it turns to the object."""
+        place = self.chosen(choice).standing_position
+        facing = face(place, self.target.pose, height_m=place.position.z)
+        return clearance.refusal(place) is None and clearance.refusal(facing) is None
 
     def chosen(self, choice: PickUpChoice) -> MoveAndPickUpPerformable:
         """Return the action for this choice and the object's current pose.

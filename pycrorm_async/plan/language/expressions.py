@@ -209,6 +209,8 @@ class Code(Designator):
 async def perform_operand(operand: Operand) -> Any:
     """Perform an operand; resolve it first if it is a description."""
     designator = operand if isinstance(operand, Designator) else operand.resolve()
+    if inspect.isawaitable(designator):
+        designator = await designator
     return await _check_operand(designator, "an expression").perform()
 
 

@@ -5,7 +5,8 @@ from __future__ import annotations
 import functools
 import itertools
 import operator
-from collections.abc import Iterator
+from collections.abc import AsyncGenerator, AsyncIterable
+from contextlib import aclosing
 from dataclasses import dataclass
 from typing import Any
 
@@ -47,19 +48,27 @@ class Retry(Expression):
         """Return the result of the first success, or raise the last failure with the earlier ones as notes."""
         failures: list[Exception] = []
         notes: list[str] = []
-        for number, performable in enumerate(itertools.islice(self._alternatives(), self.max_tries), start=1):
-            result, failure = await attempt(functools.partial(perform_operand, performable))
-            if failure is None:
-                return result
-            failures = [failure]
-            notes.append(f"try {number}: {describe_error(failure)}")
-            del failure
+        async with aclosing(self._alternatives()) as alternatives:
+            async for performable in alternatives:
+                result, failure = await attempt(functools.partial(perform_operand, performable))
+                if failure is None:
+                    return result
+                failures = [failure]
+                notes.append(f"try {len(notes) + 1}: {describe_error(failure)}")
+                del failure
+                if len(notes) == self.max_tries:
+                    break
         if not failures:
             raise IllPosedGoalFailure(f"{self!r}: the description has no alternative")
         for note in notes[:-1]:
             failures[0].add_note(note)
         raise combine_failures(failures, "")
 
-    def _alternatives(self) -> Iterator[Any]:
+    async def _alternatives(self) -> AsyncGenerator[Any, None]:
         (operand,) = self.operands
-        return itertools.repeat(operand) if isinstance(operand, Designator) else iter(operand)
+        if isinstance(operand, AsyncIterable):  # a description that asks a memory between two alternatives
+            async for each in operand:
+                yield each
+        else:
+            for each in itertools.repeat(operand) if isinstance(operand, Designator) else operand:
+                yield each

@@ -51,8 +51,9 @@ class DatabaseCostmapLocation:
         experience: the source of past successes; None means the open memory.
 
     Each place has the arm, the grasp and the torso height of the past success, and is 0.3 m clear of obstacles; where
-    collisions count, the base with its heading is clear of them instead. The experience covers what is visible in the
-    memory's tables; `await memory.flush()` makes everything performed so far visible.
+    collisions count, the base with its heading is clear of them instead. The best place is the one with the highest
+    share of successes among the tries like it, for the target's height; failures count. A pick-up of this process
+    counts as soon as it has ended, one of another process once it is visible in the memory's tables.
 
     Raises `CallerError` without a memory or for `Arms.BOTH`; `NoWorld`, `NoRobotHere` and
     `PerceptionObjectNotInWorld`.
@@ -90,7 +91,9 @@ class DatabaseCostmapLocation:
                 "past successes are queried from a memory, and none is open: resolve inside"
                 " `async with Memory.open(url)`, or pass one as `experience`"
             )
-        past = await source.successes(designator_of(self.target).object_type, arm=self.reachable_arm)
+        robot = resolve_robot(self.reachable_for) if self.reachable_for is not None else None
+        height = pose_of(self.target).position.z - base_height_m(robot)
+        past = await source.successes(designator_of(self.target).object_type, arm=self.reachable_arm, height=height)
         return _ExperienceLocation(self.target, self.reachable_for, self.reachable_arm, past)
 
 

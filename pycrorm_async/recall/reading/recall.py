@@ -63,6 +63,11 @@ class Recall:
         self._reading = reading
         self._clock = clock
 
+    @property
+    def reader(self) -> CaseReader:
+        """The cases that are searched."""
+        return self._reader
+
     @classmethod
     def of(cls, reading: Reading) -> Recall:
         """Return the recall of a memory that is open for reading."""

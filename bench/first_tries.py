@@ -1,0 +1,227 @@
+"""Measure how often a pick-up succeeds at the first try: recalled, with a learned policy, with the default policy.
+
+    python -m bench.first_tries            heights that were not tried before, then varied scenes from nothing
+    python -m bench.first_tries --quick    one seed, a few scenes
+
+*Heights.* A memory in SQLite has 200, 500 or 2,000 tries of the default policy with the milk in the air at 0.6, 0.9 and
+1.2 m, turned at random. Then the milk is at heights between these, 150 scenes a seed, and only the first try counts;
+what is tried there is not recorded. With *off* the base lands off its place, by a normal error of 4 cm in x and y. The
+learned policy is that of `learn` with 10 samples a leaf, and its likeliest sample of 20 that fit the scene.
+
+*Varied.* A memory that is empty at first, in which every try is recorded at once and is not flushed. Each scene has the
+milk at 0.5 to 1.4 m, the torso at 0 to 0.3 m, one given arm, and a robot that can stand in a third of the circle around
+the object only. One try a scene; the first-try success of each 200 scenes, and the number of different ways (arm,
+grasp, place to 1 cm) that served in the last 200, because where one way serves everywhere nothing is generalised.
+
+The script prints one JSON line; the tables are on stderr. The robot is kinematic, and collisions do not count.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import math
+import tempfile
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from pycrorm_async import Memory, Reading
+from pycrorm_async.learning import MoveAndPickUp, Policy, RecalledPickUp, Scene, Tally, learn
+from pycrorm_async.learning.rollouts.scene import Stage
+from pycrorm_async.plan.actions.basic import MoveAndPickUpPerformable
+from pycrorm_async.plan.failures import PlanFailure
+from pycrorm_async.recall.experience import PickUpExperience
+from pycrorm_async.world import Arms, Object, ObjectType, Pose
+from pycrorm_async.world.pose import yaw_quaternion
+
+TRIED_M = (0.6, 0.9, 1.2)
+OFF_M = 0.04
+PART = 200
+"""The scenes of one point of the curve."""
+Chooser = Callable[[Stage, np.random.Generator], Any]
+
+
+def prepared(stage: Stage, rng: np.random.Generator, height: float, torso: float = 0.0) -> None:
+    """Put the milk at this height, turned at random, and the robot back."""
+    stage.reset()
+    stage.target.set_pose(Pose((1.3, 1.0, height), yaw_quaternion(rng.uniform(-math.pi, math.pi))))
+    stage.robot.set_joint_position("torso_lift_joint", torso)
+
+
+async def succeeds(action: MoveAndPickUpPerformable, rng: np.random.Generator, off_m: float) -> bool:
+    """Perform the action with a base that lands off its place."""
+    x, y, z = action.standing_position.position
+    x, y = x + rng.normal(0, off_m) if off_m else x, y + rng.normal(0, off_m) if off_m else y
+    try:
+        await replace(action, standing_position=Pose((x, y, z), action.standing_position.orientation)).perform()
+    except PlanFailure:
+        return False
+    return True
+
+
+# --- heights that were not tried before -----------------------------------------------------------------------------
+
+
+async def fill(memory: Memory, stage: Stage, tries: int, rng: np.random.Generator, off_m: float) -> None:
+    async with memory.episode(description="tries under the default policy"):
+        for number in range(tries):
+            prepared(stage, rng, TRIED_M[number % len(TRIED_M)])
+            (action,) = MoveAndPickUp(stage.target, samples=1, rng=rng).plain()
+            await succeeds(action, rng, off_m)
+    await memory.flush()
+
+
+async def first_tries(stage: Stage, choose: Chooser, scenes: int, rng: np.random.Generator, off_m: float) -> Tally:
+    tally = Tally()
+    for _ in range(scenes):
+        prepared(stage, rng, rng.uniform(TRIED_M[0], TRIED_M[-1]))
+        done = False
+        with suppress(PlanFailure):  # a policy may know no way at this height
+            action = await anext(aiter(choose(stage, rng)))
+            done = await succeeds(action, rng, off_m)
+        tally.successes += done
+        tally.failures["failed"] += not done
+    return tally
+
+
+async def likeliest(stage: Stage, rng: np.random.Generator, policy: Policy | None) -> Any:
+    for action in MoveAndPickUp(stage.target, policy=policy, rng=rng):
+        yield action
+
+
+async def heights(folder: Path, tries: int, seed: int, scenes: int, off_m: float) -> dict[str, Tally]:
+    rng, url = np.random.default_rng((seed, tries)), f"sqlite:///{folder}/heights_{tries}_{seed}_{off_m}.db"
+    with Scene().entered() as stage:
+        async with Memory.open(url) as memory:
+            await fill(memory, stage, tries, rng, off_m)
+            policy = learn(await memory.dataframe(MoveAndPickUp.query_for_database()), min_samples_leaf=10)
+        choosers: dict[str, Chooser] = {
+            "default policy": lambda stage, rng: likeliest(stage, rng, None),
+            "learned policy": lambda stage, rng: likeliest(stage, rng, policy),
+        }
+        figures = {name: await first_tries(stage, each, scenes, rng, off_m) for name, each in choosers.items()}
+        async with Reading.open(url) as reading:  # in which nothing is recorded
+            known = PickUpExperience.of(reading)
+
+            def recalled(stage: Stage, rng: np.random.Generator) -> RecalledPickUp:
+                return RecalledPickUp(stage.target, policy=policy, experience=known, rng=rng)
+
+            figures["recalled"] = await first_tries(stage, recalled, scenes, rng, off_m)
+    return figures
+
+
+# --- from nothing, in varied scenes ---------------------------------------------------------------------------------
+
+
+def fan() -> str:
+    """Return the URDF of low obstacles that leave a free sector of a third of the circle around the origin."""
+    parts: list[str] = []
+    for angle in np.linspace(math.radians(80), math.radians(280), 9).tolist():
+        for radius, length in ((0.5, 0.4), (1.1, 0.7), (2.0, 1.0)):
+            name, place = f"box_{len(parts)}", f"{radius * math.cos(angle):.3f} {radius * math.sin(angle):.3f} 0.025"
+            shape = f'<geometry><box size="{length} {radius / 5} 0.05"/></geometry>'
+            parts.append(
+                f'<link name="{name}"><visual>{shape}</visual><collision>{shape}</collision></link>'
+                f'<joint name="at_{name}" type="fixed"><parent link="fan"/><child link="{name}"/>'
+                f'<origin xyz="{place}" rpy="0 0 {angle:.3f}"/></joint>'
+            )
+    return f'<robot name="fan"><link name="fan"/>{"".join(parts)}</robot>'
+
+
+async def pick_up(stage: Stage, arm: Arms, rng: np.random.Generator, *, recall: bool) -> Any:
+    if recall:
+        async for recalled in RecalledPickUp(stage.target, [arm], rng=rng):
+            yield recalled
+    for sampled in MoveAndPickUp(stage.target, [arm], rng=rng):
+        yield sampled
+
+
+async def online(folder: Path, seed: int, scenes: int, *, recall: bool) -> tuple[list[float], int]:
+    """Return the share of first tries that succeeded in each part, and the number of ways in the last one."""
+    rng = np.random.default_rng(seed)
+    served: list[bool] = []
+    ways: list[tuple[int, tuple[Any, ...]]] = []
+    with Scene().entered() as stage:
+        obstacle = Object("fan", ObjectType.GENERIC_OBJECT, fan())
+        async with Memory.open(f"sqlite:///{folder}/online_{seed}_{recall}.db") as memory:
+            for _ in range(scenes):
+                prepared(stage, rng, rng.uniform(0.5, 1.4), rng.uniform(0, 0.3))
+                obstacle.set_pose(Pose((1.3, 1.0, 0.0), yaw_quaternion(rng.uniform(-math.pi, math.pi))))
+                arm = [Arms.LEFT, Arms.RIGHT][rng.integers(2)]
+                done = False
+                with suppress(PlanFailure):  # some scenes have no place to stand
+                    action = await anext(aiter(pick_up(stage, arm, rng, recall=recall)))
+                    x, y, _ = action.standing_position.relative_to(stage.target.pose).position
+                    async with memory.episode(description="one scene"):
+                        done = await succeeds(action, rng, 0.0)
+                    if done:
+                        ways.append((len(served), (action.arm, action.grasp, round(x, 2), round(y, 2))))
+                served.append(done)
+    parts = [sum(served[first : first + PART]) / PART for first in range(0, scenes, PART)]
+    return parts, len({way for number, way in ways if number >= scenes - PART})
+
+
+async def measure(seeds: int, scenes: int, tries: Sequence[int], online_scenes: int, folder: Path) -> dict[str, Any]:
+    figures: dict[str, Any] = {"heights": [], "varied": []}
+    cases = [(number, 0.0) for number in tries] + [(max(tries), OFF_M)]
+    for number, off_m in cases:
+        total: dict[str, Tally] = {}
+        each_seed: dict[str, list[float]] = {}
+        for seed in track(range(seeds), f"{number} tries, {off_m * 100:g} cm off", console=_console()):
+            for name, tally in (await heights(folder, number, seed, scenes, off_m)).items():
+                total[name] = total.get(name, Tally()) + tally
+                each_seed.setdefault(name, []).append(round(tally.success_rate, 3))
+        for name, tally in total.items():
+            interval = [round(each, 3) for each in tally.interval]
+            line = {"by": name, "tries": number, "off_m": off_m, "first_try": round(tally.success_rate, 3)}
+            figures["heights"].append({**line, "interval": interval, "seeds": each_seed[name]})
+    for recall in (False, True):
+        for seed in track(range(seeds), "varied scenes", console=_console()):
+            parts, ways = await online(folder, seed, online_scenes, recall=recall)
+            by = "recalled" if recall else "default policy"
+            figures["varied"].append({"by": by, "seed": seed, "first_try": parts, "ways": ways})
+    return figures
+
+
+def _console() -> Console:
+    return Console(stderr=True)
+
+
+def show(figures: dict[str, Any]) -> None:
+    table = Table("tries", "base off", "chosen by", "first try", "95 %", "seeds", title="heights not tried before")
+    for each in figures["heights"]:
+        low, high = each["interval"]
+        spread = " ".join(f"{share:.0%}" for share in each["seeds"])
+        off = f"{each['off_m'] * 100:g} cm"
+        table.add_row(str(each["tries"]), off, each["by"], f"{each['first_try']:.1%}", f"{low:.0%}-{high:.0%}", spread)
+    curve = Table("chosen by", "seed", f"first try, each {PART} scenes", "ways at the end", title="varied scenes")
+    for each in figures["varied"]:
+        shares = " ".join(f"{share:.0%}" for share in each["first_try"])
+        curve.add_row(each["by"], str(each["seed"]), shares, str(each["ways"]))
+    _console().print(table, curve)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="one seed, a few scenes")
+    quick = parser.parse_args().quick
+    with tempfile.TemporaryDirectory(prefix="first_tries_") as folder:
+        if quick:
+            figures = asyncio.run(measure(1, 20, (200,), PART, Path(folder)))
+        else:
+            figures = asyncio.run(measure(3, 150, (200, 500, 2_000), 5 * PART, Path(folder)))
+    show(figures)
+    print(json.dumps({"command": "python -m bench.first_tries" + (" --quick" if quick else ""), **figures}))
+
+
+if __name__ == "__main__":
+    main()
