@@ -107,6 +107,6 @@ def _write_episode(
     note(f"The page has {size / 1e6:.1f} MB and opens in any browser, also offline.")
     if first is None and last is None and written.last < written.events:
         note(
-            f"It shows the events {written.first} to {written.last} of {written.events}, because there are more nodes"
-            f" than a page can hold; the next page: --from {written.last + 1}"
+            f"It shows the events {written.first} to {written.last} of {written.events}, because a page holds no more;"
+            f" the next page: --from {written.last + 1}"
         )

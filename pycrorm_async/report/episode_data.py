@@ -27,7 +27,7 @@ async def episode_document(
 ) -> dict[str, Any]:
     """Return the document of an episode, of all its events or of those from `first` to `last`.
 
-    It ends at the event at which the 100,000th node started, if there are more; `document["episode"]` has its `last`.
+    It ends with the 100,000th node, or after 200,000 moves, if there are more; `document["episode"]` has its `last`.
 
     Raises `UnknownEpisode`; `CallerError` for a window that holds no event; `LogDamaged` or `DatabaseForeign` for an
     event that cannot be read.

@@ -42,6 +42,8 @@ _TEXTS_CHARACTERS = 6_000_000
 _TEXT_SHORTEST, _TEXT_LONGEST = 80, 20_000
 _NODES_MAX = 100_000
 """Bounds the nodes of a page: it then has about 10 MB and opens in less than 3 s."""
+_NUMBERS_MAX = 1_400_000
+"""Bounds the numbers of poses and joints of a page, of which each takes about 7 bytes: 200,000 moves of an object."""
 _CURVE_POINTS_MAX = 2_000
 """Bounds the values of a curve, which is a few hundred pixels wide."""
 _LISTED_MAX = 20_000
@@ -115,8 +117,8 @@ class EpisodeFold:
 
     @property
     def is_full(self) -> bool:
-        """True if a page can hold no further node."""
-        return len(self._nodes) >= _NODES_MAX
+        """True if a page can hold no further node, or no further move."""
+        return len(self._nodes) >= _NODES_MAX or self.world.numbers >= _NUMBERS_MAX
 
     @staticmethod
     def _list(entries: list[dict[str, Any]], entry: dict[str, Any]) -> None:

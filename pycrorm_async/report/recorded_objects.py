@@ -39,6 +39,7 @@ class WorldFold:
         attachments: `[parent, child, link, from, to]`, the objects by identity, `to` 0 while attached.
         samples: by object and channel.
         full_until: the last event before the world was emptied; None while it has objects.
+        numbers: how many numbers the tracks of poses and joints hold.
     """
 
     def __init__(self, first: int) -> None:
@@ -47,6 +48,7 @@ class WorldFold:
         self.attachments: list[list[Any]] = []
         self.samples: dict[int, dict[str, Track]] = {}
         self.full_until: int | None = None
+        self.numbers = 0
         self._present = 0
         self._removals_from: int | None = None
 
@@ -86,9 +88,11 @@ class WorldFold:
     def _move(self, identity: int, sequence: int, pose: PoseValue) -> None:
         if (moved := self.objects.get(identity)) is not None:
             moved.poses.set(sequence, rounded((*pose.position, *pose.orientation)))
+            self.numbers += 7
 
     def _set_joints(self, identity: int, sequence: int, joints: dict[str, float]) -> None:
         if (moved := self.objects.get(identity)) is not None:
+            self.numbers += len(joints)
             for name, position in joints.items():
                 moved.joints.setdefault(name, Track(self._first)).set(sequence, round(position, 4))
 

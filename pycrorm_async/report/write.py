@@ -67,7 +67,8 @@ async def report(
             `episodes`. It may be running: the page shows the events up to the last one in the log.
         path: of the file; `episode-NUMBER.html` in the working directory by default.
         force: replace the file if it exists.
-        first, last: sequences of the first and the last event to show; all by default, up to 100,000 nodes.
+        first, last: sequences of the first and the last event to show; all by default, up to 100,000 nodes
+            or 200,000 moves.
 
     Raises `UnknownEpisode`; `CallerError` if the file exists or cannot have this name, or if no event is in the window;
     `LogDamaged` or `DatabaseForeign` for an event that cannot be read; `OSError` if the disk is full.

@@ -2,7 +2,7 @@
 
 import asyncio
 import shutil
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
 
@@ -12,6 +12,7 @@ import pytest
 from pycrorm_async.errors import UnknownEpisode
 from pycrorm_async.live import follower as following
 from pycrorm_async.live.follower import LogFollower
+from pycrorm_async.live.server import LiveServer, listen
 from pycrorm_async.memory import Memory
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.report import episode_fold
@@ -30,6 +31,12 @@ async def followed(url: str) -> AsyncIterator[LogFollower]:
     finally:
         task.cancel()
         await asyncio.gather(task, return_exceptions=True)
+
+
+async def until(holds: Callable[[], bool]) -> None:
+    async with asyncio.timeout(20):
+        while not holds():  # noqa: ASYNC110  the follower has no event for its listeners
+            await asyncio.sleep(0.05)
 
 
 def url_of(folder: Path) -> str:
@@ -137,3 +144,29 @@ async def test_feeds_without_listeners_are_forgotten(tmp_path: Path, monkeypatch
         assert await follower.feed("1") is one
         assert await follower.feed("1", 3) is other
     await follower.close()
+
+
+async def test_a_browser_that_leaves_is_no_listener_any_more(tmp_path: Path) -> None:
+    with robot_in(tmp_path) as robot:
+        robot.start("one")
+        follower = LogFollower(DatabaseAddress.parse(url_of(tmp_path)))
+        stop, ready = asyncio.Event(), asyncio.Event()
+        with listen(0) as listener:
+            port = listener.getsockname()[1]
+            serving = asyncio.create_task(LiveServer(follower, "t").serve(listener, stop=stop, ready=ready.set))
+            await ready.wait()
+            reader, writer = await asyncio.open_connection("127.0.0.1", port)
+            writer.write(b"GET /t/episode/1/events HTTP/1.1\r\nHost: localhost\r\n\r\n")
+            assert b"event: part" in await reader.readuntil(b"event: part")
+            [feed] = follower._feeds.values()
+            assert feed.listeners == 1
+            writer.close()
+            await until(lambda: not feed.listeners)
+            _, other = await asyncio.open_connection("127.0.0.1", port)
+            other.write(b"GET /t/events HTTP/1.1\r\nHost: localhost\r\n\r\n")
+            await until(lambda: bool(follower.overview.listeners))
+            stop.set()  # also with a stream open
+            async with asyncio.timeout(10):
+                await serving
+            other.close()
+        robot.end("one")

@@ -147,6 +147,14 @@ async def test_a_page_ends_where_it_can_hold_no_further_node(url: str, monkeypat
     assert document["episode"]["last"] < document["episode"]["head"]
 
 
+async def test_a_page_ends_where_it_can_hold_no_further_move(url: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(episode_fold, "_NUMBERS_MAX", 14)
+    document = await document_of(url)
+    assert len(document["objects"][0]["poses"][1]) == 2
+    assert document["episode"]["full"]
+    assert document["episode"]["last"] < document["episode"]["head"]
+
+
 def test_texts_are_numbered_once_and_cut_to_their_share() -> None:
     texts = Texts()
     assert [texts.number(each) for each in ("", "a" * 100, "b", "b")] == [0, 1, 2, 2]

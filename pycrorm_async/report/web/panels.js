@@ -90,8 +90,8 @@ export class Panels {
     const { episode } = this;
     const facts = [
       ["status", element("span", {}, `${signOf(node.status)} ${node.status}`)],
-      ["events", element("span", {}, this.#moment(node.start), " to ", node.end ? this.#moment(node.end) : "no end")],
-      ["took", node.end ? duration(episode.secondsAt(node.end) - episode.secondsAt(node.start)) : "unknown"],
+      ["events", element("span", {}, this.#moment(node.start), node.end ? " to " : " on", node.end ? this.#moment(node.end) : null)],
+      ["took", this.#took(node)],
       ["parameters", node.parameters ? recorded(node.parameters) : null],
       ["reason", node.reason ? recorded(node.reason) : null],
       ["message", node.message ? recorded(node.message, { class: "long" }) : null],
@@ -105,6 +105,13 @@ export class Panels {
       return element("p", {}, this.#moment(each.at), " ", recorded(refused ? `${text}; refused: ${refused}` : text));
     });
     return [element("h3", {}, recorded(node.name)), list, ...chosen];
+  }
+
+  #took({ start, end, status }) {
+    const { episode } = this;
+    if (!end && status !== "RUNNING") return "unknown";
+    const seconds = episode.secondsAt(end || episode.last) - episode.secondsAt(start);
+    return end ? duration(seconds) : `${duration(seconds)} so far`;
   }
 
   #failures() {
