@@ -235,6 +235,16 @@ async def test_a_running_episode_is_refused_by_name_and_left_out_of_a_view(eithe
     assert (exported.rows, exported.left_out) == (4, 1)
 
 
+async def test_an_episode_that_the_tables_hold_in_part_is_left_out(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path}/memory.db"
+    records = [*declarations(NAVIGATE, PICK_UP, SAYING), *episode(2).records]
+    await append_and_fold(url, records[:-4])
+    await append_and_fold(url, records[-4:], folded=False)
+    async with Reading.open(url) as opened:
+        exported = await export(opened, "task_tree_node", tmp_path / "a.csv")
+    assert (exported.rows, exported.left_out) == (0, 1)
+
+
 @pytest.mark.parametrize(
     ("what", "episodes", "name", "error", "message"),
     [
