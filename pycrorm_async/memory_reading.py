@@ -16,6 +16,7 @@ from pycrorm_async.errors import CallerError
 from pycrorm_async.events.blobs import Blob
 from pycrorm_async.export.export import Exported, FileFormat, Remade, export_again
 from pycrorm_async.export.export import export as write_export
+from pycrorm_async.export.lerobot.images import ImageSize
 from pycrorm_async.export.lerobot.states import Clock
 from pycrorm_async.export.selection import Exportable
 from pycrorm_async.hooks.episode import Episode
@@ -227,6 +228,7 @@ class ReadableMemory(PartsHolder):
         arguments: Mapping[str, Any] = MappingProxyType({}),
         clock: Clock | None = None,
         fps: int | None = None,
+        images: ImageSize | None = None,
     ) -> Exported:
         """Write episodes or rows to a file, up to the last flush; see `pycrorm_async.export.export.export`."""
         reading = self._open_parts.reading
@@ -240,6 +242,7 @@ class ReadableMemory(PartsHolder):
             force=force,
             clock=clock,
             fps=fps,
+            images=images,
         )
 
     async def export_again(

@@ -66,6 +66,9 @@ def export(
         typer.Option(help="Of lerobot and mcap: the axis, event or time."),
     ] = None,
     fps: Annotated[int | None, typer.Option(help="Of lerobot: frames per second; of mcap by event: events.")] = None,
+    images: Annotated[
+        str | None, typer.Option(metavar="WIDTHxHEIGHT", help="Of lerobot: a picture of the scene at each frame.")
+    ] = None,
     force: Annotated[bool, typer.Option("--force", help="Replace the file if it exists.")] = False,
     url: UrlOption = DEFAULT_URL,
     spool: SpoolOption = None,
@@ -75,12 +78,13 @@ def export(
     if (again is None) == (not what):
         raise CallerError("name what to export, for example `pycrorm export last --out last.parquet`, or --again")
     if again is not None:
-        if file_format is not None or episode or arguments or clock is not None or fps is not None:
+        if file_format is not None or episode or arguments or clock is not None or fps is not None or images:
             raise CallerError("--again takes all but --out and --force from the manifest: leave the other options out")
         return _again(again, out, url, spool, force=force, as_json=as_json)
     assert what, "checked above"
     target = out if out is not None else Path(f"{'-'.join(what)[:100]}.{file_format or 'parquet'}")
     options: dict[str, Any] = {"file_format": file_format, "clock": clock, "fps": fps}
+    options["images"] = _size(images)
     options["arguments"] = _arguments(what[0], arguments or [])
 
     async def write(progress: ProgressCallback | None) -> Exported:
@@ -94,6 +98,16 @@ def export(
     note_pending_events(url, spool)
     _print(exported, as_json=as_json)
     return 0
+
+
+def _size(text: str | None) -> tuple[int, int] | None:
+    """Return width and height of `320x240`."""
+    if text is None:
+        return None
+    width, separator, height = text.partition("x")
+    if not (separator and width.isdecimal() and height.isdecimal()):
+        raise CallerError(f"--images takes WIDTHxHEIGHT, as in 320x240, not {text!r}")
+    return int(width), int(height)
 
 
 def _arguments(question: str, pairs: list[str]) -> dict[str, Any]:

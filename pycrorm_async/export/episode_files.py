@@ -7,8 +7,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
+import numpy as np
+
 from pycrorm_async.errors import CallerError
 from pycrorm_async.export.lerobot.dataset import DEFAULT_FPS, LeRobotFolder
+from pycrorm_async.export.lerobot.images import ImageSize, check_size, draw_frames
 from pycrorm_async.export.lerobot.states import Clock, frames_of
 from pycrorm_async.export.mcap_file import write_mcap
 from pycrorm_async.export.recorded_episode import read_episode
@@ -24,15 +27,18 @@ __all__ = ["EpisodeOptions", "write_lerobot", "write_scene"]
 
 
 class EpisodeOptions(NamedTuple):
-    """The axis of an episode, events or time, and how many frames or events make a second of it."""
+    """The axis of an episode, events or time, how many frames or events make a second of it, and the size of images."""
 
     clock: Clock
     fps: int = DEFAULT_FPS
+    images: ImageSize | None = None
 
     def check(self) -> None:
         """Raise `CallerError` for another clock, or a rate that no robot has."""
         if self.clock not in ("event", "time"):
             raise CallerError(f"the clock is event or time, not {self.clock!r}")
+        if self.images is not None:
+            check_size(self.images)
         if not 1 <= self.fps <= 1000:
             raise CallerError(f"frames per second are between 1 and 1000, not {self.fps}")
 
@@ -54,7 +60,10 @@ async def write_lerobot(
     for each in episodes:
         episode = await read_episode(reading, each)
         frames = await asyncio.to_thread(frames_of, episode, options.clock, options.fps)
-        await asyncio.to_thread(dataset.add, episode, frames)
+        pictures = None
+        if options.images is not None:
+            pictures = np.stack(await draw_frames(reading, episode, frames, options.images))
+        await asyncio.to_thread(dataset.add, episode, frames, pictures)
         done += each.events
         if progress is not None:
             progress(done, total)

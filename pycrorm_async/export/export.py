@@ -22,6 +22,7 @@ from pycrorm_async.errors import CallerError
 from pycrorm_async.export.episode_files import EpisodeOptions, write_lerobot, write_scene
 from pycrorm_async.export.files import checksums, new_file, new_folder, refuse_existing
 from pycrorm_async.export.lerobot.dataset import DEFAULT_FPS, MARKER
+from pycrorm_async.export.lerobot.images import ImageSize
 from pycrorm_async.export.lerobot.states import Clock
 from pycrorm_async.export.manifest import Manifest, episode_differences, manifest_path, read_manifest, versions_of
 from pycrorm_async.export.row_files import RowFormat, write_rows
@@ -90,6 +91,7 @@ async def export(
     force: bool = False,
     clock: Clock | None = None,
     fps: int | None = None,
+    images: ImageSize | None = None,
     progress: ProgressCallback | None = None,
 ) -> Exported:
     """Write rows or episodes to a file that has its name only when it is complete, and its manifest beside it.
@@ -106,6 +108,7 @@ async def export(
         clock, fps: of LeRobot: a frame for each event that changed the robot's state (`event`, the default), or `fps`
             frames each second (`time`). Of MCAP: the wall time of the events (`time`, the default), or `fps` events in
             each second (`event`).
+        images: of LeRobot: width and height of a picture of the scene at each frame, which needs the extra `world`.
         progress: gets the number of rows, or events, done and of all.
 
     Raises `CallerError` if the file exists, if nothing has this name, or for a running episode; `UnknownEpisode`;
@@ -116,7 +119,7 @@ async def export(
     chosen = file_format or format_of(target)
     if chosen not in get_args(FileFormat):
         raise CallerError(f"there is no format {chosen!r}{nearest(chosen, get_args(FileFormat))}; formats: {_listed()}")
-    options = _options(chosen, clock, fps)
+    options = _options(chosen, clock, fps, images)
     left_out = 0
     with new_file(manifest_path(target), force=True) as described:
         match chosen:
@@ -265,12 +268,14 @@ def _complete(manifest: Manifest, files: dict[str, str], path: Path) -> Manifest
     return whole
 
 
-def _options(file_format: FileFormat, clock: Clock | None, fps: int | None) -> EpisodeOptions:
+def _options(file_format: FileFormat, clock: Clock | None, fps: int | None, images: ImageSize | None) -> EpisodeOptions:
     """Return the options of formats with a clock. Raises `CallerError` for one that the format does not take."""
     if file_format not in ("lerobot", "mcap") and (clock, fps) != (None, None):
         raise CallerError("clock and fps are options of the formats lerobot and mcap")
+    if file_format != "lerobot" and images is not None:
+        raise CallerError("images are an option of the format lerobot")
     options = EpisodeOptions(
-        clock or ("time" if file_format == "mcap" else "event"), DEFAULT_FPS if fps is None else fps
+        clock or ("time" if file_format == "mcap" else "event"), DEFAULT_FPS if fps is None else fps, images
     )
     options.check()
     return options

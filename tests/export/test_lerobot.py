@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import io
 import json
 from pathlib import Path
 from typing import Any
 
+import matplotlib.image
 import numpy as np
 import pandas as pd
 import pytest
@@ -105,6 +107,24 @@ async def test_by_time_a_frame_holds_the_state_in_force(reading: Reading, tmp_pa
     assert (await export_again(reading, tmp_path / "time.manifest.json")).same
 
 
+@pytest.mark.slow
+async def test_images_show_the_scene_of_each_frame(reading: Reading, tmp_path: Path) -> None:
+    await export(reading, 3, tmp_path / "seen", file_format="lerobot", images=(64, 48))
+    info = json.loads((tmp_path / "seen/meta/info.json").read_text())
+    name = "observation.images.scene"
+    assert info["features"][name] == {"dtype": "image", "shape": [48, 64, 3], "names": ["height", "width", "channels"]}
+    frames = parquet.read_table(tmp_path / "seen/data/chunk-000/file-000.parquet")
+    assert str(frames.schema.field(name).type) == "struct<bytes: binary, path: string>"
+    pictures = [matplotlib.image.imread(io.BytesIO(each["bytes"])) for each in frames.column(name).to_pylist()]
+    assert {each.shape for each in pictures} == {(48, 64, 3)}
+    assert not np.array_equal(pictures[0], pictures[-1])  # the robot is elsewhere
+    statistics = json.loads((tmp_path / "seen/meta/stats.json").read_text())[name]
+    means = np.mean(pictures, axis=(0, 1, 2)).reshape(3, 1, 1)
+    np.testing.assert_allclose(statistics["mean"], means, atol=1e-3)
+    assert statistics["count"] == [len(pictures)]
+    assert (await export_again(reading, tmp_path / "seen.manifest.json")).same
+
+
 async def test_a_data_set_is_replaced_only_when_asked_and_only_by_its_kind(dataset: Path, reading: Reading) -> None:
     with pytest.raises(CallerError, match="kitchen exists: add --force"):
         await export(reading, 1, dataset, file_format="lerobot")
@@ -129,6 +149,7 @@ async def test_a_data_set_is_replaced_only_when_asked_and_only_by_its_kind(datas
         ),
         ([3], {"clock": "time", "fps": 1}, r"episode 3 has 1 frames by time, and LeRobot needs two: a higher --fps"),
         ([1], {"clock": "sun"}, "the clock is event or time, not 'sun'"),
+        ([1], {"images": (0, 240)}, r"an image is 16 to 2000 pixels wide and high, not \(0, 240\)"),
         ([1], {"fps": 0}, "frames per second are between 1 and 1000, not 0"),
         ("root_failure", {}, "the format lerobot holds whole episodes, and root_failure is a view"),
         ([99], {}, "there is no episode '99'"),
@@ -145,6 +166,8 @@ async def test_what_the_format_cannot_hold_is_named_and_leaves_no_folder(
 async def test_options_of_lerobot_are_refused_for_rows(reading: Reading, tmp_path: Path) -> None:
     with pytest.raises(CallerError, match="clock and fps are options of the formats lerobot and mcap"):
         await export(reading, 1, tmp_path / "a.csv", fps=3)
+    with pytest.raises(CallerError, match="images are an option of the format lerobot"):
+        await export(reading, 1, tmp_path / "a.csv", images=(320, 240))
 
 
 def test_lerobots_own_loader_reads_it(dataset: Path) -> None:

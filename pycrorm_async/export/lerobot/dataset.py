@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.export.lerobot.states import Frames
-from pycrorm_async.export.lerobot.statistics import Statistics, joined, statistics_of
+from pycrorm_async.export.lerobot.statistics import Statistics, joined, statistics_of, statistics_of_images
 from pycrorm_async.export.recorded_episode import RecordedEpisode
 from pycrorm_async.query.frames.arrow_batches import needed_pyarrow
+from pycrorm_async.query.scene.picture import png
 
 __all__ = ["DEFAULT_FPS", "LeRobotFolder", "MARKER"]
 
@@ -28,6 +29,7 @@ DEFAULT_FPS = 10
 _CHUNK_FILES = 1000
 _FILE_MEGABYTES = 100
 _VECTORS = ("observation.state", "action")
+_PICTURE = "observation.images.scene"
 _NUMBERS = {
     "timestamp": "float32",
     "time_s": "float64",
@@ -56,7 +58,8 @@ class LeRobotFolder:
         self._statistics: list[dict[str, Statistics]] = []
         self._plan: list[dict[str, Any]] = []
         self._file = 0
-        self._file_frames = 0
+        self._file_bytes = 0
+        self._picture_shape: tuple[int, ...] = ()
         self._writer: Any = None
 
     @property
@@ -64,14 +67,20 @@ class LeRobotFolder:
         """The number of frames added so far."""
         return self._frames
 
-    def add(self, episode: RecordedEpisode, frames: Frames) -> None:
-        """Write the frames of an episode. Raises `CallerError` if its robot has other joints than that of the first."""
+    def add(self, episode: RecordedEpisode, frames: Frames, pictures: NDArray[np.uint8] | None = None) -> None:
+        """Write the frames of an episode, with a picture of each or for no episode.
+
+        Raises `CallerError` if its robot has other joints than that of the first.
+        """
         self._check_channels(episode, frames)
         number, count = len(self._episodes), len(frames.at)
         task = episode.description or f"episode {episode.number}"
         columns = self._columns(frames, number, task)
         statistics = {name: statistics_of(values) for name, values in columns.items()}
-        chunk, file = self._write(columns, len(frames.channels))
+        if pictures is not None:
+            self._picture_shape = pictures.shape[1:]
+            statistics[_PICTURE] = statistics_of_images(pictures)
+        chunk, file = self._write(columns, len(frames.channels), pictures)
         self._episodes.append(
             {
                 "episode_index": number,
@@ -143,7 +152,9 @@ class LeRobotFolder:
             "subtask_index": np.array(subtasks, dtype=np.int64),
         }
 
-    def _write(self, columns: dict[str, NDArray[Any]], width: int) -> tuple[int, int]:
+    def _write(
+        self, columns: dict[str, NDArray[Any]], width: int, pictures: NDArray[np.uint8] | None
+    ) -> tuple[int, int]:
         """Write the frames of an episode as one row group; return the numbers of the chunk and the file."""
         pa = needed_pyarrow()
         from pyarrow import parquet
@@ -154,17 +165,20 @@ class LeRobotFolder:
             else pa.array(values)
             for name, values in columns.items()
         }
+        if pictures is not None:
+            encoded = [{"bytes": png(each), "path": None} for each in pictures]
+            arrays[_PICTURE] = pa.array(encoded, pa.struct({"bytes": pa.binary(), "path": pa.string()}))
         table = pa.table(arrays)
-        if self._writer is not None and self._file_frames * width * 8 > _FILE_MEGABYTES * 2**20:
+        if self._writer is not None and self._file_bytes > _FILE_MEGABYTES * 2**20:
             self._writer.close()
-            self._writer, self._file, self._file_frames = None, self._file + 1, 0
+            self._writer, self._file, self._file_bytes = None, self._file + 1, 0
         chunk, file = divmod(self._file, _CHUNK_FILES)
         if self._writer is None:
             path = self._folder / "data" / f"chunk-{chunk:03d}" / f"file-{file:03d}.parquet"
             path.parent.mkdir(parents=True, exist_ok=True)
             self._writer = parquet.ParquetWriter(path, table.schema)
         self._writer.write_table(table)
-        self._file_frames += len(table)
+        self._file_bytes += table.nbytes
         return chunk, file
 
     def _add_plan(self, episode: RecordedEpisode, frames: Frames, number: int) -> None:
@@ -194,7 +208,11 @@ class LeRobotFolder:
 
     def _info(self, frames: Frames) -> dict[str, Any]:
         vector = {"dtype": "float32", "shape": [len(frames.channels)], "names": list(frames.channels)}
-        numbers = {name: {"dtype": dtype, "shape": [1], "names": None} for name, dtype in _NUMBERS.items()}
+        features: dict[str, Any] = dict.fromkeys(_VECTORS, vector)
+        features |= {name: {"dtype": dtype, "shape": [1], "names": None} for name, dtype in _NUMBERS.items()}
+        if self._picture_shape:
+            names = ["height", "width", "channels"]
+            features[_PICTURE] = {"dtype": "image", "shape": list(self._picture_shape), "names": names}
         return {
             "codebase_version": "v3.0",
             "robot_type": frames.robot,
@@ -208,7 +226,7 @@ class LeRobotFolder:
             "splits": {"train": f"0:{len(self._episodes)}"},
             "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
             "video_path": None,
-            "features": {**dict.fromkeys(_VECTORS, vector), **numbers},
+            "features": features,
         }
 
 

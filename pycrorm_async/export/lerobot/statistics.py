@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Statistics", "joined", "statistics_of"]
+__all__ = ["Statistics", "joined", "statistics_of", "statistics_of_images"]
 
 Statistics: TypeAlias = dict[str, NDArray[Any]]
 """By the name of a statistic, one number for each channel of a feature; of `count` one number."""
@@ -29,10 +29,17 @@ def statistics_of(values: NDArray[Any]) -> Statistics:
     }
 
 
+def statistics_of_images(pictures: NDArray[np.uint8]) -> Statistics:
+    """Return the statistics of each colour over all pixels, from 0 to 1, in the shape (3, 1, 1) that LeRobot has."""
+    pixels = statistics_of(pictures.reshape(-1, 3) / 255)
+    shaped = {name: each.reshape(3, 1, 1) for name, each in pixels.items() if name != "count"}
+    return {**shaped, "count": np.array([len(pictures)])}
+
+
 def joined(parts: Sequence[Statistics]) -> Statistics:
     """Return the statistics over several episodes; quantiles are the weighted means of theirs, as LeRobot has them."""
     counts = np.array([each["count"][0] for each in parts], dtype=np.float64)
-    shares = (counts / counts.sum())[:, None]
+    shares = (counts / counts.sum()).reshape(-1, *[1] * parts[0]["mean"].ndim)
     means = np.stack([each["mean"] for each in parts])
     mean = (means * shares).sum(axis=0)
     variances = np.stack([each["std"] for each in parts]) ** 2

@@ -30,7 +30,7 @@ from pycrorm_async.world.objects import Object
 from pycrorm_async.world.pose import Vector
 from pycrorm_async.world.queries.photograph import Camera, photograph
 
-__all__ = ["When", "picture"]
+__all__ = ["When", "picture", "png"]
 
 When: TypeAlias = float | str | datetime | None
 """Seconds since the start, `e115` for an event, a wall clock's time; None: the moment before the world is emptied."""
@@ -131,7 +131,7 @@ def _drawn(
             reason = world.assumed[points[0]].removeprefix("a point, because ")
             raise CallerError(f"episode {then.number} has no shapes to draw: of {points[0]}, {reason}")
         camera = _camera(world, moved, size, yaw_deg, pitch_deg)
-        return _png(photograph(world, camera, *size).pixels)
+        return png(photograph(world, camera, *size).pixels)
 
 
 def _camera(
@@ -164,7 +164,7 @@ def _visible(world: RecordedWorld, camera: Camera, radius: float, actors: Sequen
     return sum(math.log1p(int((picture.bodies == each.body.number).sum())) for each in actors) * (1 - covered)
 
 
-def _png(pixels: NDArray[np.uint8]) -> bytes:
+def png(pixels: NDArray[np.uint8]) -> bytes:
     """Encode pixels of shape (height, width, 3)."""
     height, width, _ = pixels.shape
 
