@@ -15,6 +15,7 @@ import asyncio
 import threading
 from collections.abc import Coroutine
 from concurrent.futures import Future
+from datetime import datetime
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar, overload
 
@@ -22,17 +23,22 @@ from sqlalchemy import Select
 
 from pycrorm_async.errors import CallerError, FlushTimeout
 from pycrorm_async.memory_status import MemoryStatus
+from pycrorm_async.query.as_of import AnyEpisode
 from pycrorm_async.query.asking.ask import Ask
 from pycrorm_async.query.asking.episode_diff import EpisodeDiff
 from pycrorm_async.query.asking.question import AskedEpisode, Question, SyncQuestion
 from pycrorm_async.query.frames.dataframe import Library
+from pycrorm_async.query.notebook.listings import Episodes, TaskTree
+from pycrorm_async.query.snapshot import Moment
 from pycrorm_async.query.sql.read_only import DEFAULT_LIMITS, SqlLimits, SqlResult
 from pycrorm_async.recording.recording import Recording
 
 if TYPE_CHECKING:
     import pandas as pd
+    from matplotlib.figure import Figure
 
     from pycrorm_async.memory import Memory
+    from pycrorm_async.query.scene.picture import When
 
 __all__ = ["SyncMemory"]
 
@@ -145,6 +151,28 @@ class SyncMemory:
         """The named questions: `memory.ask.root_failures(object="milk").frame()`."""
         reading = self._memory.reading
         return Ask(lambda plan: SyncQuestion(Question(reading, plan), self._await))
+
+    def episodes(self, *, simulated: bool = False) -> Episodes:
+        """Return every episode, the oldest first; see `Memory.episodes`."""
+        return self._await(self._memory.episodes(simulated=simulated))
+
+    def tree(self, episode: AnyEpisode) -> TaskTree:
+        """Return the task tree of an episode; see `Memory.tree`."""
+        return self._await(self._memory.tree(episode))
+
+    def as_of(
+        self, episode: AnyEpisode, *, time: float | datetime | None = None, sequence: int | None = None
+    ) -> Moment:
+        """Return the task tree and the world at any moment of an episode; see `Memory.as_of`."""
+        return self._await(self._memory.as_of(episode, time=time, sequence=sequence))
+
+    def picture(self, episode: AnyEpisode, *, at: When = None, **view: Any) -> bytes:
+        """Return the scene of an episode at a moment as PNG; see `Memory.picture`."""
+        return self._await(self._memory.picture(episode, at=at, **view))
+
+    def plot_success(self, x: str, y: str, **options: Any) -> Figure:
+        """Draw how often the actions of a view succeeded over two of its columns; see `Memory.plot_success`."""
+        return self._await(self._memory.plot_success(x, y, **options))
 
     def diff(self, first: AskedEpisode, second: AskedEpisode) -> EpisodeDiff:
         """Compare two episodes; see `Reading.diff`."""

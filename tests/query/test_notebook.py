@@ -188,6 +188,11 @@ def test_a_chart_has_events_or_time_as_its_axis() -> None:
         tree.gantt("days")  # type: ignore[arg-type]
 
 
+def test_a_chart_of_few_events_repeats_no_label() -> None:
+    labels = re.findall(r">(e\d+)<", TaskTree([node(1, end_sequence=3)]).gantt().svg)
+    assert labels == ["e1", "e2", "e3"]
+
+
 def test_concurrent_nodes_have_lanes_of_their_own() -> None:
     tree = TaskTree([node(1, end_sequence=9), node(2, 1, end_sequence=7), node(3, 1, end_sequence=8)])
     lanes = [each["y"] for tag, each in Page(tree.gantt().svg).elements if tag == "rect"]

@@ -39,6 +39,24 @@ def test_an_episode_is_asked_about_while_the_memory_is_open(tmp_path: Path) -> N
         assert memory.status.stored == memory.status.written > 0
 
 
+@pytest.mark.slow
+def test_its_episodes_are_read_and_drawn(tmp_path: Path) -> None:
+    with Memory.sync(url_of(tmp_path)) as memory:
+        with memory.recording.episode(description="d") as episode:
+            episode.object_added("crate", "crate", "GENERIC_OBJECT", Pose([1, 0, 0]))
+            episode.start("a", memory.recording.type("action", "Step", {"size": float}), {"size": 0.5})
+            episode.end("a")
+        memory.flush()
+        (only,) = memory.episodes()
+        assert (only.number, only.description) == (1, "d")
+        assert [each.dtype for each in memory.tree(only)] == [None, "Step"]
+        assert memory.as_of("last", sequence=99).status == "SUCCEEDED"
+        assert memory.picture(1, at="e4", width=64, height=48).startswith(b"\x89PNG")
+        assert memory.plot_success("size", "dtype", of="Step").axes
+        assert "1 episode" in memory._repr_html_()
+    assert "not open" in memory._repr_html_()
+
+
 async def test_it_serves_inside_a_running_loop_too(tmp_path: Path) -> None:
     with Memory.sync(url_of(tmp_path)) as memory:
         step(memory)

@@ -43,10 +43,14 @@ def gantt(nodes: Sequence[NodeSummary], axis: Axis = "events") -> Drawing:
     scale = (_WIDTH - 2 * _PAD) / ((last - first) or 1.0)
     height = (max((each.lane for each in bars), default=-1) + 1) * _LANE + _AXIS
     parts = [_drawn(each, _PAD + (each.start - first) * scale, _PAD + (each.end - first) * scale) for each in bars]
+    labels: set[str] = set()
     for index in range(_TICKS):
         x = _PAD + (_WIDTH - 2 * _PAD) * index / (_TICKS - 1)
         value = first + (last - first) * index / (_TICKS - 1)
         label = duration(round(value * 1e9)) if axis == "time" else f"e{value:.0f}"
+        if label in labels:  # a chart of few events
+            continue
+        labels.add(label)
         anchor = "start" if index == 0 else "end" if index == _TICKS - 1 else "middle"
         parts.append(f'<text x="{x:.1f}" y="{height - 4:.0f}" text-anchor="{anchor}" opacity=".7">{label}</text>')
     return Drawing(
