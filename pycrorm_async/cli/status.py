@@ -21,7 +21,7 @@ from pycrorm_async.projections.custom.discovery import installed_projections
 from pycrorm_async.projections.custom.projection_tables import ProjectionState, states
 from pycrorm_async.projections.schema.generations import PROJECTION_VERSION, SHOWN, read_generation
 from pycrorm_async.projections.schema.unmade_types import failed_views, unmade_types
-from pycrorm_async.query.named_queries import RunningEpisode, running_episodes
+from pycrorm_async.query.running_episodes import RunningEpisode, running_episodes
 from pycrorm_async.queue.files.spool import RecorderFolder, Spool
 from pycrorm_async.queue.maintenance.inspection import inspect_folder
 from pycrorm_async.store.address import DatabaseAddress

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 from typing import Any
@@ -12,9 +12,10 @@ from sqlalchemy.ext.asyncio import AsyncConnection
 from sqlalchemy.orm import aliased
 
 from pycrorm_async.events.ids import SLOT_NODE, row_id, row_key
-from pycrorm_async.orm import Designator, EpisodeRobot, EpisodeTag, Object, Observation, ProcessMetaData, TaskTreeNode
+from pycrorm_async.orm import Designator, EpisodeTag, Object, Observation, ProcessMetaData, TaskTreeNode
 from pycrorm_async.orm.base import same_row
 from pycrorm_async.query.asking.episode_list import EpisodeChoice
+from pycrorm_async.query.running_episodes import RobotSummary, robots_of
 from pycrorm_async.store.episode_lookup import number_named
 from pycrorm_async.task_status import TaskStatus
 
@@ -35,38 +36,6 @@ class SimulatingNode:
     episode: int | None
     node: int | None
     dtype: str | None
-
-
-@dataclass(frozen=True)
-class RobotSummary:
-    """A robot that took part in an episode.
-
-    Attributes:
-        name: of its object in the world.
-        model, serial: of its `RobotDescription`; None without one, and in episodes of version 0.1.0.
-        description: fingerprint of its recorded description; None likewise.
-    """
-
-    name: str
-    model: str | None
-    serial: str | None
-    description: str | None
-
-    def __str__(self) -> str:
-        """Return the name, with model and serial as far as they add to it."""
-        model = " ".join(each for each in (self.model, self.serial) if each is not None)
-        return f"{self.name} ({model})" if model not in ("", self.name) else self.name
-
-
-@dataclass(frozen=True)
-class RunningEpisode:
-    """An episode that has not ended, as far as the tables show it, and the robots that took part so far."""
-
-    number: int
-    id: str
-    started_at: datetime
-    description: str
-    robots: tuple[RobotSummary, ...]
 
 
 @dataclass(frozen=True)
@@ -171,7 +140,7 @@ async def episodes(connection: AsyncConnection, chosen: int | EpisodeChoice | No
     numbers = chosen.newest() if isinstance(chosen, EpisodeChoice) else None if chosen is None else [chosen]
     if numbers is not None:
         query = query.where(ProcessMetaData.id.in_(numbers))
-    robots = await _robots(connection, numbers)
+    robots = await robots_of(connection, numbers)
     tags: dict[int, list[str]] = {}
     tagged = select(EpisodeTag.process_metadata_id, EpisodeTag.tag).order_by(EpisodeTag.tag)
     if numbers is not None:
@@ -212,36 +181,6 @@ async def episodes(connection: AsyncConnection, chosen: int | EpisodeChoice | No
         )
         for row in await connection.execute(query)
     ]
-
-
-async def running_episodes(connection: AsyncConnection, limit: int) -> tuple[list[RunningEpisode], int]:
-    """Return the running episodes that started last, at most `limit`, the newest first; and the number of all."""
-    episode = ProcessMetaData
-    total = func.count().over().label("total")
-    query = select(episode.id, episode.uuid, episode.created_at, episode.description, total)
-    query = query.where(episode.status == TaskStatus.RUNNING.name).order_by(episode.id.desc()).limit(limit)
-    rows = (await connection.execute(query)).all()
-    robots = await _robots(connection, [each.id for each in rows])
-    episodes = [
-        RunningEpisode(each.id, each.uuid, each.created_at, each.description, tuple(robots.get(each.id, ())))
-        for each in rows
-    ]
-    return episodes, rows[0].total if rows else 0
-
-
-async def _robots(
-    connection: AsyncConnection, numbers: Collection[int] | Select[*tuple[int]] | None
-) -> dict[int, list[RobotSummary]]:
-    """Return the robots of every episode, or of those with these numbers, by episode."""
-    robot = EpisodeRobot
-    query = select(robot.__table__).order_by(robot.id)
-    if numbers is not None:
-        query = query.where(robot.process_metadata_id.in_(numbers))
-    robots: dict[int, list[RobotSummary]] = {}
-    for row in await connection.execute(query):
-        summary = RobotSummary(row.name, row.model, row.serial, row.description_fingerprint)
-        robots.setdefault(row.process_metadata_id, []).append(summary)
-    return robots
 
 
 def _overview() -> Select[*tuple[Any, ...]]:

@@ -58,6 +58,7 @@ def test_the_listed_tables_are_those_of_the_classes() -> None:
 _LIGHT = """
 import sys
 import pycrorm_async.cli.copy, pycrorm_async.cli.rebuild, pycrorm_async.cli.verify, pycrorm_async.cli.writer
+import pycrorm_async.cli.status
 raise SystemExit("the mapped classes are imported" if "pycrorm_async.orm" in sys.modules else 0)
 """
 
