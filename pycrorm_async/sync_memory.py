@@ -31,6 +31,7 @@ from pycrorm_async.query.frames.dataframe import Library
 from pycrorm_async.query.notebook.listings import Episodes, TaskTree
 from pycrorm_async.query.snapshot import Moment
 from pycrorm_async.query.sql.read_only import DEFAULT_LIMITS, SqlLimits, SqlResult
+from pycrorm_async.recall.answer import Answer
 from pycrorm_async.recording.recording import Recording
 
 if TYPE_CHECKING:
@@ -177,6 +178,10 @@ class SyncMemory:
     def diff(self, first: AskedEpisode, second: AskedEpisode) -> EpisodeDiff:
         """Compare two episodes; see `Reading.diff`."""
         return self._await(self._memory.diff(first, second))
+
+    def recall(self, type: str | type | None = None, **cue: Any) -> Answer:  # noqa: A002  the feature's name
+        """Return the past actions most like a cue; see `Recall.__call__`."""
+        return self._await(self._memory.recall(type, **cue))
 
     def query(self, sql: str, limits: SqlLimits = DEFAULT_LIMITS) -> SqlResult:
         """Return the rows of one query in SQL that can only read; see `Reading.query`."""

@@ -61,9 +61,9 @@ class Symbols:
         code = int(self.codes[row])
         return self.words[code - 1] if code else None
 
-    def counts(self) -> dict[str, int]:
-        """Return the number of cases that have each word."""
-        return _counts(self.words, self.codes)
+    def counts(self) -> NDArray[np.int64]:
+        """Return the number of cases that have each code."""
+        return np.bincount(self.codes, minlength=len(self.words) + 1)
 
     def present(self) -> Mask:
         """Return which cases have the feature."""
@@ -131,9 +131,9 @@ class Sets:
         codes = self.codes[end - int(self.sizes[row]) : end].tolist()
         return tuple(self.words[code - 1] for code in codes) or None
 
-    def counts(self) -> dict[str, int]:
-        """Return the number of cases that have each word."""
-        return _counts(self.words, self.codes)
+    def counts(self) -> NDArray[np.int64]:
+        """Return the number of cases that have each code."""
+        return np.bincount(self.codes, minlength=len(self.words) + 1)
 
     def present(self) -> Mask:
         """Return which cases have the feature."""
@@ -231,11 +231,6 @@ def smallest_codes(codes: Any, largest: int) -> Codes:
     """Return codes as the smallest unsigned integers that hold `largest`."""
     smallest: Codes = np.asarray(codes, np.min_scalar_type(largest))
     return smallest
-
-
-def _counts(words: Words, codes: Codes) -> dict[str, int]:
-    sizes = np.bincount(codes, minlength=len(words) + 1)[1:].tolist()
-    return dict(zip(words, sizes, strict=True))
 
 
 def _joined(dictionaries: Sequence[Words]) -> Words:

@@ -13,6 +13,7 @@ import numpy as np
 
 from pycrorm_async.recall.blocks import WORDS_MAX, Block, Group
 from pycrorm_async.recall.case import RESERVED, Case, is_angle
+from pycrorm_async.recall.columns import Words
 
 __all__ = ["ANGLE_TOLERANCE", "CaseLibrary"]
 
@@ -28,7 +29,6 @@ class CaseLibrary:
 
     def __init__(self, blocks: Sequence[Block] = ()) -> None:
         self.blocks = tuple(blocks)
-        self._counts: dict[tuple[str | None, str], Mapping[str, int]] = {}
         self._spreads: dict[tuple[str | None, str], float] = {}
         self._groups: dict[str | None, tuple[Group, ...]] = {}
 
@@ -47,11 +47,11 @@ class CaseLibrary:
     @cached_property
     def left_out(self) -> frozenset[str]:
         """The features with more than `WORDS_MAX` words, which are not compared."""
-        words: dict[str, set[str]] = {}
+        words: dict[str, list[Words]] = {}
         for block in self.blocks:
             for name, spread in block.texts.items():
-                words.setdefault(name, set()).update(spread.column.words)
-        long = (name for name, each in words.items() if len(each) > WORDS_MAX)
+                words.setdefault(name, []).append(spread.column.words)
+        long = (name for name, each in words.items() if _exceeds(each))
         return frozenset(chain(long, *(block.left_out for block in self.blocks)))
 
     def groups(self, type: str | None = None) -> tuple[Group, ...]:  # noqa: A002  the name of the feature
@@ -67,17 +67,18 @@ class CaseLibrary:
         """Return the number of cases of a type."""
         return len(self) if type is None else self.types.get(type, 0)
 
-    def counts(self, type: str | None, feature: str) -> Mapping[str, int]:  # noqa: A002
-        """Return the number of cases of a type that have each word of a feature."""
-        counts = self._counts.get((type, feature))
-        if counts is None:
-            total: dict[str, int] = {}
-            for group in self.groups(type):
-                counts_of_group = _cached(group, ("counts", feature), lambda group: _counts(group, feature))
-                for word, count in counts_of_group.items():
-                    total[word] = total.get(word, 0) + count
-            counts = self._counts[type, feature] = total
-        return counts
+    def seen(self, type: str | None, feature: str, word: str) -> int:  # noqa: A002
+        """Return the number of cases of a type that have a word."""
+        total, key = 0, ("counts", feature)
+        for group in self.groups(type):
+            column = group.texts.get(feature)
+            code = 0 if column is None else column.words.code(word)
+            if column is not None and code:
+                counts = group.caches.get(key)
+                if counts is None:
+                    counts = group.caches[key] = column.counts().tolist()
+                total += counts[code]
+        return total
 
     def texts(self, type: str | None = None) -> frozenset[str]:  # noqa: A002
         """Return the names of the text features of a type, those of the outcome among them."""
@@ -114,9 +115,9 @@ class CaseLibrary:
         return chain.from_iterable(block.cases() for block in self.blocks)
 
 
-def _counts(group: Group, feature: str) -> Mapping[str, int]:
-    column = group.texts.get(feature)
-    return {} if column is None else column.counts()
+def _exceeds(dictionaries: Sequence[Words]) -> bool:
+    """Return whether there are more than `WORDS_MAX` words. Most often their numbers say so without a union."""
+    return sum(map(len, dictionaries)) > WORDS_MAX and len({*chain.from_iterable(dictionaries)}) > WORDS_MAX
 
 
 def _standard_deviation(groups: Sequence[Group], feature: str) -> float:

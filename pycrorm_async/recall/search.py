@@ -97,7 +97,7 @@ def weights_of(cue: Cue, library: CaseLibrary) -> Weights:
     """Return what each feature of the cue weighs, counted within its type."""
     cases, seen = library.size(cue.type), []
     if cue.as_of_us is None:
-        seen = [library.counts(cue.type, feature).get(value, 0) for feature, value in cue.has]
+        seen = [library.seen(cue.type, feature, value) for feature, value in cue.has]
     else:
         groups = [(group, _ended_by(group, cue.as_of_us)) for group in library.groups(cue.type)]
         cases = sum(int(ended.sum()) for _, ended in groups)
