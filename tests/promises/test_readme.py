@@ -17,7 +17,7 @@ from typer.testing import CliRunner
 
 from pycrorm_async import Memory
 from pycrorm_async.cli.main import app
-from pycrorm_async.learning import load_policy, name_of
+from pycrorm_async.learning import Scene, load_policy, name_of
 from tests.commands import answer, pycrorm
 
 pytestmark = pytest.mark.slow
@@ -42,7 +42,7 @@ COURSE, PLOTTED, AROUND, ROBOTS, BEGAN, FRAMES, ASKED, TAGGED, SEEN, THEN, AGAIN
 )
 (EXPORTED,) = python_of("pycrorm_async/export/README.md")
 (RECALLED,) = python_of("pycrorm_async/recall/README.md")
-BETTER, ORIGINS = python_of("pycrorm_async/learning/README.md")
+BETTER, REPEATED, ORIGINS = python_of("pycrorm_async/learning/README.md")
 
 
 def test_the_readme_is_short_and_every_link_of_a_page_leads_to_a_file() -> None:
@@ -362,9 +362,14 @@ async def test_a_policy_is_learned_from_the_recorded_rollouts_and_used(
     async with Memory.open("sqlite:///tries.db") as memory:
         [learned], used = await names["origins"](memory)
         [training] = [each for each in await memory.reading.episodes() if each.id in learned.training_episodes]
+        exec(REPEATED, names)
+        with Scene().entered() as stage:
+            await names["fetch"](stage.target, policy)
+        recalled = await memory.recall("RecalledPickUpAction", only={"status": "SUCCEEDED"})
     assert (learned.policy, learned.successes) == (name_of(policy), tally.successes)
     assert training.nodes > 1000
     assert used == []
+    assert [each.symbols["chosen_by"] for each in recalled] == ["recall"]
 
 
 def test_the_readme_names_every_verb_and_no_other(tmp_path: Path) -> None:
