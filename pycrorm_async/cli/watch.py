@@ -5,7 +5,8 @@ from __future__ import annotations
 import asyncio
 import signal
 import webbrowser
-from typing import Annotated
+from collections.abc import Coroutine
+from typing import Annotated, Any
 
 import typer
 
@@ -48,10 +49,15 @@ def watch(
     address = shared_address(url)
     note_pending_events(url, spool)
     follower = LogFollower(address)
-    if terminal:
-        asyncio.run(_draw(follower, episode))
-        return
-    asyncio.run(_serve(follower, episode, port, open_it=open_it, as_json=as_json))
+    follow = _draw(follower, episode) if terminal else _serve(follower, episode, port, open_it=open_it, as_json=as_json)
+    asyncio.run(_closed_after(follower, follow))
+
+
+async def _closed_after(follower: LogFollower, following: Coroutine[Any, Any, None]) -> None:
+    try:
+        await following
+    finally:
+        await follower.close()
 
 
 def _stop_at_signals() -> asyncio.Event:
@@ -74,11 +80,7 @@ async def _draw(follower: LogFollower, episode: str | None) -> None:
 async def _serve(follower: LogFollower, episode: str | None, port: int | None, *, open_it: bool, as_json: bool) -> None:
     from pycrorm_async.live.server import LiveServer, listen  # needs the extra `live`
 
-    try:
-        await _check(follower, episode)
-    except BaseException:
-        await follower.close()
-        raise
+    await _check(follower, episode)
     token = kept_token()
     with listen(port) as listener:
         used = listener.getsockname()[1]

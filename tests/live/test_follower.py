@@ -156,8 +156,8 @@ async def test_a_browser_that_leaves_is_no_listener_any_more(tmp_path: Path) -> 
             serving = asyncio.create_task(LiveServer(follower, "t").serve(listener, stop=stop, ready=ready.set))
             await ready.wait()
             reader, writer = await asyncio.open_connection("127.0.0.1", port)
-            writer.write(b"GET /t/episode/1/events HTTP/1.1\r\nHost: localhost\r\n\r\n")
-            assert b"event: part" in await reader.readuntil(b"event: part")
+            writer.write(b"GET /t/episode/1/events?after=1 HTTP/1.1\r\nHost: localhost\r\nLast-Event-ID: 2\r\n\r\n")
+            assert b"id: 4\nevent: part\ndata: " in await reader.readuntil(b'"format":1,"after":2,')
             [feed] = follower._feeds.values()
             assert feed.listeners == 1
             writer.close()

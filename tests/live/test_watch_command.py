@@ -76,6 +76,14 @@ def test_a_port_in_use_is_refused_if_it_was_asked_for() -> None:
             assert other.getsockname()[1] not in (port, PORT)
 
 
+def test_a_command_whose_port_is_in_use_is_one_line(folder: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        done = pycrorm("watch", "--port", port, cwd=folder, timeout_s=30)
+    assert done.returncode == 2
+    assert one_line_of(done).endswith("(another process uses it): give another, or leave out --port")
+
+
 def test_a_missing_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "uvicorn", None)
     monkeypatch.delitem(sys.modules, "pycrorm_async.live.server")
@@ -97,6 +105,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ("arguments", "code", "message"),
     [
         (("77",), 2, "there is no episode '77' (`pycrorm episodes` lists the 1 there are)"),
+        (("77", "--terminal"), 2, "there is no episode '77' (`pycrorm episodes` lists the 1 there are)"),
         (("1", "--terminal", "--json"), 2, "--terminal serves no page: leave out --port, --open and --json"),
         (("--url", "mysql://host/name"), 2, "mysql:// is not a supported database"),
         (("--url", "sqlite://"), 2, "sqlite:// exists only in its own process"),
@@ -124,6 +133,9 @@ def test_the_server_answers_its_own_pages_and_no_others(watch: Callable[..., Wat
     assert server.get(f"/{root}/episode/1", host="evil.example")[0] == 403
     assert server.get(f"/{root[:-1]}x/episode/1")[0] == 403
     assert server.get("/")[0] == 403
+    reload = (200, "event: reload\ndata: {}\n\n")  # of another episode, and of a log that went back
+    assert server.get(f"/{root}/episode/1/events?id=another") == reload
+    assert server.get(f"/{root}/episode/1/events?after=99") == reload
     assert server.get(f"/{root}/../episode/1")[0] in (403, 404)
     server.process.send_signal(signal.SIGINT)
     assert server.process.wait(20) == 0
