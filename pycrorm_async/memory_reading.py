@@ -14,11 +14,6 @@ from sqlalchemy.ext.asyncio import AsyncSession
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.blobs import Blob
-from pycrorm_async.export.export import Exported, FileFormat, Remade, export_again
-from pycrorm_async.export.export import export as write_export
-from pycrorm_async.export.lerobot.images import ImageSize
-from pycrorm_async.export.lerobot.states import Clock
-from pycrorm_async.export.selection import Exportable
 from pycrorm_async.hooks.episode import Episode
 from pycrorm_async.memory_parts import PartsHolder
 from pycrorm_async.plan.task_tree import TaskTreeNode
@@ -47,6 +42,10 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from pycrorm_async.export.export import Exported, FileFormat, Remade
+    from pycrorm_async.export.lerobot.images import ImageSize
+    from pycrorm_async.export.lerobot.states import Clock
+    from pycrorm_async.export.selection import Exportable
     from pycrorm_async.query.scene.picture import When
     from pycrorm_async.query.success.figure import Kind
     from pycrorm_async.query.success.samples import Source
@@ -231,9 +230,10 @@ class ReadableMemory(PartsHolder):
         images: ImageSize | None = None,
     ) -> Exported:
         """Write episodes or rows to a file, up to the last flush; see `pycrorm_async.export.export.export`."""
-        reading = self._open_parts.reading
-        return await write_export(
-            reading,
+        from pycrorm_async.export.export import export  # here, because most memories write no file
+
+        return await export(
+            self._open_parts.reading,
             what,
             path,
             file_format=file_format,
@@ -254,6 +254,8 @@ class ReadableMemory(PartsHolder):
         force: bool = False,
     ) -> Remade:
         """Make an export again from its manifest and compare; see `pycrorm_async.export.export.export_again`."""
+        from pycrorm_async.export.export import export_again
+
         return await export_again(self._open_parts.reading, manifest, path, statement=statement, force=force)
 
     async def plot_success(

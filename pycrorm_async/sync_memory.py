@@ -16,6 +16,7 @@ import threading
 from collections.abc import Coroutine
 from concurrent.futures import Future
 from datetime import datetime
+from os import PathLike
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar, overload
 
@@ -38,6 +39,8 @@ if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.figure import Figure
 
+    from pycrorm_async.export.export import Exported
+    from pycrorm_async.export.selection import Exportable
     from pycrorm_async.memory import Memory
     from pycrorm_async.query.scene.picture import When
 
@@ -217,3 +220,7 @@ class SyncMemory:
     ) -> Any:
         """Return the rows as a frame of pandas, polars or Arrow; see `Memory.dataframe`."""
         return self._await(self._memory.reading.dataframe(statement, to=to, simulated=simulated, deferred=deferred))
+
+    def export(self, what: Exportable, path: str | PathLike[str], **options: Any) -> Exported:
+        """Write episodes or rows to a file; see `Memory.export`, which has the same options."""
+        return self._await(self._memory.export(what, path, **options))

@@ -280,6 +280,15 @@ async def test_without_pyarrow_the_error_names_the_extra(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_memory_without_asyncio_exports_too(tmp_path: Path) -> None:
+    with Memory.sync(f"sqlite:///{tmp_path}/memory.db") as memory:
+        with memory.recording.episode(description="a walk"):
+            pass
+        memory.flush()
+        exported = memory.export("last", tmp_path / "walk.csv")
+    assert (exported.rows, exported.episodes) == (1, 1)
+
+
 @pytest.mark.slow
 def test_the_command_writes_compares_and_names_mistakes_in_one_line(kitchen: Path, tmp_path: Path) -> None:
     done = pycrorm("export", "1", "2", "--out", tmp_path / "both.parquet", "--json", cwd=kitchen)
