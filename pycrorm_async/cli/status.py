@@ -19,11 +19,14 @@ from pycrorm_async.operations.fold_worker import FoldWorkerState
 from pycrorm_async.operations.fold_workers import DaemonNote
 from pycrorm_async.projections.custom.discovery import installed_projections
 from pycrorm_async.projections.custom.projection_tables import ProjectionState, states
-from pycrorm_async.projections.schema.generations import PROJECTION_VERSION, SHOWN, read_generation
+from pycrorm_async.projections.schema.generations import PROJECTION, PROJECTION_VERSION, SHOWN, read_generation
 from pycrorm_async.projections.schema.unmade_types import failed_views, unmade_types
 from pycrorm_async.query.running_episodes import RunningEpisode, running_episodes
 from pycrorm_async.queue.files.spool import RecorderFolder, Spool
 from pycrorm_async.queue.maintenance.inspection import inspect_folder
+from pycrorm_async.recall.blocks import WORDS_MAX
+from pycrorm_async.recall.cases.case_projection import CaseProjection
+from pycrorm_async.recall.cases.stored_blocks import read_left_out
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 
@@ -273,13 +276,23 @@ async def _query(
             episode_states,
             await _running(log),
             projections,
-            await log.limits_near(),
+            [*await log.limits_near(), *await _left_out_of_recall(log)],
             await unmade_types(log),
             await failed_views(log),
             await durability(log),
         )
     finally:
         await log.close()
+
+
+async def _left_out_of_recall(log: EventLog) -> list[str]:
+    """Return a line for each feature that recall does not compare."""
+    async with log.snapshot() as connection:
+        generation = await read_generation(connection, f"{PROJECTION}{CaseProjection.name}")
+        if generation is None or generation.version != CaseProjection.version:
+            return []
+        features = await read_left_out(connection, generation.number)
+    return [f"recall does not compare {each}: it has more than {WORDS_MAX:,} different texts" for each in features]
 
 
 async def _running(log: EventLog) -> tuple[list[RunningEpisode], int]:

@@ -11,8 +11,10 @@ import pytest
 from pycrorm_async import Memory
 from pycrorm_async.cli.recall import _parse, recall
 from pycrorm_async.errors import CallerError
+from pycrorm_async.recall import blocks
+from pycrorm_async.world import Arms
 from tests.commands import answer, one_line_of, pycrorm
-from tests.recall.sliding_grips import FETCH, GRIP, record
+from tests.recall.sliding_grips import FETCH, GRIP, GripSlidingActionPerformable, record
 
 pytestmark = pytest.mark.slow
 
@@ -137,6 +139,20 @@ def test_a_wrong_cue_ends_with_the_code_of_usage(folder: Path) -> None:
     done = pycrorm("recall", GRIP, "amr=LEFT", cwd=folder)
     assert done.returncode == 2
     assert "did you mean arm?" in one_line_of(done)
+
+
+async def test_a_feature_with_too_many_texts_is_left_out_and_status_names_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(blocks, "WORDS_MAX", 3)
+    async with Memory.open(f"sqlite:///{tmp_path / 'pycrorm.db'}") as memory, memory.episode():
+        for number in range(5):
+            await GripSlidingActionPerformable(Arms.LEFT, 0.5, f"cup {number}").perform()
+    warnings = answer("status", cwd=tmp_path)["warnings"]
+    assert warnings == ["recall does not compare item: it has more than 16,384 different texts"]
+    done = pycrorm("recall", GRIP, "item=cup 1", cwd=tmp_path)
+    assert "item has more than 16,384 different values, so it is not compared" in one_line_of(done)
+    assert answer("recall", GRIP, "arm=LEFT", cwd=tmp_path)["considered"] == 5
 
 
 def test_a_memory_that_does_not_exist_is_named(tmp_path: Path) -> None:

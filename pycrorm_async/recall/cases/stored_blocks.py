@@ -41,6 +41,7 @@ __all__ = [
     "merge_blocks",
     "read_blocks",
     "read_headings",
+    "read_left_out",
     "rows_of",
 ]
 
@@ -134,6 +135,13 @@ async def read_blocks(connection: AsyncConnection, generation: int, numbers: Col
             raise _damaged(number, f"the bytes of its column {feature!r} were changed")
         rows_by_number.setdefault(number, []).append(row)
     return {number: _decoded(number, rows) for number, rows in rows_by_number.items()}
+
+
+async def read_left_out(connection: AsyncConnection, generation: int) -> list[str]:
+    """Read the features that a block has left out, because they have too many words to liken cases."""
+    columns = _columns(generation)
+    query = select(columns.c.feature).where(columns.c.kind == "left_out").distinct().order_by(columns.c.feature)
+    return list(await connection.scalars(query))
 
 
 async def merge_blocks(connection: AsyncConnection, generation: int) -> None:
