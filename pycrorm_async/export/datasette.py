@@ -15,7 +15,7 @@ from typing import Any
 from sqlalchemy import inspect as inspect_database
 
 from pycrorm_async.errors import CallerError
-from pycrorm_async.orm import Base
+from pycrorm_async.orm.documentation.descriptions import ViewDescription, described
 from pycrorm_async.query.asking.ask import QUESTIONS, Ask
 from pycrorm_async.query.reading import Reading
 
@@ -23,6 +23,11 @@ __all__ = ["datasette_metadata"]
 
 _INTERNAL = re.compile(r"zz_.*|.*__\d+|pycrorm_.*|sqlite_stat\d")
 """The tables of a generation, the bookkeeping of the log, and the statistics of SQLite's planner."""
+_LOG = {
+    "event": "The log: every event with its payload as JSON. All views can be made from it again.",
+    "episode": "How far each episode is stored (head) and visible in the views (folded).",
+}
+"""The tables that no class maps."""
 _FACETS = ("dtype", "kind", "status", "reason", "arm", "grasp", "obj_type", "robot", "relation", "source", "recovered")
 _FACETS_MAX = 4
 """Datasette counts the values of each facet at every visit."""
@@ -45,14 +50,14 @@ async def datasette_metadata(reading: Reading) -> dict[str, Any]:
         )
     async with log.reading() as connection:
         tables = await connection.run_sync(_columns_by_table)
-    described = {each.local_table.description: _first_sentence(each.class_) for each in Base.registry.mappers}
+    views = described()
     return {
         "title": "Episodic memory of robots",
         "description": "The views of a memory of pycrorm-async, and the questions of `pycrorm ask`." + _TIMES,
         "databases": {
             log.address.path.stem: {
                 "tables": {
-                    name: {"hidden": True} if _INTERNAL.fullmatch(name) else _table(columns, described.get(name))
+                    name: {"hidden": True} if _INTERNAL.fullmatch(name) else _table(name, columns, views.get(name))
                     for name, columns in tables.items()
                 },
                 "queries": {name: _query(reading, name) for name in QUESTIONS},
@@ -67,10 +72,11 @@ def _columns_by_table(connection: Any) -> dict[str, list[str]]:
     return {name: [each["name"] for each in inspector.get_columns(name)] for name in names}
 
 
-def _table(columns: list[str], description: str | None) -> dict[str, Any]:
-    table: dict[str, Any] = {}
-    if description is not None:
-        table["description"] = description
+def _table(name: str, columns: list[str], view: ViewDescription | None) -> dict[str, Any]:
+    table: dict[str, Any] = {"description": _LOG[name]} if name in _LOG else {}
+    if view is not None:
+        table["description"] = view.text
+        table["columns"] = {name: text for name, text in view.columns.items() if name in columns}
     newest = next((each for each in _NEWEST if each in columns), None)
     if newest is not None:
         table["sort_desc"] = newest

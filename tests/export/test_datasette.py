@@ -38,6 +38,9 @@ async def test_internal_tables_are_hidden_and_views_are_described_sorted_and_fac
     shown = {name for name, each in tables.items() if not each.get("hidden")}
     assert {name for name in shown if names[name] == "table"} == {"event", "episode"}
     assert {name for name in names if names[name] == "view"} <= shown
+    columns = tables["root_failure"].pop("columns")
+    assert columns["message"] == "its message"
+    assert columns["start_time"] == "µs since 1970-01-01 00:00 UTC"
     assert tables["root_failure"] == {
         "description": " ".join((RootFailure.__doc__ or "").partition("\n\n")[0].split()),
         "sort_desc": "id",
