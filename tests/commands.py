@@ -31,7 +31,7 @@ def environment() -> dict[str, str]:
 
 
 _VERBS = "ask copy demo diff episodes events export learn query rebuild run show spool status verify writer".split()
-_LOADED = [*(f"pycrorm_async.cli.{name}" for name in ("main", *_VERBS)), "tests.preloaded"]
+_LOADED = [*(f"pycrorm_async.cli.{name}" for name in ("main", *_VERBS)), "tests.commands", "tests.preloaded"]
 _starting = threading.Lock()
 FORKED: Final = multiprocessing.get_context("forkserver")
 """Makes processes by forking one that has loaded the program. A test process has one such server, see `fork`."""
