@@ -7,6 +7,8 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from typing import Any
 
+import msgspec
+
 from pycrorm_async.events.types import (
     EpisodeEnded,
     EpisodeStarted,
@@ -22,7 +24,7 @@ from pycrorm_async.events.types import (
     ObjectRemoved,
 )
 from pycrorm_async.events.values import FailureValue, ObjectReference, PoseValue, RobotValue, SeenValue
-from tests.projections.event_script import MOVE, NAVIGATE, PICK_UP, SAYING, Script, declarations, name_of, pose
+from tests.projections.event_script import MOVE, NAVIGATE, PICK_UP, SAYING, T0_NS, Script, declarations, name_of, pose
 
 TYPES = declarations(NAVIGATE, PICK_UP, SAYING, MOVE)
 DTYPES = {name_of(each): each.dtype for each in (NAVIGATE, PICK_UP, SAYING, MOVE)}
@@ -61,7 +63,8 @@ class RandomEpisode(Script):
         return super().put(event, version=version)
 
     def _place(self) -> PoseValue:
-        return pose(self._dice.choice([0.0, 0.5, 2.0]), self._dice.choice([0.0, 1.0]), 0.9)
+        place = pose(self._dice.choice([0.0, 0.5, 2.0]), self._dice.choice([0.0, 1.0]), 0.9)
+        return msgspec.structs.replace(place, time_ns=T0_NS + self.number)
 
     def _children(self, parent: int, count: int, *, depth: int, open_: bool) -> bool:
         """Put this many nodes; return whether one of them failed."""
