@@ -69,6 +69,13 @@ def frame_of(statement: Any) -> Question:
     return read
 
 
+def answer_of(name: str, *arguments: Any) -> Question:
+    async def read(reading: Reading) -> None:
+        await getattr(reading.ask, name)(*arguments).rows()
+
+    return read
+
+
 async def what_went_well(reading: Reading) -> None:
     assert await PickUpExperience.of(reading).successes(ObjectType.MILK, arm=None)
 
@@ -118,11 +125,24 @@ async def rows_read(log: EventLog, statements: list[tuple[str, Any]]) -> dict[st
         pytest.param(rows_of(select(SpatialRelation)), id="spatial relations"),
         pytest.param(rows_of(select(Pose).join(PickUpAction.object).join(Object.pose)), id="a join"),
         pytest.param(the_tree, id="the task tree"),
+        pytest.param(answer_of("root_failures"), id="root_failures"),
+        pytest.param(answer_of("moves_of", "milk"), id="moves_of"),
+        pytest.param(answer_of("experience_at", 0.5, 0.5), id="experience_at"),
         pytest.param(rows_of(select(PickUpAction)), id="actions as objects"),
         pytest.param(rows_of(select(TaskTreeNode)), id="nodes as objects"),
     ],
 )
 async def test_no_query_reads_an_episode_once_for_each_row(rollouts: str, question: Question) -> None:
+    await assert_few_rows_read(rollouts, question)
+
+
+@pytest.mark.parametrize("rollouts", ["with statistics"], indirect=True)
+@pytest.mark.parametrize("question", [answer_of("steps_before_failures"), answer_of("object_history", "milk")])
+async def test_a_question_about_each_failure_reads_no_episode_for_it(rollouts: str, question: Question) -> None:
+    await assert_few_rows_read(rollouts, question)
+
+
+async def assert_few_rows_read(rollouts: str, question: Question) -> None:
     statements: list[tuple[str, Any]] = []
 
     def note(_connection: Any, _cursor: Any, text: str, parameters: Any, _context: Any, _many: bool) -> None:

@@ -124,7 +124,7 @@ def steps_before_failures(
             step.id.label("node_id"),
         )
         .join(step, step.id.in_(latest))
-        .where(step.process_metadata_id == failure.process_metadata_id, *matching(episode, **search))
+        .where(*matching(episode, **search))
         .order_by(failure.id, step.id.desc())
     )
     return limited(statement, limit)
