@@ -63,6 +63,7 @@ RUNS = (
     Run("size"),
     Run("questions"),
     Run("questions, large", ("--pick-ups", "500000"), quick=False),
+    Run("objects"),
     Run("rebuild", ("--workers", "1", "2")),
     Run("rebuild postgresql", ("--postgresql", "--workers", "1", "2")),
     Run("rebuild, large", ("--no-company", "--events", "100000", "10000000"), quick=False),

@@ -283,6 +283,13 @@ class Dialect(Protocol):
         """Replace views, by name and SQL, without affecting running queries. A view may use earlier ones of `after`."""
         ...
 
+    async def comment_views(self, connection: AsyncConnection, comments: Mapping[str, Mapping[str, str]]) -> None:
+        """Describe views and columns in the database, if it keeps comments: texts by column, the view's own by ``.
+
+        Views and columns that do not exist are skipped.
+        """
+        ...
+
     async def sweep(self, connection: AsyncConnection) -> None:
         """Drop replaced views that no query reads and no other view uses. Does not wait for locks."""
         ...

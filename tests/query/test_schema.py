@@ -11,12 +11,13 @@ import pytest
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.orm.base import Base
-from pycrorm_async.orm.documentation.descriptions import described
+from pycrorm_async.orm.documentation.descriptions import comments, described
 from pycrorm_async.orm.types import Moment
+from pycrorm_async.projections.schema.views.comments import comments as stored_comments
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.schema.memory_schema import CORE_VIEWS, as_mermaid, as_text, read_schema
 from tests.commands import pycrorm
-from tests.databases import run_in_own_loop
+from tests.databases import Server, ask, run_in_own_loop
 from tests.projections.event_script import NAVIGATE, PICK_UP, SAYING, declarations
 from tests.projections.factories import append_and_fold
 from tests.query.test_reading import episode
@@ -88,3 +89,33 @@ def test_the_command_prints_text_json_and_a_diagram(url: str, tmp_path: Path) ->
     assert "    object }o--|| pose : pose_id\n" in diagram
     wrong = pycrorm("schema", "posse", "--url", url, cwd=tmp_path)
     assert (wrong.returncode, wrong.stderr) == (2, "pycrorm: this memory has no view 'posse'; did you mean pose?\n")
+
+
+def test_the_stored_comments_are_those_of_the_docstrings() -> None:
+    assert stored_comments() == comments(), "run python -m pycrorm_async.orm.documentation"
+
+
+def commented(url: str) -> dict[tuple[str, str], str]:
+    """Return the comments in the database by view and column."""
+    rows = ask(
+        url,
+        "SELECT relname, coalesce(attname, ''), description FROM pg_description JOIN pg_class ON pg_class.oid = objoid"
+        " LEFT JOIN pg_attribute ON attrelid = objoid AND attnum = objsubid AND attnum > 0"
+        " WHERE classoid = 'pg_class'::regclass AND relnamespace = 'memory'::regnamespace",
+    )
+    return {(view, column): text for view, column, text in rows}
+
+
+def test_postgresql_keeps_the_texts_as_comments_also_after_new_types_and_a_rebuild(
+    server: Server, tmp_path: Path
+) -> None:
+    url = server.new_database()
+    run_in_own_loop(append_and_fold(url, [*declarations(NAVIGATE, PICK_UP), *episode(1).records[:3]]))
+    first = commented(url)
+    assert first["pose", "time"] == "µs since 1970-01-01 00:00 UTC"
+    assert first["task_tree_node", ""] == "One perform, from its start to its end."
+    assert len(first) > 400
+    run_in_own_loop(append_and_fold(url, [*declarations(SAYING), *episode(2).records]))
+    assert commented(url) == first
+    assert pycrorm("rebuild", "--url", url, cwd=tmp_path).returncode == 0
+    assert commented(url) == first

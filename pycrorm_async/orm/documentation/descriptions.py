@@ -9,9 +9,10 @@ from __future__ import annotations
 import ast
 import inspect
 import re
-import textwrap
+import sys
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cache
 from itertools import pairwise
 from typing import Any
 
@@ -21,7 +22,7 @@ from pycrorm_async.orm.base import EPISODE, Base
 from pycrorm_async.orm.designators import Action, Designator, Language, Motion
 from pycrorm_async.orm.types import JsonText, Moment
 
-__all__ = ["ViewDescription", "described", "describe"]
+__all__ = ["ViewDescription", "comments", "describe", "described"]
 
 _TIME = "µs since 1970-01-01 00:00 UTC"
 _ENTRY = re.compile(r"^    (\w+(?:, \w+)*): (.*)$")
@@ -62,6 +63,7 @@ class ViewDescription:
         mapped: name of the mapped class.
         text: one sentence.
         columns: text by column; a column without one is left out.
+        built_in: whether every memory has the view.
         references: the column that a column refers to, such as `pose.id`, by column.
     """
 
@@ -70,6 +72,7 @@ class ViewDescription:
     text: str
     columns: dict[str, str]
     references: dict[str, str]
+    built_in: bool
 
 
 def described() -> dict[str, ViewDescription]:
@@ -104,7 +107,8 @@ def describe(class_: Any) -> ViewDescription:
     if class_ in _COURSES:
         columns = describe(Designator).columns | columns
     references = {str(column.name): key.target_fullname for column in table.columns for key in column.foreign_keys}
-    return ViewDescription(table.name, class_.__name__, _sentence(class_.__doc__), columns, references)
+    built_in = class_.__module__.startswith("pycrorm_async.orm.")
+    return ViewDescription(table.name, class_.__name__, _sentence(class_.__doc__), columns, references, built_in)
 
 
 def _unmapped(view: str) -> Iterable[str]:
@@ -130,6 +134,16 @@ def _sentence(doc: str | None) -> str:
     return " ".join(first.split())
 
 
+@cache
+def _classes_in(module: str) -> dict[str, list[ast.stmt]]:
+    """Return the statements of each class of a module; none for one without a file, such as a notebook."""
+    try:
+        source = inspect.getsource(sys.modules[module])
+    except (OSError, TypeError, KeyError):
+        return {}
+    return {each.name: each.body for each in ast.parse(source).body if isinstance(each, ast.ClassDef)}
+
+
 def _documented(class_: type) -> dict[str, str]:
     """Return the texts of a class's attributes, by name."""
     texts: dict[str, str] = {}
@@ -143,13 +157,14 @@ def _documented(class_: type) -> dict[str, str]:
             texts |= {name: f"{texts[name]} {line.strip()}" for name in names}
         elif line.strip():
             break
-    try:
-        body = ast.parse(textwrap.dedent(inspect.getsource(class_))).body[0]
-    except (OSError, TypeError):  # a class without a source file, such as one defined in a notebook
-        return texts
-    statements = body.body if isinstance(body, ast.ClassDef) else []
-    for assigned, text in pairwise(statements):
+    for assigned, text in pairwise(_classes_in(class_.__module__).get(class_.__name__, ())):
         match assigned, text:
             case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(words))):
                 texts[name] = _sentence(words)
     return texts
+
+
+def comments() -> dict[str, dict[str, str]]:
+    """Return the texts of the built-in views and their columns; the view's own text has the empty name."""
+    views = (each for each in described().values() if each.built_in)
+    return {each.name: {"": each.text, **each.columns} for each in views}

@@ -41,6 +41,7 @@ from pycrorm_async.projections.schema.materialised_views import make_materialise
 from pycrorm_async.projections.schema.public_views import Tables, ViewDefinition, projection_views, public_views
 from pycrorm_async.projections.schema.tables import columns_in_order, indexed, leaf_columns, make_table
 from pycrorm_async.projections.schema.user_views import view_text
+from pycrorm_async.projections.schema.views.comments import comments
 from pycrorm_async.projections.table_names import index_name, physical_name
 from pycrorm_async.store.dialects import dialect_of
 
@@ -230,6 +231,8 @@ async def show(connection: AsyncConnection, generation: Generation) -> Generatio
     projections = projections_in(await read_generations(connection))
     views = view_texts_of(connection, generation, projections)
     failed = await _replace_views(connection, before.views if before else {}, views, generation, projections)
+    if before is None or before.views != views:
+        await dialect_of(connection).comment_views(connection, comments())
     layout = generation.layout.with_failed_views(generation.layout.failed_views | failed)
     shown = replace(generation, layout=layout, views={name: each for name, each in views.items() if name not in failed})
     await write_generation(connection, SHOWN, shown)

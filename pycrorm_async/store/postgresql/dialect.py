@@ -279,6 +279,10 @@ class PostgreSQL:
         creations = [f"CREATE VIEW {quote(name)} AS {text}" for name, text in after.items()]
         await self.execute_all(connection, [*tables.NEW_VIEWS_SCHEMA, *creations, *tables.SHOW_NEW_VIEWS_SCHEMA])
 
+    async def comment_views(self, connection: AsyncConnection, comments: Mapping[str, Mapping[str, str]]) -> None:
+        columns = (await connection.exec_driver_sql(tables.COLUMNS_OF_VIEWS)).all()
+        await self.execute_all(connection, tables.comment_statements(map(tuple, columns), comments))
+
     async def sweep(self, connection: AsyncConnection) -> None:
         for schema, views in await _rows(_ReplacedSchema, connection, tables.GONE_SCHEMAS):
             try:

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import groupby
+from operator import itemgetter
+
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX
 from pycrorm_async.store.postgresql.search_path import LOG_SCHEMA as LOG
 from pycrorm_async.store.postgresql.search_path import PATH, STRANGER
@@ -30,6 +34,8 @@ __all__ = [
     "NEW_VIEWS_SCHEMA",
     "SHOW_NEW_VIEWS_SCHEMA",
     "GONE_SCHEMAS",
+    "COLUMNS_OF_VIEWS",
+    "comment_statements",
     "SYSTEM_COLUMNS",
 ]
 
@@ -220,3 +226,25 @@ SELECT pg_catalog.to_regclass(pg_catalog.format('{TABLES}.%I', $1::text)) IS NOT
 READ_LOG = f"SELECT id, format FROM {LOG}.pycrorm_log"  # noqa: S608
 INSERT_LOG = f"INSERT INTO {LOG}.pycrorm_log (one, id, format, created_wall_ns) VALUES (1, $1, $2, $3)"  # noqa: S608
 SET_FORMAT = f"UPDATE {LOG}.pycrorm_log SET format = $1"  # noqa: S608
+
+
+COLUMNS_OF_VIEWS = f"""
+SELECT relname, attname FROM pg_catalog.pg_class JOIN pg_catalog.pg_attribute ON attrelid = pg_class.oid
+WHERE relnamespace = '{VIEWS}'::regnamespace AND relkind = 'v' AND attnum > 0 ORDER BY relname, attnum"""  # noqa: S608
+
+
+def comment_statements(columns: Iterable[Sequence[str]], comments: Mapping[str, Mapping[str, str]]) -> list[str]:
+    """Return the statements that describe these columns of views, and the views themselves."""
+    statements = []
+    for view, named in groupby(columns, key=itemgetter(0)):
+        texts = comments.get(view, {})
+        place = f'{VIEWS}."{view}"'
+        statements += [f"COMMENT ON VIEW {place} IS {_literal(texts[''])}"] if "" in texts else []
+        statements += [
+            f'COMMENT ON COLUMN {place}."{name}" IS {_literal(texts[name])}' for _, name in named if name in texts
+        ]
+    return statements
+
+
+def _literal(text: str) -> str:
+    return "'" + text.replace("'", "''") + "'"

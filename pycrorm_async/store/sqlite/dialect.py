@@ -237,6 +237,9 @@ class SQLite:
             connection, [*drops, *(f"CREATE VIEW {_quote(name)} AS {text}" for name, text in changed)]
         )
 
+    async def comment_views(self, connection: AsyncConnection, comments: Mapping[str, Mapping[str, str]]) -> None:
+        """Do nothing: SQLite keeps no comments."""
+
     async def sweep(self, connection: AsyncConnection) -> None:
         """Do nothing: replaced views are dropped at once; readers have a snapshot."""
 
