@@ -160,6 +160,26 @@ def _size(lines: Lines) -> Verdict:
 _SIZES_MAX = {"sqlite": 800, "postgresql": 1_150}
 
 
+def _recall_common(lines: Lines) -> Verdict:
+    line = _recalled(lines)
+    common, soar = line["recall_ms"]["common"]["median"], line["soar"]
+    beside = soar["recall_ms"]["common"]["median"] if isinstance(soar, dict) else None
+    text = f"{common:g} ms" if beside is None else f"{common:g} ms, Soar {beside:g} ms"
+    return Verdict(text, common <= 0.2 and (beside is None or common <= beside))
+
+
+def _recall_kinds(lines: Lines) -> Verdict:
+    line = _recalled(lines)
+    slowest = max(line["recall_ms"], key=lambda kind: line["recall_ms"][kind]["p99"])
+    p99, size = line["recall_ms"][slowest]["p99"], line["bytes_an_action"]
+    return Verdict(f"{p99:g} ms ({slowest}), {size:g} bytes an action", p99 <= 10 and size <= 80)
+
+
+def _recalled(lines: Lines) -> Mapping[str, Any]:
+    largest: Mapping[str, Any] = lines["recall"]["1,000,000"]
+    return largest
+
+
 BUDGETS = (
     Budget("one hook, mean of start and end", "median ≤ 5 µs, p99 ≤ 50 µs", _hook),
     Budget("the fastest headless rollout with memory against without", "≤ 5 % slower", _plan),
@@ -174,4 +194,6 @@ BUDGETS = (
     Budget("memory of a recording process", "flat (system of the thesis: 32 kB a node)", _recording),
     Budget("disk a node, log and tables", "≤ 800 bytes SQLite, ≤ 1,150 bytes PostgreSQL", _size),
     Budget("the thesis' learning query over 50,000 pick-ups → DataFrame", "≤ 100 ms", _learning),
+    Budget("recall of a common cue among 1,000,000 actions, beside Soar", "median ≤ 0.2 ms, ≤ Soar's", _recall_common),
+    Budget("recall by every kind of cue among 1,000,000 actions", "p99 ≤ 10 ms, ≤ 80 bytes an action", _recall_kinds),
 )

