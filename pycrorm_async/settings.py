@@ -34,6 +34,7 @@ _CHOICES = {
     "record_meshes": get_args(RecordMeshes),
     "file_access": get_args(FileAccess),
     "fold": get_args(Fold),
+    "recall": (True, False),
 }
 
 
@@ -68,6 +69,8 @@ class Settings:
         idle_ms: a plan that has emitted no event for this long counts as idle, and its events are folded.
         fold: the writer thread folds when the plan idles ("idle"), or only at a flush and at the end of the memory
             ("at_end"): for an executive that sleeps often, because the fold competes with it for the interpreter.
+        recall: make a case of each action that ends, for `memory.recall`, when the tables are folded. Without it, cases
+            are made by the next process that has it, or by `pycrorm rebuild`.
         flush_timeout_s: `flush` and closing fail when the database has stored no event for this long; none is lost.
         connect_timeout_s: the first connection to a database may take this long.
         sample_interval_ms: the robot's state is sampled at this interval while a motion runs, and also at the motion's
@@ -103,6 +106,7 @@ class Settings:
     fold_worker_answer_s: float = 300.0
     idle_ms: int = 200
     fold: Fold = "idle"
+    recall: bool = True
     flush_timeout_s: float = 15.0
     connect_timeout_s: float = 10.0
     sample_interval_ms: int | None = None

@@ -48,6 +48,9 @@ def writer(
     spool: SpoolOption = None,
     projection: ProjectionOption = None,
     file_access: FileAccessOption = "owner",
+    recall: Annotated[
+        bool, typer.Option("--recall/--no-recall", help="Make the cases that `pycrorm recall` compares.")
+    ] = True,
     as_json: JsonOption = False,
 ) -> int:
     """Drain a spool continuously: append its events to the database and fold them into the tables.
@@ -60,7 +63,7 @@ def writer(
     episode, now or earlier, or they do not fit the tables; 3 if a recorder's folder cannot be read or written; 4 if
     files are damaged. Refused events are kept in the spool, in the folder that the message names.
     """
-    projections, settings = load_projections(projection or ()), Settings(file_access=file_access)
+    projections, settings = load_projections(projection or ()), Settings(file_access=file_access, recall=recall)
     collect_seldom()
     if once:
         return store_once(url, spool, projections, settings, as_json=as_json)

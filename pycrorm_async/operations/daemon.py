@@ -84,7 +84,7 @@ async def serve(
         report(f"draining {place.path} into {address}")
         stored = StoredSegments(place.path, settings, wall_ns=SYSTEM_CLOCK.wall_ns)
         folders = _Folders(place, destination.log_id, address, stored)
-        assignment = Assignment(url, destination.log_id, projections)
+        assignment = Assignment(url, destination.log_id, projections, recall=settings.recall)
         workers = await stack.enter_async_context(
             FoldWorkers(fold_workers, assignment, settings=settings, say=report, note=note, forked=forked)
         )

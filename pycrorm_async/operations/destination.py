@@ -149,7 +149,8 @@ async def open_destination(
     try:
         spool.bind(log.log_id)
         log.blobs.source = _SpoolBlobs(spool.path)
-        projector = Projector(log, views=views, projections=projections, installed=installed_projections(projections))
+        installed = installed_projections(projections, own=settings is None or settings.recall)
+        projector = Projector(log, views=views, projections=projections, installed=installed)
         healed: HealedLog | None = None
         if settings is not None and settings.keep_stored_s and settings.keep_stored_bytes:
             folder = stored_in(spool.path, log.log_id)

@@ -37,12 +37,14 @@ READY: Final = "ready"
 
 
 class Assignment(NamedTuple):
-    """The database to fold, the id of its log, the custom projections to fold, and the wait for SQLite's lock."""
+    """The database to fold, the id of its log, the custom projections to fold, the wait for SQLite's lock, and whether
+    to make cases."""
 
     url: str
     log_id: str
     projections: Sequence[Projection] = ()
     busy_timeout_s: float = BUSY_TIMEOUT_S
+    recall: bool = True
 
 
 class Prepare(NamedTuple):
@@ -129,7 +131,8 @@ class _RequestHandler:
         """Open the tables at the first request, and again after a failure."""
         if self._projector is None:
             projections = self._assignment.projections
-            projector = Projector(log, projections=projections, installed=installed_projections(projections))
+            installed = installed_projections(projections, own=self._assignment.recall)
+            projector = Projector(log, projections=projections, installed=installed)
             await projector.open()
             self._projector = projector
         return self._projector

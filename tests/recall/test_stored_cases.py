@@ -15,6 +15,7 @@ from random import Random
 import pytest
 
 from pycrorm_async.errors import DamageError
+from pycrorm_async.memory import Memory
 from pycrorm_async.operations.copy import copy_episodes
 from pycrorm_async.operations.rebuild import rebuild_memory, rebuild_projection
 from pycrorm_async.projections.custom.discovery import own_projections
@@ -27,9 +28,11 @@ from pycrorm_async.projections.verify.verify import VerifyResult, verify
 from pycrorm_async.recall.case import Case
 from pycrorm_async.recall.cases import stored_blocks
 from pycrorm_async.recall.cases.stored_blocks import BlockHeading, read_blocks, read_headings
+from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.golden.unpacking import unpack_memory_v1
+from tests.memory.note_actions import NoteActionPerformable
 from tests.projections.event_script import mixed
 from tests.projections.sql_queries import ask
 from tests.recall.case_script import TYPES, CaseScript, cases_of, in_order, random_script
@@ -147,6 +150,19 @@ async def test_a_memory_of_an_earlier_version_has_its_cases_after_a_rebuild_and_
         assert [each._replace(node=0, parent=None) for each in (await stored(log))[1]] == [
             each._replace(node=0, parent=None) for each in before
         ]
+
+
+async def test_a_memory_that_makes_no_cases_leaves_them_to_the_next(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path}/memory.db"
+    async with Memory.open(url, settings=Settings(recall=False)) as memory:
+        await NoteActionPerformable("one").perform()
+    async with opened(url) as log:
+        assert await states(log, own_projections()) == []
+    async with Memory.open(url) as memory:
+        await NoteActionPerformable("two").perform()
+        await memory.flush()
+        async with opened(url) as log:
+            assert [each.symbols["text"] for each in (await stored(log))[1]] == ["one", "two"]
 
 
 @pytest.mark.soak

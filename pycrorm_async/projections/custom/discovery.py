@@ -74,14 +74,15 @@ def _instance(kind: Any, reference: str) -> Projection:
     return projection
 
 
-def installed_projections(projections: Sequence[Projection]) -> tuple[Projection, ...]:
-    """Return the installed projections whose names these do not have, and those of this package. A faulty one is
-    logged and left out.
+def installed_projections(projections: Sequence[Projection], *, own: bool = True) -> tuple[Projection, ...]:
+    """Return the installed projections whose names these do not have, with those of this package if `own` is true.
+
+    A faulty one is logged and left out.
 
     What is installed while the process runs is not found, as a new version of a loaded module is not.
     """
     names = {each.name for each in projections}
-    installed = [each for each in own_projections() if each.name not in names]
+    installed = [each for each in own_projections() if own and each.name not in names]
     names.update(each.name for each in installed)
     for entry in _entries():
         try:
