@@ -8,7 +8,7 @@ from typing import Any
 
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
-from pycrorm_async.events.types import EVENT_TYPES, DesignatorTypeDeclared, NodeStarted
+from pycrorm_async.events.types import DesignatorTypeDeclared, NodeStarted
 from pycrorm_async.projections.custom.episode_folds import BatchOfFolds, EpisodeFolds
 from pycrorm_async.projections.custom.projection import (
     Changes,
@@ -43,7 +43,7 @@ class ProjectedBatch(ABC):
         self._projection = projection
         self._declared = declared
         reads = projection.reads
-        self._left_out = frozenset() if reads is None else EVENT_TYPES.keys() - {each.__name__ for each in reads}
+        self._reads = None if reads is None else frozenset(each.__name__ for each in reads)
         self._folds: BatchOfFolds | None = None
         if isinstance(projection, EpisodeProjection):
             self._folds = BatchOfFolds(EpisodeFolds(projection) if folds is None else folds, self._event)
@@ -87,7 +87,7 @@ class ProjectedBatch(ABC):
         """Write all rows in the caller's transaction. Raises `RowRefused`."""
 
     def _event(self, stored: StoredEvent) -> Event | None:
-        if stored.type in self._left_out:
+        if self._reads is not None and stored.type not in self._reads:
             return None
         happening = happening_of(stored)
         declaration: DesignatorTypeDeclared | None = None
