@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import json
 from pathlib import Path
@@ -16,6 +17,7 @@ from pyarrow import parquet
 from pycrorm_async import Reading
 from pycrorm_async.errors import CallerError
 from pycrorm_async.export.export import export, export_again
+from pycrorm_async.export.files import new_folder
 
 SCHEMA = json.loads(Path(__file__).with_name("lerobot_v3.json").read_text())
 
@@ -136,6 +138,20 @@ async def test_a_data_set_is_replaced_only_when_asked_and_only_by_its_kind(datas
     with pytest.raises(CallerError, match="is not such a data set"):
         await export(reading, 1, other, file_format="lerobot", force=True)
     assert (other / "mine").exists()
+
+
+def test_a_folder_that_cannot_be_completed_leaves_the_one_before(tmp_path: Path) -> None:
+    target = tmp_path / "set"
+    for before in ([], ["set", "mine"]):
+        with pytest.raises(OSError, match="No space left"), new_folder(target, force=True, marker="mine") as written:
+            (written / "part").touch()
+            raise OSError(errno.ENOSPC, "No space left on device")
+        assert [each.name for each in tmp_path.rglob("*")] == before
+        target.mkdir(exist_ok=True)
+        (target / "mine").touch()
+    with new_folder(target, force=True, marker="mine") as written:
+        (written / "new").touch()
+    assert [each.name for each in tmp_path.rglob("*")] == ["set", "new"]
 
 
 @pytest.mark.parametrize(
