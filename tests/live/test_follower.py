@@ -154,19 +154,24 @@ async def test_a_browser_that_leaves_is_no_listener_any_more(tmp_path: Path) -> 
         with listen(0) as listener:
             port = listener.getsockname()[1]
             serving = asyncio.create_task(LiveServer(follower, "t").serve(listener, stop=stop, ready=ready.set))
-            await ready.wait()
-            reader, writer = await asyncio.open_connection("127.0.0.1", port)
-            writer.write(b"GET /t/episode/1/events?after=1 HTTP/1.1\r\nHost: localhost\r\nLast-Event-ID: 2\r\n\r\n")
-            assert b"id: 4\nevent: part\ndata: " in await reader.readuntil(b'"format":1,"after":2,')
-            [feed] = follower._feeds.values()
-            assert feed.listeners == 1
-            writer.close()
-            await until(lambda: not feed.listeners)
-            _, other = await asyncio.open_connection("127.0.0.1", port)
-            other.write(b"GET /t/events HTTP/1.1\r\nHost: localhost\r\n\r\n")
-            await until(lambda: bool(follower.overview.listeners))
-            stop.set()  # also with a stream open
-            async with asyncio.timeout(10):
-                await serving
+            try:
+                async with asyncio.timeout(30):
+                    await ready.wait()
+                    reader, writer = await asyncio.open_connection("127.0.0.1", port)
+                    writer.write(
+                        b"GET /t/episode/1/events?after=1 HTTP/1.1\r\nHost: localhost\r\nLast-Event-ID: 2\r\n\r\n"
+                    )
+                    assert b"id: 4\nevent: part\ndata: " in await reader.readuntil(b'"format":1,"after":2,')
+                    [feed] = follower._feeds.values()
+                    assert feed.listeners == 1
+                    writer.close()
+                    await until(lambda: not feed.listeners)
+                    _, other = await asyncio.open_connection("127.0.0.1", port)
+                    other.write(b"GET /t/events HTTP/1.1\r\nHost: localhost\r\n\r\n")
+                    await until(lambda: bool(follower.overview.listeners))
+            finally:
+                stop.set()  # also with a stream open
+                async with asyncio.timeout(20):
+                    await serving
             other.close()
         robot.end("one")
