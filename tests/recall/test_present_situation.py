@@ -8,7 +8,7 @@ import pytest
 
 from pycrorm_async import Memory
 from pycrorm_async.errors import CallerError
-from pycrorm_async.plan import ActionAbstract, PlanFailure, simulated_robot
+from pycrorm_async.plan import ActionAbstract, PickUpAction, PlanFailure, simulated_robot
 from pycrorm_async.plan.object_designators import ObjectDesignator, ObjectDesignatorDescription
 from pycrorm_async.recall.reading.present_situation import present_situation
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
@@ -54,6 +54,12 @@ async def test_the_present_has_the_features_of_the_case_that_starts_now() -> Non
                 assert numbers == pytest.approx(dict(found.numbers), abs=1e-6)
                 assert {"stand_x", "stand_yaw", "object_z", "torso"} <= numbers.keys()
 
+                assert (
+                    present_situation(milk, PickUpAction)
+                    == present_situation(milk, "PickUpAction")
+                    == (symbols, numbers)
+                )
+
                 milk.set_pose(Pose([2.0, 0.5, 0.9]))
                 await inspect(milk)
                 await inspect(milk)
@@ -68,4 +74,4 @@ async def test_the_present_has_the_features_of_the_case_that_starts_now() -> Non
             with pytest.raises(CallerError, match="is no object in a world"):
                 await memory.recall.similar_to_now(milk, InspectActionPerformable)
             with pytest.raises(CallerError, match="is no class of designators"):
-                await memory.recall.similar_to_now(robot, int)  # type: ignore[arg-type]
+                await memory.recall.similar_to_now(robot, int)

@@ -79,6 +79,11 @@ async def test_a_changed_byte_is_an_error_that_names_the_block(tmp_path: Path) -
         plain.commit()
     with pytest.raises(DamageError, match="'arm' were changed"):
         await answers(url)
+    with contextlib.closing(sqlite3.connect(tmp_path / "memory.db")) as plain:
+        plain.execute(f"UPDATE {name} SET data = 'LEFT' WHERE feature = 'arm'")
+        plain.commit()
+    with pytest.raises(DamageError, match="'arm' is a text"):
+        await answers(url)
 
 
 def test_a_memory_without_asyncio_recalls_too(tmp_path: Path) -> None:

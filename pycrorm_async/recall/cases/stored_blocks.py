@@ -130,6 +130,8 @@ async def read_blocks(connection: AsyncConnection, generation: int, numbers: Col
     for number, feature, kind, words, data, checksum in await connection.execute(
         select(*fields).where(columns.c.id.in_(wanted))
     ):
+        if isinstance(data, str):  # SQLite keeps a value of any type in a column
+            raise _damaged(number, f"its column {feature!r} is a text")
         row = BlockRow(feature, kind, words, bytes(data))
         if _checksum(row) != checksum:
             raise _damaged(number, f"the bytes of its column {feature!r} were changed")

@@ -6,12 +6,14 @@ from collections.abc import Mapping
 from typing import Any
 
 from pycrorm_async.errors import CallerError
+from pycrorm_async.events.types import DesignatorTypeDeclared
 from pycrorm_async.events.values import ObjectReference, RobotValue
-from pycrorm_async.hooks.declaration import declared_type
+from pycrorm_async.hooks.declaration import built_in_declaration, declared_type
 from pycrorm_async.plan.designator import Designator
 from pycrorm_async.plan.object_designators import ObjectDesignator
 from pycrorm_async.projections.fold.world_fold import WorldFold, WorldObject
 from pycrorm_async.recall.cases.situation import FeatureFields, Numbers, Symbols, situation
+from pycrorm_async.recall.reading.cue_arguments import dtype_of
 from pycrorm_async.recording.values.value_snapshot import pose_value
 from pycrorm_async.world.bullet import BulletWorld
 from pycrorm_async.world.objects import Object
@@ -20,22 +22,31 @@ from pycrorm_async.world.robots.acting_robot import acting_robot
 __all__ = ["present_situation"]
 
 
-def present_situation(target: Object | ObjectDesignator, action: type[Designator]) -> tuple[Symbols, Numbers]:
+def present_situation(target: Object | ObjectDesignator, action: str | type) -> tuple[Symbols, Numbers]:
     """Return the features of an action that would start now, without those of parameters other than the object.
 
-    Raises `CallerError` for an object that is in no world, and for a class that is no designator.
+    `action` is a designator class, or a built-in type by its description or its dtype.
+
+    Raises `CallerError` for an object that is in no world, and for another class.
     """
     body = target.world_object if isinstance(target, ObjectDesignator) else target
     if not isinstance(body, Object) or body not in body.world.objects:
         raise CallerError(f"{target!r} is no object in a world, so nothing can be compared with its situation")
-    if not issubclass(action, Designator):
-        raise CallerError(f"{action!r} is no class of designators, as PickUpAction is")
-    fields = FeatureFields.of(declared_type(action, strict=False).declaration)
+    fields = FeatureFields.of(_declaration(action))
     sequences = {each: number for number, each in enumerate(body.world.objects, 1)}
     parameters: dict[str, Any] = {}
     if fields.objects:
         parameters[fields.objects[0]] = {"object": sequences[body], "row": sequences[body]}
     return situation(fields, parameters, _robot(body.world, sequences), _world(body.world, sequences))
+
+
+def _declaration(action: str | type) -> DesignatorTypeDeclared:
+    if isinstance(action, type) and issubclass(action, Designator):
+        return declared_type(action, strict=False).declaration
+    declaration = built_in_declaration(dtype_of(action) or "")
+    if declaration is None:
+        raise CallerError(f"{action!r} is no class of designators, as PickUpAction is")
+    return declaration
 
 
 def _robot(world: BulletWorld, sequences: Mapping[Object, int]) -> RobotValue | None:

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
 from pycrorm_async.errors import CallerError, MissingExtra
-from pycrorm_async.plan.designator import Designator
 from pycrorm_async.plan.object_designators import ObjectDesignator
 from pycrorm_async.query.as_of import AnyEpisode
 from pycrorm_async.query.reading import Reading
@@ -142,7 +141,7 @@ class Recall:
     async def similar_to_now(
         self,
         target: Object | ObjectDesignator,
-        action: type[Designator],
+        action: str | type,
         *,
         has: Mapping[str, Any] = _NOTHING,
         near: Mapping[str, Any] = _NOTHING,
@@ -155,7 +154,7 @@ class Recall:
 
         Args:
             target: an object in a world, or its designator.
-            action: a designator class.
+            action: a designator class, or a built-in type as `PickUpAction`, also by its name.
             has, near: further features, and others than the present ones, as the arm that is to be used.
             conditions: those of the call, as `only` and `episode`.
         """
