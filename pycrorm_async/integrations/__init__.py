@@ -1,1 +1,1 @@
-"""Integrations record what other executives perform, through the package `recording`."""
+"""Integrations record what other executives perform, through the package `recording`, and answer agents."""
