@@ -298,7 +298,8 @@ class Answer(Sequence[RecalledCase]):
         header, rows = self.table()
         head = "".join(f"<th>{name}</th>" for name in header)
         body = "".join(f"<tr>{''.join(f'<td>{_cell(value)}</td>' for value in row)}</tr>" for row in rows)
-        return f"<p>{escape(self.why())}</p><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+        facts = "<br>".join(map(escape, self.why().splitlines()))
+        return f"<p>{facts}</p><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
 
 
 def answer(cue: Cue, library: CaseLibrary, memory: Surroundings | None = None) -> Answer:
