@@ -12,9 +12,9 @@ from typing import Any
 import pytest
 import pytest_asyncio
 
-from pycrorm_async import Memory, Reading
+from pycrorm_async import Memory, Reading, Settings
 from pycrorm_async.clock import SYSTEM_CLOCK
-from pycrorm_async.errors import CallerError, UnknownEpisode
+from pycrorm_async.errors import CallerError, DatabaseUnavailable, UnknownEpisode
 from pycrorm_async.recall.answer import Answer
 from pycrorm_async.recall.case import Case
 from pycrorm_async.recall.following import Relation
@@ -240,3 +240,14 @@ async def test_events_that_found_the_buffer_full_are_read_from_the_log(
             answer = await memory.recall(GRIP, k=100)
             assert len(answer) == 3 * round_
             assert {each.status for each in answer} == {"FAILED"}
+
+
+async def test_a_memory_that_makes_no_cases_says_how_to_make_them(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path / 'memory.db'}"
+    async with Memory.open(url, settings=Settings(recall=False)) as memory:
+        await grip(Arms.LEFT, 1.5)
+        with pytest.raises(DatabaseUnavailable, match=r"recall=False.* run `pycrorm writer --once`"):
+            await memory.recall(GRIP)
+    async with Memory.open(url) as memory:  # as the command does
+        await memory.flush()
+        assert [each.status for each in await memory.recall(GRIP)] == ["FAILED"]

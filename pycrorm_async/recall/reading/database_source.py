@@ -30,7 +30,10 @@ class DatabaseSource:
         async with log.snapshot() as connection:
             tables = await read_generation(connection, f"{PROJECTION}{CaseProjection.name}")
             if tables is None:
-                raise DatabaseUnavailable(f"{log.address} has no cases to recall yet: run `pycrorm writer --once`")
+                raise DatabaseUnavailable(
+                    f"{log.address} has no cases to recall yet (with Settings(recall=False) none are made): run"
+                    " `pycrorm writer --once`"
+                )
             if tables.version != CaseProjection.version:
                 raise TablesOutdated(
                     f"{log.address}: its cases have version {tables.version} instead of {CaseProjection.version}: run"
