@@ -102,6 +102,8 @@ async def test_cases_do_not_depend_on_batches_restarts_processes_or_merges(
     assert (await stored(log))[1] == expected
 
 
+@pytest.mark.slow
+@pytest.mark.soak_on("postgresql")
 async def test_blocks_are_merged_as_they_grow(log: EventLog) -> None:
     script = CaseScript()
     await log.append([*TYPES, *script.records])
@@ -118,6 +120,8 @@ async def test_blocks_are_merged_as_they_grow(log: EventLog) -> None:
     assert (state.name, state.behind, state.parked, state.fault) == ("recall", 0, {}, None)
 
 
+@pytest.mark.slow
+@pytest.mark.soak_on("postgresql")
 async def test_cases_are_folded_at_intervals_unless_a_caller_waits_for_them(log: EventLog) -> None:
     script = CaseScript()
     await log.append([*TYPES, *script.records])
@@ -238,6 +242,7 @@ CHANGES = {
 }  # fmt: skip
 
 
+@pytest.mark.slow
 async def test_verify_finds_what_was_changed_and_a_rebuild_repairs_it(log: EventLog) -> None:
     expected = await filled(log)
     assert len((await stored(log))[0]) == 4
@@ -264,6 +269,8 @@ async def test_verify_finds_what_was_changed_and_a_rebuild_repairs_it(log: Event
     assert (await verified(log)).drift == 0
 
 
+@pytest.mark.slow
+@pytest.mark.soak_on("postgresql")
 async def test_a_damaged_block_stops_the_merge_with_its_reason_and_no_other_fold(
     log: EventLog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
