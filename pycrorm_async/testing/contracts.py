@@ -50,7 +50,7 @@ async def check_projection(projection: Projection, plan: Callable[[], Awaitable[
     live = await _rows_of(projection, url)
     log = await EventLog.open(shared_address(url), create=False)
     try:
-        [state] = await states(log, [projection])
+        [state] = [each for each in await states(log, [projection]) if each.name == projection.name]
         second = await verify(log, projections=[projection])
     finally:
         await log.close()
