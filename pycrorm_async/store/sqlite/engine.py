@@ -18,6 +18,7 @@ import aiosqlite
 from sqlalchemy import URL, event
 from sqlalchemy import Connection as SyncConnection
 from sqlalchemy.ext.asyncio import AsyncEngine, create_async_engine
+from sqlalchemy.pool import AsyncAdaptedQueuePool, ConnectionPoolEntry
 
 __all__ = ["make_engine", "BEGIN", "USE_WAL", "Connection"]
 
@@ -47,6 +48,7 @@ def make_engine(path: Path, *, read_only: bool, busy_timeout_s: float) -> AsyncE
     engine = create_async_engine(
         URL.create("sqlite+aiosqlite", database=str(path)),
         async_creator=lambda: _connect(uri, busy_timeout_s),
+        poolclass=_Pool,
         execution_options={BEGIN: "BEGIN" if read_only else _WRITE},
         hide_parameters=True,
     )
@@ -55,6 +57,26 @@ def make_engine(path: Path, *, read_only: bool, busy_timeout_s: float) -> AsyncE
     if not read_only:
         event.listen(engine.sync_engine, "connect", _set_write_pragmas)
     return engine
+
+
+class _Pool(AsyncAdaptedQueuePool):
+    """A pool whose connections are closed when it is disposed of, those in use as soon as they are returned.
+
+    A task that is cancelled while it returns its connection disposes of the engine, perhaps before another task has
+    completed the return. The connection then comes back to a pool that no call empties any more.
+    """
+
+    _is_disposed = False
+
+    def dispose(self) -> None:
+        self._is_disposed = True
+        super().dispose()
+
+    def _do_return_conn(self, record: ConnectionPoolEntry) -> None:
+        if self._is_disposed:
+            record.close()
+        else:
+            super()._do_return_conn(record)
 
 
 class Connection(aiosqlite.Connection):
