@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import asyncio
 
-from pycrorm_async.cli.options import DEFAULT_URL, UrlOption
+from pycrorm_async.cli.options import DEFAULT_URL, SpoolOption, UrlOption
+from pycrorm_async.cli.pending_events import note_pending_events
 from pycrorm_async.store.address import DatabaseAddress
 
 __all__ = ["mcp"]
 
 
-def mcp(url: UrlOption = DEFAULT_URL) -> None:
+def mcp(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None) -> None:
     """Serve the memory to an agent by the Model Context Protocol (extra [mcp]); nothing is ever written.
 
     The agent's program starts this command; `pycrorm_async/integrations/README.md` says how to enter it there.
     """
     from pycrorm_async.integrations.mcp_server import memory_server  # here, because it needs the extra
 
+    note_pending_events(url, spool)  # on stderr, which the agent's program shows or keeps
     with DatabaseAddress.parse(url).located() as address:
         asyncio.run(memory_server(address).run_stdio_async())

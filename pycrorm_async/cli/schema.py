@@ -8,8 +8,9 @@ from typing import Annotated, Literal
 
 import typer
 
-from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, UrlOption
+from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
 from pycrorm_async.cli.output import print_json
+from pycrorm_async.cli.pending_events import note_pending_events
 from pycrorm_async.errors import CallerError
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.schema.memory_schema import CORE_VIEWS, View, as_mermaid, as_text, read_schema
@@ -26,6 +27,7 @@ def schema(
         typer.Option("--format", help="mermaid: a diagram, by default of the views that most queries read."),
     ] = "text",
     url: UrlOption = DEFAULT_URL,
+    spool: SpoolOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Describe the views of a memory: what a row is, and each column with its type, its unit and what it refers to."""
@@ -38,6 +40,7 @@ def schema(
             return await read_schema(reading, names)
 
     described = asyncio.run(read())
+    note_pending_events(url, spool)
     if as_json:
         print_json(described)
     else:

@@ -31,7 +31,7 @@ from pycrorm_async.store.address import DatabaseAddress
 try:
     from mcp.server import MCPServer
     from mcp.server.mcpserver.exceptions import ToolError
-    from mcp_types import ToolAnnotations
+    from mcp.types import ToolAnnotations
 except ImportError:
     raise MissingExtra("a server for agents needs mcp: pip install 'pycrorm-async[mcp]'") from None
 
