@@ -38,6 +38,8 @@ NEAR_M: Final = 0.1
 """The distance in m, of the base in the object's frame and of the height, at which a try counts exp(-1/2)."""
 _WAYS_MAX: Final = 500
 """Bounds the ways with one arm and grasp that are scored; those that succeeded nearest in height are taken."""
+_DIGITS: Final = 6
+"""Of lengths and angles: cases have float32, which does not reach further, and 0.3 is 0.3 again."""
 _SAME: Final = 1e-4
 """The resolution, in m and rad, at which two ways count as equal."""
 
@@ -161,14 +163,9 @@ def _scored(
     for row, number, score, weight in zip(
         ways.tolist(), times.tolist(), scores.tolist(), evidence.tolist(), strict=True
     ):
-        own = float(tries.torso[row])
-        stand = Pose(
-            (float(tries.x[row]), float(tries.y[row]), -float(tries.over_base[row])),
-            yaw_quaternion(float(tries.yaw[row])),
-            "object",
-            time_ns=0,
-        )
-        yield row, PastSuccess(
-            Arms[str(tries.arm[row])], Grasp[str(tries.grasp[row])], None if own != own else own, stand, score, number,
-            weight, prior,
-        )  # fmt: skip
+        place = (tries.x, tries.y, tries.yaw, tries.over_base, tries.torso)
+        x, y, yaw, over_base, torso_height = (round(float(each[row]), _DIGITS) for each in place)
+        stand = Pose((x, y, -over_base), yaw_quaternion(yaw), "object", time_ns=0)
+        has_torso = torso_height == torso_height
+        arm, grasp = Arms[str(tries.arm[row])], Grasp[str(tries.grasp[row])]
+        yield row, PastSuccess(arm, grasp, torso_height if has_torso else None, stand, score, number, weight, prior)

@@ -40,7 +40,13 @@ from tests.memory.note_actions import url_of
 pytestmark = pytest.mark.slow
 
 BELIEVED = BelieveObject("cup", ObjectType.JEROEN_CUP, Pose([1.2, 0.4, 0.9], yaw_quaternion(0.5)))
-VALUES: dict[Any, Any] = {Arms: Arms.LEFT, Grasp: Grasp.FRONT, GripperState: GripperState.OPEN, Pose: Pose([0.5, 0, 0])}
+VALUES: dict[Any, Any] = {
+    Arms: Arms.LEFT,
+    Grasp: Grasp.FRONT,
+    GripperState: GripperState.OPEN,
+    Pose: Pose([0.5, 0, 0]),
+    str: "recall",
+}
 
 
 @dataclasses.dataclass

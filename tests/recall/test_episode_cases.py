@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import pi
+from math import cos, pi, radians, sin
 
 import pytest
 
@@ -14,9 +14,9 @@ from pycrorm_async.events.types import (
     ObjectMoved,
     ObjectRemoved,
 )
-from pycrorm_async.events.values import ObjectReference
+from pycrorm_async.events.values import ObjectReference, PoseValue
 from pycrorm_async.recall.case import RESERVED, Case
-from tests.projections.event_script import declared, name_of, pose, row, time_us
+from tests.projections.event_script import T0_NS, declared, name_of, pose, row, time_us
 from tests.recall.case_script import LEFT_TURN, CaseScript, cases_of
 
 
@@ -68,6 +68,17 @@ def test_a_case_has_the_situation_before_the_action_and_its_outcome() -> None:
         },
         abs=1e-6,
     )  # fmt: skip
+
+
+def test_beside_an_object_that_lies_or_leans_the_robot_has_no_place_in_its_frame() -> None:
+    script = CaseScript()
+    for degrees in (0, 7, 9, 90, 180):
+        turn = radians(degrees) / 2
+        milk = script.add("milk", "MILK", PoseValue((1.0, 0.0, 0.9), (sin(turn), 0.0, 0.0, cos(turn)), "map", T0_NS))
+        script.end(script.fetch(milk))
+    places = [{"stand_x", "stand_y", "stand_yaw"} & each.numbers.keys() for each in cases_of(script)]
+    assert [len(each) for each in places] == [3, 3, 0, 0, 0]
+    assert all(each.numbers["object_z"] == pytest.approx(0.9) for each in cases_of(script))
 
 
 def test_the_outcome_is_no_feature_of_the_situation() -> None:

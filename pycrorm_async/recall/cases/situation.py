@@ -7,7 +7,7 @@
 | `near` | types of the objects within 0.5 m of this object |
 | `held` | types of the objects attached to the robot |
 | texts, enum members, booleans | by field; `True` and `False` for a boolean |
-| `stand_x`, `stand_y`, `stand_yaw` | pose of the robot in the object's frame |
+| `stand_x`, `stand_y`, `stand_yaw` | pose of the robot in the frame of an object that stands upright |
 | `torso`, `object_z`, `height` | position of the torso, height of the object, and over the torso |
 | integers, reals | by field |
 | `<field>_x`, `_y`, `_z`, `_yaw` | a pose in the robot's frame |
@@ -36,6 +36,8 @@ Numbers: TypeAlias = dict[str, float]
 
 _NEAR_M = 0.5
 """The distance within which another object counts as near."""
+_UPRIGHT_MIN: Final = 0.99
+"""The cosine of 8 degrees: the x-y plane of an object that leans more does not lie on the floor."""
 _OBJECTS_MAX: Final = 1_000
 """Bounds the objects that are looked at for each action. In a world with more of them nothing is near."""
 _NUMBER_MAX: Final = 1e300
@@ -144,8 +146,10 @@ def _add_object(symbols: Symbols, numbers: Numbers, seen: _Seen, robot: RobotVal
         return
     if robot.torso_height is not None:
         numbers["height"] = height - robot.pose.position[2] - robot.torso_height
-    numbers["stand_x"], numbers["stand_y"], _ = _position_in(robot.pose.position, seen.pose)
-    numbers["stand_yaw"] = _yaw_in(robot.pose.orientation, seen.pose.orientation)
+    x, y, _, _ = seen.pose.orientation
+    if 1 - 2 * (x * x + y * y) >= _UPRIGHT_MIN:
+        numbers["stand_x"], numbers["stand_y"], _ = _position_in(robot.pose.position, seen.pose)
+        numbers["stand_yaw"] = _yaw_in(robot.pose.orientation, seen.pose.orientation)
 
 
 def _add_surroundings(
