@@ -199,8 +199,10 @@ class Memory(ReadableMemory, ObservingMemory):
             # Open the database before making a spool, and bind the spool before this recorder adds its folder to it.
             access, expected = spool.access, expected_log(address, spool)
             log = await EventLog.open(address, create=True, clock=self._clock, file_access=access, belongs_to=expected)
-            declared = [declaration_of(each) for each in await log.declarations()]
-            await log.close()
+            try:
+                declared = [declaration_of(each) for each in await log.declarations()]
+            finally:
+                await log.close()
             spool.bind(log.log_id)
         recorder_id = episode_id(self._clock.wall_ns(), os.urandom(10))
         queue = RecorderQueue.create(

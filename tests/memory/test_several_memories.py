@@ -5,6 +5,7 @@ import contextvars
 import threading
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -14,6 +15,7 @@ from pycrorm_async.errors import (
 )
 from pycrorm_async.plan import ActionAbstract
 from pycrorm_async.plan.execution.observer import recorder
+from pycrorm_async.store.log import EventLog
 from pycrorm_async.world.observers import watcher
 from tests.commands import run_script
 from tests.memory.note_actions import NoteActionPerformable, texts, url_of
@@ -205,6 +207,28 @@ async def test_an_opening_that_fails_or_is_cancelled_leaves_no_thread(tmp_path: 
             break
         await asyncio.sleep(0.02)
     assert ours() <= before
+
+
+async def test_an_opening_that_is_cancelled_while_it_reads_the_types_closes_its_connection(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    reached: asyncio.Future[Any] = asyncio.get_running_loop().create_future()
+
+    async def declarations(log: EventLog) -> list[bytes]:
+        async with log.engine.connect() as connection:
+            driver = (await connection.get_raw_connection()).driver_connection
+        reached.set_result(driver)
+        await asyncio.sleep(60)
+        return []
+
+    monkeypatch.setattr(EventLog, "declarations", declarations)
+    task = asyncio.create_task(Memory.open(url_of(tmp_path)).__aenter__())
+    driver = await reached
+    assert driver._connection is not None
+    task.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await task
+    assert driver._connection is None
 
 
 async def test_an_abandoned_plan_that_is_closed_in_another_context_leaves_the_episode_there_alone(
