@@ -220,7 +220,7 @@ def main() -> None:
         else:
             figures = asyncio.run(measure(3, 150, (200, 500, 2_000), 5 * PART, Path(folder)))
     show(figures)
-    print(json.dumps({"command": "python -m bench.first_tries" + (" --quick" if quick else ""), **figures}))
+    print(json.dumps({"bench": "first_tries", **figures}))
 
 
 if __name__ == "__main__":

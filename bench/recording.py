@@ -86,7 +86,8 @@ def main() -> None:
     table.add_row("seam, a start with three parameters and a robot", f"{figures['start']:.1f}")
     table.add_row("seam, an end", f"{figures['end']:.1f}")
     Console(stderr=True).print(table)
-    print(json.dumps({f"{name}_us": value for name, value in figures.items()} | {"rounds": rounds, "nodes": NODES}))
+    costs = {f"{name}_us": value for name, value in figures.items()}
+    print(json.dumps({"bench": "recording", "rounds": rounds, "nodes": NODES, **costs}))
 
 
 if __name__ == "__main__":

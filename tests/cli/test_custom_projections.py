@@ -177,7 +177,8 @@ def test_status_reports_what_a_projection_cannot_fold_and_which_version_is_not_f
     assert "episode 1 is parked in the projection weighed: event 5: weighed raised ValueError: no water" in ran.stderr
     state = answer("status", cwd=lab, code=1)
     assert state["episodes"] == []
-    assert [each["parked"] for each in state["projections"]] == [{"1": "event 5: weighed raised ValueError: no water"}]
+    parked = {each["name"]: each["parked"] for each in state["projections"]}
+    assert parked["weighed"] == {"1": "event 5: weighed raised ValueError: no water"}
     rebuild = pycrorm("status", cwd=lab)
     assert "episode 1 is stopped in the projection weighed: event 5: weighed raised ValueError" in one_line_of(rebuild)
     ran = pycrorm("writer", "--once", "--projection", "lab:Next", cwd=lab)
