@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -59,13 +60,13 @@ async def nothing() -> None:
 async def _record(url: str) -> None:
     async with Memory.open(url, settings=Settings(sample_interval_ms=1), views=[LONGEST]) as memory:
         for name, plan in (
-            ("fails", breakfast(fails=True)),
-            ("succeeds", breakfast(fails=False)),
-            ("courier", drive()),
-            ("no robot", nothing()),
+            ("fails", partial(breakfast, fails=True)),
+            ("succeeds", partial(breakfast, fails=False)),
+            ("courier", drive),
+            ("no robot", nothing),
         ):
             async with memory.episode(description=name):
-                await plan
+                await plan()
         await memory.flush()
 
 
