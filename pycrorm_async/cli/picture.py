@@ -15,7 +15,7 @@ from pycrorm_async.errors import CallerError
 from pycrorm_async.query.as_of import parse_moment
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.scene.picture import picture as draw
-from pycrorm_async.report.output_file import refuse_existing, write_file
+from pycrorm_async.report.output_files import refuse_existing, write_file
 
 __all__ = ["picture"]
 

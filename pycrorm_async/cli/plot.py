@@ -17,7 +17,7 @@ from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.success.figure import Kind, success_figure
 from pycrorm_async.query.success.samples import Samples, success_samples
 from pycrorm_async.query.success.success_table import SuccessTable, success_table
-from pycrorm_async.report.output_file import refuse_existing, write_file
+from pycrorm_async.report.output_files import refuse_existing, write_file
 
 __all__ = ["plot"]
 

@@ -20,11 +20,17 @@ from sqlalchemy.exc import CompileError
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.export.episode_files import EpisodeOptions, write_lerobot, write_scene
-from pycrorm_async.export.files import checksums, new_file, new_folder, refuse_existing
 from pycrorm_async.export.lerobot.dataset import DEFAULT_FPS, MARKER
 from pycrorm_async.export.lerobot.images import ImageSize
 from pycrorm_async.export.lerobot.states import Clock
-from pycrorm_async.export.manifest import Manifest, episode_differences, manifest_path, read_manifest, versions_of
+from pycrorm_async.export.manifest import (
+    Manifest,
+    checksums,
+    episode_differences,
+    manifest_path,
+    read_manifest,
+    versions_of,
+)
 from pycrorm_async.export.row_files import RowFormat, write_rows
 from pycrorm_async.export.selection import CoveredEpisode, Exportable, Selection, select_rows
 from pycrorm_async.projections.schema.generations import PROJECTION_VERSION
@@ -32,6 +38,7 @@ from pycrorm_async.query.asking.question import Question
 from pycrorm_async.query.frames.columns import columns_of
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.suggestions import nearest
+from pycrorm_async.report.output_files import new_file, new_folder, refuse_existing
 
 if TYPE_CHECKING:
     from pycrorm_async.progress_bar import ProgressCallback
@@ -115,7 +122,7 @@ async def export(
     `MissingExtra`; `OSError` if the disk is full, and then leaves no file.
     """
     target = Path(path)
-    refuse_existing(target, force=force)
+    refuse_existing(target, force=force, folder=True)
     chosen = file_format or format_of(target)
     if chosen not in get_args(FileFormat):
         raise CallerError(f"there is no format {chosen!r}{nearest(chosen, get_args(FileFormat))}; formats: {_listed()}")

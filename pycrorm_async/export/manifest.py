@@ -6,6 +6,7 @@ the episodes with the digests of their events, and the SHA-256 of each written f
 
 from __future__ import annotations
 
+import hashlib
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ import msgspec
 from pycrorm_async.errors import CallerError
 from pycrorm_async.export.selection import CoveredEpisode
 
-__all__ = ["Manifest", "episode_differences", "manifest_path", "read_manifest", "versions_of"]
+__all__ = ["Manifest", "checksums", "episode_differences", "manifest_path", "read_manifest", "versions_of"]
 
 
 class Manifest(msgspec.Struct, frozen=True, kw_only=True):
@@ -91,3 +92,15 @@ def episode_differences(recorded: tuple[CoveredEpisode, ...], present: dict[str,
         elif now.number != each.number:
             lines.append(f"episode {each.number} ({each.id}) has the number {now.number} here, so its ids differ")
     return lines
+
+
+def checksums(path: Path) -> dict[str, str]:
+    """Return the SHA-256 of a file, or of each file in a folder, by name inside it."""
+    files = sorted(each for each in path.rglob("*") if each.is_file()) if path.is_dir() else [path]
+    root = path if path.is_dir() else path.parent
+    return {str(each.relative_to(root)): _sha256(each) for each in files}
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -21,7 +21,7 @@ from typing import Any
 
 import msgspec
 
-from pycrorm_async.report.output_file import write_file
+from pycrorm_async.report.output_files import write_file
 
 __all__ = ["page_of", "overview_page_of", "write_page"]
 

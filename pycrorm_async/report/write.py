@@ -19,7 +19,7 @@ from pycrorm_async.query.named_queries import EpisodeSummary
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.report.episode_data import episode_document
 from pycrorm_async.report.html_page import overview_page_of, page_of, write_page
-from pycrorm_async.report.output_file import refuse_existing
+from pycrorm_async.report.output_files import refuse_existing
 from pycrorm_async.report.overview_data import newest_episodes, overview_document
 from pycrorm_async.report.success_data import success_documents
 

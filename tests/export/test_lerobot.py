@@ -17,7 +17,7 @@ from pyarrow import parquet
 from pycrorm_async import Reading
 from pycrorm_async.errors import CallerError
 from pycrorm_async.export.export import export, export_again
-from pycrorm_async.export.files import new_folder
+from pycrorm_async.report.output_files import new_folder
 
 SCHEMA = json.loads(Path(__file__).with_name("lerobot_v3.json").read_text())
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import shutil
 import tempfile
@@ -12,18 +11,26 @@ from pathlib import Path
 
 from pycrorm_async.errors import CallerError
 
-__all__ = ["checksums", "new_file", "new_folder", "refuse_existing"]
-
-_PIECE_BYTES = 1 << 20
-"""Bytes that are read at once."""
+__all__ = ["new_file", "new_folder", "refuse_existing", "write_file"]
 
 
-def refuse_existing(path: Path, *, force: bool) -> None:
-    """Raise `CallerError` for a name that cannot be written: one that exists, without `force`, or has no folder."""
+def refuse_existing(path: Path, *, force: bool, folder: bool = False) -> None:
+    """Raise `CallerError` for a name that cannot be written: one that exists, without `force`, or has no folder.
+
+    A folder is refused also with `force`, unless `folder` says that one may be written.
+    """
+    if path.is_dir() and not folder:
+        raise CallerError(f"{path} is a folder: give the name of a file in it")
     if path.exists() and not force:
-        raise CallerError(f"{path} exists: add --force (force=True) to replace it, or give another name")
+        raise CallerError(f"{path} exists: add --force to replace it, or give another name")
     if not path.absolute().parent.is_dir():
         raise CallerError(f"the folder {path.parent} does not exist: create it first")
+
+
+def write_file(content: bytes, path: Path, *, force: bool = False) -> None:
+    """Write a file that is complete as soon as it has its name. Raises `CallerError`, `OSError`."""
+    with new_file(path, force=force) as written:
+        written.write_bytes(content)
 
 
 @contextmanager
@@ -34,8 +41,6 @@ def new_file(path: Path, *, force: bool) -> Iterator[Path]:
     `OSError` where the disk is full.
     """
     refuse_existing(path, force=force)
-    if path.is_dir():
-        raise CallerError(f"{path} is a folder: give the name of a file in it, for example {path / 'export.parquet'}")
     descriptor, name = tempfile.mkstemp(dir=path.absolute().parent, prefix=f".{path.name[:100]}.", suffix=".part")
     os.close(descriptor)
     written = Path(name)
@@ -49,7 +54,7 @@ def new_file(path: Path, *, force: bool) -> Iterator[Path]:
             path.hardlink_to(written)  # fails, unlike a renaming, if another process made the file meanwhile
         _sync(path.absolute().parent)
     except FileExistsError:
-        raise CallerError(f"{path} exists: add --force (force=True) to replace it, or give another name") from None
+        raise CallerError(f"{path} exists: add --force to replace it, or give another name") from None
     finally:
         written.unlink(missing_ok=True)
 
@@ -60,7 +65,7 @@ def new_folder(path: Path, *, force: bool, marker: str) -> Iterator[Path]:
 
     With `force` it replaces a folder that has the file `marker`, and no other one.
     """
-    refuse_existing(path, force=force)
+    refuse_existing(path, force=force, folder=True)
     if path.exists() and not (path / marker).is_file():
         raise CallerError(f"{path} exists and is not such a data set ({marker} is not in it): give another name")
     written = Path(tempfile.mkdtemp(dir=path.absolute().parent, prefix=f".{path.name[:100]}.", suffix=".part"))
@@ -82,21 +87,6 @@ def new_folder(path: Path, *, force: bool, marker: str) -> Iterator[Path]:
     finally:
         shutil.rmtree(written, ignore_errors=True)
         shutil.rmtree(replaced, ignore_errors=True)
-
-
-def checksums(path: Path) -> dict[str, str]:
-    """Return the SHA-256 of a file, or of each file in a folder, by name inside it."""
-    files = sorted(each for each in path.rglob("*") if each.is_file()) if path.is_dir() else [path]
-    root = path if path.is_dir() else path.parent
-    return {str(each.relative_to(root)): _sha256(each) for each in files}
-
-
-def _sha256(path: Path) -> str:
-    digest = hashlib.sha256()
-    with path.open("rb") as file:
-        while piece := file.read(_PIECE_BYTES):
-            digest.update(piece)
-    return digest.hexdigest()
 
 
 def _sync(path: Path) -> None:
