@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import csv
+import math
 import sys
 from collections.abc import Iterable
 from typing import Annotated, Any, Literal
@@ -41,7 +42,9 @@ def query(
     since 1970-01-01 UTC; columns that end in _ns are ns of the robot's monotonic clock.
     """
     text = sys.stdin.read() if sql == "-" else sql
-    limits = SqlLimits(rows=limit or None, bytes=int(megabytes * _MEGABYTE), seconds=seconds)
+    if not 0 < megabytes < math.inf:
+        raise CallerError(f"--megabytes must be > 0 and finite, got {megabytes}")
+    limits = SqlLimits(rows=limit or None, bytes=max(int(megabytes * _MEGABYTE), 1), seconds=seconds)
     if as_json and form == "csv":
         raise CallerError("--json and --format csv exclude each other")
     if form == "csv":

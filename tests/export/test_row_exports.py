@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import csv
 import json
-import resource
 import sys
-from collections.abc import AsyncIterator, Iterator
-from contextlib import contextmanager
+from collections.abc import AsyncIterator
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -28,6 +26,7 @@ from pycrorm_async.query.asking.ask import QUESTIONS
 from pycrorm_async.world.enums import Arms
 from tests.commands import one_line_of, pycrorm
 from tests.databases import run_in_own_loop
+from tests.full_disk import files_of_at_most
 from tests.projections.event_script import NAVIGATE, PICK_UP, SAYING, declarations
 from tests.projections.factories import append_and_fold
 from tests.query.test_reading import episode
@@ -52,17 +51,6 @@ def scripted(module_database_url: str) -> str:
 async def either(scripted: str) -> AsyncIterator[Reading]:
     async with Reading.open(scripted) as opened:
         yield opened
-
-
-@contextmanager
-def files_of_at_most(size: int) -> Iterator[None]:
-    """Let every file of this process that grows beyond `size` bytes fail, as a full disk does."""
-    before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, before[1]))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 async def test_files_of_an_episode_with_failures_and_of_one_without_have_one_schema(

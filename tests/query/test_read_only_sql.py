@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
+import psutil
 import pytest
 
 from pycrorm_async.errors import DatabaseUnavailable, QueryRefused
@@ -19,6 +21,7 @@ from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.postgresql.roles import GRANTS
 from tests.databases import Server, ask_each, change_each, run_in_own_loop
+from tests.full_disk import files_of_at_most
 from tests.projections.event_script import NAVIGATE, PICK_UP, SAYING, declarations
 from tests.projections.factories import append_and_fold
 from tests.query.test_reading import episode
@@ -172,10 +175,15 @@ async def test_a_query_on_a_file_that_is_gone_is_unavailable(tmp_path: Path) -> 
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("limits", [{"rows": 0}, {"bytes": -1}, {"seconds": 0.0}])
-def test_a_limit_of_nothing_is_refused(limits: dict[str, int]) -> None:
-    with pytest.raises(QueryRefused, match="must be > 0"):
+@pytest.mark.parametrize(
+    "limits",
+    [{"rows": 0}, {"bytes": -1}, {"seconds": 0.0}, {"seconds": math.nan}, {"seconds": math.inf}, {"bytes": math.nan}],
+)
+def test_a_limit_of_nothing_or_of_no_number_is_refused(limits: dict[str, Any]) -> None:
+    with pytest.raises(QueryRefused, match="must be > 0 and finite"):
         SqlLimits(**limits)
+    with pytest.raises(QueryRefused, match="is at most 86400"):
+        SqlLimits(seconds=1e9)
 
 
 # --- attacks --------------------------------------------------------------------------------------------------
@@ -293,6 +301,61 @@ async def test_an_endless_query_is_stopped(endless: str, sql: _Sql) -> None:
     with pytest.raises(QueryRefused, match=r"was stopped after 0[.]3 s: select less, or allow it more time"):
         await sql.query(endless, QUICK)
     assert time.monotonic() - started_s < 15
+
+
+ONE_LONG_STEP = "SELECT instr(zeroblob(15000000), zeroblob(7000000) || x'01')"
+"""Computes for minutes in one step of SQLite, between two of its checks for an interruption."""
+
+
+@pytest.fixture
+async def file_sql(tmp_path: Path) -> AsyncIterator[_Sql]:
+    """A SQLite memory without tables."""
+    url = f"sqlite:///{tmp_path / 'memory.db'}"
+    await (await EventLog.open(DatabaseAddress.parse(url), create=True)).close()
+    async with _opened(url) as opened:
+        yield opened
+
+
+async def test_a_single_step_of_sqlite_is_stopped_and_cancelled(file_sql: _Sql) -> None:
+    started_s = time.monotonic()
+    with pytest.raises(QueryRefused, match=r"was stopped after 0[.]3 s"):
+        await file_sql.query(ONE_LONG_STEP, QUICK)
+    task = asyncio.create_task(file_sql.query(ONE_LONG_STEP, SqlLimits(seconds=60)))
+    await asyncio.sleep(0.3)
+    task.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await task
+    assert time.monotonic() - started_s < 20
+
+
+async def test_a_query_on_a_file_fills_neither_the_memory_nor_the_disk(file_sql: _Sql) -> None:
+    with pytest.raises(QueryRefused, match="needs more memory than it may use"):
+        await file_sql.query(f"SELECT {', '.join(['zeroblob(16000000)'] * 60)}")
+    numbers = "WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM n LIMIT 20) "
+    with (
+        files_of_at_most(10_000_000),
+        pytest.raises(QueryRefused, match="needs more space for temporary files than it may use"),
+    ):
+        await file_sql.query(f"{numbers} SELECT x, zeroblob(1000000) AS zeros FROM n ORDER BY zeros, -x")
+    _, rows, _ = await file_sql.query(f"{numbers} SELECT x, randomblob(700000) FROM n ORDER BY -x")
+    assert [each[0] for each in rows] == [*range(20, 0, -1)]
+
+
+async def test_a_process_of_a_query_that_dies_is_named(file_sql: _Sql) -> None:
+    task = asyncio.create_task(file_sql.query(ONE_LONG_STEP, SqlLimits(seconds=60)))
+    process = await asyncio.to_thread(_process_of_a_query)
+    process.kill()
+    with pytest.raises(QueryRefused, match="the process of the query ended with the code -9"):
+        await task
+    assert not process.is_running()
+
+
+def _process_of_a_query() -> psutil.Process:
+    while True:
+        for each in psutil.Process().children():
+            if "sqlite_process" in str(each.cmdline()):
+                return each
+        time.sleep(0.02)
 
 
 async def test_time_at_which_the_rows_are_not_read_does_not_count(sql: _Sql) -> None:

@@ -7,16 +7,17 @@ async with sql.stream("SELECT * FROM event", SqlLimits(rows=None)) as rows:
 
 **Theory of operation.** The text of a query is not trusted: a person typed it, or a language model wrote it. Each query
 has a connection of its own, which is closed after it, so that no setting, lock or temporary table outlives a query.
-The database refuses everything but reading: SQLite through an authorizer (`sqlite_reader`), PostgreSQL through a login
-without other rights, a read-only transaction and a cursor (`postgresql_reader`). Parsing the text here would not do,
-because a parser that differs from the database's in one detail would let a statement through.
+The database refuses everything but reading: SQLite through an authorizer, in a process with limits (`sqlite_reader`),
+PostgreSQL through a login without other rights, a read-only transaction and a cursor (`postgresql_reader`). Parsing the
+text here would not do, because a parser that differs from the database's in one detail would let a statement through.
 
-A query that reaches a bound on time is stopped by the database. One that reaches a bound on rows or bytes ends early,
-and `more` is True.
+A query that reaches a bound on time is stopped: SQLite's process is killed, a server cancels it. One that reaches a
+bound on rows or bytes ends early, and `more` is True.
 """
 
 from __future__ import annotations
 
+import math
 import re
 import time
 from collections.abc import AsyncIterator
@@ -31,6 +32,8 @@ __all__ = ["DEFAULT_LIMITS", "ReadOnlySql", "SqlLimits", "SqlResult", "SqlRows"]
 
 _ROWS_AT_ONCE = 500
 """Bounds the rows that are fetched in one visit to the database."""
+_SECONDS_MAX = 86_400
+"""Bounds the limit on seconds: a day. PostgreSQL takes at most 24 of them."""
 _CHARACTERS = re.compile("[^\0\ud800-\udfff]*")
 
 
@@ -50,8 +53,10 @@ class SqlLimits:
 
     def __post_init__(self) -> None:
         for name, value in (("rows", self.rows), ("bytes", self.bytes), ("seconds", self.seconds)):
-            if value is not None and value <= 0:
-                raise QueryRefused(f"the limit on {name} of a query must be > 0, got {value}")
+            if value is not None and not 0 < value < math.inf:
+                raise QueryRefused(f"the limit on {name} of a query must be > 0 and finite, got {value}")
+        if self.seconds > _SECONDS_MAX:
+            raise QueryRefused(f"the limit on seconds of a query is at most {_SECONDS_MAX}, got {self.seconds:g}")
 
 
 DEFAULT_LIMITS = SqlLimits()

@@ -1,35 +1,38 @@
-"""Run one query on a SQLite file, in a thread, on a connection that can only read.
+"""Run one query on a SQLite file, in a process of its own that can only read.
 
-`mode=ro` and `PRAGMA query_only` still let ATTACH create a file. So an authorizer, which SQLite asks about every action
-when it compiles a statement, allows SELECT, READ, FUNCTION and RECURSIVE, and nothing else. The connection is one of
-the driver's own, without functions in Python: SQLAlchemy adds REGEXP, which no time limit can stop.
+**Theory of operation.** `mode=ro` and `PRAGMA query_only` still let ATTACH create a file. So an authorizer, which
+SQLite asks about every action when it compiles a statement, allows SELECT, READ, FUNCTION and RECURSIVE, and nothing
+else. The connection is one of the driver's own: SQLAlchemy adds REGEXP, a function in Python.
+
+SQLite checks for an interruption between the steps of its machine, and one step, such as `instr` of two large values,
+can take hours. It can bound its memory only for a whole process, the writer in it included. So each query has a process
+(`sqlite_process`). It starts in 20 ms, has limits on its memory, its temporary files and its CPU time, and is killed
+when the time is over or the query is cancelled. A killed reader leaves no lock, and its temporary files have no names.
+It has a session of its own, so that Ctrl-C interrupts only the parent. When the parent dies, the process ends with its
+stdin, or at the limit on its CPU time.
 """
 
 from __future__ import annotations
 
 import asyncio
+import marshal
 import sqlite3
-import time
+import subprocess
+import sys
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from pathlib import Path
 from typing import Any, TypeVar
 
 from pycrorm_async.errors import QueryRefused
 from pycrorm_async.query.sql.refusals import NOT_ONE, ONLY_READS, missing_relation, stopped
-from pycrorm_async.store.address import BUSY_TIMEOUT_S
 
 __all__ = ["sqlite_cursor"]
 
 _T = TypeVar("_T")
-_ALLOWED = frozenset({sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ, sqlite3.SQLITE_FUNCTION, sqlite3.SQLITE_RECURSIVE})
-_FORBIDDEN_FUNCTIONS = frozenset({"load_extension", "fts3_tokenizer"})
-"""Functions that run code from a file, or return an address in the memory of this process."""
-_STEPS = 10_000
-"""Steps of SQLite's machine between two checks of the time; about 0.1 ms."""
-_VALUE_BYTES = 16 << 20
-"""Bounds a value while it is computed, so that `zeroblob` and `replace` cannot fill the memory. Stored values are
-smaller: a part of a blob has 4 MiB."""
+_PROGRAM = Path(__file__).with_name("sqlite_process.py")
+_START_S = 60.0
+"""Bounds the start of the process, which a busy machine delays and which does not count as time of the query."""
 _ACTIONS = {
     value: name.removeprefix("SQLITE_").replace("_", " ")
     for name, value in vars(sqlite3).items()
@@ -43,96 +46,127 @@ _ACTIONS = {
 """The action's name by its code, which other constants share."""
 _REFUSALS = (sqlite3.SQLITE_ERROR, sqlite3.SQLITE_AUTH, sqlite3.SQLITE_TOOBIG, sqlite3.SQLITE_MISMATCH)
 """Codes of errors that are the query's own; all others are the database's."""
+_NO_ROOM = (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR_WRITE)
+"""Codes of a temporary file that cannot grow, because a reader writes no other."""
+_FAULT_VALUES = 5
+"""Values of a message that says why the query ended."""
+_TOO_MUCH = "the query needs more {} than it may use: select or sort less"
 
 
 class _Cursor:
-    def __init__(self, path: Path, bytes_max: int) -> None:
+    def __init__(self) -> None:
         self.columns: tuple[str, ...] = ()
-        self._bytes_left = bytes_max
-        self._until_s = 0.0
-        self._denied: str | None = None
-        uri = f"{path.as_uri()}?mode=ro"
-        self._connection = sqlite3.connect(
-            uri, uri=True, isolation_level=None, timeout=BUSY_TIMEOUT_S, check_same_thread=False
-        )
-        # Making these tables counts as an UPDATE of the schema, although nothing is stored.
-        self._connection.execute("SELECT 1 FROM json_each('[]'), json_tree('[]')")
-        self._names = [str(name) for (name,) in self._connection.execute("SELECT name FROM sqlite_master")]
-        self._connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, max(bytes_max, _VALUE_BYTES))
-        self._connection.set_progress_handler(lambda: time.monotonic() > self._until_s, _STEPS)
-        self._connection.set_authorizer(self._authorize)
-        self._rows: sqlite3.Cursor | None = None
+        self._process: subprocess.Popen[bytes] | None = None
+        self._seconds = 0.0
 
-    def _authorize(self, action: int, _first: str | None, second: str | None, *_: str | None) -> int:
-        if action in _ALLOWED and not (action == sqlite3.SQLITE_FUNCTION and second in _FORBIDDEN_FUNCTIONS):
-            return sqlite3.SQLITE_OK
-        self._denied = self._denied or (
-            f"{second}()" if action == sqlite3.SQLITE_FUNCTION else _ACTIONS.get(action, f"action {action}")
-        )
-        return sqlite3.SQLITE_DENY
-
-    async def start(self, sql: str, seconds: float) -> None:
-        def execute() -> sqlite3.Cursor:
-            return self._connection.execute(sql)
-
-        self._rows = await self._run(execute, seconds)
-        if self._rows.description is None:
+    async def start(self, path: Path, sql: str, bytes_max: int, seconds: float) -> None:
+        self._seconds = seconds
+        await self._run(self._open, _START_S)
+        await self._exchange((f"{path.as_uri()}?mode=ro", sql, bytes_max, seconds), _START_S)
+        self.columns = tuple(await self._exchange(None, seconds))
+        if not self.columns:
             raise QueryRefused(ONLY_READS)
-        self.columns = tuple(each[0] for each in self._rows.description)
 
     async def fetch(self, rows: int, seconds: float) -> tuple[list[tuple[Any, ...]], bool]:
-        def fetch() -> tuple[list[tuple[Any, ...]], bool]:
-            assert self._rows is not None
-            fetched: list[tuple[Any, ...]] = []
-            while len(fetched) < rows and (row := self._rows.fetchone()) is not None:
-                size = sum(len(each) if isinstance(each, str | bytes) else 8 for each in row)
-                if size > self._bytes_left:
-                    return fetched, True
-                self._bytes_left -= size
-                fetched.append(row)
-            return fetched, False
+        clock = asyncio.get_running_loop().time
+        until_s = clock() + seconds
+        fetched: list[tuple[Any, ...]] = []
+        state = ""
+        while len(fetched) < rows and not state:
+            piece, state = await self._exchange(rows - len(fetched), until_s - clock())
+            fetched += piece
+        return fetched, state == "full"
 
-        return await self._run(fetch, seconds)
+    def _open(self) -> None:
+        try:
+            self._process = subprocess.Popen(  # noqa: S603  this interpreter with our own program
+                [sys.executable, "-I", "-S", str(_PROGRAM)],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                start_new_session=True,
+            )
+        except OSError as error:
+            raise QueryRefused(f"the process of the query cannot be started: {error.strerror}") from None
+
+    async def _exchange(self, request: Any, seconds: float) -> Any:
+        """Write a request, unless it is None, and return the answer."""
+        process = self._process
+        assert process is not None
+        reader, writer = process.stdout, process.stdin
+        assert reader is not None
+        assert writer is not None
+
+        def exchange() -> Any:
+            if request is not None:
+                marshal.dump(request, writer)
+                writer.flush()
+            return marshal.load(reader)  # noqa: S302  of our own program
+
+        try:
+            answer = await self._run(exchange, seconds)
+        except (EOFError, OSError, ValueError, TypeError):  # of an answer that was cut
+            number = await asyncio.to_thread(process.wait)
+            raise QueryRefused(f"the process of the query ended with the code {number}: select less") from None
+        if isinstance(answer, tuple) and len(answer) == _FAULT_VALUES:
+            raise _refusal(*answer)
+        return answer
 
     async def _run(self, work: Callable[[], _T], seconds: float) -> _T:
-        """Run it in a thread, to its end also if this task is cancelled: then SQLite is interrupted."""
-        self._until_s = time.monotonic() + seconds
+        """Run it in a thread, to its end also if the time is over or this task is cancelled: then kill the process."""
         thread = asyncio.ensure_future(asyncio.to_thread(work))
         try:
-            return await asyncio.shield(thread)
-        except asyncio.CancelledError:
-            self._until_s = 0.0
-            self._connection.interrupt()
-            await asyncio.wait([thread])
-            raise
-        except (sqlite3.Error, sqlite3.Warning, UnicodeEncodeError) as error:
-            raise self._refusal(error, seconds) from None
-
-    def _refusal(self, error: Exception, seconds: float) -> Exception:
-        code = getattr(error, "sqlite_errorcode", None)
-        if self._denied is not None:
-            return QueryRefused(f"{ONLY_READS}; {self._denied} is not allowed")
-        if code is None and "one statement" in str(error):
-            return QueryRefused(NOT_ONE)
-        if code == sqlite3.SQLITE_INTERRUPT:
-            return QueryRefused(stopped(seconds))
-        if code is None or code & 0xFF in _REFUSALS:
-            text = str(error)
-            if text.startswith("no such table: "):
-                return missing_relation(text.removeprefix("no such table: "), self._names)
-            return QueryRefused(f"the query is refused: {text}")
-        return error
+            done, _ = await asyncio.wait([thread], timeout=max(seconds, 0.001))
+            if not done:
+                raise QueryRefused(stopped(self._seconds))
+            return thread.result()
+        finally:
+            if not thread.done():
+                if self._process is not None:
+                    self._process.kill()
+                await asyncio.wait([thread])
+                thread.exception()  # a cut answer, which otherwise would be logged as never read
 
     def close(self) -> None:
-        self._connection.close()
+        if self._process is None:
+            return
+        self._process.kill()
+        for each in (self._process.stdin, self._process.stdout):
+            if each is not None:
+                with suppress(OSError):  # of bytes that the process did not read
+                    each.close()
+        self._process.wait()
+
+
+def _refusal(
+    kind: str, code: int | None, text: str, denied: tuple[int, str | None] | None, names: list[str]
+) -> Exception:
+    """Return the error that the process met, as the query's own or as one of the database."""
+    if kind == "memory":
+        return QueryRefused(_TOO_MUCH.format("memory"))
+    if denied is not None:
+        action, function = denied
+        what = f"{function}()" if action == sqlite3.SQLITE_FUNCTION else _ACTIONS.get(action, f"action {action}")
+        return QueryRefused(f"{ONLY_READS}; {what} is not allowed")
+    if code is None and "one statement" in text:
+        return QueryRefused(NOT_ONE)
+    if code in _NO_ROOM:
+        return QueryRefused(_TOO_MUCH.format("space for temporary files"))
+    if code is None or code & 0xFF in _REFUSALS:
+        if text.startswith("no such table: "):
+            return missing_relation(text.removeprefix("no such table: "), names)
+        return QueryRefused(f"the query is refused: {text}")
+    error = sqlite3.OperationalError(text)
+    error.sqlite_errorcode = code
+    return error
 
 
 @asynccontextmanager
 async def sqlite_cursor(path: Path, sql: str, *, bytes_max: int, seconds: float) -> AsyncIterator[_Cursor]:
     """Run one query on the file at this path."""
-    cursor = await asyncio.to_thread(_Cursor, path, bytes_max)
+    cursor = _Cursor()
     try:
-        await cursor.start(sql, seconds)
+        await cursor.start(path, sql, bytes_max, seconds)
         yield cursor
     finally:
-        cursor.close()
+        await asyncio.to_thread(cursor.close)
