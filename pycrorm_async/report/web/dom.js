@@ -13,6 +13,16 @@ export function element(tag, attributes = {}, ...children) {
 /** Recorded text in an element of its own direction, so that right-to-left text does not reorder its surroundings. */
 export const recorded = (text, attributes = {}) => element("bdi", attributes, String(text));
 
+/** Replace what is in a holder; a focused control keeps the focus if the new content has it too, else the holder gets it. */
+export function replaceIn(holder, ...children) {
+  const keyOf = (control) => control.dataset.key ?? control.textContent;
+  const focused = holder.contains(document.activeElement) && holder !== document.activeElement ? keyOf(document.activeElement) : null;
+  holder.replaceChildren(...children);
+  if (focused === null) return;
+  const same = [...holder.querySelectorAll("button, a")].find((each) => keyOf(each) === focused);
+  (same ?? holder).focus({ preventScroll: true });
+}
+
 const SVG = "http://www.w3.org/2000/svg";
 
 export function svg(tag, attributes = {}, ...children) {

@@ -96,7 +96,8 @@ export class Episode {
       node.became(ends[index], texts[statuses[index]], texts[reasons[index]], texts[messages[index]]);
       this.nodes.push(node);
       this.nodeAt.set(start, node);
-      (node.parent?.children ?? this.roots).push(node);
+      const siblings = node.parent?.children ?? this.roots;
+      node.place = siblings.push(node);
     });
     ended[0].forEach((start, index) => {
       const [end, status, reason, message] = ended.slice(1).map((column) => column[index]);
@@ -189,6 +190,7 @@ export class Node {
   constructor(episode, start, parent, kind, type) {
     Object.assign(this, { episode, start, parent, kind, type, children: [], isRootFailure: false, holdsFailure: false });
     this.depth = parent === null ? 0 : parent.depth + 1;
+    this.place = 1;
     this.name = type || (kind === "root" ? "plan" : kind);
   }
 

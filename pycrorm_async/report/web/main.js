@@ -82,7 +82,7 @@ class Page {
 
   #controls() {
     const { episode } = this;
-    this.play = element("button", { type: "button", title: "play (space)", onclick: () => this.togglePlay() }, "▶");
+    this.play = element("button", { type: "button", title: "play (space)", "aria-label": "play", onclick: () => this.togglePlay() }, "▶");
     this.slider = element("input", { type: "range", min: episode.first, max: episode.last, step: 1, "aria-label": "event" });
     this.slider.addEventListener("input", () => this.seek(Number(this.slider.value)));
     this.clock = element("output", { class: "clock" });
@@ -188,6 +188,7 @@ class Page {
       this.#step(performance.now(), this.event, Math.max(last - first, 1) / PLAYED_S);
     }
     this.play.textContent = this.playing === null ? "▶" : "❚❚";
+    this.play.setAttribute("aria-label", this.playing === null ? "play" : "pause");
   }
 
   #step(began, from, rate) {
@@ -215,8 +216,8 @@ class Page {
     this.gantt.show(event, this.selected);
     this.panels.show(event, this.selected, running);
     this.slider.value = event;
-    this.slider.setAttribute("aria-valuetext", `event ${event}`);
     this.clock.textContent = `${duration(episode.secondsAt(event))} · event ${event} of ${episode.last}`;
+    this.slider.setAttribute("aria-valuetext", this.clock.textContent);
     if (matchMedia("print").matches) this.#print();
     clearTimeout(this.writing);
     const address = this.following ? location.pathname : `#e${this.event}`;

@@ -1,6 +1,6 @@
 // Shows many episodes: how often they succeed and for how long, why they fail, and a table that leads to their pages.
 
-import { duration, element, recorded, svg } from "./dom.js";
+import { duration, element, recorded, replaceIn, svg } from "./dom.js";
 import { signOf } from "./episode.js";
 import { successMap } from "./success.js";
 
@@ -101,7 +101,7 @@ class Overview {
       ),
     );
     const content = rows.length > 0 ? [element("h2", {}, "Running now"), element("ul", { class: "running" }, ...rows)] : [];
-    part("running").replaceChildren(...content);
+    replaceIn(part("running"), ...content);
   }
 
   #trend() {
@@ -132,8 +132,9 @@ class Overview {
     const columns = { number: "episode", started: "started", status: "status", seconds: "took", nodes: "nodes", failed: "failed", description: "description" };
     const heads = Object.entries(columns).map(([key, title]) => {
       const sign = this.by === key ? (this.down ? " ▾" : " ▴") : "";
-      const sort = { type: "button", onclick: () => this.#sortBy(key) };
-      return element("th", { scope: "col" }, element("button", sort, `${title}${sign}`));
+      const sort = { type: "button", "data-key": key, onclick: () => this.#sortBy(key) };
+      const order = this.by === key ? (this.down ? "descending" : "ascending") : null;
+      return element("th", { scope: "col", "aria-sort": order }, element("button", sort, `${title}${sign}`));
     });
     const order = this.down ? -1 : 1;
     const sorted = this.episodes.slice().sort((one, other) => {
@@ -144,7 +145,7 @@ class Overview {
     const table = element("table", {}, element("thead", {}, element("tr", {}, ...heads)), element("tbody", {}, ...rows));
     const left = sorted.length - rows.length;
     const note = left > 0 ? element("p", { class: "quiet" }, `${left} more episodes are counted above and not listed.`) : "";
-    part("episodes").replaceChildren(element("h2", {}, "Episodes"), table, note);
+    replaceIn(part("episodes"), element("h2", {}, "Episodes"), table, note);
   }
 
   #row(each) {

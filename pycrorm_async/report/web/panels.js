@@ -1,7 +1,7 @@
 // Shows what belongs to a node or to the moment: details, failures by reason, percepts, observations, states.
 
 import { failureGroups, lastUpTo, signOf } from "./episode.js";
-import { duration, element, recorded, svg } from "./dom.js";
+import { duration, element, recorded, replaceIn, svg } from "./dom.js";
 
 const LISTED_MAX = 200;
 const MESSAGES_MAX = 5;
@@ -11,7 +11,8 @@ export class Panels {
   constructor(holder, episode, { onSeek, onSelect }) {
     Object.assign(this, { holder, episode, onSeek, onSelect });
     this.bar = element("div", { class: "tabs", role: "tablist" });
-    this.body = element("div", { class: "panel", role: "tabpanel", tabindex: 0 });
+    this.body = element("div", { class: "panel", id: "panel", role: "tabpanel", tabindex: 0 });
+    this.bar.addEventListener("keydown", (pressed) => this.#press(pressed));
     holder.append(this.bar, this.body);
     this.current = episode.rootFailures.length > 0 ? "failures" : "details";
     this.#drawBar();
@@ -38,16 +39,26 @@ export class Panels {
   }
 
   #drawBar() {
-    this.bar.replaceChildren(
-      ...this.tabs.map(([name, title, count]) =>
-        element(
-          "button",
-          { type: "button", role: "tab", "aria-selected": String(name === this.current), onclick: () => this.open(name) },
-          title,
-          count === null ? null : element("span", { class: "count" }, String(count)),
-        ),
-      ),
-    );
+    const tabs = this.tabs.map(([name, title, count]) => {
+      const selected = name === this.current;
+      const attributes = { type: "button", role: "tab", id: `tab-${name}`, "data-key": name, "aria-selected": String(selected) };
+      const behaviour = { tabindex: selected ? 0 : -1, "aria-controls": "panel", onclick: () => this.open(name) };
+      const number = count === null ? null : element("span", { class: "count" }, String(count));
+      return element("button", { ...attributes, ...behaviour }, title, number);
+    });
+    replaceIn(this.bar, ...tabs);
+    this.body.setAttribute("aria-labelledby", `tab-${this.current}`);
+  }
+
+  /** Open the tab beside the focused one. */
+  #press(pressed) {
+    const step = { ArrowRight: 1, ArrowLeft: -1 }[pressed.key];
+    if (step === undefined) return;
+    const names = this.tabs.map(([name]) => name);
+    this.open(names[(names.indexOf(this.current) + step + names.length) % names.length]);
+    this.bar.querySelector("[aria-selected=true]").focus();
+    pressed.preventDefault();
+    pressed.stopPropagation();
   }
 
   open(name) {
@@ -65,7 +76,7 @@ export class Panels {
   #draw() {
     if (this.event === undefined) return;
     const [, , , content] = this.tabs.find(([name]) => name === this.current);
-    this.body.replaceChildren(...content());
+    replaceIn(this.body, ...content());
   }
 
   /** Draw all panels below one another, for print. */

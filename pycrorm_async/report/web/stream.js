@@ -11,7 +11,7 @@ const { live } = JSON.parse(document.getElementById("document").textContent);
 class Stream {
   constructor(address, view) {
     Object.assign(this, { address, view, version: null, last: view.episode?.last ?? 0, waiting: [] });
-    this.badge = element("button", { type: "button", id: "live", role: "status" });
+    this.badge = element("button", { type: "button", id: "live", "aria-live": "polite" });
     this.note = element("p", { class: "quiet", id: "stream" });
     holder.querySelector("h1").after(this.badge);
     holder.append(this.note);

@@ -6,6 +6,7 @@ import { duration, element, recorded } from "./dom.js";
 const ROW_PX = 26;
 const OPEN_MAX = 300;
 const PRINTED_MAX = 2000;
+const HINT_MAX = 600;
 
 export class TreeView {
   constructor(holder, episode, { onSelect }) {
@@ -21,6 +22,7 @@ export class TreeView {
     holder.append(this.spacer);
     holder.addEventListener("scroll", () => this.#draw());
     holder.addEventListener("keydown", (pressed) => this.#press(pressed));
+    holder.addEventListener("focus", () => this.#bringIntoSight(this.#current()));
     new ResizeObserver(() => this.#draw()).observe(holder);
     this.#openAtFailures();
     this.#list();
@@ -81,11 +83,14 @@ export class TreeView {
     Object.assign(this, { event, selected });
     this.printing = false;
     this.running = new Set(running);
-    if (selected === null) {
-      const innermost = running.filter((each) => this.rowOf.has(each)).at(-1);
-      if (innermost !== undefined) this.#bringIntoSight(innermost);
-    }
+    this.innermost = running.filter((each) => this.rowOf.has(each)).at(-1) ?? null;
+    if (selected === null && this.innermost !== null) this.#bringIntoSight(this.innermost);
     this.#draw();
+  }
+
+  /** The node that the keys start from: the selected one, the innermost of the moment, or the first. */
+  #current() {
+    return [this.selected, this.innermost].find((each) => this.rowOf.has(each)) ?? this.rows[0]?.node ?? null;
   }
 
   reveal(node) {
@@ -96,6 +101,7 @@ export class TreeView {
   }
 
   #bringIntoSight(node) {
+    if (node === null) return;
     const top = this.rowOf.get(node) * ROW_PX;
     const { scrollTop, clientHeight } = this.holder;
     if (top < scrollTop || top + 2 * ROW_PX > scrollTop + clientHeight) {
@@ -104,17 +110,28 @@ export class TreeView {
   }
 
   #press(pressed) {
-    const step = { ArrowDown: 1, ArrowUp: -1 }[pressed.key];
-    const here = this.selected !== null ? this.rowOf.get(this.selected) ?? 0 : 0;
-    if (step !== undefined) {
-      let next = here + step;
-      while (this.rows[next]?.message) next += step;
-      if (this.rows[next] !== undefined) this.#choose(this.rows[next].node);
-    } else if (this.selected !== null && ["ArrowLeft", "ArrowRight"].includes(pressed.key)) {
-      this.#toggle(this.selected, pressed.key === "ArrowRight");
-    } else return;
+    const node = this.#current();
+    if (node === null || pressed.ctrlKey || pressed.metaKey || pressed.altKey) return;
+    const actions = {
+      ArrowDown: () => this.#beside(node, 1),
+      ArrowUp: () => this.#beside(node, -1),
+      ArrowRight: () => (this.#isOpen(node) ? node.children[0] : node.children.length > 0 && this.#toggle(node, true)),
+      ArrowLeft: () => (this.#isOpen(node) && node.children.length > 0 ? this.#toggle(node, false) : node.parent),
+      Enter: () => node,
+    };
+    const action = actions[pressed.key];
+    if (action === undefined) return;
+    const next = action();
+    if (next) this.#choose(next);
     pressed.preventDefault();
     pressed.stopPropagation();
+  }
+
+  /** The node of the row below or above; undefined at the ends. */
+  #beside(node, step) {
+    let next = this.rowOf.get(node) + step;
+    while (this.rows[next]?.message) next += step;
+    return this.rows[next]?.node;
   }
 
   #choose(node) {
@@ -152,6 +169,8 @@ export class TreeView {
       return made;
     });
     this.spacer.replaceChildren(...drawn);
+    const current = this.#current();
+    if (current !== null) this.holder.setAttribute("aria-activedescendant", `n${current.start}`);
   }
 
   #rowOf({ node, message }) {
@@ -162,7 +181,7 @@ export class TreeView {
   }
 
   #messageOf(node) {
-    const made = element("div", { class: "row message" });
+    const made = element("div", { class: "row message", "aria-hidden": "true", title: node.message.slice(0, HINT_MAX) });
     made.append(recorded(node.message.slice(0, 300)));
     return made;
   }
@@ -183,11 +202,17 @@ export class TreeView {
     const hidden = !open && node.children.length > 0 ? element("span", { class: "count" }, `${node.children.length}`) : null;
     const inside = !open && node.holdsFailure && !node.failed ? element("span", { class: "count bad" }, "✗ inside") : null;
     const took = node.end ? duration(this.episode.secondsAt(node.end) - this.episode.secondsAt(node.start)) : "";
+    const spoken = [node.name, node.status, node.reason, took && `took ${took}`, node.parameters, node.isRootFailure && node.message];
     return element(
       "div",
       {
         class: classes.join(" "),
         role: "treeitem",
+        id: `n${node.start}`,
+        title: node.parameters && `${node.name} ${node.parameters}`.slice(0, HINT_MAX),
+        "aria-label": spoken.filter(Boolean).join(", ").slice(0, HINT_MAX),
+        "aria-posinset": node.place,
+        "aria-setsize": (node.parent?.children ?? this.episode.roots).length,
         "aria-level": node.depth + 1,
         "aria-expanded": node.children.length > 0 ? String(open) : null,
         "aria-selected": String(node === this.selected),

@@ -1,0 +1,62 @@
+"""The page by keyboard and for screen readers: the focus stays where it was, and each row and control has its words."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.report.browser import Browser
+
+pytestmark = pytest.mark.slow
+
+FOCUSED = "document.activeElement.textContent"
+CURRENT = "document.getElementById(document.getElementById('tree').getAttribute('aria-activedescendant'))"
+
+
+def test_the_focus_stays_on_the_control_that_was_used(chrome: Browser, pages: dict[str, Path]) -> None:
+    with chrome.open(pages["plan"]) as tab:
+        tab.ask("document.querySelector('[role=tab][aria-selected=true]').focus()")
+        tab.press("ArrowRight")
+        assert tab.ask(FOCUSED) == "Attachments1"
+        assert tab.ask("document.querySelectorAll('[role=tab][tabindex=\"0\"]').length") == 1
+        assert tab.ask("document.getElementById('panel').getAttribute('aria-labelledby')") == "tab-attachments"
+        tab.ask("document.querySelector('.panel .moment').focus()")
+        moment = tab.ask(FOCUSED)
+        tab.ask("document.activeElement.click()")
+        assert tab.ask(FOCUSED) == moment
+        assert tab.ask("`e${pycrormPage.event}`") == moment
+        tab.ask("pycrormPage.panels.open('failures')")
+        assert tab.ask("document.activeElement.id") == "panel"  # the control is gone
+
+
+def test_the_tree_is_walked_from_the_current_row_and_says_it(chrome: Browser, pages: dict[str, Path]) -> None:
+    with chrome.open(pages["plan"]) as tab:
+        tab.ask("document.getElementById('tree').focus()")
+        assert tab.ask(f"{CURRENT}.getAttribute('aria-label')").startswith("TransportAction, SUCCEEDED, took ")
+        tab.press("ArrowUp")
+        spoken = tab.ask(f"{CURRENT}.getAttribute('aria-label')")
+        assert spoken.startswith("MoveTCPMotion, FAILED, IKError, took ")
+        assert "l_gripper_tool_frame cannot reach" in spoken
+        assert tab.ask("pycrormPage.selected.reason") == "IKError"
+        tab.press("ArrowLeft")
+        assert tab.ask("pycrormPage.selected.name") == "PickUpAction"
+        tab.press("ArrowLeft")
+        assert tab.ask(f"{CURRENT}.getAttribute('aria-expanded')") == "false"
+        tab.press("ArrowLeft")
+        assert tab.ask("pycrormPage.selected.name") == "plan"
+        tab.press("ArrowRight")
+        assert tab.ask("pycrormPage.selected.name") == "ParkArmsAction"
+        places = f"['aria-level', 'aria-posinset', 'aria-setsize'].map((each) => {CURRENT}.getAttribute(each))"
+        assert tab.ask(places) == ["2", "1", "5"]
+
+
+def test_every_control_has_a_name_that_is_no_sign(chrome: Browser, pages: dict[str, Path]) -> None:
+    with chrome.open(pages["plan"]) as tab:
+        tree = tab.call("Accessibility.getFullAXTree")["nodes"]
+        roles = ("button", "slider", "tab", "treeitem")
+        names = [
+            (each["role"]["value"], each["name"]["value"])
+            for each in tree
+            if not each["ignored"] and each["role"]["value"] in roles
+        ]
+        assert {role for role, _ in names} == set(roles)
+        assert [each for each in names if not any(map(str.isalnum, each[1]))] == []
