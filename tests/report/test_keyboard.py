@@ -15,8 +15,9 @@ CURRENT = "document.getElementById(document.getElementById('tree').getAttribute(
 def test_the_focus_stays_on_the_control_that_was_used(chrome: Browser, pages: dict[str, Path]) -> None:
     with chrome.open(pages["plan"]) as tab:
         tab.ask("document.querySelector('[role=tab][aria-selected=true]').focus()")
-        tab.press("ArrowRight")
-        assert tab.ask(FOCUSED) == "Attachments1"
+        for name in ("Objects4", "Attachments1"):
+            tab.press("ArrowRight")
+            assert tab.ask(FOCUSED) == name
         assert tab.ask("document.querySelectorAll('[role=tab][tabindex=\"0\"]').length") == 1
         assert tab.ask("document.getElementById('panel').getAttribute('aria-labelledby')") == "tab-attachments"
         tab.ask("document.querySelector('.panel .moment').focus()")

@@ -95,7 +95,7 @@ def test_failures_are_grouped_by_reason_with_their_count(chrome: Browser, pages:
 def test_every_tab_draws(chrome: Browser, pages: dict[str, Path]) -> None:
     with chrome.open(pages["plan"]) as tab:
         names = tab.ask("pycrormPage.panels.tabs.map(([name]) => name)")
-        assert names == ["details", "failures", "attachments", "states"]
+        assert names == ["details", "failures", "objects", "attachments", "states"]
         for name in names:
             tab.ask(f"pycrormPage.panels.open('{name}')")
             assert len(tab.ask("document.querySelector('.panel').textContent")) > 20
@@ -128,7 +128,7 @@ def test_print_has_the_map_all_rows_and_all_panels(chrome: Browser, pages: dict[
         tab.wait_for("document.querySelectorAll('#map polygon').length > 20")
         rows = tab.ask("document.querySelectorAll('#tree .row').length")
         assert rows == tab.ask("pycrormPage.tree.rows.length")
-        assert tab.ask("document.querySelectorAll('.panel h2').length") == 4
+        assert tab.ask("document.querySelectorAll('.panel h2').length") == 5
         assert tab.print(tmp_path / "page.pdf").stat().st_size > 10_000
         assert_quiet(tab, pages["plan"])
 

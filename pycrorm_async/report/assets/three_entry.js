@@ -1,6 +1,5 @@
 // The parts of three.js that the page uses; esbuild leaves the others out of the bundle.
 export {
-  AmbientLight,
   Box3,
   BoxGeometry,
   BufferGeometry,
@@ -13,13 +12,13 @@ export {
   HemisphereLight,
   Line,
   LineBasicMaterial,
-  Matrix4,
   Mesh,
   MeshStandardMaterial,
   PerspectiveCamera,
-  Quaternion,
+  PlaneGeometry,
   Raycaster,
   Scene,
+  ShadowMaterial,
   SphereGeometry,
   Vector2,
   Vector3,

@@ -1,7 +1,7 @@
 // Puts the page together: one moment, `event`, that the tree, the scene, the chart and the panels show.
 
 import { Bodies, pathsOf } from "./bodies.js";
-import { duration, element, recorded } from "./dom.js";
+import { duration, element, recorded, svg } from "./dom.js";
 import { Episode, signOf } from "./episode.js";
 import { GanttView } from "./gantt_view.js";
 import { MapView } from "./map_view.js";
@@ -11,7 +11,11 @@ import { TreeView } from "./tree_view.js";
 
 const PLAYED_S = 20;
 const NOTES_MAX = 3;
-const HELP = "Space plays. ← → go by one event, with Shift by ten; Home and End to the ends. F goes to the next failure, A changes the axis.";
+const HELP = [
+  "Space plays. ← → go by one event, with Shift by ten; Home and End to the ends. F goes to the next failure, A changes the axis of the chart.",
+  "Scene: drag turns, drag with the right button or two fingers moves, the wheel zooms; a click chooses an object, a double click goes to it. W shows the whole scene, R follows the robot.",
+  "Chart: the wheel zooms, a double click shows all.",
+];
 const part = (name) => document.getElementById(name);
 
 class Page {
@@ -19,6 +23,7 @@ class Page {
     this.episode = episode;
     this.event = this.#eventInAddress() ?? episode.opens;
     this.selected = null;
+    this.object = null;
     this.playing = null;
     this.following = false;
     const seek = (event) => this.seek(event);
@@ -28,7 +33,7 @@ class Page {
     this.view = this.#sceneOrMap();
     this.tree = new TreeView(part("tree"), episode, { onSelect: select });
     this.gantt = new GanttView(part("gantt"), episode, { onSeek: seek, onSelect: select });
-    this.panels = new Panels(part("panels"), episode, { onSeek: seek, onSelect: select });
+    this.panels = new Panels(part("panels"), episode, { onSeek: seek, onSelect: select, onChoose: (object) => this.choose(object) });
     this.#head();
     this.#controls();
     this.#listen();
@@ -45,7 +50,7 @@ class Page {
 
   #sceneOrMap() {
     try {
-      return new SceneView(part("scene"), this.episode, this.bodies);
+      return new SceneView(part("scene"), this.episode, this.bodies, { onPick: (object) => this.choose(object) });
     } catch {
       document.body.classList.add("no-webgl");
       return this.map;
@@ -76,6 +81,7 @@ class Page {
       return [assumed && `${each.name} is drawn as ${assumed}`, boxes && `${each.name} has boxes instead of ${boxes}`];
     });
     const notes = [...new Set(texts)].filter(Boolean).slice(0, NOTES_MAX).map((each) => element("p", {}, recorded(each)));
+    document.body.classList.toggle("no-objects", episode.objects.length === 0);
     if (episode.objects.length === 0) notes.push(element("p", {}, "This episode recorded no objects: there is no scene to draw."));
     part("notes").replaceChildren(...notes);
   }
@@ -86,13 +92,52 @@ class Page {
     this.slider = element("input", { type: "range", min: episode.first, max: episode.last, step: 1, "aria-label": "event" });
     this.slider.addEventListener("input", () => this.seek(Number(this.slider.value)));
     this.clock = element("output", { class: "clock" });
-    this.axis = element("button", { type: "button", title: "axis of the chart (A)", onclick: () => this.#changeAxis() }, "by event");
-    const help = element("button", { type: "button", class: "help", title: HELP, "aria-label": HELP, onclick: () => this.#help() }, "?");
+    this.axis = element("button", { type: "button", title: "axis of the chart: events, which are equally far apart, or time (A)", onclick: () => this.#changeAxis() }, "by event");
+    const help = element("button", { type: "button", class: "help", title: "keys and mouse (?)", "aria-label": "keys and mouse", onclick: () => this.#help() }, "?");
     part("controls").append(this.play, this.slider, this.clock, this.axis, help);
+    const whole = element("button", { type: "button", title: "show the whole scene (W)", onclick: () => this.#showWhole() }, "whole scene");
+    this.tracking = element("button", { type: "button", title: "keep the robot, or the chosen object, in sight (R)", onclick: () => this.#track() });
+    part("views").append(whole, this.tracking);
+    this.#nameTracked();
   }
 
   #help() {
-    part("help").textContent = part("help").textContent ? "" : HELP;
+    part("help").replaceChildren(...(part("help").hasChildNodes() ? [] : HELP.map((each) => element("p", {}, each))));
+  }
+
+  #showWhole() {
+    if (this.tracked) this.#track();
+    this.view.frame();
+    this.show();
+  }
+
+  /** Follow the chosen object or the robot with the camera, or stop it. */
+  #track() {
+    this.tracked = this.tracked ? null : this.#trackable() ?? null;
+    this.view.follow(this.tracked);
+    this.#nameTracked();
+    this.show();
+  }
+
+  #trackable() {
+    const present = this.episode.presentAt(this.event);
+    return present.find((each) => each === this.object) ?? present.find((each) => each.type === "ROBOT");
+  }
+
+  #nameTracked() {
+    const object = this.tracked ?? this.#trackable();
+    this.tracking.hidden = object === undefined;
+    this.tracking.setAttribute("aria-pressed", String(Boolean(this.tracked)));
+    this.tracking.replaceChildren("follow ", recorded(object?.name ?? ""));
+  }
+
+  /** Show an object of the scene, or none. */
+  choose(object) {
+    this.object = object;
+    this.view.choose(object);
+    this.panels.choose(object);
+    if (object !== null) this.panels.open("objects");
+    this.show();
   }
 
   #changeAxis() {
@@ -125,6 +170,9 @@ class Page {
       End: () => this.seek(last),
       f: () => this.#nextFailure(),
       a: () => this.#changeAxis(),
+      r: () => this.#track(),
+      w: () => this.#showWhole(),
+      Escape: () => this.choose(null),
       "?": () => this.#help(),
     };
     const action = actions[pressed.key.length === 1 ? pressed.key.toLowerCase() : pressed.key];
@@ -210,7 +258,10 @@ class Page {
     const running = episode.runningAt(event);
     const action = this.selected ?? running.filter((each) => each.kind === "action").at(-1) ?? null;
     this.action = action;
-    this.view.show(event, action, pathsOf(episode, action));
+    const paths = pathsOf(episode, action);
+    this.view.show(event, action, paths);
+    this.#legend(paths);
+    if (!this.tracked) this.#nameTracked();
     if (this.following) this.tree.follow(running);
     this.tree.show(event, running, { selected: this.selected });
     this.gantt.show(event, this.selected);
@@ -222,6 +273,16 @@ class Page {
     clearTimeout(this.writing);
     const address = this.following ? location.pathname : `#e${this.event}`;
     this.writing = setTimeout(() => history.replaceState(null, "", address), 250);
+  }
+
+  /** Name the paths in the scene, and the distance of its lines. */
+  #legend(paths) {
+    const ways = paths.slice(0, 4).map(({ object, color }, index) => {
+      const line = svg("line", { x1: 0, x2: 18, y1: 5, y2: 5, class: color.slice(2), "stroke-dasharray": index % 2 ? "4 3" : "none" });
+      return element("span", {}, svg("svg", { width: 18, height: 10, "aria-hidden": "true" }, line), " path of ", recorded(object.name));
+    });
+    const during = ways.length > 0 ? element("span", {}, "during ", recorded(this.action.name)) : null;
+    part("legend").replaceChildren(...ways, ...(during ? [during] : []), element("span", {}, "grid 1 m"));
   }
 
   #print() {

@@ -9,7 +9,18 @@ export class MapView {
     this.holder = holder;
     this.episode = episode;
     this.bodies = bodies;
+    this.chosen = null;
   }
+
+  /** Draw an object with a thick outline, or none. */
+  choose(object) {
+    this.chosen = object;
+  }
+
+  /** The map always shows everything. */
+  follow() {}
+
+  frame() {}
 
   paint() {
     if (this.event !== undefined) this.show(this.event, null, this.paths);
@@ -29,10 +40,15 @@ export class MapView {
     const picture = svg("svg", { viewBox: view, class: "map", role: "img", "aria-label": "map of the world from above" });
     for (let x = Math.ceil(left); x <= right; x++) picture.append(line([x, low], [x, high], scale));
     for (let y = Math.ceil(low); y <= high; y++) picture.append(line([left, y], [right, y], scale));
-    const shapes = present.flatMap(({ outlines }) => outlines).sort((one, other) => one.top - other.top);
-    for (const { hull, color } of shapes) {
+    const shapes = present.flatMap(({ body, outlines }) => outlines.map((each) => ({ ...each, object: body.object })));
+    for (const { hull, color, object } of shapes.sort((one, other) => one.top - other.top)) {
       const corners = hull.map(([x, y]) => `${x.toFixed(3)},${(-y).toFixed(3)}`).join(" ");
-      picture.append(svg("polygon", { points: corners, fill: color, class: "outline", "stroke-width": scale * 0.15 }));
+      const thick = object === this.chosen ? 0.7 : 0.15;
+      const shape = svg("polygon", { points: corners, fill: color, class: "outline", "stroke-width": scale * thick });
+      const title = svg("title");
+      title.textContent = object.name;
+      shape.append(title);
+      picture.append(shape);
     }
     paths.forEach(({ points: path, color }, index) => {
       const corners = path.map(([x, y]) => `${x},${-y}`).join(" ");

@@ -7,9 +7,16 @@ const LISTED_MAX = 200;
 const MESSAGES_MAX = 5;
 const LINKS_MAX = 12;
 
+const listOf = (facts) => element("dl", {}, ...facts.flatMap(([name, value]) => [element("dt", {}, name), element("dd", {}, value)]));
+
+const unsigned = (text) => (Number(text) === 0 ? text.replace("-", "") : text);
+
+/** The angle about the vertical axis of an orientation, in degrees. */
+const yawOf = ([x, y, z, w]) => (Math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)) * 180) / Math.PI;
+
 export class Panels {
-  constructor(holder, episode, { onSeek, onSelect }) {
-    Object.assign(this, { holder, episode, onSeek, onSelect });
+  constructor(holder, episode, { onSeek, onSelect, onChoose }) {
+    Object.assign(this, { holder, episode, onSeek, onSelect, onChoose, chosen: null });
     this.bar = element("div", { class: "tabs", role: "tablist" });
     this.body = element("div", { class: "panel", id: "panel", role: "tabpanel", tabindex: 0 });
     this.bar.addEventListener("keydown", (pressed) => this.#press(pressed));
@@ -19,11 +26,12 @@ export class Panels {
   }
 
   get tabs() {
-    const { rootFailures, detections, observations, attachments, samples, series } = this.episode;
+    const { rootFailures, objects, detections, observations, attachments, samples, series } = this.episode;
     const curves = [...samples.values()].reduce((sum, each) => sum + each.size, series.size);
     return [
       ["details", "Details", null, () => this.#details()],
       ["failures", "Failures", rootFailures.length, () => this.#failures()],
+      ["objects", "Objects", objects.length, () => this.#objects()],
       ["detections", "Percepts", detections.length, () => this.#detections()],
       ["attachments", "Attachments", attachments.length, () => this.#attachments()],
       ["observations", "Observations", observations.length, () => this.#observations()],
@@ -68,6 +76,11 @@ export class Panels {
     this.#draw();
   }
 
+  /** Mark an object in the list of objects, or none. */
+  choose(object) {
+    this.chosen = object;
+  }
+
   show(event, selected, running) {
     Object.assign(this, { event, selected, running });
     this.#draw();
@@ -97,8 +110,8 @@ export class Panels {
 
   #details() {
     const node = this.selected ?? this.running.at(-1);
-    if (node === undefined) return [element("p", { class: "quiet" }, "No node runs at this moment.")];
     const { episode } = this;
+    if (node === undefined) return [element("p", { class: "quiet" }, "No node runs at this moment."), ...this.#episodeFacts()];
     const facts = [
       ["status", element("span", {}, `${signOf(node.status)} ${node.status}`)],
       ["events", element("span", {}, this.#moment(node.start), node.end ? " to " : " on", node.end ? this.#moment(node.end) : null)],
@@ -106,16 +119,26 @@ export class Panels {
       ["parameters", node.parameters ? recorded(node.parameters) : null],
       ["reason", node.reason ? recorded(node.reason) : null],
       ["message", node.message ? recorded(node.message, { class: "long" }) : null],
-      ["below", node.parent ? this.#node(node.parent.start) : null],
+      ["part of", node.parent ? this.#node(node.parent.start) : null],
     ].filter(([, value]) => value !== null);
-    const list = element("dl", {}, ...facts.flatMap(([name, value]) => [element("dt", {}, name), element("dd", {}, value)]));
+    const list = listOf(facts);
     const places = episode.locations.filter((each) => each.node === node.start).slice(0, LISTED_MAX);
     const chosen = places.map((each) => {
       const refused = Object.entries(each.refused).map(([reason, count]) => `${count} ${reason}`).join(", ");
       const text = `${each.location}: ${each.offered} of ${each.considered} places offered`;
       return element("p", {}, this.#moment(each.at), " ", recorded(refused ? `${text}; refused: ${refused}` : text));
     });
-    return [element("h3", {}, recorded(node.name)), list, ...chosen];
+    const whole = node.parent === null ? this.#episodeFacts() : [];
+    return [element("h3", {}, recorded(node.name)), list, ...chosen, ...whole];
+  }
+
+  /** What was recorded about the episode as a whole. */
+  #episodeFacts() {
+    const { id, plan, created_by, host, software, metadata } = this.episode;
+    const recordedBy = [created_by, host].filter(Boolean).join(" on ");
+    const facts = Object.entries({ id, plan, "recorded by": recordedBy, software, ...metadata });
+    const shown = facts.filter(([, value]) => value).map(([name, value]) => [recorded(name), recorded(value)]);
+    return [element("h3", {}, "Episode"), listOf(shown)];
   }
 
   #took({ start, end, status }) {
@@ -176,6 +199,26 @@ export class Panels {
       const what = percepts.length > 0 ? percepts.join("; ") : "nothing seen";
       return element("p", {}, this.#moment(at), ` ${source.replace("_", " ")} `, type ? `looked for ${type}: ` : "", recorded(what), " ", this.#node(node));
     });
+  }
+
+  /** The objects of the moment: where each is, which way it looks, and what it moves with. */
+  #objects() {
+    const { episode, event } = this;
+    const present = episode.presentAt(event);
+    if (present.length === 0) return [element("p", { class: "quiet" }, "No object is in the world at this moment.")];
+    const attached = episode.attachedAt(event);
+    const heads = ["object", "type", "x (m)", "y (m)", "z (m)", "yaw (°)", "moves with"].map((each) => element("th", { scope: "col" }, each));
+    const rows = present.slice(0, LISTED_MAX).map((object) => {
+      const [x, y, z, ...orientation] = object.poses.valueAt(event);
+      const numbers = [x.toFixed(3), y.toFixed(3), z.toFixed(3), yawOf(orientation).toFixed(0)].map((each) => element("td", { class: "number" }, unsigned(each)));
+      const parents = attached.filter(([, child]) => child === object.id).map(([parent]) => episode.nameOf(parent));
+      const chosen = object === this.chosen;
+      const name = element("button", { type: "button", class: "moment", "aria-pressed": String(chosen), onclick: () => this.onChoose(chosen ? null : object) }, recorded(object.name));
+      return element("tr", { class: chosen ? "lit" : null }, element("td", {}, name), element("td", {}, object.type), ...numbers, element("td", {}, recorded(parents.join(", "))));
+    });
+    const left = present.length - rows.length;
+    const note = left > 0 ? [element("p", { class: "quiet" }, `${left} more objects are not listed.`)] : [];
+    return [element("table", {}, element("thead", {}, element("tr", {}, ...heads)), element("tbody", {}, ...rows)), ...note];
   }
 
   #attachments() {

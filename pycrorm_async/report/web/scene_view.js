@@ -1,58 +1,131 @@
-// Draws the world after an event with WebGL: bodies, the paths of the current action, names.
+// Draws the world after an event with WebGL: bodies, the paths of the current action, names; and shows what is pointed at.
 
 import { pathsOf } from "./bodies.js";
 import { colorOf, element } from "./dom.js";
+import { SceneCamera } from "./scene_camera.js";
+
+const CLICK_PX = 4;
+const GRID_MAX = 200;
+const SUN = [-5, 3.5, 8];
 
 export class SceneView {
-  /** Throws if the browser has no WebGL. */
-  constructor(holder, episode, bodies) {
-    this.holder = holder;
-    this.episode = episode;
-    this.bodies = bodies;
+  /** Throws if the browser has no WebGL. `onPick` gets the object that is clicked, or null. */
+  constructor(holder, episode, bodies, { onPick }) {
+    Object.assign(this, { holder, episode, bodies, onPick, chosen: null });
     const canvas = document.createElement("canvas");
     const context = canvas.getContext("webgl2", { antialias: true });
     if (context === null) throw new Error("this browser has no WebGL");
     this.renderer = new THREE.WebGLRenderer({ canvas, context });
     this.renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
-    this.renderer.domElement.setAttribute("aria-label", "the scene at the moment under the cursor");
-    this.renderer.domElement.setAttribute("role", "img");
+    this.renderer.shadowMap.enabled = !isSoftware(context);
+    this.renderer.shadowMap.autoUpdate = false; // a turn of the camera needs none
+    canvas.setAttribute("aria-label", "the scene at the moment under the cursor; the panel Objects lists what is in it");
+    canvas.setAttribute("role", "img");
     this.names = element("div", { class: "names", "aria-hidden": "true" });
-    holder.append(this.renderer.domElement, this.names);
+    this.hint = element("div", { class: "hint", "aria-hidden": "true" });
+    holder.append(canvas, this.names, this.hint);
     this.scene = new THREE.Scene();
-    this.camera = new THREE.PerspectiveCamera(42, 1, 0.05, 500);
-    this.camera.up.set(0, 0, 1);
-    this.controls = new THREE.OrbitControls(this.camera, this.renderer.domElement);
-    this.controls.addEventListener("change", () => this.#render());
-    this.controls.addEventListener("start", () => (this.touched = true));
-    this.scene.add(new THREE.HemisphereLight(0xffffff, 0x9a9488, 2.1));
-    const sun = new THREE.DirectionalLight(0xffffff, 1.9);
-    sun.position.set(-4, -3, 8);
-    this.scene.add(sun);
+    this.camera = new SceneCamera(canvas, () => this.#render());
+    this.scene.add(new THREE.HemisphereLight(0xffffff, 0x9a9488, 1.9));
+    this.sun = new THREE.DirectionalLight(0xffffff, 2.1);
+    this.sun.castShadow = true;
+    this.sun.shadow.mapSize.set(2048, 2048);
+    this.sun.shadow.normalBias = 0.02;
+    this.floor = new THREE.Mesh(new THREE.PlaneGeometry(1, 1), new THREE.ShadowMaterial({ opacity: 0.16 }));
+    this.floor.receiveShadow = true;
+    this.floor.position.z = -0.004;
     this.world = new THREE.Group();
     this.paths = new THREE.Group();
-    this.scene.add(this.world, this.paths);
+    this.scene.add(this.sun, this.sun.target, this.floor, this.world, this.paths);
+    this.#light(new THREE.Vector3(), 5);
+    this.#listen(canvas);
     this.paint();
     new ResizeObserver(() => this.#resize()).observe(holder);
+  }
+
+  #listen(canvas) {
+    let pressed = null;
+    canvas.addEventListener("pointerdown", ({ clientX, clientY }) => (pressed = [clientX, clientY]));
+    canvas.addEventListener("pointerup", (released) => {
+      const moved = pressed === null ? Infinity : Math.hypot(released.clientX - pressed[0], released.clientY - pressed[1]);
+      pressed = null;
+      if (moved < CLICK_PX && released.button === 0) this.onPick(this.#bodyAt(released)?.object ?? null);
+    });
+    canvas.addEventListener("pointermove", (pointed) => this.#point(pointed));
+    canvas.addEventListener("pointerleave", () => (this.hint.textContent = ""));
+    canvas.addEventListener("dblclick", (pointed) => {
+      const body = this.#bodyAt(pointed);
+      if (body !== undefined) this.camera.lookAt(body);
+    });
+  }
+
+  /** The body that is drawn at the place of a pointer. */
+  #bodyAt({ offsetX, offsetY }) {
+    const { clientWidth, clientHeight } = this.holder;
+    const place = new THREE.Vector2((offsetX / clientWidth) * 2 - 1, 1 - (offsetY / clientHeight) * 2);
+    const ray = new THREE.Raycaster();
+    ray.setFromCamera(place, this.camera.camera);
+    let [drawn] = ray.intersectObjects(this.world.children, true).map((each) => each.object);
+    while (drawn && drawn.parent !== this.world) drawn = drawn.parent;
+    return this.present?.find((each) => each.group === drawn);
+  }
+
+  /** Name the object under the pointer, once in a picture. */
+  #point(pointed) {
+    const waits = this.pointed;
+    this.pointed = pointed.buttons === 0 ? pointed : null;
+    if (waits) return;
+    requestAnimationFrame(() => {
+      const body = this.pointed ? this.#bodyAt(this.pointed) : undefined;
+      const { offsetX, offsetY } = this.pointed ?? {};
+      this.pointed = null;
+      this.hint.replaceChildren(...(body === undefined ? [] : [element("bdi", {}, body.object.name), ` ${body.object.type}`]));
+      if (body !== undefined) Object.assign(this.hint.style, { left: `${offsetX + 14}px`, top: `${offsetY + 14}px` });
+      this.renderer.domElement.style.cursor = body === undefined ? "grab" : "pointer";
+    });
   }
 
   /** Use the colours of the page's theme. */
   paint() {
     this.scene.background = new THREE.Color(colorOf("--scene"));
-    if (this.grid) this.scene.remove(this.grid);
-    const line = colorOf("--grid");
-    this.grid = new THREE.GridHelper(20, 20, line, line);
-    this.grid.rotation.x = Math.PI / 2;
-    this.grid.position.z = -0.002;
-    this.scene.add(this.grid);
+    this.#drawGrid();
     this.drawnNode = undefined;
     if (this.event !== undefined) this.show(this.event, this.node, this.pathList);
+  }
+
+  /** A grid of metres around the middle of the scene. */
+  #drawGrid() {
+    if (this.grid) {
+      this.scene.remove(this.grid);
+      this.grid.geometry.dispose();
+    }
+    const size = Math.min(GRID_MAX, 2 * Math.ceil(Math.max(10, 2.5 * this.reach)));
+    const line = colorOf("--grid");
+    this.grid = new THREE.GridHelper(size, size, line, line);
+    this.grid.rotation.x = Math.PI / 2;
+    this.grid.position.set(Math.round(this.middle.x), Math.round(this.middle.y), -0.002);
+    this.scene.add(this.grid);
+  }
+
+  /** Let the sun shine and throw shadows on all that is within reach. */
+  #light(middle, reach) {
+    Object.assign(this, { middle, reach });
+    const far = 2 * reach + 4;
+    const { camera } = this.sun.shadow;
+    this.sun.target.position.copy(middle);
+    this.sun.position.set(...SUN).setLength(far).add(middle);
+    Object.assign(camera, { left: -far / 2, right: far / 2, top: far / 2, bottom: -far / 2, near: 0.1, far: 2 * far });
+    camera.updateProjectionMatrix();
+    this.renderer.shadowMap.needsUpdate = true;
+    this.floor.position.setX(middle.x).setY(middle.y);
+    this.floor.scale.set(2 * far, 2 * far, 1);
   }
 
   /** Take in what the episode has by now; `show` draws it. */
   grow() {
     this.drawnNode = undefined;
     const { length } = this.episode.objects;
-    if (length !== this.framedObjects && this.framed && !this.touched) this.#frame();
+    if (length !== this.framedObjects && this.framed && !this.camera.touched) this.frame();
   }
 
   show(event, node, paths) {
@@ -63,7 +136,26 @@ export class SceneView {
     for (const each of groups) if (each.parent !== this.world) this.world.add(each);
     if (node !== this.drawnNode) this.#drawPaths(paths);
     this.drawnNode = node;
+    this.camera.update(this.present);
+    this.renderer.shadowMap.needsUpdate = true;
     this.#render();
+  }
+
+  /** Let an object shine, or none. */
+  choose(object) {
+    for (const [each, power] of [[this.chosen, 0], [object, 0.45]]) {
+      if (each === null) continue;
+      this.bodies.of(each).group.traverse((part) => {
+        if (part.isMesh) part.material.emissive.set(colorOf("--link")).multiplyScalar(power);
+      });
+    }
+    this.chosen = object;
+    this.#render();
+  }
+
+  /** Keep an object in sight, or none. */
+  follow(object) {
+    this.camera.follow(object === null ? null : this.bodies.of(object));
   }
 
   #drawPaths(paths) {
@@ -80,32 +172,24 @@ export class SceneView {
   }
 
   /** Look at everything that is there when the page opens, from the side of the robot. */
-  #frame() {
-    this.framedObjects = this.episode.objects.length;
-    const box = new THREE.Box3();
-    for (const each of this.bodies.at(this.episode.opens)) box.expandByObject(each.group);
+  frame() {
+    const { episode } = this;
+    this.framedObjects = episode.objects.length;
+    this.camera.touched = false;
+    const paths = pathsOf(episode, episode.actionAt(episode.opens)).flatMap(({ points }) => points);
+    const { middle, reach } = this.camera.frame(this.bodies.at(episode.opens), paths);
     if (this.event !== undefined) this.bodies.at(this.event);
-    for (const { points } of pathsOf(this.episode, this.episode.actionAt(this.episode.opens))) {
-      for (const [x, y, z] of points) box.expandByPoint(new THREE.Vector3(x, y, z));
-    }
-    if (box.isEmpty()) box.expandByPoint(new THREE.Vector3(-1, -1, 0)).expandByPoint(new THREE.Vector3(1, 1, 1));
-    const middle = box.getCenter(new THREE.Vector3());
-    const reach = Math.max(box.getSize(new THREE.Vector3()).length() / 2, 0.6);
-    const upright = (this.camera.fov * Math.PI) / 360;
-    const narrowest = Math.min(upright, Math.atan(Math.tan(upright) * this.camera.aspect));
-    const away = new THREE.Vector3(-1.3, -1.1, 1.05).setLength(reach / Math.sin(narrowest));
-    this.controls.target.copy(middle);
-    this.camera.position.copy(middle).add(away);
-    this.controls.update();
+    this.#light(middle.clone().setZ(0), reach);
+    this.#drawGrid();
+    this.#render();
   }
 
   #resize() {
     const { clientWidth: width, clientHeight: height } = this.holder;
     if (width === 0 || height === 0) return;
     this.renderer.setSize(width, height);
-    this.camera.aspect = width / height;
-    this.camera.updateProjectionMatrix();
-    if (!this.framed) this.#frame();
+    this.camera.resize(width, height);
+    if (!this.framed || !this.camera.touched) this.frame();
     this.framed = true;
     this.#render();
   }
@@ -115,7 +199,7 @@ export class SceneView {
     this.waiting = true;
     requestAnimationFrame(() => {
       this.waiting = false;
-      this.renderer.render(this.scene, this.camera);
+      this.renderer.render(this.scene, this.camera.camera);
       this.#placeNames();
     });
   }
@@ -127,14 +211,24 @@ export class SceneView {
       if (object.type === "ENVIRONMENT") continue;
       const box = new THREE.Box3().setFromObject(group);
       const top = new THREE.Vector3((box.min.x + box.max.x) / 2, (box.min.y + box.max.y) / 2, box.max.z);
-      top.project(this.camera);
+      top.project(this.camera.camera);
       if (Math.abs(top.z) > 1) continue;
-      const label = element("span", {}, element("bdi", {}, object.name));
+      const label = element("span", { class: object === this.chosen ? "chosen" : null }, element("bdi", {}, object.name));
       labels.push({ label, x: ((top.x + 1) / 2) * width, y: ((1 - top.y) / 2) * height - 4 });
     }
     this.names.replaceChildren(...labels.map((each) => each.label));
     stack(labels);
   }
+}
+
+/** True if a processor draws, for which shadows cost more than all the rest. */
+function isSoftware(context) {
+  let name = context.getParameter(context.RENDERER);
+  if (/WebKit/.test(name)) {
+    const names = context.getExtension("WEBGL_debug_renderer_info");
+    if (names !== null) name = context.getParameter(names.UNMASKED_RENDERER_WEBGL);
+  }
+  return /swiftshader|llvmpipe|softpipe|software|basic render/i.test(name);
 }
 
 /** Place labels, each above those that it would cover. */

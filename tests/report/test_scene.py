@@ -1,0 +1,78 @@
+"""The scene of the page: framed closely, objects chosen by a click, a camera that follows the robot, named paths."""
+
+from pathlib import Path
+
+import pytest
+
+from tests.report.browser import Browser
+from tests.report.test_page import assert_quiet, position
+
+pytestmark = pytest.mark.slow
+
+
+def test_an_object_is_chosen_by_a_click_in_the_scene_or_in_the_list(chrome: Browser, pages: dict[str, Path]) -> None:
+    with chrome.open(pages["plan"], fragment="#e60") as tab:
+        place = """(() => {
+          const { camera } = pycrormPage.view.camera;
+          const { width, height, left, top } = document.querySelector("canvas").getBoundingClientRect();
+          const cereal = pycrormPage.bodies.of(pycrormPage.episode.objects[3]).group;
+          const at = new THREE.Box3().setFromObject(cereal).getCenter(new THREE.Vector3()).project(camera);
+          return [left + (at.x + 1) / 2 * width, top + (1 - at.y) / 2 * height];
+        })()"""
+        tab.settle()
+        x, y = tab.ask(place)
+        tab.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
+        tab.wait_for("document.querySelector('.hint').textContent === 'cereal BREAKFAST_CEREAL'")
+        for kind in ("mousePressed", "mouseReleased"):
+            tab.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", clickCount=1)
+        assert tab.ask("pycrormPage.object.name") == "cereal"
+        chosen = "[...document.querySelectorAll('.panel tr.lit td')].map((each) => each.textContent)"
+        assert tab.ask(chosen) == ["cereal", "BREAKFAST_CEREAL", "1.300", "0.700", "0.950", "0", ""]
+        tab.ask("[...document.querySelectorAll('.panel button')].find((each) => each.textContent === 'milk').click()")
+        assert tab.ask(chosen) == ["milk", "MILK", "1.300", "1.000", "0.900", "0", "pr2"]
+        tab.press("Escape")
+        assert tab.ask(chosen) == []
+        assert_quiet(tab, pages["plan"])
+
+
+def test_the_camera_follows_the_robot_and_shows_the_whole_scene_again(chrome: Browser, pages: dict[str, Path]) -> None:
+    aim = "pycrormPage.view.camera.controls.target.toArray().map((each) => Number(each.toFixed(3)))"
+    with chrome.open(pages["plan"], fragment="#e10") as tab:
+        tab.settle()
+        whole = tab.ask(aim)
+        tab.press("r")
+        assert tab.ask("document.querySelector('#views [aria-pressed=true]').textContent") == "follow pr2"
+        x, y, _ = tab.ask(aim)
+        tab.ask("pycrormPage.seek(60)")
+        (u, v, _), robot = tab.ask(aim), position(tab, "pr2")
+        assert abs(u - robot[0]) < abs(x - robot[0]) + 0.5
+        assert [round(u - x, 2), round(v - y, 2)] == [robot[0], robot[1]]  # it stood at the origin
+        tab.press("w")
+        assert tab.ask(aim) == whole
+        assert tab.ask("document.querySelector('#views [aria-pressed=true]')") is None
+
+
+def test_everything_is_in_sight_and_as_large_as_that_allows(chrome: Browser, pages: dict[str, Path]) -> None:
+    extent = """(() => {
+      const ends = [];
+      for (const { group } of pycrormPage.view.present) group.traverse((each) => {
+        if (!each.isMesh) return;
+        const { position } = each.geometry.attributes;
+        for (let at = 0; at < position.count; at++)
+          ends.push(new THREE.Vector3().fromBufferAttribute(position, at).applyMatrix4(each.matrixWorld));
+      });
+      for (const each of ends) each.project(pycrormPage.view.camera.camera);
+      return [Math.max(...ends.map(({ x }) => Math.abs(x))), Math.max(...ends.map(({ y }) => Math.abs(y)))];
+    })()"""
+    for width in (420, 1400):
+        with chrome.open(pages["plan"], width=width) as tab:
+            tab.settle()
+            across, up = tab.ask(extent)
+            assert max(across, up) < 1
+            assert max(across, up) > 0.7
+
+
+def test_the_paths_in_the_scene_are_named(chrome: Browser, pages: dict[str, Path]) -> None:
+    with chrome.open(pages["plan"]) as tab:
+        named = "[...document.querySelectorAll('#legend > span')].map((each) => each.textContent)"
+        assert tab.ask(named) == [" path of pr2", " path of milk", "during TransportAction", "grid 1 m"]
