@@ -7,6 +7,7 @@ whose parameters differ take no space from each other. Equal cases make equal co
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -15,7 +16,7 @@ from typing import Any, Final, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from pycrorm_async.events.ids import row_id, row_key
+from pycrorm_async.events.ids import SEQUENCE_MAX, row_id, row_key
 from pycrorm_async.recall.case import FEATURES_MAX, RESERVED, Case, bounded_case
 from pycrorm_async.recall.columns import Numbers, Sets, Symbols, joined_numbers, joined_words
 
@@ -26,6 +27,7 @@ WORDS_MAX: Final = 16_384
 EPISODE_SHIFT: Final = row_id(1, 0, 0).bit_length() - 1
 """The bits of a node's id below its episode's number."""
 
+_SEQUENCE: Final = row_id(0, 1, 0)
 _Column = TypeVar("_Column", Numbers, Symbols | Sets)
 Rows = slice | NDArray[np.int64]
 
@@ -109,30 +111,32 @@ class Block:
     @classmethod
     def of(cls, cases: Iterable[Case]) -> Block:
         """Make a block of cases, each as `bounded_case` returns it."""
-        by_type: dict[str, list[Case]] = {}
-        for case in sorted(map(_with_few_features, cases), key=_age, reverse=True):
-            by_type.setdefault(case.type, []).append(case)
-        by_type = dict(sorted(by_type.items()))
-        every = [case for each in by_type.values() for case in each]
-        sizes = {name: len(each) for name, each in by_type.items()}
+        rows = [case if _has_few_features(case) else bounded_case(case) for case in cases]
+        counts = Counter(case.type for case in rows)
+        sizes = {name: counts[name] for name in sorted(counts)}
+        codes = {name: code for code, name in enumerate(sizes)}
+        types = np.array([codes[case.type] for case in rows])
+        nodes = np.array([case.node for case in rows], np.int64)
+        started = np.array([case.started_us for case in rows], np.int64)
+        order = np.lexsort((-nodes, -started, types))
+        ordered = [rows[place] for place in order.tolist()]
+        columns = list(zip(*ordered, strict=True)) or [()] * len(Case._fields)
+        *_, symbols, numbers, statuses, reasons, durations, parents, simulated = columns
         texts: dict[str, Spread[Symbols | Sets]] = {
-            "status": _spread(sizes, _texts, [case.status for case in every]),
-            "reason": _spread(sizes, _texts, [case.reason for case in every]),
-            "simulated": _spread(sizes, _texts, ["yes" if case.simulated else None for case in every]),
-            **_spreads(sizes, _texts, [case.symbols for case in every]),
+            "status": _spread(sizes, _texts, statuses),
+            "reason": _spread(sizes, _texts, reasons),
+            "simulated": _spread(sizes, _texts, ["yes" if each else None for each in simulated]),
+            **_spreads(sizes, _texts, symbols),
         }
-        numbers: dict[str, Spread[Numbers]] = {
-            "duration": _spread(sizes, Numbers.of, [case.duration_s for case in every]),
-            **_spreads(sizes, Numbers.of, [case.numbers for case in every]),
-        }
+        values = {"duration": _spread(sizes, Numbers.of, durations), **_spreads(sizes, Numbers.of, numbers)}
         return _without_long_dictionaries(
             cls(
                 sizes,
-                np.array([case.node for case in every], np.int64),
-                np.array([case.started_us for case in every], np.int64),
-                np.array([row_key(case.parent).sequence if case.parent else 0 for case in every], np.int32),
+                nodes[order],
+                started[order],
+                (np.array([each or 0 for each in parents], np.int64) // _SEQUENCE & SEQUENCE_MAX).astype(np.int32),
                 {name: each for name, each in sorted(texts.items()) if each.types},
-                {name: each for name, each in sorted(numbers.items()) if each.types},
+                {name: each for name, each in sorted(values.items()) if each.types},
             )
         )
 
@@ -302,9 +306,5 @@ def _without_long_dictionaries(block: Block) -> Block:
     return Block(block.sizes, *columns, texts, block.numbers, block.left_out | long)
 
 
-def _with_few_features(case: Case) -> Case:
-    return case if len(case.symbols) + len(case.numbers) <= FEATURES_MAX else bounded_case(case)
-
-
-def _age(case: Case) -> tuple[int, int]:
-    return case.started_us, case.node
+def _has_few_features(case: Case) -> bool:
+    return len(case.symbols) + len(case.numbers) <= FEATURES_MAX

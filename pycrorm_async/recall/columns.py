@@ -47,9 +47,10 @@ class Symbols:
     @classmethod
     def of(cls, values: Sequence[Any]) -> Symbols:
         """Make the column of these texts, None where a case does not have the feature. Long ones are left out."""
-        words = Words(sorted(each for each in {*values} if each and len(each) <= TEXT_MAX))
-        codes = words.codes
-        return cls(words, smallest_codes([codes.get(each, 0) for each in values], len(words)))
+        different = {*values}
+        words = Words(sorted(each for each in different if each and len(each) <= TEXT_MAX))
+        codes = {**dict.fromkeys(different, 0), **words.codes}
+        return cls(words, np.fromiter(map(codes.__getitem__, values), np.min_scalar_type(len(words)), len(values)))
 
     def equal_to(self, word: str, rows: slice) -> Mask:
         """Return which of these rows have the word."""
@@ -173,7 +174,7 @@ class Numbers:
     @classmethod
     def of(cls, values: Sequence[float | None]) -> Numbers:
         """Make the column of these numbers, None where a case does not have the feature, without what is not finite."""
-        wide = np.array([np.nan if each is None else each for each in values], np.float64)
+        wide = np.array(values, np.float64)  # with NaN for None
         wide[np.isinf(wide)] = np.nan
         large = np.abs(wide) > SINGLE_MAX
         narrow = np.where(large, np.nan, wide).astype(np.float32)

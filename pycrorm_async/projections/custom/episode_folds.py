@@ -16,12 +16,12 @@ in the cache or in one batch.
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from typing import Final
 
 from pycrorm_async.events.types import EpisodeEnded
-from pycrorm_async.projections.custom.projection import Changes, EpisodeFold, EpisodeProjection, Event
+from pycrorm_async.projections.custom.projection import EpisodeFold, EpisodeProjection
 from pycrorm_async.projections.fold.fold import CannotFold
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import Span, StoredEvent
@@ -33,6 +33,7 @@ _EPISODES_MAX: Final = 1_000
 With more open episodes than this, those that were not folded for the longest time are read from their start again."""
 _PAGE_EVENTS: Final = 2_000
 """Bounds the events that are read at once to restore a fold."""
+_ENDED: Final = EpisodeEnded.__name__
 
 
 @dataclass(slots=True)
@@ -44,13 +45,14 @@ class _OpenFold:
     has_ended: bool = False
     fault: str | None = None
 
-    def read(self, stored: StoredEvent, event: Event | None, rows: Changes) -> None:
+    def next(self, stored: StoredEvent) -> EpisodeFold:
+        """Return the fold for the next event. Raises `CannotFold` if it could not be restored."""
         if self.fault is not None:
             raise CannotFold(self.fault)
-        if event is not None:
-            self.fold(event, rows)
         self.reached = stored.sequence
-        self.has_ended = self.has_ended or stored.type == EpisodeEnded.__name__
+        if stored.type == _ENDED:
+            self.has_ended = True
+        return self.fold
 
 
 class EpisodeFolds:
@@ -85,12 +87,19 @@ class BatchOfFolds:
 
     Args:
         folds: those that earlier batches left.
-        event_of: returns the event that the fold gets; None for one that it does not read. Raises `CannotFold`.
+        reads: the types of events that a fold gets; None for all.
+        read: gives an event to a fold.
     """
 
-    def __init__(self, folds: EpisodeFolds, event_of: Callable[[StoredEvent], Event | None]) -> None:
+    def __init__(
+        self,
+        folds: EpisodeFolds,
+        reads: Collection[str] | None,
+        read: Callable[[EpisodeFold, StoredEvent], object],
+    ) -> None:
         self._folds = folds
-        self._event_of = event_of
+        self._reads = reads
+        self._read = read
         self._taken: dict[int, _OpenFold] = {}
 
     async def restore(self, log: EventLog, spans: Sequence[Span]) -> None:
@@ -104,12 +113,16 @@ class BatchOfFolds:
                 page = Span(span.number, fold.reached, min(fold.reached + _PAGE_EVENTS, span.after))
                 fold.fault = self._read_again(fold, await log.spans([page]), page.last)
 
-    def fold(self, stored: StoredEvent, rows: Changes) -> None:
-        """Fold an event with the fold of its episode. After an exception the episode's fold is not kept."""
-        if stored.number not in self._taken:
+    def fold_of(self, stored: StoredEvent) -> EpisodeFold:
+        """Return the fold of an event's episode, which must get this event next. Raises `CannotFold`.
+
+        After an exception of the fold the caller discards it.
+        """
+        taken = self._taken.get(stored.number)
+        if taken is None:
             assert stored.sequence == 1, "a batch that continues an episode restores its fold first"
-            self._taken[stored.number] = _OpenFold(self._folds.projection.episode())
-        self._taken[stored.number].read(stored, self._event_of(stored), rows)
+            taken = self._taken[stored.number] = _OpenFold(self._folds.projection.episode())
+        return taken.next(stored)
 
     def discard(self, number: int) -> None:
         """Drop the fold of an episode, because one of its events could not be folded."""
@@ -126,7 +139,9 @@ class BatchOfFolds:
             if stored.sequence != fold.reached + 1:
                 break
             try:
-                fold.read(stored, self._event_of(stored), Changes())
+                read = fold.next(stored)
+                if self._reads is None or stored.type in self._reads:
+                    self._read(read, stored)
             except CannotFold as reason:
                 return f"event {stored.sequence}, read again: {reason}"
             except Exception as error:  # noqa: BLE001 - user code; the reason parks the episode

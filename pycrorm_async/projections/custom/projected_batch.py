@@ -1,4 +1,4 @@
-"""Fold a batch of events with a custom projection, and collect the changes of rows that it makes."""
+"""Fold a batch of events with a custom projection; subclasses keep what the fold makes, and store it."""
 
 from __future__ import annotations
 
@@ -8,17 +8,10 @@ from typing import Any
 
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
-from pycrorm_async.events.types import DesignatorTypeDeclared, NodeStarted
+from pycrorm_async.events.types import DesignatorTypeDeclared
 from pycrorm_async.projections.custom.episode_folds import BatchOfFolds, EpisodeFolds
-from pycrorm_async.projections.custom.projection import (
-    Changes,
-    EpisodeProjection,
-    Event,
-    PackedProjection,
-    Projection,
-)
-from pycrorm_async.projections.fold.column_values import is_missing, microseconds
-from pycrorm_async.projections.fold.fold import CannotFold, happening_of
+from pycrorm_async.projections.custom.projection import EpisodeProjection, Projection
+from pycrorm_async.projections.fold.fold import CannotFold
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import Span, StoredEvent
 
@@ -26,7 +19,7 @@ __all__ = ["ProjectedBatch"]
 
 
 class ProjectedBatch(ABC):
-    """A batch of a custom projection. Subclasses store its rows. Implements `Batch`.
+    """A batch of a custom projection. Implements `Batch`.
 
     Args:
         projection: to fold with.
@@ -46,7 +39,7 @@ class ProjectedBatch(ABC):
         self._reads = None if reads is None else frozenset(each.__name__ for each in reads)
         self._folds: BatchOfFolds | None = None
         if isinstance(projection, EpisodeProjection):
-            self._folds = BatchOfFolds(EpisodeFolds(projection) if folds is None else folds, self._event)
+            self._folds = BatchOfFolds(EpisodeFolds(projection) if folds is None else folds, self._reads, self.made)
 
     async def restore(self, log: EventLog, spans: Sequence[Span]) -> None:
         """Restore the folds of the episodes that this batch continues."""
@@ -54,28 +47,31 @@ class ProjectedBatch(ABC):
             await self._folds.restore(log, spans)
 
     def fold(self, event: StoredEvent) -> None:
-        """Add the projection's changes for this event. Raises `CannotFold`, and then has added none."""
-        changes = Changes()
+        """Add what the projection makes of this event. Raises `CannotFold`, and then has added nothing."""
         try:
+            fold = self._projection.fold if self._folds is None else self._folds.fold_of(event)
+            if self._reads is not None and event.type not in self._reads:
+                return
             try:
-                if self._folds is not None:
-                    self._folds.fold(event, changes)
-                elif (read := self._event(event)) is not None:
-                    self._projection.fold(read, changes)
+                made = self.made(fold, event)
             except CannotFold:
                 raise
             except Exception as error:
                 raise CannotFold(f"{self._projection.name} raised {type(error).__name__}: {error}") from error
-            if changes.all:
-                self.add(event, changes)
+            if made:
+                self.add(event, made)
         except CannotFold:
             if self._folds is not None:
                 self._folds.discard(event.number)
             raise
 
     @abstractmethod
-    def add(self, event: StoredEvent, changes: Changes) -> None:
-        """Add the changes of one event. Raises `CannotFold`, and then has added none."""
+    def made(self, fold: Any, event: StoredEvent) -> Sequence[Any]:
+        """Return what a fold of the projection makes of an event. Raises `CannotFold`."""
+
+    @abstractmethod
+    def add(self, event: StoredEvent, made: Sequence[Any]) -> None:
+        """Add what the fold made of one event. Raises `CannotFold`, and then has added nothing."""
 
     async def ready(self, engine: AsyncEngine, generation: int) -> None:  # noqa: ARG002 - for subclasses
         """Leave the folds of the episodes to the next batch. Subclasses prepare their statements, too."""
@@ -85,18 +81,3 @@ class ProjectedBatch(ABC):
     @abstractmethod
     async def write(self, connection: AsyncConnection, generation: int) -> None:
         """Write all rows in the caller's transaction. Raises `RowRefused`."""
-
-    def _event(self, stored: StoredEvent) -> Event | None:
-        if self._reads is not None and stored.type not in self._reads:
-            return None
-        happening = happening_of(stored)
-        declaration: DesignatorTypeDeclared | None = None
-        parameters: Mapping[str, Any] = {}
-        if isinstance(happening, NodeStarted) and happening.designator is not None:
-            declaration = self._declared.get(happening.designator)
-            if declaration is None and not isinstance(self._projection, PackedProjection):
-                raise CannotFold(f"the designator type {happening.designator} was never declared")
-            parameters = {name: None if is_missing(each) else each for name, each in happening.parameters.items()}
-        number, sequence, _, _, wall_ns, monotonic_ns, _ = stored
-        dtype = None if declaration is None else declaration.dtype
-        return Event(number, sequence, microseconds(wall_ns), monotonic_ns, happening, dtype, parameters, declaration)

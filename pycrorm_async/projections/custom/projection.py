@@ -164,9 +164,13 @@ class EpisodeProjection(Projection):
 class PackedProjection(EpisodeProjection):
     """The base class of projections of this package that pack rows into other rows, as cases into blocks.
 
-    Its tables may have columns of every storage, and names that are reserved for it. A row of the fold is no row of a
-    table: `batch` collects and packs it.
+    Its tables may have columns of every storage, and names that are reserved for it. Its batch reads the events as they
+    are stored, collects what a fold makes of them, and packs it.
     """
+
+    @abstractmethod
+    def episode(self) -> Any:
+        """Return the fold of one episode, as the batch needs it."""
 
     @abstractmethod
     def batch(self, declared: Mapping[str, DesignatorTypeDeclared], folds: EpisodeFolds) -> ProjectedBatch:

@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
+from pycrorm_async.bulk_records import make
 from pycrorm_async.events.codec import unwritable
-from pycrorm_async.events.types import DesignatorTypeDeclared
+from pycrorm_async.events.types import DesignatorTypeDeclared, NodeStarted
 from pycrorm_async.projections.custom.episode_folds import EpisodeFolds
 from pycrorm_async.projections.custom.projected_batch import ProjectedBatch
 from pycrorm_async.projections.custom.projection import (
     OF_EVERY_TABLE,
     Changes,
+    EpisodeFold,
+    Event,
     Projection,
     columns_of,
 )
-from pycrorm_async.projections.fold.column_values import json_text
-from pycrorm_async.projections.fold.fold import CannotFold
+from pycrorm_async.projections.fold.column_values import is_missing, json_text, microseconds
+from pycrorm_async.projections.fold.fold import CannotFold, happening_of
 from pycrorm_async.projections.fold.row_batch import Row
 from pycrorm_async.projections.fold.row_writer import stored_rows
 from pycrorm_async.projections.schema.core_columns import OWN, Storage
@@ -48,11 +51,17 @@ class CustomRows(ProjectedBatch):
         self._updates: dict[str, dict[int, dict[str, Any]]] = {name: {} for name in self._columns}
         self._insertion: Insertion = None
 
-    def add(self, event: StoredEvent, changes: Changes) -> None:
+    def made(self, fold: EpisodeFold, event: StoredEvent) -> Sequence[Any]:
+        """Return the changes of rows that a fold makes of an event. Raises `CannotFold`."""
+        changes = Changes()
+        fold(self._event(event), changes)
+        return changes.all
+
+    def add(self, event: StoredEvent, made: Sequence[Any]) -> None:
         """Add the changes of one event, if both databases store their values alike. Raises `CannotFold`."""
         new: set[tuple[str, int]] = set()
         checked = []
-        for inserts, table, id_, columns in changes.all:
+        for inserts, table, id_, columns in made:
             checked.append((inserts, table, id_, self._checked(event, table, id_, columns)))
             if inserts and ((table, id_) in new or id_ in self._inserts[table]):
                 raise CannotFold(f"{table} has a row {id_} already")
@@ -97,6 +106,21 @@ class CustomRows(ProjectedBatch):
                     for name in ("id", *columns)
                 }
                 await dialect.update_rows(connection, physical_name(f"{OWN}{table}", generation), kinds, changed)
+
+    def _event(self, stored: StoredEvent) -> Event:
+        number, sequence, _, _, wall_ns, monotonic_ns, payload = stored
+        happening = happening_of(stored)
+        parameters: Mapping[str, Any] = {}
+        dtype = declaration = None
+        if isinstance(happening, NodeStarted) and happening.designator is not None:
+            declaration = self._declared.get(happening.designator)
+            if declaration is None:
+                raise CannotFold(f"the designator type {happening.designator} was never declared")
+            dtype, parameters = declaration.dtype, happening.parameters
+            if b'"missing"' in payload:
+                parameters = {name: None if is_missing(each) else each for name, each in parameters.items()}
+        time_us = microseconds(wall_ns)
+        return make(Event, (number, sequence, time_us, monotonic_ns, happening, dtype, parameters, declaration))
 
     def _checked(self, event: StoredEvent, table: str, id_: Any, values: Mapping[str, Any]) -> dict[str, Any]:
         columns = self._columns.get(table)

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.events.types import DesignatorTypeDeclared
 from pycrorm_async.projections.custom.episode_folds import EpisodeFolds
 from pycrorm_async.projections.custom.projected_batch import ProjectedBatch
-from pycrorm_async.projections.custom.projection import Changes, PackedProjection
+from pycrorm_async.projections.custom.projection import PackedProjection
 from pycrorm_async.recall.blocks import Block
 from pycrorm_async.recall.case import Case
+from pycrorm_async.recall.cases.episode_cases import EpisodeCases
 from pycrorm_async.recall.cases.stored_blocks import merge_blocks, rows_of
 from pycrorm_async.store.dialect import Insertion
 from pycrorm_async.store.dialects import dialect_of
@@ -30,8 +31,11 @@ class CaseBatch(ProjectedBatch):
         self.cases: list[Case] = []
         self._insertion: Insertion = None
 
-    def add(self, event: StoredEvent, changes: Changes) -> None:  # noqa: ARG002 - of the base class
-        self.cases += [columns["case"] for _, _, _, columns in changes.all]
+    def made(self, fold: EpisodeCases, event: StoredEvent) -> Sequence[Case]:
+        return fold.read(event, self._declared.get)
+
+    def add(self, event: StoredEvent, made: Sequence[Case]) -> None:  # noqa: ARG002 - of the base class
+        self.cases += made
 
     async def ready(self, engine: AsyncEngine, generation: int) -> None:
         await super().ready(engine, generation)

@@ -8,12 +8,13 @@ from typing import Any, ClassVar
 from pycrorm_async.events.types import DesignatorTypeDeclared
 from pycrorm_async.projections.custom.episode_folds import EpisodeFolds
 from pycrorm_async.projections.custom.projected_batch import ProjectedBatch
-from pycrorm_async.projections.custom.projection import Changes, EpisodeFold, Event, PackedProjection
+from pycrorm_async.projections.custom.projection import PackedProjection
 from pycrorm_async.projections.verify.findings import VerifyResult
 from pycrorm_async.projections.verify.parts import PartCheck
 from pycrorm_async.recall.cases.case_batch import CaseBatch
 from pycrorm_async.recall.cases.case_check import CaseCheck
 from pycrorm_async.recall.cases.episode_cases import READS, EpisodeCases
+from pycrorm_async.recall.cases.situation import FeatureFields
 from pycrorm_async.recall.cases.stored_blocks import (
     BLOCK_COLUMNS,
     BLOCKS,
@@ -32,14 +33,11 @@ class CaseProjection(PackedProjection):
     tables: ClassVar[Any] = {BLOCKS: BLOCK_COLUMNS, COLUMNS: COLUMN_COLUMNS}
     reads = READS
 
-    def episode(self) -> EpisodeFold:
-        cases = EpisodeCases()
+    def __init__(self) -> None:
+        self._types: dict[str, FeatureFields] = {}
 
-        def fold(event: Event, rows: Changes) -> None:
-            for case in cases.read(event):
-                rows.insert(BLOCKS, case.node, case=case)
-
-        return fold
+    def episode(self) -> Any:
+        return EpisodeCases(self._types)
 
     def batch(self, declared: Mapping[str, DesignatorTypeDeclared], folds: EpisodeFolds) -> ProjectedBatch:
         return CaseBatch(self, declared, folds)

@@ -1,7 +1,7 @@
 """Make a case of each action of one episode when it ends, with the situation in which it started.
 
 >>> cases = EpisodeCases()
->>> [case for event in events for case in cases.read(event)]
+>>> [case for event in events for case in cases.read(event, declarations.get)]
 
 The fold is pure, and its memory grows with the nodes that run and the objects in the world. Besides the features of
 `situation` a case has `inside`, the type of the nearest action around it, and `after` and `after_status`, type and
@@ -10,11 +10,14 @@ status of the action that ended last inside the same action. All features are kn
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, TypeAlias
 
+from pycrorm_async.bulk_records import make
 from pycrorm_async.events.ids import SLOT_NODE, row_id
 from pycrorm_async.events.types import (
+    DesignatorTypeDeclared,
     EpisodeEnded,
     EpisodeStarted,
     NodeEnded,
@@ -25,10 +28,12 @@ from pycrorm_async.events.types import (
     ObjectMoved,
     ObjectRemoved,
 )
-from pycrorm_async.projections.custom.projection import Event
+from pycrorm_async.projections.fold.column_values import is_missing, microseconds
+from pycrorm_async.projections.fold.fold import happening_of
 from pycrorm_async.projections.fold.world_fold import WorldFold
 from pycrorm_async.recall.case import Case
 from pycrorm_async.recall.cases.situation import FeatureFields, Numbers, Symbols, situation
+from pycrorm_async.store.stored import StoredEvent
 
 __all__ = ["EpisodeCases", "READS"]
 
@@ -46,110 +51,110 @@ READS: Final = (
 """The types of events that cases are made from."""
 
 
-@dataclass(slots=True)
-class _Running:
-    """A node that runs. `scope` is the sequence of the nearest action, itself included; 0 outside any."""
-
-    scope: int
-    action: _Action | None = None
+DeclarationOf: TypeAlias = Callable[[str], DesignatorTypeDeclared | None]
+"""Returns the designator type of a fingerprint; None if it was never declared, or by a newer version."""
 
 
 @dataclass(slots=True)
 class _Action:
-    """An action that runs, with the situation in which it started."""
+    """An action that runs, with the situation in which it started.
+
+    Attributes:
+        scope: the nearest action around it; None outside any.
+        after: type and status of the action that ended last inside it.
+    """
 
     node: int
-    type: str
-    time: int
+    time_us: int
     monotonic_ns: int
-    parent: int
-    simulated: bool
+    type: str
+    scope: _Action | None
     symbols: Symbols
     numbers: Numbers
-
-
-@dataclass(slots=True)
-class _Scope:
-    """What has happened inside an action: its type, and type and status of the action that ended last in it."""
-
-    type: str | None = None
+    simulated: bool
     after: tuple[str, str] | None = None
+    has_ended: bool = False
+
+    def case(self, number: int, status: str, reason: str | None = None, duration_s: float | None = None) -> Case:
+        """Return its case in the episode of this number."""
+        node, parent = row_id(number, self.node, SLOT_NODE), None
+        if self.scope is not None:
+            parent = row_id(number, self.scope.node, SLOT_NODE)
+        situation = self.time_us, self.type, self.symbols, self.numbers
+        return make(Case, (node, *situation, status, reason, duration_s, parent, self.simulated))
 
 
 class EpisodeCases:
-    """The cases of one episode, event by event."""
+    """The cases of one episode, event by event.
 
-    def __init__(self) -> None:
+    Args:
+        types: the feature fields by fingerprint, which the folds of several episodes share.
+    """
+
+    def __init__(self, types: dict[str, FeatureFields] | None = None) -> None:
+        self._types = {} if types is None else types
         self._world = WorldFold()
-        self._nodes: dict[int, _Running] = {}
-        self._scopes: dict[int, _Scope] = {0: _Scope()}
-        self._fields: dict[str, FeatureFields] = {}
+        self._scopes: dict[int, _Action | None] = {}
+        """The nearest action of each node that runs, itself included; None outside any."""
+        self._after: tuple[str, str] | None = None
         self._simulated = False
 
-    def read(self, event: Event) -> list[Case]:
+    def read(self, event: StoredEvent, declaration_of: DeclarationOf) -> Sequence[Case]:
         """Apply the next event; return the cases of the actions that it ends. Raises `CannotFold`."""
-        match event.happening:
+        match happening_of(event):
             case NodeStarted() as started:
-                self._started(event, started)
+                self._start(event, started, declaration_of)
             case NodeEnded() as ended:
-                return self._ended(event, ended)
+                return self._end(event, ended)
             case EpisodeStarted(simulated=simulated):
                 self._simulated = simulated
-            case EpisodeEnded(status="LOST"):
-                running = [each.action for each in self._nodes.values() if each.action is not None]
-                self._nodes.clear()
-                return [self._case(event.number, each, "LOST", None, None) for each in running]
-            case EpisodeEnded():
-                self._nodes.clear()
+            case EpisodeEnded(status=status):
+                running = [each for node, each in self._scopes.items() if each is not None and each.node == node]
+                self._scopes.clear()
+                return [each.case(event.number, status) for each in running] if status == "LOST" else ()
             case happening:
                 self._world.read(event.sequence, happening)
-        return []
+        return ()
 
-    def _started(self, event: Event, started: NodeStarted) -> None:
-        around = self._nodes.get(started.parent) if started.parent is not None else None
-        parent = around.scope if around is not None else 0
-        if started.kind != "action" or event.dtype is None:
-            self._nodes[event.sequence] = _Running(parent)
+    def _start(self, event: StoredEvent, started: NodeStarted, declaration_of: DeclarationOf) -> None:
+        _, node, _, _, wall_ns, monotonic_ns, payload = event
+        scope = self._scopes.get(started.parent) if started.parent is not None else None
+        self._scopes[node] = scope
+        if started.kind != "action" or started.designator is None:
             return
-        assert started.designator is not None
-        assert event.declaration is not None
-        fields = self._fields.get(started.designator)
+        fields = self._types.get(started.designator)
         if fields is None:
-            fields = self._fields[started.designator] = FeatureFields.of(event.declaration)
-        symbols, numbers = situation(fields, event.parameters, started.robot, self._world)
-        scope = self._scopes.get(parent) or _Scope()  # one that ended before all that it started has ended
-        if scope.type is not None:
-            symbols["inside"] = scope.type
-        if scope.after is not None:
-            symbols["after"], symbols["after_status"] = scope.after
+            declaration = declaration_of(started.designator)
+            if declaration is None:
+                return
+            fields = self._types[started.designator] = FeatureFields.of(declaration)
+        parameters = started.parameters
+        if b'"missing"' in payload:
+            parameters = {name: each for name, each in parameters.items() if not is_missing(each)}
+        symbols, numbers = situation(fields, parameters, started.robot, self._world)
+        after = self._after
+        if scope is not None:
+            after = scope.after
+            if scope.has_ended:  # before all that it started has ended
+                after = None
+            else:
+                symbols["inside"] = scope.type
+        if after is not None:
+            symbols["after"], symbols["after_status"] = after
         simulated = self._simulated or started.simulated
-        action = _Action(
-            event.sequence, event.dtype, event.time, event.monotonic_ns, parent, simulated, symbols, numbers
+        self._scopes[node] = _Action(
+            node, microseconds(wall_ns), monotonic_ns, fields.dtype, scope, symbols, numbers, simulated
         )
-        self._nodes[event.sequence] = _Running(event.sequence, action)
-        self._scopes[event.sequence] = _Scope(event.dtype)
 
-    def _ended(self, event: Event, ended: NodeEnded) -> list[Case]:
-        running = self._nodes.pop(ended.node, None)
-        if running is None or (action := running.action) is None:
-            return []
-        del self._scopes[ended.node]
-        if (around := self._scopes.get(action.parent)) is not None:
-            around.after = action.type, ended.status
+    def _end(self, event: StoredEvent, ended: NodeEnded) -> Sequence[Case]:
+        action = self._scopes.pop(ended.node, None)
+        if action is None or action.node != ended.node:
+            return ()
+        action.has_ended = True
+        if action.scope is None:
+            self._after = action.type, ended.status
+        else:
+            action.scope.after = action.type, ended.status
         duration_s = (event.monotonic_ns - action.monotonic_ns) / 1e9 if ended.status != "LOST" else None
         reason = ended.failure.type.rpartition(".")[2] if ended.failure is not None else None
-        return [self._case(event.number, action, ended.status, reason, duration_s)]
-
-    def _case(self, number: int, action: _Action, status: str, reason: str | None, duration_s: float | None) -> Case:
-        return Case(
-            row_id(number, action.node, SLOT_NODE),
-            action.time,
-            action.type,
-            action.symbols,
-            action.numbers,
-            status,
-            reason,
-            duration_s,
-            row_id(number, action.parent, SLOT_NODE) if action.parent else None,
-            action.simulated,
-        )
+        return (action.case(event.number, ended.status, reason, duration_s),)

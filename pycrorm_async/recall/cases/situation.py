@@ -50,11 +50,12 @@ _COMPUTED = RESERVED | frozenset(
 
 
 class FeatureFields(NamedTuple):
-    """The fields of a designator type that are features, each with its feature."""
+    """The fields of a designator type that are features, each with its feature, and the type itself."""
 
+    dtype: str
     texts: tuple[tuple[str, str], ...]
     numbers: tuple[tuple[str, str], ...]
-    poses: tuple[tuple[str, str], ...]
+    poses: tuple[tuple[str, tuple[str, str, str, str]], ...]
     objects: tuple[str, ...]
 
     @classmethod
@@ -68,7 +69,8 @@ class FeatureFields(NamedTuple):
             return tuple((name, f"{name}_parameter" if name in _COMPUTED else name) for name in names)
 
         objects = tuple(named.get("object", ()))
-        return cls(features("text", "enum", "boolean"), features("integer", "real"), features("pose"), objects)
+        poses = tuple((name, (f"{each}_x", f"{each}_y", f"{each}_z", f"{each}_yaw")) for name, each in features("pose"))
+        return cls(declaration.dtype, features("text", "enum", "boolean"), features("integer", "real"), poses, objects)
 
 
 def situation(
@@ -108,9 +110,11 @@ def _add_robot(
         symbols["robot"] = robot.name
     if robot.torso_height is not None:
         numbers["torso"] = robot.torso_height
-    for name, feature in fields.poses:
-        if (value := parameters.get(name)) is not None:
-            _add_pose(numbers, feature, value, robot.pose)
+    for name, features in fields.poses:
+        if (value := parameters.get(name)) is not None and value["frame"] == robot.pose.frame:
+            x, y, z, yaw = features
+            numbers[x], numbers[y], numbers[z] = _position_in(value["position"], robot.pose)
+            numbers[yaw] = _yaw_in(value["orientation"], robot.pose.orientation)
 
 
 class _Seen(NamedTuple):
@@ -179,22 +183,15 @@ def _is_near(each: WorldObject, target: WorldObject) -> bool:
     return (x - to_x) ** 2 + (y - to_y) ** 2 + (z - to_z) ** 2 <= _NEAR_M**2
 
 
-def _add_pose(numbers: dict[str, float], feature: str, value: Any, robot: PoseValue) -> None:
-    pose = msgspec.convert(value, PoseValue)
-    if pose.frame == robot.frame:
-        x, y, z = _position_in(pose.position, robot)
-        yaw = _yaw_in(pose.orientation, robot.orientation)
-        numbers |= {f"{feature}_x": x, f"{feature}_y": y, f"{feature}_z": z, f"{feature}_yaw": yaw}
-
-
 def _position_in(position: Sequence[float], frame: PoseValue) -> tuple[float, float, float]:
     """Return a position in the frame of a pose."""
     (x, y, z, w), (at_x, at_y, at_z) = frame.orientation, frame.position
     dx, dy, dz = position[0] - at_x, position[1] - at_y, position[2] - at_z
+    turned_x, turned_y, turned_z = y * dz - z * dy - w * dx, z * dx - x * dz - w * dy, x * dy - y * dx - w * dz
     return (
-        (1 - 2 * (y * y + z * z)) * dx + 2 * (x * y + z * w) * dy + 2 * (x * z - y * w) * dz,
-        2 * (x * y - z * w) * dx + (1 - 2 * (x * x + z * z)) * dy + 2 * (y * z + x * w) * dz,
-        2 * (x * z + y * w) * dx + 2 * (y * z - x * w) * dy + (1 - 2 * (x * x + y * y)) * dz,
+        dx + 2 * (y * turned_z - z * turned_y),
+        dy + 2 * (z * turned_x - x * turned_z),
+        dz + 2 * (x * turned_y - y * turned_x),
     )
 
 

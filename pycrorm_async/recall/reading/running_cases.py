@@ -17,21 +17,21 @@ from typing import Final
 
 from pycrorm_async.clock import Clock
 from pycrorm_async.errors import CallerError, EpisodeParked
-from pycrorm_async.events.codec import decode, encode
+from pycrorm_async.events.codec import encode
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, EpisodeId, episode_text, parse_episode_id, row_id, row_key
-from pycrorm_async.events.types import EpisodeEnded, Happening, NodeStarted
-from pycrorm_async.projections.custom.projection import Event
-from pycrorm_async.projections.fold.column_values import is_missing, microseconds
-from pycrorm_async.projections.fold.fold import CannotFold, happening_of
+from pycrorm_async.events.types import EpisodeEnded
+from pycrorm_async.projections.fold.fold import CannotFold
 from pycrorm_async.recall.case import Case
 from pycrorm_async.recall.cases.episode_cases import READS, EpisodeCases
 from pycrorm_async.recording.writing.emitter import Emitter
 from pycrorm_async.recording.writing.event_feed import EventBuffer
 from pycrorm_async.store.episode_lookup import episode_named
 from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.stored import StoredEvent
 
 __all__ = ["ProcessCases"]
 
+_READS: Final = frozenset(each.__name__ for each in READS)
 _EVENTS_MAX: Final = 100_000
 """Bounds the events between two recalls. Beyond it the open episodes are read from the log again."""
 
@@ -95,14 +95,15 @@ class ProcessCases:
             self._buffer.take()
             self._episodes.clear()
             cases += await self._read_open()
-        for each in sorted(self._buffer.take(), key=lambda each: (each.event.episode, each.event.sequence)):
-            _, sequence, happening, dtype = each.event
-            running = self._episodes.get(each.event.episode)
+        for event, wall_ns, monotonic_ns in sorted(self._buffer.take(), key=lambda each: each.event[:2]):
+            episode, sequence, happening, _ = event
+            running = self._episodes.get(episode)
             if running is None and sequence == 1:
-                running = self._begin(each.event.episode)
+                running = self._begin(episode)
             if running is not None and sequence > running.reached:
-                wall_us = microseconds(each.wall_ns)
-                running.unnumbered += self._read(running, sequence, wall_us, each.monotonic_ns, happening, dtype)
+                kind, payload = type(happening), encode(happening)
+                identity = running.number, sequence, kind.__name__, kind.version
+                running.unnumbered += self._read(running, StoredEvent(*identity, wall_ns, monotonic_ns, payload))
         cases += await self._numbered()
         return cases, [case for each in self._episodes.values() for case in each.unnumbered]
 
@@ -117,7 +118,7 @@ class ProcessCases:
         with suppress(EpisodeParked):  # `flush` and `status` report it; what is stored is folded here
             await self._flush()
         log = await self._log()
-        cases = []
+        cases: list[Case] = []
         for episode in self._open_episodes():
             if await log.episode_number(episode) is None:
                 continue
@@ -125,36 +126,19 @@ class ProcessCases:
             running = self._episodes[row.id] = _Running(row.id, row.number, is_numbered=True)
             async for page in log.pages(row):
                 for stored in page:
-                    with suppress(CannotFold):
-                        happening = happening_of(stored)
-                        times = microseconds(stored.wall_ns), stored.monotonic_ns
-                        dtype = self._dtype_of(happening)
-                        cases += self._read(running, stored.sequence, *times, happening, dtype)
+                    cases += self._read(running, stored)
         return cases
 
-    def _dtype_of(self, happening: Happening) -> str | None:
-        declared = self._feed.declaration(happening.designator) if isinstance(happening, NodeStarted) else None
-        return None if declared is None else declared.dtype
-
-    def _read(
-        self, running: _Running, sequence: int, wall_us: int, monotonic_ns: int, happening: Happening, dtype: str | None
-    ) -> list[Case]:
-        declaration, parameters = None, {}
-        if isinstance(happening, NodeStarted) and happening.designator is not None:
-            declaration = self._feed.declaration(happening.designator)
-            happening = decode(NodeStarted.__name__, encode(happening), NodeStarted.version)
-            assert isinstance(happening, NodeStarted)
-            parameters = {name: None if is_missing(each) else each for name, each in happening.parameters.items()}
-        running.reached = sequence
-        running.has_ended = running.has_ended or isinstance(happening, EpisodeEnded)
-        if not isinstance(happening, READS):
-            return []
-        event = Event(running.number, sequence, wall_us, monotonic_ns, happening, dtype, parameters, declaration)
+    def _read(self, running: _Running, stored: StoredEvent) -> Sequence[Case]:
+        running.reached = stored.sequence
+        running.has_ended = running.has_ended or stored.type == EpisodeEnded.__name__
+        if stored.type not in _READS:
+            return ()
         try:
-            return running.fold.read(event)
+            return running.fold.read(stored, self._feed.declaration)
         except CannotFold:  # the fold of the tables parks the episode, with the reason
             running.has_ended = True
-            return []
+            return ()
 
     async def _numbered(self) -> list[Case]:
         """Return the cases of the episodes that have a number by now, and drop those episodes that have ended."""
