@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import inspect
 import re
 from collections.abc import Callable
@@ -14,8 +13,8 @@ from typing import Annotated, Any, Literal
 import typer
 
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
-from pycrorm_async.cli.output import duration, moment, note, print_json, print_table, stdout
-from pycrorm_async.cli.pending_events import note_pending_events
+from pycrorm_async.cli.output import duration, moment, note, print_json, print_line, print_table
+from pycrorm_async.cli.reading import read_memory
 from pycrorm_async.cli.since import parse_since
 from pycrorm_async.query.asking.ask import QUESTIONS, Ask
 from pycrorm_async.query.asking.question import Question
@@ -81,9 +80,7 @@ def _verb(name: str) -> Callable[..., None]:
             key: parse_since(value) if key == "since" else value for key, value in options.items() if value is not None
         }
         if sql:
-            stdout.print(
-                getattr(Reading(DatabaseAddress.parse(url)).ask, name)(**arguments).sql, markup=False, soft_wrap=True
-            )
+            print_line(getattr(Reading(DatabaseAddress.parse(url)).ask, name)(**arguments).sql)
             return
         _answer(name, arguments, url, spool, simulated=simulated, as_json=as_json)
 
@@ -125,14 +122,12 @@ def _option(parameter: inspect.Parameter) -> Any:
 def _answer(
     name: str, arguments: dict[str, Any], url: str, spool: Path | None, *, simulated: bool, as_json: bool
 ) -> None:
-    async def ask() -> tuple[list[str], list[tuple[Any, ...]]]:
-        async with Reading.open(url) as reading:
-            question: Question = getattr(reading.ask, name)(**arguments)
-            columns = list(question.statement.selected_columns.keys())
-            return columns, [tuple(row) for row in await question.rows(simulated=simulated)]
+    async def ask(reading: Reading) -> tuple[list[str], list[tuple[Any, ...]]]:
+        question: Question = getattr(reading.ask, name)(**arguments)
+        columns = list(question.statement.selected_columns.keys())
+        return columns, [tuple(row) for row in await question.rows(simulated=simulated)]
 
-    columns, rows = asyncio.run(ask())
-    note_pending_events(url, spool)
+    columns, rows = read_memory(url, spool, ask)
     if as_json:
         print_json([dict(zip(columns, map(_plain, row), strict=True)) for row in rows])
         return

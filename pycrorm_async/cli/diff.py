@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import asyncio
 from typing import Annotated
 
 import typer
 
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
 from pycrorm_async.cli.output import duration, note, print_json, print_table, stdout
-from pycrorm_async.cli.pending_events import note_pending_events
-from pycrorm_async.query.asking.episode_diff import EpisodeDiff
+from pycrorm_async.cli.reading import read_memory
 from pycrorm_async.query.named_queries import EpisodeSummary
-from pycrorm_async.query.reading import Reading
 
 __all__ = ["diff"]
 
@@ -30,13 +27,7 @@ def diff(
 
     Nodes correspond by the types from the root down. A node that only one of them has stands for the nodes below it.
     """
-
-    async def compare() -> EpisodeDiff:
-        async with Reading.open(url) as reading:
-            return await reading.diff(first, second)
-
-    compared = asyncio.run(compare())
-    note_pending_events(url, spool)
+    compared = read_memory(url, spool, lambda reading: reading.diff(first, second))
     if as_json:
         print_json(compared)
         return

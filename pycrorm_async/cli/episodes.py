@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Mapping
 from typing import Annotated
 
@@ -10,12 +9,11 @@ import typer
 
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
 from pycrorm_async.cli.output import duration, moment, print_json, print_table, stdout
-from pycrorm_async.cli.pending_events import note_pending_events
+from pycrorm_async.cli.reading import read_memory
 from pycrorm_async.cli.since import parse_since
 from pycrorm_async.cli.tree import simulated_by
 from pycrorm_async.query.asking.episode_list import EpisodeChoice
 from pycrorm_async.query.named_queries import EpisodeSummary
-from pycrorm_async.query.reading import Reading
 from pycrorm_async.store.address import DatabaseAddress
 
 __all__ = ["episodes"]
@@ -57,13 +55,7 @@ def episodes(
     """List the recorded episodes, the oldest first."""
     earliest = None if since is None else parse_since(since)
     choice = EpisodeChoice(status, earliest, tuple(tag or ()), robot, text, limit)
-
-    async def query() -> list[EpisodeSummary]:
-        async with Reading.open(url) as reading:
-            return await reading.episodes(choice, simulated=simulated)
-
-    summaries = asyncio.run(query())
-    note_pending_events(url, spool)
+    summaries = read_memory(url, spool, lambda reading: reading.episodes(choice, simulated=simulated))
     if as_json:
         print_json(summaries)
         return

@@ -11,7 +11,7 @@ from typing import Annotated
 import msgspec
 import typer
 
-from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
+from pycrorm_async.cli.options import DEFAULT_URL, EpisodeArgument, JsonOption, SpoolOption, UrlOption
 from pycrorm_async.cli.pending_events import note_pending_events
 from pycrorm_async.errors import CallerError, LogDamaged
 from pycrorm_async.events.types import EVENT_TYPES
@@ -24,7 +24,7 @@ __all__ = ["events"]
 
 
 def events(
-    episode: Annotated[str, typer.Argument(help="The episode's number, its id or first digits of the id, or `last`.")],
+    episode: EpisodeArgument,
     after: Annotated[int, typer.Option(min=0, metavar="SEQUENCE", help="Print only events after this one.")] = 0,
     kind: Annotated[
         list[str] | None, typer.Option("--type", help="Print only events of this type; repeatable.")

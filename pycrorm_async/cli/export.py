@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
-from pycrorm_async.cli.output import note, print_json, stderr, stdout
+from pycrorm_async.cli.output import note, print_json, print_line, stderr
 from pycrorm_async.cli.pending_events import note_pending_events
 from pycrorm_async.cli.since import parse_since
 from pycrorm_async.errors import CallerError
@@ -137,9 +137,9 @@ def _again(manifest: Path, out: Path | None, url: str, spool: Path | None, *, fo
     if as_json:
         print_json({"same": remade.same, "differences": remade.differences, "file": remade.exported and out})
     else:
-        stdout.print("the same bytes" if remade.same else "not the same", markup=False)
+        print_line("the same bytes" if remade.same else "not the same")
         for each in remade.differences:
-            stdout.print(f"  {each}", markup=False, highlight=False, soft_wrap=True)
+            print_line(f"  {each}")
     return 0 if remade.same else 1
 
 
@@ -149,7 +149,7 @@ def _print(exported: Exported, *, as_json: bool) -> None:
         counts = {"rows": exported.rows, "episodes": exported.episodes, "left_out": exported.left_out}
         print_json({"file": exported.path, "format": manifest.file_format, **counts, "files": manifest.files})
         return
-    stdout.print(str(exported.path), markup=False, highlight=False, soft_wrap=True)
+    print_line(exported.path)
     note(f"It has {exported.rows:,} rows of {exported.episodes} episodes; {exported.path}.manifest.json describes it.")
     if exported.left_out:
         note(f"{exported.left_out} episodes are left out, because they run or are not in the tables yet.")

@@ -12,6 +12,7 @@ from pycrorm_async.settings import FileAccess, Writer
 __all__ = [
     "UrlOption",
     "SpoolOption",
+    "EpisodeArgument",
     "JsonOption",
     "WriterOption",
     "FileAccessOption",
@@ -62,5 +63,8 @@ ProjectionOption = Annotated[
         metavar="MODULE:CLASS",
         help="Custom projection to use, in addition to those of installed packages; repeatable.",
     ),
+]
+EpisodeArgument = Annotated[
+    str, typer.Argument(help="The episode's number, its id or first digits of the id, or `last`.")
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document.")]

@@ -24,6 +24,7 @@ __all__ = [
     "write_last",
     "note",
     "print_json",
+    "print_line",
     "print_table",
     "print_facts",
     "duration",
@@ -73,6 +74,11 @@ def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[obje
     for row in rows:
         table.add_row(*(_cell(value) for value in row))
     stdout.print(table)
+
+
+def print_line(text: object) -> None:
+    """Print a line without wrapping, so that users can copy its paths, addresses and ids."""
+    stdout.print(str(text), markup=False, soft_wrap=True)
 
 
 def print_facts(title: str, facts: Mapping[str, object]) -> None:

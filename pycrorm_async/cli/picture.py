@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import asyncio
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
-from pycrorm_async.cli.output import print_json, stdout
-from pycrorm_async.cli.pending_events import note_pending_events
+from pycrorm_async.cli.options import DEFAULT_URL, EpisodeArgument, JsonOption, SpoolOption, UrlOption
+from pycrorm_async.cli.output import print_json, print_line
+from pycrorm_async.cli.reading import read_memory
 from pycrorm_async.errors import CallerError
 from pycrorm_async.query.as_of import parse_moment
 from pycrorm_async.query.reading import Reading
@@ -21,7 +20,7 @@ __all__ = ["picture"]
 
 
 def picture(
-    episode: Annotated[str, typer.Argument(help="The episode's number, its id or first digits of the id, or `last`.")],
+    episode: EpisodeArgument,
     at: Annotated[
         str | None,
         typer.Option(
@@ -54,22 +53,18 @@ def picture(
     if out is not None:
         refuse_existing(out, force=force)
 
-    async def write() -> Path:
-        async with Reading.open(url) as reading:
-            number = (await reading.episode(episode)).number
-            png = await draw(
-                reading, number, at=at, width=width, height=height, yaw_deg=yaw, pitch_deg=pitch, focus=focus
-            )
-            path = out if out is not None else Path(f"episode-{number}.png")
-            write_file(png, path, force=force)
-            return path
+    async def write(reading: Reading) -> Path:
+        number = (await reading.episode(episode)).number
+        png = await draw(reading, number, at=at, width=width, height=height, yaw_deg=yaw, pitch_deg=pitch, focus=focus)
+        path = out if out is not None else Path(f"episode-{number}.png")
+        write_file(png, path, force=force)
+        return path
 
-    path = asyncio.run(write())
-    note_pending_events(url, spool)
+    path = read_memory(url, spool, write)
     if as_json:
         print_json({"file": path, "bytes": path.stat().st_size, "width": width, "height": height})
     else:
-        stdout.print(str(path), markup=False, highlight=False, soft_wrap=True)
+        print_line(path)
 
 
 def _size(text: str) -> tuple[int, int]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import io
 from pathlib import Path
 from typing import Annotated, Any
@@ -10,12 +9,11 @@ from typing import Annotated, Any
 import typer
 
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
-from pycrorm_async.cli.output import note, print_json, stdout
-from pycrorm_async.cli.pending_events import note_pending_events
+from pycrorm_async.cli.output import note, print_json, print_line
+from pycrorm_async.cli.reading import read_memory
 from pycrorm_async.errors import CallerError
-from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.success.figure import Kind, success_figure
-from pycrorm_async.query.success.samples import Samples, success_samples
+from pycrorm_async.query.success.samples import success_samples
 from pycrorm_async.query.success.success_table import SuccessTable, success_table
 from pycrorm_async.report.output_files import refuse_existing, write_file
 
@@ -52,21 +50,15 @@ def plot(
     if out.suffix not in _SUFFIXES:
         raise CallerError(f"--out {out} must end in one of {', '.join(_SUFFIXES)}")
     refuse_existing(out, force=force)
-
-    async def read() -> Samples:
-        async with Reading.open(url) as reading:
-            return await success_samples(reading, x, y, of)
-
-    samples = asyncio.run(read())
+    samples = read_memory(url, spool, lambda reading: success_samples(reading, x, y, of))
     buffer = io.BytesIO()
     success_figure(samples, kind=kind, bins=bins).savefig(buffer, format=out.suffix[1:], dpi=120)
     write_file(buffer.getvalue(), out, force=force)
     table = success_table(samples, bins=bins)
-    note_pending_events(url, spool)
     if as_json:
         print_json({"file": out, **_document(table)})
         return
-    stdout.print(str(out), markup=False, highlight=False, soft_wrap=True)
+    print_line(out)
     note(f"{table.succeeded:,} of {table.rows:,} rows succeeded.")
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import csv
 import math
 import sys
@@ -13,7 +12,7 @@ import typer
 
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
 from pycrorm_async.cli.output import note, print_json, print_table
-from pycrorm_async.cli.pending_events import note_pending_events
+from pycrorm_async.cli.reading import read_memory
 from pycrorm_async.errors import CallerError
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.sql.read_only import SqlLimits, SqlResult
@@ -48,15 +47,14 @@ def query(
     if as_json and form == "csv":
         raise CallerError("--json and --format csv exclude each other")
     if form == "csv":
-        more = asyncio.run(_write_csv(url, text, limits))
+        more = read_memory(url, spool, lambda reading: _write_csv(reading, text, limits))
     else:
-        result = asyncio.run(_run(url, text, limits))
+        result = read_memory(url, spool, lambda reading: reading.query(text, limits))
         more = result.more
         if as_json or form == "json":
             print_json(_document(result))
         else:
             print_table(f"{len(result.rows)} rows", result.columns, ([*map(_cell, row)] for row in result.rows))
-    note_pending_events(url, spool)
     if more:
         note(
             f"the query has more rows: these are the first, up to {limit or 'any number of'} rows and {megabytes:g} MB;"
@@ -64,13 +62,8 @@ def query(
         )
 
 
-async def _run(url: str, sql: str, limits: SqlLimits) -> SqlResult:
-    async with Reading.open(url) as reading:
-        return await reading.query(sql, limits)
-
-
-async def _write_csv(url: str, sql: str, limits: SqlLimits) -> bool:
-    async with Reading.open(url) as reading, reading.stream(sql, limits) as rows:
+async def _write_csv(reading: Reading, sql: str, limits: SqlLimits) -> bool:
+    async with reading.stream(sql, limits) as rows:
         lines = csv.writer(sys.stdout)
         lines.writerow(rows.columns)
         async for row in rows:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import re
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -11,7 +10,7 @@ import typer
 
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
 from pycrorm_async.cli.output import note, print_json, print_table, stdout
-from pycrorm_async.cli.pending_events import note_pending_events
+from pycrorm_async.cli.reading import read_memory
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.ids import SEQUENCE_MAX, row_id
 from pycrorm_async.query.reading import Reading
@@ -79,19 +78,17 @@ def recall(
     if like is not None and cue:
         raise CallerError("--like takes the cue from an action: leave out the type and the features")
 
-    async def query() -> tuple[Answer, tuple[str, ...]]:
-        async with Reading.open(url) as reading:
-            memory = Recall.of(reading)
-            if like is not None:
-                found = await memory.like(await _node(reading, like), k=k, simulated=simulated)
-            else:
-                found = await memory(
-                    parsed.type, has=parsed.has, near=parsed.near, lacks=parsed.lacks, only=parsed.only, **conditions
-                )
-            return found, await memory.types()
+    async def query(reading: Reading) -> tuple[Answer, tuple[str, ...]]:
+        memory = Recall.of(reading)
+        if like is not None:
+            found = await memory.like(await _node(reading, like), k=k, simulated=simulated)
+        else:
+            found = await memory(
+                parsed.type, has=parsed.has, near=parsed.near, lacks=parsed.lacks, only=parsed.only, **conditions
+            )
+        return found, await memory.types()
 
-    found, types = asyncio.run(query())
-    note_pending_events(url, spool)
+    found, types = read_memory(url, spool, query)
     _note_unknown(found.cue.type, types)
     if as_json:
         print_json(_document(found))
@@ -225,13 +222,11 @@ def _follows(
     if dtype is None or like is not None or any(parsed[1:]):
         raise CallerError("--follows takes one type, as in `pycrorm recall --follows PickUpAction --reason IKError`")
 
-    async def query() -> tuple[Following, tuple[str, ...]]:
-        async with Reading.open(url) as reading:
-            memory = Recall.of(reading)
-            return await memory.follows(dtype, status=status, reason=reason), await memory.types()
+    async def query(reading: Reading) -> tuple[Following, tuple[str, ...]]:
+        memory = Recall.of(reading)
+        return await memory.follows(dtype, status=status, reason=reason), await memory.types()
 
-    following, types = asyncio.run(query())
-    note_pending_events(url, spool)
+    following, types = read_memory(url, spool, query)
     _note_unknown(dtype, types)
     if as_json:
         followers = [

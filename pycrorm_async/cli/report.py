@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import asyncio
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
-from pycrorm_async.cli.output import note, print_json, problem, stdout
-from pycrorm_async.cli.pending_events import note_pending_events
+from pycrorm_async.cli.output import note, print_json, print_line, problem
+from pycrorm_async.cli.reading import read_memory
 from pycrorm_async.errors import CallerError
-from pycrorm_async.query.reading import Reading
-from pycrorm_async.report.write import Overview, Report, overview
+from pycrorm_async.report.write import overview
 from pycrorm_async.report.write import report as write_report
 
 __all__ = ["report"]
@@ -63,17 +61,12 @@ def report(
 
 
 def _write_overview(out: Path, tags: list[str], url: str, spool: Path | None, *, force: bool, as_json: bool) -> int:
-    async def write() -> Overview:
-        async with Reading.open(url) as reading:
-            return await overview(reading, out, tags=tags, force=force)
-
-    written = asyncio.run(write())
-    note_pending_events(url, spool)
+    written = read_memory(url, spool, lambda reading: overview(reading, out, tags=tags, force=force))
     if as_json:
         counts = {"episodes": written.episodes, "pages": written.pages, "left_out": written.left_out}
         print_json({"file": written.path, **counts, "unreadable": written.unreadable})
     else:
-        stdout.print(str(written.path), markup=False, highlight=False, soft_wrap=True)
+        print_line(written.path)
         note(f"It has {written.episodes} episodes; pages of {written.pages} are in {out.stem}.pages beside it.")
     for number, reason in written.unreadable.items():
         problem(f"episode {number} has no page: {reason}")
@@ -91,19 +84,15 @@ def _write_episode(
     as_json: bool,
 ) -> None:
     first, last = window
-
-    async def write() -> Report:
-        async with Reading.open(url) as reading:
-            return await write_report(reading, episode, out, force=force, first=first, last=last)
-
-    written = asyncio.run(write())
-    note_pending_events(url, spool)
+    written = read_memory(
+        url, spool, lambda reading: write_report(reading, episode, out, force=force, first=first, last=last)
+    )
     size = written.path.stat().st_size
     if as_json:
         shown = {"first": written.first, "last": written.last, "events": written.events}
         print_json({"file": written.path, "bytes": size, **shown})
         return
-    stdout.print(str(written.path), markup=False, highlight=False, soft_wrap=True)
+    print_line(written.path)
     note(f"The page has {size / 1e6:.1f} MB and opens in any browser, also offline.")
     if first is None and last is None and written.last < written.events:
         note(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import sys
 from typing import Annotated, Literal
 
@@ -10,10 +9,9 @@ import typer
 
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
 from pycrorm_async.cli.output import print_json
-from pycrorm_async.cli.pending_events import note_pending_events
+from pycrorm_async.cli.reading import read_memory
 from pycrorm_async.errors import CallerError
-from pycrorm_async.query.reading import Reading
-from pycrorm_async.query.schema.memory_schema import CORE_VIEWS, View, as_mermaid, as_text, read_schema
+from pycrorm_async.query.schema.memory_schema import CORE_VIEWS, as_mermaid, as_text, read_schema
 
 __all__ = ["schema"]
 
@@ -34,13 +32,7 @@ def schema(
     if as_json and form == "mermaid":
         raise CallerError("--json and --format mermaid exclude each other")
     names = tuple(views or (CORE_VIEWS if form == "mermaid" else ()))
-
-    async def read() -> list[View]:
-        async with Reading.open(url) as reading:
-            return await read_schema(reading, names)
-
-    described = asyncio.run(read())
-    note_pending_events(url, spool)
+    described = read_memory(url, spool, lambda reading: read_schema(reading, names))
     if as_json:
         print_json(described)
     else:

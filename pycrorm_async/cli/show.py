@@ -2,28 +2,26 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
+from pycrorm_async.cli.options import DEFAULT_URL, EpisodeArgument, JsonOption, SpoolOption, UrlOption
 from pycrorm_async.cli.output import duration, moment, print_facts, print_json
-from pycrorm_async.cli.pending_events import note_pending_events
+from pycrorm_async.cli.reading import read_memory
 from pycrorm_async.cli.snapshot_view import print_snapshot
 from pycrorm_async.cli.tree import print_tree, simulated_by
 from pycrorm_async.query.as_of import parse_moment
 from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.query.snapshot import Moment
 
 __all__ = ["show"]
 
 
 def show(
-    episode: Annotated[str, typer.Argument(help="The episode's number, its id or first digits of the id, or `last`.")],
+    episode: EpisodeArgument,
     at: Annotated[
         str | None,
         typer.Option(
@@ -49,13 +47,11 @@ def show(
 
 
 def _show(episode: str, url: str, spool: Path | None, *, events: bool, full: bool, as_json: bool) -> None:
-    async def query() -> tuple[EpisodeSummary, list[NodeSummary]]:
-        async with Reading.open(url) as reading:
-            summary = await reading.episode(episode)
-            return summary, await reading.tree(summary)
+    async def query(reading: Reading) -> tuple[EpisodeSummary, list[NodeSummary]]:
+        summary = await reading.episode(episode)
+        return summary, await reading.tree(summary)
 
-    summary, tree = asyncio.run(query())
-    note_pending_events(url, spool)
+    summary, tree = read_memory(url, spool, query)
     if as_json:
         print_json({"episode": summary, "tree": tree})
         return
@@ -102,13 +98,7 @@ def _show_moment(
     episode: str, at: str, url: str, spool: Path | None, *, events: bool, full: bool, as_json: bool
 ) -> None:
     time, sequence = parse_moment(at, "--at")
-
-    async def query() -> Moment:
-        async with Reading.open(url) as reading:
-            return await reading.as_of(episode, time=time, sequence=sequence)
-
-    snapshot = asyncio.run(query())
-    note_pending_events(url, spool)
+    snapshot = read_memory(url, spool, lambda reading: reading.as_of(episode, time=time, sequence=sequence))
     if as_json:
         print_json(snapshot)
     else:

@@ -19,7 +19,7 @@ from pycrorm_async.cli.options import (
     SpoolOption,
     UrlOption,
 )
-from pycrorm_async.cli.output import moment, note, print_facts, print_json, print_table, problem, stdout
+from pycrorm_async.cli.output import moment, note, print_facts, print_json, print_line, print_table, problem
 from pycrorm_async.cli.writer import store_once
 from pycrorm_async.errors import PycrormError
 from pycrorm_async.operations import recovery
@@ -94,11 +94,11 @@ def repair(
         print_json(_repair_document(finished, repaired, refused))
     else:
         for path in finished:
-            _line(f"{path.name}: completed an interrupted repair")
+            print_line(f"{path.name}: completed an interrupted repair")
         for report in repaired:
             _print_repair(report)
         if not (finished or repaired or refused):
-            _line("nothing is damaged")
+            print_line("nothing is damaged")
     for error in refused.values():
         problem(str(error))
     if repaired and not as_json:
@@ -183,26 +183,26 @@ def _print_recorder(each: RecorderReport) -> None:
         },
     )
     for one in each.open:
-        _line(f"  open: episode {one.id}, {one.sequence} events, the last at {_time(one.wall_ns)}")
+        print_line(f"  open: episode {one.id}, {one.sequence} events, the last at {_time(one.wall_ns)}")
 
 
 def _print_repair(report: RepairReport) -> None:
-    _line(
+    print_line(
         f"{report.name}: repaired; {report.kept} records before the damage are kept,"
         f" {report.saved} behind it are salvaged"
     )
-    _line(f"  original folder: {report.set_aside}")
-    _line(f"  damage: {_damage_text(report.damage)}")
+    print_line(f"  original folder: {report.set_aside}")
+    print_line(f"  damage: {_damage_text(report.damage)}")
     if report.unreadable:
-        _line(f"  not kept: {_spans('position', report.unreadable)}, because the bytes cannot be read")
+        print_line(f"  not kept: {_spans('position', report.unreadable)}, because the bytes cannot be read")
     for each in report.given_up:
         kept = f"kept up to event {each.kept_to}" if each.kept_to else "not kept at all"
-        _line(
+        print_line(
             f"  not kept: {_spans('event', each.sequences)} of episode {each.episode}, because the events before them"
             f" are missing ({_spans('position', each.positions)} in the original folder); the episode is {kept}"
         )
     if report.headless:
-        _line("  not kept: the ends of episodes that were open in the oldest file and have no later record")
+        print_line("  not kept: the ends of episodes that were open in the oldest file and have no later record")
 
 
 def _state(each: RecorderReport) -> str:
@@ -219,11 +219,6 @@ def _time(wall_ns: int) -> str:
         return f"{moment(datetime.fromtimestamp(wall_ns / 1e9, UTC))} UTC"
     except (ValueError, OverflowError, OSError):  # the recording machine's clock was not set
         return f"{wall_ns} ns"
-
-
-def _line(text: str) -> None:
-    """Print a line without wrapping, so that users can copy its paths and ids."""
-    stdout.print(text, markup=False, soft_wrap=True)
 
 
 def _spans(noun: str, ranges: Sequence[Range]) -> str:

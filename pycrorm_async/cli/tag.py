@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
-from pycrorm_async.cli.output import note, print_json, stdout
+from pycrorm_async.cli.options import DEFAULT_URL, EpisodeArgument, JsonOption, SpoolOption, UrlOption
+from pycrorm_async.cli.output import note, print_json, print_line
 from pycrorm_async.cli.pending_events import note_pending_events
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.tags import checked_tags
@@ -19,7 +19,7 @@ __all__ = ["tag"]
 
 
 def tag(
-    episode: Annotated[str, typer.Argument(help="The episode's number, its id or first digits of the id, or `last`.")],
+    episode: EpisodeArgument,
     tags: Annotated[list[str] | None, typer.Argument(metavar="TAG...", help="Tags to add.")] = None,
     remove: Annotated[list[str] | None, typer.Option(metavar="TAG", help="Tag to remove; repeatable.")] = None,
     url: UrlOption = DEFAULT_URL,
@@ -42,4 +42,4 @@ def tag(
     if as_json:
         print_json(done)
     else:
-        stdout.print(f"episode {done.number}: {', '.join(done.tags) or 'no tags'}", markup=False, highlight=False)
+        print_line(f"episode {done.number}: {', '.join(done.tags) or 'no tags'}")

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
-from pycrorm_async.cli.output import note, print_json, stdout
+from pycrorm_async.cli.output import note, print_json, print_line, stdout
 from pycrorm_async.cli.pending_events import note_pending_events
 from pycrorm_async.cli.terminal_view import draw_episode, draw_overview
 from pycrorm_async.errors import CallerError, DatabaseUnavailable
@@ -92,7 +92,7 @@ async def _serve(follower: LogFollower, episode: str | None, port: int | None, *
                 print_json({"address": location, "port": used, "database": follower.address.to_type})
                 stdout.file.flush()
             else:
-                stdout.print(location, markup=False, highlight=False, soft_wrap=True)
+                print_line(location)
                 note("Only browsers on this machine that know this address get the page. Ctrl-C stops the server.")
             if open_it and not webbrowser.open(location):
                 note("No browser could be opened: open the address in one.")
