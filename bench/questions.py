@@ -32,8 +32,8 @@ from bench.reporting.figures import console, spread
 from pycrorm_async import Memory, Reading, UserView
 from pycrorm_async.operations.recovery import recover
 from pycrorm_async.orm import Object, PickUpAction, PickUpWithContextView, Pose, ProcessMetaData, TaskTreeNode
-from pycrorm_async.plan.task_tree import TaskStatus
 from pycrorm_async.recall.experience import PickUpExperience
+from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world import ObjectType
 from tests.databases import ask, server_in
 

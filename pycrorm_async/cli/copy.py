@@ -14,8 +14,6 @@ from pycrorm_async.cli.pending_events import note_pending_events
 from pycrorm_async.operations.copy import CopySummary, copy_episodes
 from pycrorm_async.progress_bar import watched
 
-__all__ = ["copy"]
-
 
 def copy(
     target: Annotated[str, typer.Option("--to", metavar="URL", help="Memory to append to; created if missing.")],

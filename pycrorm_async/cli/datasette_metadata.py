@@ -7,8 +7,6 @@ from pycrorm_async.cli.output import print_json
 from pycrorm_async.cli.reading import read_memory
 from pycrorm_async.export.datasette import datasette_metadata as describe
 
-__all__ = ["datasette_metadata"]
-
 
 def datasette_metadata(
     url: UrlOption = DEFAULT_URL,

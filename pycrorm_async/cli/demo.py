@@ -46,8 +46,6 @@ from pycrorm_async.world import Arms, BulletWorld, Grasp, ObjectType, Pose
 from pycrorm_async.world import Object as WorldObject
 from pycrorm_async.world.bullet_loader import engine
 
-__all__ = ["demo", "kitchen_world", "breakfast"]
-
 
 def kitchen_world() -> None:
     """Add the scene of the thesis (kitchen, robot, milk and cereal) to the world of this context."""

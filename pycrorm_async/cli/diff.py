@@ -7,11 +7,10 @@ from typing import Annotated
 import typer
 
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
-from pycrorm_async.cli.output import duration, note, print_json, print_table, stdout
+from pycrorm_async.cli.output import note, print_json, print_table, stdout
 from pycrorm_async.cli.reading import read_memory
 from pycrorm_async.query.named_queries import EpisodeSummary
-
-__all__ = ["diff"]
+from pycrorm_async.query.parameter_text import duration
 
 _HELP = "The episode's number, its id or first digits of the id, or `last`."
 

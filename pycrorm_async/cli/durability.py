@@ -13,8 +13,6 @@ from pycrorm_async.store.dialect import StoredOn
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import Incarnation
 
-__all__ = ["Durability", "KeptSegments", "durability", "summarise_kept_segments", "print_durability"]
-
 
 @dataclass(frozen=True)
 class KeptSegments:

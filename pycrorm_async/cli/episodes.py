@@ -8,15 +8,14 @@ from typing import Annotated
 import typer
 
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
-from pycrorm_async.cli.output import duration, moment, print_json, print_table, stdout
+from pycrorm_async.cli.output import moment, print_json, print_table, stdout
 from pycrorm_async.cli.reading import read_memory
 from pycrorm_async.cli.since import parse_since
 from pycrorm_async.cli.tree import simulated_by
 from pycrorm_async.query.asking.episode_list import EpisodeChoice
 from pycrorm_async.query.named_queries import EpisodeSummary
+from pycrorm_async.query.parameter_text import duration
 from pycrorm_async.store.address import DatabaseAddress
-
-__all__ = ["episodes"]
 
 _WIDTH_WITH_ROBOTS = 100
 """Bounds the width of a terminal on which the table has the robots: on one of 80 characters the description has none

@@ -20,8 +20,6 @@ from pycrorm_async.store.episode_lookup import episode_named
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import StoredEvent
 
-__all__ = ["events"]
-
 
 def events(
     episode: EpisodeArgument,

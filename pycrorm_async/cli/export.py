@@ -11,17 +11,15 @@ from typing import Annotated, Any
 import typer
 
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
-from pycrorm_async.cli.output import note, print_json, print_line, stderr
+from pycrorm_async.cli.output import note, print_json, print_line
 from pycrorm_async.cli.pending_events import note_pending_events
 from pycrorm_async.cli.since import parse_since
 from pycrorm_async.errors import CallerError
 from pycrorm_async.export.export import Exported, Remade, export_again
 from pycrorm_async.export.export import export as write_export
-from pycrorm_async.progress_bar import ProgressCallback, watched
+from pycrorm_async.progress_bar import ProgressCallback, stderr, watched
 from pycrorm_async.query.asking.ask import QUESTIONS, Ask
 from pycrorm_async.query.reading import Reading
-
-__all__ = ["export"]
 
 _READ: Mapping[str, Callable[[str], Any]] = {
     "bool": lambda text: {"true": True, "false": False}[text.lower()],

@@ -20,8 +20,6 @@ from types import FrameType
 
 from pycrorm_async.cli.output import note, write_last
 
-__all__ = ["Interruption"]
-
 _NOTE_DELAY_S = 1.0
 """Delays the note that events are being stored, so that it appears only if storing takes noticeably long."""
 _PLAN_SIGNALS_MAX = 2

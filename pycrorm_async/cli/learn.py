@@ -33,8 +33,6 @@ from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.world.bullet_loader import engine
 from pycrorm_async.world.robots.robot_description import Limits
 
-__all__ = ["learn"]
-
 _FIGURE_SUFFIXES = (".png", ".svg", ".pdf")
 
 

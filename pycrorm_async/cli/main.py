@@ -27,7 +27,7 @@ from rich.logging import RichHandler
 from typer.exceptions import TyperException
 
 from pycrorm_async import __version__
-from pycrorm_async.cli.output import problem, stderr, stdout
+from pycrorm_async.cli.output import problem, stdout
 from pycrorm_async.errors import (
     CallerError,
     DamageError,
@@ -37,8 +37,7 @@ from pycrorm_async.errors import (
     FlushTimeout,
     PycrormError,
 )
-
-__all__ = ["main", "app", "exit_code"]
+from pycrorm_async.progress_bar import stderr
 
 
 def exit_code(error: PycrormError) -> int:

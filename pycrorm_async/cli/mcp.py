@@ -8,8 +8,6 @@ from pycrorm_async.cli.options import DEFAULT_URL, SpoolOption, UrlOption
 from pycrorm_async.cli.pending_events import note_pending_events
 from pycrorm_async.store.address import DatabaseAddress
 
-__all__ = ["mcp"]
-
 
 def mcp(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None) -> None:
     """Serve the memory to an agent by the Model Context Protocol (extra [mcp]); nothing is ever written.

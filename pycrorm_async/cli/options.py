@@ -9,17 +9,6 @@ import typer
 
 from pycrorm_async.settings import FileAccess, Writer
 
-__all__ = [
-    "UrlOption",
-    "SpoolOption",
-    "EpisodeArgument",
-    "JsonOption",
-    "WriterOption",
-    "FileAccessOption",
-    "ProjectionOption",
-    "DEFAULT_URL",
-]
-
 DEFAULT_URL = "sqlite:///pycrorm.db"
 
 UrlOption = Annotated[

@@ -15,21 +15,6 @@ from rich.markup import escape
 from rich.table import Table
 
 from pycrorm_async.progress_bar import stderr
-from pycrorm_async.query.parameter_text import duration
-
-__all__ = [
-    "stdout",
-    "stderr",
-    "problem",
-    "write_last",
-    "note",
-    "print_json",
-    "print_line",
-    "print_table",
-    "print_facts",
-    "duration",
-    "moment",
-]
 
 _WIDTH_PIPED = 160
 """Width of tables in characters if stdout is not a terminal; wide enough to keep most rows on one line."""

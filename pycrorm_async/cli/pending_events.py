@@ -8,8 +8,6 @@ from pycrorm_async.cli.output import note
 from pycrorm_async.queue.files.spool import Spool
 from pycrorm_async.store.address import DatabaseAddress
 
-__all__ = ["note_pending_events"]
-
 
 def note_pending_events(url: str, spool: Path | None) -> None:
     """Print one line on stderr for dead recorders with events left to store, and one for living recorders."""

@@ -16,8 +16,6 @@ from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.scene.picture import picture as draw
 from pycrorm_async.report.output_files import refuse_existing, write_file
 
-__all__ = ["picture"]
-
 
 def picture(
     episode: EpisodeArgument,

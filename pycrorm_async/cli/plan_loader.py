@@ -13,8 +13,6 @@ from typing import Any, NamedTuple
 
 from pycrorm_async.errors import CallerError
 
-__all__ = ["PlanNotLoadable", "LoadedPlan", "load_plan"]
-
 
 class PlanNotLoadable(CallerError):
     """The plan file or its function cannot be used; the message is one line."""

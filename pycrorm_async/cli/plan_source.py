@@ -8,8 +8,6 @@ from pathlib import Path
 
 from pycrorm_async.recording.writing.provenance import PlanSource
 
-__all__ = ["plan_source"]
-
 _GIT_TIMEOUT_S = 2.0
 """Bounds each call of git, so that a repository on a slow disk delays a plan by at most three times as much."""
 

@@ -17,8 +17,6 @@ from pycrorm_async.query.success.samples import success_samples
 from pycrorm_async.query.success.success_table import SuccessTable, success_table
 from pycrorm_async.report.output_files import refuse_existing, write_file
 
-__all__ = ["plot"]
-
 _SUFFIXES = (".png", ".svg", ".pdf")
 
 

@@ -17,8 +17,6 @@ from pycrorm_async.errors import CallerError
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.sql.read_only import SqlLimits, SqlResult
 
-__all__ = ["query"]
-
 _ROWS = 1_000
 _MEGABYTE = 1_000_000
 

@@ -10,8 +10,6 @@ from typing import TypeVar
 from pycrorm_async.cli.pending_events import note_pending_events
 from pycrorm_async.query.reading import Reading
 
-__all__ = ["read_memory"]
-
 T = TypeVar("T")
 
 

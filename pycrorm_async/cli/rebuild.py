@@ -10,15 +10,14 @@ import typer
 
 from pycrorm_async.bulk_records import collect_seldom
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, ProjectionOption, SpoolOption, UrlOption
-from pycrorm_async.cli.output import duration, note, print_json, stdout
+from pycrorm_async.cli.output import note, print_json, stdout
 from pycrorm_async.cli.pending_events import note_pending_events
 from pycrorm_async.errors import CallerError
 from pycrorm_async.operations.rebuild import RebuildSummary, projections_of, rebuild_memory, rebuild_projection
 from pycrorm_async.progress_bar import watched
 from pycrorm_async.projections.custom.discovery import installed_projections, load_projections
 from pycrorm_async.projections.custom.projection import PackedProjection, Projection
-
-__all__ = ["rebuild"]
+from pycrorm_async.query.parameter_text import duration
 
 _TABLES = "tables"
 

@@ -19,8 +19,6 @@ from pycrorm_async.recall.cue import closest
 from pycrorm_async.recall.following import Following
 from pycrorm_async.recall.reading.recall import Recall
 
-__all__ = ["recall"]
-
 _TERM = re.compile(r"(?P<how>not:|only:)?(?P<feature>[^=~]+)(?P<sign>[=~])(?P<value>.*)", re.DOTALL)
 _NODE = re.compile(r"(?P<episode>.+)/e?(?P<sequence>\d+)")
 

@@ -14,8 +14,6 @@ from pycrorm_async.errors import CallerError
 from pycrorm_async.report.write import overview
 from pycrorm_async.report.write import report as write_report
 
-__all__ = ["report"]
-
 
 def report(
     episode: Annotated[

@@ -25,18 +25,17 @@ from pycrorm_async.cli.options import (
     UrlOption,
     WriterOption,
 )
-from pycrorm_async.cli.output import note, print_json, print_table, problem, stderr
+from pycrorm_async.cli.output import note, print_json, print_table, problem
 from pycrorm_async.cli.plan_loader import LoadedPlan, load_plan
 from pycrorm_async.cli.plan_source import plan_source
 from pycrorm_async.errors import CallerError, EpisodeParked
 from pycrorm_async.events.tags import checked_tags
 from pycrorm_async.memory import Memory
+from pycrorm_async.progress_bar import stderr
 from pycrorm_async.projections.custom.discovery import load_projections
 from pycrorm_async.query.named_queries import EpisodeSummary
 from pycrorm_async.recording.values.texts import message_of
 from pycrorm_async.settings import OnFull, OnUnrecordable, RecordMeshes, Settings
-
-__all__ = ["run"]
 
 _DRAIN_WAIT_S = 2
 """Bounds the wait until a daemon drains the new recorder; a running daemon scans the spool more often than that."""

@@ -13,8 +13,6 @@ from pycrorm_async.cli.reading import read_memory
 from pycrorm_async.errors import CallerError
 from pycrorm_async.query.schema.memory_schema import CORE_VIEWS, as_mermaid, as_text, read_schema
 
-__all__ = ["schema"]
-
 
 def schema(
     views: Annotated[

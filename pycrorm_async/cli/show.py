@@ -9,15 +9,14 @@ from typing import Annotated
 import typer
 
 from pycrorm_async.cli.options import DEFAULT_URL, EpisodeArgument, JsonOption, SpoolOption, UrlOption
-from pycrorm_async.cli.output import duration, moment, print_facts, print_json
+from pycrorm_async.cli.output import moment, print_facts, print_json
 from pycrorm_async.cli.reading import read_memory
 from pycrorm_async.cli.snapshot_view import print_snapshot
 from pycrorm_async.cli.tree import print_tree, simulated_by
 from pycrorm_async.query.as_of import parse_moment
 from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary
+from pycrorm_async.query.parameter_text import duration
 from pycrorm_async.query.reading import Reading
-
-__all__ = ["show"]
 
 
 def show(

@@ -7,8 +7,6 @@ from datetime import UTC, datetime, timedelta
 
 from pycrorm_async.errors import CallerError
 
-__all__ = ["parse_since"]
-
 _AGE = re.compile(r"(\d{1,6})\s*(min|h|d|w)")
 _UNITS = {
     "min": timedelta(minutes=1),

@@ -11,8 +11,6 @@ from pycrorm_async.events.blobs import BLOB_KEY
 from pycrorm_async.query.parameter_text import parameters_text
 from pycrorm_async.query.snapshot import Moment, ObjectThen, ObservationThen, RobotThen
 
-__all__ = ["print_snapshot"]
-
 _JOINTS_MAX = 3
 """Bounds the joints listed for an object, so that its row stays short."""
 

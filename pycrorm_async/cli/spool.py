@@ -33,8 +33,6 @@ from pycrorm_async.queue.maintenance.salvage import Range
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 
-__all__ = ["inspect", "repair", "rebind"]
-
 FolderArgument = Annotated[
     Path | None, typer.Argument(metavar="DIR", help="The spool; default: that of --spool, or the one of --url.")
 ]

@@ -15,8 +15,6 @@ from pycrorm_async.events.tags import checked_tags
 from pycrorm_async.operations.destination import shared_address
 from pycrorm_async.operations.tag import tag_episode
 
-__all__ = ["tag"]
-
 
 def tag(
     episode: EpisodeArgument,

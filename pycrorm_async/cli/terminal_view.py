@@ -17,7 +17,7 @@ from pycrorm_async.cli.tree import tree_of
 from pycrorm_async.errors import DatabaseUnavailable, UnknownEpisode
 from pycrorm_async.events.ids import parse_episode_id
 from pycrorm_async.live.follower import LogFollower
-from pycrorm_async.projections.fold.fold import CannotFold
+from pycrorm_async.projections.fold.column_values import CannotFold
 from pycrorm_async.query.as_of import unreadable
 from pycrorm_async.query.snapshot import Moment, NodeThen
 from pycrorm_async.query.snapshot_fold import MomentFold
@@ -25,8 +25,6 @@ from pycrorm_async.report.episode_data import designators_of
 from pycrorm_async.store.episode_lookup import episode_named
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import EpisodeRow
-
-__all__ = ["draw_episode", "draw_overview", "in_sight"]
 
 _INTERVAL_S = 0.1
 _SHARE = 4

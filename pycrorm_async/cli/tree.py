@@ -8,11 +8,9 @@ from rich.markup import escape
 from rich.text import Text
 from rich.tree import Tree
 
-from pycrorm_async.cli.output import duration, stdout
+from pycrorm_async.cli.output import stdout
 from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary
-from pycrorm_async.query.parameter_text import one_line, parameters_text
-
-__all__ = ["print_tree", "tree_of", "simulated_by"]
+from pycrorm_async.query.parameter_text import duration, one_line, parameters_text
 
 _MESSAGE_MAX = 100
 """Bounds the characters of a failure's message, so that a failed node takes few lines."""

@@ -26,8 +26,6 @@ from pycrorm_async.projections.verify.verify import verify as verify_log
 from pycrorm_async.store.episode_lookup import episode_named
 from pycrorm_async.store.log import EventLog
 
-__all__ = ["verify"]
-
 _FINDINGS_MAX = 20
 """Bounds the printed findings of each kind; the rest is only counted."""
 

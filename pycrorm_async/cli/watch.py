@@ -20,8 +20,6 @@ from pycrorm_async.live.follower import LogFollower
 from pycrorm_async.operations.destination import shared_address
 from pycrorm_async.store.episode_lookup import episode_named
 
-__all__ = ["watch"]
-
 
 def watch(
     episode: Annotated[

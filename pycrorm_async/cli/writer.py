@@ -23,18 +23,17 @@ from pycrorm_async.cli.options import (
     SpoolOption,
     UrlOption,
 )
-from pycrorm_async.cli.output import note, print_json, problem, stderr, stdout
+from pycrorm_async.cli.output import note, print_json, problem, stdout
 from pycrorm_async.errors import DamageError, SpoolDamaged
 from pycrorm_async.operations.daemon import serve
 from pycrorm_async.operations.fold_workers import WORKERS, forked
 from pycrorm_async.operations.processes import ChildProcess
 from pycrorm_async.operations.recovery import RecoveryReport, recover
+from pycrorm_async.progress_bar import stderr
 from pycrorm_async.projections.custom.discovery import load_projections
 from pycrorm_async.projections.custom.projection import Projection
 from pycrorm_async.settings import Settings
 from pycrorm_async.writer.daemon import STOP_S, DaemonSummary
-
-__all__ = ["writer", "store_once"]
 
 _WATCHDOG_MARGIN_S = 5.0
 """Seconds after `STOP_S` until the watchdog ends a process whose database does not answer at all."""

@@ -22,7 +22,8 @@ from pycrorm_async.events.types import (
     StateSampled,
 )
 from pycrorm_async.export.selection import CoveredEpisode
-from pycrorm_async.projections.fold.fold import CannotFold, happening_of
+from pycrorm_async.projections.fold.column_values import CannotFold
+from pycrorm_async.projections.fold.fold import happening_of
 from pycrorm_async.query.as_of import unreadable
 from pycrorm_async.query.parameter_text import parameters_text
 from pycrorm_async.query.reading import Reading

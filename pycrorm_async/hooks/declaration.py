@@ -45,9 +45,6 @@ from pycrorm_async.recording.values.parameter_types import (
 )
 from pycrorm_async.recording.values.texts import clean, cut, message_of
 
-__all__ = ["Declarations", "built_in_declaration", "declared_type"]
-
-
 _NESTED_MAX = 8
 """Bounds the nesting of dataclasses in a parameter, so that a dataclass that contains itself ends."""
 _REASON_MAX = 500

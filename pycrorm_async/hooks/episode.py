@@ -42,8 +42,6 @@ from pycrorm_async.world.enums import ObjectType
 from pycrorm_async.world.objects import Object
 from pycrorm_async.world.observers import current_world
 
-__all__ = ["Episode", "NodeRecord"]
-
 
 class NodeRecord(NamedTuple):
     """The hooks' record of a running node, kept as `TaskTreeNode.record`.

@@ -17,8 +17,6 @@ from pycrorm_async.recording.values.texts import clean
 from pycrorm_async.recording.values.value_snapshot import References, pose_value
 from pycrorm_async.world.enums import ObjectType
 
-__all__ = ["location_resolved", "object_detected"]
-
 
 def location_resolved(
     location: str, offered: Sequence[Candidate], *, taken: int | None, considered: int, refused: Sequence[Refusal],

@@ -16,8 +16,6 @@ from pycrorm_async.recording.writing.emitter import Emitter
 from pycrorm_async.recording.writing.episode_writer import EpisodeWriter
 from pycrorm_async.recording.writing.observing import name_of, put_observation
 
-__all__ = ["Observations"]
-
 
 class Observations:
     """Records observations of one memory."""

@@ -45,8 +45,6 @@ from pycrorm_async.world.bullet import BulletWorld
 from pycrorm_async.world.enums import ObjectType
 from pycrorm_async.world.observers import current_world
 
-__all__ = ["Recorder", "current_episode"]
-
 _log = logging.getLogger("pycrorm_async")
 current_episode: ContextVar[Episode | None] = ContextVar("current_episode", default=None)
 """The innermost episode opened in this context; it may be closed already."""

@@ -32,8 +32,6 @@ from pycrorm_async.recording.writing.episode_writer import EpisodeWriter
 from pycrorm_async.world.objects import Object
 from pycrorm_async.world.robots.acting_robot import acting_robot
 
-__all__ = ["Sampler"]
-
 
 class _Motion:
     """A running motion: its node, the robot that acts, and the values last written of its channels.

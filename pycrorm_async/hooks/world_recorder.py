@@ -36,8 +36,6 @@ from pycrorm_async.world.pose import Pose
 from pycrorm_async.world.robots.acting_robot import acting_robot
 from pycrorm_async.world.world_copy import counterpart, related
 
-__all__ = ["WorldRecorder"]
-
 
 class WorldRecorder(ObjectRows[Object]):
     """Observes one world for one episode; the constructor records the present state of the world.

@@ -35,8 +35,6 @@ from pycrorm_async.world.enums import ObjectType
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["Study", "CurvePoint", "SceneComparison", "Cost", "study", "CURVE", "scene_variants"]
-
 CURVE = (500, 1_000, 2_000, 5_000, 10_000, 20_000, 50_000)
 """Numbers of default rollouts to learn from, one point of the learning curve each; those above the recorded number
 are skipped. 50,000 is the number of the thesis."""

@@ -31,17 +31,6 @@ from pycrorm_async.world.enums import Arms, Grasp
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = [
-    "Experiment",
-    "Phase",
-    "ExperimentResult",
-    "ReportProgress",
-    "run",
-    "read_rollouts",
-    "coverage_of",
-    "HELD_OUT_SEED",
-]
-
 HELD_OUT_SEED = 1_000_003
 """Added to the experiment's seed for the held-out default rollouts, so that their seed is not used for learning."""
 

@@ -9,7 +9,7 @@ from typing import Any
 from pycrorm_async.errors import DatabaseUnavailable
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX
 from pycrorm_async.live.activity import Activity
-from pycrorm_async.projections.fold.fold import CannotFold
+from pycrorm_async.projections.fold.column_values import CannotFold
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.report.episode_data import designators_of
 from pycrorm_async.report.overview_data import newest_episodes, overview_document

@@ -32,8 +32,6 @@ from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import EpisodeRow, StoredEvent
 from pycrorm_async.writer.retry import BRIEF, retry
 
-__all__ = ["copy_episodes", "CopySummary", "EpisodeCopy"]
-
 
 @dataclass(frozen=True)
 class EpisodeCopy:

@@ -44,8 +44,6 @@ from pycrorm_async.store.log import EventLog
 from pycrorm_async.writer.daemon import Daemon, DaemonSummary
 from pycrorm_async.writer.ports import ClaimedSource, ScanResult, Tables
 
-__all__ = ["serve"]
-
 
 async def serve(
     url: str,

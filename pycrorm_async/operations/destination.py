@@ -26,8 +26,6 @@ from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 
-__all__ = ["LogAndTables", "open_destination", "expected_log", "shared_address"]
-
 _APPENDS_AT_ONCE = 4
 """Bounds the concurrent appends to a server, for any number of recorders: the pool's connections less one for folding.
 """

@@ -31,8 +31,6 @@ from pycrorm_async.store.address import BUSY_TIMEOUT_S, DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import Span
 
-__all__ = ["Assignment", "Prepare", "Write", "FoldRest", "FoldShare", "Failure", "Request", "Answer", "READY", "main"]
-
 READY: Final = "ready"
 
 

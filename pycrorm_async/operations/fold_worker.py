@@ -40,8 +40,6 @@ from pycrorm_async.settings import Settings
 from pycrorm_async.store.stored import Span
 from pycrorm_async.writer.retry import Backoff
 
-__all__ = ["FoldWorker", "FoldWorkerState", "FoldWorkerLost", "verdict"]
-
 _RESTART_S_MAX: Final = 60.0
 """The longest pause before a restart."""
 _CHECK_S: Final = 0.25

@@ -32,8 +32,6 @@ from pycrorm_async.settings import Settings
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.writer.ports import Tables
 
-__all__ = ["WORKERS", "DaemonNote", "FoldWorkers", "FoldWorkerTables", "forked"]
-
 WORKERS: Final = 2
 """The fold workers of one daemon: one writes while the other prepares. More would compete for the database's writes."""
 _NOTE_S: Final = 1.0

@@ -43,8 +43,6 @@ from pycrorm_async.settings import Settings
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import Basis, EpisodeRow
 
-__all__ = ["HealedLog"]
-
 _EPISODES_MAX: Final = 1_000
 """Bounds the episodes whose heads one statement reads."""
 _ROUNDS: Final = 3

@@ -25,8 +25,6 @@ from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import BUSY_TIMEOUT_S, DatabaseAddress
 from pycrorm_async.store.log import EventLog
 
-__all__ = ["RebuildSummary", "rebuild_memory", "rebuild_projection", "projections_of"]
-
 ReportProgress: TypeAlias = Callable[[str, int, int], None]
 
 _log = logging.getLogger("pycrorm_async")

@@ -31,14 +31,6 @@ from pycrorm_async.store.log import EventLog
 from pycrorm_async.writer.drain_once import DrainSummary, drain_once
 from pycrorm_async.writer.ports import Source
 
-__all__ = [
-    "dead_queues",
-    "RecoveryReport",
-    "recover",
-    "Rebinding",
-    "rebind",
-]
-
 _log = logging.getLogger("pycrorm_async")
 
 

@@ -24,8 +24,6 @@ from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import EpisodeRow
 from pycrorm_async.writer.retry import BRIEF, retry
 
-__all__ = ["TaggedEpisode", "tag_episode"]
-
 _ATTEMPTS = 20
 """Bounds the attempts while other processes tag the same episode; each of them fails only if another succeeded."""
 

@@ -91,7 +91,8 @@ from pycrorm_async.plan.object_designators import (
     ObjectDesignatorDescription,
     ObjectPart,
 )
-from pycrorm_async.plan.task_tree import CollectedTree, TaskStatus, TaskTreeNode, collected_tree
+from pycrorm_async.plan.task_tree import CollectedTree, TaskTreeNode, collected_tree
+from pycrorm_async.task_status import TaskStatus
 
 __all__ = [
     "Designator",

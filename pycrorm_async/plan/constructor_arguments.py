@@ -12,8 +12,6 @@ from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
-__all__ = ["ARGUMENTS", "record_arguments"]
-
 ARGUMENTS = "_constructed_with"
 """Name of the instance's attribute that holds the arguments, a namespace with one attribute per argument."""
 

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from pycrorm_async.world.bullet import BulletWorld
     from pycrorm_async.world.objects import Object
 
-__all__ = ["CurrentRobot", "check_in_map", "in_link", "require_world", "require_robot"]
-
 
 class CurrentRobot(NamedTuple):
     """A robot: its object in the world and the description of its kind."""

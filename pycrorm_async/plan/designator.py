@@ -25,8 +25,6 @@ from pycrorm_async.plan.language.operators import Composable
 from pycrorm_async.plan.language.resources import NOTHING, Resource
 from pycrorm_async.plan.task_tree import NodeKind
 
-__all__ = ["Designator", "ActionAbstract", "BaseMotion"]
-
 
 class Designator(Composable, ABC):
     """Base of everything performable; derive from `ActionAbstract` or `BaseMotion`.

@@ -6,15 +6,6 @@ from collections.abc import Sequence
 
 from pycrorm_async.errors import CallerError
 
-__all__ = [
-    "PerformNotAsync",
-    "ResourcesNotAMethod",
-    "NotResolved",
-    "ResolutionError",
-    "NoRobotChosen",
-    "NoRobotHere",
-]
-
 
 class PerformNotAsync(CallerError, TypeError):
     """A designator class declares a `perform` that is not `async def perform(self)`."""

@@ -13,8 +13,6 @@ from pycrorm_async.plan.failures import (
     PlanFailure,
 )
 
-__all__ = ["describe_error", "is_plan_failure", "reaching_for"]
-
 _DESCRIPTION_LENGTH_MAX: Final = 200
 """Bounds the characters of a description, so that a list of failed alternatives stays readable."""
 

@@ -14,8 +14,6 @@ from pycrorm_async.connected_var import ConnectedVar
 from pycrorm_async.world.enums import Arms, Grasp, ObjectType
 from pycrorm_async.world.pose import Pose
 
-__all__ = ["Experience", "PastSuccess", "experience"]
-
 
 @dataclass(frozen=True, slots=True)
 class PastSuccess:

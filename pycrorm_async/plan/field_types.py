@@ -16,8 +16,6 @@ from typing import Any
 
 from pycrorm_async.plan.errors import ResolutionError
 
-__all__ = ["check_properties"]
-
 Check = Callable[[Any], bool]
 
 

@@ -31,20 +31,6 @@ from pycrorm_async.world.world_copy import counterpart, original, related
 if TYPE_CHECKING:
     from pycrorm_async.world.bullet import BulletWorld
 
-__all__ = [
-    "ObjectDesignator",
-    "ObjectPart",
-    "LocatedObject",
-    "BelieveObject",
-    "ObjectDesignatorDescription",
-    "LocatedObjectDescription",
-    "ObjectLike",
-    "designator_of",
-    "in_world",
-    "pose_of",
-]
-
-
 T = TypeVar("T")
 
 

@@ -17,16 +17,6 @@ from pycrorm_async.task_status import TaskStatus
 if TYPE_CHECKING:
     from pycrorm_async.plan.designator import Designator
 
-__all__ = [
-    "NodeKind",
-    "TaskStatus",
-    "TaskTreeNode",
-    "CollectedTree",
-    "collected_tree",
-    "collecting",
-    "current_node",
-]
-
 NodeKind = Literal["root", "action", "motion", "language"]
 
 

@@ -34,8 +34,6 @@ from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import Span
 
-__all__ = ["Projector"]
-
 _log = logging.getLogger("pycrorm_async.projections")
 
 _ANYTHING_FOLDED = text("SELECT 1 FROM episode WHERE folded > 0 LIMIT 1")

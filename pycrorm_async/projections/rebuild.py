@@ -76,8 +76,6 @@ from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import Span
 
-__all__ = ["Rebuild", "Share", "claimed", "recorded"]
-
 _MAKING = "/making"
 _BATCH_EVENTS = 8_000
 """Bounds the events of one transaction: on SQLite such a batch holds the write lock for some 50 ms."""

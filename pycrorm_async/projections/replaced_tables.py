@@ -22,8 +22,6 @@ from pycrorm_async.projections.table_names import physical_name
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 
-__all__ = ["REPLACED", "clear", "readable_generations"]
-
 REPLACED = "/gone/"
 """Separates owner and number in the key of a replaced generation."""
 _SLICE_ROWS = 10_000

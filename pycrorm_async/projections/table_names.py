@@ -11,8 +11,6 @@ from typing import Final
 
 from pycrorm_async.events.fields import bounded
 
-__all__ = ["index_name", "next_number", "physical_name"]
-
 _FIRST_NUMBER: Final = 1_001
 """The number of a memory's first generation. Earlier versions counted from 1 and gave the tables no prefix."""
 _PREFIX: Final = "zz_"

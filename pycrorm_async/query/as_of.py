@@ -16,7 +16,7 @@ import msgspec
 from pycrorm_async.errors import CallerError, DatabaseForeign, LogDamaged, PycrormError, UnknownEpisode
 from pycrorm_async.events.codec import description_of, fingerprint
 from pycrorm_async.events.types import EVENT_TYPES, DescriptionDeclared
-from pycrorm_async.projections.fold.fold import CannotFold
+from pycrorm_async.projections.fold.column_values import CannotFold
 from pycrorm_async.query.named_queries import EpisodeSummary
 from pycrorm_async.query.snapshot import Moment
 from pycrorm_async.query.snapshot_fold import MomentFold

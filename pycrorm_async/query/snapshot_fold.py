@@ -24,7 +24,8 @@ from pycrorm_async.events.types import (
     Observed,
 )
 from pycrorm_async.events.values import FailureValue
-from pycrorm_async.projections.fold.fold import CannotFold, happening_of
+from pycrorm_async.projections.fold.column_values import CannotFold
+from pycrorm_async.projections.fold.fold import happening_of
 from pycrorm_async.projections.fold.world_fold import WorldFold, WorldObject
 from pycrorm_async.query.snapshot import Moment, NodeThen, ObjectThen, ObservationThen, RobotThen, WorldThen
 from pycrorm_async.store.stored import StoredEvent

@@ -9,7 +9,7 @@ import msgspec
 
 from pycrorm_async.errors import CallerError, UnknownEpisode
 from pycrorm_async.events.codec import description_of, fingerprint
-from pycrorm_async.projections.fold.fold import CannotFold
+from pycrorm_async.projections.fold.column_values import CannotFold
 from pycrorm_async.query.as_of import unreadable
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.scene.object_model import assumed_model, point_model

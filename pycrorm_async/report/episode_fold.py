@@ -29,7 +29,8 @@ from pycrorm_async.events.types import (
     ObjectDetected,
     Observed,
 )
-from pycrorm_async.projections.fold.fold import CannotFold, happening_of
+from pycrorm_async.projections.fold.column_values import CannotFold
+from pycrorm_async.projections.fold.fold import happening_of
 from pycrorm_async.query.parameter_text import parameters_text
 from pycrorm_async.report.recorded_objects import WorldFold
 from pycrorm_async.report.tracks import Texts, Track, differences, rounded

@@ -24,8 +24,6 @@ from pycrorm_async.store.postgresql import engine as postgresql
 from pycrorm_async.store.sqlite import engine as sqlite
 from pycrorm_async.store.temporary_database import private_folder, usual_place
 
-__all__ = ["DatabaseAddress", "BUSY_TIMEOUT_S"]
-
 BUSY_TIMEOUT_S = 5.0
 """Bounds the wait of a statement for another writer; beyond it the database counts as unavailable."""
 

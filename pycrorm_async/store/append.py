@@ -44,8 +44,6 @@ from pycrorm_async.store.digests.digest_table import Extension, RunningDigests
 from pycrorm_async.store.limits import warnings_of
 from pycrorm_async.store.stored import NOTHING_KNOWN, Basis, EpisodeRow, Stored, StoredEvent
 
-__all__ = ["Appending"]
-
 _PART_EVENTS: Final = 1_024
 """Bounds the events whose digests and rows are computed at once. PostgreSQL stores the rows of one part while those of
 the next are computed."""

@@ -21,8 +21,6 @@ from pycrorm_async.events.envelope import Record, is_computed_end
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX, EpisodeId, episode_text
 from pycrorm_async.store.stored import EpisodeRow, StoredEvent
 
-__all__ = ["SortedBatch", "EpisodeStep", "NumbersExhausted", "sort", "step", "new_episode", "differing"]
-
 _CHECKED_AT_ONCE: Final = 256
 """Bounds the payloads that are joined to be checked by one call, so that they stay in the processor's cache: joining
 10,000 takes five times as long."""

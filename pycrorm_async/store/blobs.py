@@ -22,8 +22,6 @@ from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.values import BlobReference
 from pycrorm_async.store.dialect import Dialect
 
-__all__ = ["PART_BYTES", "BlobSource", "Blobs"]
-
 PART_BYTES: Final = 4 * 2**20
 """Bounds one row and transaction: SQLite's write lock is held for some ten milliseconds."""
 _HASHES_MAX: Final = 500

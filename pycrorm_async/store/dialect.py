@@ -11,20 +11,6 @@ from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 from pycrorm_async.errors import PycrormError
 from pycrorm_async.store.stored import EpisodeRow, Incarnation, Span, StoredEvent
 
-__all__ = [
-    "Dialect",
-    "Birth",
-    "DigestStatements",
-    "Expected",
-    "LogIdentity",
-    "Insertion",
-    "Migrations",
-    "Progress",
-    "RowRefused",
-    "RowsByTable",
-    "StoredOn",
-]
-
 Migrations: TypeAlias = Sequence[Sequence[str]]
 """Numbered steps; the first N of them create format N."""
 

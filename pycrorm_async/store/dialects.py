@@ -9,8 +9,6 @@ from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 from pycrorm_async.errors import InternalError
 from pycrorm_async.store.dialect import Dialect
 
-__all__ = ["dialect_of"]
-
 
 def dialect_of(place: AsyncConnection | AsyncEngine) -> Dialect:
     """Return the dialect of a connection or an engine."""

@@ -14,8 +14,6 @@ from pycrorm_async.errors import UnknownEpisode
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import EpisodeRow
 
-__all__ = ["number_named", "episode_named", "grown_episodes", "is_simulated", "tags_of"]
-
 
 def number_named(name: str, ids: Mapping[int, str], *, listed: int) -> int:
     """Return the number of the named episode among these ids by number.

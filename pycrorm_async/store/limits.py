@@ -12,8 +12,6 @@ from collections.abc import Sequence
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX
 from pycrorm_async.store.stored import EpisodeRow
 
-__all__ = ["EPISODES_MANY", "EVENTS_MANY", "number_warning", "events_warning", "warnings_of"]
-
 EPISODES_MANY = EPISODE_NUMBER_MAX * 9 // 10 + 1
 """Episode number from which a memory counts as nearly full: 3,774,873, nine tenths of the limit."""
 

@@ -28,12 +28,12 @@ from pycrorm_async.settings import FileAccess
 from pycrorm_async.store.address import BUSY_TIMEOUT_S, DatabaseAddress
 from pycrorm_async.store.append import Appending
 from pycrorm_async.store.blobs import Blobs
-from pycrorm_async.store.dialect import Dialect, Progress, StoredOn
+from pycrorm_async.store.dialect import Birth, Dialect, Progress, StoredOn
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.digests.digest_table import RunningDigests, last_digests
 from pycrorm_async.store.digests.episode_digest import DigestRow
 from pycrorm_async.store.limits import EVENTS_MANY, events_warning, number_warning
-from pycrorm_async.store.schema import Birth, make_file, make_or_migrate, must_exist, recognise
+from pycrorm_async.store.schema import make_file, make_or_migrate, must_exist, recognise
 from pycrorm_async.store.sqlite.engine import BEGIN
 from pycrorm_async.store.stored import (
     NOTHING_KNOWN,
@@ -46,8 +46,6 @@ from pycrorm_async.store.stored import (
     beyond,
     share_out,
 )
-
-__all__ = ["EventLog", "advance_folded", "park"]
 
 _log = logging.getLogger("pycrorm_async")
 _MANY_EVENTS = 1_000

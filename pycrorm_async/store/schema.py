@@ -20,8 +20,6 @@ from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.digests.digest_table import create_digest_table
 from pycrorm_async.store.sqlite.leftovers import move_leftovers
 
-__all__ = ["Birth", "make_or_migrate", "recognise", "make_file", "must_exist"]
-
 _HOW_TO_CREATE = "record one with `pycrorm run` or `pycrorm demo`"
 
 

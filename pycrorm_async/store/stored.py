@@ -7,20 +7,6 @@ from typing import NamedTuple
 
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, EpisodeId
 
-__all__ = [
-    "StoredEvent",
-    "EpisodeRow",
-    "Basis",
-    "Stored",
-    "Incarnation",
-    "NOTHING_KNOWN",
-    "numbers_reserved",
-    "Span",
-    "size_of",
-    "beyond",
-    "share_out",
-]
-
 
 class StoredEvent(NamedTuple):
     """One event of the log. `payload` is the appended bytes, unchanged."""

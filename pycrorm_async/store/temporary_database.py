@@ -21,8 +21,6 @@ from pathlib import Path
 
 from pycrorm_async.errors import DatabaseUnavailable
 
-__all__ = ["private_folder", "usual_place"]
-
 _MARK = "mark"
 _ATTEMPTS = 100
 """Bounds the attempts to create a folder; each fails only if another process sweeps at that moment."""

@@ -16,8 +16,6 @@ from pycrorm_async.world.pose import Pose
 if TYPE_CHECKING:
     from pycrorm_async.world.objects import Object
 
-__all__ = ["Attachment", "Attachments"]
-
 
 @dataclass(frozen=True, slots=True)
 class Attachment:

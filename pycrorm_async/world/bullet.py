@@ -21,8 +21,6 @@ from pycrorm_async.world.observers import WorldObserver, WorldWatcher, current_w
 from pycrorm_async.world.queries import visibility
 from pycrorm_async.world.state import WorldState
 
-__all__ = ["BulletWorld"]
-
 _GRAVITY_M_PER_S2 = -9.8
 
 

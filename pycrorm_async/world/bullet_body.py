@@ -23,8 +23,6 @@ from pycrorm_async.world.pose import IDENTITY, Pose, Quaternion, Vector, product
 from pycrorm_async.world.queries.bounding_boxes import BoundingBox, Frame, Solid, box_around, solids_of
 from pycrorm_async.world.robots.joint_chain import Joint, along, divided
 
-__all__ = ["Body", "Color"]
-
 Color = tuple[float, float, float, float]
 """Red, green, blue, opacity, each 0 to 1."""
 

@@ -23,8 +23,6 @@ from typing import Any
 
 from pycrorm_async.world.errors import BulletMissing
 
-__all__ = ["engine", "captured"]
-
 _MODULES = ("pybullet", "pycram_bullet")
 _STREAMS_LOCK = Lock()  # a process has one C stdout
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 from enum import Enum, IntEnum
 from typing import Any, cast
 
-__all__ = ["Arms", "Grasp", "GripperState", "ObjectType", "JointType", "WorldMode"]
-
 
 class Arms(IntEnum):
     """An arm of the robot; BOTH for actions that move the left and the right one.

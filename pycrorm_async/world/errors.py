@@ -7,24 +7,6 @@ import sys
 from pycrorm_async.errors import CallerError, MissingExtra
 from pycrorm_async.world.pose import COORDINATE_MAX, Pose
 
-__all__ = [
-    "WorldError",
-    "WorldUnavailable",
-    "BulletMissing",
-    "WorldClosed",
-    "NoWorld",
-    "ObjectRefused",
-    "ObjectNotInWorld",
-    "DuplicateName",
-    "DescriptionNotLoadable",
-    "UnknownJoint",
-    "UnknownLink",
-    "JointLimitExceeded",
-    "PoseRefused",
-    "AttachmentRefused",
-    "CostmapMismatch",
-]
-
 
 class WorldError(CallerError):
     """Root of the errors of this package."""

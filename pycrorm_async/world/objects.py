@@ -39,8 +39,6 @@ if TYPE_CHECKING:
     from pycrorm_async.world.bullet import BulletWorld
     from pycrorm_async.world.robots.chain_ik import Chain
 
-__all__ = ["Object"]
-
 _PAST_LIMIT_MAX = 1e-6  # rad or m; tolerates positions that rounding puts past a limit
 
 

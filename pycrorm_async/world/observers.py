@@ -30,8 +30,6 @@ if TYPE_CHECKING:
     from pycrorm_async.world.bullet import BulletWorld
     from pycrorm_async.world.objects import Object
 
-__all__ = ["WorldObserver", "WorldWatcher", "current_world", "watcher"]
-
 
 class WorldObserver(Protocol):
     """Receives every change made by the world's setters, once per motion, after the motion is complete.

@@ -17,18 +17,6 @@ from typing import NamedTuple
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import CallerError
 
-__all__ = [
-    "Vector",
-    "Quaternion",
-    "IDENTITY",
-    "COORDINATE_MAX",
-    "MalformedPose",
-    "Pose",
-    "rotated",
-    "product",
-    "yaw_quaternion",
-]
-
 
 class Vector(NamedTuple):
     """A position or a displacement, m."""

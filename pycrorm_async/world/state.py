@@ -18,8 +18,6 @@ if TYPE_CHECKING:
     from pycrorm_async.world.bullet import BulletWorld
     from pycrorm_async.world.objects import Object
 
-__all__ = ["WorldState", "ObjectState", "save", "restore"]
-
 
 @dataclass(frozen=True, slots=True)
 class ObjectState:

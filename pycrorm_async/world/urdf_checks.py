@@ -15,8 +15,6 @@ from xml.etree.ElementTree import Element, ParseError, fromstring, tostring
 from pycrorm_async.world.errors import DescriptionNotLoadable
 from pycrorm_async.world.pose import COORDINATE_MAX
 
-__all__ = ["urdf_text"]
-
 
 def urdf_text(name: str, description: str | Path) -> str:
     """Read and check a URDF and return its text with the absolute path of every mesh.

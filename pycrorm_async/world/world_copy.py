@@ -18,8 +18,6 @@ from pycrorm_async.world.bullet import BulletWorld
 from pycrorm_async.world.enums import WorldMode
 from pycrorm_async.world.objects import Object
 
-__all__ = ["copied", "counterpart", "original", "related"]
-
 
 @contextmanager
 def copied(world: BulletWorld) -> Iterator[BulletWorld]:

@@ -7,8 +7,6 @@ from typing import TypeVar
 
 from pycrorm_async.errors import DatabaseUnavailable
 
-__all__ = ["Availability"]
-
 _T = TypeVar("_T")
 _NOTABLE_S = 1.0
 """A database that has not answered for less than this is not reported: a deadlock or a quick restart."""

@@ -19,8 +19,6 @@ from pycrorm_async.writer.patience import Patience
 from pycrorm_async.writer.ports import Destination, Source
 from pycrorm_async.writer.retry import PATIENT, retry
 
-__all__ = ["LiveWriter", "WriterState"]
-
 _log = logging.getLogger("pycrorm_async")
 _T = TypeVar("_T")
 

@@ -38,8 +38,6 @@ from pycrorm_async.writer.ports import ClaimedSource, Log, ScanResult, SourceSca
 from pycrorm_async.writer.retry import PATIENT, Backoff
 from pycrorm_async.writer.visibility import VisibilityTracker
 
-__all__ = ["Daemon", "DaemonSummary", "STOP_S"]
-
 STOP_S: Final = 10.0
 """Bounds the time of stopping. Records not stored by then stay in their folders for the next daemon."""
 _SCAN_INTERVAL_S: Final = 0.2

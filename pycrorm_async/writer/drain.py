@@ -25,8 +25,6 @@ from pycrorm_async.settings import Settings
 from pycrorm_async.writer.ports import Source
 from pycrorm_async.writer.retry import PATIENT, Backoff, retry
 
-__all__ = ["Append", "Drain", "DrainState", "run_to_completion"]
-
 _log = logging.getLogger("pycrorm_async")
 _T = TypeVar("_T")
 Append: TypeAlias = Callable[[Sequence[Record]], Coroutine[Any, Any, Mapping[EpisodeId, str]]]

@@ -13,8 +13,6 @@ from pycrorm_async.writer.drain import Drain, DrainState
 from pycrorm_async.writer.ports import Destination, Source
 from pycrorm_async.writer.retry import BRIEF, retry
 
-__all__ = ["DrainSummary", "drain_once"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class DrainSummary:

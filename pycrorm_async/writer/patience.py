@@ -11,8 +11,6 @@ import asyncio
 from collections.abc import Callable
 from typing import Final
 
-__all__ = ["Patience"]
-
 _CHECK_S: Final = 0.25
 """Interval at which the progress is read, and the precision of the bound."""
 

@@ -11,16 +11,6 @@ from typing import NamedTuple, Protocol, TypeAlias
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EpisodeId
 
-__all__ = [
-    "Source",
-    "Log",
-    "Destination",
-    "ClaimedSource",
-    "SourceScanner",
-    "ScanResult",
-    "Tables",
-]
-
 
 class Source(Protocol):
     """The consumer's side of a queue, live or recovered."""

@@ -13,8 +13,6 @@ from typing import TypeVar
 
 from pycrorm_async.errors import DatabaseUnavailable
 
-__all__ = ["retry", "Backoff", "PATIENT", "BRIEF"]
-
 _T = TypeVar("_T")
 
 

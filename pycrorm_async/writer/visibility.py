@@ -12,8 +12,6 @@ from pycrorm_async.settings import Settings
 from pycrorm_async.writer.drain import Append, Drain
 from pycrorm_async.writer.ports import ClaimedSource
 
-__all__ = ["VisibilityTracker"]
-
 _BATCHES_MAX = 256
 """Bounds the batches tracked separately, so that memory stays flat while the tables lag; later ones are merged."""
 

@@ -30,8 +30,6 @@ from pycrorm_async.writer.background_writer import LiveWriter, WriterState
 from pycrorm_async.writer.patience import Patience
 from pycrorm_async.writer.ports import Destination, Source
 
-__all__ = ["WriterThread"]
-
 _STOP_S = 10.0
 """Bounds the wait of `close`, after it has timed out, for the thread to close its database."""
 

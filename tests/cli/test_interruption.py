@@ -30,7 +30,7 @@ main()
 SPEAKING = """
 import asyncio, os, signal
 from pycrorm_async.cli.interruption import Interruption
-from pycrorm_async.cli.output import stderr
+from pycrorm_async.progress_bar import stderr
 
 class Interrupted:
     def __rich_console__(self, console, options):

@@ -6,6 +6,7 @@ from typing import get_args
 
 from pycrorm_async.events import values
 from pycrorm_async.plan import task_tree
+from pycrorm_async.task_status import TaskStatus
 
 
 def test_the_kinds_of_a_node_are_the_same_in_a_plan_and_in_the_log() -> None:
@@ -13,6 +14,6 @@ def test_the_kinds_of_a_node_are_the_same_in_a_plan_and_in_the_log() -> None:
 
 
 def test_the_status_of_a_node_is_the_same_in_a_plan_and_in_the_log() -> None:
-    in_the_plan = {status.name: status.value for status in task_tree.TaskStatus}
+    in_the_plan = {status.name: status.value for status in TaskStatus}
     assert in_the_plan == {word: word for word in get_args(values.NodeStatus)}
     assert len(in_the_plan) == 7

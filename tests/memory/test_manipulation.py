@@ -31,7 +31,7 @@ from pycrorm_async.plan import (
     simulated_robot,
 )
 from pycrorm_async.plan.failures import EnvironmentManipulationImpossible, PerceptionObjectNotFound
-from pycrorm_async.plan.task_tree import TaskStatus
+from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world import Arms, BulletWorld, Grasp, GripperState, Object, ObjectType, Pose
 from tests.memory.note_actions import url_of
 

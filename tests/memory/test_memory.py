@@ -14,7 +14,7 @@ from sqlalchemy import select
 from pycrorm_async import Memory, Reading
 from pycrorm_async.orm import ProcessMetaData, TaskTreeNode
 from pycrorm_async.plan import ActionAbstract, PlanFailure
-from pycrorm_async.plan.task_tree import TaskStatus
+from pycrorm_async.task_status import TaskStatus
 from tests.commands import environment
 from tests.memory.note_actions import NoteActionPerformable, texts, url_of
 

@@ -32,7 +32,7 @@ from pycrorm_async.plan import (
     simulated_robot,
 )
 from pycrorm_async.plan.object_designators import ObjectDesignator
-from pycrorm_async.plan.task_tree import TaskStatus
+from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world import Arms, BulletWorld, Grasp, GripperState, Object, ObjectType, Pose
 from pycrorm_async.world.pose import yaw_quaternion
 from tests.memory.note_actions import url_of

@@ -20,11 +20,11 @@ from pycrorm_async.events.types import DesignatorTypeDeclared, NodeStarted, Obje
 from pycrorm_async.events.values import ObjectReference, RobotValue
 from pycrorm_async.orm import Action, Base, Designator, Motion, PickUpAction, TaskTreeNode
 from pycrorm_async.orm.dynamic import DynamicClasses
-from pycrorm_async.plan.task_tree import TaskStatus
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.schema.layout import Layout, unite
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
+from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.enums import Arms
 from tests.commands import environment
 from tests.projections.event_script import PICK_UP, SAYING, Script, declarations, declared, field, name_of, pose, row

@@ -55,11 +55,11 @@ from pycrorm_async.orm import (
     TaskTreeNode,
 )
 from pycrorm_async.orm.types import Moment
-from pycrorm_async.plan.task_tree import TaskStatus
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
+from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.enums import Arms, Grasp, ObjectType
 from tests.databases import run_in_own_loop
 from tests.projections.event_script import (

@@ -8,7 +8,8 @@ from contextlib import contextmanager
 from typing import Literal
 
 from pycrorm_async.plan.execution.observer import Candidate, Refusal, Seen, Simulation, current_simulation, recorder
-from pycrorm_async.plan.task_tree import TaskStatus, TaskTreeNode, current_node
+from pycrorm_async.plan.task_tree import TaskTreeNode, current_node
+from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world import ObjectType
 
 

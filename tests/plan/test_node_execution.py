@@ -18,7 +18,8 @@ import pytest
 from pycrorm_async.plan.designator import ActionAbstract
 from pycrorm_async.plan.execution.observer import recorder
 from pycrorm_async.plan.failures import ObjectUnreachable, PlanFailure
-from pycrorm_async.plan.task_tree import TaskStatus, TaskTreeNode, collected_tree, current_node
+from pycrorm_async.plan.task_tree import TaskTreeNode, collected_tree, current_node
+from pycrorm_async.task_status import TaskStatus
 from tests.plan.fake_observer import Recording
 
 pytestmark = pytest.mark.slow

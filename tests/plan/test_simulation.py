@@ -32,7 +32,8 @@ from pycrorm_async.plan import (
 from pycrorm_async.plan.execution.observer import current_simulation
 from pycrorm_async.plan.failures import PerceptionObjectNotInWorld
 from pycrorm_async.plan.object_designators import designator_of, in_world
-from pycrorm_async.plan.task_tree import TaskStatus, current_node
+from pycrorm_async.plan.task_tree import current_node
+from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose, current_world
 from pycrorm_async.world.errors import WorldClosed
 from pycrorm_async.world.pose import yaw_quaternion

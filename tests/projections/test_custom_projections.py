@@ -20,7 +20,7 @@ from pycrorm_async.memory import Memory
 from pycrorm_async.projections.custom.projection import Changes, Event, Projection
 from pycrorm_async.projections.custom.projection_rows import CustomRows
 from pycrorm_async.projections.custom.projection_tables import states
-from pycrorm_async.projections.fold.fold import CannotFold
+from pycrorm_async.projections.fold.column_values import CannotFold
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.rebuild import Rebuild, claimed
 from pycrorm_async.projections.replaced_tables import clear

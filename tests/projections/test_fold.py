@@ -36,8 +36,8 @@ from pycrorm_async.events.values import (
     RobotValue,
     SeenValue,
 )
-from pycrorm_async.projections.fold.column_values import json_text
-from pycrorm_async.projections.fold.fold import CannotFold, fold
+from pycrorm_async.projections.fold.column_values import CannotFold, json_text
+from pycrorm_async.projections.fold.fold import fold
 from pycrorm_async.projections.fold.parameters import Designators
 from pycrorm_async.projections.fold.row_batch import Rows
 from pycrorm_async.projections.schema.core_columns import COLUMNS

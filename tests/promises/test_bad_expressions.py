@@ -26,7 +26,7 @@ from pycrorm_async.plan import (
     Repeat,
     Retry,
 )
-from pycrorm_async.plan.task_tree import TaskStatus
+from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world import Arms, Grasp, ObjectType, Pose
 from tests.memory.note_actions import NoteActionPerformable
 from tests.promises.lab import lab, nodes_of, recorded, statuses

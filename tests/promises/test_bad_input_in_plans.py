@@ -32,7 +32,7 @@ from pycrorm_async.plan import (
     SetGripperAction,
     TransportActionPerformable,
 )
-from pycrorm_async.plan.task_tree import TaskStatus
+from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world import Arms, BulletWorld, Grasp, GripperState, ObjectType, Pose
 from pycrorm_async.world.robots.robot_description import PR2
 from tests.memory.note_actions import NoteActionPerformable

@@ -27,9 +27,10 @@ from pycrorm_async.projections.fold import fold
 from pycrorm_async.projections.schema.generations import PROJECTION_VERSION
 from pycrorm_async.projections.verify.verify import verify
 from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.dialect import Birth
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.schema import Birth, make_or_migrate
+from pycrorm_async.store.schema import make_or_migrate
 from pycrorm_async.world import Arms
 from tests.databases import ask, ask_to_change
 from tests.golden.unpacking import unpack_memory_v1

@@ -63,7 +63,7 @@ from pycrorm_async.plan import (
 from pycrorm_async.plan import BelieveObject as Believed
 from pycrorm_async.plan import ObjectPart as Part
 from pycrorm_async.plan.failures import CollisionError, PerceptionObjectNotInWorld, ReachabilityFailure, ReasoningError
-from pycrorm_async.plan.task_tree import TaskStatus
+from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world import Arms, Grasp, ObjectType, Pose
 from pycrorm_async.world import Object as WorldObject
 from tests.memory.note_actions import NoteActionPerformable

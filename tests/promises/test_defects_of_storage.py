@@ -40,7 +40,7 @@ from pycrorm_async.plan import (
     ParkArmsActionPerformable,
     PlanFailure,
 )
-from pycrorm_async.plan.task_tree import TaskStatus
+from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world import Arms, ObjectType, Pose
 from pycrorm_async.world import Object as WorldObject
 from tests.commands import environment

@@ -29,8 +29,8 @@ from pycrorm_async.orm import (
 from pycrorm_async.orm import Pose as PoseRow
 from pycrorm_async.plan import ActionAbstract, PlaceActionPerformable
 from pycrorm_async.plan.execution.observer import PlanObserver, Simulation, recorder
-from pycrorm_async.plan.task_tree import TaskStatus
 from pycrorm_async.plan.task_tree import TaskTreeNode as Node
+from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world import Arms, BulletWorld, Grasp, ObjectType, Pose
 from pycrorm_async.world import Object as WorldObject
 from tests.commands import answer

@@ -19,7 +19,7 @@ from sqlalchemy import func, select
 from pycrorm_async import Memory
 from pycrorm_async.orm import Designator, TaskTreeNode
 from pycrorm_async.plan import ActionAbstract
-from pycrorm_async.plan.task_tree import TaskStatus
+from pycrorm_async.task_status import TaskStatus
 from tests.memory_in_use import bytes_in_use
 
 @dataclass

@@ -27,7 +27,7 @@ from pycrorm_async.plan import (
     SimulatedTaskTree,
 )
 from pycrorm_async.plan.object_designators import designator_of
-from pycrorm_async.plan.task_tree import TaskStatus
+from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world import Arms, Grasp, GripperState, Object, ObjectType, Pose, current_world
 from pycrorm_async.world.pose import yaw_quaternion
 from tests.memory.note_actions import NoteActionPerformable

@@ -14,11 +14,12 @@ from pycrorm_async.projections.projector import Projector
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.append import Appending
+from pycrorm_async.store.dialect import Birth
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.postgresql.roles import GRANTS
 from pycrorm_async.store.postgresql.tables import MIGRATIONS
-from pycrorm_async.store.schema import Birth, make_or_migrate
+from pycrorm_async.store.schema import make_or_migrate
 from tests.databases import Server, ask
 from tests.store.concurrent_openers import open_at_once
 from tests.store.factories import declaration, episode, record, run_of

@@ -53,7 +53,7 @@ from pycrorm_async.plan import (
     collected_tree,
 )
 from pycrorm_async.plan import ObjectPart as Part
-from pycrorm_async.plan.task_tree import TaskStatus
+from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world import Arms, Grasp, GripperState, ObjectType, Pose
 from pycrorm_async.world.pose import yaw_quaternion
 from tests.plan.conftest import kitchen

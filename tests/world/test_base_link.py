@@ -24,7 +24,8 @@ from pycrorm_async.world.errors import ObjectRefused, UnknownLink
 from pycrorm_async.world.pose import yaw_quaternion
 from pycrorm_async.world.queries.collision_queries import collisions_at
 from pycrorm_async.world.queries.footprints import footprint_of
-from pycrorm_async.world.robots.kinematics import Limits, solve
+from pycrorm_async.world.robots.kinematics import solve
+from pycrorm_async.world.robots.robot_description import Limits
 from pycrorm_async.world.world_copy import copied, counterpart
 from tests.world.base_links import HEIGHT_M, RAILS, link_poses, rail_robot, raised_robot
 from tests.world.fakes import ChangeLog

@@ -12,8 +12,6 @@ from pycrorm_async.learning.policies.evidence import Evidence, Rectangle, Region
 from pycrorm_async.learning.policies.marginals import Normal
 from pycrorm_async.learning.policies.policy import ARMS, GRASPS, Leaf, Policy
 
-__all__ = ["AROUND_OBJECT", "default_policy"]
-
 VARIANCE_M2 = 0.5
 FARTHEST_M = 2.0
 NEAREST_M = 0.2

@@ -19,8 +19,6 @@ from pycrorm_async.errors import CallerError
 from pycrorm_async.learning.policies.marginals import Floats
 from pycrorm_async.world.enums import Arms, Grasp
 
-__all__ = ["Evidence", "Rectangle", "Region"]
-
 
 class Rectangle(NamedTuple):
     """A rectangle of robot positions: relative_x and relative_y between the limits, limits included; m."""

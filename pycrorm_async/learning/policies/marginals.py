@@ -14,8 +14,6 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Floats", "Linear", "Marginal", "Normal", "Peak"]
-
 Floats = NDArray[np.float64]
 
 

@@ -27,8 +27,6 @@ from pycrorm_async.learning.policies.evidence import Evidence, Rectangle, Region
 from pycrorm_async.learning.policies.marginals import Floats, Marginal
 from pycrorm_async.world.enums import Arms, Grasp
 
-__all__ = ["ARMS", "GRASPS", "Leaf", "PickUpChoice", "Policy"]
-
 ARMS = (Arms.LEFT, Arms.RIGHT)
 GRASPS = tuple(Grasp)
 _ANYWHERE = np.array([[-math.inf], [math.inf], [-math.inf], [math.inf]])

@@ -24,8 +24,6 @@ from pycrorm_async.learning.policies.evidence import Evidence, Rectangle, Region
 from pycrorm_async.learning.policies.policy import ARMS, GRASPS, Leaf, Policy
 from pycrorm_async.world.enums import Arms, Grasp
 
-__all__ = ["decode_policy", "encode_policy", "load_policy", "name_of", "save_policy"]
-
 FORMAT = "pycrorm policy"
 VERSION = 1
 

@@ -10,8 +10,6 @@ import numpy as np
 from pycrorm_async.errors import CallerError, MissingExtra
 from pycrorm_async.learning.policies.policy import PickUpChoice, Policy
 
-__all__ = ["draw_policies"]
-
 _SAMPLES = 200_000
 _PLOT_RANGE_M = (-1.5, 1.5)
 _CELLS = 120

@@ -23,8 +23,6 @@ from pycrorm_async.orm import LearnPolicyAction, Observation, ObservationValue
 from pycrorm_async.plan.designator import ActionAbstract
 from pycrorm_async.query.reading import Reading
 
-__all__ = ["EPISODES_MAX", "LearnPolicyActionPerformable", "policy_contents", "read_policy", "record_policy"]
-
 EPISODES_MAX = 10_000
 """Bounds the training episodes that are recorded by id, so that they fit into one event; `episode_count` counts all."""
 _MEDIA_TYPE = "application/json"

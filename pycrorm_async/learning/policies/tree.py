@@ -34,8 +34,6 @@ from pycrorm_async.learning.policies.policy import ARMS, GRASPS, Leaf, Policy
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["learn", "check_leaf"]
-
 SYMBOLS: dict[str, Sequence[Enum]] = {"arm": ARMS, "grasp": GRASPS}
 PLACE = ("object_x", "object_y")
 HEIGHT = "height"

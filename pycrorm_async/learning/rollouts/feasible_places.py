@@ -17,8 +17,6 @@ from pycrorm_async.world.objects import Object
 from pycrorm_async.world.pose import Pose
 from pycrorm_async.world.queries.costmaps import Costmap, OccupancyCostmap, VisibilityCostmap
 
-__all__ = ["free_and_visible", "rectangles", "CLEARANCE_M", "REACH_M"]
-
 CLEARANCE_M = 0.3
 """Minimum distance between the middle of the robot's base and any obstacle, the thesis' value."""
 REACH_M = 2.0

@@ -14,8 +14,6 @@ from pycrorm_async.memory import Memory
 from pycrorm_async.plan.actions.basic import MoveAndPickUpPerformable
 from pycrorm_async.plan.failures import PlanFailure
 
-__all__ = ["KitchenResult", "pick_up_in_kitchen", "KITCHEN"]
-
 KITCHEN = Scene(kitchen=True, collisions=True, torso_height=0.3)
 """The thesis' milk on the worktop, with the torso raised so that the arm can stay clear of the worktop."""
 

@@ -26,8 +26,6 @@ from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.enums import Arms, Grasp
 from pycrorm_async.world.pose import Pose, rotated
 
-__all__ = ["MoveAndPickUp", "HEIGHT_TOLERANCE_M"]
-
 HEIGHT_TOLERANCE_M = 0.05
 """Experience with objects up to this much higher or lower, measured from the torso, applies to the object at hand."""
 _DRAWS_MAX = 10

@@ -23,8 +23,6 @@ from pycrorm_async.plan.locations.base_clearance import BaseClearance, base_clea
 from pycrorm_async.plan.object_designators import ObjectDesignatorDescription, ObjectLike, in_world
 from pycrorm_async.world.enums import Arms, Grasp
 
-__all__ = ["RecalledPickUp", "RecalledPickUpPerformable"]
-
 _EVIDENCE_MIN = 0.5
 """The evidence below which nothing like a way was tried: a success 12 cm higher or lower, and nothing else."""
 

@@ -16,8 +16,6 @@ from pycrorm_async.task_status import TaskStatus
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["rollouts_question", "drop_repeats", "successes", "tally_of", "stages_of", "missing_runs", "STAGES"]
-
 STAGES = ("before the pre-pose", "pre-pose", "grasp", "lift")
 """Stages at which a pick-up can fail, indexed by the number of goals its hand was given."""
 

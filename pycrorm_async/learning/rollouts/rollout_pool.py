@@ -54,8 +54,6 @@ from pycrorm_async.operations.daemon import serve
 from pycrorm_async.operations.processes import ChildProcess
 from pycrorm_async.settings import Settings
 
-__all__ = ["Workers", "WorkerLost", "MemoryLocation", "Job", "ROLLOUTS_PER_RUN", "SETTINGS"]
-
 ROLLOUTS_PER_RUN = 500
 """Rollouts in one run of a worker, which is one episode: enough to make the cost of building the world negligible."""
 _PROGRESS_INTERVAL_S = 0.2

@@ -32,8 +32,6 @@ from pycrorm_async.query.success.interval import interval_95
 if TYPE_CHECKING:
     from pycrorm_async.memory import Memory
 
-__all__ = ["Tally", "batch_rollout", "BatchRolloutActionPerformable", "randomness"]
-
 
 @dataclass
 class Tally:

@@ -14,8 +14,6 @@ from pycrorm_async.world.objects import Object
 from pycrorm_async.world.pose import Pose, yaw_quaternion
 from pycrorm_async.world.robots.robot_description import Limits
 
-__all__ = ["Scene", "Stage"]
-
 
 @dataclass(frozen=True)
 class Scene:

@@ -40,24 +40,6 @@ from pycrorm_async.world.enums import Arms, Grasp, GripperState
 from pycrorm_async.world.errors import NoWorld
 from pycrorm_async.world.pose import Pose
 
-__all__ = [
-    "ActionDescription",
-    "CloseAction",
-    "DetectAction",
-    "GraspingAction",
-    "GripAction",
-    "LookAtAction",
-    "MoveTorsoAction",
-    "NavigateAction",
-    "OpenAction",
-    "ParkArmsAction",
-    "PickUpAction",
-    "PlaceAction",
-    "ReleaseAction",
-    "SetGripperAction",
-    "TransportAction",
-]
-
 P = TypeVar("P")
 T = TypeVar("T")
 

@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from pycrorm_async.plan.language.monitor_watch import Watch
     from pycrorm_async.plan.language.resource_arbiter import Arbiter, Claim
 
-__all__ = ["ExecutionContext", "execution_context"]
-
 
 @dataclass(frozen=True, slots=True)
 class ExecutionContext:

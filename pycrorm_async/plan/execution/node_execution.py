@@ -46,12 +46,11 @@ from pycrorm_async.plan.exceptions import is_plan_failure
 from pycrorm_async.plan.execution.execution_context import ExecutionContext, execution_context
 from pycrorm_async.plan.execution.observer import recorder
 from pycrorm_async.plan.execution.unawaited_performs import Unstarted, called_performs
-from pycrorm_async.plan.task_tree import TaskStatus, TaskTreeNode, collecting, current_node
+from pycrorm_async.plan.task_tree import TaskTreeNode, collecting, current_node
+from pycrorm_async.task_status import TaskStatus
 
 if TYPE_CHECKING:
     from pycrorm_async.plan.designator import Designator
-
-__all__ = ["wrap_perform", "is_wrapped"]
 
 YIELD_INTERVAL_NS = 20_000_000
 """Longest time a plan runs without yielding to the event loop, 20 ms. A plan that never suspends would otherwise block

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from pycrorm_async.plan.task_tree import TaskTreeNode
     from pycrorm_async.world.bullet import BulletWorld
 
-__all__ = ["PlanObserver", "Candidate", "Refusal", "Seen", "Simulation", "recorder", "current_simulation"]
-
 
 @dataclass(frozen=True, slots=True)
 class Candidate:

@@ -24,8 +24,6 @@ from pycrorm_async.plan.task_tree import CollectedTree, collecting, current_node
 from pycrorm_async.world.observers import current_world
 from pycrorm_async.world.world_copy import copied
 
-__all__ = ["SimulatedTaskTree"]
-
 
 class SimulatedTaskTree:
     """A simulation, entered once with `with`; yields the tree of the nodes performed inside.

@@ -35,8 +35,6 @@ from typing import Any, TypeAlias
 
 from pycrorm_async.connected_var import ConnectedVar
 
-__all__ = ["CalledPerforms", "Unstarted", "called_performs"]
-
 Unstarted: TypeAlias = list[Any]
 """The `CalledPerforms` and the weak reference, held by the frame of a coroutine that has not started.
 

@@ -16,21 +16,6 @@ from pycrorm_async.world.enums import JointType
 from pycrorm_async.world.objects import Object
 from pycrorm_async.world.pose import Pose, rotated
 
-__all__ = [
-    "OPENING_MARGIN",
-    "STEP_M_MAX",
-    "STEP_RAD_MAX",
-    "Handle",
-    "closed_position",
-    "grasp_pose",
-    "hand_poses",
-    "handle_of",
-    "handle_poses",
-    "hold_pose",
-    "moved_position",
-    "opened_position",
-]
-
 OPENING_MARGIN = 0.05
 """Distance that opening leaves between the joint and its upper limit, m or rad."""
 STEP_M_MAX = 0.05

@@ -13,20 +13,6 @@ from pycrorm_async.world.pose import Pose, Quaternion, product, rotated
 from pycrorm_async.world.queries.bounding_boxes import BoundingBox
 from pycrorm_async.world.robots.robot_description import GRASP_ORIENTATIONS
 
-__all__ = [
-    "APPROACH_M",
-    "HOLD_DISTANCE_M_MAX",
-    "LIFT_M",
-    "RETRACT_M",
-    "PickUpPoses",
-    "approach",
-    "distance_to_box",
-    "grasp_orientation",
-    "pick_up_poses",
-    "place_pose",
-    "retract",
-]
-
 APPROACH_M = 0.1
 LIFT_M = 0.03
 RETRACT_M = 0.07

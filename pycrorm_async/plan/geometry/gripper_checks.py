@@ -18,8 +18,6 @@ from pycrorm_async.world.pose import Pose, Quaternion
 from pycrorm_async.world.queries.bounding_boxes import box_around
 from pycrorm_async.world.robots.robot_description import ArmDescription
 
-__all__ = ["check_fits", "check_same_world", "check_free", "check_takable", "lifting_arms", "take"]
-
 
 def check_takable(robot: CurrentRobot, arm: Arms, target: Object) -> None:
     """Check that the gripper can take the object, and that the arm lifts it with all that is attached to it.

@@ -31,8 +31,6 @@ from pycrorm_async.plan.language.resource_arbiter import Arbiter
 from pycrorm_async.plan.language.task_branches import join_tasks, raise_errors
 from pycrorm_async.plan.task_tree import NodeKind
 
-__all__ = ["Code", "Expression", "Operand", "Parallel", "Repeat", "Sequential", "TryAll", "TryInOrder"]
-
 Operand: TypeAlias = Designator | ActionDescription[Any]
 
 

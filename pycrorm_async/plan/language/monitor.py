@@ -21,9 +21,8 @@ from pycrorm_async.plan.language.monitor_watch import Condition, Watch
 from pycrorm_async.plan.language.operators import Composable
 from pycrorm_async.plan.language.outcome import Outcome
 from pycrorm_async.plan.language.task_branches import join_tasks, raise_errors
-from pycrorm_async.plan.task_tree import TaskStatus, current_node
-
-__all__ = ["Monitor", "watch_operand"]
+from pycrorm_async.plan.task_tree import current_node
+from pycrorm_async.task_status import TaskStatus
 
 
 @dataclass(init=False, repr=False, eq=False)

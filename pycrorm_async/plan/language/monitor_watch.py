@@ -15,8 +15,6 @@ from typing import Any, TypeAlias
 
 from pycrorm_async.plan.execution.execution_context import ExecutionContext, execution_context
 
-__all__ = ["Condition", "Watch"]
-
 Condition: TypeAlias = Callable[[], bool | Awaitable[bool]] | asyncio.Event
 
 

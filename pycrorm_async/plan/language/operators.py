@@ -12,8 +12,6 @@ if TYPE_CHECKING:
     from pycrorm_async.plan.language.expressions import Parallel, Repeat, Sequential, TryAll, TryInOrder
     from pycrorm_async.plan.language.monitor import Monitor
 
-__all__ = ["Composable"]
-
 
 class Composable:
     """Base of everything that can be an operand.

@@ -9,8 +9,6 @@ from typing import Any, NamedTuple
 from pycrorm_async.plan.exceptions import describe_error, is_plan_failure
 from pycrorm_async.plan.failures import PlanFailures
 
-__all__ = ["Attempt", "Outcome", "attempt", "combine_failures"]
-
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Outcome:

@@ -41,8 +41,6 @@ from pycrorm_async.world.robots.acting_robot import acting_robot
 if TYPE_CHECKING:
     from pycrorm_async.plan.designator import Designator
 
-__all__ = ["Arbiter", "Claim"]
-
 Part: TypeAlias = tuple[Any, Resource]
 """A part of one robot."""
 

@@ -19,8 +19,6 @@ from pycrorm_async.world.enums import Arms
 if TYPE_CHECKING:
     from pycrorm_async.world.robots.robot_description import RobotDescription
 
-__all__ = ["NOTHING", "Resource", "arms", "moving", "reaching"]
-
 
 class Resource(Enum):
     """A part of the robot that one designator at a time can use."""

@@ -17,8 +17,6 @@ from pycrorm_async.plan.language.expressions import Expression, perform_operand
 from pycrorm_async.plan.language.operators import Composable
 from pycrorm_async.plan.language.outcome import attempt, combine_failures
 
-__all__ = ["Retry"]
-
 
 @dataclass(init=False, repr=False, eq=False)
 class Retry(Expression):

@@ -10,8 +10,6 @@ import asyncio
 from collections.abc import Sequence
 from typing import Any
 
-__all__ = ["join_tasks", "raise_errors"]
-
 
 async def join_tasks(tasks: Sequence[asyncio.Task[Any]]) -> asyncio.CancelledError | None:
     """Wait until all tasks have ended; cancel the others as soon as one was cancelled or raised.

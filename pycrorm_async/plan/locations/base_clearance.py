@@ -10,8 +10,6 @@ from pycrorm_async.world.pose import Pose
 from pycrorm_async.world.queries.costmaps import Costmap
 from pycrorm_async.world.queries.footprints import Obstacles, footprint_of
 
-__all__ = ["BaseClearance", "base_clearance"]
-
 
 class BaseClearance:
     """The footprints of one or more robots, and the obstacles around them as they are now."""

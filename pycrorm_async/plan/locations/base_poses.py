@@ -29,8 +29,6 @@ from pycrorm_async.world.robots.acting_robot import acting_robot
 from pycrorm_async.world.robots.kinematics import Unreachable, solve
 from pycrorm_async.world.robots.robot_description import Drive, PR2Description
 
-__all__ = ["Reach", "base_height_m", "face", "reaching_arms", "resolve_robot", "base_poses"]
-
 CELLS_MAX = 600
 """Bounds the cells per search at which kinematics is checked, so that a search without a solution ends."""
 VISIBLE_SHARE_MIN = 0.5

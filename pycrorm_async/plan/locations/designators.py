@@ -35,15 +35,6 @@ from pycrorm_async.plan.task_tree import current_node
 from pycrorm_async.world.enums import Arms, Grasp
 from pycrorm_async.world.pose import Pose
 
-__all__ = [
-    "AccessingLocation",
-    "CostmapLocation",
-    "Location",
-    "LocationDesignator",
-    "ObjectRelativeLocation",
-    "SemanticCostmapLocation",
-]
-
 CANDIDATES_MAX = 1_000
 """Bounds the offered places that are reported of one search: the first ones, and the last, which may be the one taken.
 A loop over the places of a large surface may ask for thousands."""

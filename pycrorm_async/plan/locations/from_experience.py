@@ -29,8 +29,6 @@ from pycrorm_async.world.objects import Object
 from pycrorm_async.world.pose import Pose, rotated, yaw_quaternion
 from pycrorm_async.world.queries.costmaps import OccupancyCostmap
 
-__all__ = ["DatabaseCostmapLocation"]
-
 CLEARANCE_M = 0.3
 """Minimum distance between the middle of the robot's base and any obstacle, the thesis' value."""
 _CELLS = 300  # 6 m across: the range of the policies' base poses, with a margin

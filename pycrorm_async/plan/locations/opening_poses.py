@@ -21,8 +21,6 @@ from pycrorm_async.world.pose import Pose
 from pycrorm_async.world.queries.bounding_boxes import BoundingBox, box_around
 from pycrorm_async.world.queries.costmaps import Costmap, GaussianCostmap, OccupancyCostmap
 
-__all__ = ["opening_poses"]
-
 CLEARANCE_M = 0.4
 CELLS_MAX = 600
 HEADINGS = 8

@@ -12,8 +12,6 @@ from pycrorm_async.world.objects import Object
 from pycrorm_async.world.pose import Pose, Quaternion, Vector, yaw_quaternion
 from pycrorm_async.world.queries.bounding_boxes import BoundingBox, box_around
 
-__all__ = ["surface_poses"]
-
 STEP_M = 0.02
 _POINT = BoundingBox(Vector(0.0, 0.0, 0.0), Vector(0.0, 0.0, 0.0))
 

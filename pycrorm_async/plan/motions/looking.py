@@ -15,8 +15,6 @@ from pycrorm_async.world.pose import Pose, Vector, rotated
 from pycrorm_async.world.robots.chain_ik import Chain
 from pycrorm_async.world.robots.robot_description import PR2Description
 
-__all__ = ["head_joints"]
-
 ROUNDS_MAX = 50
 """Bounds the rounds over the joints; a camera near its axes needs about ten."""
 _TURN_MIN_RAD = 1e-9

@@ -22,8 +22,6 @@ from pycrorm_async.world.pose import Pose
 from pycrorm_async.world.queries.visibility import met_towards
 from pycrorm_async.world.robots.robot_description import FieldOfView
 
-__all__ = ["SEEN_SHARE_MIN", "in_field_of_view", "report_perception", "seen_by_camera", "objects_in_world"]
-
 Source: TypeAlias = Literal["camera", "world_state"]
 
 SEEN_SHARE_MIN = 0.8

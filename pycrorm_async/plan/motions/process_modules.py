@@ -35,17 +35,6 @@ if TYPE_CHECKING:
         WorldStateDetectingMotion,
     )
 
-__all__ = [
-    "MovingModules",
-    "ProcessModules",
-    "ChosenRobot",
-    "simulated_robot",
-    "simulated_robot_within",
-    "chosen_robot",
-    "chosen_limits",
-    "collisions_count",
-]
-
 
 class MovingModules(Protocol):
     """The motions of the robot itself, the minimum that a user's own robot implements.

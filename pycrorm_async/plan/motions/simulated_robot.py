@@ -37,8 +37,8 @@ from pycrorm_async.world.enums import Arms
 from pycrorm_async.world.errors import JointLimitExceeded, UnknownJoint
 from pycrorm_async.world.pose import Pose
 from pycrorm_async.world.queries.collision_queries import collisions_at
-from pycrorm_async.world.robots.kinematics import Limits, Unreachable, solve
-from pycrorm_async.world.robots.robot_description import Drive
+from pycrorm_async.world.robots.kinematics import Unreachable, solve
+from pycrorm_async.world.robots.robot_description import Drive, Limits
 
 if TYPE_CHECKING:
     from pycrorm_async.plan.motions.motions import (
@@ -54,8 +54,6 @@ if TYPE_CHECKING:
         OpeningMotion,
         WorldStateDetectingMotion,
     )
-
-__all__ = ["SimulatedModules"]
 
 
 class SimulatedModules:

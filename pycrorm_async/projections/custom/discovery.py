@@ -20,8 +20,6 @@ from typing import Any
 from pycrorm_async.errors import CallerError
 from pycrorm_async.projections.custom.projection import Projection, columns_of
 
-__all__ = ["GROUP", "validate_projections", "load_projections", "installed_projections", "own_projections"]
-
 GROUP = "pycrorm.projections"
 _OF_THIS_PACKAGE = ("pycrorm_async.recall.cases.case_projection:CaseProjection",)
 """The projections of every memory. They are loaded by name, because their folders are above this one."""

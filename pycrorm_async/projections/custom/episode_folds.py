@@ -22,7 +22,7 @@ from typing import Final
 
 from pycrorm_async.events.types import EpisodeEnded
 from pycrorm_async.projections.custom.projection import EpisodeFold, EpisodeProjection
-from pycrorm_async.projections.fold.fold import CannotFold
+from pycrorm_async.projections.fold.column_values import CannotFold
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import Span, StoredEvent
 

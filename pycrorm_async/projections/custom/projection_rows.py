@@ -20,8 +20,8 @@ from pycrorm_async.projections.custom.projection import (
     Projection,
     columns_of,
 )
-from pycrorm_async.projections.fold.column_values import is_missing, json_text, microseconds
-from pycrorm_async.projections.fold.fold import CannotFold, happening_of
+from pycrorm_async.projections.fold.column_values import CannotFold, is_missing, json_text, microseconds
+from pycrorm_async.projections.fold.fold import happening_of
 from pycrorm_async.projections.fold.row_batch import Row
 from pycrorm_async.projections.fold.row_writer import stored_rows
 from pycrorm_async.projections.schema.core_columns import OWN, Storage

@@ -47,17 +47,6 @@ from pycrorm_async.projections.schema.user_views import with_user_views
 from pycrorm_async.projections.table_names import next_number
 from pycrorm_async.store.log import EventLog
 
-__all__ = [
-    "CustomTables",
-    "ProjectionState",
-    "states",
-    "CustomFoldDefinition",
-    "layout_of",
-    "make_projection_tables",
-    "refuse_taken",
-    "fault_in_version",
-]
-
 _CHECK_S = 1.0
 """The interval between checks for events from other processes, because a check costs a scan of all episodes."""
 

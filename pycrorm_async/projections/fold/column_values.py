@@ -16,22 +16,6 @@ from pycrorm_async.events.values import FieldDeclared, ObjectReference, ObjectVa
 from pycrorm_async.projections.fold.row_batch import Row
 from pycrorm_async.projections.schema.core_columns import COLUMNS
 
-__all__ = [
-    "AS_IT_IS",
-    "UNCHANGED",
-    "CannotFold",
-    "row",
-    "in_slot",
-    "microseconds",
-    "pose_columns",
-    "pose_row",
-    "is_missing",
-    "scalar",
-    "pose_of",
-    "object_of",
-    "json_text",
-]
-
 _ROWS_OF_EPISODE, _ROWS_OF_EVENT = row_id(1, 0, 0), row_id(0, 1, 0)
 UNCHANGED: Row = (None,) * (len(COLUMNS["object"]) - COLUMNS["object"].index("joints"))
 """The columns of an object that only its first row has, from its joints on."""

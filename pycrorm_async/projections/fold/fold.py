@@ -62,9 +62,6 @@ from pycrorm_async.projections.fold.parameters import Designators, ParameterRows
 from pycrorm_async.projections.fold.row_batch import EpisodeEnd, Row, Rows
 from pycrorm_async.store.stored import StoredEvent
 
-__all__ = ["fold", "fold_happening", "happening_of", "CannotFold", "UndecodablePayload"]
-
-
 _NO_OUTCOME: Row = (None, None, None, None)
 
 

@@ -19,8 +19,6 @@ from pycrorm_async.projections.schema.tables import make_table
 from pycrorm_async.projections.table_names import physical_name
 from pycrorm_async.store.dialects import dialect_of
 
-__all__ = ["boxes_of", "insert_link_boxes"]
-
 _COLUMNS = tuple(OF_NO_EPISODE[LINK_BOX])
 
 

@@ -9,8 +9,6 @@ from pycrorm_async.events.blobs import BLOB_KEY
 from pycrorm_async.events.types import Observed
 from pycrorm_async.projections.fold.row_batch import Row
 
-__all__ = ["WHOLE", "value_rows"]
-
 WHOLE: Final = "value"
 """Key of an observation that is a scalar or a blob itself, and so has no path."""
 

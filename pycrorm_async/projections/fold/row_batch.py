@@ -20,8 +20,6 @@ from pycrorm_async.projections.fold.node_row import (
 )
 from pycrorm_async.projections.schema.core_columns import COLUMNS
 
-__all__ = ["Rows", "Row", "NodeEnd", "EpisodeEnd"]
-
 Row: TypeAlias = tuple[Any, ...]
 
 _EPISODE_COLUMNS = itemgetter(*COLUMNS["process_metadata"])

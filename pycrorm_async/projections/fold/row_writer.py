@@ -24,8 +24,6 @@ from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import Span, StoredEvent
 
-__all__ = ["TableRows", "name_episodes", "stored_rows", "uuids_of"]
-
 _episode = sqlalchemy.table("episode", column("number"), column("id"))
 
 

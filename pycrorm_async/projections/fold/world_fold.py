@@ -14,9 +14,7 @@ from pycrorm_async.events.types import (
     ObjectRemoved,
 )
 from pycrorm_async.events.values import PoseValue
-from pycrorm_async.projections.fold.fold import CannotFold
-
-__all__ = ["WorldFold", "WorldObject"]
+from pycrorm_async.projections.fold.column_values import CannotFold
 
 
 @dataclass(slots=True)

@@ -29,7 +29,7 @@ from typing import NamedTuple, Protocol
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.errors import LogDamaged
-from pycrorm_async.projections.fold.fold import CannotFold
+from pycrorm_async.projections.fold.column_values import CannotFold
 from pycrorm_async.projections.fold.parameters import Designators
 from pycrorm_async.projections.fold.row_writer import TableRows
 from pycrorm_async.projections.schema.generations import Generation, Hold

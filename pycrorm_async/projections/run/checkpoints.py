@@ -17,21 +17,6 @@ from pycrorm_async.store.dialect import Progress, RowRefused
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.stored import EpisodeRow
 
-__all__ = [
-    "TABLE",
-    "COLUMNS",
-    "SEEN",
-    "place_of",
-    "behind",
-    "late",
-    "folded",
-    "left",
-    "parked",
-    "advance",
-    "park",
-    "carry_over",
-]
-
 TABLE = "pycrorm_progress"
 COLUMNS: dict[str, Storage] = {"id": "key", "folded": "integer", "parked": "text"}
 """The episode's number, the last sequence that is in the tables, and the reason if it is parked."""

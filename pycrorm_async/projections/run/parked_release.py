@@ -12,7 +12,8 @@ from collections.abc import Sequence
 from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.events.codec import fingerprint
-from pycrorm_async.projections.fold.fold import CannotFold, fold
+from pycrorm_async.projections.fold.column_values import CannotFold
+from pycrorm_async.projections.fold.fold import fold
 from pycrorm_async.projections.fold.parameters import Designators
 from pycrorm_async.projections.fold.row_batch import Rows
 from pycrorm_async.projections.schema.generations import Generation

@@ -24,8 +24,6 @@ from typing import Final, Protocol
 from pycrorm_async.projections.run.batch_fold import BatchPreview, FoldTarget
 from pycrorm_async.store.stored import Span, size_of
 
-__all__ = ["FoldPipeline", "BatchWorker", "LOOKAHEAD_EVENTS_MIN"]
-
 LOOKAHEAD_EVENTS_MIN: Final = 2_000
 """The smallest batch that is prepared ahead; a smaller one waits for the events that arrive during the write."""
 

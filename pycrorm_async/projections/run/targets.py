@@ -35,8 +35,6 @@ from pycrorm_async.store.dialect import Progress
 from pycrorm_async.store.log import EventLog, advance_folded, park
 from pycrorm_async.store.stored import Span, beyond, share_out
 
-__all__ = ["LiveTarget", "SideTarget", "Share", "WHOLE"]
-
 _log = logging.getLogger("pycrorm_async.projections")
 
 _EPISODES_MAX = 400

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Literal, TypeAlias
 
-__all__ = ["Storage", "EPISODE", "OWN", "CORE", "LINK_BOX", "OF_NO_EPISODE", "COLUMNS"]
-
 Storage: TypeAlias = Literal[
     "key", "row", "pose", "object", "integer", "real", "text", "boolean", "time", "json", "bytes", "number"
 ]

@@ -7,8 +7,6 @@ from pycrorm_async.projections.schema.tables import indexed
 from pycrorm_async.projections.table_names import index_name, physical_name
 from pycrorm_async.store.dialect import Expected
 
-__all__ = ["expected"]
-
 _EXPECTED = {"process_metadata": 1_000, "simulated_episode": 100, LINK_BOX: 1_000}
 _EXPECTED_CORE, _EXPECTED_LEAF = 1_000_000, 50_000
 _ALIKE = {

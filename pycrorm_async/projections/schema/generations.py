@@ -45,35 +45,11 @@ from pycrorm_async.projections.schema.views.comments import comments
 from pycrorm_async.projections.table_names import index_name, physical_name
 from pycrorm_async.store.dialects import dialect_of
 
-__all__ = [
-    "Generation",
-    "Hold",
-    "PROJECTION_VERSION",
-    "SHOWN",
-    "MAKING",
-    "GONE",
-    "PROJECTION",
-    "current_generation",
-    "read_generation",
-    "read_generations",
-    "projections_in",
-    "view_texts_of",
-    "built_in_texts",
-    "table_texts",
-    "write_generation",
-    "delete_generation",
-    "make_generation",
-    "make_empty",
-    "grow_tables",
-    "show",
-]
-
 PROJECTION_VERSION = 5
 """The version of the fold, raised when its rows change: tables of an older version must be rebuilt."""
 
 SHOWN = "tables"
 MAKING = "tables/making"
-GONE = "tables/gone/"
 PROJECTION = "projection/"
 
 _log = logging.getLogger("pycrorm_async.projections")

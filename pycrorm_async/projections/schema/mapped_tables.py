@@ -23,8 +23,6 @@ from pycrorm_async.projections.schema.layout import Leaf
 if TYPE_CHECKING:
     from pycrorm_async.orm import Designator
 
-__all__ = ["built_in_leaves", "mapped_leaves", "leaves_of", "storage_of"]
-
 _Columns = dict[str, Storage]
 _ARM: Final[_Columns] = {"arm": "text"}
 _GRIPPER: Final[_Columns] = {"gripper": "text"}

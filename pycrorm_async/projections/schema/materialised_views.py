@@ -20,8 +20,6 @@ from pycrorm_async.projections.schema.tables import make_table
 from pycrorm_async.projections.table_names import index_name, physical_name
 from pycrorm_async.store.dialects import dialect_of
 
-__all__ = ["ViewRefused", "make_materialised", "refresh_some", "shown_texts", "materialised_tables"]
-
 _EPISODES = 200
 """Bounds the episodes refreshed in one transaction, and so the time for which it locks out other writers."""
 _PROGRESS: dict[str, Storage] = {"id": "key", "folded": "integer"}

@@ -48,8 +48,6 @@ from pycrorm_async.projections.schema.views.spatial_relation_view import Spatial
 from pycrorm_async.projections.schema.views.world_line import world_line
 from pycrorm_async.world.enums import ObjectType
 
-__all__ = ["public_views", "projection_views", "Tables", "View", "ViewDefinition"]
-
 View: TypeAlias = Select[Any] | CompoundSelect[Any] | TextualSelect
 _Columns: TypeAlias = tuple[tuple[str, Storage], ...]
 

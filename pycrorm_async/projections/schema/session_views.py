@@ -10,8 +10,6 @@ from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 from pycrorm_async.projections.schema.generations import Generation, projections_in, read_generations, view_texts_of
 from pycrorm_async.store.dialects import dialect_of
 
-__all__ = ["with_views", "all_views"]
-
 
 @asynccontextmanager
 async def with_views(engine: AsyncEngine, views: Mapping[str, str]) -> AsyncIterator[AsyncConnection]:

@@ -35,14 +35,6 @@ from sqlalchemy.types import TypeEngine
 from pycrorm_async.projections.schema.core_columns import CORE, EPISODE, LINK_BOX, OWN, Storage
 from pycrorm_async.projections.table_names import index_name, physical_name
 
-__all__ = [
-    "leaf_columns",
-    "make_table",
-    "column_type",
-    "columns_in_order",
-    "indexed",
-]
-
 _TEXT_KEYS = {
     ("parameter_item", "field"),
     ("joint_change", "joint"),

@@ -20,8 +20,6 @@ from pycrorm_async.projections.schema.core_columns import EPISODE
 from pycrorm_async.projections.schema.layout import Layout, MaterialisedView
 from pycrorm_async.projections.schema.mapped_tables import storage_of
 
-__all__ = ["UserView", "with_user_views", "view_texts", "view_text"]
-
 
 @dataclass(frozen=True)
 class UserView:

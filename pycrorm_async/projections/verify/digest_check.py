@@ -21,8 +21,6 @@ from pycrorm_async.store.digests.episode_digest import BLOCK_EVENTS, RunningDige
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import EpisodeRow, Span, StoredEvent
 
-__all__ = ["DigestCheck", "OutsideDigest", "check_outside", "check_places", "read_kept"]
-
 _KEPT = text("""
 SELECT episode, sequence, digest FROM pycrorm_digest
 WHERE episode >= :first AND episode <= :last AND (episode > :first OR sequence > :after)

@@ -13,7 +13,8 @@ from pycrorm_async.events.blobs import references_in
 from pycrorm_async.events.ids import row_id, row_key
 from pycrorm_async.events.order import OrderCheck
 from pycrorm_async.events.types import ObjectAdded
-from pycrorm_async.projections.fold.fold import CannotFold, UndecodablePayload, fold_happening, happening_of
+from pycrorm_async.projections.fold.column_values import CannotFold
+from pycrorm_async.projections.fold.fold import UndecodablePayload, fold_happening, happening_of
 from pycrorm_async.projections.fold.node_row import STATUS
 from pycrorm_async.projections.fold.parameters import Designators
 from pycrorm_async.projections.fold.row_batch import Rows
@@ -21,8 +22,6 @@ from pycrorm_async.projections.verify.findings import VerifyResult
 from pycrorm_async.projections.verify.row_comparison import Difference
 from pycrorm_async.store.digests.episode_digest import BLOCK_EVENTS
 from pycrorm_async.store.stored import Span, StoredEvent
-
-__all__ = ["EpisodeCheck"]
 
 
 class EpisodeCheck:

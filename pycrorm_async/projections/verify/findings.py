@@ -8,8 +8,6 @@ from typing import Literal, NamedTuple
 
 from pycrorm_async.projections.verify.row_comparison import Difference
 
-__all__ = ["Damage", "StoppedEpisode", "VerifyResult"]
-
 _FINDINGS_MAX = 100
 """Bounds the findings of each kind that are kept; all are counted."""
 

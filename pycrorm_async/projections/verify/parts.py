@@ -14,8 +14,6 @@ from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import Span
 
-__all__ = ["EpisodeRange", "PartCheck", "Place", "Unreadable"]
-
 _PART_EVENTS = 4_000
 """Bounds the events of one part, and so the memory used."""
 _ATTEMPTS = 10

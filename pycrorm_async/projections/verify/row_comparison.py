@@ -18,8 +18,6 @@ from pycrorm_async.projections.schema.core_columns import CORE, LINK_BOX, OF_NO_
 from pycrorm_async.projections.schema.generations import Generation
 from pycrorm_async.projections.schema.tables import leaf_columns, make_table
 
-__all__ = ["Comparison", "Difference", "Range"]
-
 _EPISODE_KEYED = ("process_metadata", "simulated_episode")
 _NODES = "task_tree_node"
 _KEYS_AT_ONCE = 1_000

@@ -10,7 +10,7 @@ from sqlalchemy.ext.asyncio import AsyncConnection
 from pycrorm_async.projections.custom.projection import PackedProjection, Projection
 from pycrorm_async.projections.custom.projection_rows import CustomRows
 from pycrorm_async.projections.custom.projection_tables import CustomFoldDefinition, fault_in_version, layout_of
-from pycrorm_async.projections.fold.fold import CannotFold
+from pycrorm_async.projections.fold.column_values import CannotFold
 from pycrorm_async.projections.run import checkpoints
 from pycrorm_async.projections.run.batch_fold import Batch
 from pycrorm_async.projections.schema.core_columns import OWN
@@ -21,8 +21,6 @@ from pycrorm_async.projections.verify.row_comparison import Comparison, Differen
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import Span
-
-__all__ = ["ProjectionCheck", "check_of", "uncompared_projections"]
 
 
 def check_of(projection: Projection, result: VerifyResult) -> PartCheck:

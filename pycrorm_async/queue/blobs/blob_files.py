@@ -20,16 +20,6 @@ from pycrorm_async.queue.files.file_access import create_folder, create_folders
 from pycrorm_async.queue.files.names import BLOBS, KEPT_BLOBS, MAKING, STORED
 from pycrorm_async.queue.files.segment import sync_folder
 
-__all__ = [
-    "blob_bytes",
-    "blob_files",
-    "carry_blobs",
-    "is_whole",
-    "keep_blobs",
-    "kept_with",
-    "read_blob",
-]
-
 
 def blob_files(folder: Path) -> list[Path]:
     """List the blobs in a recorder's folder. Raises `OSError`, but not for a missing folder."""

@@ -33,8 +33,6 @@ from pycrorm_async.queue.files.segment import sync_folder
 from pycrorm_async.queue.live.appender import FULL
 from pycrorm_async.queue.live.gc_safe_lock import GcSafeLock
 
-__all__ = ["LiveBlobs"]
-
 _BLOCK_BYTES: Final = 4_096
 _FULL_REASON: Final = "spool_bytes_max is reached"
 

@@ -18,8 +18,6 @@ from pycrorm_async.queue.files.reader import Cursor
 from pycrorm_async.queue.files.scan import read_header, seal, survey
 from pycrorm_async.queue.files.segment import header_bytes, read_segment, segment_path
 
-__all__ = ["truncate_at_lost_blob"]
-
 
 class _Referring(NamedTuple):
     """A record with the blobs it refers to; `offset` is the sum of the frames before it in its segment."""

@@ -35,8 +35,6 @@ from pycrorm_async.queue.files.file_access import open_file
 from pycrorm_async.queue.files.locks import call_in_forked_child
 from pycrorm_async.queue.files.names import DRAIN, PROGRESS
 
-__all__ = ["Progress", "RecorderStatus", "DrainStatus", "DrainNote", "DrainStatusReader"]
-
 _MAGIC: Final = b"PYCRPROG" + (1).to_bytes(8, "little")
 _FILE_BYTES: Final = 4096
 _RECORDER_AT, _RECORDER = 64, Struct("=QQI")

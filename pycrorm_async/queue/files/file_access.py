@@ -18,8 +18,6 @@ from typing import BinaryIO, Final
 from pycrorm_async.errors import SpoolUnavailable
 from pycrorm_async.settings import FILE_MODES, FileAccess
 
-__all__ = ["create_spool", "create_folder", "create_folders", "open_file", "rewrite"]
-
 _FOLDER_MODES: Final = {"owner": 0o700, "group": 0o2770}
 _SHARED: Final = stat.S_ISGID | stat.S_IWGRP
 

@@ -20,8 +20,6 @@ from typing import Final
 
 from pycrorm_async.errors import SpoolUnavailable
 
-__all__ = ["check_file_system", "file_system_type"]
-
 _COPIES: Final = "a full disk kills the process that records there"
 _NETWORK: Final = "a lock or a record may be lost there with the connection"
 _REFUSED: Final[Mapping[int, tuple[str, str]]] = MappingProxyType(

@@ -13,30 +13,6 @@ from zlib import crc32
 
 from pycrorm_async.bulk_records import make
 
-__all__ = [
-    "Buffer",
-    "Frame",
-    "Fields",
-    "EVENT",
-    "DECLARATION",
-    "COMMIT",
-    "HEADER_BYTES",
-    "TYPE_BYTES_MAX",
-    "COMMIT_BYTES",
-    "NO_EPISODE",
-    "CHECKSUM",
-    "CHECKSUM_START",
-    "encode",
-    "encode_header",
-    "encode_body",
-    "encode_commit",
-    "encode_span",
-    "decode",
-    "decode_each",
-    "span_checksum",
-    "frame_bytes",
-]
-
 Buffer: TypeAlias = bytes | mmap.mmap
 
 EVENT: Final = 1

@@ -21,8 +21,6 @@ from zlib import crc32
 
 from pycrorm_async.queue.files.file_access import open_file
 
-__all__ = ["FileIdentity", "FileLock", "is_locked", "read_note", "call_in_forked_child", "folder_lock"]
-
 _ATTEMPTS = 5
 """Attempts at a lock that a concurrent `is_locked` may hold, and at a note that is being written: milliseconds."""
 _FOLDER_ATTEMPTS = 10_000

@@ -2,8 +2,6 @@
 
 from typing import Final
 
-__all__ = ["ALIVE", "BLOBS", "DRAIN", "KEPT_BLOBS", "MAKING", "MENDED", "PROGRESS", "REFUSED", "STORED", "TAIL"]
-
 ALIVE: Final = "alive"
 """The recorder holds the lock of this file as long as it lives."""
 BLOBS: Final = "blobs"

@@ -17,8 +17,6 @@ from pycrorm_async.events.envelope import Record
 from pycrorm_async.queue.files.frame import COMMIT, EVENT, Buffer, decode_each
 from pycrorm_async.queue.files.segment import decode_header, header_bytes, map_segment, salt_of, segment_path
 
-__all__ = ["Cursor", "Place", "Batch", "Reader", "check_type"]
-
 
 class Cursor(NamedTuple):
     """A place between two records: segment and offset of the next frame, and position of the record before it."""

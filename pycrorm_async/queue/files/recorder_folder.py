@@ -22,20 +22,6 @@ from pycrorm_async.queue.files.names import ALIVE, BLOBS, DRAIN, MAKING, PROGRES
 from pycrorm_async.queue.files.segment import segment_numbers, segment_path, sync_folder
 from pycrorm_async.settings import FileAccess
 
-__all__ = [
-    "FolderName",
-    "wrap_os_errors",
-    "begin_folder",
-    "folder_error",
-    "finish_folder",
-    "is_folder_name",
-    "parse_folder_name",
-    "make_folder",
-    "remove_folder",
-    "remove_made_ahead",
-    "write_durably",
-]
-
 
 class FolderName(NamedTuple):
     """A folder's name: of a recorder's folder, or of the dead letters of one `episode` of that recorder."""

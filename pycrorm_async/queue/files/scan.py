@@ -59,20 +59,6 @@ from pycrorm_async.queue.files.segment import (
     sync_folder,
 )
 
-__all__ = [
-    "ValidPrefix",
-    "Survey",
-    "SegmentScanner",
-    "scan",
-    "survey",
-    "whole_frames",
-    "read_header",
-    "check_record",
-    "seal",
-    "sync_segments",
-    "tails",
-]
-
 _SALT_OFFSET = HEADER_BYTES - 8
 _EPISODE_ENDED = EPISODE_ENDED.encode()
 

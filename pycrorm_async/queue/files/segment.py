@@ -22,26 +22,6 @@ from pycrorm_async.queue.files.file_access import open_file
 from pycrorm_async.queue.files.frame import Buffer
 from pycrorm_async.queue.files.locks import FileIdentity
 
-__all__ = [
-    "FORMAT",
-    "EPISODE_STARTED",
-    "EPISODE_ENDED",
-    "SEGMENT_BYTES_MAX",
-    "LastRecord",
-    "SegmentHeader",
-    "Segment",
-    "header_bytes",
-    "encode_header",
-    "decode_header",
-    "format_of",
-    "salt_of",
-    "segment_path",
-    "segment_numbers",
-    "sync_folder",
-    "read_segment",
-    "map_segment",
-]
-
 MAGIC: Final = b"PYCRQSEG"
 FORMAT: Final = 1
 SUFFIX: Final = ".segment"

@@ -15,8 +15,6 @@ from pycrorm_async.queue.files.recorder_folder import is_folder_name, parse_fold
 from pycrorm_async.queue.retention.acknowledged_heads import forget_numbers
 from pycrorm_async.settings import FileAccess
 
-__all__ = ["Spool", "RecorderFolder"]
-
 BINDING: Final = "log"
 """Name of the file with the id of the log that the spool is bound to."""
 WRITER: Final = "writer"

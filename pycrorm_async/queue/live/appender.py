@@ -66,8 +66,6 @@ from pycrorm_async.queue.live.capacity import Capacity
 from pycrorm_async.queue.live.declarations import AppendState, Declarations
 from pycrorm_async.queue.live.gc_safe_lock import GcSafeLock
 
-__all__ = ["FULL", "NOTHING_OPEN", "OUT_OF_RESOURCES", "Appender", "SegmentStart"]
-
 NOTHING_OPEN: Final[Mapping[EpisodeId, LastRecord]] = MappingProxyType({})
 FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT})
 """Errors of a full disk."""

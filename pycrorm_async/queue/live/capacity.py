@@ -13,8 +13,6 @@ from pycrorm_async.queue.files.frame import COMMIT_BYTES, TYPE_BYTES_MAX, frame_
 from pycrorm_async.queue.files.segment import SEGMENT_BYTES_MAX, header_bytes
 from pycrorm_async.settings import Settings
 
-__all__ = ["Capacity"]
-
 _COMMITS_BYTES = 2 * COMMIT_BYTES
 _EPISODES_MIN = 16
 """Open episodes that every segment's header has space for beside the largest record."""

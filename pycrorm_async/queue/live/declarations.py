@@ -16,8 +16,6 @@ from zlib import crc32
 from pycrorm_async.clock import Clock
 from pycrorm_async.queue.files.frame import CHECKSUM_START, DECLARATION, HEADER_BYTES, NO_EPISODE, Frame, encode
 
-__all__ = ["Declarations", "AppendState"]
-
 _DESCRIPTION = b"DescriptionDeclared"
 
 

@@ -12,8 +12,6 @@ from pycrorm_async.queue.files.drain_status import DrainStatus
 from pycrorm_async.queue.live.recorder_queue import RecorderQueue
 from pycrorm_async.settings import Settings
 
-__all__ = ["DelegatedWriter"]
-
 _log = logging.getLogger("pycrorm_async")
 _POLL_S = 0.01
 """Interval at which the drain status is read."""

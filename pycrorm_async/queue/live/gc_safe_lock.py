@@ -30,8 +30,6 @@ from typing import TypeVar
 
 from pycrorm_async.errors import InternalError
 
-__all__ = ["GcSafeLock"]
-
 _T = TypeVar("_T")
 
 

@@ -18,8 +18,6 @@ from collections.abc import Callable
 from concurrent.futures import CancelledError, Future
 from concurrent.futures import TimeoutError as NotInTime
 
-__all__ = ["Notifier"]
-
 
 class Notifier:
     """Wakes all coroutines and threads that wait at the time of the call."""

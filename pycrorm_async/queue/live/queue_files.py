@@ -49,8 +49,6 @@ from pycrorm_async.queue.live.sync_thread import SyncThread
 from pycrorm_async.queue.retention.stored_segments import StoredSegments
 from pycrorm_async.settings import Settings
 
-__all__ = ["QueueFiles", "PROGRESS_INTERVAL_S"]
-
 PROGRESS_INTERVAL_S = 0.05
 """Interval at which the sync thread reads `progress` while segments or producers wait for another process."""
 _MOVE_RETRY_S_MAX = 5.0

@@ -33,8 +33,6 @@ from pycrorm_async.queue.live.relocatable_appender import Relocated
 from pycrorm_async.queue.sources.own_source import OwnSource
 from pycrorm_async.settings import Settings
 
-__all__ = ["RecorderQueue"]
-
 _LAST_SYNC_S = 30.0
 """Bounds the time that `release` waits for the last sync; a disk that takes longer has failed."""
 _log = logging.getLogger("pycrorm_async")

@@ -26,8 +26,6 @@ from pycrorm_async.queue.files.frame import (
 from pycrorm_async.queue.files.segment import EPISODE_ENDED, Segment
 from pycrorm_async.queue.live.syncable_appender import SyncableAppender
 
-__all__ = ["RelocatableAppender", "Relocated"]
-
 _EPISODE_ENDED: Final = EPISODE_ENDED.encode()
 _LATE_BYTES: Final = 2**16
 """Bounds the bytes carried while the lock is held and producers wait: half a millisecond of work."""

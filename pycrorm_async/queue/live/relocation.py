@@ -40,8 +40,6 @@ from pycrorm_async.queue.live.appender import SegmentStart
 from pycrorm_async.queue.live.relocatable_appender import RelocatableAppender
 from pycrorm_async.settings import FileAccess
 
-__all__ = ["Home", "Remains", "move"]
-
 _EPISODES_MAX = 8
 """Bounds the episodes that one line of a loss names."""
 _STALLS_MAX = 100

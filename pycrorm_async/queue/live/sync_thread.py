@@ -20,8 +20,6 @@ from queue import Empty, SimpleQueue
 
 from pycrorm_async.clock import monotonic_ns
 
-__all__ = ["SyncThread"]
-
 
 class SyncThread:
     """Takes turns until stopped. `turn` returns the seconds until it wants the next turn, or None."""

@@ -13,8 +13,6 @@ from pycrorm_async.queue.files.frame import COMMIT_BYTES, encode_commit
 from pycrorm_async.queue.files.segment import Segment
 from pycrorm_async.queue.live.appender import OUT_OF_RESOURCES, Appender, SegmentStart
 
-__all__ = ["Span", "SyncableAppender"]
-
 
 class Span(NamedTuple):
     """The records of one sync: those up to `position`, `records` of them new, and the files that hold them."""

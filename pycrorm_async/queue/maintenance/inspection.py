@@ -24,19 +24,6 @@ from pycrorm_async.queue.files.scan import Survey, survey, tails
 from pycrorm_async.queue.files.segment import segment_numbers, segment_path
 from pycrorm_async.queue.files.spool import RecorderFolder, Spool
 
-__all__ = [
-    "DAMAGED_SUFFIX",
-    "SpoolReport",
-    "FolderReport",
-    "RecorderReport",
-    "SegmentReport",
-    "OpenEpisode",
-    "Damage",
-    "inspect_folder",
-    "inspect_recorder",
-    "inspect_spool",
-]
-
 DAMAGED_SUFFIX: Final = ".damaged"
 """Suffix that `repair` appends to the name of the damaged folder it replaces."""
 _SURVEYS = 20

@@ -26,8 +26,6 @@ from pycrorm_async.queue.files.segment import sync_folder
 from pycrorm_async.queue.maintenance.inspection import DAMAGED_SUFFIX, Damage
 from pycrorm_async.queue.maintenance.salvage import Range, Salvage, ranges
 
-__all__ = ["RepairReport", "DroppedRecords", "repair_folder", "finish_repairs"]
-
 
 @dataclass(frozen=True)
 class DroppedRecords:

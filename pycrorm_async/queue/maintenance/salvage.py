@@ -29,8 +29,6 @@ from pycrorm_async.queue.files.segment import (
     segment_path,
 )
 
-__all__ = ["Range", "Salvage", "ranges"]
-
 Range: TypeAlias = tuple[int, int]
 """The first and the last of consecutive numbers."""
 

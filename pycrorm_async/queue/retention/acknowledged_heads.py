@@ -34,8 +34,6 @@ from pycrorm_async.queue.files.file_access import create_folders, open_file
 from pycrorm_async.queue.files.locks import FileLock
 from pycrorm_async.queue.files.recorder_folder import write_durably
 
-__all__ = ["AcknowledgedHeads", "Head", "forget_numbers"]
-
 _NAME: Final = "heads"
 _FILE_BYTES_MAX: Final = 2**20
 """Bounds the file before it is compacted: reading this much takes some 20 ms at every start."""

@@ -19,8 +19,6 @@ from pycrorm_async.queue.files.spool import Spool
 from pycrorm_async.queue.retention.stored_segments import stored_in
 from pycrorm_async.queue.sources.dead_source import computed_ends
 
-__all__ = ["StoredRecorder", "stored_recorders", "stored_records"]
-
 
 class StoredRecorder(NamedTuple):
     """A recorder's segments by number. `over` if its own folder is deleted, because all its records are stored."""

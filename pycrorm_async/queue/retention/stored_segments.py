@@ -28,8 +28,6 @@ from pycrorm_async.queue.files.segment import segment_numbers, segment_path
 from pycrorm_async.queue.files.spool import Spool
 from pycrorm_async.settings import Settings
 
-__all__ = ["StoredSegments", "KeptSegment", "FILES_MAX", "kept_segments", "stored_in"]
-
 FILES_MAX: Final = 4_096
 """Bounds the number of kept segments: every recorder that ends lists them, which takes some 20 ms for this many."""
 

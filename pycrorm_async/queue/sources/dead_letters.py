@@ -35,8 +35,6 @@ from pycrorm_async.queue.files.segment import (
     sync_folder,
 )
 
-__all__ = ["DeadLetters"]
-
 _SEGMENT_BYTES: Final = 2**22
 """Size in bytes at which the next records begin another file."""
 

@@ -46,8 +46,6 @@ from pycrorm_async.queue.files.segment import EPISODE_ENDED, segment_path
 from pycrorm_async.queue.retention.stored_segments import StoredSegments
 from pycrorm_async.queue.sources.dead_letters import DeadLetters
 
-__all__ = ["DeadSource", "computed_ends", "open_dead"]
-
 
 def open_dead(folder: Path, *, stored: StoredSegments | None = None, check: bool = False) -> DeadSource | None:
     """Open a dead folder as a source; None if its recorder lives, another process drains it, or it is missing.

@@ -29,8 +29,6 @@ from pycrorm_async.queue.files.scan import read_header
 from pycrorm_async.queue.files.segment import header_bytes, map_segment, segment_numbers, segment_path
 from pycrorm_async.queue.sources.dead_letters import DeadLetters
 
-__all__ = ["LiveSource"]
-
 _PAUSE_S_MIN = 0.002
 _PAUSE_S_MAX = 0.02
 """Bounds the pause between two reads of `progress`, and with it the delay until a synced record is supplied."""

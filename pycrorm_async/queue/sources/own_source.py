@@ -23,8 +23,6 @@ from pycrorm_async.queue.live.notifier import Notifier
 from pycrorm_async.queue.live.queue_files import QueueFiles
 from pycrorm_async.queue.sources.dead_letters import DeadLetters
 
-__all__ = ["OwnSource"]
-
 
 class OwnSource:
     """The consumer's side of a queue; it holds the lock `drain` from its first batch on."""

@@ -20,7 +20,7 @@ from pycrorm_async.errors import CallerError, EpisodeParked
 from pycrorm_async.events.codec import encode
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, EpisodeId, episode_text, parse_episode_id, row_id, row_key
 from pycrorm_async.events.types import EpisodeEnded
-from pycrorm_async.projections.fold.fold import CannotFold
+from pycrorm_async.projections.fold.column_values import CannotFold
 from pycrorm_async.recall.case import Case
 from pycrorm_async.recall.cases.episode_cases import READS, EpisodeCases
 from pycrorm_async.recording.writing.emitter import Emitter

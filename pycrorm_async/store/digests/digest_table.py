@@ -28,8 +28,6 @@ from pycrorm_async.store.dialect import Dialect
 from pycrorm_async.store.digests.episode_digest import BLOCK_EVENTS, DigestRow, RunningDigest
 from pycrorm_async.store.stored import EpisodeRow
 
-__all__ = ["Extension", "RunningDigests", "create_digest_table", "has_digests", "last_digests"]
-
 _EPISODES_MAX: Final = 1_000
 """Bounds the running digests that a process keeps, half a kilobyte each; without one, a block is read again."""
 

@@ -33,8 +33,6 @@ from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.store.stored import StoredEvent
 
-__all__ = ["BLOCK_EVENTS", "SCHEME", "DigestRow", "RunningDigest"]
-
 BLOCK_EVENTS: Final = 256
 """Events of a block. Fewer would find a changed event more closely, and cost more time and space for their digests."""
 SCHEME: Final = b"pycrorm episode\0"

@@ -27,8 +27,6 @@ from pycrorm_async.store.postgresql.engine import WARNING
 from pycrorm_async.store.postgresql.search_path import LOG_SCHEMA, TABLES_SCHEMA, VIEWS_SCHEMA
 from pycrorm_async.store.stored import EpisodeRow, Incarnation, Span, StoredEvent, numbers_reserved
 
-__all__ = ["PostgreSQL"]
-
 _SERVER_MIN = 140_000
 _RESTORING = "a restore may be running; try again when it has finished"
 

@@ -12,15 +12,6 @@ from sqlalchemy.pool import ConnectionPoolEntry
 from pycrorm_async.errors import DatabaseUnavailable
 from pycrorm_async.store.postgresql.search_path import PIN
 
-__all__ = [
-    "make_engine",
-    "refusal",
-    "WHERE",
-    "TLS",
-    "ANSWER_S_MAX",
-    "WARNING",
-]
-
 ANSWER_S_MAX = 60.0
 """Bounds a statement; a server that takes longer counts as unavailable."""
 

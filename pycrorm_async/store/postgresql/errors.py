@@ -14,8 +14,6 @@ from sqlalchemy.exc import DataError, DBAPIError, IntegrityError, InterfaceError
 from pycrorm_async.errors import DamageError, DatabaseUnavailable, InternalError, PycrormError
 from pycrorm_async.store.dialect import RowRefused
 
-__all__ = ["FAULTS", "CommitInDoubt", "rows_refused", "translate_error", "refusal", "is_missing_table"]
-
 FAULTS: tuple[type[Exception], ...] = (
     DBAPIError,
     asyncpg.PostgresError,

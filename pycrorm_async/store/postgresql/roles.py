@@ -34,8 +34,6 @@ from pycrorm_async.store.postgresql.search_path import TABLES_SCHEMA as TABLES
 from pycrorm_async.store.postgresql.search_path import VIEWS_SCHEMA as VIEWS
 from pycrorm_async.store.postgresql.tables import BLOB, DIGEST, INCARNATION
 
-__all__ = ["GRANTS"]
-
 _TRANSFER = f"""
 DO $$
 DECLARE

@@ -19,8 +19,6 @@ The owner folds and reads with a separate login that is a member of `pycrorm_fol
 
 from __future__ import annotations
 
-__all__ = ["LOG_SCHEMA", "TABLES_SCHEMA", "VIEWS_SCHEMA", "PATH", "PIN", "STRANGER"]
-
 LOG_SCHEMA = "pycrorm"
 """Schema of the log."""
 TABLES_SCHEMA = "memory_tables"

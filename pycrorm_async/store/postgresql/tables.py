@@ -12,33 +12,6 @@ from pycrorm_async.store.postgresql.search_path import PATH, STRANGER
 from pycrorm_async.store.postgresql.search_path import TABLES_SCHEMA as TABLES
 from pycrorm_async.store.postgresql.search_path import VIEWS_SCHEMA as VIEWS
 
-__all__ = [
-    "MIGRATIONS",
-    "INCARNATION",
-    "HAS_INCARNATION",
-    "BLOB",
-    "DIGEST",
-    "TABLE_NAMES",
-    "HAS_TABLE",
-    "READ_LOG",
-    "INSERT_LOG",
-    "SET_FORMAT",
-    "SERVER_VERSION",
-    "ALONE",
-    "CLAIM",
-    "RELEASE",
-    "WAIT_BRIEFLY",
-    "WAIT_FOR_NOBODY",
-    "WAIT_AS_EVER",
-    "IN_VIEWS_SCHEMA",
-    "NEW_VIEWS_SCHEMA",
-    "SHOW_NEW_VIEWS_SCHEMA",
-    "GONE_SCHEMAS",
-    "COLUMNS_OF_VIEWS",
-    "comment_statements",
-    "SYSTEM_COLUMNS",
-]
-
 SYSTEM_COLUMNS = frozenset("xmin xmax cmin cmax ctid tableoid".split())
 """Names that every table reserves for system columns; a view may use them."""
 

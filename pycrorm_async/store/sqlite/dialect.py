@@ -34,8 +34,6 @@ from pycrorm_async.store.sqlite.multi_row_insert import bound, inserts
 from pycrorm_async.store.sqlite.rebuild_lock import claim
 from pycrorm_async.store.stored import EpisodeRow, Incarnation, Span, StoredEvent, numbers_reserved
 
-__all__ = ["SQLite"]
-
 
 class SQLite:
     """Implements `Dialect`. A batch takes few statements: `executemany` releases the interpreter lock at every row."""

@@ -20,8 +20,6 @@ from sqlalchemy import Connection as SyncConnection
 from sqlalchemy.ext.asyncio import AsyncEngine, create_async_engine
 from sqlalchemy.pool import AsyncAdaptedQueuePool, ConnectionPoolEntry
 
-__all__ = ["make_engine", "BEGIN", "USE_WAL", "Connection"]
-
 _T = TypeVar("_T")
 
 BEGIN = "sqlite_begin"

@@ -12,8 +12,6 @@ from pycrorm_async.errors import (
     PycrormError,
 )
 
-__all__ = ["translate_error", "refusal"]
-
 _UNAVAILABLE = {
     sqlite3.SQLITE_PERM,
     sqlite3.SQLITE_BUSY,

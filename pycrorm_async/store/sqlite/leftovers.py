@@ -15,8 +15,6 @@ import time
 from pathlib import Path
 from typing import Final
 
-__all__ = ["move_leftovers"]
-
 _INDEX: Final = "-shm"
 _WITH_CONTENT: Final = ("-wal", "-journal")
 _ORPHANED: Final = ".orphaned"

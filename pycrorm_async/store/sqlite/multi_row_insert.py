@@ -7,8 +7,6 @@ from itertools import chain
 from types import NoneType
 from typing import Any, Final
 
-__all__ = ["bound", "inserts"]
-
 _PARAMETERS_MAX: Final = 8_000
 """Bounds the parameters of a statement. SQLite allows 32,766 but is a third slower with that many; with fewer, the
 writer waits for a busy plan more often."""

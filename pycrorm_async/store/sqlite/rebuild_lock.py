@@ -10,8 +10,6 @@ from pathlib import Path
 
 from pycrorm_async.errors import DatabaseUnavailable
 
-__all__ = ["claim"]
-
 
 @contextmanager
 def claim(database: Path) -> Iterator[bool]:

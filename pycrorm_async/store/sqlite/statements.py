@@ -13,30 +13,6 @@ from __future__ import annotations
 from pycrorm_async.store.dialect import DigestStatements
 from pycrorm_async.store.sqlite.tables import DIGEST
 
-__all__ = [
-    "DIGEST_STATEMENTS",
-    "INSERT_DECLARATIONS",
-    "SELECT_EPISODES_BY_ID",
-    "SELECT_NUMBER_MAX",
-    "SELECT_NUMBERS_TAKEN",
-    "INSERT_INCARNATION",
-    "SELECT_INCARNATIONS",
-    "EVENT_COLUMNS",
-    "UPSERT_EPISODES",
-    "SELECT_STORED_AGAIN",
-    "SELECT_EPISODES",
-    "SELECT_BEHIND",
-    "SELECT_STOPPED",
-    "SELECT_LONG",
-    "SELECT_EVENTS",
-    "SELECT_SPAN",
-    "SELECT_DECLARATIONS",
-    "SELECT_DESCRIPTIONS",
-    "ADVANCE_FOLDED",
-    "PARK",
-    "EXPECT",
-]
-
 # --- append ---------------------------------------------------------------------------------------------------
 
 INSERT_DECLARATIONS = """

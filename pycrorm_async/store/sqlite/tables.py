@@ -4,18 +4,6 @@ from __future__ import annotations
 
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX
 
-__all__ = [
-    "MIGRATIONS",
-    "INCARNATION",
-    "BLOB",
-    "DIGEST",
-    "TABLE_NAMES",
-    "HAS_TABLE",
-    "READ_LOG",
-    "INSERT_LOG",
-    "SET_FORMAT",
-]
-
 
 def _refuse(name: str, change: str, table: str) -> str:
     return (

@@ -17,8 +17,6 @@ from pycrorm_async.world.models.kitchen import kitchen_urdf
 from pycrorm_async.world.models.pr2 import pr2_urdf
 from pycrorm_async.world.models.primitives import Range, box_urdf, cylinder_urdf
 
-__all__ = ["built_in_urdf"]
-
 
 class _Box(NamedTuple):
     x: Range

@@ -12,8 +12,6 @@ from pycrorm_async.world.enums import Arms
 from pycrorm_async.world.models.urdf_elements import DARK, GREY, OPTICAL, WHITE, fixed, link, moving
 from pycrorm_async.world.robots.robot_description import COURIER, Bounds
 
-__all__ = ["courier_urdf"]
-
 _X, _Y, _Z = (1, 0, 0), (0, 1, 0), (0, 0, 1)
 _AT_PARENT = (0.0, 0.0, 0.0)
 _UPPER_ARM_M, _FOREARM_M, _TOOL_M = 0.42, 0.36, 0.17

@@ -6,8 +6,6 @@ import math
 from functools import lru_cache
 from xml.etree.ElementTree import fromstring
 
-__all__ = ["described_mass_kg"]
-
 
 @lru_cache(maxsize=256)
 def described_mass_kg(urdf: str) -> float | None:

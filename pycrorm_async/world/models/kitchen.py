@@ -19,8 +19,6 @@ from typing import NamedTuple
 
 from pycrorm_async.world.models.primitives import INERTIA, numbers, shape
 
-__all__ = ["kitchen_urdf"]
-
 _FRONT, _ISLAND_FRONT = 1.05, -1.10
 _WOOD, _STEEL, _PALE = (0.62, 0.45, 0.28, 1.0), (0.7, 0.72, 0.75, 1.0), (0.93, 0.92, 0.88, 1.0)
 _DRAWER_TRAVEL_M, _DOOR_SWING_RAD = 0.35, 1.9

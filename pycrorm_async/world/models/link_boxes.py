@@ -15,8 +15,6 @@ from xml.etree.ElementTree import Element, fromstring
 
 from pycrorm_async.world.queries.bounding_boxes import BoundingBox
 
-__all__ = ["LinkBox", "link_boxes"]
-
 _Vector: TypeAlias = tuple[float, float, float]
 _Matrix: TypeAlias = tuple[_Vector, _Vector, _Vector]
 

@@ -11,8 +11,6 @@ from xml.etree.ElementTree import Element, SubElement, fromstring, tostring
 from pycrorm_async.world.models.primitives import numbers
 from pycrorm_async.world.queries.bounding_boxes import BoundingBox
 
-__all__ = ["mesh_files", "meshed_links", "with_mesh_files", "with_boxes"]
-
 _EDGE_MIN = 1e-6
 """The shortest edge of a box, m: Bullet needs one above zero."""
 

@@ -18,8 +18,6 @@ from pycrorm_async.errors import MissingExtra
 from pycrorm_async.world.models.urdf_elements import DARK, GREY, OPTICAL, WHITE, fixed, link, moving
 from pycrorm_async.world.robots.robot_description import FINGER_OPEN_RAD, PR2, Bounds, PR2Arm
 
-__all__ = ["pr2_urdf", "pr2_mesh_urdf_path"]
-
 _X, _Y, _Z = (1, 0, 0), (0, 1, 0), (0, 0, 1)
 _MESH_MODEL = "cmeel.prefix/share/example-robot-data/robots/pr2_description/urdf/pr2.urdf"
 

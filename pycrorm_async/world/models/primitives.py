@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from xml.sax.saxutils import quoteattr
 
-__all__ = ["Range", "box_urdf", "cylinder_urdf", "point_urdf", "shape", "numbers", "INERTIA"]
-
 _INERTIAL = '<inertial><mass value="{:g}"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'
 INERTIA = _INERTIAL.format(1.0)
 """The inertia of a link of a robot or an environment: Bullet warns about links without one. Its values do not matter

@@ -12,8 +12,6 @@ from xml.etree.ElementTree import Element, SubElement, fromstring
 from pycrorm_async.world.models.primitives import INERTIA, numbers
 from pycrorm_async.world.robots.robot_description import Bounds
 
-__all__ = ["DARK", "GREY", "OPTICAL", "WHITE", "fixed", "link", "moving"]
-
 WHITE, GREY, DARK = "0.93 0.93 0.95 1", "0.6 0.6 0.65 1", "0.2 0.2 0.22 1"
 OPTICAL = (-math.pi / 2, 0.0, -math.pi / 2)
 """Rotation from a camera's body (x ahead) to its optical frame (z ahead)."""

@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 
 from pycrorm_async.world.pose import Quaternion, Vector
 
-__all__ = ["BoundingBox", "Frame", "Solid", "solids_of", "box_around", "rotation_matrix"]
-
 Array = NDArray[np.float64]
 Frame = tuple[Vector, Quaternion]
 """A position and a unit quaternion, used in inner loops where creating a `Pose` would be too slow."""

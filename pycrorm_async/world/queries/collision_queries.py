@@ -12,8 +12,6 @@ if TYPE_CHECKING:
     from pycrorm_async.world.objects import Object
     from pycrorm_async.world.pose import Pose
 
-__all__ = ["collisions_at", "TOUCH_M"]
-
 TOUCH_M = 1e-3
 """Penetrations up to this depth count as contact, not as collision: an object standing on a table has one."""
 

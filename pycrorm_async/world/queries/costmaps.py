@@ -30,17 +30,6 @@ from pycrorm_async.world.robots.acting_robot import acting_robot
 if TYPE_CHECKING:
     from pycrorm_async.world.bullet import BulletWorld
 
-__all__ = [
-    "Costmap",
-    "OccupancyCostmap",
-    "GaussianCostmap",
-    "VisibilityCostmap",
-    "SemanticCostmap",
-    "cell_steps",
-    "ignored_objects",
-    "is_obstacle",
-]
-
 Map = NDArray[np.float64]
 _TALLEST_M = 2.0  # boxes that begin above this height are above every robot
 _ROUNDING = 1e-9

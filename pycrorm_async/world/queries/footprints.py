@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from pycrorm_async.world.bullet import BulletWorld
     from pycrorm_async.world.objects import Object
 
-__all__ = ["Footprint", "Obstacles", "footprint_of"]
-
 _ROUNDING_M = 1e-9
 """Outlines that overlap by less than this only touch."""
 

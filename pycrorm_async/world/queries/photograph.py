@@ -16,8 +16,6 @@ from pycrorm_async.world.pose import Vector
 if TYPE_CHECKING:
     from pycrorm_async.world.bullet import BulletWorld
 
-__all__ = ["Camera", "Photograph", "photograph"]
-
 _NEAR_M, _FAR_M = 0.05, 60.0
 _SKY = (238.0, 241.0, 245.0)
 _FLOOR_LIGHT, _FLOOR_CONTRAST = 225.0, 0.35

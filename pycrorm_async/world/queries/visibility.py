@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from pycrorm_async.world.bullet import BulletWorld
     from pycrorm_async.world.objects import Object
 
-__all__ = ["first_met", "met_towards", "visible_share"]
-
 _RAYS_AT_ONCE = 16_000  # Bullet accepts at most 16,384 rays per call
 
 

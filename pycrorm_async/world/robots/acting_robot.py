@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from pycrorm_async.world.bullet import BulletWorld
     from pycrorm_async.world.objects import Object
 
-__all__ = ["acting_robot", "robot_acting"]
-
 _chosen: ContextVar[Object | None] = ContextVar("_chosen", default=None)
 
 

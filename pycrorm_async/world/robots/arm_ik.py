@@ -19,8 +19,6 @@ from numpy.typing import NDArray
 from pycrorm_async.world.pose import Quaternion, Vector, product, rotated
 from pycrorm_async.world.robots.robot_description import Bounds, PR2Arm
 
-__all__ = ["Curve", "Floats", "Reach", "curve", "pan_windows", "stretches_m", "wrist_angles", "reach", "hand"]
-
 Floats = NDArray[np.float64]
 PAN, LIFT, ROLL, ELBOW, FOREARM_ROLL, FLEX, WRIST_ROLL = range(7)
 ROUNDING = 1e-9

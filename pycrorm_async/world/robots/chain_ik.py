@@ -32,8 +32,6 @@ from pycrorm_async.world.robots.robot_description import Bounds
 if TYPE_CHECKING:
     import optik
 
-__all__ = ["Chain"]
-
 STARTS_MAX = 100
 """Bounds the starts of a search: with 20, one of a thousand reachable poses was refused, with 100 none of 4,000."""
 TIME_MAX_S = 1.0

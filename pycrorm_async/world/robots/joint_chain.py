@@ -16,8 +16,6 @@ from pycrorm_async.world.enums import JointType
 from pycrorm_async.world.pose import Pose, Quaternion, Vector, product, rotated
 from pycrorm_async.world.robots.robot_description import Bounds
 
-__all__ = ["Joint", "along", "divided", "joints_between"]
-
 _ENDLESS = Bounds(-math.inf, math.inf)
 _MOVABLE = {"revolute": JointType.REVOLUTE, "continuous": JointType.CONTINUOUS, "prismatic": JointType.PRISMATIC}
 

@@ -36,8 +36,6 @@ from pycrorm_async.world.robots.robot_description import (
 if TYPE_CHECKING:
     from pycrorm_async.world.objects import Object
 
-__all__ = ["Limits", "Unreachable", "chain_of", "forward", "solve", "solve_from"]
-
 A = TypeVar("A")
 
 PAN_STEP_RAD = 0.01

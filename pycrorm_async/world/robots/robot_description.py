@@ -22,24 +22,6 @@ from pycrorm_async.errors import CallerError
 from pycrorm_async.world.enums import Arms, Grasp, GripperState
 from pycrorm_async.world.pose import Pose, Quaternion, Vector
 
-__all__ = [
-    "RobotDescription",
-    "ArmDescription",
-    "Bounds",
-    "Drive",
-    "FieldOfView",
-    "Limits",
-    "PR2Arm",
-    "PR2Description",
-    "GRASP_ORIENTATIONS",
-    "FINGER_OPEN_RAD",
-    "COURIER",
-    "PR2",
-    "register_robot",
-    "robot_description",
-    "with_payload",
-]
-
 
 class Limits(Enum):
     """One of the two ranges of an arm's joints."""

@@ -19,8 +19,6 @@ from pycrorm_async.world.robots.joint_chain import joints_between
 from pycrorm_async.world.robots.robot_description import ArmDescription, RobotDescription, with_payload
 from pycrorm_async.world.urdf_checks import urdf_text
 
-__all__ = ["describe_arm", "describe_robot"]
-
 
 def describe_robot(
     name: str,

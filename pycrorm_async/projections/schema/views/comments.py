@@ -11,8 +11,6 @@ from pathlib import Path
 
 import msgspec
 
-__all__ = ["FILE", "comments"]
-
 FILE = Path(__file__).with_name("comments.json")
 
 

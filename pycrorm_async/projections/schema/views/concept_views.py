@@ -14,8 +14,6 @@ from sqlalchemy import Text, TextualSelect
 from pycrorm_async.events.concepts import CONCEPT_OF_OBJECT_TYPE, CONCEPTS, ancestors
 from pycrorm_async.projections.schema.views.constants import constants
 
-__all__ = ["CONCEPT_VIEWS"]
-
 
 def _concepts() -> TextualSelect:
     parents = (

@@ -11,8 +11,6 @@ from typing import Any
 from sqlalchemy import Text, TextualSelect, column, text
 from sqlalchemy.types import TypeEngine
 
-__all__ = ["constants"]
-
 
 def constants(columns: Mapping[str, TypeEngine[Any]], rows: Iterable[Iterable[str | float | None]]) -> TextualSelect:
     """Return a select of these rows; texts must be plain words, all other columns are numbers."""

@@ -16,8 +16,6 @@ from sqlalchemy.ext.compiler import compiles
 
 from pycrorm_async.projections.schema.core_columns import EPISODE
 
-__all__ = ["numbers", "present", "same_episode"]
-
 
 def same_episode(one: FromClause, other: FromClause, condition: ColumnElement[bool]) -> ColumnElement[bool]:
     """Return the condition of a join within an episode."""

@@ -18,8 +18,6 @@ from sqlalchemy.ext.compiler import compiles
 from pycrorm_async.projections.schema.views.joins import numbers, present, same_episode
 from pycrorm_async.projections.schema.views.world_line import world_line
 
-__all__ = ["pick_ups_with_context"]
-
 _POSE = "x y z qx qy qz qw"
 
 

@@ -8,8 +8,6 @@ from sqlalchemy import Boolean, ColumnElement, Text, literal_column, select
 from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.sql.functions import FunctionElement
 
-__all__ = ["member", "Absent"]
-
 
 class _Member(FunctionElement[str]):
     """A member of a JSON object stored as text: a string as text, an object or a list as JSON."""

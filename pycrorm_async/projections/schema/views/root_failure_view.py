@@ -18,8 +18,6 @@ from pycrorm_async.events.ids import SEQUENCE_MAX, SLOT_MAX
 from pycrorm_async.projections.schema.core_columns import EPISODE
 from pycrorm_async.task_status import TaskStatus
 
-__all__ = ["root_failures"]
-
 _FAILED = (TaskStatus.FAILED.name, TaskStatus.ERROR.name)
 _SLOT_BITS = SLOT_MAX.bit_length()
 _NUMBER_BITS = SEQUENCE_MAX.bit_length() + _SLOT_BITS

@@ -46,8 +46,6 @@ from pycrorm_async.world.models.catalog import built_in_urdf
 from pycrorm_async.world.models.kitchen import kitchen_urdf
 from pycrorm_async.world.models.link_boxes import link_boxes
 
-__all__ = ["SpatialTables", "spatial_relations", "ON_M", "NEXT_TO_M"]
-
 ON_M = 0.02
 """The largest distance between a bottom and a top that counts as contact, m: poses of placings differ by less."""
 NEXT_TO_M = 0.1

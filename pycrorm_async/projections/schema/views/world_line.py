@@ -9,8 +9,6 @@ from __future__ import annotations
 
 from sqlalchemy import ColumnElement, Table, case, exists, func, select
 
-__all__ = ["world_line"]
-
 OBJECTS_MAX = 1_000
 """Bounds the objects in the line, because an episode may add any number."""
 
