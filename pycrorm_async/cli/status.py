@@ -20,7 +20,7 @@ from pycrorm_async.operations.fold_workers import DaemonNote
 from pycrorm_async.projections.custom.discovery import installed_projections
 from pycrorm_async.projections.custom.projection_tables import ProjectionState, states
 from pycrorm_async.projections.schema.generations import PROJECTION, PROJECTION_VERSION, SHOWN, read_generation
-from pycrorm_async.projections.schema.unmade_types import failed_views, unmade_types
+from pycrorm_async.projections.unmade_types import contradictions, failed_views, unmade_types
 from pycrorm_async.query.running_episodes import RunningEpisode, running_episodes
 from pycrorm_async.queue.files.spool import RecorderFolder, Spool
 from pycrorm_async.queue.maintenance.inspection import inspect_folder
@@ -276,7 +276,7 @@ async def _query(
             episode_states,
             await _running(log),
             projections,
-            [*await log.limits_near(), *await _left_out_of_recall(log)],
+            [*await log.limits_near(), *await _left_out_of_recall(log), *await contradictions(log)],
             await unmade_types(log),
             await failed_views(log),
             await durability(log),

@@ -26,8 +26,8 @@ from pycrorm_async.events.ids import parse_episode_id
 from pycrorm_async.orm.designators import Designator
 from pycrorm_async.orm.dynamic import DynamicClasses
 from pycrorm_async.projections.schema.generations import Generation, current_generation
-from pycrorm_async.projections.schema.layout import unite
 from pycrorm_async.projections.schema.session_views import all_views, with_views
+from pycrorm_async.projections.schema.union import unite
 from pycrorm_async.query import named_queries
 from pycrorm_async.query.as_of import AnyEpisode, as_of
 from pycrorm_async.query.asking.ask import Ask

@@ -21,7 +21,8 @@ from pycrorm_async.events.values import ObjectReference, RobotValue
 from pycrorm_async.orm import Action, Base, Designator, Motion, PickUpAction, TaskTreeNode
 from pycrorm_async.orm.dynamic import DynamicClasses
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.projections.schema.layout import Layout, unite
+from pycrorm_async.projections.schema.layout import Layout
+from pycrorm_async.projections.schema.union import unite
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.task_status import TaskStatus

@@ -156,11 +156,8 @@ async def test_without_unfolded_events_nothing_is_done(log: EventLog) -> None:
         ("unknown", "event 3: RobotDanced is not an event this version knows"),
         ("newer", "event 3: NodeEnded has version 2, this version knows 1"),
         (
-            "contradicting",
-            (
-                "event 3: SayingAction.text is declared as text and as integer (types that share a name must agree:"
-                " rename one field or set another dtype)"
-            ),
+            "taken",
+            "event 3: SayingAction: its table would be 'pose', which the memory itself uses (set another dtype)",
         ),
         (
             "refused by the database",
@@ -171,7 +168,7 @@ async def test_without_unfolded_events_nothing_is_done(log: EventLog) -> None:
 async def test_an_episode_that_cannot_be_folded_is_parked_there_and_the_others_continue(
     log: EventLog, bad: str, reason: str
 ) -> None:
-    numeric = declared("SayingAction", "saying_action", field("text", "integer", 2))
+    taken = declared("SayingAction", "pose", field("text", "text", 2))
     first, second = Script(1), Script(2)
     for script in (first, second):
         script.put(EpisodeStarted("why", "me", "host", "1.0", "3.11"))
@@ -185,13 +182,13 @@ async def test_an_episode_that_cannot_be_folded_is_parked_there_and_the_others_c
             first.put_payload("RobotDanced", b"{}")
         case "newer":
             first.put(NodeEnded(2, "SUCCEEDED"), version=2)
-        case "contradicting":
-            first.put(NodeStarted("action", 2, name_of(numeric), {"text": 1}))
+        case "taken":
+            first.put(NodeStarted("action", 2, name_of(taken), {"text": "hi"}))
         case _:
             first.put(LocationResolved("CostmapLocation", considered=2**64 - 1))
     first.put(NodeEnded(2, "SUCCEEDED"))
     second.put(NodeStarted("action", 2, name_of(SAYING), {"text": "hi"}))
-    projector = await stored_and_folded(log, [*declarations(SAYING, numeric), *mixed(first, second)])
+    projector = await stored_and_folded(log, [*declarations(SAYING, taken), *mixed(first, second)])
     (stopped,) = await log.stopped()
     assert stopped.number == 1
     assert stopped.parked is not None

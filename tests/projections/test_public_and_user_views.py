@@ -26,8 +26,8 @@ from pycrorm_async.orm import ParkArmsAction, PickUpAction, PickUpWithContextVie
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.schema.generations import current_generation
 from pycrorm_async.projections.schema.layout import LayoutConflict
-from pycrorm_async.projections.schema.unmade_types import failed_views
 from pycrorm_async.projections.schema.user_views import UserView, view_texts
+from pycrorm_async.projections.unmade_types import failed_views
 from pycrorm_async.projections.verify.verify import verify
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.task_status import TaskStatus

@@ -242,12 +242,13 @@ async def test_a_renamed_field_can_be_queried_by_both_names(golden: str) -> None
         assert list(guests) == ["Ada", "Cleo", "Dora", "Eve"]
 
 
-async def test_a_field_of_another_type_stops_its_own_episode_with_both_types_named(golden: str) -> None:
-    async with Memory.open(golden) as memory:
-        await greeting(whom=int)(7).perform()
-        with pytest.raises(Exception, match=r"GreetAction\.whom is declared as text and as integer"):
-            await memory.flush()
-    assert await designators_of(golden, "GreetAction", "whom") == [ADA, CLEO, DORA]
+async def test_a_field_of_another_type_is_kept_under_its_type(golden: str) -> None:
+    await performed(golden, greeting(whom=int)(7))
+    expected = [(*ADA, None), (*CLEO, None), (*DORA, None), ("GreetAction", None, 7)]
+    assert await designators_of(golden, "GreetAction", "whom", "whom_integer") == expected
+    before = tables_of(golden)
+    await rebuild_memory(golden)
+    assert differences(before, tables_of(golden)) == []
 
 
 # --- a renamed designator ---------------------------------------------------------------------------------------------

@@ -11,6 +11,7 @@ from sqlalchemy.orm import Mapped, mapped_column
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.types import DesignatorTypeDeclared, NodeStarted
 from pycrorm_async.orm import Action, Designator, Motion, TaskTreeNode
+from pycrorm_async.projections.unmade_types import contradictions
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.store.log import EventLog
 from tests.projections.event_script import SAYING, Script, declarations, declared, field, name_of
@@ -24,12 +25,7 @@ WAVE_MOTION = declared("Wave", "wave", field("times", "integer", 2), kind="motio
 WAVE_AS_POSE = declared("Wave", "pose", field("times", "integer", 2))
 WAVE_IN_WORDS = declared("Wave", "wave", field("times", "text", 2))
 SAYING_TWIN = declared("Saying_Action", "saying_action", field("times", "integer", 2))
-OTHER_KIND = "Wave is declared as {} and as {}"
 OF_US = "Wave: its table would be 'pose', which the memory itself uses (set another dtype)"
-OF_ANOTHER = "Saying_Action needs the table saying_action, which belongs to SayingAction (set another dtype)"
-OTHER_TYPE = (
-    "Wave.times is declared as {} and as {} (types that share a name must agree: rename one field or set another dtype)"
-)
 
 
 class ORMBow(Action):
@@ -57,44 +53,60 @@ async def perform_each(log: EventLog, *types: DesignatorTypeDeclared) -> None:
 
 
 @pytest.mark.parametrize(
-    ("first", "second", "parked", "reason"),
+    ("first", "second", "other", "attribute"),
     [
-        (WAVE, WAVE_MOTION, 3, OTHER_KIND.format("action", "motion")),
-        (WAVE_MOTION, WAVE, 3, OTHER_KIND.format("motion", "action")),
-        (WAVE, WAVE_IN_WORDS, 3, OTHER_TYPE.format("integer", "text")),
-        (WAVE_IN_WORDS, WAVE, 3, OTHER_TYPE.format("text", "integer")),
-        (WAVE, WAVE_AS_POSE, 3, OF_US),
-        (WAVE_AS_POSE, WAVE, 2, OF_US),
-        (WAVE, SAYING_TWIN, 3, OF_ANOTHER),
-        (SAYING_TWIN, WAVE, 2, OF_ANOTHER),
+        (WAVE, WAVE_MOTION, "WaveMotion", "times"),
+        (WAVE_MOTION, WAVE, "WaveAction", "times"),
+        (WAVE, WAVE_IN_WORDS, "Wave", "times_text"),
+        (WAVE_IN_WORDS, WAVE, "Wave", "times_integer"),
+        (WAVE, SAYING_TWIN, "Saying_ActionAction", "times"),
     ],
     ids=[
         "a motion after the action",
         "a motion before the action",
         "text after integer",
         "text before integer",
-        "a taken table last",
-        "a taken table first",
-        "another's table last",
-        "another's table first",
+        "the table of another",
     ],
 )
-async def test_the_refused_declaration_parks_its_episode_and_every_query_has_an_answer(
-    log: EventLog, first: DesignatorTypeDeclared, second: DesignatorTypeDeclared, parked: int, reason: str
+async def test_the_later_declaration_has_other_names_and_every_query_has_an_answer(
+    log: EventLog, first: DesignatorTypeDeclared, second: DesignatorTypeDeclared, other: str, attribute: str
 ) -> None:
     await perform_each(log, first, second)
-    assert [(each.number, each.parked) for each in await log.stopped()] == [(parked, f"event 1: {reason}")]
-    kept = second if parked == 2 else first
-    expected = [("SayingAction", "SayingAction"), ("Wave", "Wave")]
+    assert await log.stopped() == []
+    expected = [("SayingAction", "SayingAction"), ("Wave", "Wave"), (other, other)]
+    kinds = ["action", first.kind, second.kind]
     async with Reading.open_address(log.address) as reading:
         assert await answer_to(reading, select(Designator)) == expected
-        assert await answer_to(reading, select(Action)) == (expected if kept.kind == "action" else expected[:1])
-        assert await answer_to(reading, select(Motion)) == (expected[1:] if kept.kind == "motion" else [])
-        wave: Any = reading.mapped("Wave")
+        for question, kind in ((select(Action), "action"), (select(Motion), "motion")):
+            answer = [each for each, its in zip(expected, kinds, strict=True) if its == kind]
+            assert await answer_to(reading, question) == answer
         async with reading.session() as session:
-            assert [each.times for each in await session.scalars(select(wave))] == [
-                3 if kept.fields[0].type == "integer" else "three"
+            values = [
+                [getattr(each, name) for each in await session.scalars(select(reading.mapped(dtype)).order_by("id"))]
+                for dtype, name in (("Wave", "times"), (other, attribute))
             ]
+        recorded = [3 if each.fields[0].type == "integer" else "three" for each in (first, second)]
+        beside = [None] if other == "Wave" else []
+        assert values == [[recorded[0], *beside], [*beside, recorded[1]]]
+    line = (await contradictions(log))[0]
+    assert line.endswith(f" is kept as {attribute if other == 'Wave' else other}")
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "parked"),
+    [(WAVE, WAVE_AS_POSE, 3), (WAVE_AS_POSE, WAVE, 2)],
+    ids=["a table of the memory last", "a table of the memory first"],
+)
+async def test_the_refused_declaration_parks_its_episode_and_every_query_has_an_answer(
+    log: EventLog, first: DesignatorTypeDeclared, second: DesignatorTypeDeclared, parked: int
+) -> None:
+    await perform_each(log, first, second)
+    assert [(each.number, each.parked) for each in await log.stopped()] == [(parked, f"event 1: {OF_US}")]
+    async with Reading.open_address(log.address) as reading:
+        for question in (select(Designator), select(Action)):
+            assert await answer_to(reading, question) == [("SayingAction", "SayingAction"), ("Wave", "Wave")]
+        assert await answer_to(reading, select(Motion)) == []
 
 
 async def test_a_type_without_an_accepted_declaration_has_no_class(log: EventLog) -> None:

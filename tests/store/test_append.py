@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import asyncio
 import json
 import sqlite3
 
@@ -262,6 +263,25 @@ async def test_declarations_are_stored_once_in_the_order_of_their_first_arrival(
         (fingerprint(two),),
         (fingerprint(three),),
     ]
+
+
+async def test_declarations_are_committed_in_the_order_in_which_they_are_read(log: EventLog) -> None:
+    if log.address.is_sqlite:
+        return  # one transaction writes at a time
+    other = await EventLog.open(log.address, create=True)
+    try:
+        async with log.writing() as connection:
+            await Appending(dialect_of(connection), [declaration(b'{"dtype":"A"}')]).write(connection)
+            second = asyncio.create_task(other.append([declaration(b'{"dtype":"B"}')]))
+            await asyncio.wait([second], timeout=0.3)
+            assert not second.done()
+        await second
+        assert await log.declarations() == [b'{"dtype":"A"}', b'{"dtype":"B"}']
+        async with log.writing() as connection:
+            await Appending(dialect_of(connection), [declaration(b'{"dtype":"C"}')]).write(connection)
+            await other.append([declaration(b'{"dtype":"A"}'), *run_of(episode(1), 1, 2)])  # a repeat waits for nothing
+    finally:
+        await other.close()
 
 
 async def test_a_record_without_an_episode_that_is_no_declaration_is_damage(log: EventLog, database_url: str) -> None:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, TypeAlias
+from types import MappingProxyType
+from typing import Any, Self, TypeAlias
 
 from pycrorm_async.events.types import DesignatorTypeDeclared, NodeStarted
 from pycrorm_async.events.values import FieldDeclared, ObjectReference, ObjectValue
@@ -23,6 +24,7 @@ from pycrorm_async.projections.fold.column_values import (
 )
 from pycrorm_async.projections.fold.row_batch import Row
 from pycrorm_async.projections.schema.core_columns import EPISODE
+from pycrorm_async.projections.schema.union import Union
 from pycrorm_async.store.stored import StoredEvent
 
 __all__ = ["Designators", "DesignatorFold", "ParameterRows"]
@@ -37,15 +39,19 @@ ParameterRows: TypeAlias = list[tuple[str, Row]]
 class DesignatorFold:
     """Folds the parameters of the nodes of one declaration.
 
+    `own_names` are the names under which events have the values of renamed fields, by the fields' names.
+
     Attributes:
         leaf: the leaf table and its columns.
     """
 
-    def __init__(self, declared: DesignatorTypeDeclared) -> None:
+    def __init__(self, declared: DesignatorTypeDeclared, own_names: Mapping[str, str] = MappingProxyType({})) -> None:
         columned = [each for each in declared.fields if each.type not in ("list", "dict")]
         self.dtype = declared.dtype
         self.leaf = (declared.table, ("id", EPISODE, *(each.column for each in columned)))
-        self._columned = [(f.name, AS_IT_IS.get(f.type), _CONVERTED.get(f.type, _scalar), f) for f in columned]
+        self._columned = [
+            (own_names.get(f.name, f.name), AS_IT_IS.get(f.type), _CONVERTED.get(f.type, _scalar), f) for f in columned
+        ]
         self._listed = [each for each in declared.fields if each.type in ("list", "dict")]
 
     def rows(self, event: StoredEvent, node: int, parameters: Mapping[str, Any], others: ParameterRows) -> Row:
@@ -76,10 +82,17 @@ class Designators:
         self,
         declarations: Mapping[str, DesignatorTypeDeclared] | None = None,
         refused: Mapping[str, str] | None = None,
+        own_names: Mapping[str, Mapping[str, str]] = MappingProxyType({}),
     ) -> None:
         self._refused = dict(refused or {})
         accepted = {name: each for name, each in (declarations or {}).items() if name not in self._refused}
-        self._folds = {name: DesignatorFold(each) for name, each in accepted.items()}
+        self._folds = {name: DesignatorFold(each, own_names.get(name, {})) for name, each in accepted.items()}
+
+    @classmethod
+    def of_union(cls, united: Union) -> Self:
+        """Return the folds of these declarations."""
+        own_names = {name: each.own_names for name, each in united.fitted.items()}
+        return cls(united.accepted, united.refused, own_names)
 
     def of(self, started: NodeStarted) -> DesignatorFold | None:
         """Return the fold of this node's type; None for a root. Raises `CannotFold`."""

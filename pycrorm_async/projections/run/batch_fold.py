@@ -34,7 +34,8 @@ from pycrorm_async.projections.fold.parameters import Designators
 from pycrorm_async.projections.fold.row_writer import TableRows
 from pycrorm_async.projections.schema.generations import Generation, Hold
 from pycrorm_async.projections.schema.growth import GrowthTarget, grow
-from pycrorm_async.projections.schema.layout import Layout, unite
+from pycrorm_async.projections.schema.layout import Layout
+from pycrorm_async.projections.schema.union import unite
 from pycrorm_async.store.dialect import Progress, RowRefused
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
@@ -156,9 +157,9 @@ class _Tables:
     """The fold into the built-in tables. Implements `FoldDefinition`."""
 
     def learn(self, layout: Layout, payloads: Sequence[bytes]) -> tuple[Layout, Callable[[], Batch]]:
-        layout, accepted, refused = unite(layout, payloads)
-        designators = Designators(accepted, refused)
-        return layout, lambda: TableRows(designators)
+        united = unite(layout, payloads)
+        designators = Designators.of_union(united)
+        return united.layout, lambda: TableRows(designators)
 
 
 TABLES = _Tables()

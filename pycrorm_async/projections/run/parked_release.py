@@ -18,7 +18,7 @@ from pycrorm_async.projections.fold.parameters import Designators
 from pycrorm_async.projections.fold.row_batch import Rows
 from pycrorm_async.projections.schema.generations import Generation
 from pycrorm_async.projections.schema.growth import GrowthTarget, grow
-from pycrorm_async.projections.schema.layout import unite
+from pycrorm_async.projections.schema.union import unite
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import park
 
@@ -43,8 +43,7 @@ async def release_parked(connection: AsyncConnection, target: GrowthTarget, gene
     generation = await _retry_unmade(connection, target, generation, payloads)
     if not parked:
         return generation
-    united = unite(generation.layout, payloads)
-    designators = Designators(united.accepted, united.refused)
+    designators = Designators.of_union(unite(generation.layout, payloads))
     for episode, place in places:
         if place is None or int(place[1]) != episode.folded + 1:
             continue

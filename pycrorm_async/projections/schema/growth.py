@@ -25,7 +25,8 @@ from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.events.codec import fingerprint
 from pycrorm_async.projections.schema.generations import Generation
-from pycrorm_async.projections.schema.layout import Layout, unite
+from pycrorm_async.projections.schema.layout import Layout
+from pycrorm_async.projections.schema.union import Union, unite
 from pycrorm_async.store.dialects import dialect_of
 
 __all__ = ["GrowthTarget", "grow"]
@@ -77,7 +78,9 @@ async def _grow(
         return generation
     try:
         async with connection.begin_nested():
-            return await target.grow(connection, generation, united.layout)
+            grown = await target.grow(connection, generation, united.layout)
+            _log_contradictions(united, generation.layout)
+            return grown
     except (ArgumentError, CompileError, IdentifierError) as error:  # SQLAlchemy cannot express the definition
         reason = str(error)
     except dialect_of(connection).faults as error:
@@ -98,3 +101,12 @@ async def _grow(
     grown = await target.grow(connection, generation, generation.layout.with_unmade(name, reason))
     _log.warning("%s; episodes that use this type are parked, all others continue", reason)
     return grown
+
+
+def _log_contradictions(united: Union, before: Layout) -> None:
+    """Log the contradictions of those declarations that need a column or a table of their own now."""
+    for name, fitted in united.fitted.items():
+        declared = united.accepted[name]
+        columns = before.leaves.get(declared.table)
+        if columns is None or any(own not in columns for own in fitted.own_names):
+            _log.warning("; ".join(fitted.lines))

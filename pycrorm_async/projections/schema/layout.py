@@ -1,8 +1,8 @@
 """Compute the leaf tables, columns and views that declared designator types need.
 
-A layout only grows. Declarations are united in the order in which they were stored: a new field is a new column. A
-declaration that gives a column a second type is refused, with both types named. A type's view shows the rows of all
-tables of that type and of its descendants, so `pick_up_action` also shows every careful pick-up.
+A layout only grows: a new field is a new column. It refuses a declaration that contradicts it, which `unite` then adds
+under other names. A type's view shows the rows of all tables of that type and of its descendants, so `pick_up_action`
+also shows every careful pick-up.
 
 A renamed type is one type: the declaration with its new name lists the old ones (`aliases`), the tables of all these
 names are its tables, and each of their views shows all its rows, whichever declaration was stored first.
@@ -10,18 +10,17 @@ names are its tables, and each of their views shows all its rows, whichever decl
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping
 from typing import NamedTuple, Self
 
 import msgspec
 
-from pycrorm_async.events.codec import UnknownShape, declaration_of, fingerprint
-from pycrorm_async.events.fields import fault_in_declaration, mapped_declaration, table_name
+from pycrorm_async.events.fields import fault_in_declaration, table_name
 from pycrorm_async.events.types import DesignatorTypeDeclared
 from pycrorm_async.events.values import FieldType
 from pycrorm_async.projections.schema.core_columns import Storage
 
-__all__ = ["Layout", "DesignatorType", "Leaf", "MaterialisedView", "LayoutConflict", "STORED_AS", "Union", "unite"]
+__all__ = ["Layout", "DesignatorType", "Leaf", "MaterialisedView", "LayoutConflict", "Contradiction", "STORED_AS"]
 
 STORED_AS: dict[FieldType, Storage] = {
     "integer": "integer",
@@ -45,7 +44,11 @@ _BASE_OF_KIND = {"action": "Action", "motion": "Motion", "language": "Language"}
 
 
 class LayoutConflict(ValueError):
-    """A declaration contradicts the layout, so it cannot share its tables."""
+    """A declaration cannot have tables in the layout."""
+
+
+class Contradiction(LayoutConflict):
+    """A declaration contradicts another one, so it needs other names."""
 
 
 class Leaf(NamedTuple):
@@ -143,14 +146,14 @@ class Layout(msgspec.Struct, frozen=True):
         former = tuple(each for each in declared.aliases if each != dtype and self.present_name(each) != dtype)
         for each in former:
             if self.renamed.get(each, each) not in declared.aliases:
-                raise LayoutConflict(
+                raise Contradiction(
                     f"{each} was renamed to {self.renamed[each]}, so {dtype} cannot have the alias {each}: remove it"
                 )
         present = self.types.get(dtype) or DesignatorType(declared.kind, ())
         same_type = [present, *(self.types[each] for each in former if each in self.types)]
         for type_ in same_type:
             if declared.kind != type_.kind:
-                raise LayoutConflict(f"{declared.dtype} is declared as {type_.kind} and as {declared.kind}")
+                raise Contradiction(f"{declared.dtype} is declared as {type_.kind} and as {declared.kind}")
         others = (table for type_ in same_type for table in type_.tables)
         tables = tuple(dict.fromkeys((*present.tables, declared.table, *others)))
         self._refuse_taken(declared, {dtype, *former})
@@ -186,11 +189,11 @@ class Layout(msgspec.Struct, frozen=True):
         request = f"{declared.dtype} needs the table {declared.table}"
         for dtype, each in self.types.items():
             if declared.table in each.tables and dtype not in own:
-                raise LayoutConflict(f"{request}, which belongs to {dtype} (set another dtype)")
+                raise Contradiction(f"{request}, which belongs to {dtype} (set another dtype)")
         # Databases treat names that differ only in case as equal.
         for name in (*self.user_views, *(each for each in self.leaves if each != declared.table)):
             if name.lower() == declared.table.lower():
-                raise LayoutConflict(f"{request}, but {name} exists already (set another dtype)")
+                raise Contradiction(f"{request}, but {name} exists already (set another dtype)")
 
     def members(self, table: str) -> tuple[str, ...]:
         """Return the leaf tables whose rows the view of `table` shows: its own, those of its types and descendants."""
@@ -211,12 +214,21 @@ class Layout(msgspec.Struct, frozen=True):
 
     def columns(self, table: str) -> dict[str, Storage]:
         """Return the columns of the view of `table`: its own, and those of its type's other tables."""
-        tables = [table, *(other for each in self.types.values() if table in each.tables for other in each.tables)]
+        tables = (other for each in self.types.values() if table in each.tables for other in each.tables)
+        return dict(self._named_columns((table, *tables)).values())
+
+    def columns_beside(self, declared: DesignatorTypeDeclared) -> dict[str, tuple[str, Storage]]:
+        """Return name and storage, by name in lower case, of the columns that this declaration must agree with."""
+        names = map(self.present_name, (declared.dtype, *declared.aliases))
+        tables = (table for each in names if each in self.types for table in self.types[each].tables)
+        return self._named_columns((declared.table, *tables))
+
+    def _named_columns(self, tables: Iterable[str]) -> dict[str, tuple[str, Storage]]:
         named: dict[str, tuple[str, Storage]] = {}
-        for each in tables:
-            for name, storage in self.leaves[each].items():
+        for table in tables:
+            for name, storage in self.leaves.get(table, {}).items():
                 named.setdefault(name.lower(), (name, storage))
-        return dict(named.values())
+        return named
 
     def lineage(self, dtype: str) -> str:
         """Return the names under which a row of this type may be mapped, nearest first; the last always has a class."""
@@ -242,49 +254,9 @@ def _refuse_different(dtype: str, present: Mapping[str, Storage], columns: Mappi
     for column, storage in columns.items():
         existing = lowered.get(column.lower(), column)
         if existing != column:
-            raise LayoutConflict(f"{dtype} is declared with the column {existing} and with {column}: rename one")
+            raise Contradiction(f"{dtype} is declared with the column {existing} and with {column}: rename one")
         if present.get(column, storage) != storage:
-            raise LayoutConflict(
+            raise Contradiction(
                 f"{dtype}.{column} is declared as {present[column]} and as {storage}"
                 " (types that share a name must agree: rename one field or set another dtype)"
             )
-
-
-class Union(NamedTuple):
-    """The layout with the accepted declarations; by fingerprint, those declarations and the reasons of refusals."""
-
-    layout: Layout
-    accepted: dict[str, DesignatorTypeDeclared]
-    refused: dict[str, str]
-
-
-def unite(layout: Layout, payloads: Sequence[bytes]) -> Union:
-    """Add to the layout those of these declarations that can share its tables."""
-    accepted: dict[str, DesignatorTypeDeclared] = {}
-    refused: dict[str, str] = {}
-    for payload in payloads:
-        name = fingerprint(payload)
-        if name in layout.unmade:
-            refused[name] = layout.unmade[name]
-            continue
-        try:
-            declared = mapped_declaration(declaration_of(payload))
-            layout = layout.with_declaration(declared)
-            accepted[name] = declared
-        except LayoutConflict as reason:
-            refused[name] = str(reason)
-        except (UnknownShape, msgspec.DecodeError) as error:  # from a newer version, or damaged
-            refused[name] = f"this version cannot read the declaration of its type: {error}"
-    unreadable = [fingerprint(each) for each in payloads if not _is_readable(each)]
-    return Union(layout.with_unreadable(unreadable) if unreadable else layout, accepted, refused)
-
-
-def _is_readable(payload: bytes) -> bool:
-    """Return whether both databases can extract a member: PostgreSQL refuses JSON that contains U+0000."""
-    if b"\\u0000" in payload:
-        return False
-    try:
-        msgspec.json.decode(payload)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
-        return False
-    return True

@@ -21,8 +21,8 @@ from pycrorm_async.projections.fold.parameters import Designators
 from pycrorm_async.projections.fold.row_batch import Rows
 from pycrorm_async.projections.fold.row_writer import name_episodes, uuids_of
 from pycrorm_async.projections.schema.generations import Generation, current_generation
-from pycrorm_async.projections.schema.layout import unite
-from pycrorm_async.projections.schema.unmade_types import failed_views, unmade_types
+from pycrorm_async.projections.schema.union import unite
+from pycrorm_async.projections.unmade_types import failed_views, unmade_types
 from pycrorm_async.projections.verify.digest_check import (
     DigestCheck,
     OutsideDigest,
@@ -325,5 +325,4 @@ async def _episodes(connection: AsyncConnection, within: EpisodeRange, limit: in
 
 async def _designators(connection: AsyncConnection, generation: Generation) -> Designators:
     payloads = await dialect_of(connection).declarations(connection)
-    _, accepted, refused = unite(generation.layout, payloads)
-    return Designators(accepted, refused)
+    return Designators.of_union(unite(generation.layout, payloads))

@@ -41,9 +41,17 @@ __all__ = [
     "PARK",
 ]
 
+# Transactions that insert new declarations take turns, so that the order by `ordinal` is that of their commits.
+# Otherwise a fold could read the second before the first, and name contradicting fields otherwise than a rebuild.
 INSERT_DECLARATIONS = """
+WITH new AS MATERIALIZED (
+    SELECT one.* FROM unnest($1::text[], $2::text[]) WITH ORDINALITY AS one (fingerprint, payload, place)
+    WHERE NOT EXISTS (SELECT FROM pycrorm.pycrorm_declaration AS stored WHERE stored.fingerprint = one.fingerprint)
+), turn AS MATERIALIZED (
+    SELECT pg_catalog.pg_advisory_xact_lock(7266203370152417863) FROM new LIMIT 1
+)
 INSERT INTO pycrorm.pycrorm_declaration (fingerprint, payload)
-SELECT fingerprint, payload FROM unnest($1::text[], $2::text[]) WITH ORDINALITY AS one (fingerprint, payload, place)
+SELECT fingerprint, payload FROM new CROSS JOIN (SELECT pg_catalog.count(*) FROM turn) AS taken
 ORDER BY place ON CONFLICT (fingerprint) DO NOTHING"""
 
 NEW_NUMBERS = "SELECT pg_catalog.nextval('pycrorm.episode_number') FROM pg_catalog.generate_series(1, $1::int)"

@@ -1,6 +1,6 @@
-"""List the designator types of a memory that have no tables, and the users' views that are left out, with the reasons.
+"""List the designator types of a memory that have no tables, and those kept under other names, with the reasons.
 
-Episodes that use such a type are parked.
+Episodes that use a type without tables are parked. Users' views that are left out are listed here too.
 """
 
 from __future__ import annotations
@@ -9,23 +9,35 @@ import msgspec
 
 from pycrorm_async.events.codec import fingerprint
 from pycrorm_async.projections.schema.generations import SHOWN, read_generation
-from pycrorm_async.projections.schema.layout import Layout, unite
+from pycrorm_async.projections.schema.layout import Layout
+from pycrorm_async.projections.schema.union import Union, unite
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 
-__all__ = ["unmade_types", "failed_views"]
+__all__ = ["unmade_types", "contradictions", "failed_views"]
 
 
 class _DtypeOnly(msgspec.Struct):
     dtype: str = ""
 
 
-async def unmade_types(log: EventLog) -> dict[str, str]:
-    """Return the reasons by dtype, or by fingerprint where the declaration's dtype cannot be read."""
+async def _united(log: EventLog) -> tuple[Union, list[bytes]]:
     async with log.snapshot() as connection:
         generation = await read_generation(connection, SHOWN)
         payloads = await dialect_of(connection).declarations(connection)
-    refused = unite(Layout() if generation is None else generation.layout, payloads).refused
+    return unite(Layout() if generation is None else generation.layout, payloads), payloads
+
+
+async def contradictions(log: EventLog) -> list[str]:
+    """Return a line for each declared field and type that contradicts an earlier one, with its name in the tables."""
+    united, _ = await _united(log)
+    return [line for each in united.fitted.values() for line in each.lines]
+
+
+async def unmade_types(log: EventLog) -> dict[str, str]:
+    """Return the reasons by dtype, or by fingerprint where the declaration's dtype cannot be read."""
+    united, payloads = await _united(log)
+    refused = united.refused
     names = {fingerprint(each): _dtype(each) for each in payloads if fingerprint(each) in refused}
     return {names[each] or each: reason for each, reason in refused.items()}
 

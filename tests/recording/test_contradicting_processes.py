@@ -1,0 +1,95 @@
+"""Processes that declare one type with other fields, and record at the same time through a daemon."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+
+import pytest
+
+from pycrorm_async.events.codec import declaration_of
+from pycrorm_async.events.types import NodeStarted
+from pycrorm_async.operations.rebuild import rebuild_memory
+from pycrorm_async.projections.schema import union
+from pycrorm_async.projections.verify.verify import verify
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.log import EventLog
+from tests.commands import pycrorm, run_script
+from tests.databases import ask
+from tests.memory.daemon_in_loop import Daemon
+from tests.projections.event_script import Script, declarations, declared, field, name_of
+from tests.projections.sql_queries import stored_and_folded
+from tests.table_comparison import differences, tables_of
+
+pytestmark = pytest.mark.slow
+
+_RECORD = """
+import sys
+from pycrorm_async import Memory
+
+url, spool, kind, text = sys.argv[1:]
+value = {"integer": int, "text": str, "boolean": bool}[kind](text)
+with Memory.sync(url, spool=spool, writer="daemon") as memory:
+    with memory.recording.episode(description=kind) as episode:
+        for number in range(3):
+            wave = memory.recording.type("action", "Wave", {"times": kind, "arm": "text"})
+            episode.start(number, wave, {"times": value, "arm": "LEFT"})
+            episode.end(number)
+    memory.flush()
+    assert memory.status.missing.total == 0
+"""
+
+
+async def test_each_type_of_a_field_has_a_column_and_no_episode_is_parked(database_url: str, tmp_path: Path) -> None:
+    spool = tmp_path / "spool"
+    daemon = Daemon(database_url, spool)
+    values = {"integer": "3", "text": "three", "boolean": "x"}
+    runs = (asyncio.to_thread(run_script, _RECORD, database_url, spool, *each) for each in values.items())
+    assert [(each.returncode, each.stderr) for each in await asyncio.gather(*runs)] == [(0, "")] * 3
+    await daemon.stop()
+    log = await EventLog.open(DatabaseAddress.parse(database_url), create=False)
+    try:
+        assert await log.stopped() == []
+        first, *later = [declaration_of(each).fields[0].type for each in await log.declarations()]
+        result = await verify(log)
+        assert (result.damages, result.differences, result.unmade) == ([], [], {})
+    finally:
+        await log.close()
+    columns = ", ".join(("times", *(f"times_{each}" for each in later), "arm"))
+    rows = ask(database_url, f"SELECT {columns} FROM wave ORDER BY id")
+    recorded = {"integer": 3, "text": "three", "boolean": True}
+    for place, kind in enumerate((first, *later)):
+        assert [row[place] for row in rows if row[place] is not None] == [recorded[kind]] * 3
+    assert [row[3] for row in rows] == ["LEFT"] * 9
+    lines = [
+        f"warning: Wave.times is declared as {first} and as {each}; the {each} is kept as times_{each}"
+        for each in later
+    ]
+    status = await asyncio.to_thread(pycrorm, "status", "--url", database_url, "--spool", spool, cwd=tmp_path)
+    assert (status.returncode, [each for each in status.stderr.splitlines() if "Wave" in each]) == (0, lines)
+    before = tables_of(database_url)
+    await rebuild_memory(database_url)
+    assert differences(before, tables_of(database_url)) == []
+
+
+async def test_episodes_that_an_earlier_version_parked_are_folded_when_the_tables_are_opened_or_rebuilt(
+    database_url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(_layout: object, _declared: object, reason: Exception) -> None:
+        raise reason
+
+    types = declared("Wave", "wave", field("times", "integer", 2)), declared("Wave", "wave", field("times", "text", 2))
+    scripts = Script(1), Script(2)
+    scripts[0].put(NodeStarted("action", None, name_of(types[0]), {"times": 3}))
+    scripts[1].put(NodeStarted("action", None, name_of(types[1]), {"times": "three"}))
+    log = await EventLog.open(DatabaseAddress.parse(database_url), create=True)
+    try:
+        with monkeypatch.context() as earlier:
+            earlier.setattr(union, "_fit", refuse)
+            await stored_and_folded(log, [*declarations(*types), *scripts[0].records, *scripts[1].records])
+            assert [each.number for each in await log.stopped()] == [2]
+        await rebuild_memory(database_url)
+        assert await log.stopped() == []
+        assert ask(database_url, "SELECT times, times_text FROM wave ORDER BY id") == [(3, None), (None, "three")]
+    finally:
+        await log.close()
