@@ -26,7 +26,7 @@ def parameters_text(parameters: Mapping[str, Any], *, full: bool = False) -> str
 
 def _value_text(value: Any, *, full: bool) -> str:
     if isinstance(value, dict) and "position" in value:
-        return "(" + ", ".join(f"{each:.2f}" for each in value["position"]) + ")"
+        return "(" + ", ".join(f"{round(each, 2) + 0.0:.2f}" for each in value["position"]) + ")"
     if isinstance(value, dict) and BLOB_KEY in value:
         return f"{value.get('media_type')} of {value.get('size')} bytes"
     if isinstance(value, dict) and value.get("name"):
@@ -36,7 +36,8 @@ def _value_text(value: Any, *, full: bool) -> str:
     if isinstance(value, float):
         return f"{value:g}"
     if isinstance(value, dict | list):
-        return msgspec.json.encode(value).decode() if full else f"{len(value)} entries"
+        count = "1 entry" if len(value) == 1 else f"{len(value)} entries"
+        return msgspec.json.encode(value).decode() if full else count
     return one_line(value, None if full else _TEXT_MAX)
 
 

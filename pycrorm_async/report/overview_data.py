@@ -50,6 +50,7 @@ async def overview_document(
                 "started": f"{each.started_at:%Y-%m-%d %H:%M:%S}",
                 "description": each.description[:_DESCRIPTION_MAX],
                 "status": each.status,
+                "robots": [robot.name for robot in each.robots],
                 "seconds": None if each.duration_ns is None else round(each.duration_ns / 1e9, 6),
                 "nodes": each.nodes,
                 "failed": each.failed,

@@ -16,6 +16,7 @@ from pycrorm_async.query.success.success_table import Axis, SuccessTable, succes
 __all__ = ["success_documents"]
 
 _PAIRS = (("relative_x", "relative_y"), ("arm", "grasp"))
+_METRES = ("relative_x", "relative_y")
 
 
 async def success_documents(reading: Reading, numbers: Collection[int]) -> list[dict[str, Any]]:
@@ -41,6 +42,7 @@ def _axis(axis: Axis) -> dict[str, Any]:
     """Return the name, the labels of the cells or the texts of the edges between them, and the number of cells."""
     return {
         "name": axis.name,
+        "unit": "m" if axis.name in _METRES else "",
         "labels": axis.labels,
         "edges": [axis.text(each) for each in axis.edges],
         "cells": axis.cells,

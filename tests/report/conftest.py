@@ -67,3 +67,11 @@ def pages(recorded: Path) -> dict[str, Path]:
         assert done.returncode == 0, done.stderr
         found[name] = recorded / f"{name}.html"
     return found
+
+
+@pytest.fixture(scope="session")
+def overview(recorded: Path) -> Path:
+    """Return the table of the recorded episodes."""
+    done = pycrorm("report", "--all", "--out", "all.html", cwd=recorded)
+    assert done.returncode == 0, done.stderr
+    return recorded / "all.html"

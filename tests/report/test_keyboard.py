@@ -61,3 +61,36 @@ def test_every_control_has_a_name_that_is_no_sign(chrome: Browser, pages: dict[s
         ]
         assert {role for role, _ in names} == set(roles)
         assert [each for each in names if not any(map(str.isalnum, each[1]))] == []
+
+
+def test_a_table_of_episodes_is_sorted_by_keys_and_says_so(chrome: Browser, overview: Path) -> None:
+    with chrome.open(overview) as tab:
+        tab.ask("document.querySelector('th button').focus()")
+        assert tab.ask("document.querySelector('th').getAttribute('aria-sort')") == "descending"
+        tab.ask("document.activeElement.click()")
+        assert tab.ask("document.querySelector('th').getAttribute('aria-sort')") == "ascending"
+        assert tab.ask(FOCUSED) == "episode ▴"
+
+
+@pytest.mark.parametrize("width", [420, 800, 1400])
+def test_the_table_of_episodes_is_in_sight_without_scrolling(chrome: Browser, overview: Path, width: int) -> None:
+    with chrome.open(overview, width=width) as tab:
+        heads = "[...document.querySelectorAll('#episodes th')].map((each) => each.textContent)"
+        assert tab.ask(heads) == [
+            "episode ▾",
+            "started (UTC)",
+            "status",
+            "took",
+            "nodes",
+            "failed",
+            "robots",
+            "description",
+        ]
+        assert tab.ask("document.documentElement.scrollWidth") == width
+        robots = "[...document.querySelectorAll('#episodes tbody td:nth-child(7)')].map((each) => each.textContent)"
+        assert tab.ask(robots) == ["courier, other", "pr2", "pr2"]
+        texts = tab.ask("[...document.querySelectorAll('#success text')].map((each) => each.textContent)")
+        assert [each for each in texts if "_" in each] == ["relative_x (m)", "relative_y (m)"]
+        if width == 1400:
+            assert tab.ask("document.querySelector('#episodes tbody').getBoundingClientRect().bottom") < 900
+        assert tab.problems() == []

@@ -211,3 +211,19 @@ async def test_every_link_is_where_bullet_has_it(
         assert drawn.keys() == set(robot.links)
         for link, position in drawn.items():
             assert position == pytest.approx(list(robot.link_pose(link).position), abs=2e-3), link
+
+
+def test_curves_have_values_with_units_and_their_range(chrome: Browser, pages: dict[str, Path]) -> None:
+    with chrome.open(pages["plan"]) as tab:
+        tab.ask("pycrormPage.panels.open('states')")
+        texts = "[...document.querySelectorAll('figure')].map((each) => each.innerText.split('\\n').filter(Boolean))"
+        curves = {name: rest for name, *rest in tab.ask(texts)}
+        assert curves["pr2 base.y"] == ["0.44 m", "-1.5 to 0.89 m"]
+        assert curves["pr2 l_elbow_flex_joint"][0].endswith(" rad")
+
+
+def test_a_moment_at_which_nothing_runs_shows_the_episode(chrome: Browser, pages: dict[str, Path]) -> None:
+    with chrome.open(pages["drives"], fragment="#e1") as tab:
+        text = tab.ask("document.querySelector('.panel').innerText")
+        assert text.startswith("No node runs at this moment.\n\nEpisode\nid\n")
+        assert "plan\nbreakfast.py:drives" in text

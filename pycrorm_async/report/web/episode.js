@@ -181,6 +181,14 @@ export class Episode {
     return this.attachments.filter(([, , , from, to]) => from <= event && (to === 0 || to > event));
   }
 
+  /** The unit of a sampled value of an object: of its pose, of a joint; empty if it has none or is not known. */
+  unitOf(id, name) {
+    if (/^base\.[xyz]$/.test(name)) return "m";
+    const joints = this.models[this.objectById.get(id)?.model]?.joints ?? [];
+    const type = joints.find(([joint]) => joint === name)?.[1];
+    return { revolute: "rad", continuous: "rad", prismatic: "m" }[type] ?? "";
+  }
+
   nameOf(id) {
     return this.objectById.get(id)?.name ?? `object ${id}`;
   }

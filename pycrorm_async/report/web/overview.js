@@ -129,7 +129,9 @@ class Overview {
   }
 
   #table() {
-    const columns = { number: "episode", started: "started", status: "status", seconds: "took", nodes: "nodes", failed: "failed", description: "description" };
+    const robots = this.episodes.some((each) => each.robots?.length > 0) ? { robots: "robots" } : {};
+    const columns = { number: "episode", started: "started (UTC)", status: "status", seconds: "took", nodes: "nodes", failed: "failed", ...robots, description: "description" };
+    this.named = "robots" in columns;
     const heads = Object.entries(columns).map(([key, title]) => {
       const sign = this.by === key ? (this.down ? " ▾" : " ▴") : "";
       const sort = { type: "button", "data-key": key, onclick: () => this.#sortBy(key) };
@@ -138,7 +140,7 @@ class Overview {
     });
     const order = this.down ? -1 : 1;
     const sorted = this.episodes.slice().sort((one, other) => {
-      const [a, b] = [one[this.by] ?? -1, other[this.by] ?? -1];
+      const [a, b] = [one, other].map((each) => (Array.isArray(each[this.by]) ? each[this.by].join() : each[this.by] ?? -1));
       return (a < b ? -1 : a > b ? 1 : 0) * order;
     });
     const rows = sorted.slice(0, ROWS_MAX).map((each) => this.#row(each));
@@ -154,11 +156,12 @@ class Overview {
       "tr",
       {},
       element("td", { class: "number" }, each.page ? element("a", { href: each.page }, name) : name),
-      element("td", {}, each.started),
-      element("td", { class: `is-${each.status.toLowerCase()}` }, element("span", { class: "sign" }, signOf(each.status)), ` ${each.status}`),
+      element("td", { class: "fixed" }, each.started),
+      element("td", { class: `fixed is-${each.status.toLowerCase()}` }, element("span", { class: "sign" }, signOf(each.status)), ` ${each.status}`),
       element("td", { class: "number" }, each.seconds === null ? "" : duration(each.seconds)),
       element("td", { class: "number" }, String(each.nodes)),
       element("td", { class: "number" }, String(each.failed)),
+      this.named ? element("td", {}, recorded((each.robots ?? []).join(", "))) : null,
       element("td", {}, recorded(each.description), each.unreadable ? unreadable(each.unreadable) : null),
     );
   }

@@ -242,16 +242,16 @@ export class Panels {
     const { episode } = this;
     const named = [...episode.series].map(([name, track]) => [name, track]);
     for (const [id, channels] of episode.samples) {
-      for (const [name, track] of channels) named.push([`${episode.nameOf(id)} ${name}`, track]);
+      for (const [name, track] of channels) named.push([`${episode.nameOf(id)} ${name}`, track, episode.unitOf(id, name)]);
     }
     const moving = named.filter(([, track]) => new Set(track.values).size > 1);
-    const shown = moving.slice(0, 60).map(([name, track]) => this.#curve(name, track));
+    const shown = moving.slice(0, 60).map((each) => this.#curve(...each));
     const left = named.length - shown.length;
     const note = left > 0 ? [element("p", { class: "quiet" }, `${left} more have one value only or are not shown.`)] : [];
     return [element("div", { class: "curves" }, ...shown), ...note];
   }
 
-  #curve(name, track) {
+  #curve(name, track, unit = "") {
     const { first, last } = this.episode;
     const [width, height] = [220, 46];
     const low = track.values.reduce((one, other) => Math.min(one, other), Infinity);
@@ -267,7 +267,9 @@ export class Panels {
     path += `H${width}`;
     const picture = svg("svg", { viewBox: `0 0 ${width} ${height}`, class: "curve", preserveAspectRatio: "none", "aria-hidden": "true" });
     picture.append(svg("path", { d: path }), svg("line", { x1: x(this.event), x2: x(this.event), y1: 0, y2: height }));
-    const value = Number(track.valueAt(this.event)).toPrecision(4);
-    return element("figure", {}, element("figcaption", {}, recorded(name), element("b", {}, value)), picture);
+    const short = (number) => String(Number(Number(number).toPrecision(4)));
+    const value = `${short(track.valueAt(this.event))} ${unit}`;
+    const range = element("span", { class: "range" }, `${short(low)} to ${short(high)} ${unit}`);
+    return element("figure", {}, element("figcaption", {}, recorded(name), element("b", {}, value)), picture, range);
   }
 }

@@ -31,10 +31,12 @@ export function successMap({ x, y, cells, succeeded, rows }) {
   }
   for (const [at, text] of ticksOf(x, wide)) picture.append(svg("text", { x: left + at, y: height + 16, "text-anchor": "middle" }, text));
   for (const [at, text] of ticksOf(y, high)) picture.append(svg("text", { x: left - 6, y: height - at + 4, "text-anchor": "end" }, text));
-  picture.append(svg("text", { x: left + SIZE / 2, y: height + 36, "text-anchor": "middle" }, x.name));
-  picture.append(svg("text", { x: 2, y: -14 }, y.name));
+  picture.append(svg("text", { x: left + SIZE / 2, y: height + 36, "text-anchor": "middle" }, captionOf(x)));
+  picture.append(svg("text", { x: 2, y: -14 }, captionOf(y)));
   return picture;
 }
+
+const captionOf = ({ name, unit }) => (unit ? `${name} (${unit})` : name);
 
 const placeOf = (axis, cell) => axis.labels[cell] ?? `${axis.name} ${axis.edges[cell]} to ${axis.edges[cell + 1]}`;
 
