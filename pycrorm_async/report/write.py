@@ -21,6 +21,7 @@ from pycrorm_async.report.episode_data import episode_document
 from pycrorm_async.report.html_page import overview_page_of, page_of, write_page
 from pycrorm_async.report.output_files import refuse_existing
 from pycrorm_async.report.overview_data import newest_episodes, overview_document
+from pycrorm_async.report.similar_cases import SimilarCases, page_name
 from pycrorm_async.report.success_data import success_documents
 
 __all__ = ["Overview", "Report", "overview", "report"]
@@ -73,11 +74,25 @@ async def report(
     Raises `UnknownEpisode`; `CallerError` if the file exists or cannot have this name, or if no event is in the window;
     `LogDamaged` or `DatabaseForeign` for an event that cannot be read; `OSError` if the disk is full.
     """
+    return await _report(SimilarCases(reading), reading, episode, path, force=force, first=first, last=last)
+
+
+async def _report(
+    similar: SimilarCases,
+    reading: Reading,
+    episode: AnyEpisode,
+    path: str | PathLike[str] | None,
+    *,
+    force: bool,
+    first: int | None = None,
+    last: int | None = None,
+) -> Report:
     if path is not None:
         refuse_existing(Path(path), force=force)
     name = str(episode.number if isinstance(episode, EpisodeSummary) else episode)
     document = await episode_document(reading, name, first=first, last=last)
-    file = Path(path) if path is not None else Path(f"episode-{document['episode']['number']}.html")
+    document["similar"] = await similar.document(document["episode"]["number"], document["nodes"][0])
+    file = Path(path) if path is not None else Path(page_name(document["episode"]["number"]))
     await asyncio.to_thread(lambda: write_page(page_of(document), file, force=force))
     shown = document["episode"]
     return Report(file, shown["first"], shown["last"], shown["head"])
@@ -101,18 +116,28 @@ async def overview(
     if not episodes:
         raise CallerError(f"no episode has the tags {', '.join(tags)}" if tags else "this memory has no episode yet")
     folder.mkdir(exist_ok=True)
-    pages: dict[int, str] = {}
-    unreadable: dict[int, str] = {}
-    for each in episodes[-_PAGES_MAX:]:
-        name = f"episode-{each.number}.html"
-        try:
-            await report(reading, each, folder / name, force=force)
-        except (LogDamaged, DatabaseForeign) as error:
-            unreadable[each.number] = str(error)
-        else:
-            pages[each.number] = f"{quote(folder.name)}/{name}"
+    shown = episodes[-_PAGES_MAX:]
+    unreadable = await _write_pages(reading, shown, folder, force=force)
+    shown = [each for each in shown if each.number not in unreadable]
+    if unreadable:  # again, because some pages may link to those that are missing
+        await _write_pages(reading, shown, folder, force=True)
+    pages = {each.number: f"{quote(folder.name)}/{page_name(each.number)}" for each in shown}
     title = f"Episodes with the tags {', '.join(tags)}" if tags else "Episodes"
     document = await overview_document(reading, title, episodes, total, pages, unreadable)
     document["successes"] = await success_documents(reading, [each.number for each in episodes])
     await asyncio.to_thread(lambda: write_page(overview_page_of(document), file, force=force))
     return Overview(file, len(episodes), len(pages), total - len(episodes), unreadable)
+
+
+async def _write_pages(
+    reading: Reading, episodes: Collection[EpisodeSummary], folder: Path, *, force: bool
+) -> dict[int, str]:
+    """Write a page of each episode, with links to each other; return the reasons why some have none, by number."""
+    unreadable: dict[int, str] = {}
+    similar = SimilarCases(reading, [each.number for each in episodes])
+    for each in episodes:
+        try:
+            await _report(similar, reading, each, folder / page_name(each.number), force=force)
+        except (LogDamaged, DatabaseForeign) as error:
+            unreadable[each.number] = str(error)
+    return unreadable

@@ -19,7 +19,7 @@ const HELP = [
 const part = (name) => document.getElementById(name);
 
 class Page {
-  constructor(episode) {
+  constructor(episode, similar) {
     this.episode = episode;
     this.event = this.#eventInAddress() ?? episode.opens;
     this.selected = null;
@@ -33,7 +33,8 @@ class Page {
     this.view = this.#sceneOrMap();
     this.tree = new TreeView(part("tree"), episode, { onSelect: select });
     this.gantt = new GanttView(part("gantt"), episode, { onSeek: seek, onSelect: select });
-    this.panels = new Panels(part("panels"), episode, { onSeek: seek, onSelect: select, onChoose: (object) => this.choose(object) });
+    const choose = (object) => this.choose(object);
+    this.panels = new Panels(part("panels"), episode, { onSeek: seek, onSelect: select, onChoose: choose, similar });
     this.#head();
     this.#controls();
     this.#listen();
@@ -292,6 +293,7 @@ class Page {
   }
 }
 
-const page = new Page(new Episode(JSON.parse(part("document").textContent)));
+const written = JSON.parse(part("document").textContent);
+const page = new Page(new Episode(written), written.similar ?? null);
 document.documentElement.dataset.ready = "yes";
 globalThis.pycrormPage = page;

@@ -2,6 +2,7 @@
 
 import { failureGroups, lastUpTo, signOf } from "./episode.js";
 import { duration, element, recorded, replaceIn, svg } from "./dom.js";
+import { similarTo } from "./similar.js";
 
 const LISTED_MAX = 200;
 const MESSAGES_MAX = 5;
@@ -15,8 +16,8 @@ const unsigned = (text) => (Number(text) === 0 ? text.replace("-", "") : text);
 const yawOf = ([x, y, z, w]) => (Math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)) * 180) / Math.PI;
 
 export class Panels {
-  constructor(holder, episode, { onSeek, onSelect, onChoose }) {
-    Object.assign(this, { holder, episode, onSeek, onSelect, onChoose, chosen: null });
+  constructor(holder, episode, { onSeek, onSelect, onChoose, similar }) {
+    Object.assign(this, { holder, episode, onSeek, onSelect, onChoose, similar, chosen: null });
     this.bar = element("div", { class: "tabs", role: "tablist" });
     this.body = element("div", { class: "panel", id: "panel", role: "tabpanel", tabindex: 0 });
     this.bar.addEventListener("keydown", (pressed) => this.#press(pressed));
@@ -129,7 +130,8 @@ export class Panels {
       return element("p", {}, this.#moment(each.at), " ", recorded(refused ? `${text}; refused: ${refused}` : text));
     });
     const whole = node.parent === null ? this.#episodeFacts() : [];
-    return [element("h3", {}, recorded(node.name)), list, ...chosen, ...whole];
+    const alike = similarTo(node, this.similar, (start) => this.#node(start));
+    return [element("h3", {}, recorded(node.name)), list, ...chosen, ...alike, ...whole];
   }
 
   /** What was recorded about the episode as a whole. */
