@@ -10,6 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
+from pycrorm_async.cli.interruption import interrupt_on_termination
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
 from pycrorm_async.cli.output import note, print_json, print_line
 from pycrorm_async.cli.pending_events import note_pending_events
@@ -91,6 +92,7 @@ def export(
                 reading, what, target, episodes=episode or (), force=force, progress=progress, **options
             )
 
+    interrupt_on_termination()
     with watched("exporting", unit="rows") as progress:
         exported = asyncio.run(write(progress if stderr.is_terminal else None))
     note_pending_events(url, spool)
@@ -129,6 +131,7 @@ def _again(manifest: Path, out: Path | None, url: str, spool: Path | None, *, fo
         async with Reading.open(url) as reading:
             return await export_again(reading, manifest, out, force=force, progress=progress)
 
+    interrupt_on_termination()
     with watched("exporting", unit="rows") as progress:
         remade = asyncio.run(write(progress if stderr.is_terminal else None))
     note_pending_events(url, spool)

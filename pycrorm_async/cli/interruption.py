@@ -86,6 +86,17 @@ class Interruption:
         self._storing = True
 
 
+def interrupt_on_termination() -> None:
+    """Let SIGTERM do what Ctrl-C does, so that a verb that writes files leaves no part of one."""
+
+    def interrupt(*_: object) -> None:
+        if signal.getsignal(signal.SIGINT) in (signal.SIG_IGN, signal.SIG_DFL):
+            raise KeyboardInterrupt
+        signal.raise_signal(signal.SIGINT)
+
+    signal.signal(signal.SIGTERM, interrupt)
+
+
 def _is_default(handler: object) -> bool:
     """Return whether Python or asyncio installed the handler, rather than the program or a parent that ignores it."""
     if handler in (signal.default_int_handler, signal.SIG_DFL):

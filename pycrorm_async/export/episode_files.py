@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
@@ -18,6 +17,7 @@ from pycrorm_async.export.recorded_episode import read_episode
 from pycrorm_async.export.rerun_file import write_rerun
 from pycrorm_async.export.scene_frames import scene_objects
 from pycrorm_async.export.selection import CoveredEpisode
+from pycrorm_async.export.writing_thread import in_thread
 from pycrorm_async.query.reading import Reading
 
 if TYPE_CHECKING:
@@ -59,15 +59,15 @@ async def write_lerobot(
     dataset = LeRobotFolder(folder, fps=options.fps)
     for each in episodes:
         episode = await read_episode(reading, each)
-        frames = await asyncio.to_thread(frames_of, episode, options.clock, options.fps)
+        frames = await in_thread(frames_of, episode, options.clock, options.fps)
         pictures = None
         if options.images is not None:
             pictures = np.stack(await draw_frames(reading, episode, frames, options.images))
-        await asyncio.to_thread(dataset.add, episode, frames, pictures)
+        await in_thread(dataset.add, episode, frames, pictures)
         done += each.events
         if progress is not None:
             progress(done, total)
-    await asyncio.to_thread(dataset.finish)
+    await in_thread(dataset.finish)
     return dataset.frames
 
 
@@ -84,5 +84,5 @@ async def write_scene(
     episode = await read_episode(reading, episodes[0])
     objects = await scene_objects(reading, episode)
     if file_format == "rrd":
-        return await asyncio.to_thread(write_rerun, episode, objects, path)
-    return await asyncio.to_thread(lambda: write_mcap(episode, objects, path, clock=options.clock, fps=options.fps))
+        return await in_thread(write_rerun, episode, objects, path)
+    return await in_thread(lambda: write_mcap(episode, objects, path, clock=options.clock, fps=options.fps))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import msgspec
 
+from pycrorm_async.export.writing_thread import in_thread
 from pycrorm_async.query.frames.arrow_batches import needed_pyarrow
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ async def write_rows(
             if schema is None:
                 schema = batch.schema
                 write = stack.enter_context(_WRITERS[file_format](path, schema, json_columns))
-            await asyncio.to_thread(write, batch)
+            await in_thread(write, batch)
             rows += batch.num_rows
             report_rows(rows)
     return rows, schema

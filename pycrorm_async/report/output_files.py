@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
+import fcntl
+import glob
 import os
 import shutil
 import tempfile
+import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from pycrorm_async.errors import CallerError
 
 __all__ = ["new_file", "new_folder", "refuse_existing", "write_file"]
+
+_SUFFIX = ".part"
+_LOCKED_AFTER_S = 60.0
+"""Bounds the time between the creation of a part and its lock, which a stopped machine can delay."""
 
 
 def refuse_existing(path: Path, *, force: bool, folder: bool = False) -> None:
@@ -41,8 +48,9 @@ def new_file(path: Path, *, force: bool) -> Iterator[Path]:
     `OSError` where the disk is full.
     """
     refuse_existing(path, force=force)
-    descriptor, name = tempfile.mkstemp(dir=path.absolute().parent, prefix=f".{path.name[:100]}.", suffix=".part")
-    os.close(descriptor)
+    _delete_parts(path)
+    descriptor, name = tempfile.mkstemp(dir=path.absolute().parent, prefix=_prefix(path), suffix=_SUFFIX)
+    fcntl.flock(descriptor, fcntl.LOCK_EX)
     written = Path(name)
     try:
         yield written
@@ -57,6 +65,7 @@ def new_file(path: Path, *, force: bool) -> Iterator[Path]:
         raise CallerError(f"{path} exists: add --force to replace it, or give another name") from None
     finally:
         written.unlink(missing_ok=True)
+        os.close(descriptor)
 
 
 @contextmanager
@@ -68,7 +77,10 @@ def new_folder(path: Path, *, force: bool, marker: str) -> Iterator[Path]:
     refuse_existing(path, force=force, folder=True)
     if path.exists() and not (path / marker).is_file():
         raise CallerError(f"{path} exists and is not such a data set ({marker} is not in it): give another name")
-    written = Path(tempfile.mkdtemp(dir=path.absolute().parent, prefix=f".{path.name[:100]}.", suffix=".part"))
+    _delete_parts(path)
+    written = Path(tempfile.mkdtemp(dir=path.absolute().parent, prefix=_prefix(path), suffix=_SUFFIX))
+    descriptor = os.open(written, os.O_RDONLY)
+    fcntl.flock(descriptor, fcntl.LOCK_EX)
     replaced = written.with_suffix(".replaced")
     try:
         yield written
@@ -87,6 +99,24 @@ def new_folder(path: Path, *, force: bool, marker: str) -> Iterator[Path]:
     finally:
         shutil.rmtree(written, ignore_errors=True)
         shutil.rmtree(replaced, ignore_errors=True)
+        os.close(descriptor)
+
+
+def _prefix(path: Path) -> str:
+    return f".{path.name[:100]}."
+
+
+def _delete_parts(path: Path) -> None:
+    """Delete what killed processes left of files of this name. A process locks its own part while it writes."""
+    for each in path.absolute().parent.glob(f"{glob.escape(_prefix(path))}????????{_SUFFIX}"):
+        with suppress(OSError):  # another process, or another user's
+            descriptor = os.open(each, os.O_RDONLY)
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                if time.time() - each.stat().st_mtime > _LOCKED_AFTER_S:
+                    shutil.rmtree(each) if each.is_dir() else each.unlink()
+            finally:
+                os.close(descriptor)
 
 
 def _sync(path: Path) -> None:

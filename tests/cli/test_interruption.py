@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
+import os
 import signal
 import sqlite3
 import subprocess
@@ -12,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+from pycrorm_async.cli.interruption import interrupt_on_termination
 from tests.commands import answer, pycrorm
 
 LOADING = """
@@ -117,3 +120,26 @@ def test_an_interrupt_during_output_comes_after_the_last_line(tmp_path: Path) ->
     )
     line = "pycrorm: interrupted; events not stored yet are safe in the spool, and the next start stores them\n"
     assert (done.returncode, done.stderr) == (130, line)
+
+
+def test_a_verb_that_writes_files_treats_sigterm_as_ctrl_c() -> None:
+    before = signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT)
+    cleaned: list[int] = []
+
+    async def write() -> None:
+        try:
+            os.kill(os.getpid(), signal.SIGTERM)
+            await asyncio.sleep(20)
+        finally:
+            cleaned.append(1)
+
+    try:
+        for handler in (signal.default_int_handler, signal.SIG_IGN):
+            signal.signal(signal.SIGINT, handler)
+            interrupt_on_termination()
+            with pytest.raises(KeyboardInterrupt):
+                asyncio.run(write())
+    finally:
+        signal.signal(signal.SIGTERM, before[0])
+        signal.signal(signal.SIGINT, before[1])
+    assert cleaned == [1, 1]

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
 import csv
+import fcntl
 import json
+import os
 import sys
-from collections.abc import AsyncIterator
+import threading
+from collections.abc import AsyncIterator, Iterator
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -19,6 +24,7 @@ from sqlalchemy.orm import aliased
 
 from pycrorm_async import Memory, Reading
 from pycrorm_async.errors import CallerError, MissingExtra, UnknownEpisode
+from pycrorm_async.export import row_files
 from pycrorm_async.export.export import export, export_again
 from pycrorm_async.export.manifest import read_manifest
 from pycrorm_async.orm import PickUpWithContextView, RootFailure, TaskTreeNode
@@ -201,6 +207,55 @@ async def test_a_full_disk_leaves_no_file(reading: Reading, tmp_path: Path) -> N
         with files_of_at_most(DISK_BYTES), pytest.raises(OSError, match="File too large"):
             await export(reading, LARGE, tmp_path / name)
     assert list(tmp_path.iterdir()) == []
+
+
+async def test_a_cancelled_export_closes_its_file_after_the_last_write(
+    reading: Reading, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    steps: list[str] = []
+    begun, goes_on = asyncio.Event(), threading.Event()
+    loop = asyncio.get_running_loop()
+
+    @contextmanager
+    def slow_writer(*_: object) -> Iterator[Any]:
+        def write(_batch: object) -> None:
+            loop.call_soon_threadsafe(begun.set)
+            goes_on.wait(20)
+            steps.append("written")
+
+        try:
+            yield write
+        finally:
+            steps.append("closed")
+
+    monkeypatch.setitem(row_files._WRITERS, "csv", slow_writer)
+    task = asyncio.create_task(export(reading, "1", tmp_path / "a.csv"))
+    await begun.wait()
+    for _ in range(3):  # as a user who presses Ctrl-C again
+        task.cancel()
+        await asyncio.sleep(0.01)
+    goes_on.set()
+    with pytest.raises(asyncio.CancelledError):
+        await task
+    assert steps == ["written", "closed"]
+    assert list(tmp_path.iterdir()) == []
+
+
+async def test_parts_of_killed_exports_are_deleted_and_those_of_running_ones_kept(
+    either: Reading, tmp_path: Path
+) -> None:
+    dead, running, new, other = (
+        tmp_path / name
+        for name in (".a.csv.deadbeef.part", ".a.csv.lockedxx.part", ".a.csv.newwwwww.part", ".b.csv.deadbeef.part")
+    )
+    for each in (dead, running, new, other):
+        each.write_text("a part")
+        if each != new:
+            os.utime(each, (1_000_000_000, 1_000_000_000))
+    with running.open() as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        await export(either, "2", tmp_path / "a.csv")
+    assert sorted(tmp_path.glob(".*")) == [running, new, other]
 
 
 async def test_a_file_is_replaced_only_when_asked(reading: Reading, tmp_path: Path) -> None:
