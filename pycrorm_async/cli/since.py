@@ -24,11 +24,11 @@ def parse_since(text: str, now: datetime | None = None) -> datetime:
 
     Raises `CallerError` for another text.
     """
-    if age := _AGE.fullmatch(text.strip()):
-        return (now or datetime.now(UTC)) - int(age[1]) * _UNITS[age[2]]
     try:
+        if age := _AGE.fullmatch(text.strip()):
+            return (now or datetime.now(UTC)) - int(age[1]) * _UNITS[age[2]]
         moment = datetime.fromisoformat(text.strip())
-    except ValueError:
+    except (ValueError, OverflowError):
         raise CallerError(
             f"{text!r} is no time: write 2026-11-23, '2026-11-23 14:30' (UTC), 2026-11-23T14:30+01:00,"
             " or an age such as 90min, 12h, 7d, 2w"

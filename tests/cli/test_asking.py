@@ -178,7 +178,7 @@ def test_episodes_are_chosen_by_status_text_start_and_number(folder: Path) -> No
     assert "is no time" in one_line_of(pycrorm("episodes", "--since", "monday", cwd=folder))
 
 
-@pytest.mark.parametrize("text", ["", "7", "7 years", "2026-13-01", "9999999d"])
+@pytest.mark.parametrize("text", ["", "7", "7 years", "2026-13-01", "9999999d", "999999w"])
 def test_an_impossible_start_is_refused(text: str) -> None:
     with pytest.raises(CallerError, match="is no time"):
         parse_since(text)

@@ -13,14 +13,15 @@ from typing import Any
 import pytest
 
 from pycrorm_async.errors import CallerError, UnknownEpisode
-from pycrorm_async.events.types import EpisodeEnded, EpisodeStarted, ObjectMoved
+from pycrorm_async.events.types import EpisodeEnded, EpisodeStarted, NodeEnded, NodeStarted, ObjectMoved
+from pycrorm_async.events.values import FailureValue, RobotValue
 from pycrorm_async.memory import Memory
 from pycrorm_async.query.asking.ask import QUESTIONS
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.enums import Arms, Grasp
 from tests.databases import ask_each, run_in_own_loop
-from tests.projections.event_script import T0_NS
+from tests.projections.event_script import PICK_UP, T0_NS, Script, declarations, declared, field, name_of, pose
 from tests.projections.factories import append_and_fold
 from tests.query.random_memory import (
     NAMES,
@@ -396,6 +397,22 @@ async def test_wrong_names_and_values_are_answered_with_the_right_ones(reading: 
         ask.steps_before_failures(steps=1_000)
     with pytest.raises(CallerError, match="x must be a number of metres, got 'left'"):
         ask.experience_at("left", 0)  # type: ignore[arg-type]
+    with pytest.raises(CallerError, match="x must be a number of metres, got 1000"):
+        ask.experience_at(10**400, 0)
+    for name, value in (("arm", 3), ("object", b"milk"), ("text", ["a"]), ("reason", 1.5), ("message", True)):
+        with pytest.raises(CallerError, match=f"{name} must be a text, got"):
+            ask.root_failures(**{name: value})  # type: ignore[arg-type]
+    for text in ("a\0b", "\ud800"):
+        with pytest.raises(CallerError, match=r"tag has U\+0000 or half of a surrogate pair"):
+            ask.episodes(tag=text)
+        with pytest.raises(CallerError, match=r"name has U\+0000"):
+            ask.object_history(text)
+    with pytest.raises(CallerError, match="dtype must be a text"):
+        ask.durations(dtype=int)  # type: ignore[arg-type]
+    with pytest.raises(CallerError, match="recovered must be True or False, got 'yes'"):
+        ask.root_failures(recovered="yes")  # type: ignore[arg-type]
+    with pytest.raises(CallerError, match="since must be a datetime with a time zone, got 'today'"):
+        ask.episodes(since="today")  # type: ignore[arg-type]
     with pytest.raises(CallerError, match="radius_m must be > 0"):
         ask.experience_at(0, 0, radius_m=0)
     with pytest.raises(CallerError, match="kind must be"):
@@ -442,3 +459,24 @@ def test_a_memory_without_asyncio_answers_with_frames_and_rows(tmp_path: Path) -
     with pytest.raises(CallerError, match="not open"):
         memory.ask.durations()
     assert list(itertools.islice(QUESTIONS, 2)) == ["root_failures", "failures_by_cause"]
+
+
+# --- arms that are not names ----------------------------------------------------------------------------------
+
+
+async def test_an_arm_that_is_a_number_or_a_list_is_text_on_both_databases(database_url: str) -> None:
+    numbered = declared("NumberedArm", "numbered_arm", field("arm", "integer", 2))
+    listed = declared("ListedArm", "listed_arm", field("arm", "list", 2, item="text"))
+    script = Script(1)
+    script.put(EpisodeStarted("", "me", "host", "1", "3.11"))
+    for type_, arm in ((numbered, 3), (listed, ["LEFT", "RIGHT"]), (PICK_UP, "LEFT")):
+        robot = RobotValue(pose(), "ROBOT", None)
+        node = script.put(NodeStarted("action", None, name_of(type_), {"arm": arm}, robot))
+        script.put(NodeEnded(node, "FAILED", FailureValue("ValueError", "")))
+    script.put(EpisodeEnded("FAILED"))
+    await append_and_fold(database_url, [*declarations(numbered, listed, PICK_UP), *script.records])
+    async with Reading.open(database_url) as reading:
+        assert (await reading.ask.root_failures()).arm.tolist() == ["3", '["LEFT","RIGHT"]', "LEFT"]
+        assert sorted((await reading.ask.arms_used()).arm) == ["3", "LEFT", '["LEFT","RIGHT"]']
+        assert sorted((await reading.ask.experience_at(0, 0)).arm) == ["3", "LEFT", '["LEFT","RIGHT"]']
+        assert [each.dtype for each in await reading.ask.root_failures(arm="3").rows()] == ["NumberedArm"]

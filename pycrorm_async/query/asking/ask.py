@@ -9,7 +9,9 @@ from typing import TYPE_CHECKING, Any, Generic, Literal, NoReturn, TypeVar
 
 from sqlalchemy import Select
 
+from pycrorm_async.errors import CallerError
 from pycrorm_async.query.asking import actions, episode_list, failures, object_courses
+from pycrorm_async.query.asking.columns import check_texts
 from pycrorm_async.query.asking.question import AskedEpisode, QuestionPlan
 from pycrorm_async.query.suggestions import nearest
 from pycrorm_async.task_status import TaskStatus
@@ -18,6 +20,8 @@ from pycrorm_async.world.enums import Arms, Grasp, ObjectType
 __all__ = ["Ask", "QUESTIONS"]
 
 Q = TypeVar("Q")
+_TEXTS = frozenset(("arm", "dtype", "kind", "message", "name", "object", "object_", "reason", "robot", "text"))
+"""The arguments that are texts; others are checked where they are used."""
 
 
 class Ask(Generic[Q]):
@@ -162,6 +166,7 @@ class Ask(Generic[Q]):
         self, x: float, y: float, *, radius_m: float = 0.5, dtype: str | None = None, limit: int | None = None
     ) -> Q:
         """Sum up the actions that a robot started within `radius_m` of a place: by type and arm, with successes."""
+        check_texts({"dtype": dtype})
         select_of = partial(actions.experience_at, x, y, radius_m, dtype, limit)
         select_of()  # so that a wrong argument is refused at once
         return self._make(QuestionPlan("experience_at", (), select_of))
@@ -170,11 +175,11 @@ class Ask(Generic[Q]):
 
     def object_history(self, name: str, *, episode: AskedEpisode | None = None, limit: int | None = None) -> Q:
         """List all that happened to the object of this name: added, moved, attached, seen, failed with, removed."""
-        return self._ask("object_history", episode, partial(object_courses.object_history, name, limit=limit))
+        return self._ask("object_history", episode, partial(object_courses.object_history, name=name, limit=limit))
 
     def moves_of(self, name: str, *, episode: AskedEpisode | None = None, limit: int | None = None) -> Q:
         """List each move of an object with the node that moved it and the nearest action around that node."""
-        return self._ask("moves_of", episode, partial(object_courses.moves_of, name, limit=limit))
+        return self._ask("moves_of", episode, partial(object_courses.moves_of, name=name, limit=limit))
 
     # --- episodes ---------------------------------------------------------------------------------------------
 
@@ -202,7 +207,11 @@ class Ask(Generic[Q]):
         choice = episode_list.EpisodeChoice(state, since, () if tag is None else (tag,), robot, text, limit)
         return self._make(QuestionPlan("episodes", (), partial(episode_list.episode_list, choice)))
 
-    def _ask(self, name: str, episode: AskedEpisode | None, select_of: Callable[..., Select[*tuple[Any, ...]]]) -> Q:
+    def _ask(self, name: str, episode: AskedEpisode | None, select_of: partial[Select[*tuple[Any, ...]]]) -> Q:
+        check_texts({key: value for key, value in select_of.keywords.items() if key in _TEXTS})
+        recovered = select_of.keywords.get("recovered")
+        if recovered is not None and not isinstance(recovered, bool):
+            raise CallerError(f"recovered must be True or False, got {recovered!r}")
         select_of(episode=None)  # so that a wrong argument is refused at once
         if episode is None:
             return self._make(QuestionPlan(name, (), partial(select_of, episode=None)))

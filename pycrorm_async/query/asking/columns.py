@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import re
+from collections.abc import Mapping
+from contextlib import suppress
 from enum import Enum
 from typing import Any, TypeVar
 
@@ -16,6 +19,7 @@ from pycrorm_async.task_status import TaskStatus
 
 __all__ = [
     "FAILED",
+    "check_texts",
     "checked_count",
     "checked_metres",
     "containing",
@@ -28,6 +32,8 @@ __all__ = [
 
 E = TypeVar("E", bound=Enum)
 _STATEMENT = TypeVar("_STATEMENT", bound=Select[Any])
+
+_CHARACTERS = re.compile("[^\0\ud800-\udfff]*")
 
 FAILED = (TaskStatus.FAILED, TaskStatus.ERROR, TaskStatus.LOST)
 
@@ -43,7 +49,7 @@ class _JsonText(FunctionElement[str]):
 @compiles(_JsonText)
 def _of_sqlite(element: _JsonText, compiler: Any, **options: Any) -> str:
     document, name = (compiler.process(each, **options) for each in element.clauses)
-    return f"json_extract({document}, '$.' || {name})"
+    return f"CAST(json_extract({document}, '$.' || {name}) AS text)"  # a number would stay one
 
 
 @compiles(_JsonText, "postgresql")
@@ -87,9 +93,19 @@ def checked_count(name: str, value: Any, most: int = 2**31) -> int:
 
 def checked_metres(name: str, value: Any) -> float:
     """Return the value. Raises `CallerError` unless it is a finite number."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise CallerError(f"{name} must be a number of metres, got {value!r}")
-    return value
+    if isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < math.inf:
+        with suppress(OverflowError):  # of an int beyond the largest float
+            return float(value)
+    raise CallerError(f"{name} must be a number of metres, got {value!r}")
+
+
+def check_texts(arguments: Mapping[str, Any]) -> None:
+    """Raise `CallerError` for an argument that is neither a text that a memory can hold, nor None."""
+    for name, value in arguments.items():
+        if value is not None and not isinstance(value, str):
+            raise CallerError(f"{name.removesuffix('_')} must be a text, got {value!r}")
+        if value is not None and not _CHARACTERS.fullmatch(value):
+            raise CallerError(f"{name.removesuffix('_')} has U+0000 or half of a surrogate pair, which no memory holds")
 
 
 def member_of(enum: type[E], value: E | str, what: str) -> str:

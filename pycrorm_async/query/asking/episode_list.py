@@ -10,7 +10,7 @@ from sqlalchemy import ColumnElement, Select, exists, or_, select
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.orm import EpisodeRobot, EpisodeTag, ProcessMetaData
-from pycrorm_async.query.asking.columns import containing, limited, member_of
+from pycrorm_async.query.asking.columns import check_texts, containing, limited, member_of
 from pycrorm_async.task_status import TaskStatus
 
 __all__ = ["EpisodeChoice", "episode_list"]
@@ -37,6 +37,11 @@ class EpisodeChoice:
     limit: int | None = None
 
     def __post_init__(self) -> None:
+        check_texts({"status": self.status, "robot": self.robot, "text": self.text})
+        for each in self.tags:
+            check_texts({"tag": each})
+        if self.since is not None and not isinstance(self.since, datetime):
+            raise CallerError(f"since must be a datetime with a time zone, got {self.since!r}")
         if self.since is not None and self.since.tzinfo is None:
             raise CallerError(f"since has no time zone: {self.since.isoformat()}")
         self.conditions()

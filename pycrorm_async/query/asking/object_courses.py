@@ -48,7 +48,7 @@ def _same(table: Any, id_: Any, other: Any) -> ColumnElement[bool]:
     return and_(other.c.id == id_, other.c.process_metadata_id == table.c.process_metadata_id)
 
 
-def object_history(name: str, episode: EpisodeNumber | None, limit: int | None) -> Select[*tuple[Any, ...]]:
+def object_history(episode: EpisodeNumber | None, *, name: str, limit: int | None) -> Select[*tuple[Any, ...]]:
     """Return what happened to the objects of this name, in the order of the events."""
     attached, removed, joints = Attachment.__table__, ObjectRemoval.__table__, JointChange.__table__
     seen, failed, other = Detection.__table__, RootFailure.__table__, _OBJECT.alias("other")
@@ -101,7 +101,7 @@ def object_history(name: str, episode: EpisodeNumber | None, limit: int | None) 
     return limited(statement, limit)
 
 
-def moves_of(name: str, episode: EpisodeNumber | None, limit: int | None) -> Select[*tuple[Any, ...]]:
+def moves_of(episode: EpisodeNumber | None, *, name: str, limit: int | None) -> Select[*tuple[Any, ...]]:
     """Return each move of the objects of this name, the node that moved it, and the nearest action around that."""
     by = _NODE.alias("by")
     moved = select(

@@ -20,7 +20,7 @@ class _Member(FunctionElement[str]):
 @compiles(_Member)
 def _of_text(element: _Member, compiler: Any, **options: Any) -> str:
     document, name = (compiler.process(each, **options) for each in element.clauses)
-    return f"json_extract({document}, {name})"
+    return f"CAST(json_extract({document}, {name}) AS text)"  # a number would stay one
 
 
 @compiles(_Member, "postgresql")

@@ -45,9 +45,10 @@ _FIRST_ID = f"((up.id >> {_NUMBER_BITS}) << {_NUMBER_BITS})"
 _OBJECT_ROW = f"""SELECT name FROM {{object}} AS moved
  WHERE moved.{EPISODE} = {{node}}.{EPISODE} AND moved.id = {_FIRST_ID}"""  # noqa: S608
 
-_ARM_SQLITE = "coalesce(json_extract(up.parameters, '$.arm'), json_extract(up.parameters, '$.gripper'))"
+_ARM_SQLITE = "CAST(coalesce(json_extract(up.parameters, '$.arm'), json_extract(up.parameters, '$.gripper')) AS text)"
 _ARM_POSTGRESQL = "coalesce(CAST(up.parameters AS json) ->> 'arm', CAST(up.parameters AS json) ->> 'gripper')"
-_OBJECT_SQLITE = f"""CASE WHEN json_extract(field.value, '$.object') IS NULL THEN json_extract(field.value, '$.name')
+_OBJECT_SQLITE = f"""CASE WHEN json_extract(field.value, '$.object') IS NULL
+ THEN CAST(json_extract(field.value, '$.name') AS text)
  ELSE ({_OBJECT_ROW} + (json_extract(field.value, '$.row') << {_SLOT_BITS})) END"""
 _OBJECT_POSTGRESQL = f"""CASE WHEN field.value ->> 'object' IS NULL THEN field.value ->> 'name'
  ELSE ({_OBJECT_ROW} + (CAST(field.value ->> 'row' AS bigint) << {_SLOT_BITS})) END"""
