@@ -33,6 +33,9 @@ _AGE_S_MIN: Final = 1e-3
 """The youngest age in s that counts, so that a use at this very moment does not outweigh all others."""
 
 
+_NO_NODES: Final = np.zeros(0, np.int64)
+
+
 class Forgotten(NamedTuple):
     """The cases whose ways have an activation below a threshold.
 
@@ -61,60 +64,78 @@ def activation(ages_s: NDArray[np.float64]) -> float:
 
 def activation_by_node(library: CaseLibrary, now_us: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Return all nodes, ascending, and the activation of the way of each."""
-    parts = [_of_type(name, library, now_us) for name in library.types]
-    nodes = np.concatenate([each for each, _, _ in parts] or [np.zeros(0, np.int64)])
-    values = np.concatenate([each for _, each, _ in parts] or [np.zeros(0)])
+    ways = [_ways_of(name, library, now_us) for name in library.types]
+    nodes = np.concatenate([each.nodes for each in ways] or [_NO_NODES])
+    values = np.concatenate([np.repeat(each.activations, each.sizes) for each in ways] or [np.zeros(0)])
     order = np.argsort(nodes)
     return nodes[order], values[order]
 
 
 def forgotten(library: CaseLibrary, *, threshold: float, now_us: int) -> Forgotten:
     """Return the cases whose ways have an activation below the threshold. Nothing is deleted."""
-    nodes, ways = [], 0
+    nodes, count = [], 0
     for name in library.types:
-        of_type, values, way = _of_type(name, library, now_us)
-        below = values < threshold
-        nodes.append(of_type[below])
-        ways += int(np.unique(way[below]).size)
-    hidden = np.sort(np.concatenate(nodes or [np.zeros(0, np.int64)]))
-    return Forgotten(int(hidden.size), ways, hidden)
+        ways = _ways_of(name, library, now_us)
+        below = ways.activations < threshold
+        nodes.append(ways.nodes[np.repeat(below, ways.sizes)])
+        count += int(below.sum())
+    hidden = np.sort(np.concatenate(nodes or [_NO_NODES]))
+    return Forgotten(int(hidden.size), count, hidden)
 
 
-def _of_type(
-    name: str, library: CaseLibrary, now_us: int
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.int64]]:
-    """Return the nodes of a type, the activation of the way of each, and the number of that way."""
+class _Ways(NamedTuple):
+    """The ways of one type.
+
+    Attributes:
+        nodes: the cases of the first way, of the second and so on.
+        sizes: the number of the cases of each way.
+        activations: of each way.
+    """
+
+    nodes: NDArray[np.int64]
+    sizes: NDArray[np.int64]
+    activations: NDArray[np.float64]
+
+
+def _ways_of(name: str, library: CaseLibrary, now_us: int) -> _Ways:
     groups = library.groups(name)
     started_us = np.concatenate([each.started_us for each in groups])
-    newest_first = np.argsort(-started_us, kind="stable")
-    nodes = np.concatenate([each.nodes for each in groups])[newest_first]
-    ways = _ways(groups, library.left_out)[newest_first]
-    ages: NDArray[np.float64] = np.maximum((now_us - started_us[newest_first]) / 1e6, _AGE_S_MIN)
+    nodes = np.concatenate([each.nodes for each in groups])
+    ways = _numbers_of_ways(groups, library)
+    if (np.diff(started_us) > 0).any():  # cases of one block started between those of another
+        newest_first = np.argsort(-started_us, kind="stable")
+        started_us, nodes, ways = started_us[newest_first], nodes[newest_first], ways[newest_first]
     by_way = np.argsort(ways, kind="stable")
-    ages_by_way = ages[by_way]
-    firsts: NDArray[np.int64] = np.flatnonzero(np.r_[True, np.diff(ways[by_way]) != 0])
-    sizes = np.diff(np.r_[firsts, ways.size])
-    places = np.arange(ways.size) - np.repeat(firsts, sizes)
-    totals = np.add.reduceat(np.where(places < _EXACT, ages_by_way**-_DECAY, 0.0), firsts)
+    ways = ways[by_way]
+    firsts = np.flatnonzero(np.r_[True, ways[1:] != ways[:-1]])
+    sizes = np.diff(firsts, append=ways.size)
+    ages: NDArray[np.float64] = np.maximum((now_us - started_us[by_way]) / 1e6, _AGE_S_MIN)
+    totals = np.zeros(firsts.size)
+    for use in range(_EXACT):
+        having = sizes > use
+        totals[having] += ages[firsts[having] + use] ** -_DECAY
     long = sizes > _EXACT
-    third, oldest = ages_by_way[(firsts + _EXACT - 1)[long]], ages_by_way[(firsts + sizes - 1)[long]]
+    third, oldest = ages[firsts[long] + _EXACT - 1], ages[firsts[long] + sizes[long] - 1]
     totals[long] += _spread_evenly_all(sizes[long] - _EXACT, third, oldest)
-    return nodes, np.log(totals)[ways], ways
+    return _Ways(nodes[by_way], sizes, np.log(totals))
 
 
-def _ways(groups: Sequence[Group], left_out: frozenset[str]) -> NDArray[np.int64]:
-    """Return the number of the way of each case, 0, 1, 2 and so on."""
+def _numbers_of_ways(groups: Sequence[Group], library: CaseLibrary) -> NDArray[np.int64]:
+    """Return a number for each case, the same for all cases of a way."""
     sizes = [*map(len, groups)]
     ways, count = np.zeros(sum(sizes), np.int64), 1
-    for name in sorted({name for group in groups for name in group.texts} - {*OUTCOME, "simulated"} - left_out):
-        column = joined_words([group.texts.get(name) for group in groups], sizes)
+    names = {name for group in groups for name in group.texts}
+    for name in sorted(names - {*OUTCOME, "simulated"} - library.left_out):
+        column = joined_words([group.texts.get(name) for group in groups], sizes, library.words(name))
         if not isinstance(column, Symbols):
             continue
-        if count > _NUMBERS_MAX // (len(column.words) + 1):
+        different = len(column.words) + 1
+        if count > _NUMBERS_MAX // different:
             ways, count = _renumbered(ways)
-        ways = ways * (len(column.words) + 1) + column.codes
-        count *= len(column.words) + 1
-    return _renumbered(ways)[0]
+        ways *= different
+        ways += column.codes
+        count *= different
+    return ways
 
 
 def _renumbered(ways: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:

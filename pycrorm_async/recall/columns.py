@@ -6,7 +6,7 @@ column; code 0 means that a case does not have the feature, code i the word i - 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from itertools import chain
 from typing import Any, TypeAlias
@@ -16,7 +16,17 @@ from numpy.typing import NDArray
 
 from pycrorm_async.recall.case import SINGLE_MAX, SYMBOLS_MAX, TEXT_MAX
 
-__all__ = ["Mask", "Numbers", "Sets", "Symbols", "Words", "joined_numbers", "joined_words", "smallest_codes"]
+__all__ = [
+    "Mask",
+    "Numbers",
+    "Sets",
+    "Symbols",
+    "Words",
+    "joined",
+    "joined_numbers",
+    "joined_words",
+    "smallest_codes",
+]
 
 Mask: TypeAlias = NDArray[np.bool_]
 Codes: TypeAlias = "NDArray[np.unsignedinteger[Any]]"
@@ -35,6 +45,18 @@ class Words(tuple[str, ...]):
     def code(self, word: str) -> int:
         """Return the code of a word; 0 if no case has it."""
         return self.codes.get(word, 0)
+
+    def codes_in(self, other: Words) -> Codes:
+        """Return, for each code of this dictionary, that of its word in another one, which contains all of them.
+
+        The last result is kept, because the columns of many groups share two dictionaries.
+        """
+        kept: tuple[Words, Codes] | None = self.__dict__.get("_codes_in")
+        if kept is None or kept[0] is not other:
+            codes = other.codes
+            kept = other, smallest_codes([0, *(codes[word] for word in self)], len(other))
+            self.__dict__["_codes_in"] = kept
+        return kept[1]
 
 
 class Symbols:
@@ -86,7 +108,7 @@ class Symbols:
 
     def recoded(self, words: Words) -> Symbols:
         """Return the column with a dictionary that contains its own."""
-        return self if words is self.words else Symbols(words, _translation(self.words, words)[self.codes])
+        return self if words is self.words else Symbols(words, self.words.codes_in(words)[self.codes])
 
 
 class Sets:
@@ -162,7 +184,7 @@ class Sets:
 
     def recoded(self, words: Words) -> Sets:
         """Return the column with a dictionary that contains its own."""
-        return self if words is self.words else Sets(words, self.sizes, _translation(self.words, words)[self.codes])
+        return self if words is self.words else Sets(words, self.sizes, self.words.codes_in(words)[self.codes])
 
 
 class Numbers:
@@ -204,9 +226,15 @@ class Numbers:
         return Numbers(self.values[rows])
 
 
-def joined_words(columns: Sequence[Symbols | Sets | None], sizes: Sequence[int]) -> Symbols | Sets:
-    """Put columns of one feature below each other; where there is none, that many cases do not have the feature."""
-    words = _joined([column.words for column in columns if column is not None])
+def joined_words(
+    columns: Sequence[Symbols | Sets | None], sizes: Sequence[int], words: Words | None = None
+) -> Symbols | Sets:
+    """Put columns of one feature below each other; where there is none, that many cases do not have the feature.
+
+    `words` is a dictionary that contains those of all columns; by default it is made.
+    """
+    if words is None:
+        words = joined([column.words for column in columns if column is not None])
     parts = list(zip(columns, sizes, strict=True))
     if any(isinstance(column, Sets) for column in columns):
         sets = [_as_sets(column, size).recoded(words) for column, size in parts]
@@ -234,11 +262,12 @@ def smallest_codes(codes: Any, largest: int) -> Codes:
     return smallest
 
 
-def _joined(dictionaries: Sequence[Words]) -> Words:
-    first = dictionaries[0] if dictionaries else Words()
-    if all(each is first for each in dictionaries):
-        return first
-    return Words(sorted({*chain.from_iterable(dictionaries)}))
+def joined(dictionaries: Iterable[Words]) -> Words:
+    """Return one dictionary with the words of all."""
+    different = {id(each): each for each in dictionaries}
+    if len(different) == 1:
+        return next(iter(different.values()))
+    return Words(sorted({*chain.from_iterable(different.values())}))
 
 
 def _bounded_set(value: str | tuple[str, ...] | None) -> tuple[str, ...]:
@@ -254,8 +283,3 @@ def _as_sets(column: Symbols | Sets | None, count: int) -> Sets:
             return Sets(words, (codes > 0).astype(np.uint8), codes[codes > 0])
         case Sets():
             return column
-
-
-def _translation(old: Words, new: Words) -> Codes:
-    codes = new.codes
-    return smallest_codes([0, *(codes[word] for word in old)], len(new))

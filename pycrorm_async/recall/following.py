@@ -8,16 +8,16 @@ from __future__ import annotations
 
 from collections import Counter
 from enum import Enum
-from functools import cached_property
 from typing import Final, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pycrorm_async.events.ids import SEQUENCE_MAX, row_id
 from pycrorm_async.recall.answer import Rate, rate_of
 from pycrorm_async.recall.blocks import EPISODE_SHIFT, Group
 from pycrorm_async.recall.case import Case
-from pycrorm_async.recall.columns import Mask, Symbols, joined_words
+from pycrorm_async.recall.columns import Mask, joined_words
 from pycrorm_async.recall.library import CaseLibrary
 
 __all__ = ["Follower", "Following", "Relation", "Sequences", "relation"]
@@ -109,13 +109,30 @@ class Sequences:
         self._rows = np.concatenate([np.arange(size, dtype=np.int64) for size in sizes] or [_NONE])
         nodes = np.concatenate([group.nodes for group in self._groups] or [_NONE])
         parents = np.concatenate([group.parents.astype(np.int64) for group in self._groups] or [_NONE])
-        keys = (nodes >> EPISODE_SHIFT) * (SEQUENCE_MAX + 1) + parents
-        self._by_node = np.argsort(nodes)
+        self._by_node = np.argsort(nodes, kind="stable")
         self._nodes = nodes[self._by_node]
-        self._by_parent = np.lexsort((nodes, keys))
+        keys = (self._nodes >> EPISODE_SHIFT) * (SEQUENCE_MAX + 1) + parents[self._by_node]
+        by_key = np.argsort(keys, kind="stable")
+        self._by_parent = self._by_node[by_key]
+        self._keys = keys[by_key]
         self._places = np.empty_like(self._by_parent)
         self._places[self._by_parent] = np.arange(nodes.size)
-        self._keys = keys[self._by_parent]
+        self._types = tuple(library.types)
+        self._statuses = library.words("status")
+        self._next = self._outcomes_of_next()
+
+    def _outcomes_of_next(self) -> NDArray[np.int64]:
+        """Return, for each case, a number for type and status of the action that came next; -1 where none did."""
+        outcomes = np.empty_like(self._places)
+        width = len(self._statuses) + 1
+        codes = {name: code for code, name in enumerate(self._types)}
+        for group, first in zip(self._groups, self._firsts, strict=True):
+            statuses = joined_words([group.texts.get("status")], [len(group)], self._statuses)
+            outcomes[first : first + len(group)] = codes[group.type] * width + statuses.codes.astype(np.int64)
+        following = np.full_like(self._places, -1)
+        is_next = np.flatnonzero(self._keys[1:] == self._keys[:-1])
+        following[self._by_parent[is_next]] = outcomes[self._by_parent[is_next + 1]]
+        return following
 
     def case(self, node: int) -> Case | None:
         """Return the case of a node; None if it has none, because it is no action or still runs."""
@@ -148,38 +165,29 @@ class Sequences:
             dtype: of the cases to ask about.
             status, reason: likewise; by default any.
         """
-        rows = [
-            first + np.flatnonzero(_chosen(group, status, reason))
-            for group, first in zip(self._groups, self._firsts, strict=True)
-            if group.type == dtype
-        ]
-        places = self._places[np.concatenate(rows or [_NONE])]
-        if not places.size:
+        outcomes = np.concatenate(
+            [
+                self._next[first : first + len(group)][_chosen(group, status, reason)]
+                for group, first in zip(self._groups, self._firsts, strict=True)
+                if group.type == dtype
+            ]
+            or [_NONE]
+        )
+        if not outcomes.size:
             return Following(0, ())
-        after = np.minimum(places + 1, self._keys.size - 1)
-        is_next = (self._keys[after] == self._keys[places]) & (after > places)
-        following = self._by_parent[after[is_next]]
-        types, statuses = sorted({group.type for group in self._groups}), self._statuses
-        of_group = np.array([types.index(group.type) for group in self._groups])
-        width = len(statuses.words) + 1
-        outcomes = of_group[self._group_numbers[following]] * width + statuses.codes[following]
         counts: dict[str, Counter[str]] = {}
-        for outcome, count in zip(*(each.tolist() for each in np.unique(outcomes, return_counts=True)), strict=True):
-            counts.setdefault(types[outcome // width], Counter())[statuses.words[outcome % width - 1]] = count
+        last, *numbers = np.bincount(outcomes + 1, minlength=1).tolist()
+        width = len(self._statuses) + 1
+        for outcome, count in enumerate(numbers):
+            if count:
+                counts.setdefault(self._types[outcome // width], Counter())[self._statuses[outcome % width - 1]] = count
         followers = [
-            Follower(name, each.total(), each.total() / places.size, rate_of(each)) for name, each in counts.items()
+            Follower(name, each.total(), each.total() / outcomes.size, rate_of(each)) for name, each in counts.items()
         ]
-        last = places.size - following.size
         if last:
-            followers.append(Follower(None, last, last / places.size, None))
+            followers.append(Follower(None, last, last / outcomes.size, None))
         order = sorted(followers, key=lambda each: (-each.cases, each.type or ""))
-        return Following(int(places.size), tuple(order))
-
-    @cached_property
-    def _statuses(self) -> Symbols:
-        joined = joined_words([group.texts.get("status") for group in self._groups], [*map(len, self._groups)])
-        assert isinstance(joined, Symbols)
-        return joined
+        return Following(int(outcomes.size), tuple(order))
 
     def _sibling(self, case: Case, step: int) -> Case | None:
         index = self._index(case.node)

@@ -13,7 +13,7 @@ import numpy as np
 
 from pycrorm_async.recall.blocks import WORDS_MAX, Block, Group
 from pycrorm_async.recall.case import RESERVED, Case, is_angle
-from pycrorm_async.recall.columns import Words
+from pycrorm_async.recall.columns import Words, joined
 
 __all__ = ["ANGLE_TOLERANCE", "CaseLibrary"]
 
@@ -31,6 +31,7 @@ class CaseLibrary:
         self.blocks = tuple(blocks)
         self._spreads: dict[tuple[str | None, str], float] = {}
         self._groups: dict[str | None, tuple[Group, ...]] = {}
+        self._words: dict[str, Words] = {}
 
     def __len__(self) -> int:
         """Return the number of cases."""
@@ -62,6 +63,14 @@ class CaseLibrary:
             groups = tuple(sorted(chosen, key=lambda each: (-int(each.started_us[0]), -int(each.nodes[0]))))
             self._groups[type] = groups
         return groups
+
+    def words(self, feature: str) -> Words:
+        """Return one dictionary of a text feature, for the cases of all types."""
+        words = self._words.get(feature)
+        if words is None:
+            columns = (block.texts[feature].column for block in self.blocks if feature in block.texts)
+            words = self._words[feature] = joined(column.words for column in columns)
+        return words
 
     def size(self, type: str | None = None) -> int:  # noqa: A002
         """Return the number of cases of a type."""
