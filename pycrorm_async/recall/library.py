@@ -32,6 +32,8 @@ class CaseLibrary:
         self._spreads: dict[tuple[str | None, str], float] = {}
         self._groups: dict[str | None, tuple[Group, ...]] = {}
         self._words: dict[str, Words] = {}
+        self._texts: dict[str | None, frozenset[str]] = {}
+        self._numbers: dict[str | None, frozenset[str]] = {}
 
     def __len__(self) -> int:
         """Return the number of cases."""
@@ -91,12 +93,18 @@ class CaseLibrary:
 
     def texts(self, type: str | None = None) -> frozenset[str]:  # noqa: A002
         """Return the names of the text features of a type, those of the outcome among them."""
-        names = chain.from_iterable(group.texts for group in self.groups(type))
-        return frozenset(names) - (RESERVED - {"status", "reason"}) - self.left_out
+        names = self._texts.get(type)
+        if names is None:
+            every = frozenset(chain.from_iterable(group.texts for group in self.groups(type)))
+            names = self._texts[type] = every - (RESERVED - {"status", "reason"}) - self.left_out
+        return names
 
     def numbers(self, type: str | None = None) -> frozenset[str]:  # noqa: A002
         """Return the names of the numbers of a type, the duration among them."""
-        return frozenset(chain.from_iterable(group.numbers for group in self.groups(type)))
+        names = self._numbers.get(type)
+        if names is None:
+            names = self._numbers[type] = frozenset(chain.from_iterable(group.numbers for group in self.groups(type)))
+        return names
 
     def tolerance(self, type: str | None, feature: str) -> float:  # noqa: A002
         """Return the tolerance of a number for which the cue has none: its standard deviation, to two digits.

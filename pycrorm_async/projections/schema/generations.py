@@ -29,7 +29,7 @@ from functools import lru_cache
 from typing import Any, Literal, TypeAlias
 
 import msgspec
-from sqlalchemy import Dialect, Integer, LargeBinary, Text, column, delete, literal, select, table, text
+from sqlalchemy import Dialect, Integer, LargeBinary, Select, Text, column, delete, literal, select, table, text
 from sqlalchemy.ext.asyncio import AsyncConnection
 from sqlalchemy.schema import CreateColumn, CreateIndex, CreateTable, ExecutableDDLElement, Index
 
@@ -132,6 +132,11 @@ async def read_generation(connection: AsyncConnection, name: str, *, hold: Hold 
         query = query.with_for_update(read=hold == "share")
     row = (await connection.execute(query)).first()
     return None if row is None else _generation(row)
+
+
+def select_generation(name: str) -> Select[tuple[int, int]]:
+    """Return the query of number and version of the generation under this key, for a query of its tables as well."""
+    return select(_notes.c.generation, _notes.c.version).where(_notes.c.projection == name)
 
 
 async def read_generations(connection: AsyncConnection) -> dict[str, Generation]:

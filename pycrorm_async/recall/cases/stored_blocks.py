@@ -19,13 +19,14 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Collection, Iterable, Mapping
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
-from sqlalchemy import TableClause, column, delete, func, select, table
+from sqlalchemy import Select, TableClause, column, delete, func, select, table, true
 from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.errors import DamageError, DatabaseForeign
 from pycrorm_async.projections.schema.core_columns import OWN
+from pycrorm_async.projections.schema.generations import select_generation
 from pycrorm_async.projections.table_names import physical_name
 from pycrorm_async.recall.block_rows import BlockRow, decode, encode
 from pycrorm_async.recall.blocks import Block, merge
@@ -43,6 +44,7 @@ __all__ = [
     "read_headings",
     "read_left_out",
     "rows_of",
+    "select_numbers",
 ]
 
 BLOCKS: Final = "recall_block"
@@ -112,6 +114,16 @@ async def read_headings(connection: AsyncConnection, generation: int) -> list[Bl
     blocks = _blocks(generation)
     columns = blocks.c.id, blocks.c.level, blocks.c.cases, blocks.c.episode_min, blocks.c.episode_max
     return [BlockHeading(*row) for row in await connection.execute(select(*columns).order_by(blocks.c.id))]
+
+
+def select_numbers(name: str, generation: int) -> Select[Any]:
+    """Return the query of number and version of the generation under this key, and of the blocks of another one.
+
+    The result has a row for each block, and at least one. Where the first number is that of `generation`, the tables
+    were not replaced.
+    """
+    blocks = _blocks(generation)
+    return select_generation(name).outerjoin(blocks, true()).add_columns(blocks.c.id)
 
 
 async def read_blocks(connection: AsyncConnection, generation: int, numbers: Collection[int]) -> dict[int, Block]:

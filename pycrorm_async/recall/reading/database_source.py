@@ -1,17 +1,25 @@
-"""Read the stored blocks of a memory."""
+"""Read the stored blocks of a memory, and with one statement see that none has changed."""
 
 from __future__ import annotations
 
 from collections.abc import Collection
+from contextlib import suppress
+from typing import Any, Final
 
-from pycrorm_async.errors import DatabaseUnavailable, TablesOutdated
+from sqlalchemy import Select
+
+from pycrorm_async.errors import DatabaseUnavailable, PycrormError, TablesOutdated
 from pycrorm_async.projections.schema.generations import PROJECTION, read_generation
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.recall.cases.case_projection import CaseProjection
-from pycrorm_async.recall.cases.stored_blocks import read_blocks, read_headings
+from pycrorm_async.recall.cases.stored_blocks import read_blocks, read_headings, select_numbers
 from pycrorm_async.recall.reading.case_reader import StoredBlocks
+from pycrorm_async.store.log import EventLog
 
 __all__ = ["DatabaseSource"]
+
+
+_KEY: Final = f"{PROJECTION}{CaseProjection.name}"
 
 
 class DatabaseSource:
@@ -19,6 +27,7 @@ class DatabaseSource:
 
     def __init__(self, reading: Reading) -> None:
         self._reading = reading
+        self._numbers: tuple[int, Select[Any]] | None = None
 
     async def read(self, generation: int, known: Collection[int]) -> StoredBlocks:
         """Return the blocks in one snapshot.
@@ -27,8 +36,10 @@ class DatabaseSource:
         `DamageError` for a block whose bytes were changed.
         """
         log = await self._reading.log()
+        if await self._is_unchanged(log, generation, known):
+            return StoredBlocks(generation, frozenset(known), {})
         async with log.snapshot() as connection:
-            tables = await read_generation(connection, f"{PROJECTION}{CaseProjection.name}")
+            tables = await read_generation(connection, _KEY)
             if tables is None:
                 raise DatabaseUnavailable(
                     f"{log.address} has no cases to recall yet (with Settings(recall=False) none are made): run"
@@ -43,3 +54,16 @@ class DatabaseSource:
             wanted = numbers.difference(known if tables.number == generation else ())
             added = await read_blocks(connection, tables.number, sorted(wanted)) if wanted else {}
         return StoredBlocks(tables.number, numbers, added)
+
+    async def _is_unchanged(self, log: EventLog, generation: int, known: Collection[int]) -> bool:
+        """Return whether the blocks of this generation are those that are known; False also where it was dropped."""
+        if not known:
+            return False
+        if self._numbers is None or self._numbers[0] != generation:
+            self._numbers = generation, select_numbers(_KEY, generation)
+        with suppress(PycrormError):  # where a rebuild has dropped the table; another fault is met again
+            async with log.reading() as connection:
+                rows = (await connection.execute(self._numbers[1])).all()
+            generations = {(number, version) for number, version, _ in rows}
+            return generations == {(generation, CaseProjection.version)} and {block for _, _, block in rows} == {*known}
+        return False
