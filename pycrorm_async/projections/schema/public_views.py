@@ -42,7 +42,7 @@ from pycrorm_async.projections.schema.layout import Layout
 from pycrorm_async.projections.schema.tables import column_type, columns_in_order, leaf_columns, make_table
 from pycrorm_async.projections.schema.views.concept_views import CONCEPT_VIEWS
 from pycrorm_async.projections.schema.views.pick_up_view import pick_ups_with_context
-from pycrorm_async.projections.schema.views.portable_expressions import Absent, member
+from pycrorm_async.projections.schema.views.portable_expressions import absent, member
 from pycrorm_async.projections.schema.views.root_failure_view import root_failures
 from pycrorm_async.projections.schema.views.spatial_relation_view import SpatialTables, spatial_relations
 from pycrorm_async.projections.schema.views.world_line import world_line
@@ -180,7 +180,7 @@ def _happened(rows: Table, simulations: Table) -> ColumnElement[bool]:
     """Return the condition that a row does not belong to a simulation."""
     if "simulated" in rows.c:
         return ~rows.c.simulated
-    return Absent(rows.c[EPISODE], simulations.c.id)
+    return absent(rows.c[EPISODE], simulations.c.id)
 
 
 def _process_metadata(tables: Tables) -> Select[Any]:

@@ -9,11 +9,10 @@ from contextlib import suppress
 from enum import Enum
 from typing import Any, TypeVar
 
-from sqlalchemy import ColumnElement, Double, Integer, Select, Text, case, cast, func, literal_column, or_
-from sqlalchemy.ext.compiler import compiles
-from sqlalchemy.sql.functions import FunctionElement
+from sqlalchemy import ColumnElement, Double, Integer, Select, Text, case, cast, func, or_
 
 from pycrorm_async.errors import CallerError
+from pycrorm_async.projections.schema.views.portable_expressions import member
 from pycrorm_async.query.suggestions import nearest
 from pycrorm_async.task_status import TaskStatus
 
@@ -38,30 +37,9 @@ _CHARACTERS = re.compile("[^\0\ud800-\udfff]*")
 FAILED = (TaskStatus.FAILED, TaskStatus.ERROR, TaskStatus.LOST)
 
 
-class _JsonText(FunctionElement[str]):
-    """A member of a JSON document as text; NULL if the document has none."""
-
-    name = "json_text"
-    type = Text()
-    inherit_cache = True
-
-
-@compiles(_JsonText)
-def _of_sqlite(element: _JsonText, compiler: Any, **options: Any) -> str:
-    document, name = (compiler.process(each, **options) for each in element.clauses)
-    return f"CAST(json_extract({document}, '$.' || {name}) AS text)"  # a number would stay one
-
-
-@compiles(_JsonText, "postgresql")
-def _of_postgresql(element: _JsonText, compiler: Any, **options: Any) -> str:
-    document, name = (compiler.process(each, **options) for each in element.clauses)
-    return f"(CAST({document} AS json) ->> {name})"
-
-
 def json_text(document: Any, name: str) -> ColumnElement[str]:
-    """Return the member of this name of a column of JSON, as text."""
-    assert name.isidentifier(), name
-    return _JsonText(document, literal_column(f"'{name}'"))
+    """Return the member of this name of a column of JSON, as text; of a number SQLite alone would return the number."""
+    return cast(member(document, name), Text)
 
 
 def times_with(condition: Any) -> ColumnElement[int]:

@@ -9,12 +9,12 @@ join.
 from __future__ import annotations
 
 from types import SimpleNamespace
-from typing import Any, Self
+from typing import Any
 
 from sqlalchemy import ColumnElement, FromClause, and_, func
-from sqlalchemy.ext.compiler import compiles
 
 from pycrorm_async.projections.schema.core_columns import EPISODE
+from pycrorm_async.projections.schema.views.portable_expressions import PerDatabase
 
 
 def same_episode(one: FromClause, other: FromClause, condition: ColumnElement[bool]) -> ColumnElement[bool]:
@@ -27,29 +27,12 @@ def present(row: FromClause) -> ColumnElement[bool]:
     return func.coalesce(row.c.id, 0) > 0
 
 
-class _Number(ColumnElement[float]):
-    """A number of an outer join's row that is `present`. On PostgreSQL a filter on it does not make an inner join."""
-
-    inherit_cache = False
-
-    def __init__(self, value: ColumnElement[float]) -> None:
-        self.type = value.type
-        self.value = value
-
-    def self_group(self, against: Any = None) -> Self:  # noqa: ARG002  SQLAlchemy's signature
-        return self
-
-
-@compiles(_Number)
-def _itself(element: _Number, compiler: Any, **options: Any) -> str:
-    return str(compiler.process(element.value, **options))
-
-
-@compiles(_Number, "postgresql")
-def _coalesced(element: _Number, compiler: Any, **options: Any) -> str:
-    return str(compiler.process(func.coalesce(element.value, 0.0), **options))
-
-
 def numbers(row: FromClause, names: str) -> Any:
-    """Return columns of an outer join's row that is `present`, as attributes."""
-    return SimpleNamespace(**{name: _Number(row.c[name]) for name in names.split()})
+    """Return columns of an outer join's row that is `present`, as attributes.
+
+    On PostgreSQL a filter on one of them does not make the join an inner join.
+    """
+    columns = {name: row.c[name] for name in names.split()}
+    return SimpleNamespace(
+        **{name: PerDatabase(each, postgresql=func.coalesce(each, 0.0)) for name, each in columns.items()}
+    )

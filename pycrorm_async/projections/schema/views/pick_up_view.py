@@ -10,44 +10,26 @@ Poses and objects are joined as outer joins (see `joins`).
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any, Self
+from typing import Any
 
-from sqlalchemy import Boolean, ColumnElement, FromClause, ScalarSelect, Select, Table, func, select
-from sqlalchemy.ext.compiler import compiles
+from sqlalchemy import Boolean, ColumnElement, FromClause, ScalarSelect, Select, Table, func, literal_column, select
 
 from pycrorm_async.projections.schema.views.joins import numbers, present, same_episode
+from pycrorm_async.projections.schema.views.portable_expressions import PerDatabase
 from pycrorm_async.projections.schema.views.world_line import world_line
 
 _POSE = "x y z qx qy qz qw"
 
 
-class _PlannerHint(ColumnElement[bool]):
-    """A condition that always holds, rendered for PostgreSQL only: the dtypes of the nodes that have such a row.
+def _planner_hint(fact: ColumnElement[bool]) -> ColumnElement[bool]:
+    """Return a condition that always holds, rendered for PostgreSQL only: the dtypes of the nodes with such a row.
 
     Without it PostgreSQL read all succeeded nodes, ten times as many, to find the succeeded pick-ups; with it, it uses
     the index on the dtype (50,000 pick-ups in a good half of the time). It then underestimates the pick-ups by a factor
     of ten, so a query for the latest of them must state its order (`Dialect.in_order`). SQLite starts with the rows of
     the type anyway.
     """
-
-    inherit_cache = False
-    type = Boolean()
-
-    def __init__(self, fact: ColumnElement[bool]) -> None:
-        self.fact = fact
-
-    def self_group(self, against: Any = None) -> Self:  # noqa: ARG002  SQLAlchemy's signature
-        return self
-
-
-@compiles(_PlannerHint)
-def _nothing(_element: _PlannerHint, _compiler: Any, **_options: Any) -> str:
-    return "1"
-
-
-@compiles(_PlannerHint, "postgresql")
-def _fact(element: _PlannerHint, compiler: Any, **options: Any) -> str:
-    return str(compiler.process(element.fact, **options))
+    return PerDatabase(literal_column("1", Boolean()), postgresql=fact)
 
 
 def pick_ups_with_context(
@@ -98,7 +80,7 @@ def pick_ups_with_context(
         .outerjoin(robot, same_episode(robot, node, robot.c.id == node.c.robot_pose_id))
         .outerjoin(object_, same_episode(object_, picked, object_.c.id == picked.c.object_designator_id))
         .outerjoin(place, same_episode(place, object_, place.c.id == object_.c.pose_id))
-        .where(_PlannerHint(node.c.dtype.in_(dtypes)), present(robot), present(place))
+        .where(_planner_hint(node.c.dtype.in_(dtypes)), present(robot), present(place))
     )
 
 

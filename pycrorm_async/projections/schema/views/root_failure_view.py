@@ -9,13 +9,13 @@ in the leaf tables would need one subquery for every type of a memory.
 
 from __future__ import annotations
 
-from typing import Any, Self
+from typing import Any
 
-from sqlalchemy import Boolean, ColumnElement, Select, Table, Text, exists, literal_column, select
-from sqlalchemy.ext.compiler import compiles
+from sqlalchemy import Boolean, Select, Table, Text, exists, literal_column, select
 
 from pycrorm_async.events.ids import SEQUENCE_MAX, SLOT_MAX
 from pycrorm_async.projections.schema.core_columns import EPISODE
+from pycrorm_async.projections.schema.views.portable_expressions import sql_of
 from pycrorm_async.task_status import TaskStatus
 
 _FAILED = (TaskStatus.FAILED.name, TaskStatus.ERROR.name)
@@ -61,30 +61,6 @@ _FIELDS_POSTGRESQL = """, json_each(CAST(up.parameters AS json)) AS field WHERE
  OR (field.value ->> 'dtype' IS NOT NULL AND field.value ->> 'name' IS NOT NULL))"""
 
 
-class _Sql(ColumnElement[Any]):
-    """An expression given as SQL for each database."""
-
-    inherit_cache = False
-
-    def __init__(self, type_: Any, sqlite: str, postgresql: str | None = None) -> None:
-        self.type = type_
-        self.sqlite = sqlite
-        self.postgresql = postgresql or sqlite
-
-    def self_group(self, against: Any = None) -> Self:  # noqa: ARG002  SQLAlchemy's signature
-        return self
-
-
-@compiles(_Sql)
-def _of_sqlite(element: _Sql, _compiler: Any, **_options: Any) -> str:
-    return element.sqlite
-
-
-@compiles(_Sql, "postgresql")
-def _of_postgresql(element: _Sql, _compiler: Any, **_options: Any) -> str:
-    return element.postgresql
-
-
 def root_failures(nodes: Table, objects: Table) -> Select[*tuple[Any, ...]]:
     """Return the view's query."""
     child = nodes.alias("child")
@@ -105,12 +81,12 @@ def root_failures(nodes: Table, objects: Table) -> Select[*tuple[Any, ...]]:
     def nearest(value: str, condition: str, above: str) -> str:
         return f"({sql(_STARTED, above, value=sql(value))} {condition} {_NEAREST})"
 
-    object_ = _Sql(
+    object_ = sql_of(
         Text(),
         nearest(_OBJECT_SQLITE, _FIELDS_SQLITE, _ABOVE_SQLITE),
         nearest(_OBJECT_POSTGRESQL, _FIELDS_POSTGRESQL, _ABOVE_POSTGRESQL),
     )
-    arm = _Sql(
+    arm = sql_of(
         Text(),
         nearest(_ARM_SQLITE, f"WHERE {_ARM_SQLITE} IS NOT NULL", _ABOVE_SQLITE),
         nearest(_ARM_POSTGRESQL, f"WHERE {_ARM_POSTGRESQL} IS NOT NULL", _ABOVE_POSTGRESQL),
@@ -120,12 +96,12 @@ def root_failures(nodes: Table, objects: Table) -> Select[*tuple[Any, ...]]:
         nodes.c.process_metadata_id,
         nodes.c.dtype,
         nodes.c.status,
-        _Sql(Text(), *climbing(_PATH)).label("path"),
+        sql_of(Text(), *climbing(_PATH)).label("path"),
         object_.label("object"),
         arm.label("arm"),
         nodes.c.reason,
         nodes.c.failure_message.label("message"),
-        _Sql(Boolean(), *climbing(_RECOVERED)).label("recovered"),
+        sql_of(Boolean(), *climbing(_RECOVERED)).label("recovered"),
         nodes.c.start_time,
         nodes.c.end_time,
     ).where(nodes.c.status.in_(_FAILED), ~failed_child)
