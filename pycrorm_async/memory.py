@@ -13,36 +13,28 @@ from __future__ import annotations
 import asyncio
 import logging
 import os
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, AsyncExitStack, asynccontextmanager, suppress
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, AsyncExitStack, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from types import MappingProxyType, TracebackType
+from types import TracebackType
 from typing import Any, Self
 
 from pycrorm_async import __version__
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
-from pycrorm_async.connected_var import set_inside
 from pycrorm_async.errors import CallerError, EpisodeParked, PycrormError, TablesForeign
 from pycrorm_async.events.codec import declaration_of
 from pycrorm_async.events.ids import episode_id
-from pycrorm_async.events.tags import checked_tags
-from pycrorm_async.hooks.episode import Episode
 from pycrorm_async.hooks.observations import Observations
-from pycrorm_async.hooks.plan_recorder import Recorder, current_episode
-from pycrorm_async.memory_parts import Parts
-from pycrorm_async.memory_reading import ObservingMemory, ReadableMemory
-from pycrorm_async.memory_status import MemoryStatus
+from pycrorm_async.hooks.plan_recorder import Recorder
+from pycrorm_async.memory_parts import MemoryStatus, Parts
+from pycrorm_async.memory_recording import RecordingMemory
 from pycrorm_async.operations.destination import expected_log, open_destination
 from pycrorm_async.operations.recovery import dead_queues
-from pycrorm_async.operations.tag import tag_episode
-from pycrorm_async.plan.execution.unawaited_performs import called_performs
 from pycrorm_async.projections.custom.discovery import validate_projections
 from pycrorm_async.projections.custom.projection import Projection
 from pycrorm_async.projections.schema.user_views import UserView
-from pycrorm_async.query.as_of import AnyEpisode
-from pycrorm_async.query.named_queries import EpisodeSummary
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.queue.files.locks import call_in_forked_child
 from pycrorm_async.queue.files.spool import Spool
@@ -50,7 +42,6 @@ from pycrorm_async.queue.live.delegated_writer import DelegatedWriter
 from pycrorm_async.queue.live.recorder_queue import RecorderQueue
 from pycrorm_async.recall.experience import PickUpExperience
 from pycrorm_async.recording.recording import Recording
-from pycrorm_async.recording.values.episode_arguments import read_labels
 from pycrorm_async.recording.writing.emitter import Emitter
 from pycrorm_async.recording.writing.open_episodes import OpenEpisodes
 from pycrorm_async.recording.writing.provenance import PlanSource, Provenance
@@ -65,7 +56,7 @@ __all__ = ["Memory", "MemoryStatus"]
 _log = logging.getLogger("pycrorm_async")
 
 
-class Memory(ReadableMemory, ObservingMemory):
+class Memory(RecordingMemory):
     """The memory of one process in one database. Use `Memory.open` as an async context manager.
 
     While it is open, it records every plan performed in its context: in the open episode, or in one of the plan's own.
@@ -282,118 +273,8 @@ class Memory(ReadableMemory, ObservingMemory):
             if unreported is not None:
                 _log.error("when closing the memory: %s", unreported)
 
-    def _unreported(self, fault: PycrormError) -> PycrormError | None:
-        """Return the fault without parked episodes that a flush has reported; None if no other is left."""
-        if not isinstance(fault, EpisodeParked):
-            return fault
-        reasons = {episode: reason for episode, reason in fault.reasons.items() if episode not in self._reported}
-        self._reported.update(reasons)
-        return EpisodeParked(reasons) if reasons else None
-
     def _forked(self) -> None:
         """Disconnect a forked child: the memory belongs to its parent, and plans of the child are not recorded."""
         if self._parts is not None:
             self._parts.emitter.is_closed = self._parts.experience.is_closed = True
             self._parts = None
-
-    # --- recording --------------------------------------------------------------------------------------------
-
-    @asynccontextmanager
-    async def episode(
-        self,
-        *,
-        description: str | None = None,
-        plan: str | None = None,
-        seed: int | None = None,
-        tags: Sequence[str] = (),
-        metadata: Mapping[str, Any] = MappingProxyType({}),
-    ) -> AsyncIterator[Episode]:
-        """Record an episode: plans performed inside, and the world that was entered before or is entered inside.
-
-        If the spool is full, waits for space or raises `SpoolFull`, according to `Settings.on_full`.
-
-        Args:
-            description: the purpose; default: the plan's name.
-            plan: the plan's name.
-            seed: of the plan's random numbers, 64 bits, so that it can be repeated.
-            tags: short texts to find the episode by; `tag` changes them later.
-            metadata: JSON values of your own, at most 64 KiB.
-
-        Raises:
-            EpisodeRefused: an episode is open in this task already. A child task may open its own.
-            CallerError: for an argument of the wrong type, and a tag that is not a text of 1 to 100 characters.
-        """
-        parts = self._open_parts
-        recorder = parts.recorder
-        if (room := recorder.admit()) is not None:
-            await room
-        labels = read_labels(tags, metadata, parts.emitter)
-        text = description or plan or "an episode"
-        episode = recorder.open_episode(description=text, plan=plan, seed=seed, labels=labels)
-        failure: BaseException | None = None
-        with (
-            parts.in_context(),
-            set_inside(current_episode, episode),
-            set_inside(called_performs, episode.calls),
-        ):
-            try:
-                yield episode
-            except BaseException as raised:
-                failure = raised
-                raise
-            finally:
-                recorder.close_episode(episode, failure)
-
-    async def tag(self, episode: AnyEpisode, *tags: str, remove: Sequence[str] = ()) -> None:
-        """Add and remove tags of an episode of this database: a number, id, `last`, or object.
-
-        Tags of an episode that is open in this memory are recorded in it; those of one that has ended are written
-        directly to the log, after a flush.
-
-        Raises `CallerError` for an episode that another process still records, and for a removed tag that the episode
-        does not have; `UnknownEpisode`; `DatabaseUnavailable`, also if this login may not append.
-        """
-        parts = self._open_parts
-        added, removed = checked_tags(tags), checked_tags(remove)
-        name = str(episode.id if isinstance(episode, EpisodeSummary) else episode)
-        for each in parts.recorder.episodes.all:
-            if str(each) == name:
-                each.change_tags(added, removed)
-                return
-        await self.flush()
-        await tag_episode(self._located, name, added, removed, clock=self._clock)
-
-    async def synced(self) -> None:
-        """Wait until all events recorded so far survive a power loss.
-
-        Raises `SpoolUnavailable` if the disk fails, or if files of the spool were deleted or replaced. Recording then
-        continues in a new folder if one can be created, and `status` lists the lost records.
-        """
-        await self._open_parts.queue.synced_to(self._open_parts.queue.written)
-
-    async def flush(self) -> None:
-        """Wait until all events recorded so far are stored and visible in the tables.
-
-        Raises:
-            EpisodeParked: an episode could not be stored or folded, with the reason; each episode is reported once.
-            FlushTimeout: nothing was stored or folded for `flush_timeout_s`. The events are safe in the spool.
-        """
-        parts = self._open_parts
-        try:
-            await parts.flush()
-        except EpisodeParked as fault:
-            unreported = self._unreported(fault)
-            if unreported is not None:
-                raise unreported from fault
-        if parts.reading.is_open:
-            await parts.reading.refresh()
-
-    @property
-    def status(self) -> MemoryStatus:
-        """The present state of the memory."""
-        return MemoryStatus.of(self._open_parts, self._unadopted)
-
-    @property
-    def is_open(self) -> bool:
-        """True while the memory is open."""
-        return self._parts is not None

@@ -1,8 +1,8 @@
-"""`ReadableMemory` holds the queries of an open memory, `ObservingMemory` its observations and subscriptions."""
+"""`ReadableMemory` holds the queries of an open memory."""
 
 from __future__ import annotations
 
-from collections.abc import AsyncGenerator, Callable, Mapping, Sequence
+from collections.abc import AsyncGenerator, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager
 from datetime import datetime
 from os import PathLike
@@ -16,7 +16,6 @@ from pycrorm_async.errors import CallerError
 from pycrorm_async.events.blobs import Blob
 from pycrorm_async.hooks.episode import Episode
 from pycrorm_async.memory_parts import PartsHolder
-from pycrorm_async.plan.task_tree import TaskTreeNode
 from pycrorm_async.query.as_of import AnyEpisode
 from pycrorm_async.query.asking.ask import Ask
 from pycrorm_async.query.asking.episode_diff import EpisodeDiff
@@ -31,8 +30,6 @@ from pycrorm_async.recall.reading.case_reader import CaseReader
 from pycrorm_async.recall.reading.database_source import DatabaseSource
 from pycrorm_async.recall.reading.recall import Recall
 from pycrorm_async.recall.reading.running_cases import ProcessCases
-from pycrorm_async.recording.recording import Recording
-from pycrorm_async.recording.writing.event_feed import BUFFER_EVENTS, EventStream, RecordedEvent, Subscription
 from pycrorm_async.report.write import Report
 from pycrorm_async.report.write import report as write_report
 
@@ -50,7 +47,7 @@ if TYPE_CHECKING:
     from pycrorm_async.query.success.figure import Kind
     from pycrorm_async.query.success.samples import Source
 
-__all__ = ["ObservingMemory", "ReadableMemory"]
+__all__ = ["ReadableMemory"]
 
 
 class ReadableMemory(PartsHolder):
@@ -298,59 +295,3 @@ class ReadableMemory(PartsHolder):
     async def number_of(self, episode: Episode) -> int:
         """Return the number that this database gave to the episode, after `flush`."""
         return await self._open_parts.reading.number_of(str(episode))
-
-
-class ObservingMemory(PartsHolder):
-    """The observations and subscriptions of a memory. Each method raises `CallerError` while it is not open."""
-
-    @property
-    def recording(self) -> Recording:
-        """Writes episodes of an executive that is not ours, from any thread and without asyncio."""
-        return self._open_parts.recording
-
-    @property
-    def recent_episodes(self) -> tuple[str, ...]:
-        """The ids of the last hundred episodes this memory opened."""
-        return self._open_parts.recorder.episodes.recent
-
-    @property
-    def opened_count(self) -> int:
-        """The number of episodes this memory opened."""
-        return self._open_parts.recorder.episodes.opened_count
-
-    def observe(self, name: str, values: object, *, node: TaskTreeNode | None = None) -> None:
-        """Record an observation of your own in the open episode: a measurement, a message, an image.
-
-        >>> memory.observe("wrist force", {"x": 1.5, "y": -0.25, "contact": True})
-        >>> memory.observe("camera", Blob(png, "image/png"))
-
-        May be called from any thread. A thread outside the plan's context observes for the episode opened last. A value
-        that cannot be recorded, or finds no space in the spool, is recorded as missing and counted; a plan never waits.
-
-        Args:
-            name: by which observations are queried.
-            values: a number, bool, text, array or `Blob`, or a dict or list of these. An array of more than 64 elements
-                is stored as a blob of the media type `application/x-npy`.
-            node: the node that observed it; by default the current one, or the root of the episode.
-
-        Raises `Unrecordable` with `on_unrecordable="refuse"` only.
-        """
-        self._open_parts.observations.observe(name, values, node=node)
-
-    # --- subscribing ------------------------------------------------------------------------------------------
-
-    def subscribe(self, callback: Callable[[RecordedEvent], object], *, buffer: int = BUFFER_EVENTS) -> Subscription:
-        """Call `callback` with each event from now on, in a thread of its own, until closed or the memory is closed.
-
-        Use the result as a context manager, or call its `close()`. The plan never waits: an event that finds more than
-        `buffer` others waiting is left out, and `left_out` counts it. Exceptions of the callback are counted in
-        `failed`, and the first is logged.
-        """
-        return self._open_parts.emitter.feed.subscribe(callback, buffer=buffer)
-
-    def events(self, *, buffer: int = BUFFER_EVENTS) -> EventStream:
-        """Return each event from now on as an asynchronous iterator in this loop, which ends when the memory is closed.
-
-        A plan that never suspends lets no other task of its loop run: observe it from a thread, or after the plan.
-        """
-        return self._open_parts.emitter.feed.stream(buffer=buffer)

@@ -23,7 +23,8 @@ from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar, overload
 from sqlalchemy import Select
 
 from pycrorm_async.errors import CallerError, FlushTimeout
-from pycrorm_async.memory_status import MemoryStatus
+from pycrorm_async.memory_parts import MemoryStatus
+from pycrorm_async.memory_recording import RecordingMemory
 from pycrorm_async.query.as_of import AnyEpisode
 from pycrorm_async.query.asking.ask import Ask
 from pycrorm_async.query.asking.episode_diff import EpisodeDiff
@@ -41,7 +42,6 @@ if TYPE_CHECKING:
 
     from pycrorm_async.export.export import Exported
     from pycrorm_async.export.selection import Exportable
-    from pycrorm_async.memory import Memory
     from pycrorm_async.query.scene.picture import When
 
 __all__ = ["SyncMemory"]
@@ -52,7 +52,7 @@ T = TypeVar("T")
 class SyncMemory:
     """A memory to use with `with`, once; `Memory.sync` makes it. Its methods may be called from any thread."""
 
-    def __init__(self, memory: Memory) -> None:
+    def __init__(self, memory: RecordingMemory) -> None:
         self._memory = memory
         self._thread: threading.Thread | None = None
         self._opened: Future[asyncio.AbstractEventLoop] = Future()
