@@ -65,6 +65,11 @@ def rotated(q: Sequence[float], v: Sequence[float]) -> Vector:
     )
 
 
+def dot(a: Sequence[float], b: Sequence[float]) -> float:
+    """Return the scalar product of two vectors."""
+    return sum(x * y for x, y in zip(a, b, strict=True))
+
+
 def yaw_quaternion(angle: float) -> Quaternion:
     """Return the rotation by `angle` rad about the z axis."""
     return Quaternion(0.0, 0.0, math.sin(angle / 2), math.cos(angle / 2))

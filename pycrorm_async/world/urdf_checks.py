@@ -75,7 +75,7 @@ def _check(robot: Element) -> None:
     _unique("joint", [joint.get("name", "") for joint in joints])
     above: dict[str, str] = {}
     for joint in joints:
-        parent, child = _end(joint, "parent"), _end(joint, "child")
+        parent, child = joined_link(joint, "parent"), joined_link(joint, "child")
         for end in (parent, child):
             if end not in links:
                 raise _Fault(f"joint {joint.get('name')!r} names a link {end!r} that does not exist")
@@ -121,6 +121,7 @@ def _unique(kind: str, names: Iterable[str]) -> None:
             raise _Fault(f"{count} {kind}s are named {each!r}")
 
 
-def _end(joint: Element, end: str) -> str:
+def joined_link(joint: Element, end: str) -> str:
+    """Return the link at an end of a joint, `parent` or `child`; empty if the joint names none."""
     element = joint.find(end)
     return "" if element is None else element.get("link", "")

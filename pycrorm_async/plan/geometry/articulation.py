@@ -7,14 +7,13 @@ Pure geometry in the map, metres and rad; nothing is moved.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from typing import NamedTuple
 
 from pycrorm_async.plan.failures import EnvironmentManipulationImpossible
 from pycrorm_async.plan.object_designators import ObjectLike, ObjectPart, in_world
 from pycrorm_async.world.enums import JointType
 from pycrorm_async.world.objects import Object
-from pycrorm_async.world.pose import Pose, rotated
+from pycrorm_async.world.pose import Pose, dot, rotated
 
 OPENING_MARGIN = 0.05
 """Distance that opening leaves between the joint and its upper limit, m or rad."""
@@ -119,7 +118,7 @@ def hold_pose(handle: Handle) -> Pose:
     from_hinge = [-across / 2 for across in opposite.position]
     for side in (1.0, -1.0):
         turn = Pose(orientation=(side * x, side * y, side * z, 1.0))
-        if _dot(rotated(turn.orientation, (1.0, 0.0, 0.0)), from_hinge) > 0.0:
+        if dot(rotated(turn.orientation, (1.0, 0.0, 0.0)), from_hinge) > 0.0:
             break
     return turn
 
@@ -151,7 +150,3 @@ def _limits(handle: Handle) -> tuple[float, float]:
         message = f"{handle.joint} has no limits, so it has no open and no closed position"
         raise EnvironmentManipulationImpossible(message, handle.link, handle.joint)
     return lower, upper
-
-
-def _dot(a: Sequence[float], b: Sequence[float]) -> float:
-    return sum(x * y for x, y in zip(a, b, strict=True))

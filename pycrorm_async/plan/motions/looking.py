@@ -11,7 +11,7 @@ import math
 from collections.abc import Sequence
 
 from pycrorm_async.plan.current_robot import CurrentRobot
-from pycrorm_async.world.pose import Pose, Vector, rotated
+from pycrorm_async.world.pose import Pose, Vector, dot, rotated
 from pycrorm_async.world.robots.chain_ik import Chain
 from pycrorm_async.world.robots.robot_description import PR2Description
 
@@ -80,13 +80,9 @@ def _turned(robot: CurrentRobot, target: Pose) -> dict[str, float]:
 def _angle_about(axis: Vector, one: Sequence[float], other: Sequence[float]) -> float:
     """Return the angle about the axis from one direction to the other, -π to π."""
     (ax, ay, az), (x, y, z) = axis, one
-    along_one, along_other = _dot(axis, one), _dot(axis, other)
+    along_one, along_other = dot(axis, one), dot(axis, other)
     across = (ay * z - az * y, az * x - ax * z, ax * y - ay * x)
-    return math.atan2(_dot(across, other), _dot(one, other) - along_one * along_other)
-
-
-def _dot(a: Sequence[float], b: Sequence[float]) -> float:
-    return sum(x * y for x, y in zip(a, b, strict=True))
+    return math.atan2(dot(across, other), dot(one, other) - along_one * along_other)
 
 
 def _clamp(value: float, limits: tuple[float, float]) -> float:

@@ -14,6 +14,7 @@ from typing import NamedTuple, TypeAlias
 from xml.etree.ElementTree import Element, fromstring
 
 from pycrorm_async.world.queries.bounding_boxes import BoundingBox
+from pycrorm_async.world.urdf_checks import joined_link
 
 _Vector: TypeAlias = tuple[float, float, float]
 _Matrix: TypeAlias = tuple[_Vector, _Vector, _Vector]
@@ -64,8 +65,8 @@ def link_boxes(urdf: str, boxes: Mapping[str, BoundingBox] | None = None) -> Ite
     links = {link.get("name", ""): link for link in robot.findall("link")}
     joints: dict[str, list[Element]] = {}
     for joint in robot.findall("joint"):
-        joints.setdefault(_name(joint, "parent"), []).append(joint)
-    children = {_name(joint, "child") for each in joints.values() for joint in each}
+        joints.setdefault(joined_link(joint, "parent"), []).append(joint)
+    children = {joined_link(joint, "child") for each in joints.values() for joint in each}
     pending = [(name, _Frame()) for name in links if name not in children]
     for name, frame in pending:
         inside = _shape_corners(links[name]) if boxes is None else _box_corners(boxes.get(name))
@@ -75,7 +76,7 @@ def link_boxes(urdf: str, boxes: Mapping[str, BoundingBox] | None = None) -> Ite
             half = _rounded([(high - low) / 2 for low, high in ranges])
             yield LinkBox(name, center, half, frame.joint, _rounded(frame.axis))
         moving = (joint for joint in joints.get(name, ()) if joint.get("type") in ("fixed", "prismatic"))
-        pending += [(_name(joint, "child"), _child(frame, joint)) for joint in moving]
+        pending += [(joined_link(joint, "child"), _child(frame, joint)) for joint in moving]
 
 
 def _child(frame: _Frame, joint: Element) -> _Frame:
@@ -135,8 +136,3 @@ def _numbers(text: str | None) -> _Vector:
 def _rounded(values: Sequence[float]) -> _Vector:
     x, y, z = (round(each, 6) + 0.0 for each in values)
     return x, y, z
-
-
-def _name(joint: Element, role: str) -> str:
-    element = joint.find(role)
-    return element.get("link", "") if element is not None else ""

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pycrorm_async.world.pose import Quaternion, Vector, product, rotated
+from pycrorm_async.world.pose import Quaternion, Vector, product, rotated, yaw_quaternion
 from pycrorm_async.world.robots.robot_description import Bounds, PR2Arm
 
 Floats = NDArray[np.float64]
@@ -57,7 +57,7 @@ def reach(arm_description: PR2Arm, tool: Vector, turn: Quaternion) -> Reach:
 def hand(arm_description: PR2Arm, angles: Sequence[float]) -> tuple[Vector, Quaternion]:
     """Return the tool frame's position (m from the origin of the pan joint) and rotation at seven joint angles."""
     pan, lift, _, _, forearm_roll, flex, wrist_roll = angles
-    at_pan = _about_z(pan)
+    at_pan = yaw_quaternion(pan)
     at_elbow = _elbow_turn(angles)
     at_wrist = product(at_elbow, product(product(_about_x(forearm_roll), _about_y(flex)), _about_x(wrist_roll)))
     x = y = z = 0.0
@@ -169,7 +169,7 @@ def wrist_angles(upper: Sequence[float], turn: Quaternion) -> tuple[float, float
 
 def _elbow_turn(angles: Sequence[float]) -> Quaternion:
     """Return the rotation of the forearm before its own roll."""
-    upper = product(product(_about_z(angles[PAN]), _about_y(angles[LIFT])), _about_x(angles[ROLL]))
+    upper = product(product(yaw_quaternion(angles[PAN]), _about_y(angles[LIFT])), _about_x(angles[ROLL]))
     return product(upper, _about_y(angles[ELBOW]))
 
 
@@ -196,7 +196,3 @@ def _about_x(angle: float) -> Quaternion:
 
 def _about_y(angle: float) -> Quaternion:
     return Quaternion(0.0, math.sin(angle / 2), 0.0, math.cos(angle / 2))
-
-
-def _about_z(angle: float) -> Quaternion:
-    return Quaternion(0.0, 0.0, math.sin(angle / 2), math.cos(angle / 2))

@@ -15,6 +15,7 @@ from pycrorm_async.errors import CallerError
 from pycrorm_async.world.enums import JointType
 from pycrorm_async.world.pose import Pose, Quaternion, Vector, product, rotated
 from pycrorm_async.world.robots.robot_description import Bounds
+from pycrorm_async.world.urdf_checks import joined_link
 
 _ENDLESS = Bounds(-math.inf, math.inf)
 _MOVABLE = {"revolute": JointType.REVOLUTE, "continuous": JointType.CONTINUOUS, "prismatic": JointType.PRISMATIC}
@@ -48,12 +49,12 @@ def divided(urdf: str, base_link: str, tool_link: str) -> tuple[tuple[Joint, ...
     for link in (base_link, tool_link):
         if link and link not in links:
             raise CallerError(f"the model {robot.get('name')!r} has no link {link!r}: correct the robot's description")
-    above = {_end(each, "child"): each for each in robot.findall("joint")}
+    above = {joined_link(each, "child"): each for each in robot.findall("joint")}
     path: list[Joint] = []
     link = tool_link
     while link in above:
         path.insert(0, _joint(above[link]))
-        link = _end(above[link], "parent")
+        link = joined_link(above[link], "parent")
     passed = [link, *(each.child for each in path)]  # from the root to the tool
     if base_link and base_link not in passed:
         raise CallerError(f"{tool_link!r} does not hang on {base_link!r}: correct the robot's description")
@@ -76,17 +77,12 @@ def _joint(element: Element) -> Joint:
     return Joint(
         element.get("name", ""),
         kind,
-        _end(element, "child"),
+        joined_link(element, "child"),
         Pose(_numbers(at, (0.0, 0.0, 0.0)), turn),
         (roll, pitch, yaw),
         Vector(x / length, y / length, z / length),
         bounds,
     )
-
-
-def _end(joint: Element, end: str) -> str:
-    element = joint.find(end)
-    return "" if element is None else element.get("link", "")
 
 
 def _numbers(text: str | None, default: tuple[float, float, float]) -> tuple[float, float, float]:

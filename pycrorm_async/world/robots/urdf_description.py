@@ -17,7 +17,7 @@ from pycrorm_async.world.enums import Arms, GripperState
 from pycrorm_async.world.pose import Pose
 from pycrorm_async.world.robots.joint_chain import joints_between
 from pycrorm_async.world.robots.robot_description import ArmDescription, RobotDescription, with_payload
-from pycrorm_async.world.urdf_checks import urdf_text
+from pycrorm_async.world.urdf_checks import joined_link, urdf_text
 
 
 def describe_robot(
@@ -134,33 +134,27 @@ def _first_link(name: str, urdf: str, group: Element | None) -> str:
     joint = None if group is None else group.find("joint")
     for each in fromstring(urdf).findall("joint"):  # noqa: S314  the caller's own file
         if joint is not None and each.get("name") == joint.get("name"):
-            parent = each.find("parent")
-            return "" if parent is None else parent.get("link", "")
+            return joined_link(each, "parent")
     raise CallerError(f"the SRDF of {name!r} names an end effector of a group without a chain or a joint of the URDF")
 
 
 def _sliding(robot: Element, last: str) -> Iterator[tuple[str, tuple[float, float]]]:
     """Yield the joints that the joint `last` carries, with their limits, unless one of them is not prismatic."""
-    carried = {_link(each, "child") for each in robot.findall("joint") if each.get("name") == last}
+    carried = {joined_link(each, "child") for each in robot.findall("joint") if each.get("name") == last}
     joints: list[tuple[str, tuple[float, float]]] = []
     added = True
     while added:
         below = [
             each
             for each in robot.findall("joint")
-            if _link(each, "parent") in carried and _link(each, "child") not in carried
+            if joined_link(each, "parent") in carried and joined_link(each, "child") not in carried
         ]
         added = bool(below)
         for each in below:
-            carried.add(_link(each, "child"))
+            carried.add(joined_link(each, "child"))
             limit = each.find("limit")
             if each.get("type") == "prismatic" and limit is not None:
                 joints.append((each.get("name", ""), (float(limit.get("lower", "0")), float(limit.get("upper", "0")))))
             elif each.get("type") != "fixed":
                 return
     yield from joints
-
-
-def _link(joint: Element, end: str) -> str:
-    element = joint.find(end)
-    return "" if element is None else element.get("link", "")
