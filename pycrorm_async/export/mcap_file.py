@@ -8,7 +8,8 @@ sequence is that of the event.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from itertools import groupby
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -16,7 +17,7 @@ from typing import Any, NamedTuple
 from pycrorm_async.errors import MissingExtra
 from pycrorm_async.export.lerobot.states import Clock
 from pycrorm_async.export.recorded_episode import RecordedEpisode, When
-from pycrorm_async.export.scene_frames import SceneObject, Shape, frame_changes
+from pycrorm_async.export.scene_frames import FrameChange, SceneObject, Shape, frame_changes
 
 __all__ = ["write_mcap"]
 
@@ -25,13 +26,21 @@ _TOPICS = {"/tf": "FrameTransforms", "/scene": "SceneUpdate", "/plan": "Log"}
 
 
 class _Message(NamedTuple):
+    """A message of a topic. `content` makes the message from its time stamp, which depends on the clock."""
+
     when: When
     topic: str
-    content: Any
+    content: Callable[[Any], Any]
 
 
 def write_mcap(episode: RecordedEpisode, objects: dict[int, SceneObject], path: Path, *, clock: Clock, fps: int) -> int:
-    """Write the file and return the number of messages. Raises `MissingExtra`."""
+    """Write the file and return the number of messages.
+
+    Args:
+        clock: the axis of the messages: `time`, the wall time of each event, or `event`, `fps` events in a second.
+
+    Raises `MissingExtra`.
+    """
     try:
         from foxglove import messages
         from mcap.writer import Writer
@@ -72,51 +81,43 @@ def _channel(writer: Any, topic: str, kind: Any) -> int:
 
 def _messages(episode: RecordedEpisode, objects: dict[int, SceneObject], kinds: Any) -> Iterator[_Message]:
     for when, changes in groupby(frame_changes(episode, objects), key=lambda each: each.when):
-        moved = list(changes)
-
-        def transforms(stamp: Any, moved: list[Any] = moved) -> Any:
-            return kinds.FrameTransforms(
-                transforms=[
-                    kinds.FrameTransform(
-                        timestamp=stamp,
-                        parent_frame_id=each.parent,
-                        child_frame_id=each.child,
-                        translation=_vector(kinds, each.translation),
-                        rotation=_rotation(kinds, each.rotation),
-                    )
-                    for each in moved
-                ]
-            )
-
-        yield _Message(when, "/tf", transforms)
+        yield _Message(when, "/tf", partial(_transforms, kinds, list(changes)))
     yield from _scene(episode, objects, kinds)
     yield from _plan(episode, kinds)
+
+
+def _transforms(kinds: Any, changes: list[FrameChange], stamp: Any) -> Any:
+    return kinds.FrameTransforms(
+        transforms=[
+            kinds.FrameTransform(
+                timestamp=stamp,
+                parent_frame_id=each.parent,
+                child_frame_id=each.child,
+                translation=_vector(kinds, each.translation),
+                rotation=_rotation(kinds, each.rotation),
+            )
+            for each in changes
+        ]
+    )
 
 
 def _scene(episode: RecordedEpisode, objects: dict[int, SceneObject], kinds: Any) -> Iterator[_Message]:
     seen: set[int] = set()
     for change in episode.changes:
-        scene_object = objects[change.object]
+        shapes = {frame: each for frame, each in objects[change.object].shapes.items() if each}
         if change.removed:
-
-            def deletion(stamp: Any, scene_object: SceneObject = scene_object) -> Any:
-                names = [each for each, shapes in scene_object.shapes.items() if shapes]
-                return kinds.SceneUpdate(
-                    deletions=[kinds.SceneEntityDeletion(timestamp=stamp, id=name) for name in names]
-                )
-
-            yield _Message(change.when, "/scene", deletion)
+            yield _Message(change.when, "/scene", partial(_deletion, kinds, list(shapes)))
         elif change.object not in seen:
             seen.add(change.object)
+            yield _Message(change.when, "/scene", partial(_entities, kinds, shapes))
 
-            def entities(stamp: Any, scene_object: SceneObject = scene_object) -> Any:
-                return kinds.SceneUpdate(
-                    entities=[
-                        _entity(kinds, stamp, frame, shapes) for frame, shapes in scene_object.shapes.items() if shapes
-                    ]
-                )
 
-            yield _Message(change.when, "/scene", entities)
+def _deletion(kinds: Any, names: list[str], stamp: Any) -> Any:
+    return kinds.SceneUpdate(deletions=[kinds.SceneEntityDeletion(timestamp=stamp, id=name) for name in names])
+
+
+def _entities(kinds: Any, shapes: dict[str, list[Shape]], stamp: Any) -> Any:
+    return kinds.SceneUpdate(entities=[_entity(kinds, stamp, frame, each) for frame, each in shapes.items()])
 
 
 def _entity(kinds: Any, stamp: Any, frame: str, shapes: list[Shape]) -> Any:
@@ -148,22 +149,16 @@ def _entity(kinds: Any, stamp: Any, frame: str, shapes: list[Shape]) -> Any:
 
 def _plan(episode: RecordedEpisode, kinds: Any) -> Iterator[_Message]:
     for node in episode.nodes:
-        started = f"{node.dtype} started {node.parameters}".rstrip()
+        line, level = partial(_line, kinds, node.label), kinds.LogLevel.Info
+        yield _Message(node.start, "/plan", partial(line, level, f"{node.dtype} started {node.parameters}".rstrip()))
+        if node.end is not None:
+            level = kinds.LogLevel.Error if node.status in ("FAILED", "ERROR") else level
+            reason = f" {node.reason}: {node.message}" if node.reason else ""
+            yield _Message(node.end, "/plan", partial(line, level, f"{node.dtype} {node.status}{reason}"))
 
-        def log(stamp: Any, level: Any = kinds.LogLevel.Info, text: str = started, name: str = node.label) -> Any:
-            return kinds.Log(timestamp=stamp, level=level, message=text, name=name)
 
-        yield _Message(node.start, "/plan", log)
-        if node.end is None:
-            continue
-        failed = node.status in ("FAILED", "ERROR")
-        level = kinds.LogLevel.Error if failed else kinds.LogLevel.Info
-        text = f"{node.dtype} {node.status}" + (f" {node.reason}: {node.message}" if node.reason else "")
-
-        def ended(stamp: Any, level: Any = level, text: str = text, name: str = node.label) -> Any:
-            return kinds.Log(timestamp=stamp, level=level, message=text, name=name)
-
-        yield _Message(node.end, "/plan", ended)
+def _line(kinds: Any, name: str, level: Any, text: str, stamp: Any) -> Any:
+    return kinds.Log(timestamp=stamp, level=level, message=text, name=name)
 
 
 def _vector(kinds: Any, values: tuple[float, ...]) -> Any:

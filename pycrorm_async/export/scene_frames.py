@@ -52,6 +52,11 @@ class Shape(NamedTuple):
 class SceneObject:
     """An object of the world with its model.
 
+    Args:
+        model: root link, shapes by link, and joints, as `query.scene.object_model.object_model` returns them.
+        base_link: the link whose pose is recorded; None means the root link.
+        color: of all its shapes; None means each shape's own.
+
     Attributes:
         name: of its frame.
         parents: the frame that each of its links' frames is in, by link; that of the root link is in the object's own.
@@ -73,7 +78,10 @@ class SceneObject:
         return self.name if link == self._model["root"] else f"{self.name}/{link}"
 
     def changes(self, change: Change, *, is_first: bool) -> Iterator[FrameChange]:
-        """Yield the frames that a change of this object gives new poses."""
+        """Yield the frames that a change of this object gives new poses, and for its first one those of all links.
+
+        Where the recorded pose is that of another link than the root, a joint between the two also moves the root.
+        """
         self._joints.update(change.joints)
         if change.pose is not None:
             self._pose = Pose(change.pose[:3], change.pose[3:])

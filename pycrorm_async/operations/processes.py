@@ -115,6 +115,7 @@ class ChildProcess(NamedTuple):
         return self.process.exitcode
 
     def kill(self) -> None:
+        """Kill the process unless it has ended."""
         if self.process.is_alive():
             self.process.kill()
 

@@ -1,4 +1,4 @@
-"""The columns of a block: one feature of many cases, as NumPy arrays.
+"""Hold one feature of many cases as a column of a block (`recall.blocks`), in NumPy arrays.
 
 `Symbols` holds at most one word a case, `Sets` several, `Numbers` a float. Words are kept once, in a dictionary of the
 column; code 0 means that a case does not have the feature, code i the word i - 1, and NaN that it has no number.

@@ -37,6 +37,11 @@ class Recording:
     >>> with recording.episode(description="Tutorial") as episode:
     ...     episode.start(id(task), navigate, {"target_location": Pose([1, 0, 0])})
     ...     episode.end(id(task), "FAILED", NavigationGoalNotReached())
+
+    Args:
+        known: the types that this memory has declared so far, shared with the recorder of our own plans.
+        stored: the declarations that the database holds already, also from other processes.
+        software, provenance: recorded with each episode.
     """
 
     def __init__(
@@ -111,14 +116,14 @@ class Recording:
     ) -> DeclaredType:
         if not all(isinstance(each, str) for each in (kind, dtype, *bases, *aliases, concept or "")):
             raise CallerError("the kind, the dtype, the concept, the bases and the aliases of a type must be texts")
-        made = declare_type(kind, dtype, dict(fields), self._known, bases=bases, concept=concept, aliases=aliases)
-        declared, missing = made.type, self._emitter.missing
-        for name, renamed in made.fields.items():
+        recorded = declare_type(kind, dtype, dict(fields), self._known, bases=bases, concept=concept, aliases=aliases)
+        declared, missing = recorded.type, self._emitter.missing
+        for name, renamed in recorded.fields.items():
             missing.note_renamed(declared.dtype, name, *renamed)
         for each in declared.undeclared:
             missing.note(declared.dtype, each.name, each.reason)
-        if made.dtype is not None:
-            missing.note_renamed(declared.dtype, "type", *made.dtype)
+        if recorded.dtype is not None:
+            missing.note_renamed(declared.dtype, "type", *recorded.dtype)
         if declared.fault is not None:
             missing.note(declared.dtype, "type", declared.fault)
         if declared.payload:
@@ -157,8 +162,11 @@ class Recording:
         check_arguments(description=world, plan=None, seed=None, strict=False)
         if thought_by is not None and not _is_whole(thought_by):
             raise CallerError(f"thought_by must be from `node_reference` of an episode, not {thought_by!r:.100}")
-        given: tuple[object, object] = (simulated, seed)
-        if not isinstance(given[0], bool) or isinstance(given[1], bool):
+        unchecked: tuple[object, object] = (
+            simulated,
+            seed,
+        )  # as the caller passed them
+        if not isinstance(unchecked[0], bool) or isinstance(unchecked[1], bool):
             raise CallerError("simulated must be a bool, and seed an int")
         if convert is not None and not callable(convert):
             raise CallerError(f"convert must be a function, not {convert!r:.100}")
@@ -193,9 +201,9 @@ def _is_whole(reference: Any) -> bool:
 
 def _undeclared(kind: object, dtype: object) -> DeclaredType:
     """Return the type of nodes whose type cannot be declared."""
-    known: RecordedKind = "action"
+    valid: RecordedKind = "action"
     if isinstance(kind, str) and kind in get_args(RecordedKind):
-        known = cast("RecordedKind", kind)
+        valid = cast("RecordedKind", kind)
     name = clean_repr(dtype)
     reason = "its type could not be declared"
-    return DeclaredType(name, b"", "", (), DesignatorTypeDeclared(kind=known, dtype=name, table=""), (), reason)
+    return DeclaredType(name, b"", "", (), DesignatorTypeDeclared(kind=valid, dtype=name, table=""), (), reason)

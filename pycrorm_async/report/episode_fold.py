@@ -32,7 +32,7 @@ from pycrorm_async.events.types import (
 from pycrorm_async.projections.fold.column_values import CannotFold
 from pycrorm_async.projections.fold.fold import happening_of
 from pycrorm_async.query.parameter_text import parameters_text
-from pycrorm_async.report.recorded_objects import WorldFold
+from pycrorm_async.report.recorded_objects import ObjectTracks
 from pycrorm_async.report.tracks import Texts, Track, differences, rounded
 from pycrorm_async.store.stored import EpisodeRow, StoredEvent
 
@@ -58,7 +58,7 @@ class EpisodeFold:
 
     def __init__(self, row: EpisodeRow, first: int = 1) -> None:
         self.row = row
-        self.world = WorldFold(first)
+        self.world = ObjectTracks(first)
         self._first = first
         self._texts = Texts()
         self._started: EpisodeStarted | None = None

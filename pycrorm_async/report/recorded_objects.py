@@ -18,8 +18,6 @@ from pycrorm_async.events.types import (
 from pycrorm_async.events.values import PoseValue
 from pycrorm_async.report.tracks import Track, rounded
 
-__all__ = ["WorldFold", "RecordedObject"]
-
 
 @dataclass(slots=True)
 class RecordedObject:
@@ -31,15 +29,18 @@ class RecordedObject:
     removed: int | None = None
 
 
-class WorldFold:
-    """The objects of a world, as far as the events were read.
+class ObjectTracks:
+    """The objects of a world with their tracks, as far as the events were read.
+
+    Args:
+        first: the first event that the page shows; a track has one value for all that came before it.
 
     Attributes:
         objects: by identity, the sequence of their `ObjectAdded`; removed ones too.
         attachments: `[parent, child, link, from, to]`, the objects by identity, `to` 0 while attached.
         samples: by object and channel.
         full_until: the last event before the world was emptied; None while it has objects.
-        numbers: how many numbers the tracks of poses and joints hold.
+        numbers: how many numbers the tracks of poses and joints hold, which bounds the size of the page.
     """
 
     def __init__(self, first: int) -> None:

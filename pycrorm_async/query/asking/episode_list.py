@@ -26,7 +26,7 @@ class EpisodeChoice:
         tags: an episode has all of them.
         robot: name or model of a robot that took part.
         text: a part of the description, the plan's name or a tag.
-        limit: the newest of those that remain, at most this many.
+        limit: of the episodes that meet all conditions, only the newest, this many.
     """
 
     status: str | None = None
@@ -44,6 +44,7 @@ class EpisodeChoice:
             raise CallerError(f"since must be a datetime with a time zone, got {self.since!r}")
         if self.since is not None and self.since.tzinfo is None:
             raise CallerError(f"since has no time zone: {self.since.isoformat()}")
+        # Both are built again for each query; here they raise where the choice is made.
         self.conditions()
         limited(select(), self.limit)
 
@@ -74,6 +75,7 @@ class EpisodeChoice:
 
 
 def episode_list(choice: EpisodeChoice) -> Select[*tuple[Any, ...]]:
+    """Select the chosen episodes with their outcomes, the newest first."""
     episode = ProcessMetaData
     statement = select(
         episode.id.label("episode"),

@@ -1,4 +1,4 @@
-"""Make a case of each action of one episode when it ends, with the situation in which it started.
+"""Make a case (`recall.case`) of each action of one episode when it ends: its situation at the start, its outcome.
 
 >>> cases = EpisodeCases()
 >>> [case for event in events for case in cases.read(event, declarations.get)]
@@ -135,7 +135,7 @@ class EpisodeCases:
         after = self._after
         if scope is not None:
             after = scope.after
-            if scope.has_ended:  # before all that it started has ended
+            if scope.has_ended:  # before this branch of it, so nothing in it came before
                 after = None
             else:
                 symbols["inside"] = scope.type

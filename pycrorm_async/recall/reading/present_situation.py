@@ -33,6 +33,7 @@ def present_situation(target: Object | ObjectDesignator, action: str | type) -> 
     if not isinstance(body, Object) or body not in body.world.objects:
         raise CallerError(f"{target!r} is no object in a world, so nothing can be compared with its situation")
     fields = FeatureFields.of(_declaration(action))
+    # Events refer to objects by the sequence that added them: number the objects as an episode that began now would.
     sequences = {each: number for number, each in enumerate(body.world.objects, 1)}
     parameters: dict[str, Any] = {}
     if fields.objects:

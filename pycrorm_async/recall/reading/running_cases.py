@@ -38,7 +38,13 @@ _EVENTS_MAX: Final = 100_000
 
 @dataclass(slots=True)
 class _Running:
-    """An episode of this process. `number` is the database's, or its own as long as that is not known."""
+    """An episode that this process records.
+
+    Attributes:
+        number: that of the database, or while that is not known one from the end of the numbers.
+        reached: the sequence of the last event that was folded.
+        unnumbered: its cases that `ProcessCases.new` has not returned under the database's number yet.
+    """
 
     id: str
     number: int
@@ -57,6 +63,7 @@ class ProcessCases:
         open_episodes: returns the ids of the open episodes.
         flush: makes all events visible in the tables.
         log: returns the memory's log.
+        clock: gives the times of published events.
     """
 
     def __init__(

@@ -39,9 +39,9 @@ class KnownTypes:
         """Return the reason why this field cannot be a column of the table beside all declared ones; None if it can."""
         columns = self._columns.get(table.lower(), {})
         for name in (field.name.lower(), field.column.lower()):
-            known = columns.get(name, field)
-            if (known.name, type_text(known)) != (field.name, type_text(field)):
-                return f"its type is {type_text(field)}, but the table has {known.name!r} as {type_text(known)}"
+            declared = columns.get(name, field)
+            if (declared.name, type_text(declared)) != (field.name, type_text(field)):
+                return f"its type is {type_text(field)}, but the table has {declared.name!r} as {type_text(declared)}"
         if len(columns) > _COLUMNS_MAX and field.name.lower() not in columns:
             return f"the table has {_COLUMNS_MAX} columns already"
         return None

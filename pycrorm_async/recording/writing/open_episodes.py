@@ -28,6 +28,7 @@ RECENT_MAX = 100
 """Bounds the ids in `recent`, because a process may open any number of episodes."""
 
 AnyWriter = EpisodeWriter[Any]
+"""The writer of an episode, whatever it identifies nodes by."""
 
 
 class OpenEpisodes:
@@ -116,7 +117,7 @@ class OpenEpisodes:
             _log.info("episode %s reached its event limit and continues in episode %s", episode_text(former), episode)
 
     def close(self, episode: AnyWriter, failure: BaseException | None) -> None:
-        """Write the end of an episode that `failure` left, or None. Exceptions are counted, not raised."""
+        """Write the end of an episode; `failure` is the exception that ended it, or None. Exceptions are counted."""
         if self._emitter.is_closed:
             return
         self.by_id.pop(episode.id, None)
