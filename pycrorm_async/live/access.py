@@ -51,12 +51,16 @@ def refusal(path: str, headers: Mapping[str, str], token: str) -> str | None:
         return "this server answers only its own pages"
     if headers.get("sec-fetch-site") in ("cross-site", "same-site") and headers.get("sec-fetch-mode") != "navigate":
         return "this server answers only its own pages"
-    if not hmac.compare_digest(path.split("/", 2)[1].encode(), token.encode()):
+    first, *segments = path.split("/", 2)
+    if first or not segments or not hmac.compare_digest(segments[0].encode(), token.encode()):
         return "the token in the address is wrong: use the address that `pycrorm watch` prints"
     return None
 
 
 def _hostname(host: str) -> str | None:
+    """Return the name in `Host`; None if it has more than a name and a port."""
+    if not host or set(host) & set("@/?#"):
+        return None
     try:
         return urlsplit(f"//{host}").hostname
     except ValueError:

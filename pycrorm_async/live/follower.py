@@ -144,6 +144,7 @@ class LogFollower:
             file = self._identity()
             if self._log is not None and file == self._file:
                 return self._log
+            opened = await EventLog.open(self.address, create=False)  # fails as long as there is none
             if self._log is not None:
                 await self.close()
                 self._feeds.clear()
@@ -151,9 +152,8 @@ class LogFollower:
                 self.began, self._newest = 0, None
                 self.overview = LiveOverview(self.address)
                 self.epoch += 1
-            self._log = await EventLog.open(self.address, create=False)
-            self._file = file
-            return self._log
+            self._log, self._file = opened, file
+            return opened
 
     def _identity(self) -> tuple[int, int] | None:
         """Return device and inode of a SQLite file, by which a file that replaces it differs."""

@@ -12,6 +12,7 @@ a part is its last event, so a browser that lost the connection continues behind
 from __future__ import annotations
 
 import asyncio
+import html
 import socket
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import nullcontext
@@ -45,8 +46,16 @@ _ALIVE_S = 2.0
 """The longest silence of a stream; a page that receives nothing for four times as long has lost the server."""
 _LIST_INTERVAL_S = 0.25
 """The shortest time between two parts of the list, whose text changes with every node of every robot."""
-_STOP_S = 2
+_STOP_S = 1
+"""Bounds the wait for browsers that do not read when the server stops."""
 _DIGITS_END = 16
+_WAITING = """<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><meta http-equiv="refresh" content="2">
+<meta name="color-scheme" content="light dark"><meta name="viewport" content="width=device-width, initial-scale=1">
+<meta http-equiv="Content-Security-Policy" content="default-src 'none'"><title>waiting</title></head>
+<body><h1>Waiting for the database</h1><p>{reason}</p><p>This page loads again every two seconds.</p></body></html>
+"""
+"""The page of an episode that cannot be read at the moment."""
 
 
 def listen(port: int | None) -> socket.socket:
@@ -130,11 +139,14 @@ class LiveServer:
             feed = await self._follower.feed(name, first)
             if feed.fault is not None and feed.last == 0:
                 return PlainTextResponse(feed.fault, 500)
+            if feed.last < first:
+                reason = f"episode {feed.number} has {feed.last} events, and none from event {first}"
+                return PlainTextResponse(reason, 404)
             document = await feed.document(await self._follower.log())
         except UnknownEpisode as error:
             return RedirectResponse(f"/{self._token}/") if name == "last" else PlainTextResponse(str(error), 404)
         except PycrormError as error:
-            return PlainTextResponse(str(error), 503)
+            return HTMLResponse(_WAITING.format(reason=html.escape(str(error))), 503)
         stream = f"/{self._token}/episode/{feed.number}/events?from={first}&id={feed.id}"
         live = {"stream": stream, "list": f"/{self._token}/", "page": f"/{self._token}/episode/"}
         return await _html(page_of, {**document, "live": live})

@@ -106,6 +106,26 @@ def test_a_page_says_that_its_server_died_and_continues_when_it_is_back(
             assert page.ask("pycrormPage.bodies.of(pycrormPage.episode.objects[0]).group.position.x") == 0.5
 
 
+def test_a_page_waits_while_its_database_is_away_and_continues(
+    chrome: Browser, watch: Callable[..., Watch], tmp_path: Path
+) -> None:
+    with robot_in(tmp_path) as robot:
+        robot.start("one")
+    file, away = tmp_path / "pycrorm.db", tmp_path / "away.db"
+    server = watch("--port", "0", "last")
+    with chrome.open(server.address) as page:
+        page.wait_for(f"{WORDS} === '■ ended'")
+        page.ask("globalThis.untouched = true")
+        file.rename(away)
+        page.wait_for(f"{WORDS} === '… waiting'")
+        assert "does not exist" in page.ask("document.getElementById('stream').textContent")
+        status, waiting = server.get()
+        assert (status, "does not exist" in waiting, 'http-equiv="refresh"' in waiting) == (503, True, True)
+        away.rename(file)
+        page.wait_for(f"{WORDS} === '■ ended'")
+        assert page.ask("untouched")
+
+
 def test_a_page_stays_at_a_moment_until_it_is_asked_to_follow(
     chrome: Browser, watch: Callable[..., Watch], tmp_path: Path
 ) -> None:

@@ -40,6 +40,10 @@ HOST = {"host": "127.0.0.1:8137"}
         ("/secret/", HOST | {"origin": "null"}, "only its own pages"),
         ("/secret/", HOST | {"sec-fetch-site": "cross-site", "sec-fetch-mode": "no-cors"}, "only its own pages"),
         ("/secret/", HOST | {"sec-fetch-site": "same-site", "sec-fetch-mode": "cors"}, "only its own pages"),
+        ("/secret/", {"host": "evil@127.0.0.1"}, "answers only under"),
+        ("/secret/", {"host": "127.0.0.1/evil"}, "answers only under"),
+        ("*", HOST, "the token in the address is wrong"),
+        ("", HOST, "the token in the address is wrong"),
         ("/", HOST, "the token in the address is wrong"),
         ("/secre", HOST, "the token in the address is wrong"),
         ("/secrét/", HOST, "the token in the address is wrong"),
@@ -129,6 +133,7 @@ def test_the_server_answers_its_own_pages_and_no_others(watch: Callable[..., Wat
         404,
         "there is no episode '77' (`pycrorm episodes` lists the 1 there are)",
     )
+    assert server.get(f"/{root}/episode/1?from=99") == (404, "episode 1 has 7 events, and none from event 99")
     assert server.get(f"/{root}/episode/1", origin="http://127.0.0.1:1")[0] == 403
     assert server.get(f"/{root}/episode/1", host="evil.example")[0] == 403
     assert server.get(f"/{root[:-1]}x/episode/1")[0] == 403
