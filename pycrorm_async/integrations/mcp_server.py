@@ -49,6 +49,12 @@ _LIMITS = SqlLimits(rows=200, bytes=200_000, seconds=10.0)
 """Bounds the answer to a query: more would fill the context of a model."""
 _LINES_MAX = 300
 _LINE_MAX = 400
+"""Bounds the characters of a line, and of each recorded text in an answer but that to a query."""
+_DEPTH_MAX = 40
+"""Bounds the indentation of a node."""
+_ANSWER_BYTES = 500_000
+"""Bounds every answer. Only texts of control characters, which JSON writes six times as long, come near it."""
+_ERROR_MAX = 1_000
 _READS_ONLY = ToolAnnotations(read_only_hint=True, open_world_hint=False)
 
 Tool: TypeAlias = "Callable[..., Awaitable[Any]]"
@@ -76,8 +82,11 @@ def _with_tool_errors(tool: Tool, tools: _Tools) -> Tool:
         except PycrormError as error:
             if isinstance(error, DatabaseError):
                 await tools.close()
-            raise ToolError(one_line(error, None)) from error
-        return result if isinstance(result, str) else _json(result)
+            raise ToolError(one_line(error, _ERROR_MAX)) from error
+        text = result if isinstance(result, str) else _json(_short(msgspec.to_builtins(result, enc_hook=str)))
+        if (size := len(text.encode())) > _ANSWER_BYTES:
+            raise ToolError(f"the answer has {size} bytes, and at most {_ANSWER_BYTES} are given: ask for less")
+        return text
 
     return answer
 
@@ -184,13 +193,18 @@ class _Tools:
             return as_text(views)
         return "\n".join(f"{each.name}: {each.text}" for each in views)
 
-    async def query(self, sql: str) -> dict[str, Any]:
+    async def query(self, sql: str) -> str:
         """Run one SELECT on the views that `schema` lists; at most 200 rows, 200 kB and 10 s. It can only read.
 
         Times are integers, µs since 1970-01-01 UTC; columns that end in _ns are ns of the robot's clock.
         """
         result = await (await self._open()).query(sql, _LIMITS)
-        return {"columns": result.columns, "rows": result.rows, "more_rows_exist": result.more}
+        rows, more = result.rows, result.more
+        while True:
+            text = _json({"columns": result.columns, "rows": rows, "more_rows_exist": more})
+            if len(rows) < 2 or len(text.encode()) <= _ANSWER_BYTES:
+                return text
+            rows, more = rows[: len(rows) // 2], True
 
     # --- the database -----------------------------------------------------------------------------------------
 
@@ -243,7 +257,7 @@ def _node(node: NodeSummary) -> str:
         duration(node.duration_ns),
         f"{node.reason}: {node.failure_message}" if node.reason else "",
     ]
-    return "  " * node.depth + one_line(" ".join(filter(None, facts)), _LINE_MAX)
+    return "  " * min(node.depth, _DEPTH_MAX) + one_line(" ".join(filter(None, facts)), _LINE_MAX)
 
 
 def _row(row: Row[Any]) -> dict[str, Any]:
@@ -251,6 +265,19 @@ def _row(row: Row[Any]) -> dict[str, Any]:
     return {
         name: value.name if isinstance(value, Enum) else value for name, value in values.items() if value is not None
     }
+
+
+def _short(value: Any) -> Any:
+    """Return an answer whose texts are cut to a line, because a recorded one can have megabytes."""
+    match value:
+        case str():
+            return one_line(value, _LINE_MAX)
+        case dict():
+            return {_short(key): _short(each) for key, each in value.items()}
+        case list() | tuple():
+            more = [f"{len(value) - _LINES_MAX} more"] if len(value) > _LINES_MAX else []
+            return [*map(_short, value[:_LINES_MAX]), *more]
+    return value
 
 
 def _json(document: Any) -> str:

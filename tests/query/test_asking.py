@@ -407,6 +407,8 @@ async def test_wrong_names_and_values_are_answered_with_the_right_ones(reading: 
             ask.episodes(tag=text)
         with pytest.raises(CallerError, match=r"name has U\+0000"):
             ask.object_history(text)
+    with pytest.raises(CallerError, match="text has 31 words, and at most 30 are searched for"):
+        ask.root_failures(text="x " * 31)
     with pytest.raises(CallerError, match="dtype must be a text"):
         ask.durations(dtype=int)  # type: ignore[arg-type]
     with pytest.raises(CallerError, match="recovered must be True or False, got 'yes'"):

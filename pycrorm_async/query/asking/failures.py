@@ -7,12 +7,17 @@ from typing import Any
 from sqlalchemy import BigInteger, ColumnElement, Select, func, or_, select, type_coerce
 from sqlalchemy.orm import aliased
 
+from pycrorm_async.errors import CallerError
 from pycrorm_async.orm import RootFailure, TaskTreeNode
 from pycrorm_async.query.asking.columns import checked_count, containing, limited, times_with
 from pycrorm_async.query.asking.failure_words import classes_meant_by
 from pycrorm_async.query.asking.question import EpisodeNumber
 
 __all__ = ["failures_by_cause", "root_failures", "steps_before_failures"]
+
+
+_WORDS_MAX = 30
+"""Bounds the words of a search: each is a condition on four columns, and SQLite takes a thousand."""
 
 
 def matching(
@@ -42,6 +47,8 @@ def matching(
         columns = failure.object, failure.arm, failure.message, failure.dtype
         # Words that mean a class together, as in "out of reach", count together.
         words = [text] if classes_meant_by(text) else text.split()
+        if len(words) > _WORDS_MAX:
+            raise CallerError(f"text has {len(words)} words, and at most {_WORDS_MAX} are searched for")
         conditions += [or_(containing(each, *columns), _is_reason(each)) for each in words]
     if recovered is not None:
         conditions.append(failure.recovered == recovered)

@@ -13,6 +13,9 @@ from typing import Any
 import pytest
 from mcp import Client, StdioServerParameters
 
+from pycrorm_async import Memory
+from pycrorm_async.integrations.mcp_server import memory_server
+from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.postgresql.roles import GRANTS
 from tests.commands import COMMAND, environment
 from tests.databases import change_each, run_in_own_loop
@@ -111,6 +114,41 @@ async def test_a_wrong_call_is_an_error_of_the_tool_in_one_line(url: str) -> Non
         for sql in ("DELETE FROM pose", "ATTACH '/tmp/agent.db' AS other", "SELECT 1; SELECT 2"):
             await agent.refused("query", sql=sql)
         assert [each["number"] for each in await agent.ask("episodes")] == [1, 2]
+
+
+async def test_every_answer_is_bounded_however_long_the_recorded_texts_are(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path / 'memory.db'}"
+    long = "b\x01\u20ac" * 8_000
+    with Memory.sync(url) as memory:
+        say = memory.recording.type("action", "SayAction", {"text": str})
+        for number in range(2):
+            with memory.recording.episode(description=long, metadata={"note": f"{long}{number}"}) as recorded:
+                parent = None
+                for node in range(40):  # each below the one before
+                    recorded.start(node, say, {"text": f"{long}{number}"}, parent=parent)
+                    parent = node
+                for node in reversed(range(40)):
+                    recorded.end(node, "FAILED", long)
+        memory.flush()
+    with DatabaseAddress.parse(url).located() as address:
+        server = memory_server(address)
+    async with Client(server) as client:
+        agent = Agent(client)
+        calls: list[tuple[str, dict[str, Any]]] = [
+            ("episodes", {"limit": 200}), ("show", {"nodes": 300}), ("why_failed", {"limit": 100}),
+            ("at", {"when": "e40"}), ("compare", {"first": 1, "second": 2, "limit": 300}),
+            ("query", {"sql": "SELECT text FROM say_action"}),
+            ("query", {"sql": "SELECT replace(hex(zeroblob(4500)), '0', char(1)) FROM task_tree_node LIMIT 20"}),
+        ]  # fmt: skip
+        for tool, arguments in calls:
+            answer = await agent.client.call_tool(tool, arguments)
+            assert not answer.is_error, tool
+            assert len(answer.content[0].text.encode()) <= 500_000, tool  # type: ignore[union-attr]
+        halved = await agent.ask(*calls[-1][:1], **calls[-1][1])
+        assert (0 < len(halved["rows"]) < 20, halved["more_rows_exist"]) == (True, True)
+        names = ", ".join(f"1 AS {'c' * 3000}{number}" for number in range(200))
+        assert (await agent.refused("query", sql=f"SELECT {names}")).endswith("at most 500000 are given: ask for less")
+        assert len(await agent.refused("query", sql=f"SELECT {'x' * 50_000}")) < 1_100
 
 
 async def test_a_database_that_goes_away_is_an_error_until_it_comes_back(tmp_path: Path) -> None:
