@@ -21,7 +21,6 @@ from pycrorm_async.projections.fold.column_values import CannotFold
 from pycrorm_async.query.as_of import unreadable
 from pycrorm_async.query.snapshot import Moment, NodeThen
 from pycrorm_async.query.snapshot_fold import MomentFold
-from pycrorm_async.report.episode_data import designators_of
 from pycrorm_async.store.episode_lookup import episode_named
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import EpisodeRow
@@ -50,7 +49,7 @@ async def draw_episode(follower: LogFollower, name: str, stop: asyncio.Event) ->
             if row is None:
                 raise UnknownEpisode(f"{follower.address} no longer has episode {number}")
             if row.head > last:
-                dtypes = await designators_of(log)
+                dtypes = await log.dtypes()
                 async for page in log.pages(row, after=last):
                     for event in page:
                         try:

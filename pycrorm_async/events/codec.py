@@ -29,6 +29,7 @@ __all__ = [
     "DESCRIPTION_PREFIX",
     "fingerprint",
     "declaration_type",
+    "declared_dtype",
     "declaration_of",
     "description_of",
     "unwritable",
@@ -159,6 +160,20 @@ def encoded_bytes(value: Any) -> int:
         return len(_encoder.encode(value))
     except (TypeError, ValueError, OverflowError, RecursionError) as error:
         raise NotEncodable("", str(error)) from None
+
+
+class _DtypeOnly(msgspec.Struct):
+    """The part of a DesignatorTypeDeclared that every version has."""
+
+    dtype: str
+
+
+def declared_dtype(declaration: bytes) -> str | None:
+    """Return the dtype in a DesignatorTypeDeclared of any version; None if it cannot be read."""
+    try:
+        return msgspec.json.decode(declaration, type=_DtypeOnly).dtype
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        return None
 
 
 def fingerprint(declaration: bytes, type_name: str = "DesignatorTypeDeclared") -> str:

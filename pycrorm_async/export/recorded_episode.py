@@ -6,10 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
-import msgspec
-
 from pycrorm_async.errors import CallerError
-from pycrorm_async.events.codec import fingerprint
 from pycrorm_async.events.types import (
     EpisodeEnded,
     EpisodeStarted,
@@ -90,12 +87,6 @@ class RecordedEpisode:
     nodes: list[ExportedNode] = field(default_factory=list)
 
 
-class _DtypeOnly(msgspec.Struct):
-    """The part of a declaration that every version has."""
-
-    dtype: str
-
-
 async def read_episode(reading: Reading, covered: CoveredEpisode) -> RecordedEpisode:
     """Read an episode up to the event `covered.events`.
 
@@ -105,8 +96,7 @@ async def read_episode(reading: Reading, covered: CoveredEpisode) -> RecordedEpi
     row = next(each for each in await log.episodes() if each.number == covered.number)
     if covered.events == 0:
         raise CallerError(f"the log has no event of episode {covered.number}")
-    dtypes = {fingerprint(each): msgspec.json.decode(each, type=_DtypeOnly).dtype for each in await log.declarations()}
-    fold = _EpisodeFold(RecordedEpisode(row.number, row.id), dtypes)
+    fold = _EpisodeFold(RecordedEpisode(row.number, row.id), await log.dtypes())
     async for page in log.pages(row._replace(head=covered.events)):
         for event in page:
             try:

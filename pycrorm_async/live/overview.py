@@ -11,7 +11,6 @@ from pycrorm_async.events.ids import EPISODE_NUMBER_MAX
 from pycrorm_async.live.activity import Activity
 from pycrorm_async.projections.fold.column_values import CannotFold
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.report.episode_data import designators_of
 from pycrorm_async.report.overview_data import newest_episodes, overview_document
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.episode_lookup import grown_episodes
@@ -58,7 +57,7 @@ class LiveOverview:
             if not grown:
                 return False
             self._turn += 1
-            designators = await designators_of(log)
+            designators = await log.dtypes()
             for row in grown:
                 activity = self._activities.setdefault(row.number, Activity(row))
                 activity.row = row

@@ -5,9 +5,7 @@ Episodes that use a type without tables are parked. Users' views that are left o
 
 from __future__ import annotations
 
-import msgspec
-
-from pycrorm_async.events.codec import fingerprint
+from pycrorm_async.events.codec import declared_dtype, fingerprint
 from pycrorm_async.projections.schema.generations import SHOWN, read_generation
 from pycrorm_async.projections.schema.layout import Layout
 from pycrorm_async.projections.schema.union import Union, unite
@@ -15,10 +13,6 @@ from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 
 __all__ = ["unmade_types", "contradictions", "failed_views"]
-
-
-class _DtypeOnly(msgspec.Struct):
-    dtype: str = ""
 
 
 async def _united(log: EventLog) -> tuple[Union, list[bytes]]:
@@ -38,8 +32,8 @@ async def unmade_types(log: EventLog) -> dict[str, str]:
     """Return the reasons by dtype, or by fingerprint where the declaration's dtype cannot be read."""
     united, payloads = await _united(log)
     refused = united.refused
-    names = {fingerprint(each): _dtype(each) for each in payloads if fingerprint(each) in refused}
-    return {names[each] or each: reason for each, reason in refused.items()}
+    dtypes = {fingerprint(each): declared_dtype(each) for each in payloads if fingerprint(each) in refused}
+    return {dtypes[each] or each: reason for each, reason in refused.items()}
 
 
 async def failed_views(log: EventLog) -> dict[str, str]:
@@ -47,10 +41,3 @@ async def failed_views(log: EventLog) -> dict[str, str]:
     async with log.snapshot() as connection:
         generation = await read_generation(connection, SHOWN)
     return {} if generation is None else generation.layout.failed_views
-
-
-def _dtype(payload: bytes) -> str:
-    try:
-        return msgspec.json.decode(payload, type=_DtypeOnly).dtype
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
-        return ""

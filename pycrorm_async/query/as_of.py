@@ -11,10 +11,8 @@ from datetime import UTC, datetime, timedelta
 from numbers import Integral, Real
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-import msgspec
-
 from pycrorm_async.errors import CallerError, DatabaseForeign, LogDamaged, PycrormError, UnknownEpisode
-from pycrorm_async.events.codec import description_of, fingerprint
+from pycrorm_async.events.codec import description_of
 from pycrorm_async.events.types import EVENT_TYPES, DescriptionDeclared
 from pycrorm_async.projections.fold.column_values import CannotFold
 from pycrorm_async.query.named_queries import EpisodeSummary
@@ -58,10 +56,9 @@ async def as_of(
             break
     if fold.first is None:
         raise CallerError(f"{limit} is before episode {row.number} began")
-    dtypes = {fingerprint(each): msgspec.json.decode(each, type=_DtypeOnly).dtype for each in await log.declarations()}
     payloads = await log.descriptions(fold.descriptions)
     descriptions = {name: _description(payload) for name, payload in payloads.items()}
-    return fold.moment(dtypes, descriptions, await _meshes(log, descriptions.values()) if meshes else {})
+    return fold.moment(await log.dtypes(), descriptions, await _meshes(log, descriptions.values()) if meshes else {})
 
 
 async def _meshes(log: EventLog, descriptions: Iterable[DescriptionDeclared]) -> dict[str, bytes]:
@@ -78,12 +75,6 @@ def _description(payload: bytes) -> DescriptionDeclared:
         return description_of(payload)
     except ValueError as error:
         return DescriptionDeclared(missing=f"it cannot be read: {error}")
-
-
-class _DtypeOnly(msgspec.Struct):
-    """The part of a declaration that every version has, also one that this version cannot read otherwise."""
-
-    dtype: str
 
 
 def _read(fold: MomentFold, page: Sequence[StoredEvent], within: _Within, log: EventLog) -> bool:

@@ -5,10 +5,8 @@ from __future__ import annotations
 from collections.abc import AsyncIterable, Mapping, Sequence
 from typing import Any
 
-import msgspec
-
 from pycrorm_async.errors import CallerError, UnknownEpisode
-from pycrorm_async.events.codec import description_of, fingerprint
+from pycrorm_async.events.codec import description_of
 from pycrorm_async.projections.fold.column_values import CannotFold
 from pycrorm_async.query.as_of import unreadable
 from pycrorm_async.query.reading import Reading
@@ -19,7 +17,7 @@ from pycrorm_async.store.episode_lookup import episode_named
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import StoredEvent
 
-__all__ = ["episode_document", "designators_of", "document_behind", "read_into"]
+__all__ = ["episode_document", "document_behind", "read_into"]
 
 
 async def episode_document(
@@ -49,7 +47,7 @@ async def read_into(fold: EpisodeFold, log: EventLog, pages: AsyncIterable[Seque
 
     Raises `LogDamaged` or `DatabaseForeign` for an event that cannot be read.
     """
-    designators = await designators_of(log)
+    designators = await log.dtypes()
     async for page in pages:
         for event in page:
             if fold.is_full:
@@ -60,21 +58,9 @@ async def read_into(fold: EpisodeFold, log: EventLog, pages: AsyncIterable[Seque
                 raise unreadable(fold.row.id, event, str(reason), log) from None
 
 
-async def designators_of(log: EventLog) -> dict[str, str]:
-    """Return the dtype of each declared designator type, by its fingerprint."""
-    declarations = await log.declarations()
-    return {fingerprint(each): msgspec.json.decode(each, type=_DtypeOnly).dtype for each in declarations}
-
-
 async def document_behind(fold: EpisodeFold, log: EventLog, after: int = 0) -> dict[str, Any]:
     """Return the document of the events that were folded, or the part of those behind event `after`."""
     return fold.document(await _models(log, fold, after), after=after)
-
-
-class _DtypeOnly(msgspec.Struct):
-    """The part of a declaration that every version has."""
-
-    dtype: str
 
 
 async def _models(log: EventLog, fold: EpisodeFold, after: int) -> Mapping[str, Any]:

@@ -21,7 +21,7 @@ from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
 from pycrorm_async.errors import DatabaseUnavailable, LogDamaged, PycrormError
-from pycrorm_async.events.codec import fingerprint
+from pycrorm_async.events.codec import declared_dtype, fingerprint
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, EpisodeId, episode_text
 from pycrorm_async.settings import FileAccess
@@ -282,6 +282,11 @@ class EventLog:
         """Read the payloads of all DesignatorTypeDeclared, in the order of first arrival."""
         async with self.reading() as connection:
             return await self._dialect.declarations(connection)
+
+    async def dtypes(self) -> dict[str, str]:
+        """Read the dtypes of all declared designator types, by fingerprint, without those that cannot be read."""
+        dtypes = {fingerprint(each): declared_dtype(each) for each in await self.declarations()}
+        return {name: dtype for name, dtype in dtypes.items() if dtype is not None}
 
     async def descriptions(self, fingerprints: Collection[str]) -> dict[str, bytes]:
         """Read the payloads of these DescriptionDeclared, by fingerprint; those that are not stored are left out."""

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pycrorm_async.events.codec import NotEncodable, UnknownShape, decode, encode, fingerprint
+from pycrorm_async.events.codec import NotEncodable, UnknownShape, declared_dtype, decode, encode, fingerprint
 from pycrorm_async.events.types import EVENT_TYPES, NodeEnded, NodeStarted, ObjectAdded
 from pycrorm_async.events.values import PoseValue, RobotValue
 
@@ -92,3 +92,9 @@ def test_payloads_are_plain_json() -> None:
             "target": {"position": [0.1, 0.2, 0.3], "orientation": [0, 0, 0, 1], "frame": "map", "time_ns": 1}
         },
     }
+
+
+@pytest.mark.parametrize("payload", [b"", b"\xff", b"[]", b'{"kind":"action"}', b'{"dtype":1}', b"[" * 100_000])
+def test_a_declaration_that_cannot_be_read_has_no_dtype(payload: bytes) -> None:
+    assert declared_dtype(b'{"dtype":"PickUpAction","of a newer version":1}') == "PickUpAction"
+    assert declared_dtype(payload) is None
