@@ -58,6 +58,8 @@ RUNS = (
     Run("behaviour_trees"),
     Run("digests"),
     Run("recall"),
+    Run("recall, large", ("--no-soar", "--actions", "10000000"), quick=False),
+    Run("cases"),
     Run("thesis"),
     Run("thesis postgresql", ("--postgresql",), quick=False),
     Run("size"),

@@ -77,14 +77,14 @@ class Actions:
             {name: Spread(types, column) for name, column in values.items()},
         )
 
-    def _column(self, name: str, codes: NDArray[np.int64]) -> Symbols:
+    def _column(self, name: str, codes: NDArray[np.int16]) -> Symbols:
         words = Words(f"{name.upper()}_{code}" for code in range(_TEXTS[name][0]))
         width = np.uint8 if len(words) < 256 else np.uint16
         return Symbols(words, (codes + 1).astype(width))
 
-    def _words(self, size: int, exponent: float, count: int) -> NDArray[np.int64]:
+    def _words(self, size: int, exponent: float, count: int) -> NDArray[np.int16]:
         shares = np.arange(1, size + 1) ** -float(exponent)
-        return self.chance.choice(size, count, p=shares / shares.sum()).astype(np.int64)
+        return self.chance.choice(size, count, p=shares / shares.sum()).astype(np.int16)
 
     # --- cues -------------------------------------------------------------------------------------------------
 

@@ -175,6 +175,30 @@ def _recall_kinds(lines: Lines) -> Verdict:
     return Verdict(f"{p99:g} ms ({slowest}), {size:g} bytes an action", p99 <= 10 and size <= 80)
 
 
+def _recall_growth(lines: Lines) -> Verdict:
+    smaller, larger = _recalled(lines), lines["recall, large"]["10,000,000"]
+    times = {
+        kind: each["median"] / smaller["recall_ms"][kind]["median"] / 10 for kind, each in larger["recall_ms"].items()
+    }
+    worst = max(times, key=lambda kind: times[kind])
+    text = f"{times[worst]:.2f} times an action ({worst})"
+    return Verdict(f"{text}, {larger['bytes_an_action']:g} bytes an action", times[worst] <= 1.1)
+
+
+def _cases_fold(lines: Lines) -> Verdict:
+    return _of_cases(lines, "fold_cpu_us_an_action", "µs", {"sqlite": 25, "postgresql": 25})
+
+
+def _cases_load(lines: Lines) -> Verdict:
+    return _of_cases(lines, "load_ms", "ms", {"sqlite": 100, "postgresql": 200})
+
+
+def _of_cases(lines: Lines, figure: str, unit: str, most: Mapping[str, float]) -> Verdict:
+    medians = {database: lines["cases"][database][figure]["median"] for database in most}
+    text = ", ".join(f"{database} {each:g} {unit}" for database, each in medians.items())
+    return Verdict(text, all(each <= most[database] for database, each in medians.items()))
+
+
 def _recalled(lines: Lines) -> Mapping[str, Any]:
     largest: Mapping[str, Any] = lines["recall"]["1,000,000"]
     return largest
@@ -196,4 +220,7 @@ BUDGETS = (
     Budget("the thesis' learning query over 50,000 pick-ups → DataFrame", "≤ 100 ms", _learning),
     Budget("recall of a common cue among 1,000,000 actions, beside Soar", "median ≤ 0.2 ms, ≤ Soar's", _recall_common),
     Budget("recall by every kind of cue among 1,000,000 actions", "p99 ≤ 10 ms, ≤ 80 bytes an action", _recall_kinds),
+    Budget("recall among 10,000,000 actions against 1,000,000", "≤ 1.1 times an action", _recall_growth),
+    Budget("making the case of an action, CPU time", "≤ 25 µs", _cases_fold),
+    Budget("loading the cases of 1,000,000 actions", "≤ 100 ms SQLite, ≤ 200 ms PostgreSQL", _cases_load),
 )

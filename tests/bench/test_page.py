@@ -67,6 +67,27 @@ def test_a_common_cue_is_judged_beside_soar_where_it_is_installed() -> None:
     assert verdict(kinds, of(0.1, slower, p99=10.5)).met is False
 
 
+def test_cases_are_judged_on_both_databases_and_by_their_growth() -> None:
+    def of(fold_us: float, load_ms: float, large_ms: float) -> dict[str, Any]:
+        figures = {"fold_cpu_us_an_action": {"median": fold_us}, "load_ms": {"median": load_ms}}
+        sizes = {"1,000,000": 1.0}, {"10,000,000": large_ms}
+        recalls = [
+            {size: {"recall_ms": {"rare": {"median": ms}}, "bytes_an_action": 60} for size, ms in each.items()}
+            for each in sizes
+        ]
+        cases: dict[str, Any] = {"sqlite": figures, "postgresql": figures}
+        lines: dict[str, dict[str, Any]] = {"cases": cases, "recall": recalls[0], "recall, large": recalls[1]}
+        return {name: {**ABOUT, **each} for name, each in lines.items()}
+
+    fold, load, growth = "making the case", "loading the cases", "recall among"
+    assert verdict(fold, of(25, 100, 11)) == Verdict("sqlite 25 µs, postgresql 25 µs", met=True)
+    assert verdict(fold, of(25.1, 100, 11)).met is False
+    assert verdict(load, of(25, 100, 11)) == Verdict("sqlite 100 ms, postgresql 100 ms", met=True)
+    assert verdict(load, of(25, 101, 11)).met is False
+    assert verdict(growth, of(25, 100, 11)) == Verdict("1.10 times an action (rare), 60 bytes an action", met=True)
+    assert verdict(growth, of(25, 100, 11.5)).met is False
+
+
 def test_of_all_rebuilt_logs_the_largest_is_judged() -> None:
     def of(database: str, events: int, times: float, mb: float) -> dict[str, Any]:
         sizes = [{"events": 100}, {"events": events}]
