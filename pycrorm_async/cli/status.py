@@ -30,9 +30,6 @@ from pycrorm_async.recall.cases.stored_blocks import read_left_out
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 
-__all__ = ["status", "RecorderState", "EpisodeState", "RefusedState"]
-
-
 RUNNING_MAX = 20
 """Bounds the running episodes that are listed: a simulator may have hundreds, and the newest say most."""
 _DRAINED_BY = {"itself": "itself", "another": "another process", "nobody": "no process"}

@@ -21,7 +21,7 @@ from pycrorm_async.progress_bar import watched
 from pycrorm_async.projections.custom.discovery import installed_projections, load_projections
 from pycrorm_async.projections.custom.projection import Projection
 from pycrorm_async.projections.verify.digest_check import OutsideDigest
-from pycrorm_async.projections.verify.verify import VerifyResult
+from pycrorm_async.projections.verify.findings import VerifyResult
 from pycrorm_async.projections.verify.verify import verify as verify_log
 from pycrorm_async.store.episode_lookup import episode_named
 from pycrorm_async.store.log import EventLog

@@ -19,8 +19,6 @@ from pycrorm_async.orm.documentation.descriptions import ViewDescription, descri
 from pycrorm_async.query.asking.ask import QUESTIONS, Ask
 from pycrorm_async.query.reading import Reading
 
-__all__ = ["datasette_metadata"]
-
 _INTERNAL = re.compile(r"zz_.*|.*__\d+|pycrorm_.*|sqlite_stat\d")
 """The tables of a generation, the bookkeeping of the log, and the statistics of SQLite's planner."""
 _LOG = {

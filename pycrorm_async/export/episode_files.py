@@ -23,8 +23,6 @@ from pycrorm_async.query.reading import Reading
 if TYPE_CHECKING:
     from pycrorm_async.progress_bar import ProgressCallback
 
-__all__ = ["EpisodeOptions", "write_lerobot", "write_scene"]
-
 
 class EpisodeOptions(NamedTuple):
     """The axis of an episode, events or time, how many frames or events make a second of it, and the size of images."""

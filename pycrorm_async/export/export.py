@@ -43,8 +43,6 @@ from pycrorm_async.report.output_files import new_file, new_folder, refuse_exist
 if TYPE_CHECKING:
     from pycrorm_async.progress_bar import ProgressCallback
 
-__all__ = ["Exported", "FileFormat", "Remade", "export", "export_again", "format_of"]
-
 FileFormat: TypeAlias = Literal["parquet", "csv", "jsonl", "lerobot", "rrd", "mcap"]
 
 

@@ -16,8 +16,6 @@ import msgspec
 from pycrorm_async.errors import CallerError
 from pycrorm_async.export.selection import CoveredEpisode
 
-__all__ = ["Manifest", "checksums", "episode_differences", "manifest_path", "read_manifest", "versions_of"]
-
 
 class Manifest(msgspec.Struct, frozen=True, kw_only=True):
     """The description of an export.

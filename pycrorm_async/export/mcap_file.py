@@ -19,8 +19,6 @@ from pycrorm_async.export.lerobot.states import Clock
 from pycrorm_async.export.recorded_episode import RecordedEpisode, When
 from pycrorm_async.export.scene_frames import FrameChange, SceneObject, Shape, frame_changes
 
-__all__ = ["write_mcap"]
-
 _SECOND_NS = 10**9
 _TOPICS = {"/tf": "FrameTransforms", "/scene": "SceneUpdate", "/plan": "Log"}
 

@@ -26,8 +26,6 @@ from pycrorm_async.query.parameter_text import parameters_text
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.store.stored import StoredEvent
 
-__all__ = ["Change", "ExportedNode", "RecordedEpisode", "When", "read_episode"]
-
 _BASE = ("base.x", "base.y", "base.z", "base.qx", "base.qy", "base.qz", "base.qw")
 
 

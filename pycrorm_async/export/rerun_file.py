@@ -15,8 +15,6 @@ from pycrorm_async.errors import MissingExtra
 from pycrorm_async.export.recorded_episode import RecordedEpisode, When
 from pycrorm_async.export.scene_frames import MAP, FrameChange, SceneObject, Shape, frame_changes
 
-__all__ = ["write_rerun"]
-
 _APPLICATION = "pycrorm"
 
 

@@ -15,8 +15,6 @@ from pycrorm_async.query.frames.arrow_batches import needed_pyarrow
 if TYPE_CHECKING:
     import pyarrow as pa
 
-__all__ = ["RowFormat", "write_rows"]
-
 RowFormat: TypeAlias = Literal["parquet", "csv", "jsonl"]
 _Write: TypeAlias = "Callable[[pa.RecordBatch], object]"
 

@@ -19,8 +19,6 @@ from pycrorm_async.query.scene.link_frames import Frame, joint_frame, link_frame
 from pycrorm_async.query.scene.object_model import assumed_model, object_model, point_model
 from pycrorm_async.world.pose import Pose
 
-__all__ = ["MAP", "FrameChange", "SceneObject", "Shape", "frame_changes", "scene_objects"]
-
 MAP = "map"
 _GREY = (0.6, 0.6, 0.6, 1.0)
 """The colour of a shape without one."""

@@ -26,8 +26,6 @@ from pycrorm_async.query.asking.question import Question, episode_name
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.suggestions import nearest
 
-__all__ = ["CoveredEpisode", "Exportable", "Selection", "select_rows"]
-
 Exportable: TypeAlias = "str | int | type | Sequence[str | int] | Question | Select[*tuple[Any, ...]]"
 """An episode or several, by number, id or `last`; a view, a table or a question by name; a mapped class; a question of
 `memory.ask`; a select."""

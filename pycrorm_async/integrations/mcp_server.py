@@ -35,8 +35,6 @@ try:
 except ImportError:
     raise MissingExtra("a server for agents needs mcp: pip install 'pycrorm-async[mcp]'") from None
 
-__all__ = ["memory_server"]
-
 INSTRUCTIONS = """\
 The memory of robots: every episode (one run of a plan) with its task tree, parameters, failures, objects and places.
 Begin with `episodes`. `why_failed` has the nodes at which failures began, `show` a task tree, `at` the world and what

@@ -18,8 +18,6 @@ from pathlib import Path
 from typing import Final
 from urllib.parse import urlsplit
 
-__all__ = ["refusal", "kept_token", "HEADERS"]
-
 _NAMES = frozenset({"127.0.0.1", "localhost", "::1"})
 """The names of this machine; the port is not compared, because a tunnel (`ssh -L`) may change it."""
 _TOKEN = re.compile(r"[A-Za-z0-9_-]{43}")

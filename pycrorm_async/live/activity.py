@@ -14,8 +14,6 @@ from pycrorm_async.projections.fold.fold import happening_of
 from pycrorm_async.query.parameter_text import parameters_text
 from pycrorm_async.store.stored import EpisodeRow, StoredEvent
 
-__all__ = ["Activity"]
-
 _READ = frozenset({"EpisodeStarted", "EpisodeEnded", "NodeStarted", "NodeEnded", "ObjectAdded"})
 _FAILED = frozenset({"FAILED", "ERROR"})
 _TEXT_MAX = 200

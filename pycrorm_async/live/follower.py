@@ -24,8 +24,6 @@ from pycrorm_async.store.episode_lookup import episode_named, grown_episodes, is
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import EpisodeRow
 
-__all__ = ["LogFollower", "EpisodeFeed"]
-
 _INTERVAL_S = 0.05
 _IDLE_INTERVAL_S = 0.15
 _IDLE_TURNS = 40

@@ -17,8 +17,6 @@ from pycrorm_async.store.episode_lookup import grown_episodes
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import EpisodeRow
 
-__all__ = ["LiveOverview"]
-
 _LISTED_MAX = 2_000
 """Bounds the episodes of the list that are read from the tables."""
 _ENDED_MAX = 500

@@ -38,8 +38,6 @@ except ImportError as missing:
     install = "pip install 'pycrorm-async[live]'"
     raise MissingExtra(f"the live page needs Starlette and uvicorn ({missing}): {install}") from None
 
-__all__ = ["LiveServer", "listen"]
-
 PORT = 8137
 """The port if none was asked for, so that an address keeps its meaning."""
 _ALIVE_S = 2.0

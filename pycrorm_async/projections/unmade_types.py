@@ -12,8 +12,6 @@ from pycrorm_async.projections.schema.union import Union, unite
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 
-__all__ = ["unmade_types", "contradictions", "failed_views"]
-
 
 async def _united(log: EventLog) -> tuple[Union, list[bytes]]:
     async with log.snapshot() as connection:

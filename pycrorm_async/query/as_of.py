@@ -25,8 +25,6 @@ from pycrorm_async.store.stored import StoredEvent
 if TYPE_CHECKING:
     from pycrorm_async.hooks.episode import Episode
 
-__all__ = ["AnyEpisode", "as_of", "parse_moment", "unreadable"]
-
 AnyEpisode: TypeAlias = "int | str | Episode | EpisodeSummary"
 """An episode by its number, its id or the first digits of it, `last`, or as an `Episode` or `EpisodeSummary`."""
 

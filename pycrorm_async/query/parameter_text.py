@@ -9,8 +9,6 @@ import msgspec
 
 from pycrorm_async.events.blobs import BLOB_KEY
 
-__all__ = ["parameters_text", "one_line", "duration"]
-
 _TEXT_MAX = 60
 """Bounds the characters of a text parameter, so that a node fits on one line."""
 

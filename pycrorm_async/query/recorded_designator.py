@@ -38,8 +38,6 @@ from pycrorm_async.world.enums import ObjectType
 from pycrorm_async.world.objects import Object
 from pycrorm_async.world.pose import Pose
 
-__all__ = ["NotPerformable", "performable_of"]
-
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _WITHOUT_POSE = "object {!r} was recorded as one outside the world, and without a pose"
 

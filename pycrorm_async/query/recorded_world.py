@@ -31,8 +31,6 @@ from pycrorm_async.world.pose import Vector
 from pycrorm_async.world.queries.bounding_boxes import BoundingBox
 from pycrorm_async.world.robots.robot_description import robot_description
 
-__all__ = ["world_of", "built_in_that_fits", "RecordedWorld"]
-
 
 class RecordedWorld(BulletWorld):
     """A world made from a snapshot by `world_of`.

@@ -14,8 +14,6 @@ from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.task_status import TaskStatus
 
-__all__ = ["RobotSummary", "RunningEpisode", "robots_of", "running_episodes"]
-
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _episode = table("process_metadata", *(column(name) for name in ("id", "uuid", "created_at", "description", "status")))
 _robot = table(

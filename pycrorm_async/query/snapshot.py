@@ -24,8 +24,6 @@ from pycrorm_async.world.state import ObjectState, WorldState
 if TYPE_CHECKING:
     from pycrorm_async.query.notebook.markup import Drawing
 
-__all__ = ["Moment", "ObservationThen", "NodeThen", "WorldThen", "ObjectThen", "RobotThen", "AttachmentThen"]
-
 
 @dataclass(frozen=True, kw_only=True)
 class NodeThen(NodeSummary):

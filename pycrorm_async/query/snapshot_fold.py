@@ -32,8 +32,6 @@ from pycrorm_async.store.stored import StoredEvent
 from pycrorm_async.world.pose import MalformedPose, Pose
 from pycrorm_async.world.robots.robot_description import robot_description
 
-__all__ = ["MomentFold"]
-
 _CHANGE_NOTHING = frozenset({"LocationResolved", "ObjectDetected", "StateSampled"})
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 

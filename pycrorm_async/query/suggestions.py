@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 from difflib import get_close_matches
 
-__all__ = ["nearest"]
-
 
 def nearest(name: str, valid: Iterable[str]) -> str:
     """Return a question for the end of a message, or an empty text where no valid name is near.

@@ -21,8 +21,6 @@ from pycrorm_async.recall.case import OUTCOME
 from pycrorm_async.recall.columns import Symbols, joined_words
 from pycrorm_async.recall.library import CaseLibrary
 
-__all__ = ["Forgotten", "activation", "activation_by_node", "forgotten"]
-
 _DECAY: Final = 0.5
 """The decay of ACT-R: almost all of its models leave it at this value."""
 _EXACT: Final = 3

@@ -29,8 +29,6 @@ from numpy.typing import NDArray
 from pycrorm_async.recall.blocks import Block, Spread
 from pycrorm_async.recall.columns import Numbers, Sets, Symbols, Words
 
-__all__ = ["BlockRow", "decode", "encode"]
-
 _Shape = TypeVar("_Shape")
 
 

@@ -20,8 +20,6 @@ from pycrorm_async.events.ids import SEQUENCE_MAX, row_id, row_key
 from pycrorm_async.recall.case import FEATURES_MAX, RESERVED, Case, bounded_case
 from pycrorm_async.recall.columns import Numbers, Sets, Symbols, joined_numbers, joined_words
 
-__all__ = ["Block", "EPISODE_SHIFT", "Group", "Spread", "WORDS_MAX", "merge"]
-
 WORDS_MAX: Final = 16_384
 """Bounds the words of a feature in a memory. A feature with more of them names single cases and likens none."""
 EPISODE_SHIFT: Final = row_id(1, 0, 0).bit_length() - 1

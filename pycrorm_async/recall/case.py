@@ -15,18 +15,6 @@ import numpy as np
 
 from pycrorm_async.events.ids import row_key
 
-__all__ = [
-    "Case",
-    "FEATURES_MAX",
-    "OUTCOME",
-    "RESERVED",
-    "SINGLE_MAX",
-    "SYMBOLS_MAX",
-    "TEXT_MAX",
-    "bounded_case",
-    "is_angle",
-]
-
 OUTCOME = ("status", "reason", "duration")
 """The features of the outcome. They are found by name like others, but only if a cue names them."""
 RESERVED = frozenset({"node", "parent", "started", "type", "simulated", *OUTCOME})

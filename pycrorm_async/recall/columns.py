@@ -16,18 +16,6 @@ from numpy.typing import NDArray
 
 from pycrorm_async.recall.case import SINGLE_MAX, SYMBOLS_MAX, TEXT_MAX
 
-__all__ = [
-    "Mask",
-    "Numbers",
-    "Sets",
-    "Symbols",
-    "Words",
-    "joined",
-    "joined_numbers",
-    "joined_words",
-    "smallest_codes",
-]
-
 Mask: TypeAlias = NDArray[np.bool_]
 Codes: TypeAlias = "NDArray[np.unsignedinteger[Any]]"
 Floats: TypeAlias = NDArray[np.floating[Any]]

@@ -19,8 +19,6 @@ from pycrorm_async.recall.blocks import WORDS_MAX
 from pycrorm_async.recall.case import FEATURES_MAX, TEXT_MAX
 from pycrorm_async.recall.library import CaseLibrary
 
-__all__ = ["Cue", "K_MAX", "Wanted", "check_cue", "closest", "numbers_of", "symbols_of", "word"]
-
 K_MAX = 10_000
 """Bounds the cases of one answer."""
 _LISTED = 12

@@ -16,8 +16,6 @@ from pycrorm_async.recall.reading.case_reader import CaseReader
 from pycrorm_async.recall.reading.database_source import DatabaseSource
 from pycrorm_async.world.enums import Arms, ObjectType
 
-__all__ = ["PickUpExperience"]
-
 
 class PickUpExperience:
     """The pick-ups of one memory that succeeded or failed, without simulations. Implements `Experience`.

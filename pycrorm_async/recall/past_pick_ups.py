@@ -25,8 +25,6 @@ from pycrorm_async.recall.library import CaseLibrary
 from pycrorm_async.world.enums import Arms, Grasp, ObjectType
 from pycrorm_async.world.pose import Pose, yaw_quaternion
 
-__all__ = ["NEAR_M", "TRIES_MAX", "Tries", "best_first", "tries_of"]
-
 Floats: TypeAlias = NDArray[np.float64]
 
 _FEATURES = frozenset("arm grasp object_type status stand_x stand_y stand_yaw object_z".split())

@@ -32,8 +32,6 @@ from pycrorm_async.recall.columns import Mask
 from pycrorm_async.recall.cue import Cue, Wanted
 from pycrorm_async.recall.library import CaseLibrary
 
-__all__ = ["Found", "WEIGHT_MAX", "Weights", "search", "weights_of"]
-
 WEIGHT_MAX: Final = 3.0
 """Bounds the weight of a word; it is that of a word which one of twenty cases has."""
 

@@ -37,8 +37,6 @@ from pycrorm_async.recording.writing.episode_opening import EpisodeOpening
 from pycrorm_async.recording.writing.episode_writer import EpisodeWriter
 from pycrorm_async.recording.writing.open_episodes import OpenEpisodes
 
-__all__ = ["RecordedNodes"]
-
 _ENDED_MAX = 1_000
 """Bounds the keys of ended nodes that a child can still name as its parent."""
 

@@ -22,8 +22,6 @@ from pycrorm_async.recording.values.value_snapshot import (
     missing_value,
 )
 
-__all__ = ["Convert", "RecordedValues"]
-
 Convert = Callable[[Any], Any]
 
 

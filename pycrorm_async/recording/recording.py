@@ -23,9 +23,6 @@ from pycrorm_async.recording.writing.episode_opening import EpisodeOpening
 from pycrorm_async.recording.writing.open_episodes import OpenEpisodes
 from pycrorm_async.recording.writing.provenance import Provenance
 
-__all__ = ["Recording"]
-
-
 _TYPES_MAX = 10_000
 """Bounds the types kept for reuse; when it is reached all are dropped."""
 

@@ -17,8 +17,6 @@ from pycrorm_async.store.episode_lookup import episode_named
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import StoredEvent
 
-__all__ = ["episode_document", "document_behind", "read_into"]
-
 
 async def episode_document(
     reading: Reading, episode: str | int, *, first: int | None = None, last: int | None = None

@@ -36,8 +36,6 @@ from pycrorm_async.report.recorded_objects import ObjectTracks
 from pycrorm_async.report.tracks import Texts, Track, differences, rounded
 from pycrorm_async.store.stored import EpisodeRow, StoredEvent
 
-__all__ = ["EpisodeFold", "model_name"]
-
 _TEXTS_CHARACTERS = 6_000_000
 """Bounds the characters of all texts of a page together, so that it stays below 20 MB."""
 _TEXT_SHORTEST, _TEXT_LONGEST = 80, 20_000

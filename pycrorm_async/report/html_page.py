@@ -23,8 +23,6 @@ import msgspec
 
 from pycrorm_async.report.output_files import write_file
 
-__all__ = ["page_of", "overview_page_of", "write_page"]
-
 _EPISODE = "dom episode bodies scene_camera scene_view map_view tree_view gantt_view similar panels main".split()
 _OVERVIEW = "dom episode success overview".split()
 """The modules of each page's program, every one behind those that it imports."""

@@ -12,8 +12,6 @@ from pycrorm_async.query.scene.mesh_triangles import Triangles, triangles_of
 from pycrorm_async.query.scene.object_model import object_model
 from pycrorm_async.store.log import EventLog
 
-__all__ = ["Meshes"]
-
 _TRIANGLES_MAX = 200_000
 """Bounds the triangles of a page: they take about 5 MB."""
 _NAMED_MAX = 5

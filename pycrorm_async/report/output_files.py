@@ -14,8 +14,6 @@ from pathlib import Path
 
 from pycrorm_async.errors import CallerError
 
-__all__ = ["new_file", "new_folder", "refuse_existing", "write_file"]
-
 _SUFFIX = ".part"
 _LOCKED_AFTER_S = 60.0
 """Bounds the time between the creation of a part and its lock, which a stopped machine can delay."""

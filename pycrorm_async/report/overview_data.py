@@ -13,8 +13,6 @@ from pycrorm_async.query.named_queries import EpisodeSummary
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.task_status import TaskStatus
 
-__all__ = ["overview_document", "newest_episodes"]
-
 _EPISODES_MAX = 20_000
 """Bounds the episodes of an overview: it then has about 5 MB."""
 _DESCRIPTION_MAX = 200

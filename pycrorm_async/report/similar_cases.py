@@ -19,8 +19,6 @@ from pycrorm_async.recall.reading.case_reader import CaseReader
 from pycrorm_async.recall.reading.cue_arguments import cue_like
 from pycrorm_async.recall.reading.database_source import DatabaseSource
 
-__all__ = ["SimilarCases", "page_name"]
-
 ACTIONS_MAX: Final = 200
 """Bounds the actions of a page that are compared, failures first."""
 ACTIONS_MIN: Final = 5

@@ -13,8 +13,6 @@ from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.success.samples import success_samples
 from pycrorm_async.query.success.success_table import Axis, SuccessTable, success_table
 
-__all__ = ["success_documents"]
-
 _PAIRS = (("relative_x", "relative_y"), ("arm", "grasp"))
 _METRES = ("relative_x", "relative_y")
 

@@ -7,8 +7,6 @@ from collections.abc import Iterable
 from itertools import islice
 from typing import Any
 
-__all__ = ["Track", "Texts", "differences", "rounded"]
-
 _DIGITS = 4
 """Rounds lengths to 0.1 mm and angles to 0.006 degrees, which the page cannot show finer."""
 

@@ -24,8 +24,6 @@ from pycrorm_async.report.overview_data import newest_episodes, overview_documen
 from pycrorm_async.report.similar_cases import SimilarCases, page_name
 from pycrorm_async.report.success_data import success_documents
 
-__all__ = ["Overview", "Report", "overview", "report"]
-
 _PAGES_MAX = 200
 """Bounds the pages behind an overview: one has about 0.7 MB."""
 

@@ -22,7 +22,8 @@ from pycrorm_async.operations.copy import copy_episodes
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.schema import growth, layout
 from pycrorm_async.projections.table_names import index_name, physical_name
-from pycrorm_async.projections.verify.verify import VerifyResult, verify
+from pycrorm_async.projections.verify.findings import VerifyResult
+from pycrorm_async.projections.verify.verify import verify
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.databases import Server

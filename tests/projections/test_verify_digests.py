@@ -14,7 +14,8 @@ from pycrorm_async.events.codec import encode
 from pycrorm_async.events.types import EpisodeTagged
 from pycrorm_async.operations.copy import copy_episodes
 from pycrorm_async.projections.verify.digest_check import OutsideDigest
-from pycrorm_async.projections.verify.verify import VerifyResult, verify
+from pycrorm_async.projections.verify.findings import VerifyResult
+from pycrorm_async.projections.verify.verify import verify
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.backups import Backup

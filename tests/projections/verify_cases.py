@@ -41,7 +41,8 @@ from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.rebuild import Rebuild, claimed
 from pycrorm_async.projections.replaced_tables import clear
 from pycrorm_async.projections.verify import parts
-from pycrorm_async.projections.verify.verify import VerifyResult, verify
+from pycrorm_async.projections.verify.findings import VerifyResult
+from pycrorm_async.projections.verify.verify import verify
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.databases import ask, ask_each, ask_to_change

@@ -24,7 +24,8 @@ from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.rebuild import Rebuild, claimed
 from pycrorm_async.projections.replaced_tables import clear
 from pycrorm_async.projections.schema.generations import PROJECTION, read_generation
-from pycrorm_async.projections.verify.verify import VerifyResult, verify
+from pycrorm_async.projections.verify.findings import VerifyResult
+from pycrorm_async.projections.verify.verify import verify
 from pycrorm_async.recall.case import Case
 from pycrorm_async.recall.cases import stored_blocks
 from pycrorm_async.recall.cases.stored_blocks import BlockHeading, read_blocks, read_headings

@@ -21,8 +21,6 @@ from pycrorm_async.export.recorded_episode import RecordedEpisode
 from pycrorm_async.query.frames.arrow_batches import needed_pyarrow
 from pycrorm_async.query.scene.picture import png
 
-__all__ = ["DEFAULT_FPS", "LeRobotFolder", "MARKER"]
-
 MARKER = "meta/info.json"
 DEFAULT_FPS = 10
 """Of frames by event it is nominal: LeRobot needs one."""

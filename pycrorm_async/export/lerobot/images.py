@@ -22,8 +22,6 @@ from pycrorm_async.query.snapshot import Moment
 from pycrorm_async.world.pose import Vector
 from pycrorm_async.world.queries.photograph import Camera, photograph
 
-__all__ = ["ImageSize", "check_size", "draw_frames"]
-
 ImageSize = tuple[int, int]
 """Width and height in pixels."""
 

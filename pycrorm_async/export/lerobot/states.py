@@ -16,8 +16,6 @@ from numpy.typing import NDArray
 from pycrorm_async.errors import CallerError
 from pycrorm_async.export.recorded_episode import ExportedNode, RecordedEpisode, When
 
-__all__ = ["BASE", "Clock", "IDLE", "Frames", "frames_of"]
-
 Clock: TypeAlias = Literal["event", "time"]
 """The axis of the frames."""
 

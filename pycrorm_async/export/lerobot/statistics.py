@@ -8,8 +8,6 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["Statistics", "joined", "statistics_of", "statistics_of_images"]
-
 Statistics: TypeAlias = dict[str, NDArray[Any]]
 """By the name of a statistic, one number for each channel of a feature; of `count` one number."""
 

@@ -26,8 +26,6 @@ from pycrorm_async.projections.fold.column_values import CannotFold
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import Span, StoredEvent
 
-__all__ = ["EpisodeFolds", "BatchOfFolds"]
-
 _EPISODES_MAX: Final = 1_000
 """Bounds the folds of open episodes that are kept, and with it the memory. It is above the episodes of one batch (400).
 With more open episodes than this, those that were not folded for the longest time are read from their start again."""

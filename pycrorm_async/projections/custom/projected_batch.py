@@ -15,8 +15,6 @@ from pycrorm_async.projections.fold.column_values import CannotFold
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import Span, StoredEvent
 
-__all__ = ["ProjectedBatch"]
-
 
 class ProjectedBatch(ABC):
     """A batch of a custom projection. Implements `Batch`.

@@ -33,18 +33,6 @@ if TYPE_CHECKING:
     from pycrorm_async.projections.verify.findings import VerifyResult
     from pycrorm_async.projections.verify.parts import PartCheck
 
-__all__ = [
-    "Projection",
-    "EpisodeProjection",
-    "PackedProjection",
-    "EpisodeFold",
-    "Event",
-    "Changes",
-    "Column",
-    "OF_EVERY_TABLE",
-    "columns_of",
-]
-
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,39}")
 Column: TypeAlias = Literal["row", "integer", "real", "text", "boolean", "time", "json"]
 """The storage of a column: the id of a row, a scalar, µs since 1970, JSON."""

@@ -31,8 +31,6 @@ from pycrorm_async.store.dialect import Insertion
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.stored import StoredEvent
 
-__all__ = ["CustomRows"]
-
 _INTEGER_MAX = 2**63 - 1
 
 

@@ -27,8 +27,6 @@ from pycrorm_async.projections.schema.core_columns import EPISODE
 from pycrorm_async.projections.schema.union import Union
 from pycrorm_async.store.stored import StoredEvent
 
-__all__ = ["Designators", "DesignatorFold", "ParameterRows"]
-
 _NO_POSE = (None,) * 8
 _ITEM_SCALARS = {"integer": 0, "real": 1, "text": 2, "enum": 2, "boolean": 3, "datetime": 4}
 

@@ -41,8 +41,6 @@ from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import Span, StoredEvent, size_of
 
-__all__ = ["BatchFold", "FoldTarget", "FoldDefinition", "Batch", "BatchPreview", "TABLES"]
-
 _REASON_LENGTH_MAX = 2_000
 """Bounds the characters of the reason for parking an episode: `status` shows it, and a value may have megabytes."""
 _SLICE_EVENTS = 100

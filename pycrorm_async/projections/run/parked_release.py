@@ -22,8 +22,6 @@ from pycrorm_async.projections.schema.union import unite
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import park
 
-__all__ = ["release_parked"]
-
 _EPISODES_MAX = 1_000
 """Bounds the parked episodes that one process tries, at 0.1 ms each, so that opening a memory never takes minutes."""
 _AT_AN_EVENT = re.compile(r"event (\d+): (?!the database refuses it)")

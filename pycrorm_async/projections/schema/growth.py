@@ -29,8 +29,6 @@ from pycrorm_async.projections.schema.layout import Layout
 from pycrorm_async.projections.schema.union import Union, unite
 from pycrorm_async.store.dialects import dialect_of
 
-__all__ = ["GrowthTarget", "grow"]
-
 _SLICE = 1_000
 """Bounds the tables created in one transaction: a default PostgreSQL has room for some 7,000 locks, and a table with
 its index, its TOAST table and its view takes up to five."""

@@ -20,8 +20,6 @@ from pycrorm_async.events.types import DesignatorTypeDeclared
 from pycrorm_async.events.values import FieldType
 from pycrorm_async.projections.schema.core_columns import Storage
 
-__all__ = ["Layout", "DesignatorType", "Leaf", "MaterialisedView", "LayoutConflict", "Contradiction", "STORED_AS"]
-
 STORED_AS: dict[FieldType, Storage] = {
     "integer": "integer",
     "real": "real",

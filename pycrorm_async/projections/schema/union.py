@@ -25,8 +25,6 @@ from pycrorm_async.events.values import FieldDeclared
 from pycrorm_async.projections.schema.core_columns import Storage
 from pycrorm_async.projections.schema.layout import STORED_AS, Contradiction, Layout, LayoutConflict
 
-__all__ = ["Fitted", "Union", "unite"]
-
 
 class Fitted(NamedTuple):
     """How a declaration that contradicts others is kept.

@@ -31,15 +31,13 @@ from pycrorm_async.projections.verify.digest_check import (
     read_kept,
 )
 from pycrorm_async.projections.verify.episode_check import EpisodeCheck
-from pycrorm_async.projections.verify.findings import Damage, StoppedEpisode, VerifyResult
+from pycrorm_async.projections.verify.findings import StoppedEpisode, VerifyResult
 from pycrorm_async.projections.verify.parts import EpisodeRange, Place, Unreadable
 from pycrorm_async.projections.verify.row_comparison import Comparison, Range
 from pycrorm_async.projections.verify.verify_custom import check_of, uncompared_projections
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import EpisodeRow, Span, StoredEvent
-
-__all__ = ["VerifyResult", "Damage", "StoppedEpisode", "verify"]
 
 _BY_PREFIX = "SELECT fingerprint FROM pycrorm_declaration WHERE substr(fingerprint, 1, 5)"
 _FINGERPRINTS = text(f"{_BY_PREFIX} <> '{DESCRIPTION_PREFIX}' ORDER BY ordinal")

@@ -23,8 +23,6 @@ from pycrorm_async.query.asking.question import EpisodeNumber
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.enums import Grasp, ObjectType
 
-__all__ = ["arms_used", "durations", "experience_at", "longest_actions", "successful_pick_ups"]
-
 _NODE, _DESIGNATOR = TaskTreeNode.__table__, Designator.__table__
 
 

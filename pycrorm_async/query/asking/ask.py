@@ -17,8 +17,6 @@ from pycrorm_async.query.suggestions import nearest
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.enums import Arms, Grasp, ObjectType
 
-__all__ = ["Ask", "QUESTIONS"]
-
 Q = TypeVar("Q")
 _TEXTS = frozenset(("arm", "dtype", "kind", "message", "name", "object", "object_", "reason", "robot", "text"))
 """The arguments that are texts; others are checked where they are used."""

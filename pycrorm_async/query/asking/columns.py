@@ -16,19 +16,6 @@ from pycrorm_async.projections.schema.views.portable_expressions import member
 from pycrorm_async.query.suggestions import nearest
 from pycrorm_async.task_status import TaskStatus
 
-__all__ = [
-    "FAILED",
-    "check_texts",
-    "checked_count",
-    "checked_metres",
-    "containing",
-    "json_text",
-    "limited",
-    "member_of",
-    "share_succeeded",
-    "times_with",
-]
-
 E = TypeVar("E", bound=Enum)
 _STATEMENT = TypeVar("_STATEMENT", bound=Select[Any])
 

@@ -13,8 +13,6 @@ from pycrorm_async.orm import EpisodeRobot, EpisodeTag, ProcessMetaData
 from pycrorm_async.query.asking.columns import check_texts, containing, limited, member_of
 from pycrorm_async.task_status import TaskStatus
 
-__all__ = ["EpisodeChoice", "episode_list"]
-
 
 @dataclass(frozen=True)
 class EpisodeChoice:

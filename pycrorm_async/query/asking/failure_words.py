@@ -6,8 +6,6 @@ not answer to `cereal` because the episode's description names both.
 
 from __future__ import annotations
 
-__all__ = ["classes_meant_by"]
-
 _WORDS: dict[str, tuple[str, ...]] = {
     "unreachable, out of reach, cannot reach, too far, ik, inverse kinematics": (
         "IKError",

@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from pycrorm_async.query.frames.dataframe import Library
     from pycrorm_async.query.reading import Reading
 
-__all__ = ["AskedEpisode", "EpisodeNumber", "Question", "QuestionPlan", "SyncQuestion", "episode_name"]
-
 T = TypeVar("T")
 
 AskedEpisode: TypeAlias = "int | str | Episode | EpisodeSummary"

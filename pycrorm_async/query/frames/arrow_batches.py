@@ -14,8 +14,6 @@ from pycrorm_async.query.frames.columns import ColumnKind, FrameColumn, columns_
 if TYPE_CHECKING:
     import pyarrow as pa
 
-__all__ = ["BATCH_ROWS", "arrow_batches", "arrow_type", "needed_pyarrow"]
-
 BATCH_ROWS = 32_768
 """Rows of a batch: with 24 columns their Python values take about 30 MB, and larger ones are not faster."""
 

@@ -34,8 +34,6 @@ from sqlalchemy.types import TypeEngine
 from pycrorm_async.orm.designators import ClassOfRow
 from pycrorm_async.orm.types import EnumName, JsonText, Moment
 
-__all__ = ["ColumnKind", "FrameColumn", "columns_of"]
-
 ColumnKind: TypeAlias = Literal[
     "integer", "number", "bool", "text", "enum", "time", "json", "bytes", "date", "local time", "untyped"
 ]

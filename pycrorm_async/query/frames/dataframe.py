@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
 
-__all__ = ["Library", "dataframe", "imported"]
-
 Library: TypeAlias = Literal["pandas", "polars", "arrow"]
 """The library of a frame: `pandas.DataFrame`, `polars.DataFrame` or `pyarrow.Table`."""
 

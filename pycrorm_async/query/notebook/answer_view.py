@@ -11,8 +11,6 @@ if TYPE_CHECKING:
     from pycrorm_async.query.asking.episode_diff import EpisodeDiff
     from pycrorm_async.query.sql.read_only import SqlResult
 
-__all__ = ["diff_html", "question_html", "sql_result_html"]
-
 _ROWS_MAX = 100
 _SQL_MAX = 5_000
 

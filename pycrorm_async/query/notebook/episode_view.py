@@ -10,8 +10,6 @@ from pycrorm_async.query.notebook.markup import facts, left_out, moment, quiet, 
 from pycrorm_async.query.notebook.tree_view import NODES_MAX, tree_html
 from pycrorm_async.query.parameter_text import duration
 
-__all__ = ["EPISODES_MAX", "episode_html", "episodes_html", "task_tree_html"]
-
 EPISODES_MAX = 100
 """Bounds the rows of a table of episodes."""
 _COLUMNS = ("episode", "started, UTC", "took", "status", "nodes", "failed", "description", "robots", "tags")

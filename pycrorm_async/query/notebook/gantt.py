@@ -12,8 +12,6 @@ from pycrorm_async.query.notebook.markup import FAILED, Drawing, color_of, sign_
 from pycrorm_async.query.notebook.tree_view import shown_nodes
 from pycrorm_async.query.parameter_text import duration, one_line, parameters_text
 
-__all__ = ["Axis", "gantt"]
-
 Axis: TypeAlias = Literal["events", "time"]
 
 _WIDTH, _PAD, _LANE, _BAR, _AXIS = 900.0, 8.0, 20.0, 16.0, 18.0

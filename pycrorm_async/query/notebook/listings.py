@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from pycrorm_async.query.notebook.gantt import Axis
     from pycrorm_async.query.notebook.markup import Drawing
 
-__all__ = ["Episodes", "TaskTree"]
-
 Item = TypeVar("Item")
 
 _LINES_MAX = 200

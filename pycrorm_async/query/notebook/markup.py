@@ -9,22 +9,6 @@ from datetime import datetime
 
 from pycrorm_async.query.parameter_text import one_line
 
-__all__ = [
-    "COLORS",
-    "FAILED",
-    "Drawing",
-    "color_of",
-    "facts",
-    "left_out",
-    "moment",
-    "quiet",
-    "recorded",
-    "sign_of",
-    "status",
-    "table",
-    "view",
-]
-
 FAILED = frozenset({"FAILED", "ERROR", "LOST"})
 """The statuses of nodes that count as failed in `EpisodeSummary.failed`."""
 

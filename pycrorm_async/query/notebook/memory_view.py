@@ -19,8 +19,6 @@ from pycrorm_async.query.notebook.episode_view import EPISODES_MAX, episodes_htm
 from pycrorm_async.query.notebook.markup import quiet, view
 from pycrorm_async.store.address import DatabaseAddress
 
-__all__ = ["memory_html"]
-
 _ANSWER_S_MAX = 10.0
 """Bounds the wait for a database, so that a cell ends although the server does not answer."""
 

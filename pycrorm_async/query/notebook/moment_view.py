@@ -13,8 +13,6 @@ from pycrorm_async.query.notebook.world_map import world_map
 from pycrorm_async.query.parameter_text import parameters_text
 from pycrorm_async.query.snapshot import Moment, ObjectThen, WorldThen
 
-__all__ = ["moment_html", "world_html"]
-
 _ROWS_MAX = 100
 """Bounds the objects and the observations of a view, each."""
 

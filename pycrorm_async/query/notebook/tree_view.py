@@ -9,8 +9,6 @@ from pycrorm_async.query.named_queries import NodeSummary
 from pycrorm_async.query.notebook.markup import FAILED, left_out, quiet, recorded, status
 from pycrorm_async.query.parameter_text import duration, parameters_text
 
-__all__ = ["NODES_MAX", "shown_nodes", "tree_html"]
-
 NODES_MAX = 500
 """Bounds the nodes of a view, so that a notebook with many of them stays small."""
 _NODES_OPEN = 100

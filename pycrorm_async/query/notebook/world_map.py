@@ -11,8 +11,6 @@ from pycrorm_async.query.parameter_text import one_line
 from pycrorm_async.query.scene.outlines import Outline, Point, outlines
 from pycrorm_async.query.snapshot import ObjectThen, WorldThen
 
-__all__ = ["world_map"]
-
 _SIZE_PX = 460.0
 _SIZE_MIN_M = 2.0
 _MARGIN_M = 0.3

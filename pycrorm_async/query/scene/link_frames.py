@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from pycrorm_async.world.pose import Pose
 from pycrorm_async.world.queries.bounding_boxes import rotation_matrix
 
-__all__ = ["Frame", "joint_frame", "link_frames", "placed"]
-
 Frame: TypeAlias = NDArray[np.float64]
 """A pose as a matrix of 4 rows and 4 columns."""
 

@@ -15,8 +15,6 @@ from xml.etree.ElementTree import Element, ParseError, fromstring
 import numpy as np
 import numpy.typing as npt
 
-__all__ = ["Triangles", "triangles_of", "TRIANGLES_MAX"]
-
 TRIANGLES_MAX = 50_000
 """Bounds the triangles of a file: a drawing of a few hundred pixels shows no more."""
 _STL_HEADER, _STL_TRIANGLE = 84, 50

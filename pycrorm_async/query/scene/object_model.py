@@ -18,8 +18,6 @@ from pycrorm_async.world.models.mesh_boxes import with_boxes
 from pycrorm_async.world.pose import Vector
 from pycrorm_async.world.queries.bounding_boxes import BoundingBox
 
-__all__ = ["object_model", "assumed_model", "point_model"]
-
 _POINT: dict[str, Any] = {"root": "", "shapes": {"": [["sphere", [0.03], [0, 0, 0], [0, 0, 0], [1, 0, 1, 1]]]}}
 
 

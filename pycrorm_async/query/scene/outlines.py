@@ -12,8 +12,6 @@ from pycrorm_async.query.scene.link_frames import link_frames, placed
 from pycrorm_async.query.scene.object_model import assumed_model, object_model
 from pycrorm_async.query.snapshot import ObjectThen, WorldThen
 
-__all__ = ["Outline", "Point", "outlines"]
-
 Point: TypeAlias = tuple[float, float]
 
 _GREY = (0.62, 0.64, 0.68, 1.0)

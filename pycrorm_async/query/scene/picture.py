@@ -30,8 +30,6 @@ from pycrorm_async.world.objects import Object
 from pycrorm_async.world.pose import Vector
 from pycrorm_async.world.queries.photograph import Camera, photograph
 
-__all__ = ["When", "picture", "png"]
-
 When: TypeAlias = float | str | datetime | None
 """Seconds since the start, `e115` for an event, a wall clock's time; None: the moment before the world is emptied."""
 

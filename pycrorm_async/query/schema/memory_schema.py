@@ -21,8 +21,6 @@ from pycrorm_async.projections.schema.generations import current_generation
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.suggestions import nearest
 
-__all__ = ["Column", "View", "read_schema", "as_text", "as_mermaid", "CORE_VIEWS"]
-
 CORE_VIEWS = (
     "process_metadata",
     "task_tree_node",

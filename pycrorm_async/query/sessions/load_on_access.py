@@ -21,8 +21,6 @@ from typing import TypeVar
 from sqlalchemy import Connection
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
-__all__ = ["LoadOnAccess"]
-
 _Result = TypeVar("_Result")
 
 

@@ -30,8 +30,6 @@ from pycrorm_async.errors import QueryRefused
 from pycrorm_async.query.sql.refusals import NOT_ONE, ONLY_READS, missing_relation, stopped
 from pycrorm_async.store.postgresql.search_path import LOG_SCHEMA, TABLES_SCHEMA, VIEWS_SCHEMA
 
-__all__ = ["postgresql_cursor"]
-
 READER = "pycrorm_reader"
 
 _BEGIN = (

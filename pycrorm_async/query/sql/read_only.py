@@ -28,8 +28,6 @@ from typing import Any, Protocol
 from pycrorm_async.errors import QueryRefused
 from pycrorm_async.store.log import EventLog
 
-__all__ = ["DEFAULT_LIMITS", "ReadOnlySql", "SqlLimits", "SqlResult", "SqlRows"]
-
 _ROWS_AT_ONCE = 500
 """Bounds the rows that are fetched in one visit to the database."""
 _SECONDS_MAX = 86_400

@@ -8,8 +8,6 @@ from collections.abc import Iterable
 from pycrorm_async.errors import QueryRefused
 from pycrorm_async.query.suggestions import nearest
 
-__all__ = ["NOT_ONE", "ONLY_READS", "missing_relation", "stopped"]
-
 ONLY_READS = "a query may only read: it is one SELECT, or WITH … SELECT"
 NOT_ONE = "a query is one statement: this text has several"
 _INTERNAL = re.compile(r"__\d+$|^sqlite_|^pycrorm_generation$")

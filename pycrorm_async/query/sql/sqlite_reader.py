@@ -27,8 +27,6 @@ from typing import Any, TypeVar
 from pycrorm_async.errors import QueryRefused
 from pycrorm_async.query.sql.refusals import NOT_ONE, ONLY_READS, missing_relation, stopped
 
-__all__ = ["sqlite_cursor"]
-
 _T = TypeVar("_T")
 _PROGRAM = Path(__file__).with_name("sqlite_process.py")
 _START_S = 60.0

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["Kind", "success_figure"]
-
 Kind: TypeAlias = Literal["auto", "heatmap", "scatter"]
 
 _POINTS_MAX = 500

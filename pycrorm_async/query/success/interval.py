@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 
-__all__ = ["interval_95"]
-
 _Z = 1.959964
 """95 % of a normal distribution are within this many standard deviations."""
 

@@ -20,8 +20,6 @@ from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.suggestions import nearest
 from pycrorm_async.task_status import TaskStatus
 
-__all__ = ["Samples", "Source", "Values", "success_samples"]
-
 Source: TypeAlias = "str | type[DeclarativeBase] | Select[Any]"
 """A view, table, mapped class or designator type by name, a mapped class, or a select; with a column `status`."""
 

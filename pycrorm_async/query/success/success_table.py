@@ -13,8 +13,6 @@ from pycrorm_async.errors import CallerError
 from pycrorm_async.query.success.interval import interval_95
 from pycrorm_async.query.success.samples import Samples, Values
 
-__all__ = ["Axis", "Cell", "SuccessTable", "success_table"]
-
 _BINS_MAX = 200
 _BINS_LEAST, _BINS_USUAL = 4, 16
 _ROWS_A_CELL = 5

@@ -18,8 +18,6 @@ from pycrorm_async.store.dialect import Insertion
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.stored import StoredEvent
 
-__all__ = ["CaseBatch"]
-
 
 class CaseBatch(ProjectedBatch):
     """The cases of one batch of events, which it writes as one block. Implements `Batch`."""

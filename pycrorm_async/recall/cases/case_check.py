@@ -21,8 +21,6 @@ from pycrorm_async.recall.case import Case
 from pycrorm_async.recall.cases.case_batch import CaseBatch
 from pycrorm_async.recall.cases.stored_blocks import BLOCKS, BlockHeading, read_blocks, read_headings
 
-__all__ = ["CaseCheck"]
-
 _BLOCKS_KEPT: Final = 20
 """Bounds the blocks that are kept decoded between parts, because a full one has the cases of many parts: 5 MB each."""
 

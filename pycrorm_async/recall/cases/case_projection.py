@@ -22,8 +22,6 @@ from pycrorm_async.recall.cases.stored_blocks import (
     COLUMNS,
 )
 
-__all__ = ["CaseProjection"]
-
 
 class CaseProjection(PackedProjection):
     """Makes a case of each action that ends. The row of a case is packed with others into a block."""

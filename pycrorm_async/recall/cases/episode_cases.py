@@ -35,8 +35,6 @@ from pycrorm_async.recall.case import Case
 from pycrorm_async.recall.cases.situation import FeatureFields, Numbers, Symbols, situation
 from pycrorm_async.store.stored import StoredEvent
 
-__all__ = ["EpisodeCases", "READS"]
-
 READS: Final = (
     EpisodeStarted,
     EpisodeEnded,

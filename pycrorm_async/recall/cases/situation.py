@@ -29,8 +29,6 @@ from pycrorm_async.events.values import PoseValue, RobotValue
 from pycrorm_async.projections.fold.world_fold import WorldFold, WorldObject
 from pycrorm_async.recall.case import RESERVED
 
-__all__ = ["FeatureFields", "Numbers", "Symbols", "situation"]
-
 Symbols: TypeAlias = dict[str, str | tuple[str, ...]]
 Numbers: TypeAlias = dict[str, float]
 

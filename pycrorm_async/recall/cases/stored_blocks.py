@@ -33,20 +33,6 @@ from pycrorm_async.recall.blocks import Block, merge
 from pycrorm_async.store.dialect import RowsByTable
 from pycrorm_async.store.dialects import dialect_of
 
-__all__ = [
-    "BLOCK_COLUMNS",
-    "BLOCKS",
-    "COLUMNS",
-    "COLUMN_COLUMNS",
-    "BlockHeading",
-    "merge_blocks",
-    "read_blocks",
-    "read_headings",
-    "read_left_out",
-    "rows_of",
-    "select_numbers",
-]
-
 BLOCKS: Final = "recall_block"
 COLUMNS: Final = "recall_column"
 BLOCK_COLUMNS: Final = {

@@ -19,8 +19,6 @@ from pycrorm_async.world.bullet import BulletWorld
 from pycrorm_async.world.objects import Object
 from pycrorm_async.world.robots.acting_robot import acting_robot
 
-__all__ = ["present_situation"]
-
 
 def present_situation(target: Object | ObjectDesignator, action: str | type) -> tuple[Symbols, Numbers]:
     """Return the features of an action that would start now, without those of parameters other than the object.

@@ -29,8 +29,6 @@ from pycrorm_async.store.episode_lookup import episode_named
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import StoredEvent
 
-__all__ = ["ProcessCases"]
-
 _READS: Final = frozenset(each.__name__ for each in READS)
 _EVENTS_MAX: Final = 100_000
 """Bounds the events between two recalls. Beyond it the open episodes are read from the log again."""

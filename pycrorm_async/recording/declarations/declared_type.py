@@ -8,8 +8,6 @@ from typing import NamedTuple
 from pycrorm_async.events.types import DesignatorTypeDeclared
 from pycrorm_async.events.values import FieldDeclared
 
-__all__ = ["DeclaredType", "Field", "Undeclared"]
-
 
 class Field(NamedTuple):
     """A declared field, the attribute path to its value, and its enum class if it is an enum."""

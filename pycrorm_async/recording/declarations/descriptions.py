@@ -25,8 +25,6 @@ from pycrorm_async.world.models.link_boxes import link_boxes
 from pycrorm_async.world.models.mesh_boxes import mesh_files, meshed_links, with_mesh_files
 from pycrorm_async.world.queries.bounding_boxes import BoundingBox
 
-__all__ = ["Described", "Descriptions"]
-
 _KNOWN_MAX = 1_000
 """Bounds the descriptions kept, because a program may generate any number. When it is reached all are dropped."""
 _KNOWN_CHARACTERS_MAX = 2**24

@@ -7,8 +7,6 @@ from collections.abc import Callable, Mapping
 from pycrorm_async.events.types import DesignatorTypeDeclared
 from pycrorm_async.events.values import FieldDeclared
 
-__all__ = ["KnownTypes", "type_text"]
-
 _COLUMNS_MAX = 500
 """Bounds the names of one table, below the columns that the databases allow."""
 

@@ -29,8 +29,6 @@ from pycrorm_async.recording.declarations.known_types import KnownTypes
 from pycrorm_async.recording.values.parameter_types import Shape, shape_of
 from pycrorm_async.recording.values.texts import clean, clean_repr, cut
 
-__all__ = ["Declared", "FieldSpec", "RecordedKind", "Renamed", "declare_type"]
-
 RecordedKind: TypeAlias = Literal["action", "motion", "language"]
 FieldSpec: TypeAlias = FieldType | tuple[FieldType, ItemType] | type[Any]
 """`real`; `("list", "real")`; or a Python type: `float`, an `Enum` class, `list[float]`, `Pose`."""

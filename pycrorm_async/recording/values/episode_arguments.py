@@ -13,8 +13,6 @@ from pycrorm_async.recording.values.observed_values import ObservedReader
 from pycrorm_async.recording.values.value_snapshot import NO_REFERENCES
 from pycrorm_async.recording.writing.emitter import BlobRefused, Emitter
 
-__all__ = ["NO_LABELS", "Labels", "check_arguments", "read_labels"]
-
 _METADATA_BYTES_MAX: Final = 64 * 2**10
 """Bounds the metadata of an episode, which is one column: a page of settings, not data."""
 

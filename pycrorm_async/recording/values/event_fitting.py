@@ -21,18 +21,6 @@ from pycrorm_async.events.types import (
 from pycrorm_async.events.values import FailureValue, MissingValue, PoseValue
 from pycrorm_async.recording.values.texts import clean, cut
 
-__all__ = [
-    "EPISODE_TEXT_MAX",
-    "episode_text_of",
-    "fits",
-    "fit_detection",
-    "fit_node_end",
-    "fit_episode_end",
-    "fit_episode_start",
-    "fit_resolution",
-    "clean_texts",
-]
-
 EPISODE_TEXT_MAX = 10_000
 """Bounds the characters of an episode's description, plan and world, so that their columns stay readable."""
 

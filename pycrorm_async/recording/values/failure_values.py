@@ -14,8 +14,6 @@ from pycrorm_async.recording.values.value_snapshot import (
     missing_value,
 )
 
-__all__ = ["failure_value"]
-
 _TEXT_MAX = 2_000
 """Bounds the characters of a failure's message."""
 _NAME_MAX = 500

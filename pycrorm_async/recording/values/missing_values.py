@@ -9,8 +9,6 @@ from __future__ import annotations
 import logging
 from typing import NamedTuple
 
-__all__ = ["Missing", "MissingValues"]
-
 WARNED_MAX = 1_000
 """Bounds the (type, field) pairs with a warning of their own, because classes created in a loop would never stop."""
 

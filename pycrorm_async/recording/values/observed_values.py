@@ -19,8 +19,6 @@ from pycrorm_async.events.values import BlobReference, MissingValue
 from pycrorm_async.recording.values.texts import reading_fault
 from pycrorm_async.recording.values.value_snapshot import ITEMS_MAX, References, encode_or_missing, missing_in
 
-__all__ = ["ARRAY_ITEMS_MAX", "NPY", "ObservedReader"]
-
 ARRAY_ITEMS_MAX: Final = 64
 """Bounds the elements of an array that is recorded as JSON, each with a row of its own, as a joint state needs."""
 NPY: Final = "application/x-npy"

@@ -23,17 +23,6 @@ from pycrorm_async.plan.designator import Designator
 from pycrorm_async.recording.values.value_snapshot import OBJECT_TYPES
 from pycrorm_async.world.pose import Pose
 
-__all__ = [
-    "Parameter",
-    "Shape",
-    "Unresolved",
-    "parameters_of",
-    "shape_of",
-    "type_text",
-    "undecorated_fields",
-    "OUR_PACKAGE",
-]
-
 OUR_PACKAGE = "pycrorm_async."
 
 

@@ -18,8 +18,6 @@ from pycrorm_async.recording.values.event_fitting import fits
 from pycrorm_async.recording.values.texts import reading_fault
 from pycrorm_async.recording.values.value_snapshot import References, UnrecordableValue, encode_parameter, missing_value
 
-__all__ = ["ROBOT", "read_parameters", "fit_node_start"]
-
 ROBOT = "robot state"
 """The name under which a missing robot state is counted; the blank keeps it apart from every field's name."""
 _MISSING_BYTES = 400

@@ -8,8 +8,6 @@ from __future__ import annotations
 from reprlib import Repr
 from typing import Any
 
-__all__ = ["clean", "clean_repr", "cut", "message_of", "reading_fault"]
-
 _REPR_MAX = 200
 """Bounds the characters of a repr that is recorded in place of a value; enough to recognise the value."""
 _TEXT_MAX = 150

@@ -32,21 +32,6 @@ from pycrorm_async.recording.values.texts import clean, clean_repr, cut, reading
 from pycrorm_async.world.objects import Object
 from pycrorm_async.world.pose import Pose
 
-__all__ = [
-    "DEPTH_MAX",
-    "OBJECT_TYPES",
-    "REASON_MAX",
-    "UnrecordableValue",
-    "RefusedValue",
-    "References",
-    "NO_REFERENCES",
-    "pose_value",
-    "encode_parameter",
-    "encode_or_missing",
-    "missing_in",
-    "missing_value",
-]
-
 OBJECT_TYPES: tuple[type, ...] = (ObjectDesignator, Object)
 """Field types whose values are recorded as objects; `ObjectPart` and `BelieveObject` are object designators too."""
 

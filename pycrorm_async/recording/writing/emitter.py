@@ -20,8 +20,6 @@ from pycrorm_async.recording.writing.event_feed import EventFeed
 from pycrorm_async.recording.writing.event_sink import EventSink
 from pycrorm_async.settings import Settings
 
-__all__ = ["THREAD_NAME_PREFIX", "BlobRefused", "Emitter", "Faults"]
-
 _log = logging.getLogger("pycrorm_async")
 _BLOCK_S = 1.0
 """Bounds one wait for room. `put_payload` then tries again, so the value limits only the delay of a missed wake-up."""

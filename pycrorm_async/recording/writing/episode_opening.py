@@ -15,8 +15,6 @@ from pycrorm_async.recording.values.episode_arguments import NO_LABELS, Labels
 from pycrorm_async.recording.values.texts import clean
 from pycrorm_async.recording.writing.provenance import Provenance
 
-__all__ = ["EpisodeOpening", "current_task", "end_statuses", "episode_started"]
-
 
 class EpisodeOpening(NamedTuple):
     """The arguments an episode is opened with; its follow-ups repeat them."""

@@ -46,8 +46,6 @@ from pycrorm_async.recording.writing.emitter import Emitter
 from pycrorm_async.recording.writing.episode_opening import EpisodeOpening, end_statuses, episode_started
 from pycrorm_async.world.objects import Object
 
-__all__ = ["CONTINUED", "EpisodeWriter"]
-
 CONTINUED: Final = "EpisodeContinued"
 """The failure type of nodes and episodes that ended because a follow-up episode continues them."""
 

@@ -29,16 +29,6 @@ from pycrorm_async.clock import Clock
 from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.events.types import DesignatorTypeDeclared, Happening, NodeStarted
 
-__all__ = [
-    "BUFFER_EVENTS",
-    "EventBuffer",
-    "EventFeed",
-    "EventStream",
-    "RecordedEvent",
-    "Subscription",
-    "TimedEvent",
-]
-
 _log = logging.getLogger("pycrorm_async")
 BUFFER_EVENTS: Final = 10_000
 """Bounds the events that wait for one observer: a second of a plan that records 10,000 events a second."""

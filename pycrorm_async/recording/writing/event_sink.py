@@ -7,8 +7,6 @@ from typing import Protocol
 
 from pycrorm_async.events.envelope import Heading
 
-__all__ = ["EventSink"]
-
 
 class EventSink(Protocol):
     """The producing end of a queue."""

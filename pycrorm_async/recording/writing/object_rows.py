@@ -21,8 +21,6 @@ from pycrorm_async.events.values import ObjectReference
 from pycrorm_async.recording.values.event_fitting import clean_texts
 from pycrorm_async.recording.writing.emitter import Emitter
 
-__all__ = ["ObjectRows"]
-
 K = TypeVar("K", bound=Hashable)
 
 

@@ -18,8 +18,6 @@ from pycrorm_async.recording.values.texts import clean, clean_repr, cut
 from pycrorm_async.recording.writing.emitter import Emitter
 from pycrorm_async.recording.writing.episode_writer import EpisodeWriter
 
-__all__ = ["put_observation"]
-
 _NAME_MAX = 1_000
 """Bounds the characters of a name, far above real names."""
 _PATH_BYTES_MAX = 8_192

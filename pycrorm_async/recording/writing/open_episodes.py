@@ -21,8 +21,6 @@ from pycrorm_async.events.ids import EpisodeId, episode_id, episode_text
 from pycrorm_async.recording.writing.emitter import Emitter
 from pycrorm_async.recording.writing.episode_writer import EpisodeWriter
 
-__all__ = ["OpenEpisodes"]
-
 _log = logging.getLogger("pycrorm_async")
 RECENT_MAX = 100
 """Bounds the ids in `recent`, because a process may open any number of episodes."""

@@ -13,8 +13,6 @@ from typing import Any, NamedTuple
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock, clock_quality
 from pycrorm_async.settings import Settings
 
-__all__ = ["PlanSource", "Provenance"]
-
 _LIBRARIES = tuple(
     "pycrorm-async pycram-robotics pybullet pycram-bullet numpy msgspec SQLAlchemy aiosqlite asyncpg".split()
 )

@@ -11,36 +11,6 @@ from __future__ import annotations
 from pycrorm_async.store.dialect import DigestStatements
 from pycrorm_async.store.postgresql.tables import DIGEST
 
-__all__ = [
-    "DIGEST_STATEMENTS",
-    "INSERT_DECLARATIONS",
-    "SELECT_EPISODES_BY_ID",
-    "SELECT_EPISODES_AND_WITNESS",
-    "SELECT_HEADS",
-    "NEW_NUMBERS",
-    "SKIP_NUMBERS",
-    "SELECT_NUMBERS_TAKEN",
-    "INSERT_INCARNATION",
-    "SELECT_INCARNATIONS",
-    "SYNCHRONOUS_STANDBYS",
-    "SELECT_SYNCHRONOUS",
-    "EVENT_COLUMNS",
-    "UPSERT_EPISODES",
-    "WRITE_AHEAD",
-    "SELECT_STORED_AGAIN",
-    "SELECT_EPISODES",
-    "SELECT_BEHIND",
-    "SELECT_STOPPED",
-    "SELECT_NUMBER_MAX",
-    "SELECT_LONG",
-    "SELECT_EVENTS",
-    "SELECT_SPANS",
-    "SELECT_DECLARATIONS",
-    "SELECT_DESCRIPTIONS",
-    "ADVANCE_FOLDED",
-    "PARK",
-]
-
 # Transactions that insert new declarations take turns, so that the order by `ordinal` is that of their commits.
 # Otherwise a fold could read the second before the first, and name contradicting fields otherwise than a rebuild.
 INSERT_DECLARATIONS = """
