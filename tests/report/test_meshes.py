@@ -12,6 +12,7 @@ from pycrorm_async.settings import RecordMeshes, Settings
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
 from tests import mesh_files
 from tests.report.browser import Browser
+from tests.report.test_page import NO_WEBGL
 
 pytestmark = pytest.mark.slow
 
@@ -21,10 +22,11 @@ LINK = """<link name="{0}">
 <collision><geometry><mesh filename="{1}" scale="0.5 0.5 2"/></geometry></collision></link>
 """
 JOINT = '<joint name="{1}" type="fixed"><origin xyz="1 0 0"/><parent link="{0}"/><child link="{1}"/></joint>'
+UPRIGHT = Pose([0, 0, 1])
 FILES = {"stl": mesh_files.binary_stl(), "obj": mesh_files.obj(), "dae": mesh_files.collada()}
 
 
-async def record(folder: Path, meshes: RecordMeshes = "files") -> str:
+async def record(folder: Path, meshes: RecordMeshes = "files", pose: Pose = UPRIGHT) -> str:
     """Record an episode with one object that has a link for each format of mesh files; return the URL."""
     links = []
     for suffix, content in FILES.items():
@@ -37,7 +39,7 @@ async def record(folder: Path, meshes: RecordMeshes = "files") -> str:
     async with Memory.open(url, settings=Settings(record_meshes=meshes)) as memory:
         async with memory.episode(description="meshes"):
             with BulletWorld():
-                Object("parts", ObjectType.GENERIC_OBJECT, urdf, Pose([0, 0, 1]))
+                Object("parts", ObjectType.GENERIC_OBJECT, urdf, pose)
         await memory.flush()
     return url
 
@@ -60,6 +62,17 @@ async def test_mesh_files_are_drawn_with_their_triangles(chrome: Browser, tmp_pa
         assert tab.ask(f"((link) => {part}.children[0].geometry.index.count)('stl')") == 18
         assert tab.ask("document.getElementById('notes').textContent") == ""
         assert tab.problems() == []
+
+
+async def test_the_map_has_the_outlines_of_meshes(chrome: Browser, tmp_path: Path) -> None:
+    lying = Pose([0, 0, 1], [0.5**0.5, 0, 0, 0.5**0.5])
+    async with Memory.open(await record(tmp_path, pose=lying)) as memory:
+        page = (await memory.report(1, tmp_path / "page.html")).path
+    corners = """[...document.querySelectorAll('#map polygon')].map((each) =>
+      each.getAttribute('points').split(' ').map((corner) => corner.split(',').map((number) => Number(number) + 0)))"""
+    with chrome.open(page, script=NO_WEBGL) as tab:
+        triangles = sorted(sorted({(x, y) for x, y in each}) for each in tab.ask(corners))
+        assert triangles == [[(x, 0), (x + 0.25, 2), (x + 0.5, 0)] for x in (0, 1, 2)]
 
 
 async def test_a_page_says_which_meshes_are_boxes_and_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -123,6 +123,24 @@ def test_a_map_takes_the_place_of_the_scene_without_webgl(chrome: Browser, pages
         assert_quiet(tab, pages["plan"])
 
 
+@pytest.mark.parametrize("width", [420, 1400])
+def test_the_names_on_the_map_cover_no_other_and_are_inside(
+    chrome: Browser, pages: dict[str, Path], width: int
+) -> None:
+    with chrome.open(pages["plan"], width=width, script=NO_WEBGL) as tab:
+        places = """[...document.querySelectorAll('#map svg, #map text')].map((each) => {
+          const { left, right, top, bottom } = each.getBoundingClientRect();
+          return [left, right, top, bottom];
+        })"""
+        (left, right, top, bottom), *names = tab.ask(places)
+        assert len(names) == 3
+        for index, (west, east, north, south) in enumerate(names):
+            assert left <= west < east <= right
+            assert top <= north < south <= bottom
+            for begin, end, _, _ in [each for each in names[:index] if each[2] < south - 2 and north + 2 < each[3]]:
+                assert end <= west + 1 or east <= begin + 1
+
+
 def test_print_has_the_map_all_rows_and_all_panels(chrome: Browser, pages: dict[str, Path], tmp_path: Path) -> None:
     with chrome.open(pages["plan"], media="print") as tab:
         tab.wait_for("document.querySelectorAll('#map polygon').length > 20")

@@ -69,7 +69,7 @@ class Page {
       `episode ${episode.number}`,
       episode.started,
       duration(episode.secondsAt(episode.last)),
-      `${episode.nodes.length} nodes${failed ? `, ${failed} failed from ${roots} cause${roots === 1 ? "" : "s"}` : ""}`,
+      `${episode.nodes.length} node${episode.nodes.length === 1 ? "" : "s"}${failed ? `, ${failed} failed from ${roots} cause${roots === 1 ? "" : "s"}` : ""}`,
       `by ${episode.created_by}`,
       episode.simulated ? "a simulation" : null,
       episode.tags.length > 0 ? episode.tags.join(", ") : null,

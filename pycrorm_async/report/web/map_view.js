@@ -3,6 +3,7 @@
 import { svg } from "./dom.js";
 
 const SIZE_MIN_M = 2;
+const DIRECTIONS = 160;
 
 export class MapView {
   constructor(holder, episode, bodies) {
@@ -56,11 +57,10 @@ export class MapView {
       const attributes = { points: corners, class: `path ${color.slice(2)}`, "stroke-width": scale * 0.5 };
       picture.append(svg("polyline", { ...attributes, "stroke-dasharray": dash }));
     });
-    for (const { body } of present) {
-      if (body.object.type === "ENVIRONMENT") continue;
-      const { x, y } = body.group.position;
-      const label = svg("text", { x, y: -y - scale * 1.5, "font-size": scale * 3, "text-anchor": "middle" });
-      label.textContent = body.object.name;
+    const named = present.filter(({ body }) => body.object.type !== "ENVIRONMENT");
+    for (const { x, y, size, name } of labelsOf(named, scale * 2.2, left, right)) {
+      const label = svg("text", { x, y: -y, "font-size": size, "text-anchor": "middle" });
+      label.textContent = name;
       picture.append(label);
     }
     this.holder.replaceChildren(picture);
@@ -83,21 +83,67 @@ function extent(points) {
   return [left - margin, right + margin, low - margin, high + margin];
 }
 
+const LETTER = 0.6; // the usual width of a letter, in heights
+
+/** Names above their bodies, inside the map, each above those that it would cover. */
+function labelsOf(bodies, size, left, right) {
+  const placed = [];
+  for (const { body, outlines } of bodies) {
+    const points = outlines.flatMap(({ hull }) => hull);
+    if (points.length === 0) points.push([body.group.position.x, body.group.position.y]);
+    const [xs, ys] = [points.map(([x]) => x), points.map(([, y]) => y)];
+    const { name } = body.object;
+    const half = Math.min((name.length * size * LETTER) / 2, (right - left) / 2);
+    const middle = (Math.min(...xs) + Math.max(...xs)) / 2;
+    placed.push({ name, size, half, x: Math.min(Math.max(middle, left + half), right - half), y: Math.max(...ys) + size * 0.4 });
+  }
+  const upwards = [...placed].sort((one, other) => one.y - other.y);
+  upwards.forEach((each, index) => {
+    const covers = (other) => Math.abs(each.x - other.x) < each.half + other.half && Math.abs(each.y - other.y) < size;
+    while (upwards.slice(0, index).some(covers)) each.y += size / 4;
+  });
+  return placed;
+}
+
 /** The outline from above, the height and the colour of each shape of a body. */
 function outlinesOf(body) {
   const outlines = [];
   body.group.traverse((each) => {
     if (!each.isMesh) return;
-    each.geometry.computeBoundingBox();
-    const { min, max } = each.geometry.boundingBox;
-    const corners = [];
-    for (const x of [min.x, max.x])
-      for (const y of [min.y, max.y])
-        for (const z of [min.z, max.z]) corners.push(new THREE.Vector3(x, y, z).applyMatrix4(each.matrixWorld));
-    const top = Math.max(...corners.map((corner) => corner.z));
+    const corners = outermostOf(each.geometry).map((corner) => corner.clone().applyMatrix4(each.matrixWorld));
+    const top = corners.reduce((highest, { z }) => Math.max(highest, z), -Infinity);
     outlines.push({ top, hull: hullOf(corners.map(({ x, y }) => [x, y])), color: `#${each.material.color.getHexString()}` });
   });
   return outlines;
+}
+
+/** The vertices of a geometry that can be corners of an outline: all of a few, of many the outermost in each direction. */
+function outermostOf(geometry) {
+  const { position } = geometry.attributes;
+  if (geometry.userData.outermost === undefined) {
+    const vertexAt = (index) => new THREE.Vector3().fromBufferAttribute(position, index);
+    const outermost = position.count > DIRECTIONS ? outermostIndices(position) : Array.from({ length: position.count }, (_, index) => index);
+    geometry.userData.outermost = outermost.map(vertexAt);
+  }
+  return geometry.userData.outermost;
+}
+
+/** Directions spread evenly over the sphere (Fibonacci), and for each the vertex that lies farthest in it. */
+function outermostIndices(position) {
+  const { array } = position;
+  const found = new Set();
+  for (let index = 0; index < DIRECTIONS; index++) {
+    const z = 1 - (2 * index + 1) / DIRECTIONS;
+    const [across, turn] = [Math.sqrt(1 - z * z), index * Math.PI * (3 - Math.sqrt(5))];
+    const [x, y] = [Math.cos(turn) * across, Math.sin(turn) * across];
+    let [best, farthest] = [0, -Infinity];
+    for (let at = 0; at < array.length; at += 3) {
+      const far = x * array[at] + y * array[at + 1] + z * array[at + 2];
+      if (far > farthest) [best, farthest] = [at / 3, far];
+    }
+    found.add(best);
+  }
+  return [...found];
 }
 
 /** The convex hull of points in the plane. */
