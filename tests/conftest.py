@@ -9,12 +9,14 @@ import sys
 from collections.abc import AsyncIterator, Generator, Iterator
 from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from hypothesis import HealthCheck, settings
 
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
+from tests.commands import fork_child
 from tests.databases import Server, server_in_memory
 from tests.report.browser import Browser, browser, chromium
 from tests.soak_turns import current_commit, place_of, turn_of
@@ -42,12 +44,15 @@ def chrome(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 
 @pytest.fixture(params=["sqlite", "postgresql"])
 def database_url(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str]:
-    """The URL of a new database, for each test on both kinds of database."""
+    """The URL of a new memory, for each test on both kinds of database; on SQLite its file does not exist yet.
+
+    For a test marked `empty_database` the PostgreSQL database holds no memory either.
+    """
     if request.param == "sqlite":
         yield f"sqlite:///{tmp_path / 'memory.db'}"
         return
     running: Server = request.getfixturevalue("server")
-    url = running.new_database()
+    url = running.new_database() if request.node.get_closest_marker("empty_database") else running.new_memory()
     yield url
     running.drop(url)  # several hundred files, which would be written to the disk and deleted at the end
 
@@ -62,14 +67,20 @@ async def log(database_url: str) -> AsyncIterator[EventLog]:
 
 @pytest.fixture(scope="module", params=["sqlite", "postgresql"])
 def module_database_url(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """A new database of each kind for all tests of a module, which fill it once and then only read it."""
+    """A new memory of each kind for all tests of a module, which fill it once and then only read it."""
     if request.param == "sqlite":
         yield f"sqlite:///{tmp_path_factory.mktemp('memory') / 'memory.db'}"
         return
     running: Server = request.getfixturevalue("server")
-    url = running.new_database()
+    url = running.new_memory()
     yield url
     running.drop(url)
+
+
+@pytest.fixture
+def forked_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let the fold workers that the test starts be forked instead of spawned, see `fork_child`."""
+    monkeypatch.setattr("pycrorm_async.operations.fold_worker.ChildProcess", SimpleNamespace(start=fork_child))
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -81,6 +92,9 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         help="of the tests marked soak, run the tenth whose turn COMMIT is (without one: the commit checked out), with "
         "loops shortened; use with -m soak",
     )
+
+
+gc.disable()  # until all tests are collected: nothing becomes garbage while modules are imported
 
 
 def pytest_configure() -> None:
@@ -140,6 +154,7 @@ def pytest_collection_finish() -> None:
     gc.collect()
     gc.freeze()
     gc.set_threshold(20_000)
+    gc.enable()
 
 
 @pytest.fixture

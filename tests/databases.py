@@ -21,6 +21,10 @@ from urllib.parse import urlsplit
 
 import asyncpg
 
+from pycrorm_async.projections.projector import Projector
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.log import EventLog
+
 __all__ = [
     "Server",
     "server_in",
@@ -35,6 +39,8 @@ __all__ = [
 
 _ROOM_BYTES: Final = 4 << 30
 """A server takes at most half a gigabyte, and each test process starts one or two."""
+_RENAME_LOG: Final = ("SET session_replication_role = replica", "UPDATE pycrorm_log SET id = gen_random_uuid()")
+"""Give a copied log an id of its own; as a replica the server does not run the triggers that refuse it."""
 
 
 class Server:
@@ -44,6 +50,7 @@ class Server:
         self.folder: Final = folder
         self._server = server
         self._numbers = itertools.count(1)
+        self._template: str | None = None
 
     @property
     def programs(self) -> Path:
@@ -57,9 +64,22 @@ class Server:
 
     def new_database(self) -> str:
         """Return the URL of a new, empty database."""
+        return self.url(self._new_copy("template1"))
+
+    def new_memory(self) -> str:
+        """Return the URL of a new, empty memory. It is the copy of one, because making its tables takes 0.1 s."""
+        if self._template is None:
+            self._template = self._new_copy("template1")
+            run_in_own_loop(_make_memory(self.url(self._template)))
+        url = self.url(self._new_copy(self._template))
+        change_each(url, _RENAME_LOG)
+        return url
+
+    def _new_copy(self, template: str) -> str:
         name = f"memory_{next(self._numbers)}"
-        run_in_own_loop(_run(self.url(), f"CREATE DATABASE {name}", ()))
-        return self.url(name)
+        # Copies files, which takes half the time of the default, writing each page to the write-ahead log.
+        run_in_own_loop(_run(self.url(), f"CREATE DATABASE {name} TEMPLATE {template} STRATEGY file_copy", ()))
+        return name
 
     def drop(self, url: str) -> None:
         """Drop the database of that URL, although programs are connected to it."""
@@ -187,6 +207,14 @@ def change_each(place: str | Path, statements: Iterable[str]) -> None:
         for each in statements:
             connection.execute(each)
         connection.commit()
+
+
+async def _make_memory(url: str) -> None:
+    log = await EventLog.open(DatabaseAddress.parse(url), create=True)
+    try:
+        await Projector(log).open()
+    finally:
+        await log.close()
 
 
 @asynccontextmanager

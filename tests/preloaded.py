@@ -44,3 +44,4 @@ Provenance.of(None, Settings(), SYSTEM_CLOCK)
 with suppress(BulletMissing):
     engine()
 gc.freeze()
+gc.enable()

@@ -1,6 +1,6 @@
 """Faults of a fold worker during its transaction: the daemon reports them, replaces the worker, and folds everything.
 
-The daemon runs in this loop; its one worker is a process of its own.
+The daemon runs in this loop; its one worker is a process of its own, which is forked instead of spawned.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from pycrorm_async.store.log import EventLog
 from tests.databases import ask
 from tests.operations.faults import TRAP, Trapped, arm
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("forked_workers")]
 
 PATIENT = Settings(sync_interval_ms=5, fold_worker_restart_s=0.1, fold_worker_report_s=0.1)
 IMPATIENT = replace(PATIENT, fold_worker_stopped_s=0.6)

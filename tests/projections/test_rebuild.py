@@ -64,6 +64,7 @@ async def every_kind_of_episode(url: str, spool: Path) -> None:
     await append_and_fold(url, whispering(11))
 
 
+@pytest.mark.usefixtures("forked_workers")
 async def test_rebuilt_tables_equal_row_for_row_those_folded_live(database_url: str, tmp_path: Path) -> None:
     await every_kind_of_episode(database_url, tmp_path / "spool")
     before, stopped, failed = tables_of(database_url), ask(database_url, STOPPED), ask(database_url, FAILED)
@@ -118,6 +119,7 @@ FAILED = 'SELECT * FROM "Failed" ORDER BY id'
         pytest.param(100, {0, 1, 2, 3}, 2.4, [2], marks=pytest.mark.soak),
     ],
 )
+@pytest.mark.usefixtures("forked_workers")
 async def test_large_logs_are_rebuilt_by_two_processes_where_two_cores_are_idle(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, events: int, cores: set[int], load: float, begun: list[int]
 ) -> None:
@@ -164,6 +166,7 @@ async def test_workers_that_are_killed_are_restarted_and_the_tables_are_the_same
     assert differences(before, tables_of(url)) == []
 
 
+@pytest.mark.empty_database
 async def test_missing_tables_are_made(database_url: str) -> None:
     await append_and_fold(database_url, [*TYPES, *picking(1).records, *parking(2).records], folded=False)
     done = await rebuild_memory(database_url)

@@ -157,6 +157,7 @@ async def test_a_session_cannot_write(reading: Reading) -> None:
             await connection.exec_driver_sql("DELETE FROM zz_pose__1001")
 
 
+@pytest.mark.empty_database
 async def test_a_memory_that_is_missing_or_has_no_tables_is_unavailable(log: EventLog, tmp_path: object) -> None:
     with pytest.raises(DatabaseUnavailable):
         async with Reading.open(f"sqlite:///{tmp_path}/nothing.db"):

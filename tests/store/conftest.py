@@ -11,6 +11,11 @@ from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 
 
+def pytest_itemcollected(item: pytest.Item) -> None:
+    """Let each test of this folder make its log."""
+    item.add_marker(pytest.mark.empty_database)
+
+
 @pytest.fixture
 def address(database_url: str) -> DatabaseAddress:
     return DatabaseAddress.parse(database_url)
