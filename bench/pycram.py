@@ -1,16 +1,19 @@
 """Measure how much CPU time of its thread a plan of PyCRAM takes with and without this memory.
 
-    .venv-pycram/bin/python -m bench.pycram            25 pairs for each writer, about five minutes
-    .venv-pycram/bin/python -m bench.pycram --quick    two pairs
+    .venv-pycram/bin/python -m bench.pycram                              25 pairs for each writer, about five minutes
+    .venv-pycram/bin/python -m bench.pycram --quick                      two pairs
+    .venv-pycram/bin/python -m bench.pycram --writer daemon --pairs 100  a narrow interval for one writer
 
 `python -m tests.integrations.pycram.environment` makes that environment. A plan of 19 nodes (park, raise the torso,
 pick up, drive, place) is performed twice inside `remember` and twice without, in pairs of alternating order. The first
 plan also declares the types of its nodes, which happens once; opening and closing the memory is not measured. The
 measurement is `time.thread_time` of the plan's thread: wall times would say nothing, because PyCRAM sleeps and other
 programs run. `daemon`: no daemon drains the spool, which a process of its own would do. `thread`: the tables are made
-when the block ends, which is the default of `remember`; `idle`: whenever the plan is idle. The script prints one JSON
-line: CPU of a plan in ms, the median ratio of a pair, its quartiles, the median difference, and the ratio of the least
-times, which a busy machine disturbs least.
+when the block ends, which is the default of `remember`; `idle`: whenever the plan is idle. The garbage is collected
+before each plan, so that both kinds pay for their own. The script prints one JSON line: CPU of a plan in ms, the median
+ratio of a pair, its 95 % interval (of order statistics, which assumes no distribution) and quartiles, the median
+difference, and the ratio of the least times, which a busy machine disturbs least. With 25 pairs the interval is about
+3 % to each side on a quiet machine, and 20 % on a busy one.
 """
 
 from __future__ import annotations
@@ -33,8 +36,8 @@ from tests.integrations.pycram.headless import leave_out_mesh_checks, start_pycr
 _PAIRS = 25
 
 
-def measure(folder: Path, pairs: int) -> dict[str, Any]:
-    """Measure all writers in one process and world."""
+def measure(folder: Path, pairs: int, only: str | None = None) -> dict[str, Any]:
+    """Measure all writers, or only one of them, in one process and world."""
     worlds = start_pycram(folder / "home")
     from pycram.process_module import simulated_robot
 
@@ -51,6 +54,8 @@ def measure(folder: Path, pairs: int) -> dict[str, Any]:
     result: dict[str, Any] = {"pairs": pairs}
     with simulated_robot:
         for name, arguments in kinds.items():
+            if only not in (None, name):
+                continue
             url = f"sqlite:///{folder / name}.db"
 
             def remembered(url: str = url, arguments: dict[str, Any] = arguments) -> AbstractContextManager[Any]:
@@ -75,11 +80,19 @@ def compare(remembered: Callable[[], AbstractContextManager[Any]], pairs: int) -
         figures[name] = {
             "without_ms": round(statistics.median(without_ms), 1),
             "ratio": round(statistics.median(ratios), 3),
+            "ratio_interval": [round(each, 3) for each in median_interval(ratios)],
             "ratio_quartiles": [round(each, 3) for each in statistics.quantiles(ratios, n=4)[::2]],
             "more_ms": round(statistics.median(more_ms), 2),
             "ratio_of_least": round(min(with_ms) / min(without_ms), 3),
         }
     return figures
+
+
+def median_interval(values: list[float]) -> tuple[float, float]:
+    """Return two of the values between which their population's median is with a probability of 95 %."""
+    ordered = sorted(values)
+    rank = max(0, int(len(ordered) / 2 - 0.98 * len(ordered) ** 0.5) - 1)
+    return ordered[rank], ordered[-1 - rank]
 
 
 def make_world(worlds: Any) -> None:
@@ -122,12 +135,15 @@ def perform() -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true")
-    pairs = 2 if parser.parse_args().quick else _PAIRS
+    parser.add_argument("--pairs", type=int, default=_PAIRS)
+    parser.add_argument("--writer", choices=("daemon", "thread", "idle"))
+    given = parser.parse_args()
+    pairs = 2 if given.quick else max(2, given.pairs)
     code = 1
     try:
         with tempfile.TemporaryDirectory(prefix="pycram_bench_") as folder:
-            line = measure(Path(folder), pairs)
-        print(json.dumps({"command": "python -m bench.pycram" + (" --quick" if pairs == 2 else ""), **line}))
+            line = measure(Path(folder), pairs, given.writer)
+        print(json.dumps({"command": " ".join(["python -m bench.pycram", *sys.argv[1:]]), **line}))
         code = 0
     finally:  # PyCRAM's threads do not end
         sys.stdout.flush()

@@ -89,8 +89,10 @@ class PyCRAMEpisodes:
 
     def cause(self, episode: RecordedEpisode) -> int | None:
         """Return the key of the innermost node of this thread in an episode; None without one."""
-        nodes = reversed(self.thread.nodes)
-        return next((each.key for each in nodes if each.key is not None and each.episode is episode), None)
+        for each in reversed(self.thread.nodes):  # a generator would take twice as long
+            if each.key is not None and each.episode is episode:
+                return each.key
+        return None
 
     def end_simulation(self, failure: BaseException | None) -> None:
         """End the simulation, if there is one."""

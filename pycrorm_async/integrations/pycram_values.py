@@ -40,6 +40,8 @@ _USED: Final = {
 }
 _OBJECT_TYPES: Final = {"PhysicalObject": "GENERIC_OBJECT", "Cereal": "BREAKFAST_CEREAL"}
 """PyCRAM's concepts that have another name here."""
+_AS_THEY_ARE: Final = frozenset({bool, int, float, str, datetime})
+"""The types of values that are recorded without a conversion."""
 _MONITOR_INTERVAL_S: Final = 0.1
 """PyCRAM's time between two evaluations of a condition."""
 
@@ -55,6 +57,7 @@ class PyCRAMValues:
         modules = {each: import_module(f"pycram.{module}") for module, names in _USED.items() for each in names.split()}
         self.pycram: PyCRAM = SimpleNamespace(**{name: getattr(module, name) for name, module in modules.items()})
         used = self.pycram
+        self._names: dict[type, tuple[str, ...]] = {}
         self._field_types: tuple[tuple[type, ItemType], ...] = (
             (Enum, "enum"),  # before `int`, which some of PyCRAM's enums are
             (bool, "boolean"),
@@ -85,10 +88,17 @@ class PyCRAMValues:
             }
         if not isinstance(designator, used.ActionDescription | used.BaseMotion):
             return {}
-        values = {each.name: getattr(designator, each.name) for each in _fields(type(designator))}
+        values = {name: getattr(designator, name) for name in self._names_of(type(designator))}
         if isinstance(designator, used.MoveTorsoAction):
             values["position"] = self._torso_goal(designator)
         return _with_grasp(values)
+
+    def _names_of(self, designator: type) -> tuple[str, ...]:
+        names = self._names.get(designator)
+        if names is None:
+            fields = (each.name for each in dataclasses.fields(designator) if each.init)
+            names = self._names[designator] = tuple(each for each in fields if not each.startswith("_"))
+        return names
 
     def _torso_goal(self, action: Any) -> float | None:
         """Return the goal of the torso joint, m, which PyCRAM's action names by a state."""
@@ -99,7 +109,7 @@ class PyCRAMValues:
 
     def options(self, node: Any) -> dict[str, Any]:
         """Return those parameters of an unresolved action that have one value only."""
-        values = {each.name: node.kwargs.get(each.name) for each in _fields(node.action)}
+        values = {name: node.kwargs.get(name) for name in self._names_of(node.action)}
         return _with_grasp({name: None if isinstance(each, list | tuple) else each for name, each in values.items()})
 
     def field_types(self, designator: type, values: dict[str, Any]) -> dict[str, FieldSpec]:
@@ -137,6 +147,8 @@ class PyCRAMValues:
 
     def value(self, value: Any, episode: RecordedEpisode) -> Any:
         """Convert a parameter or a result for this episode. Raises `ValueError` with the reason if it cannot."""
+        if type(value) in _AS_THEY_ARE or isinstance(value, Enum):
+            return value
         used = self.pycram
         if isinstance(value, used.Object):
             return episode.reference(self.key(value)) or ObjectValue("Object", value.name, self.object_type(value))
@@ -227,10 +239,6 @@ class PyCRAMValues:
 
 def _function_name(function: Any) -> str:
     return str(getattr(function, "__qualname__", type(function).__qualname__))
-
-
-def _fields(designator: type) -> list[dataclasses.Field[Any]]:
-    return [each for each in dataclasses.fields(designator) if each.init and not each.name.startswith("_")]
 
 
 def _with_grasp(values: dict[str, Any]) -> dict[str, Any]:

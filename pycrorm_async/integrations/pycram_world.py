@@ -62,9 +62,11 @@ class PyCRAMWorld:
     @guarded
     def _joint_moved(self, world: Any, joint: Any, position: float) -> None:
         if self._episodes.of(world) is not None:
-            owner = joint.object
-            joints = self._episodes.thread.joints
-            joints.setdefault(id(owner), (owner, {}))[1][joint.name] = float(position)
+            owner, joints = joint.object, self._episodes.thread.joints
+            moved = joints.get(id(owner))
+            if moved is None:
+                joints[id(owner)] = moved = (owner, {})
+            moved[1][joint.name] = float(position)
             self._flush_unless_moving()
 
     @guarded

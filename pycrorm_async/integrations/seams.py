@@ -36,10 +36,28 @@ class Seams:
         """Call `perform(call, subject, *args)` in place of a method, where `call()` performs the method itself."""
         original = vars(owner)[name]
 
-        @wraps(original)
         def seam(subject: Any, *args: Any, **kwargs: Any) -> Any:
-            call = partial(original, subject, *args, **kwargs)
-            return perform(call, subject, *args, **kwargs) if self.is_on else call()
+            if not self.is_on:
+                return original(subject, *args, **kwargs)
+            return perform(partial(original, subject, *args, **kwargs), subject, *args, **kwargs)
+
+        self._replace(owner, name, seam)
+
+    def after(self, owner: type, name: str, report: Callable[..., Any]) -> None:
+        """Call `report(subject, *args)` after a method."""
+        original = vars(owner)[name]
+
+        def seam(subject: Any, *args: Any, **kwargs: Any) -> Any:
+            result = original(subject, *args, **kwargs)
+            if self.is_on:
+                report(subject, *args, **kwargs)
+            return result
+
+        self._replace(owner, name, seam)
+
+    def _replace(self, owner: type, name: str, method: Callable[..., Any]) -> None:
+        original = vars(owner)[name]
+        seam = wraps(original)(method)
 
         def restore() -> None:
             if vars(owner).get(name) is seam:
@@ -47,16 +65,6 @@ class Seams:
 
         setattr(owner, name, seam)
         self._undo.callback(restore)
-
-    def after(self, owner: type, name: str, report: Callable[..., Any]) -> None:
-        """Call `report(subject, *args)` after a method."""
-
-        def perform(call: Callable[[], Any], *args: Any, **kwargs: Any) -> Any:
-            result = call()
-            report(*args, **kwargs)
-            return result
-
-        self.around(owner, name, perform)
 
     def callback(self, add: Callable[[Any], None], remove: Callable[[Any], None], callback: Callable[..., Any]) -> None:
         """Add a callback; remove it with the seams, unless another library has removed it."""

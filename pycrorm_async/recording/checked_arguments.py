@@ -94,6 +94,10 @@ class ArgumentReader:
             return {}
         positions: dict[str, float] = {}
         for name, position in dict(joints).items():
+            plain = type(name) is str and name.isascii() and "\0" not in name
+            if plain and type(position) is float and math.isfinite(position):
+                positions[name] = position  # as nearly all are; the checks below take four times as long
+                continue
             text = self.text_of("joint", name)
             number = self._number_of("joints", position)
             if text is not None and number is not None:

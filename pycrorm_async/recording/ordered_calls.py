@@ -24,7 +24,11 @@ R = TypeVar("R")
 
 
 class _Holding(threading.local):
-    depth = 0
+    """How many locks this thread holds or takes, and whether it is a thread of the memory."""
+
+    def __init__(self) -> None:
+        self.depth = 0
+        self.is_of_memory = threading.current_thread().name.startswith(THREAD_NAME_PREFIX)
 
 
 _holding = _Holding()
@@ -40,7 +44,7 @@ class OrderedCalls:
     def run(self, call: Callable[[], object]) -> None:
         """Run a call after those that came before; it must not raise."""
         self._waiting.append(call)
-        waits = not _holding.depth and not threading.current_thread().name.startswith(THREAD_NAME_PREFIX)
+        waits = not _holding.depth and not _holding.is_of_memory
         _holding.depth += 1  # before the lock, so that a call made while it is taken does not wait for it
         try:
             while (waits or self._waiting) and self._lock.acquire(blocking=waits):

@@ -88,6 +88,8 @@ class RecordedEpisode(RecordedNodes):
     @counted("ObjectMoved")
     def object_moved(self, key: Hashable, pose: Pose | PoseValue, *, node: Hashable | None = None) -> None:
         """Record the new pose of an object; nothing, if it is the same."""
+        if not self.closed and self._objects.is_at(key, pose):
+            return  # before the pose is copied, which takes longer
         copied = pose_of(pose)
         self._write("ObjectMoved", lambda: self._objects.move(self._known(key), copied, self._cause(node)))
 

@@ -14,6 +14,7 @@ from pycrorm_async.events.types import ObjectAdded, ObjectAttached, ObjectDetach
 from pycrorm_async.events.values import ObjectReference, PoseValue, RobotValue
 from pycrorm_async.recording.writing.emitter import Emitter
 from pycrorm_async.recording.writing.object_rows import ObjectRows
+from pycrorm_async.world.pose import Pose
 from pycrorm_async.world.queries.bounding_boxes import BoundingBox
 
 __all__ = ["RecordedObject", "RecordedObjects"]
@@ -94,6 +95,11 @@ class RecordedObjects(ObjectRows[Hashable]):
         torso = known.joints.get(known.torso_joint) if known.torso_joint is not None else None
         return RobotValue(known.pose, known.object_type, torso, self._references.get(key), known.name)
 
+    def is_at(self, key: Hashable, pose: object) -> bool:
+        """Whether the last pose of an object is this one; False if there is none of this key."""
+        known = self._objects.get(key)
+        return known is not None and isinstance(pose, Pose | PoseValue) and _place(known.pose) == _place(pose)
+
     def add(self, key: Hashable, added: RecordedObject, node: int | None) -> int:
         """Write that an object entered the world; of a known key, its new pose and joints."""
         if key in self._references:
@@ -123,7 +129,7 @@ class RecordedObjects(ObjectRows[Hashable]):
         """Write a new pose of an object, if it has changed."""
         known, reference = self._objects[key], self._references[key]
         last = known.pose
-        if (pose.position, pose.orientation, pose.frame) == (last.position, last.orientation, last.frame):
+        if _place(pose) == _place(last):
             return 0
         sequence = self._put(
             lambda: ObjectMoved(reference.object, known.name, known.object_type, pose, node),
@@ -157,3 +163,7 @@ class RecordedObjects(ObjectRows[Hashable]):
         self._objects.pop(key, None)
         self._attached = {pair: link for pair, link in self._attached.items() if key not in pair}
         return self._put_removed(key, lambda: node)
+
+
+def _place(pose: Pose | PoseValue) -> tuple[object, object, object]:
+    return pose.position, pose.orientation, pose.frame

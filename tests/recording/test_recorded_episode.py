@@ -45,6 +45,20 @@ def faults_of(folder: Path, write: Callable[[Recording, RecordedEpisode], None])
         return memory.status.faults
 
 
+def test_a_move_to_the_last_pose_writes_nothing_and_one_to_no_pose_is_counted(tmp_path: Path) -> None:
+    def write(_: Recording, episode: RecordedEpisode) -> None:
+        episode.object_added("m", "milk", "MILK", HERE)
+        poses: list[Any] = [Pose([1, 2, 3]), Pose([1, 2, 4]), Pose([1, 2, 4]), (1, 2, 3), None]
+        for each in poses:
+            episode.object_moved("m", each)
+
+    total, last = faults_of(tmp_path, write)
+    assert total == 2
+    assert last is not None
+    assert "expected a PoseValue, got None" in last
+    assert [each["pose"]["position"] for each in events(tmp_path, "ObjectMoved")] == [[1.0, 2.0, 4.0]]
+
+
 def test_a_tree_written_by_threads_has_the_parents_that_they_named(tmp_path: Path) -> None:
     with opened(tmp_path) as memory, memory.recording.episode(description="twenty times three") as episode:
         parallel = memory.recording.type("language", "Parallel")
