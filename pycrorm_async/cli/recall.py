@@ -180,6 +180,7 @@ def _document(found: Answer) -> dict[str, Any]:
         "cue": str(found.cue),
         "considered": found.considered,
         "never_seen": [list(each) for each in found.never_seen],
+        "joined": list(found.joined),
         "success": None if success is None else success._asdict(),
         "reasons": dict(found.reasons),
         "cases": [_case(each) for each in found],

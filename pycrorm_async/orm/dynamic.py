@@ -89,6 +89,11 @@ class DynamicClasses:
             for engine in self._engines:
                 self._introduce(engine)
 
+    @property
+    def present_names(self) -> dict[str, str]:
+        """The present name of each type, by all its names."""
+        return {each: each for each in self._declared} | self._renamed
+
     def use_in(self, engine: AsyncEngine) -> None:
         """Let sessions of this engine return objects of these classes."""
         self._engines.append(engine)

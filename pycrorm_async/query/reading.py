@@ -9,7 +9,7 @@ async with Reading.open("sqlite:///memory.db") as reading:
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncGenerator, AsyncIterator
+from collections.abc import AsyncGenerator, AsyncIterator, Mapping
 from contextlib import aclosing, asynccontextmanager
 from dataclasses import replace
 from datetime import datetime
@@ -120,6 +120,11 @@ class Reading:
             united = unite(generation.layout, declarations)
             self._classes.learn(united.accepted.values(), united.layout.renamed)
             self._declarations = declarations
+
+    async def present_names(self) -> Mapping[str, str]:
+        """Return the present name of each type that was declared, by all the names that it had."""
+        await self.refresh()
+        return self._classes.present_names
 
     @asynccontextmanager
     async def session(self, *, simulated: bool = False) -> AsyncIterator[AsyncSession]:

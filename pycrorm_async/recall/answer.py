@@ -210,13 +210,15 @@ class Answer(Sequence[RecalledCase]):
         cases: each with its score; fewer than `cue.k` where the memory has no more that share anything with the cue.
         considered: the number of cases of the type, among which words were counted.
         never_seen: pairs of feature and word of the cue that none of them has.
+        joined: the names under which the cases of the type were recorded, if it was renamed.
     """
 
-    def __init__(self, cue: Cue, cases: Sequence[RecalledCase], weights: Weights) -> None:
+    def __init__(self, cue: Cue, cases: Sequence[RecalledCase], weights: Weights, joined: Sequence[str] = ()) -> None:
         self.cue = cue
         self.cases = tuple(cases)
         self.considered = weights.cases
         self.never_seen = weights.never_seen
+        self.joined = tuple(joined)
 
     def __len__(self) -> int:
         """Return the number of cases."""
@@ -271,6 +273,8 @@ class Answer(Sequence[RecalledCase]):
         lines = [head, *([f"  {self.success}"] if self.success else [])]
         if self.reasons:
             lines.append(f"  reasons: {', '.join(f'{name} {count}' for name, count in self.reasons)}")
+        if self.joined:
+            lines.append(f"  renamed: counts the cases of {' and '.join(self.joined)}")
         lines += [f"  never seen: {feature}={word}" for feature, word in self.never_seen]
         return "\n".join(lines)
 
@@ -305,7 +309,9 @@ class Answer(Sequence[RecalledCase]):
 def answer(cue: Cue, library: CaseLibrary, memory: Surroundings | None = None) -> Answer:
     """Search the cases most like a cue, and compare each of them with it. The cue was checked by `check_cue`."""
     weights = weights_of(cue, library)
-    return Answer(cue, [RecalledCase(each, cue, weights, memory) for each in search(cue, library, weights)], weights)
+    cases = [RecalledCase(each, cue, weights, memory) for each in search(cue, library, weights)]
+    joined = library.names_of(cue.type) if cue.type is not None else ()
+    return Answer(cue, cases, weights, joined if {*joined} - {cue.type} else ())
 
 
 def compare(cue: Cue, case: Case, weights: Weights) -> tuple[Compared, ...]:

@@ -102,6 +102,7 @@ class Sequences:
     """The cases of a library in the order in which they happened under each parent."""
 
     def __init__(self, library: CaseLibrary) -> None:
+        self._library = library
         self._groups = library.groups()
         sizes = [len(group) for group in self._groups]
         self._firsts = np.cumsum([0, *sizes])[:-1].tolist()
@@ -165,6 +166,7 @@ class Sequences:
             dtype: of the cases to ask about.
             status, reason: likewise; by default any.
         """
+        dtype = self._library.present_name(dtype)
         outcomes = np.concatenate(
             [
                 self._next[first : first + len(group)][_chosen(group, status, reason)]

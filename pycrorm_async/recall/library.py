@@ -5,8 +5,10 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from itertools import chain
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -24,11 +26,17 @@ ANGLE_TOLERANCE = 0.5
 class CaseLibrary:
     """The cases of a memory at one moment. Blocks that are added make a new library.
 
-    `type` None stands for the cases of all types in each method.
+    `type` None stands for the cases of all types in each method. A type that was renamed is one type, under each of its
+    names; its cases have the present one.
+
+    Args:
+        blocks: the cases.
+        names: the present names of types, by all their names. A name that is missing is a present one.
     """
 
-    def __init__(self, blocks: Sequence[Block] = ()) -> None:
+    def __init__(self, blocks: Sequence[Block] = (), names: Mapping[str, str] = MappingProxyType({})) -> None:
         self.blocks = tuple(blocks)
+        self._names = names
         self._spreads: dict[tuple[str | None, str], float] = {}
         self._groups: dict[str | None, tuple[Group, ...]] = {}
         self._words: dict[str, Words] = {}
@@ -44,8 +52,29 @@ class CaseLibrary:
         """The number of cases of each type, in alphabetical order."""
         sizes: Counter[str] = Counter()
         for block in self.blocks:
-            sizes.update(block.sizes)
+            for name, size in block.sizes.items():
+                sizes[self.present_name(name)] += size
         return dict(sorted(sizes.items()))
+
+    @cached_property
+    def recorded_types(self) -> frozenset[str]:
+        """The names under which the cases were recorded."""
+        return frozenset(chain.from_iterable(block.sizes for block in self.blocks))
+
+    def names_of(self, type: str | None) -> tuple[str, ...]:  # noqa: A002
+        """Return the names under which the cases of a type were recorded."""
+        return tuple(sorted(name for name in self.recorded_types if self._is(name, type)))
+
+    def joins(self, names: Mapping[str, str]) -> bool:
+        """Return whether these names differ from its own for a type of which it has cases."""
+        return any(names.get(each, each) != self.present_name(each) for each in {*names, *self._names, *self.types})
+
+    def present_name(self, name: str) -> str:
+        """Return the present name of a type."""
+        return self._names.get(name, name)
+
+    def _is(self, name: str, type: str | None) -> bool:  # noqa: A002
+        return type is None or self.present_name(name) == self.present_name(type)
 
     @cached_property
     def left_out(self) -> frozenset[str]:
@@ -61,7 +90,7 @@ class CaseLibrary:
         """Return the groups of a type, that with the newest case first."""
         groups = self._groups.get(type)
         if groups is None:
-            chosen = [block.group(name) for block in self.blocks for name in block.sizes if type in (None, name)]
+            chosen = [self._group(block, name) for block in self.blocks for name in block.sizes if self._is(name, type)]
             groups = tuple(sorted(chosen, key=lambda each: (-int(each.started_us[0]), -int(each.nodes[0]))))
             self._groups[type] = groups
         return groups
@@ -74,9 +103,13 @@ class CaseLibrary:
             words = self._words[feature] = joined(column.words for column in columns)
         return words
 
+    def _group(self, block: Block, name: str) -> Group:
+        group, present = block.group(name), self.present_name(name)
+        return group if present == name else replace(group, type=present)
+
     def size(self, type: str | None = None) -> int:  # noqa: A002
         """Return the number of cases of a type."""
-        return len(self) if type is None else self.types.get(type, 0)
+        return len(self) if type is None else self.types.get(self.present_name(type), 0)
 
     def seen(self, type: str | None, feature: str, word: str) -> int:  # noqa: A002
         """Return the number of cases of a type that have a word."""
@@ -129,7 +162,7 @@ class CaseLibrary:
 
     def __iter__(self) -> Iterator[Case]:
         """Yield every case, in no particular order."""
-        return chain.from_iterable(block.cases() for block in self.blocks)
+        return (group.case(row) for group in self.groups() for row in range(len(group)))
 
 
 def _exceeds(dictionaries: Sequence[Words]) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 from pycrorm_async.recall.activation import forgotten
 from pycrorm_async.recall.blocks import Block, merge
@@ -44,6 +44,9 @@ class Memory:
         wanted = set(self.blocks) - (set(known) if generation == self.generation else set())
         self.read_numbers += wanted
         return StoredBlocks(self.generation, frozenset(self.blocks), {each: self.blocks[each] for each in wanted})
+
+    async def present_names(self) -> Mapping[str, str]:
+        return {}
 
     async def new(self) -> tuple[Sequence[Case], Sequence[Case]]:
         """The first case that ended has no number until the next call."""

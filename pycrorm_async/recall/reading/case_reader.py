@@ -49,6 +49,10 @@ class BlockSource(Protocol):
         """Return the numbers of all blocks, and those blocks that are not known to a reader of this generation."""
         ...
 
+    async def present_names(self) -> Mapping[str, str]:
+        """Return the present name of each type that the memory knows, by all the names that it had."""
+        ...
+
 
 class RunningCases(Protocol):
     """The cases of this process, stored or not."""
@@ -78,17 +82,33 @@ class CaseReader:
         self._unnumbered: Sequence[Case] = ()
         self._hidden: NDArray[np.int64] = np.zeros(0, np.int64)
         self._library = CaseLibrary()
+        self._names: Mapping[str, str] = {}
+        self._aliases: dict[str, str] = {}
         self._sequences: tuple[CaseLibrary, Sequences] | None = None
         self._reading = asyncio.Lock()
 
-    async def library(self) -> CaseLibrary:
-        """Return all cases that have ended, those that are hidden left out."""
-        async with self._reading:
-            return await self._read()
+    async def library(self, type: str | None = None, aliases: Collection[str] = ()) -> CaseLibrary:  # noqa: A002
+        """Return all cases that have ended, those that are hidden left out, under the present names of their types.
 
-    async def sequences(self) -> Sequences:
+        Args:
+            type: the type that will be asked for, because the memory may know it by another name.
+            aliases: former names of this type, also if the memory does not know them yet.
+        """
+        async with self._reading:
+            library = await self._read()
+            unknown = {*library.recorded_types, *([] if type is None else [type])} - self._names.keys()
+            if unknown or not self._aliases.keys() >= {*aliases}:
+                self._aliases |= {alias: type for alias in aliases if type is not None}
+                names = dict(await self._source.present_names())
+                names |= {alias: each for alias, each in self._aliases.items() if names.get(alias, alias) == alias}
+                if library.joins(names):
+                    self._library = CaseLibrary(library.blocks, names)
+                self._names = names
+            return self._library
+
+    async def sequences(self, type: str | None = None, aliases: Collection[str] = ()) -> Sequences:  # noqa: A002
         """Return these cases in the order in which they happened."""
-        library = await self.library()
+        library = await self.library(type, aliases)
         if self._sequences is None or self._sequences[0] is not library:
             self._sequences = library, Sequences(library)
         return self._sequences[1]
@@ -119,7 +139,7 @@ class CaseReader:
         if changed or gone or stored.added or unstored != self._unstored or [*unnumbered] != [*self._unnumbered]:
             self._unstored = unstored if len(unstored) <= _UNSTORED_BLOCKS else [merge(unstored)]
             self._unnumbered = unnumbered
-            self._library = CaseLibrary(self._visible())
+            self._library = CaseLibrary(self._visible(), self._names)
         return self._library
 
     def _visible(self) -> list[Block]:

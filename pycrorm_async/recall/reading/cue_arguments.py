@@ -20,8 +20,6 @@ from pycrorm_async.recall.cue import Cue, Wanted, closest, symbols_of, word
 from pycrorm_async.recall.library import CaseLibrary
 from pycrorm_async.store.episode_lookup import episode_named
 
-__all__ = ["AnyCase", "Conditions", "EpisodeNames", "When", "case_of", "cue_like", "dtype_of", "make_cue", "node_of"]
-
 AnyCase: TypeAlias = "Case | RecalledCase | int"
 """A case, or the id of its task-tree node."""
 When: TypeAlias = "datetime | str | AnyCase"
@@ -129,6 +127,12 @@ def dtype_of(designator: str | type | None) -> str | None:
         return designator
     dtype = getattr(designator, "dtype", None)
     return dtype if isinstance(dtype, str) else word(designator).removeprefix("ORM")
+
+
+def aliases_of(designator: str | type | None) -> tuple[str, ...]:
+    """Return the former names that a designator class declares."""
+    aliases = vars(designator).get("aliases", ()) if isinstance(designator, type) else ()
+    return tuple(aliases) if isinstance(aliases, tuple | list) else ()
 
 
 def node_of(case: AnyCase) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from contextlib import suppress
 from typing import Any, Final
 
@@ -67,3 +67,7 @@ class DatabaseSource:
             generations = {(number, version) for number, version, _ in rows}
             return generations == {(generation, CaseProjection.version)} and {block for _, _, block in rows} == {*known}
         return False
+
+    async def present_names(self) -> Mapping[str, str]:
+        """Return the present name of each declared type, by all its names."""
+        return await self._reading.present_names()

@@ -32,6 +32,7 @@ from pycrorm_async.recall.reading.cue_arguments import (
     Conditions,
     EpisodeNames,
     When,
+    aliases_of,
     case_of,
     cue_like,
     dtype_of,
@@ -98,8 +99,8 @@ class Recall:
         has ended in this process is included at once; of other processes what is visible in the tables.
 
         Args:
-            type: a designator class or its dtype; subclasses are types of their own. A type that never occurred gives
-                an empty answer.
+            type: a designator class or its dtype; subclasses are types of their own. One that was renamed is found by
+                each name, with the cases of all. A type that never occurred gives an empty answer.
             has: values by feature, as `{"arm": Arms.LEFT, "near": ["BOWL", "CUP"]}`: enums, texts, booleans, classes.
                 `status`, `reason` and `duration` of the outcome are compared only if they are given.
             near: numbers by feature: the wanted one, or a pair of it and the tolerance, from which on nothing is alike.
@@ -120,7 +121,7 @@ class Recall:
         conditions = Conditions(
             before, after, during, as_of, prohibit, only, episode, robot, tag, simulated=simulated, k=k, minimum=minimum
         )
-        library = await self._reader.library()
+        library = await self._reader.library(dtype_of(type), aliases_of(type))
         words = symbols_of(has), numbers_of(near), symbols_of(lacks)
         cue = await make_cue(library, EpisodeNames(self._reading), dtype_of(type), *words, conditions)
         return self._answer(cue, library)
@@ -158,8 +159,8 @@ class Recall:
             has, near: further features, and others than the present ones, as the arm that is to be used.
             conditions: those of the call, as `only` and `episode`.
         """
-        library = await self._reader.library()
         dtype = dtype_of(action)
+        library = await self._reader.library(dtype, aliases_of(action))
         symbols, numbers = present_situation(target, action)
         known = library.texts(dtype) | library.numbers(dtype)
         symbols = {name: each for name, each in symbols.items() if name in known and name != "object_name"}
@@ -195,8 +196,9 @@ class Recall:
         return await self._reader.forget(activation, self._clock.wall_ns() // 1_000, dry_run=dry_run)
 
     async def types(self) -> tuple[str, ...]:
-        """Return the types of the actions that have ended."""
-        return tuple((await self._reader.library()).types)
+        """Return the types of the actions that have ended, those that were renamed by each name."""
+        library = await self._reader.library()
+        return tuple(sorted({*library.types, *library.recorded_types}))
 
     # --- around a case ----------------------------------------------------------------------------------------
 
@@ -246,7 +248,8 @@ class Recall:
         dtype = dtype_of(type)
         assert dtype is not None
         wanted = {name: word(each) for name, each in (("status", status), ("reason", reason)) if each is not None}
-        return (await self._reader.sequences()).follows(dtype, **wanted)
+        sequences = await self._reader.sequences(dtype, aliases_of(type))
+        return sequences.follows(dtype, **wanted)
 
 
 def frame_of(found: Answer) -> pd.DataFrame:
