@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import os
 import sys
 from datetime import UTC, datetime
 from typing import Annotated
@@ -36,12 +35,8 @@ def events(
     unknown = sorted(kinds - EVENT_TYPES.keys())
     if unknown:
         raise CallerError(f"unknown event type {unknown[0]!r}; known types: {', '.join(sorted(EVENT_TYPES))}")
-    try:
-        asyncio.run(_print(url, episode, after, kinds if kind else None))
-        sys.stdout.flush()
-    except BrokenPipeError:  # the reader closed the pipe, as `head` does; Python's final flush would raise again
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return
+    asyncio.run(_print(url, episode, after, kinds if kind else None))
+    sys.stdout.flush()
     note_pending_events(url, spool)
 
 

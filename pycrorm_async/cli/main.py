@@ -20,6 +20,7 @@ import os
 import sys
 from collections.abc import Callable, Mapping
 from importlib import import_module
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -61,12 +62,16 @@ def _with_exit_code(verb: Callable[..., int | None]) -> Callable[..., None]:
     def run(*arguments: Any, **options: Any) -> None:
         try:
             code = verb(*arguments, **options) or 0
+            sys.stdout.flush()
         except PycrormError as error:
             problem(str(error))
             code = exit_code(error)
         except KeyboardInterrupt:
             problem("interrupted; all events recorded so far are kept")
             code = 130
+        except BrokenPipeError:  # the reader closed the pipe, as `head` does; Python's final flush would raise again
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            code = 0
         except OSError as error:
             problem(f"the output cannot be written: {error.strerror or error}")
             code = 1
@@ -81,6 +86,7 @@ def _print_version(requested: bool) -> None:  # noqa: FBT001  typer passes it by
         raise typer.Exit
 
 
+_STDERR = 2
 _HELP = "Episodic memory for robots: record plans as events and query them as tables."
 _VERBS = (
     "demo",
@@ -162,6 +168,7 @@ def _words() -> list[str]:
 
 def main() -> None:
     """Run the console script `pycrorm`."""
+    _open_closed_streams()
     handler = RichHandler(console=stderr, show_time=False, show_path=False)
     logging.basicConfig(level=logging.WARNING, format="%(message)s", handlers=[handler])
     # After an interruption the pool drops a connection whose event loop is closed, and would log a long traceback.
@@ -183,6 +190,19 @@ def main() -> None:
         _print_usage_error(error)
         code = 2
     sys.exit(code)
+
+
+def _open_closed_streams() -> None:
+    """Open /dev/null for each standard stream that the caller closed, as `>&-` does.
+
+    Otherwise the next files that are opened, such as those of the spool, would have its number, and get its output.
+    """
+    while (number := os.open(os.devnull, os.O_RDWR)) <= _STDERR:
+        pass
+    os.close(number)
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, Path(os.devnull).open(mode, encoding="utf-8"))  # noqa: SIM115  for the whole process
 
 
 def _print_usage_error(error: TyperException) -> None:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import csv
 import io
 import json
+import shlex
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -13,7 +15,7 @@ from pycrorm_async.cli.main import app
 from pycrorm_async.cli.since import parse_since
 from pycrorm_async.errors import CallerError
 from pycrorm_async.query.asking.ask import QUESTIONS
-from tests.commands import answer, one_line_of, pycrorm
+from tests.commands import COMMAND, answer, environment, one_line_of, pycrorm
 from tests.databases import Server, run_in_own_loop
 from tests.projections.factories import append_and_fold
 from tests.query.random_memory import TYPES, RandomEpisode, root_failures_of
@@ -91,6 +93,18 @@ def test_each_question_is_a_verb_whose_options_have_a_help() -> None:
     group = app("ask").registered_groups[0].typer_instance
     assert group is not None
     assert tuple(each.name for each in group.registered_commands) == QUESTIONS
+
+
+def test_a_closed_pipe_and_closed_streams_are_no_fault(folder: Path) -> None:
+    def run(arguments: str, then: str) -> subprocess.CompletedProcess[str]:
+        command = f"{shlex.join(COMMAND)} query {arguments} {then}"
+        return subprocess.run(
+            ["bash", "-c", command], cwd=folder, env=environment(), capture_output=True, text=True, check=True
+        )
+
+    piped = run("'SELECT a.* FROM event a, event b' --format csv --limit 0", "| head -1; echo ${PIPESTATUS[0]}")
+    assert (piped.stdout, piped.stderr) == ("episode,sequence,type,version,wall_ns,monotonic_ns,payload\n0\n", "")
+    run("'SELECT 1' --json", "<&- >&- 2>&-")
 
 
 # --- query ----------------------------------------------------------------------------------------------------
