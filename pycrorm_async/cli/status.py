@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import msgspec
@@ -91,6 +91,27 @@ class RefusedState:
     bytes: int
 
 
+@dataclass(frozen=True)
+class DatabaseState:
+    """The state that the database reports; without arguments that of one that does not answer.
+
+    Attributes:
+        episodes: those that are stopped or not completely folded.
+        running: the newest running episodes; `running_total` counts all of them.
+        warnings: limits that are near, and what the tables or recall leave out.
+        unmade, failed_views: the reasons why designator types have no tables and views are left out, by name.
+    """
+
+    episodes: Sequence[EpisodeState] = ()
+    running: Sequence[RunningEpisode] = ()
+    running_total: int = 0
+    projections: Sequence[ProjectionState] = ()
+    warnings: Sequence[str] = ()
+    unmade: Mapping[str, str] = field(default_factory=dict)
+    failed_views: Mapping[str, str] = field(default_factory=dict)
+    durability: Durability | None = None
+
+
 def status(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None, as_json: JsonOption = False) -> int:
     """Report recorders, writers, running episodes with their robots, and the lag of database and tables.
 
@@ -110,16 +131,9 @@ def status(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None, as_json: Jso
     ]
     has_daemon = place.has_writer
     workers = _workers(place.writer_note())
-    episodes: list[EpisodeState] = []
-    projections: list[ProjectionState] = []
-    running: tuple[list[RunningEpisode], int] = [], 0
-    limits_near: list[str] = []
-    unmade: dict[str, str] = {}
-    views: dict[str, str] = {}
-    kept, log_durability = summarise_kept_segments(place.path), None
-    fault: str | None = None
+    kept, state, fault = summarise_kept_segments(place.path), DatabaseState(), None
     try:
-        episodes, running, projections, limits_near, unmade, views, log_durability = asyncio.run(_query(address))
+        state = asyncio.run(_query(address))
     except DatabaseError as error:
         fault = str(error)
     if as_json:
@@ -131,59 +145,61 @@ def status(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None, as_json: Jso
                 "fold_workers": workers,
                 "database": fault or "ok",
                 "recorders": recorders,
-                "episodes": episodes,
+                "episodes": state.episodes,
                 "refused": refused,
-                "projections": [each._asdict() for each in projections],
-                "warnings": limits_near,
-                "unmade": unmade,
-                "failed_views": views,
+                "projections": [each._asdict() for each in state.projections],
+                "warnings": state.warnings,
+                "unmade": state.unmade,
+                "failed_views": state.failed_views,
                 "kept": kept,
-                "stored_on": None if log_durability is None else log_durability.stored_on._asdict(),
-                "running": running[0],
-                "running_total": running[1],
-                "went_back": [] if log_durability is None else [each._asdict() for each in log_durability.went_back],
+                "stored_on": None if state.durability is None else state.durability.stored_on._asdict(),
+                "running": state.running,
+                "running_total": state.running_total,
+                "went_back": [] if state.durability is None else [e._asdict() for e in state.durability.went_back],
             }
         )
     else:
-        _print(place, recorders, episodes, has_daemon=has_daemon, database_answered=fault is None)
-        _print_running(*running)
+        _print(place, recorders, state.episodes, has_daemon=has_daemon, database_answered=fault is None)
+        _print_running(state.running, state.running_total)
         _print_workers(workers)
-        print_durability(kept, log_durability)
-        for projection in projections:
+        print_durability(kept, state.durability)
+        for projection in state.projections:
             lag = f"is {projection.behind} events behind" if projection.behind else "shows all stored events"
             stdout.print(f"The projection {projection.name}, version {projection.version}, {lag}.", markup=False)
-        for warning in limits_near:
+        for warning in state.warnings:
             note(f"warning: {warning}")
     if fault is not None:
         problem(fault)
         return 3
-    stopped = [each for each in episodes if each.refused or each.parked]
-    for episode in stopped:
-        problem(f"episode {episode.number} ({episode.id}) is stopped: {episode.refused or episode.parked}")
-    for dtype, reason in unmade.items():
-        problem(f"designator type {dtype[:80]!r} has no tables: {reason}")
-    for name, reason in views.items():
-        problem(f"the view {name} is left out, because the database refuses it: {reason}")
-    halted = _report_halted(projections)
-    unreadable = [each for each in recorders if each.fault]
-    for recorder in unreadable:
-        problem(f"recorder {recorder.name}: {recorder.fault}")
-    given_up = [each for each in recorders if each.given_up]
-    for recorder in given_up:
-        problem(f"further records of recorder {recorder.name} are not stored: {recorder.given_up}")
-    for each in refused:
-        problem(f"the database refused events of episode {each.episode}; they are kept in {each.folder}")
-    return 1 if stopped or unmade or views or halted or given_up or refused or unreadable else 0
+    problems = [*_problems(state, recorders, refused)]
+    for line in problems:
+        problem(line)
+    return 1 if problems else 0
 
 
-def _report_halted(projections: Sequence[ProjectionState]) -> bool:
-    """Print a line for each fault or parked episode of the projections; return whether there is any."""
-    for projection in projections:
+def _problems(
+    state: DatabaseState, recorders: Sequence[RecorderState], refused: Sequence[RefusedState]
+) -> Iterator[str]:
+    """Yield a line for all that is stopped, left out or refused."""
+    for episode in state.episodes:
+        if stop := episode.refused or episode.parked:
+            yield f"episode {episode.number} ({episode.id}) is stopped: {stop}"
+    for dtype, reason in state.unmade.items():
+        yield f"designator type {dtype[:80]!r} has no tables: {reason}"
+    for name, reason in state.failed_views.items():
+        yield f"the view {name} is left out, because the database refuses it: {reason}"
+    for projection in state.projections:
         if projection.fault is not None:
-            problem(projection.fault)
+            yield projection.fault
         for number, reason in projection.parked.items():
-            problem(f"episode {number} is stopped in the projection {projection.name}: {reason}")
-    return any(each.parked or each.fault for each in projections)
+            yield f"episode {number} is stopped in the projection {projection.name}: {reason}"
+    for recorder in recorders:
+        if recorder.fault:
+            yield f"recorder {recorder.name}: {recorder.fault}"
+        if recorder.given_up:
+            yield f"further records of recorder {recorder.name} are not stored: {recorder.given_up}"
+    for each in refused:
+        yield f"the database refused events of episode {each.episode}; they are kept in {each.folder}"
 
 
 def _workers(note: bytes | None) -> Sequence[FoldWorkerState]:
@@ -245,17 +261,7 @@ def _recorder(folder: RecorderFolder) -> RecorderState:
     )
 
 
-async def _query(
-    address: DatabaseAddress,
-) -> tuple[
-    list[EpisodeState],
-    tuple[list[RunningEpisode], int],
-    list[ProjectionState],
-    list[str],
-    dict[str, str],
-    dict[str, str],
-    Durability,
-]:
+async def _query(address: DatabaseAddress) -> DatabaseState:
     log = await EventLog.open(address, create=False)
     try:
         rows = {each.number: each for each in [*await log.behind(), *await log.stopped()]}
@@ -268,11 +274,12 @@ async def _query(
             episode_states.append(
                 EpisodeState(row.number, row.id, row.head, row.folded, lag_events, lag_s, row.refused, row.parked)
             )
-        projections = await states(log, installed_projections(()))
-        return (
+        running, running_total = await _running(log)
+        return DatabaseState(
             episode_states,
-            await _running(log),
-            projections,
+            running,
+            running_total,
+            await states(log, installed_projections(())),
             [*await log.limits_near(), *await _left_out_of_recall(log), *await contradictions(log)],
             await unmade_types(log),
             await failed_views(log),
@@ -304,7 +311,7 @@ async def _running(log: EventLog) -> tuple[list[RunningEpisode], int]:
 def _print(
     place: Spool,
     recorders: list[RecorderState],
-    episodes: list[EpisodeState],
+    episodes: Sequence[EpisodeState],
     *,
     has_daemon: bool,
     database_answered: bool,
