@@ -16,7 +16,8 @@ from pycrorm_async.errors import CallerError
 from pycrorm_async.operations.rebuild import RebuildSummary, projections_of, rebuild_memory, rebuild_projection
 from pycrorm_async.progress_bar import watched
 from pycrorm_async.projections.custom.discovery import installed_projections, load_projections
-from pycrorm_async.projections.custom.projection import PackedProjection, Projection
+from pycrorm_async.projections.custom.packed_projection import PackedProjection
+from pycrorm_async.projections.custom.projection import Projection
 from pycrorm_async.query.parameter_text import duration
 
 _TABLES = "tables"

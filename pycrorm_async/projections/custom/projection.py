@@ -18,7 +18,7 @@ from __future__ import annotations
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, TypeAlias, final, get_args
+from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias, final, get_args
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.fields import is_reserved
@@ -26,12 +26,6 @@ from pycrorm_async.events.types import DesignatorTypeDeclared, Happening
 from pycrorm_async.projections.fold.column_values import in_slot, row
 from pycrorm_async.projections.schema.core_columns import Storage
 from pycrorm_async.projections.schema.user_views import UserView
-
-if TYPE_CHECKING:
-    from pycrorm_async.projections.custom.episode_folds import EpisodeFolds
-    from pycrorm_async.projections.custom.projected_batch import ProjectedBatch
-    from pycrorm_async.projections.verify.findings import VerifyResult
-    from pycrorm_async.projections.verify.parts import PartCheck
 
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,39}")
 Column: TypeAlias = Literal["row", "integer", "real", "text", "boolean", "time", "json"]
@@ -97,6 +91,7 @@ class Projection(ABC):
             since 1970, `json`). Every table also has `id`, and `process_metadata_id` for its episode.
         views: named queries over these tables, created beside them.
         reads: the types of events that the fold gets. Events of other types cost it nothing; None: all types.
+        is_packed: whether it is a `PackedProjection`, whose columns and names are checked less strictly.
     """
 
     name: ClassVar[str]
@@ -104,6 +99,7 @@ class Projection(ABC):
     tables: ClassVar[Mapping[str, Mapping[str, Column]]]
     views: ClassVar[Sequence[UserView]] = ()
     reads: ClassVar[Collection[type[Happening]] | None] = None
+    is_packed: ClassVar[bool] = False
 
     @abstractmethod
     def fold(self, event: Event, rows: Changes) -> None:
@@ -149,26 +145,6 @@ class EpisodeProjection(Projection):
         raise TypeError(f"{self.name} folds events with what `episode()` returns")
 
 
-class PackedProjection(EpisodeProjection):
-    """The base class of projections of this package that pack rows into other rows, as cases into blocks.
-
-    Its tables may have columns of every storage, and names that are reserved for it. Its batch reads the events as they
-    are stored, collects what a fold makes of them, and packs it.
-    """
-
-    @abstractmethod
-    def episode(self) -> Any:
-        """Return the fold of one episode, as the batch needs it."""
-
-    @abstractmethod
-    def batch(self, declared: Mapping[str, DesignatorTypeDeclared], folds: EpisodeFolds) -> ProjectedBatch:
-        """Return an empty batch."""
-
-    @abstractmethod
-    def check(self, result: VerifyResult) -> PartCheck:
-        """Return the check that compares the tables with the log."""
-
-
 def columns_of(projection: Projection) -> dict[str, dict[str, Storage]]:
     """Return the projection's tables with all their columns. Raises `CallerError` for an invalid projection."""
     fault = _fault_in(projection)
@@ -186,12 +162,11 @@ def _fault_in(projection: Projection) -> str | None:
         return f"its version is {version!r}, and must be an integer > 0"
     if not getattr(projection, "tables", None):
         return "it has no tables: set `tables`"
-    packed = isinstance(projection, PackedProjection)
-    storages = get_args(Storage if packed else Column)
+    storages = get_args(Storage if projection.is_packed else Column)
     for table, columns in projection.tables.items():
         if not _NAME.fullmatch(table):
             return f"the table name {table!r} must be lower-case letters, digits and underscores, 40 at most"
-        if is_reserved(table) and not packed:
+        if is_reserved(table) and not projection.is_packed:
             return f"the table name {table!r} is used by the memory itself"
         for column, storage in columns.items():
             if not _NAME.fullmatch(column) or column in OF_EVERY_TABLE:

@@ -20,12 +20,8 @@ from sqlalchemy.ext.asyncio import AsyncConnection
 from pycrorm_async.errors import CallerError, DatabaseForeign, DatabaseUnavailable, PycrormError
 from pycrorm_async.events.codec import declaration_of, fingerprint
 from pycrorm_async.projections.custom.episode_folds import EpisodeFolds
-from pycrorm_async.projections.custom.projection import (
-    EpisodeProjection,
-    PackedProjection,
-    Projection,
-    columns_of,
-)
+from pycrorm_async.projections.custom.packed_projection import PackedProjection
+from pycrorm_async.projections.custom.projection import EpisodeProjection, Projection, columns_of
 from pycrorm_async.projections.custom.projection_rows import CustomRows
 from pycrorm_async.projections.run import checkpoints
 from pycrorm_async.projections.run.batch_fold import Batch, BatchFold

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 from sqlalchemy import text
 from sqlalchemy.ext.asyncio import AsyncConnection
 
-from pycrorm_async.projections.custom.projection import PackedProjection, Projection
+from pycrorm_async.projections.custom.packed_projection import PackedProjection
+from pycrorm_async.projections.custom.projection import Projection
 from pycrorm_async.projections.custom.projection_rows import CustomRows
 from pycrorm_async.projections.custom.projection_tables import CustomFoldDefinition, fault_in_version, layout_of
 from pycrorm_async.projections.fold.column_values import CannotFold

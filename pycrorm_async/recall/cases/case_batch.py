@@ -8,8 +8,8 @@ from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.events.types import DesignatorTypeDeclared
 from pycrorm_async.projections.custom.episode_folds import EpisodeFolds
+from pycrorm_async.projections.custom.packed_projection import PackedProjection
 from pycrorm_async.projections.custom.projected_batch import ProjectedBatch
-from pycrorm_async.projections.custom.projection import PackedProjection
 from pycrorm_async.recall.blocks import Block
 from pycrorm_async.recall.case import Case
 from pycrorm_async.recall.cases.episode_cases import EpisodeCases

@@ -7,8 +7,8 @@ from typing import Any, ClassVar
 
 from pycrorm_async.events.types import DesignatorTypeDeclared
 from pycrorm_async.projections.custom.episode_folds import EpisodeFolds
+from pycrorm_async.projections.custom.packed_projection import PackedProjection
 from pycrorm_async.projections.custom.projected_batch import ProjectedBatch
-from pycrorm_async.projections.custom.projection import PackedProjection
 from pycrorm_async.projections.verify.findings import VerifyResult
 from pycrorm_async.projections.verify.parts import PartCheck
 from pycrorm_async.recall.cases.case_batch import CaseBatch
