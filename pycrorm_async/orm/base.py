@@ -14,6 +14,7 @@ from sqlalchemy import (
     BigInteger,
     Boolean,
     ColumnElement,
+    Dialect,
     Double,
     ForeignKey,
     Text,
@@ -125,6 +126,30 @@ def _by_id(related: Any) -> Any:
     return related
 
 
+_ENUMS = "pycrorm_enums"
+"""The entry of a class manager's `info` that has its enum columns by attribute."""
+
+
+class EnumOfObject(EnumName):
+    """The enum column of a mapped class, whose objects have members also where a connection reads names."""
+
+    cache_ok = True
+
+    def result_processor(self, dialect: Dialect, coltype: object) -> Callable[[str | None], Any] | None:
+        """Listen to loads from the first result of a synchronous connection on, because listening costs a load 8 %."""
+        if not dialect.is_async and not event.contains(Base, "load", _read_members):
+            for loaded in ("load", "refresh"):
+                event.listen(Base, loaded, _read_members, raw=True, propagate=True)
+        return super().result_processor(dialect, coltype)
+
+
+def _read_members(state: InstanceState[Base], *_: Any) -> None:
+    values = state.dict
+    for key, kind in state.manager.info[_ENUMS].items():
+        if type(values.get(key)) is str:
+            values[key] = kind.member(values[key])
+
+
 @dataclass_transform(
     field_specifiers=(
         MappedColumn,
@@ -146,11 +171,7 @@ class Base(MappedAsDataclass, AsyncAttrs, DeclarativeBase, init=False, repr=Fals
         str: Text(),
         bool: Boolean(),
         datetime: Moment(),
-        Arms: EnumName(Arms),
-        Grasp: EnumName(Grasp),
-        GripperState: EnumName(GripperState),
-        ObjectType: EnumName(ObjectType),
-        TaskStatus: EnumName(TaskStatus),
+        **{enum: EnumOfObject(enum) for enum in (Arms, Grasp, GripperState, ObjectType, TaskStatus)},
     }
 
     def __repr__(self) -> str:
@@ -189,22 +210,12 @@ class RowOfEvent:
 
 
 @event.listens_for(Base, "mapper_configured", propagate=True)
-def _complete_mapping(mapper: Mapper[Any], class_: type[Base]) -> None:
-    """Load columns of subclasses in batches, and enum members where a synchronous connection reads names."""
+def _complete_mapping(mapper: Mapper[Any], class_: type[Base]) -> None:  # noqa: ARG001  SQLAlchemy's
+    """Load columns of subclasses in batches, and know the enum columns."""
     if mapper.inherits is not None:
         mapper.class_manager.expired_attribute_loader = load_columns
-    columns = ((each.key, each.columns[0].type) for each in mapper.column_attrs)
-    enums = [(key, kind) for key, kind in columns if isinstance(kind, EnumName)]
-
-    def read_members(state: InstanceState[Base], *_: Any) -> None:
-        values = state.dict
-        for key, kind in enums:
-            if type(values.get(key)) is str:
-                values[key] = kind.member(values[key])
-
-    if enums:
-        event.listen(class_, "load", read_members, raw=True)
-        event.listen(class_, "refresh", read_members, raw=True)
+    kinds = {each.key: each.columns[0].type for each in mapper.column_attrs}
+    mapper.class_manager.info[_ENUMS] = {key: kind for key, kind in kinds.items() if isinstance(kind, EnumName)}
 
 
 def require_loaded(row: Base, name: str, requested_by: Base | None = None, request: str | None = None) -> None:

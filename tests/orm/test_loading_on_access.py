@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import gc
+import weakref
 from typing import Any
 
 import pytest
@@ -82,6 +84,26 @@ async def test_attributes_are_loaded_after_the_memory_is_closed_and_in_other_thr
     assert rows[1].robot_state.pose.position.x == 1
     assert await asyncio.to_thread(lambda: rows[2].pose.position.y) == 2
     assert rows[3].items == []
+
+
+async def test_an_object_that_was_loaded_on_access_loads_what_is_read_of_it(reading: Reading) -> None:
+    robot_pose = (await actions_of(reading))[1].robot_state.pose
+    gc.collect()  # the actions that the query returned, and all that only they kept
+    assert robot_pose.position.x == 1
+
+
+async def test_a_closed_session_is_freed_with_its_last_object(reading: Reading) -> None:
+    async with reading.session() as session:
+        session.expunge_all()
+        row = (await session.scalars(select(Action).order_by(Action.id).limit(1))).one()
+        kept = weakref.ref(session.sync_session)
+    del session
+    gc.collect()
+    assert kept() is not None
+    assert row.robot_state is not None
+    del row
+    gc.collect()
+    assert kept() is None
 
 
 async def test_an_attribute_is_read_between_the_rows_of_an_open_session(reading: Reading) -> None:

@@ -10,20 +10,29 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from contextlib import AbstractAsyncContextManager
 from typing import Any
+from weakref import ref
 
 from sqlalchemy import BinaryExpression, ColumnElement, Connection, Result, Select, event
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 from sqlalchemy.orm import ORMExecuteState, Session
+from sqlalchemy.orm.identity import IdentityMap
 from sqlalchemy.sql import visitors
 from sqlalchemy.sql.operators import in_op
 from sqlalchemy.util.concurrency import in_greenlet
 
+from pycrorm_async.bulk_records import collecting_seldom
 from pycrorm_async.events.ids import row_key
 from pycrorm_async.orm.base import EPISODE
 from pycrorm_async.orm.loading.batch_loads import KEYS, load_related
 from pycrorm_async.query.sessions.load_on_access import LoadOnAccess
 
 __all__ = ["EpisodeSession"]
+
+
+class _MapReference(ref[IdentityMap]):
+    """The reference to a session's identity map that each of its objects holds; keeps `session` alive with them."""
+
+    session: Session | None = None
 
 
 class EpisodeSession(Session):
@@ -46,24 +55,38 @@ class EpisodeSession(Session):
         super().__init__(*arguments, **options)
         self._on_access = on_access
         self._connect = connect
+        self._reference = self._refer()
 
     def execute(self, *arguments: Any, **options: Any) -> Result[Any]:
         """Execute a statement; a load of an attribute that is read without `await` runs in a thread of its own."""
         if in_greenlet():
-            return super().execute(*arguments, **options)
+            with collecting_seldom():
+                return super().execute(*arguments, **options)
         # frozen: read while the load's connection is open
         load = super().execute
         return self._on_access.run(lambda: load(*arguments, **options).freeze(), self._connect)()
 
     def close(self) -> None:
         """Release the connection. The objects stay in the session, and it lives as long as one of them does."""
-        for each in self.identity_map.all_states():
-            vars(each)["pycrorm_session"] = self
+        if self.identity_map:
+            self._reference.session = self
         transaction = self.get_transaction()
         while transaction is not None:
             parent = transaction.parent
             transaction.close()
             transaction = parent
+
+    def expunge_all(self) -> None:
+        """Remove all objects from the session, which has a new identity map then."""
+        super().expunge_all()
+        self._reference = self._refer()
+
+    def _refer(self) -> _MapReference:
+        # There is no public way to share a reference among the objects, and one of each object would double the time
+        # of `close`, which made half a dictionary for each.
+        reference = _MapReference(self.identity_map)
+        self.identity_map._wr = reference  # noqa: SLF001
+        return reference
 
     def _connection_for_bind(self, engine: Any, *arguments: Any, **options: Any) -> Connection:
         # There is no public way to execute a statement of a session on a connection outside its transaction.
