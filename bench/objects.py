@@ -72,6 +72,7 @@ def sides(engine: Engine, reading: Reading, rows: int) -> dict[str, tuple[Side, 
         return load
 
     few = min(rows, _READ_ROWS)
+    # Columns a row: actions 4 and 13, nodes 8 and 22, pick-ups 7 and 16.
     return {
         "actions": (thesis(ActionRow, rows), ours(Action, rows)),
         "nodes": (thesis(TaskTreeNodeRow, rows), ours(TaskTreeNode, rows)),

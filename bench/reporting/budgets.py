@@ -147,6 +147,13 @@ def _learning(lines: Lines) -> Verdict:
     return Verdict(text, all(each <= 100 for each in median_ms.values()))
 
 
+def _objects(lines: Lines) -> Verdict:
+    line = lines["objects"]
+    actions = {database: line[database]["actions"] for database in ("sqlite", "postgresql")}
+    text = ", ".join(f"{database} {each['ours_is']['median']:.2f} times" for database, each in actions.items())
+    return Verdict(text, all(each["ours_is"]["median"] <= 1 for each in actions.values()))
+
+
 def _size(lines: Lines) -> Verdict:
     line = lines["size"]
     bytes_a_node = {database: line[database]["ours"]["bytes_a_node"] for database in _SIZES_MAX}
@@ -218,6 +225,7 @@ BUDGETS = (
     Budget("memory of a recording process", "flat (system of the thesis: 32 kB a node)", _recording),
     Budget("disk a node, log and tables", "≤ 800 bytes SQLite, ≤ 1,150 bytes PostgreSQL", _size),
     Budget("the thesis' learning query over 50,000 pick-ups → DataFrame", "≤ 100 ms", _learning),
+    Budget("CPU time of `select(Action)`, 25,000 rows, against the system of the thesis", "≤ 1 times", _objects),
     Budget("recall of a common cue among 1,000,000 actions, beside Soar", "median ≤ 0.2 ms, ≤ Soar's", _recall_common),
     Budget("recall by every kind of cue among 1,000,000 actions", "p99 ≤ 10 ms, ≤ 80 bytes an action", _recall_kinds),
     Budget("recall among 10,000,000 actions against 1,000,000", "≤ 1.1 times an action", _recall_growth),

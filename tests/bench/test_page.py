@@ -53,6 +53,17 @@ def test_the_largest_measured_number_of_nodes_is_judged() -> None:
     assert result == Verdict("49.9 times at 488,043 nodes", met=False)
 
 
+def test_mapped_objects_are_judged_on_both_databases() -> None:
+    def of(sqlite: float, postgresql: float) -> dict[str, Any]:
+        ratios = {"sqlite": sqlite, "postgresql": postgresql}
+        return {
+            "objects": {**ABOUT, **{name: {"actions": {"ours_is": {"median": is_}}} for name, is_ in ratios.items()}}
+        }
+
+    assert verdict("CPU time of `select", of(0.7, 1.0)) == Verdict("sqlite 0.70 times, postgresql 1.00 times", met=True)
+    assert verdict("CPU time of `select", of(0.7, 1.1)).met is False
+
+
 def test_a_common_cue_is_judged_beside_soar_where_it_is_installed() -> None:
     def of(common: float, soar: dict[str, Any] | str, p99: float = 9.0) -> dict[str, Any]:
         kinds = {"common": {"median": common, "p99": 1.0}, "rare": {"median": 1.0, "p99": p99}}
