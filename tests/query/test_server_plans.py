@@ -126,6 +126,8 @@ async def rows_read(log: EventLog, statements: list[tuple[str, Any]]) -> dict[st
         pytest.param(rows_of(select(Pose).join(PickUpAction.object).join(Object.pose)), id="a join"),
         pytest.param(the_tree, id="the task tree"),
         pytest.param(answer_of("root_failures"), id="root_failures"),
+        pytest.param(answer_of("steps_before_failures"), id="steps_before_failures"),
+        pytest.param(answer_of("object_history", "milk"), id="object_history"),
         pytest.param(answer_of("moves_of", "milk"), id="moves_of"),
         pytest.param(answer_of("experience_at", 0.5, 0.5), id="experience_at"),
         pytest.param(rows_of(select(PickUpAction)), id="actions as objects"),
@@ -133,12 +135,6 @@ async def rows_read(log: EventLog, statements: list[tuple[str, Any]]) -> dict[st
     ],
 )
 async def test_no_query_reads_an_episode_once_for_each_row(rollouts: str, question: Question) -> None:
-    await assert_few_rows_read(rollouts, question)
-
-
-@pytest.mark.parametrize("rollouts", ["with statistics"], indirect=True)
-@pytest.mark.parametrize("question", [answer_of("steps_before_failures"), answer_of("object_history", "milk")])
-async def test_a_question_about_each_failure_reads_no_episode_for_it(rollouts: str, question: Question) -> None:
     await assert_few_rows_read(rollouts, question)
 
 

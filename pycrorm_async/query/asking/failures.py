@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from sqlalchemy import BigInteger, ColumnElement, Select, func, or_, select, type_coerce
+from sqlalchemy import BigInteger, ColumnElement, Select, and_, cast, func, literal_column, or_, select
 from sqlalchemy.orm import aliased
 
 from pycrorm_async.errors import CallerError
@@ -101,28 +101,34 @@ def failures_by_cause(episode: EpisodeNumber | None, limit: int | None, **search
 def steps_before_failures(
     episode: EpisodeNumber | None, steps: int, limit: int | None, **search: Any
 ) -> Select[*tuple[Any, ...]]:
-    failure, step, earlier = RootFailure, TaskTreeNode, aliased(TaskTreeNode)
-    # The nodes that had ended when the failed node started. Their ids are read backwards from that of the failed node.
+    failure, step, count = RootFailure, TaskTreeNode, checked_count("steps", steps, 100)
     latest = (
-        select(earlier.id)
-        .where(
-            earlier.process_metadata_id == failure.process_metadata_id,
-            earlier.id < failure.id,
-            earlier.kind.in_(("action", "motion")),
-            earlier.end_sequence < failure.sequence,
-        )
-        .order_by(earlier.id.desc())
-        .limit(checked_count("steps", steps, 100))
-        .correlate(failure)
-    )
-    number = func.row_number().over(partition_by=failure.id, order_by=step.id.desc())
-    statement = (
         select(
             failure.process_metadata_id.label("episode"),
             failure.sequence.label("failure_sequence"),
             failure.dtype.label("failed"),
             failure.reason,
-            type_coerce(number, BigInteger).label("steps_before"),
+            cast(literal_column("1"), BigInteger).label("steps_before"),
+            _ended_before(failure.id, failure.process_metadata_id, failure.sequence).label("node_id"),
+            failure.id.label("failure_id"),
+        )
+        .where(*matching(episode, **search))
+        .cte("latest", recursive=True)
+    )
+    # One step after the other is looked up by its id, as a plan by any other way depends on statistics.
+    same = "episode", "failure_sequence", "failed", "reason"
+    latest = latest.union_all(
+        select(
+            *(latest.c[each] for each in same),
+            latest.c.steps_before + 1,
+            _ended_before(latest.c.node_id, latest.c.episode, latest.c.failure_sequence),
+            latest.c.failure_id,
+        ).where(latest.c.steps_before < count, latest.c.node_id.is_not(None))
+    )
+    statement = (
+        select(
+            *(latest.c[each] for each in same),
+            latest.c.steps_before,
             step.sequence.label("sequence"),
             step.dtype,
             step.kind,
@@ -130,8 +136,25 @@ def steps_before_failures(
             step.duration.label("duration_s"),
             step.id.label("node_id"),
         )
-        .join(step, step.id.in_(latest))
-        .where(*matching(episode, **search))
-        .order_by(failure.id, step.id.desc())
+        .join(step, and_(step.id == latest.c.node_id, step.process_metadata_id == latest.c.episode))
+        .order_by(latest.c.failure_id, latest.c.steps_before)
     )
     return limited(statement, limit)
+
+
+def _ended_before(node_id: Any, episode: Any, sequence: Any) -> Any:
+    """Return the last action or motion before this node that had ended when the event of this sequence happened.
+
+    It reads nodes backwards by their ids, and ends at a node of another episode, which the caller leaves out. To look
+    in one episode alone would be a condition that few nodes meet. PostgreSQL, where it has no statistics, takes it for
+    so rarely met that it would read and sort all nodes of the episode for each failure.
+    """
+    earlier = aliased(TaskTreeNode)
+    is_step = and_(earlier.kind.in_(("action", "motion")), earlier.end_sequence < sequence)
+    return (
+        select(earlier.id)
+        .where(earlier.id < node_id, or_(earlier.process_metadata_id != episode, is_step))
+        .order_by(earlier.id.desc())
+        .limit(literal_column("1"))
+        .scalar_subquery()
+    )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from sqlalchemy import ColumnElement, Float, Select, Text, and_, case, cast, func, literal, null, select, union_all
+from sqlalchemy import CTE, ColumnElement, Float, Select, Text, and_, case, cast, func, literal, null, select, union_all
 
 from pycrorm_async.orm import Attachment, Detection, JointChange, Object, ObjectRemoval, Pose, RootFailure, TaskTreeNode
 from pycrorm_async.query.asking.columns import limited
@@ -51,17 +51,22 @@ def _same(table: Any, id_: Any, other: Any) -> ColumnElement[bool]:
 def object_history(episode: EpisodeNumber | None, *, name: str, limit: int | None) -> Select[*tuple[Any, ...]]:
     """Return what happened to the objects of this name, in the order of the events."""
     attached, removed, joints = Attachment.__table__, ObjectRemoval.__table__, JointChange.__table__
-    seen, failed, other = Detection.__table__, RootFailure.__table__, _OBJECT.alias("other")
+    seen, other = Detection.__table__, _OBJECT.alias("other")
     is_added = _OBJECT.c.id == _OBJECT.c.identity_id
     begins = Attachment.kind == "attached"
+    named = select(_OBJECT.c.id).where(_is_named(_OBJECT.c.name, name))
+    if episode is not None:
+        named = named.where(_OBJECT.c.process_metadata_id == episode)
+    failed = _failures(episode)
+    # The ids alone choose the rows, and what is joined to them is joined outside: of inner joins that share the episode
+    # PostgreSQL, where it has no statistics, begins with one that joins all objects of an episode with each other.
     courses = [
         _course(_OBJECT, Object.sequence, case((is_added, "added"), else_="moved"), place=_POSE)
         .outerjoin(_POSE, _same(_OBJECT, _OBJECT.c.pose_id, _POSE))
         .where(_is_named(_OBJECT.c.name, name), _OBJECT.c.identity_id.is_not(None), _OBJECT.c.dtype == "Object"),
         _course(attached, Attachment.sequence, attached.c.kind, other=other.c.name, detail=attached.c.link)
-        .join(_OBJECT, _same(attached, attached.c.child_id, _OBJECT))
-        .join(other, _same(attached, attached.c.parent_id, other))
-        .where(_is_named(_OBJECT.c.name, name)),
+        .outerjoin(other, _same(attached, attached.c.parent_id, other))
+        .where(attached.c.child_id.in_(named)),
         _course(
             attached,
             Attachment.sequence,
@@ -69,21 +74,18 @@ def object_history(episode: EpisodeNumber | None, *, name: str, limit: int | Non
             other=other.c.name,
             detail=attached.c.link,
         )
-        .join(_OBJECT, _same(attached, attached.c.parent_id, _OBJECT))
-        .join(other, _same(attached, attached.c.child_id, other))
-        .where(_is_named(_OBJECT.c.name, name)),
-        _course(removed, ObjectRemoval.sequence, "removed")
-        .join(_OBJECT, _same(removed, removed.c.object_id, _OBJECT))
-        .where(_is_named(_OBJECT.c.name, name)),
-        _course(joints, JointChange.sequence, "joint moved", detail=joints.c.joint, value=joints.c.position)
-        .join(_OBJECT, _same(joints, joints.c.object_id, _OBJECT))
-        .where(_is_named(_OBJECT.c.name, name)),
+        .outerjoin(other, _same(attached, attached.c.child_id, other))
+        .where(attached.c.parent_id.in_(named)),
+        _course(removed, ObjectRemoval.sequence, "removed").where(removed.c.object_id.in_(named)),
+        _course(joints, JointChange.sequence, "joint moved", detail=joints.c.joint, value=joints.c.position).where(
+            joints.c.object_id.in_(named)
+        ),
         _course(seen, Detection.sequence, "detected", detail=seen.c.source, value=seen.c.confidence, place=seen).where(
             _is_named(seen.c.name, name)
         ),
         _course(
             failed,
-            RootFailure.sequence,
+            failed.c.sequence,
             "an action failed",
             detail=failed.c.reason,
             node_id=failed.c.id,
@@ -99,6 +101,20 @@ def object_history(episode: EpisodeNumber | None, *, name: str, limit: int | Non
         .order_by(course.c.episode, course.c.sequence, course.c.what, course.c.detail)
     )
     return limited(statement, limit)
+
+
+def _failures(episode: EpisodeNumber | None) -> CTE:
+    """Return the failures, made before one of their objects is looked for.
+
+    PostgreSQL, where it has no statistics, expects one failure of an object, and would read all nodes of the episode to
+    know whether a node below it failed.
+    """
+    failed = RootFailure.__table__
+    columns = failed.c.id, failed.c.process_metadata_id, failed.c.start_time, failed.c.reason, failed.c.object
+    statement = select(*columns, RootFailure.sequence.label("sequence"))
+    if episode is not None:
+        statement = statement.where(failed.c.process_metadata_id == episode)
+    return statement.cte("failed").prefix_with("MATERIALIZED", dialect="postgresql")
 
 
 def moves_of(episode: EpisodeNumber | None, *, name: str, limit: int | None) -> Select[*tuple[Any, ...]]:
