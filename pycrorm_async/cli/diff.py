@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
-from pycrorm_async.cli.output import note, print_json, print_table, stdout
+from pycrorm_async.cli.output import note, print_json, print_line, print_table, stdout
 from pycrorm_async.cli.reading import read_memory
 from pycrorm_async.query.named_queries import EpisodeSummary
 from pycrorm_async.query.parameter_text import duration
@@ -21,12 +21,17 @@ def diff(
     url: UrlOption = DEFAULT_URL,
     spool: SpoolOption = None,
     as_json: JsonOption = False,
+    sql: Annotated[bool, typer.Option("--sql", help="Print the SQL of the rows that are compared.")] = False,
 ) -> None:
     """Compare two episodes: what surrounded them, their task trees, and the last places of their objects.
 
     Nodes correspond by the types from the root down. A node that only one of them has stands for the nodes below it.
+    SQL reads the rows (`--sql`); the comparison is made in Python.
     """
     compared = read_memory(url, spool, lambda reading: reading.diff(first, second))
+    if sql:
+        print_line(compared.sql)
+        return
     if as_json:
         print_json(compared)
         return

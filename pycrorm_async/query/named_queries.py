@@ -225,22 +225,27 @@ async def episode_named(connection: AsyncConnection, name: str) -> EpisodeSummar
     return (await episodes(connection, number))[0]
 
 
-async def task_tree(connection: AsyncConnection, number: int) -> list[NodeSummary]:
-    """Return the nodes of an episode, each before its children, children in the order in which they started."""
-    table, designator, objects = TaskTreeNode.__table__, Designator.__table__, Object.__table__
-    query = (
+def nodes_of(number: int) -> Select[*tuple[Any, ...]]:
+    """Return the select of an episode's nodes with their parameters."""
+    table, designator = TaskTreeNode.__table__, Designator.__table__
+    return (
         select(table, designator.c.parameters)
         .outerjoin(designator, same_row(designator, table))
         .where(table.c.process_metadata_id == number)
         .order_by(table.c.id)
     )
+
+
+async def task_tree(connection: AsyncConnection, number: int) -> list[NodeSummary]:
+    """Return the nodes of an episode, each before its children, children in the order in which they started."""
+    objects = Object.__table__
     named = select(objects.c.id, objects.c.name).where(objects.c.process_metadata_id == number)
     names = {row.id: row.name for row in await connection.execute(named)}
     simulations = await _simulations_by_node(connection, number)
     counted = select(Observation.node_id, func.count()).where(Observation.process_metadata_id == number)
     observations = dict(iter(await connection.execute(counted.group_by(Observation.node_id))))
     children: dict[int | None, list[NodeSummary]] = {}
-    for row in await connection.execute(query):
+    for row in await connection.execute(nodes_of(number)):
         children.setdefault(row.parent_id, []).append(
             NodeSummary(
                 id=row.id,

@@ -175,6 +175,7 @@ def test_two_episodes_are_compared(folder: Path) -> None:
     document = answer("diff", "1", "7", cwd=folder)
     assert document["first"]["number"] == 1
     assert {each["of"] for each in document["differences"]} == {"episode", "node", "object"}
+    assert pycrorm("diff", "1", "last", "--sql", cwd=folder).stdout.startswith("-- facts of episode 1\nSELECT ")
     assert "there is no episode '70'" in one_line_of(pycrorm("diff", "1", "70", cwd=folder))
 
 

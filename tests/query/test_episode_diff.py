@@ -20,7 +20,7 @@ from pycrorm_async.events.types import (
 from pycrorm_async.events.values import FailureValue, ObjectReference
 from pycrorm_async.query.asking.episode_diff import Difference
 from pycrorm_async.query.reading import Reading
-from tests.databases import run_in_own_loop
+from tests.databases import ask, run_in_own_loop
 from tests.projections.event_script import NAVIGATE, PICK_UP, SAYING, Script, name_of, pose, row
 from tests.projections.factories import append_and_fold
 from tests.query.random_memory import TYPES, RandomEpisode
@@ -74,6 +74,13 @@ def filled_url(module_database_url: str) -> str:
 async def reading(filled_url: str) -> AsyncIterator[Reading]:
     async with Reading.open(filled_url) as opened:
         yield opened
+
+
+async def test_its_sql_reads_the_rows_that_it_compares(reading: Reading, filled_url: str) -> None:
+    statements = (await reading.diff(1, 2)).sql.split(";")[:-1]
+    rows = [ask(filled_url, each) for each in statements]
+    assert [len(each) for each in rows] == [1, 1, *[len(await reading.tree(number)) for number in (1, 2)], 2, 3]
+    assert [sorted(row[0] for row in each) for each in rows[-2:]] == [["cup 0", "milk"], ["cup 0", "cup 1", "milk"]]
 
 
 async def test_two_runs_of_one_plan_do_not_differ_although_their_times_do(reading: Reading) -> None:

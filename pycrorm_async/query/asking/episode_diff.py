@@ -13,11 +13,11 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import msgspec
-from sqlalchemy import func, select
+from sqlalchemy import Select, func, select
 
-from pycrorm_async.orm import Object, Pose
+from pycrorm_async.orm import Object, Pose, ProcessMetaData
 from pycrorm_async.query.asking.question import AskedEpisode, episode_name
-from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary
+from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary, nodes_of
 from pycrorm_async.query.parameter_text import parameters_text
 
 if TYPE_CHECKING:
@@ -74,6 +74,21 @@ class EpisodeDiff:
 
         return diff_html(self)
 
+    @property
+    def sql(self) -> str:
+        """The SQL of the rows that are compared: facts, nodes and last places of the objects of each episode.
+
+        It reads the rows as `diff_episodes` does. The comparison is made in Python, because nodes correspond by paths
+        and numbers among siblings, and parameters are compared entry by entry.
+        """
+        parts = {"facts": _facts, "nodes": nodes_of, "last places of objects": _last_places}
+        return "\n\n".join(
+            f"-- {what} of episode {each.number}\n"
+            f"{statement(each.number).compile(compile_kwargs={'literal_binds': True})};"
+            for what, statement in parts.items()
+            for each in (self.first, self.second)
+        )
+
     def frame(self) -> Any:
         """Return the differences as a pandas DataFrame. Raises `MissingExtra` where pandas is not installed."""
         from pycrorm_async.query.frames.dataframe import imported
@@ -87,7 +102,10 @@ async def diff_episodes(reading: Reading, first: AskedEpisode, second: AskedEpis
     """Compare two episodes of one memory. Raises `UnknownEpisode`."""
     one, other = [await reading.episode(episode_name(each)) for each in (first, second)]
     trees = [await reading.tree(each) for each in (one, other)]
-    places = [await _last_places(reading, each) for each in (one, other)]
+    places = [
+        {row.name: (row.x, row.y, row.z) for row in await reading.rows(_last_places(each.number), simulated=True)}
+        for each in (one, other)
+    ]
     nodes, same = _node_differences(*trees)
     differences = (*_fact_differences(one, other), *nodes, *_place_differences(*places))
     return EpisodeDiff(one, other, differences, same)
@@ -99,6 +117,10 @@ _FACTS = (
     "status", "description", "plan", "plan_sha256", "git_commit", "git_dirty", "world", "created_by", "tags",
     "clock_synchronized", "metadata",
 )  # fmt: skip
+
+
+def _facts(number: int) -> Select[*tuple[Any, ...]]:
+    return select(ProcessMetaData.__table__).where(ProcessMetaData.id == number)
 
 
 def _fact_differences(first: EpisodeSummary, second: EpisodeSummary) -> Iterator[Difference]:
@@ -209,20 +231,19 @@ def _comparable(value: Any) -> Any:
 # --- objects --------------------------------------------------------------------------------------------------
 
 
-async def _last_places(reading: Reading, episode: EpisodeSummary) -> dict[str, tuple[float, ...]]:
-    """Return the last position of each object, as it was before it was removed."""
+def _last_places(number: int) -> Select[*tuple[Any, ...]]:
+    """Return the select of each object's last position, as it was before the object was removed."""
     last = (
         select(func.max(Object.id))
-        .where(Object.process_metadata_id == episode.number, Object.dtype == "Object", Object.identity_id.is_not(None))
+        .where(Object.process_metadata_id == number, Object.dtype == "Object", Object.identity_id.is_not(None))
         .group_by(Object.identity_id)
     )
-    statement = (
+    return (
         select(Object.name, Pose.x, Pose.y, Pose.z)
         .join(Pose, (Pose.id == Object.pose_id) & (Pose.process_metadata_id == Object.process_metadata_id))
-        .where(Object.id.in_(last), Object.process_metadata_id == episode.number)
+        .where(Object.id.in_(last), Object.process_metadata_id == number)
         .order_by(Object.id)
     )
-    return {row.name: (row.x, row.y, row.z) for row in await reading.rows(statement, simulated=True)}
 
 
 def _place_differences(
