@@ -4,8 +4,10 @@ from pathlib import Path
 
 import pytest
 
+from pycrorm_async.memory import Memory
+from pycrorm_async.world import Pose
 from tests.report.browser import Browser
-from tests.report.test_page import assert_quiet, position
+from tests.report.test_page import NO_WEBGL, assert_quiet, position
 
 pytestmark = pytest.mark.slow
 
@@ -76,3 +78,26 @@ def test_the_paths_in_the_scene_are_named(chrome: Browser, pages: dict[str, Path
     with chrome.open(pages["plan"]) as tab:
         named = "[...document.querySelectorAll('#legend > span')].map((each) => each.textContent)"
         assert tab.ask(named) == [" path of pr2", " path of milk", "during TransportAction", "grid 1 m"]
+
+
+@pytest.mark.parametrize("script", ["", NO_WEBGL])
+async def test_of_many_objects_as_many_are_named_as_can_be_read(chrome: Browser, tmp_path: Path, script: str) -> None:
+    with Memory.sync(f"sqlite:///{tmp_path / 'memory.db'}") as memory:
+        with memory.recording.episode(description="many") as episode:
+            for number in range(300):
+                episode.object_added(f"{number}", f"bowl {number}", "BOWL", Pose([number % 5, number % 7, 0.5]))
+            episode.object_added("base", "turtle", "ROBOT", Pose([0, 0, 0]))
+        memory.flush()
+    async with Memory.open(f"sqlite:///{tmp_path / 'memory.db'}") as read:
+        await read.report(1, tmp_path / "page.html")
+    with chrome.open(tmp_path / "page.html", script=script) as tab:
+        tab.settle()
+        shown = "[...document.querySelectorAll('.names span, #map text')].map((each) => each.textContent)"
+        names = tab.ask(shown)
+        assert len(names) == 60
+        assert "turtle" in names
+        assert tab.ask("[...document.querySelectorAll('#notes p')].map((each) => each.textContent)") == [
+            "bowl 0, bowl 1 and 298 others: drawn as the built-in shape, because its description was not recorded",
+            "turtle: drawn as a point, because its description was not recorded",
+        ]
+        assert tab.problems() == []

@@ -123,6 +123,16 @@ export class Bodies {
   }
 }
 
+const NAMES_MAX = 60;
+
+/** The bodies whose names are drawn, so many that names can be read: the chosen one, robots, then the others. */
+export function namedOf(present, chosen) {
+  const rankOf = ({ object }) => (object === chosen ? 0 : object.type === "ROBOT" ? 1 : 2);
+  const named = present.filter(({ object }) => object.type !== "ENVIRONMENT");
+  if (named.length <= NAMES_MAX) return named;
+  return named.sort((one, other) => rankOf(one) - rankOf(other)).slice(0, NAMES_MAX);
+}
+
 const COLORS = ["--path-1", "--path-2", "--path-3", "--path-4"];
 
 /** The ways of the objects that moved during a node: name, variable of the colour, dash, and positions. */

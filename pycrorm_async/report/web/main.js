@@ -11,6 +11,7 @@ import { TreeView } from "./tree_view.js";
 
 const PLAYED_S = 20;
 const NOTES_MAX = 3;
+const NAMED_MAX = 2;
 const HELP = [
   "Space plays. ← → go by one event, with Shift by ten; Home and End to the ends. F goes to the next failure, A changes the axis of the chart.",
   "Scene: drag turns, drag with the right button or two fingers moves, the wheel zooms; a click chooses an object, a double click goes to it. W shows the whole scene, R follows the robot.",
@@ -76,15 +77,28 @@ class Page {
       whole ? null : `events ${episode.first} to ${episode.last} of ${episode.head}`,
     ].filter((each) => each !== null);
     part("facts").replaceChildren(...facts.map((each) => recorded(each)));
-    const modelOf = (each) => episode.models[each.model] ?? episode.models[""];
-    const texts = episode.objects.flatMap((each) => {
-      const { assumed, boxes } = modelOf(each);
-      return [assumed && `${each.name} is drawn as ${assumed}`, boxes && `${each.name} has boxes instead of ${boxes}`];
-    });
-    const notes = [...new Set(texts)].filter(Boolean).slice(0, NOTES_MAX).map((each) => element("p", {}, recorded(each)));
+    const notes = this.#assumptions().slice(0, NOTES_MAX).map((each) => element("p", {}, recorded(each)));
     document.body.classList.toggle("no-objects", episode.objects.length === 0);
     if (episode.objects.length === 0) notes.push(element("p", {}, "This episode recorded no objects: there is no scene to draw."));
     part("notes").replaceChildren(...notes);
+  }
+
+  /** What is not drawn as it was recorded, with the names of the objects; the most of them first. */
+  #assumptions() {
+    const { episode } = this;
+    const names = new Map();
+    for (const { name, model } of episode.objects) {
+      const { assumed, boxes } = episode.models[model] ?? episode.models[""];
+      for (const text of [assumed && `drawn as ${assumed}`, boxes && `boxes instead of ${boxes}`].filter(Boolean)) {
+        names.set(text, (names.get(text) ?? new Set()).add(name));
+      }
+    }
+    const sorted = [...names].map(([text, all]) => [text, [...all]]).sort(([, one], [, other]) => other.length - one.length);
+    return sorted.map(([text, all]) => {
+      const others = all.length - NAMED_MAX;
+      const shown = others > 1 ? `${all.slice(0, NAMED_MAX).join(", ")} and ${others} others` : all.join(", ");
+      return `${shown}: ${text}`;
+    });
   }
 
   #controls() {

@@ -1,5 +1,6 @@
 // Draws the world after an event from above, as SVG: without WebGL, and in print.
 
+import { namedOf } from "./bodies.js";
 import { svg } from "./dom.js";
 
 const SIZE_MIN_M = 2;
@@ -57,8 +58,9 @@ export class MapView {
       const attributes = { points: corners, class: `path ${color.slice(2)}`, "stroke-width": scale * 0.5 };
       picture.append(svg("polyline", { ...attributes, "stroke-dasharray": dash }));
     });
-    const named = present.filter(({ body }) => body.object.type !== "ENVIRONMENT");
-    for (const { x, y, size, name } of labelsOf(named, scale * 2.2, left, right)) {
+    const named = namedOf(present.map(({ body }) => body), this.chosen);
+    const outlined = present.filter(({ body }) => named.includes(body));
+    for (const { x, y, size, name } of labelsOf(outlined, scale * 2.2, left, right)) {
       const label = svg("text", { x, y: -y, "font-size": size, "text-anchor": "middle" });
       label.textContent = name;
       picture.append(label);

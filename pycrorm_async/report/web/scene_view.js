@@ -1,6 +1,6 @@
 // Draws the world after an event with WebGL: bodies, the paths of the current action, names; and shows what is pointed at.
 
-import { pathsOf } from "./bodies.js";
+import { namedOf, pathsOf } from "./bodies.js";
 import { colorOf, element } from "./dom.js";
 import { SceneCamera } from "./scene_camera.js";
 
@@ -207,8 +207,7 @@ export class SceneView {
   #placeNames() {
     const { clientWidth: width, clientHeight: height } = this.holder;
     const labels = [];
-    for (const { object, group } of this.present ?? []) {
-      if (object.type === "ENVIRONMENT") continue;
+    for (const { object, group } of namedOf(this.present ?? [], this.chosen)) {
       const box = new THREE.Box3().setFromObject(group);
       const top = new THREE.Vector3((box.min.x + box.max.x) / 2, (box.min.y + box.max.y) / 2, box.max.z);
       top.project(this.camera.camera);
