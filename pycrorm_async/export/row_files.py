@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from base64 import b64encode
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
@@ -54,11 +55,24 @@ def _parquet(path: Path, schema: pa.Schema, _json_columns: frozenset[str]) -> It
 
 @contextmanager
 def _csv(path: Path, schema: pa.Schema, _json_columns: frozenset[str]) -> Iterator[_Write]:
-    needed_pyarrow()
+    pa = needed_pyarrow()
     from pyarrow import csv
 
+    binary = [number for number, each in enumerate(schema) if pa.types.is_binary(each.type)]
+    for number in binary:
+        schema = schema.set(number, schema.field(number).with_type(pa.string()))
+
+    def in_base64(column: Any) -> Any:  # as in JSON lines, because a text file cannot hold bytes
+        return pa.array([None if each is None else b64encode(each).decode() for each in column.to_pylist()], "string")
+
+    def write(batch: Any) -> None:
+        columns = list(batch.columns)
+        for number in binary:
+            columns[number] = in_base64(columns[number])
+        writer.write_batch(pa.RecordBatch.from_arrays(columns, schema=schema))
+
     with csv.CSVWriter(path, schema) as writer:
-        yield writer.write_batch
+        yield write if binary else writer.write_batch
 
 
 @contextmanager

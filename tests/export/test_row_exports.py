@@ -19,7 +19,7 @@ import pandas as pd
 import pyarrow as pa
 import pytest
 from pyarrow import parquet
-from sqlalchemy import Integer, func, select, true, type_coerce
+from sqlalchemy import Integer, LargeBinary, case, func, literal, select, true, type_coerce
 from sqlalchemy.orm import aliased
 
 from pycrorm_async import Memory, Reading
@@ -106,6 +106,16 @@ async def test_json_columns_are_values_in_json_lines_and_text_elsewhere(either: 
     assert nodes[0]["start_time"] == "2023-11-14T22:13:22Z"
     await export(either, "2", tmp_path / "episode.csv")
     assert pd.read_csv(tmp_path / "episode.csv").parameters[2] == '{"text":"hi"}'
+
+
+async def test_bytes_are_base64_in_files_of_text(either: Reading, tmp_path: Path) -> None:
+    content = type_coerce(literal(b"\xff\x00\n"), LargeBinary)
+    rows = select(case((ONE.dtype == "PickUpAction", content)).label("content"), ONE.id).order_by(ONE.id)
+    for name in ("a.csv", "a.jsonl", "a.parquet"):
+        await export(either, rows.where(ONE.process_metadata_id == 2), tmp_path / name)
+    assert pd.read_csv(tmp_path / "a.csv").content.dropna().tolist() == ["/wAK"]
+    assert json.loads((tmp_path / "a.jsonl").read_text().splitlines()[-1])["content"] == "/wAK"
+    assert parquet.read_table(tmp_path / "a.parquet").column("content")[-1].as_py() == b"\xff\x00\n"
 
 
 async def test_the_manifest_makes_the_same_bytes_again(reading: Reading, tmp_path: Path) -> None:

@@ -410,6 +410,14 @@ async def test_a_function_with_effects_is_refused_although_every_login_may_call_
         assert (await sql.query("SELECT 1 AS effect"))[0] == ("effect",)  # a name alone calls nothing
 
 
+async def test_a_date_that_python_lacks_is_refused_with_the_way_to_read_it(server: Server) -> None:
+    async with _opened(login(await _with_roles(server), "IN ROLE pycrorm_reader")) as sql:
+        for value in ("'200000-01-01'::timestamp", "'4000-01-01 BC'::timestamptz", "'24:00'::time"):
+            with pytest.raises(QueryRefused, match=r"Python has no such date or time .*: cast the column to text"):
+                await sql.query(f"SELECT {value}")
+            assert (await sql.query(f"SELECT ({value})::text"))[1][0][0][:4] in value
+
+
 async def _with_roles(server: Server) -> str:
     url = server.new_database()
     await append_and_fold(url, RECORDS)

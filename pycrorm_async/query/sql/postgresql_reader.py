@@ -157,6 +157,8 @@ class _Cursor:
                 raise QueryRefused(NOT_ONE) from None
             hint = f" ({error.hint})" if getattr(error, "hint", None) else ""
             raise QueryRefused(f"the query is refused: {text}{hint}") from None
+        except (OverflowError, ValueError) as error:  # a date before year 1 or after 9999, or the time 24:00
+            raise QueryRefused(f"Python has no such date or time ({error}): cast the column to text") from None
 
     async def _missing(self, text: str) -> QueryRefused:
         name = re.search(r'"(.+)"', text)
