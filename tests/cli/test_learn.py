@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import signal
 import sqlite3
 import subprocess
@@ -14,6 +15,7 @@ import pytest
 from pycrorm_async.learning import load_policy, name_of
 from tests.commands import COMMAND, answer, environment, one_line_of, pycrorm
 from tests.databases import ask, await_events
+from tests.shared_folders import made_once
 
 pytestmark = pytest.mark.slow
 
@@ -22,15 +24,20 @@ BY_ONE = (*SMALL, "--workers", "1")
 """The settings of the same rollouts. A worker takes two seconds to start, much longer than its rollouts."""
 
 
+def _learn(folder: Path) -> None:
+    (folder / "document.json").write_text(json.dumps(answer(*SMALL, "--study", "4", cwd=folder)))
+
+
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("learn")
+    """The folder of a small experiment with a study."""
+    return made_once(tmp_path_factory, "learn", _learn)
 
 
 @pytest.fixture(scope="module")
 def document(folder: Path) -> Any:
-    """The result of a small experiment with a study, run in the folder."""
-    return answer(*SMALL, "--study", "4", cwd=folder)
+    """The result of that experiment."""
+    return json.loads((folder / "document.json").read_text())
 
 
 def test_learn_prints_the_rollouts_the_rates_and_the_path_of_the_policy(document: Any, folder: Path) -> None:

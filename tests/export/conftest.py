@@ -24,6 +24,7 @@ from pycrorm_async.plan import (
 )
 from pycrorm_async.settings import Settings
 from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose
+from tests.shared_folders import made_once
 
 LONGEST = UserView(
     "longest", select(TaskTreeNode.dtype, func.max(TaskTreeNode.duration).label("s")).group_by(TaskTreeNode.dtype)
@@ -73,9 +74,7 @@ async def _record(url: str) -> None:
 @pytest.fixture(scope="session")
 def kitchen(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the folder of a memory: episode 1 has failures, 2 has none, 3 is a courier's, 4 has no robot."""
-    folder = tmp_path_factory.mktemp("kitchen")
-    asyncio.run(_record(f"sqlite:///{folder}/pycrorm.db"))
-    return folder
+    return made_once(tmp_path_factory, "kitchen", lambda folder: asyncio.run(_record(f"sqlite:///{folder}/pycrorm.db")))
 
 
 @pytest.fixture

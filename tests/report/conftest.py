@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from tests.commands import pycrorm
+from tests.shared_folders import made_once
 
 BREAKFAST = '''
 import os, signal
@@ -46,27 +47,30 @@ async def drives():
 '''
 
 
-@pytest.fixture(scope="session")
-def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with a memory: 1 breakfast with caught failures, 2 a killed plan, 3 another robot."""
-    folder = tmp_path_factory.mktemp("recorded")
+FUNCTIONS = ("plan", "dies", "drives")
+
+
+def _record(folder: Path) -> None:
     (folder / "breakfast.py").write_text(BREAKFAST)
-    for function, code in (("plan", 0), ("dies", -9), ("drives", 0)):
+    for function, code in zip(FUNCTIONS, (0, -9, 0), strict=True):
         done = pycrorm("run", f"breakfast.py:{function}", "--sample-interval-ms", "1", cwd=folder)
         assert done.returncode == code, done.stderr
         assert pycrorm("writer", "--once", cwd=folder).returncode == 0  # the dead one gets its number before the next
-    return folder
+    for number, function in enumerate(FUNCTIONS, 1):
+        done = pycrorm("report", str(number), "--out", f"{function}.html", cwd=folder)
+        assert done.returncode == 0, done.stderr
+
+
+@pytest.fixture(scope="session")
+def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with a memory: 1 breakfast with caught failures, 2 a killed plan, 3 another robot."""
+    return made_once(tmp_path_factory, "recorded", _record)
 
 
 @pytest.fixture(scope="session")
 def pages(recorded: Path) -> dict[str, Path]:
     """Return the pages of the recorded episodes by their functions."""
-    found = {}
-    for number, name in enumerate(("plan", "dies", "drives"), 1):
-        done = pycrorm("report", str(number), "--out", f"{name}.html", cwd=recorded)
-        assert done.returncode == 0, done.stderr
-        found[name] = recorded / f"{name}.html"
-    return found
+    return {function: recorded / f"{function}.html" for function in FUNCTIONS}
 
 
 @pytest.fixture(scope="session")

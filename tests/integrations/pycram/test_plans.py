@@ -22,6 +22,7 @@ from pycrorm_async.orm import PickUpWithContextView, TaskTreeNode
 from pycrorm_async.world import ObjectType
 from tests.commands import Started, pycrorm
 from tests.integrations.pycram.environment import ROOT, make_environment
+from tests.shared_folders import shared_place
 
 pytestmark = pytest.mark.slow
 
@@ -80,9 +81,7 @@ def text(lines: str) -> str:
 @pytest.fixture(scope="session")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
     """Perform all plans once, for all processes of the tests."""
-    shared = tmp_path_factory.getbasetemp()
-    if "PYTEST_XDIST_WORKER" in os.environ:
-        shared = shared.parent
+    shared = shared_place(tmp_path_factory)
     folder = shared / "pycram"
     with (shared / "pycram.lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
