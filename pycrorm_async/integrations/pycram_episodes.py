@@ -11,8 +11,6 @@ from pycrorm_async.recording.declarations.recorded_type import RecordedKind
 from pycrorm_async.recording.recorded_episode import RecordedEpisode
 from pycrorm_async.recording.recording import Recording
 
-__all__ = ["PyCRAMEpisodes", "RunningNode"]
-
 
 class RunningNode:
     """A node that runs: PyCRAM's node, or the action that another one performs, and the key that it is recorded under.

@@ -20,8 +20,6 @@ from pycrorm_async.events.values import ItemType, NodeStatus, ObjectValue, PoseV
 from pycrorm_async.recording.declarations.recorded_type import FieldSpec
 from pycrorm_async.recording.recorded_episode import RecordedEpisode
 
-__all__ = ["PyCRAM", "PyCRAMValues"]
-
 PyCRAM = Any
 """A namespace of PyCRAM's classes; PyCRAM has no types."""
 _USED: Final = {

@@ -14,8 +14,6 @@ from pycrorm_async.integrations.pycram_episodes import PyCRAMEpisodes, RunningNo
 from pycrorm_async.integrations.pycram_values import PyCRAMValues
 from pycrorm_async.integrations.seams import Seams, guarded
 
-__all__ = ["PyCRAMWorld"]
-
 
 class PyCRAMWorld:
     """Observes the worlds of this process."""

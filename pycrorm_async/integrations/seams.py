@@ -9,8 +9,6 @@ from typing import Any, Protocol
 
 from pycrorm_async.recording.recording import Recording
 
-__all__ = ["Seams", "guarded"]
-
 
 class _Observer(Protocol):
     seams: Seams

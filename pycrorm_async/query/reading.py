@@ -49,8 +49,6 @@ if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
 
-__all__ = ["Reading"]
-
 
 class Reading:
     """The reading side of one memory. Belongs to the loop it was opened in.

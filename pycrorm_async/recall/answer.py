@@ -26,19 +26,6 @@ from pycrorm_async.recall.cue import Cue
 from pycrorm_async.recall.library import CaseLibrary
 from pycrorm_async.recall.search import Found, Weights, search, weights_of
 
-__all__ = [
-    "Answer",
-    "Compared",
-    "Rate",
-    "RecalledCase",
-    "Surroundings",
-    "Typical",
-    "answer",
-    "compare",
-    "rate_of",
-    "success_of",
-]
-
 _TRIED = ("SUCCEEDED", "FAILED", "ERROR")
 """The statuses of an action that ran to its end. Of one that was cancelled, interrupted or lost nothing is known."""
 

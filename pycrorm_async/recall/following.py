@@ -20,8 +20,6 @@ from pycrorm_async.recall.case import Case
 from pycrorm_async.recall.columns import Mask, joined_words
 from pycrorm_async.recall.library import CaseLibrary
 
-__all__ = ["Follower", "Following", "Relation", "Sequences", "relation"]
-
 _SAME_US: Final = 1_000
 """Moments nearer to each other than this, in µs, count as one: durations are kept to seven digits."""
 

@@ -17,8 +17,6 @@ from pycrorm_async.recall.blocks import WORDS_MAX, Block, Group
 from pycrorm_async.recall.case import RESERVED, Case, is_angle
 from pycrorm_async.recall.columns import Words, joined
 
-__all__ = ["ANGLE_TOLERANCE", "CaseLibrary"]
-
 ANGLE_TOLERANCE = 0.5
 """The tolerance in rad of an angle for which the cue has none, about 30 degrees."""
 

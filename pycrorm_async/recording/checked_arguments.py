@@ -19,8 +19,6 @@ from pycrorm_async.recording.values.missing_values import MissingValues
 from pycrorm_async.recording.values.texts import clean, clean_repr, message_of
 from pycrorm_async.world.pose import Pose
 
-__all__ = ["END_STATUSES", "ArgumentReader", "pose_of", "struct_of"]
-
 END_STATUSES = tuple(each for each in get_args(NodeStatus) if each != "RUNNING")
 _INTEGERS = range(-(2**63), 2**63)
 

@@ -17,8 +17,6 @@ from typing import Any, Concatenate, ParamSpec, Protocol, TypeVar
 
 from pycrorm_async.recording.writing.emitter import THREAD_NAME_PREFIX, Emitter
 
-__all__ = ["CountingEpisode", "OrderedCalls", "counted", "noted"]
-
 P = ParamSpec("P")
 R = TypeVar("R")
 

@@ -24,8 +24,6 @@ from pycrorm_async.recording.recorded_nodes import RecordedNodes
 from pycrorm_async.recording.writing.observing import put_observation
 from pycrorm_async.world.pose import Pose
 
-__all__ = ["RecordedEpisode"]
-
 _ROOM_POLL_S = 0.005
 
 

@@ -17,8 +17,6 @@ from pycrorm_async.recording.writing.object_rows import ObjectRows
 from pycrorm_async.world.pose import Pose
 from pycrorm_async.world.queries.bounding_boxes import BoundingBox
 
-__all__ = ["RecordedObject", "RecordedObjects"]
-
 
 @dataclass(slots=True)
 class RecordedObject:

@@ -21,9 +21,6 @@ from pycrorm_async.recall.case import Case
 from pycrorm_async.recall.following import Sequences
 from pycrorm_async.recall.library import CaseLibrary
 
-__all__ = ["BlockSource", "CaseReader", "NoRunningCases", "RunningCases", "StoredBlocks"]
-
-
 _UNSTORED_BLOCKS = 16
 """Bounds the blocks of cases of this process, each of one recall; more of them are merged."""
 

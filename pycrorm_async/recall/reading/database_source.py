@@ -16,9 +16,6 @@ from pycrorm_async.recall.cases.stored_blocks import read_blocks, read_headings,
 from pycrorm_async.recall.reading.case_reader import StoredBlocks
 from pycrorm_async.store.log import EventLog
 
-__all__ = ["DatabaseSource"]
-
-
 _KEY: Final = f"{PROJECTION}{CaseProjection.name}"
 
 

@@ -45,8 +45,6 @@ from pycrorm_async.world.objects import Object
 if TYPE_CHECKING:
     import pandas as pd
 
-__all__ = ["Recall"]
-
 _NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 
