@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import asyncio
+import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 from rich.console import Group, RenderableType
 from rich.live import Live
@@ -36,7 +38,7 @@ _SIGNS = {"RUNNING": "cyan", "SUCCEEDED": "green", "LOST": "yellow", "INTERRUPTE
 
 async def draw_episode(follower: LogFollower, name: str, stop: asyncio.Event) -> None:
     """Draw an episode until it has ended. Raises `UnknownEpisode`, `LogDamaged`, `DatabaseForeign`."""
-    with Live(console=stdout, auto_refresh=False) as live:
+    with _live() as live:
         opened = await _wait_for(follower, name, live, stop)
         if opened is None:
             return
@@ -57,7 +59,7 @@ async def draw_episode(follower: LogFollower, name: str, stop: asyncio.Event) ->
                         except CannotFold as reason:
                             raise unreadable(row.id, event, str(reason), log) from None
                 last = row.head
-                live.update(_picture(fold.moment(dtypes, {}, {}), stdout.height - _HEAD_LINES), refresh=True)
+                live.update(_picture(fold.moment(dtypes, {}, {}), _lines()), refresh=True)
             if row.ended_wall_ns is not None:
                 return
             await _rest(stop, max(_INTERVAL_S, _SHARE * (time.monotonic() - began)))
@@ -76,6 +78,20 @@ async def _wait_for(
             live.update(Text(f"waiting: {error}"), refresh=True)
         await _rest(stop, _INTERVAL_S * 2)
     return None
+
+
+def _lines() -> int:
+    """Return the lines for the tree: those that the terminal leaves, or all of it in a pipe."""
+    return stdout.height - _HEAD_LINES if stdout.is_terminal else sys.maxsize
+
+
+@contextmanager
+def _live() -> Iterator[Live]:
+    """Draw in place; a pipe gets the last picture, with an end of its last line."""
+    with Live(console=stdout, auto_refresh=False) as live:
+        yield live
+    if not stdout.is_terminal:
+        stdout.line()
 
 
 def _picture(moment: Moment, lines_max: int) -> RenderableType:
@@ -115,7 +131,7 @@ def in_sight(nodes: Sequence[NodeThen], lines_max: int) -> list[NodeThen]:
 async def draw_overview(follower: LogFollower, stop: asyncio.Event) -> None:
     """Draw what each running episode does, and the newest that have ended, until stopped."""
     overview = follower.overview
-    with Live(console=stdout, auto_refresh=False) as live:
+    with _live() as live:
         async with follower.listening(overview):
             while not stop.is_set():
                 turn = follower.turn

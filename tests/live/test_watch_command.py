@@ -167,6 +167,17 @@ def test_a_terminal_shows_the_tree_of_an_episode_to_its_end(folder: Path) -> Non
     assert "DriveAction  target=(1.00, 2.00, 0.00)  FAILED" in done.stdout
 
 
+def test_a_pipe_gets_the_whole_tree_and_an_end_of_line(tmp_path: Path) -> None:
+    with robot_in(tmp_path) as robot:
+        for number in range(40):
+            robot.start(str(number))
+            robot.end(str(number))
+    done = pycrorm("watch", "1", "--terminal", cwd=tmp_path)
+    assert done.stdout.count("DriveAction") == 40
+    assert "not drawn" not in done.stdout
+    assert done.stdout.endswith("\n")
+
+
 def test_a_terminal_waits_for_the_first_episode_and_follows_it(tmp_path: Path) -> None:
     drawing = Started("watch", "last", "--terminal", cwd=tmp_path)
     assert "waiting: " in drawing.stderr.readline()
