@@ -48,8 +48,7 @@ class _OpenFold:
         if self.fault is not None:
             raise CannotFold(self.fault)
         self.reached = stored.sequence
-        if stored.type == _ENDED:
-            self.has_ended = True
+        self.has_ended = self.has_ended or stored.type == _ENDED
         return self.fold
 
 

@@ -309,21 +309,20 @@ async def _fold_all(
     """Fold the events of these spans into `rows`, in order; return the new checkpoints and the episodes to park."""
     steps: list[Progress] = []
     parked: dict[int, str] = {}
-    count = 0
     for span, part in _by_span(spans, events):
         last = span.after
-        for event in part:
-            if event.sequence != last + 1:
-                break
-            count += 1
-            if count % _SLICE_EVENTS == 0:
+        for place, event in enumerate(part):
+            if place % _SLICE_EVENTS == 0:
                 await asyncio.sleep(0)
+            sequence = event.sequence
+            if sequence != last + 1:
+                break
             try:
                 rows.fold(event)
             except CannotFold as reason:
-                parked[span.number] = f"event {event.sequence}: {reason}"
+                parked[span.number] = f"event {sequence}: {reason}"
                 break
-            last = event.sequence
+            last = sequence
         if last < span.last and span.number not in parked:
             parked[span.number] = f"event {last + 1} is missing in the log"
         steps.append((span.number, span.after, last))

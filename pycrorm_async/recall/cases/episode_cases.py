@@ -115,7 +115,7 @@ class EpisodeCases:
         return ()
 
     def _start(self, event: StoredEvent, started: NodeStarted, declaration_of: DeclarationOf) -> None:
-        _, node, _, _, wall_ns, monotonic_ns, payload = event
+        node = event.sequence
         scope = self._scopes.get(started.parent) if started.parent is not None else None
         self._scopes[node] = scope
         if started.kind != "action" or started.designator is None:
@@ -127,7 +127,7 @@ class EpisodeCases:
                 return
             fields = self._types[started.designator] = FeatureFields.of(declaration)
         parameters = started.parameters
-        if b'"missing"' in payload:
+        if b'"missing"' in event.payload:
             parameters = {name: each for name, each in parameters.items() if not is_missing(each)}
         symbols, numbers = situation(fields, parameters, started.robot, self._world)
         after = self._after
@@ -141,7 +141,14 @@ class EpisodeCases:
             symbols["after"], symbols["after_status"] = after
         simulated = self._simulated or started.simulated
         self._scopes[node] = _Action(
-            node, microseconds(wall_ns), monotonic_ns, fields.dtype, scope, symbols, numbers, simulated
+            node,
+            microseconds(event.wall_ns),
+            event.monotonic_ns,
+            fields.dtype,
+            scope,
+            symbols,
+            numbers,
+            simulated,
         )
 
     def _end(self, event: StoredEvent, ended: NodeEnded) -> Sequence[Case]:
