@@ -37,6 +37,7 @@ from pycrorm_async.errors import CallerError, DatabaseForeign, DatabaseUnavailab
 from pycrorm_async.projections.custom.projection import Projection
 from pycrorm_async.projections.custom.projection_tables import (
     CustomFoldDefinition,
+    events_of_batch,
     layout_of,
     make_projection_tables,
     refuse_taken,
@@ -129,7 +130,8 @@ class Rebuild:
         definition = TABLES if projection is None else CustomFoldDefinition(projection)
         self._fold = BatchFold(log, self._making, generation, definition)
         local = None if log.address.is_sqlite else self._fold
-        self._pipeline = FoldPipeline(self._making, batch_events=_BATCH_EVENTS, local=local)
+        batch_events = _BATCH_EVENTS if projection is None else events_of_batch(projection, _BATCH_EVENTS)
+        self._pipeline = FoldPipeline(self._making, batch_events=batch_events, local=local)
 
     @classmethod
     async def begin(

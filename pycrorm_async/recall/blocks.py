@@ -257,23 +257,29 @@ def _spreads(
     sizes: Mapping[str, int], column: Callable[[Sequence[Any]], _Column], situations: Sequence[Mapping[str, Any]]
 ) -> dict[str, Spread[_Column]]:
     """Make the column of each feature of the situations, each over the types that have it."""
-    by_type, first = {}, 0
-    for name, size in sizes.items():
-        by_type[name] = situations[first : first + size]
-        first += size
     owners: dict[str, list[str]] = {}
-    for name, each in by_type.items():
-        for feature in frozenset[str]().union(*each):
+    values: dict[str, list[Any]] = {}
+    first = 0
+    for name, size in sizes.items():
+        for feature, each in _values_by_feature(situations[first : first + size]).items():
             owners.setdefault(feature, []).append(name)
+            values.setdefault(feature, []).extend(each)
+        first += size
     reserved = RESERVED.intersection(owners)
     assert not reserved, f"features of a situation cannot be named {', '.join(sorted(reserved))}"
     spreads = {}
     for feature, types in owners.items():
-        chosen = situations if len(types) == len(sizes) else [each for name in types for each in by_type[name]]
-        spreads[feature] = _spread(
-            {name: sizes[name] for name in types}, column, [each.get(feature) for each in chosen]
-        )
+        spreads[feature] = _spread({name: sizes[name] for name in types}, column, values[feature])
     return spreads
+
+
+def _values_by_feature(situations: Sequence[Mapping[str, Any]]) -> Mapping[str, Sequence[Any]]:
+    """Return the values of each feature of the situations, None where one does not have it."""
+    names = tuple(situations[0])
+    if all(map(names.__eq__, map(tuple, situations))):  # as of most types, whose fields are always set
+        return dict(zip(names, zip(*(each.values() for each in situations), strict=True), strict=True))
+    features = frozenset[str]().union(*situations)
+    return {feature: [each.get(feature) for each in situations] for feature in features}
 
 
 def _spread(

@@ -81,14 +81,14 @@ async def test_cases_do_not_depend_on_batches_restarts_processes_or_merges(
     scripts = [random_script(number, random, actions=40) for number in range(1, 60 if in_turn else 13)]
     records = [each for first in range(0, len(scripts), 4) for each in mixed(*scripts[first : first + 4])]
     await log.append(TYPES)
-    projectors = [await projector_of(log, batch_events=30)]
+    projectors = [await projector_of(log, batch_events=15)]  # which makes batches of 30 for cases
     while records:
         size = random.randint(20, 90)
         await log.append(records[:size])
         del records[:size]
         if random.random() < 0.2:  # a restart, or another process beside the first
             kept = projectors[: random.randint(0, 1)]
-            projectors = [*kept, await projector_of(log, batch_events=random.randint(5, 60))]
+            projectors = [*kept, await projector_of(log, batch_events=random.randint(5, 60) // 2)]
         if random.random() < 0.7:
             await random.choice(projectors).catch_up()
     await asyncio.gather(*(each.catch_up() for each in projectors))

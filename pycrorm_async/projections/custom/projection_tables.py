@@ -81,6 +81,14 @@ def layout_of(projection: Projection, dialect: Dialect) -> Layout:
     return with_user_views(layout, projection.views, dialect)
 
 
+def events_of_batch(projection: Projection, batch_events: int) -> int:
+    """Return the most events in one transaction of a projection, where one of the tables has `batch_events`.
+
+    A packed projection writes a few rows only, so that most of a transaction's cost does not depend on its events.
+    """
+    return 2 * batch_events if isinstance(projection, PackedProjection) else batch_events
+
+
 async def make_projection_tables(connection: AsyncConnection, projection: Projection, key: str) -> Generation:
     """Create the projection's tables and checkpoints, empty, as a new generation under this key."""
     generations = await read_generations(connection)
@@ -182,7 +190,10 @@ class CustomTables:
             local = None if self._log.address.is_sqlite else fold
             if isinstance(each, PackedProjection):
                 self._packed.add(each.name)
-            self._folded[each.name] = fold, FoldPipeline(target, batch_events=self._batch_events, local=local)
+            self._folded[each.name] = (
+                fold,
+                FoldPipeline(target, batch_events=events_of_batch(each, self._batch_events), local=local),
+            )
         return changed
 
     async def fold_next_batch(self, *, now: bool, until_visible: bool = False) -> bool:
