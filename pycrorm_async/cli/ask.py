@@ -11,15 +11,18 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
+from sqlalchemy import select
 
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
 from pycrorm_async.cli.output import moment, note, print_json, print_line, print_table
 from pycrorm_async.cli.reading import read_memory
 from pycrorm_async.cli.since import parse_since
+from pycrorm_async.orm import DesignatorType
 from pycrorm_async.query.asking.ask import QUESTIONS, Ask
 from pycrorm_async.query.asking.question import Question
 from pycrorm_async.query.parameter_text import duration
 from pycrorm_async.query.reading import Reading
+from pycrorm_async.query.suggestions import nearest
 from pycrorm_async.store.address import DatabaseAddress
 
 _SqlOption = Annotated[bool, typer.Option("--sql", help="Print the question's SQL instead of asking it.")]
@@ -121,19 +124,28 @@ def _option(parameter: inspect.Parameter) -> Any:
 def _answer(
     name: str, arguments: dict[str, Any], url: str, spool: Path | None, *, simulated: bool, as_json: bool
 ) -> None:
-    async def ask(reading: Reading) -> tuple[list[str], list[tuple[Any, ...]]]:
+    async def ask(reading: Reading) -> tuple[list[str], list[tuple[Any, ...]], str]:
         question: Question = getattr(reading.ask, name)(**arguments)
         columns = list(question.statement.selected_columns.keys())
-        return columns, [tuple(row) for row in await question.rows(simulated=simulated)]
+        rows = [tuple(row) for row in await question.rows(simulated=simulated)]
+        return columns, rows, "" if rows else await _unknown_type(reading, arguments.get("dtype"))
 
-    columns, rows = read_memory(url, spool, ask)
+    columns, rows, unknown = read_memory(url, spool, ask)
     if as_json:
         print_json([dict(zip(columns, map(_plain, row), strict=True)) for row in rows])
         return
     headings = [each.removesuffix("_s") for each in columns]
     print_table(name, headings, ([*map(_cell, columns, row)] for row in rows))
     if not rows:
-        note("no row answers; `--sql` shows the question.")
+        note(f"no row answers; {unknown or '`--sql` shows the question.'}")
+
+
+async def _unknown_type(reading: Reading, dtype: str | None) -> str:
+    """Return a line that the memory has no such type, with the nearest one; empty if it has, or for None."""
+    if dtype is None:
+        return ""
+    types = [row.dtype for row in await reading.rows(select(DesignatorType.dtype).distinct())]
+    return "" if dtype in types else f"the memory has no type {dtype}{nearest(dtype, types)}"
 
 
 def _plain(value: Any) -> Any:

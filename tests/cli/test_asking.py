@@ -47,6 +47,8 @@ def test_a_question_is_answered_as_a_table_and_as_json(folder: Path) -> None:
     shown = pycrorm("ask", "durations", "--episode", "last", "--kind", "motion", cwd=folder)
     assert shown.returncode == 0
     assert "longest" in shown.stdout
+    mistaken = pycrorm("ask", "durations", "--dtype", "PickUpActoin", cwd=folder)
+    assert (mistaken.returncode, "has no type PickUpActoin; did you mean PickUpAction?" in mistaken.stderr) == (0, True)
     assert "MoveMotion" in shown.stdout
 
 
