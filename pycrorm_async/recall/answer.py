@@ -196,7 +196,7 @@ class Answer(Sequence[RecalledCase]):
         cue: what was asked.
         cases: each with its score; fewer than `cue.k` where the memory has no more that share anything with the cue.
         considered: the number of cases of the type, among which words were counted.
-        never_seen: pairs of feature and word of the cue that none of them has.
+        never_seen: pairs of feature and word in `has` or `only` that none of them has.
         joined: the names under which the cases of the type were recorded, if it was renamed.
     """
 
@@ -297,6 +297,8 @@ def answer(cue: Cue, library: CaseLibrary, memory: Surroundings | None = None) -
     """Search the cases most like a cue, and compare each of them with it. The cue was checked by `check_cue`."""
     weights = weights_of(cue, library)
     cases = [RecalledCase(each, cue, weights, memory) for each in search(cue, library, weights)]
+    unseen = tuple(pair for pair in cue.requires if library.seen(cue.type, *pair) == 0)
+    weights = weights._replace(never_seen=tuple(dict.fromkeys((*weights.never_seen, *unseen))))
     joined = library.names_of(cue.type) if cue.type is not None else ()
     return Answer(cue, cases, weights, joined if {*joined} - {cue.type} else ())
 

@@ -85,7 +85,7 @@ def symbols_of(pairs: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
 
 def numbers_of(near: Mapping[str, Any]) -> tuple[Wanted, ...]:
     """Return the wanted numbers of `near`: numbers, or pairs of number and tolerance. Raises `CallerError`."""
-    return tuple(_wanted(feature, value) for feature, value in near.items())
+    return tuple(_wanted(feature, value) for feature, value in _mapping(near).items())
 
 
 def word(value: object) -> str:
@@ -124,10 +124,12 @@ def check_cue(cue: Cue, library: CaseLibrary) -> None:
     """
     if cue.type is None and not (cue.has or cue.near or cue.lacks):
         raise CallerError("the cue is empty: give a type, or features in `has`, `near` or `lacks`")
-    if not 1 <= cue.k <= K_MAX:
-        raise CallerError(f"k must be 1 to {K_MAX:,}, got {cue.k}")
-    if not 0 <= cue.minimum <= 1:
-        raise CallerError(f"minimum must be a score from 0 to 1, got {cue.minimum}")
+    k: object = cue.k
+    minimum: object = cue.minimum
+    if not isinstance(k, int) or not 1 <= k <= K_MAX:
+        raise CallerError(f"k must be 1 to {K_MAX:,}, got {shortened(k)}")
+    if not isinstance(minimum, int | float) or not 0 <= minimum <= 1:
+        raise CallerError(f"minimum must be a score from 0 to 1, got {shortened(minimum)}")
     if len(cue.has) + len(cue.near) + len(cue.lacks) > FEATURES_MAX:
         count = len(cue.has) + len(cue.near) + len(cue.lacks)
         raise CallerError(f"the cue has {count:,} features, and at most {FEATURES_MAX} are compared")
@@ -152,7 +154,7 @@ def _check_features(cue: Cue, library: CaseLibrary) -> None:
             raise CallerError(f"{feature} has more than {WORDS_MAX:,} different values, so it is not compared")
         if feature in numbers:
             raise CallerError(f"{feature} is a number: ask for it with `near` (FEATURE~NUMBER), got the text {value!r}")
-        raise CallerError(f"{owner} has a feature {feature!r}{closest(feature, texts)}")
+        raise CallerError(f"{owner} has a feature {shortened(feature)}{closest(feature, texts)}")
     for each in cue.near:
         if each.feature in numbers:
             continue
@@ -160,20 +162,30 @@ def _check_features(cue: Cue, library: CaseLibrary) -> None:
             raise CallerError(
                 f"{each.feature} is a text: ask for it with `has` (FEATURE=TEXT), got the number {each.value:g}"
             )
-        raise CallerError(f"{owner} has a number {each.feature!r}{closest(each.feature, numbers)}")
+        raise CallerError(f"{owner} has a number {shortened(each.feature)}{closest(each.feature, numbers)}")
 
 
 def _symbols(pairs: Mapping[str, Any]) -> Iterator[tuple[str, str]]:
-    for feature, value in pairs.items():
+    for feature, value in _mapping(pairs).items():
         for each in value if isinstance(value, list | tuple | set | frozenset) else [value]:
             if isinstance(each, Real) and not isinstance(each, bool | Enum):
                 raise CallerError(f"{feature} is given as the number {each}: ask for numbers with `near`")
+            if each is None:
+                raise CallerError(
+                    f"{feature} is given as None: leave it out, or give the values that it must not have in `lacks`"
+                )
             symbol = word(each)
             if len(symbol) > TEXT_MAX:
                 raise CallerError(f"{feature} is a text of {len(symbol):,} characters; cases have at most {TEXT_MAX}")
             if not symbol:
                 raise CallerError(f"{feature} is an empty text, which no case has")
             yield feature, symbol
+
+
+def _mapping(features: object) -> Mapping[str, Any]:
+    if isinstance(features, Mapping):
+        return features
+    raise CallerError(f"features are given as {shortened(features)}: give a dictionary, as in {{'arm': 'LEFT'}}")
 
 
 def _wanted(feature: str, value: Any) -> Wanted:
@@ -188,13 +200,14 @@ def _wanted(feature: str, value: Any) -> Wanted:
 
 def _number(feature: str, value: Any) -> float:
     if isinstance(value, bool) or not isinstance(value, Real):
-        raise CallerError(f"{feature} is given as {_shortened(value)}, which is not a number: ask for texts with `has`")
+        raise CallerError(f"{feature} is given as {shortened(value)}, which is not a number: ask for texts with `has`")
     number = float(value)
     if not math.isfinite(number):
         raise CallerError(f"{feature} must be a finite number, got {number}")
     return number
 
 
-def _shortened(value: object) -> str:
+def shortened(value: object) -> str:
+    """Return a value as it is written in an error's line."""
     text = repr(value)
     return text if len(text) <= TEXT_MAX else f"{text[:40]}... ({len(text):,} characters)"

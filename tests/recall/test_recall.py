@@ -96,6 +96,15 @@ BAD: dict[str, tuple[dict[str, Any], type[Exception], str]] = {
     "robot": ({"robot": "pr2"}, CallerError, "has a feature 'robot'"),
     "order": ({"before": "2026-01-01", "after": "2026-01-02"}, CallerError, "`before` is not later than `after`"),
     "k": ({"k": 0}, CallerError, "k must be 1 to 10,000"),
+    "a text as k": ({"k": "3"}, CallerError, "k must be 1 to 10,000, got '3'"),
+    "half a case": ({"k": 2.5}, CallerError, "k must be 1 to 10,000, got 2.5"),
+    "a text as score": ({"minimum": "a"}, CallerError, "minimum must be a score from 0 to 1, got 'a'"),
+    "None": ({"has": {"arm": None}}, CallerError, "arm is given as None: leave it out"),
+    "a list of features": ({"has": ["arm"]}, CallerError, "features are given as ['arm']: give a dictionary"),
+    "a long feature": ({"has": {"x" * 1_000_000: "y"}}, CallerError, "... (1,000,002 characters)"),
+    "three moments": ({"during": ("2026-01-01",) * 3}, CallerError, "`during` takes a case, or two moments, got 3"),
+    "a name as case": ({"prohibit": ["1/20"]}, CallerError, "'1/20' is no case: give one of an answer"),
+    "one prohibited": ({"prohibit": 5}, CallerError, "`prohibit` takes a list of cases"),
 }
 
 
@@ -107,6 +116,22 @@ async def test_a_condition_that_cannot_be_is_refused_in_one_line(
         await recall(GRIP, **arguments)
     assert line in str(refused.value)
     assert "\n" not in str(refused.value)
+
+
+async def test_other_wrong_arguments_are_refused_in_one_line(recall: Recall) -> None:
+    with pytest.raises(CallerError, match="3 is no type: give a designator class"):
+        await recall(3)  # type: ignore[arg-type]
+    with pytest.raises(CallerError, match="give the type of the actions"):
+        await recall.follows(None)  # type: ignore[arg-type]
+    with pytest.raises(CallerError, match="'1/20' is no case"):
+        await recall.like("1/20")  # type: ignore[arg-type]
+    with pytest.raises(CallerError, match="activation must be a number, got 'often'"):
+        await recall.forget("often")  # type: ignore[arg-type]
+
+
+async def test_a_condition_that_no_case_ever_fulfilled_is_reported(recall: Recall) -> None:
+    answer = await recall(GRIP, only={"arm": "MIDDLE"})
+    assert (list(answer), answer.never_seen) == ([], (("arm", "MIDDLE"),))
 
 
 async def test_a_type_that_never_occurred_has_an_empty_answer(recall: Recall) -> None:

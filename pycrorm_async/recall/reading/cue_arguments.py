@@ -16,7 +16,7 @@ from pycrorm_async.query.named_queries import EpisodeSummary
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.recall.answer import RecalledCase
 from pycrorm_async.recall.case import RESERVED, Case
-from pycrorm_async.recall.cue import Cue, Wanted, closest, symbols_of, word
+from pycrorm_async.recall.cue import Cue, Wanted, closest, shortened, symbols_of, word
 from pycrorm_async.recall.library import CaseLibrary
 from pycrorm_async.store.episode_lookup import episode_named
 
@@ -82,6 +82,8 @@ async def make_cue(
     numbers = await _numbers(episodes, conditions)
     during = None
     if isinstance(conditions.during, tuple) and not isinstance(conditions.during, Case):
+        if len(conditions.during) != 2:
+            raise CallerError(f"`during` takes a case, or two moments, got {len(conditions.during)}")
         first, last = conditions.during
         during = _start(first, library), _end(last, library)
     elif conditions.during is not None:
@@ -104,7 +106,7 @@ async def make_cue(
         during_us=during,
         as_of_us=None if conditions.as_of is None else _start(conditions.as_of, library),
         episodes=numbers,
-        prohibit=frozenset(node_of(each) for each in conditions.prohibit),
+        prohibit=_nodes(conditions.prohibit),
         simulated=conditions.simulated,
         k=conditions.k,
         minimum=conditions.minimum,
@@ -126,7 +128,11 @@ def dtype_of(designator: str | type | None) -> str | None:
     if designator is None or isinstance(designator, str):
         return designator
     dtype = getattr(designator, "dtype", None)
-    return dtype if isinstance(dtype, str) else word(designator).removeprefix("ORM")
+    if isinstance(dtype, str):
+        return dtype
+    if not isinstance(designator, type):
+        raise CallerError(f"{shortened(designator)} is no type: give a designator class, or the name of one")
+    return word(designator).removeprefix("ORM")
 
 
 def aliases_of(designator: str | type | None) -> tuple[str, ...]:
@@ -136,8 +142,16 @@ def aliases_of(designator: str | type | None) -> tuple[str, ...]:
 
 
 def node_of(case: AnyCase) -> int:
-    """Return the id of the node of a case."""
+    """Return the id of the node of a case. Raises `CallerError` for anything else."""
+    if not isinstance(case, int | Case | RecalledCase):
+        raise CallerError(f"{shortened(case)} is no case: give one of an answer, or the id of its node")
     return case if isinstance(case, int) else case.node
+
+
+def _nodes(cases: object) -> frozenset[int]:
+    if not isinstance(cases, Iterable) or isinstance(cases, Case | str):
+        raise CallerError("`prohibit` takes a list of cases")
+    return frozenset(map(node_of, cases))
 
 
 async def _numbers(episodes: EpisodeNames, conditions: Conditions) -> frozenset[int] | None:
@@ -158,6 +172,7 @@ def case_of(case: AnyCase, library: CaseLibrary) -> Case:
         return case
     if isinstance(case, RecalledCase):
         return case.case
+    case = node_of(case)
     found = library.find(case)
     if found is None:
         key = row_key(case) if 0 < case < 2**53 else None

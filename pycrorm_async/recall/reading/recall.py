@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from importlib import import_module
+from numbers import Real
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
@@ -23,7 +24,7 @@ from pycrorm_async.query.snapshot import Moment
 from pycrorm_async.recall.activation import Forgotten
 from pycrorm_async.recall.answer import Answer, answer
 from pycrorm_async.recall.case import Case
-from pycrorm_async.recall.cue import Cue, check_cue, numbers_of, symbols_of, word
+from pycrorm_async.recall.cue import Cue, check_cue, numbers_of, shortened, symbols_of, word
 from pycrorm_async.recall.following import Following, Relation
 from pycrorm_async.recall.library import CaseLibrary
 from pycrorm_async.recall.reading.case_reader import CaseReader
@@ -189,8 +190,8 @@ class Recall:
                 after 100 s, -5.7 after a day.
             dry_run: only count.
         """
-        if isinstance(activation, bool) or activation != activation:
-            raise CallerError(f"activation must be a number, got {activation!r}")
+        if isinstance(activation, bool) or not isinstance(activation, Real) or activation != activation:
+            raise CallerError(f"activation must be a number, got {shortened(activation)}")
         return await self._reader.forget(activation, self._clock.wall_ns() // 1_000, dry_run=dry_run)
 
     async def types(self) -> tuple[str, ...]:
@@ -244,7 +245,8 @@ class Recall:
             status, reason: how they ended, and the class of the failure or its name; by default any.
         """
         dtype = dtype_of(type)
-        assert dtype is not None
+        if dtype is None:
+            raise CallerError("give the type of the actions, as in `follows(PickUpAction)`")
         wanted = {name: word(each) for name, each in (("status", status), ("reason", reason)) if each is not None}
         sequences = await self._reader.sequences(dtype, aliases_of(type))
         return sequences.follows(dtype, **wanted)
