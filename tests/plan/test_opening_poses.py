@@ -53,7 +53,11 @@ def spread_candidates(places: list[Location], about: int) -> list[Location]:
 @pytest.mark.soak_on("kitchen_counter_upper_drawer", "kitchen_counter_lower_drawer", "kitchen_island_upper_drawer")
 @ABOUT
 @pytest.mark.parametrize(
-    ("name", "torso"), [*((name, 0.3 if "lower" in name else 0.0) for name in TRAVEL), ("fridge_door", 0.3)]
+    ("name", "torso"),
+    [
+        *((name, 0.3 if "lower" in name else 0.0) for name in TRAVEL),
+        pytest.param("fridge_door", 0.3, marks=pytest.mark.soak),
+    ],
 )
 async def test_from_every_candidate_the_furniture_can_be_opened_and_closed(
     scene: Scene, name: str, torso: float, about: int
