@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import json
 import re
 import shlex
 import shutil
@@ -35,9 +36,14 @@ def python_of(page: str) -> list[str]:
     return re.findall(r"```python\n(.*?)```", PAGES[page], re.DOTALL)
 
 
+def blocks_of(page: str) -> list[str]:
+    """Return the blocks of commands on a page."""
+    return re.findall(r"```sh\n(.*?)```", PAGES[page], re.DOTALL)
+
+
 PLAN, QUESTIONS, EXECUTIVE = python_of("README.md")
 TIDY, LIFTER, STEREO, CELLS = python_of("pycrorm_async/plan/README.md")
-COURSE, PLOTTED, AROUND, ROBOTS, BEGAN, FRAMES, ASKED, TAGGED, SEEN, THEN, AGAIN, RATE, TRIES = python_of(
+COURSE, PLOTTED, AROUND, ROBOTS, BEGAN, FRAMES, ASKED, TAGGED, SEEN, THEN, AGAIN, RATE, TRIES, FOLLOWED = python_of(
     "pycrorm_async/query/README.md"
 )
 (EXPORTED,) = python_of("pycrorm_async/export/README.md")
@@ -276,6 +282,74 @@ def test_the_commands_that_ask_run_in_order(tidied: Path) -> None:
     assert verbs == {"ask", "diff", "episodes", "query"}
 
 
+def commands_of(page: str, first: str) -> list[list[str]]:
+    """Return the words of each command in the block of commands that begins so."""
+    [block] = [each for each in blocks_of(page) if each.startswith(first)]
+    return [shlex.split(line, comments=True) for line in block.splitlines()]
+
+
+def test_the_commands_that_export_run_in_order(tidied: Path, tmp_path: Path) -> None:
+    shutil.copyfile(tidied / "pycrorm.db", tmp_path / "pycrorm.db")
+    for _, *words in commands_of("pycrorm_async/export/README.md", "pycrorm export"):
+        done = pycrorm(*words, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        assert "--again" in words or (tmp_path / words[words.index("--out") + 1]).exists()
+    assert done.stdout == "the same bytes\n"
+
+
+def test_the_metadata_for_datasette_is_written(tidied: Path) -> None:
+    _, (_, *words), _ = commands_of("pycrorm_async/export/README.md", "pip install datasette")
+    assert words == ["datasette-metadata", ">", "metadata.json"]
+    assert "databases" in json.loads(pycrorm(words[0], cwd=tidied).stdout)
+
+
+def test_the_digests_that_were_kept_elsewhere_are_compared(tidied: Path, tmp_path: Path) -> None:
+    kept, compared = commands_of("pycrorm_async/operations/README.md", "pycrorm episodes")
+    assert kept[-2:] == [">", "/elsewhere/digests.json"]
+    assert compared == ["pycrorm", "verify", "--digests", "/elsewhere/digests.json"]
+    document = tmp_path / "digests.json"
+    document.write_text(pycrorm(*kept[1:-2], cwd=tidied).stdout)
+    done = pycrorm(*compared[1:-1], document, cwd=tidied)
+    assert done.returncode == 0, done.stderr
+
+
+def test_sql_finds_the_actions_of_a_concept(tidied: Path) -> None:
+    (by_concept,) = re.findall(r"```sql\n(.*?)```", PAGES["pycrorm_async/query/README.md"], re.DOTALL)
+    done = pycrorm("query", by_concept, "--format", "csv", cwd=tidied)
+    assert done.returncode == 0, done.stderr
+    assert "PickUpAction" in done.stdout
+
+
+NOT_RUN = {
+    "python3 -m venv": "`.ci/run` runs it, in a fresh clone",
+    ".venv/bin/pip install": "`.ci/run` runs it, and these tests with it",
+    "pip install 'pycrorm-async[live]'": "installs; `tests/live` watches",
+    "ssh -L": "needs a second computer",
+}
+"""The reason why no test runs a block of commands that begins so."""
+RUN = (
+    "pycrorm run hello.py",
+    "pycrorm ask",
+    "pycrorm recall",
+    "pycrorm export",
+    "pycrorm episodes",
+    "pip install datasette",
+)
+
+
+def test_every_block_of_commands_is_run_by_a_test_or_has_a_reason() -> None:
+    starts = [
+        start
+        for page in PAGES
+        for block in blocks_of(page)
+        for start in ([each for each in (*RUN, *NOT_RUN) if block.startswith(each)] or [f"{page}: {block}"])
+    ]
+    assert sorted(starts) == sorted([*RUN, *NOT_RUN])
+    texts = [each for content in PAGES.values() for each in re.findall(r"```text\n(.*?)```", content, re.DOTALL)]
+    commands = [each for each in texts if re.match(r"(pip|pycrorm) ", each)]
+    assert [each.split()[1] for each in commands] == ["demo"]  # the list of the verbs, which has a test of its own
+
+
 async def test_rows_are_exported_and_made_again(
     tidied: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -308,6 +382,27 @@ async def test_observations_are_recorded_and_queried(tmp_path: Path, capsys: pyt
     frame = await run_block(SEEN, tmp_path, "frame")
     assert frame.number.tolist() == [1.5]
     assert "Blob(content=b'the bytes of an image', media_type='image/png')" in capsys.readouterr().out
+
+
+async def test_events_are_followed_until_the_memory_is_closed(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    subscribed, listened = FOLLOWED.split("\n\n")
+    async with Memory.open(f"sqlite:///{tmp_path}/memory.db") as memory:
+
+        async def plan() -> None:
+            async with memory.episode(description="Follow me"):
+                pass
+
+        names: dict[str, Any] = {"memory": memory, "plan": plan}
+        for name, block in (("subscribe", subscribed), ("listen", listened)):
+            exec(f"async def {name}():\n{textwrap.indent(block, '    ')}", names)
+        await names["subscribe"]()
+        listening = asyncio.create_task(names["listen"]())
+        await asyncio.sleep(0)
+        assert not listening.done()
+    await asyncio.wait_for(listening, 10)
+    assert "EpisodeStarted" in capsys.readouterr().out
 
 
 async def test_a_snapshot_is_printed_and_restored_in_another_world(
