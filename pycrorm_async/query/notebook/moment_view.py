@@ -49,7 +49,7 @@ def _world(world: WorldThen) -> str:
     return (
         '<div style="display:flex;flex-wrap:wrap;gap:16px;align-items:flex-start">'
         f'<div style="flex:1 1 300px;max-width:420px">{world_map(world).svg}</div>'
-        f'<div style="flex:1 1 440px;min-width:0">{rows}{_more(len(world.objects), "objects")}</div></div>'
+        f'<div style="flex:1 1 560px;min-width:0">{rows}{_more(len(world.objects), "objects")}</div></div>'
     )
 
 

@@ -209,7 +209,7 @@ export class Panels {
     const present = episode.presentAt(event);
     if (present.length === 0) return [element("p", { class: "quiet" }, "No object is in the world at this moment.")];
     const attached = episode.attachedAt(event);
-    const heads = ["object", "type", "x (m)", "y (m)", "z (m)", "yaw (°)", "moves with"].map((each) => element("th", { scope: "col" }, each));
+    const heads = ["object", "type", "x (m)", "y (m)", "z (m)", "heading (°)", "attached to"].map((each) => element("th", { scope: "col" }, each));
     const rows = present.slice(0, LISTED_MAX).map((object) => {
       const [x, y, z, ...orientation] = object.poses.valueAt(event);
       const numbers = [x.toFixed(3), y.toFixed(3), z.toFixed(3), yawOf(orientation).toFixed(0)].map((each) => element("td", { class: "number" }, unsigned(each)));
