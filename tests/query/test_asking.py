@@ -334,10 +334,11 @@ async def test_the_sql_of_each_question_gives_its_rows(reading: Reading, filled_
     questions = [getattr(reading.ask, name)(**ARGUMENTS.get(name, {})) for name in QUESTIONS]
     for episode in (3, identity, "last"):
         questions += [getattr(reading.ask, name)(**ARGUMENTS.get(name, {}), episode=episode) for name in OF_EPISODES]
-    by_hand = ask_each(filled_url, [each.sql for each in questions])
-    for each, rows in zip(questions, by_hand, strict=True):
-        assert len(rows) == len(await each.rows()), each.sql
-        assert str(each) == each.sql
+    texts = [each.sql for each in questions]  # compiled at each access
+    by_hand = ask_each(filled_url, texts)
+    for each, text, rows in zip(questions, texts, by_hand, strict=True):
+        assert len(rows) == len(await each.rows()), text
+        assert str(each) == text
     of_three, of_identity = (
         by_hand[len(QUESTIONS) + start * len(OF_EPISODES) :][: len(OF_EPISODES)] for start in (0, 1)
     )
