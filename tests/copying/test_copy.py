@@ -14,6 +14,7 @@ import pytest
 from pycrorm_async import Memory, Reading
 from pycrorm_async.errors import CallerError, DatabaseUnavailable, UnknownEpisode
 from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.types import NodeStarted
 from pycrorm_async.operations.copy import CopySummary, copy_episodes
 from pycrorm_async.settings import Settings
 from tests.copying.memories import (
@@ -358,24 +359,20 @@ async def test_events_of_a_newer_version_are_copied_unchanged(new_url: New, new_
     assert logs_of(target) == logs_of(source)
 
 
-async def test_an_episode_whose_type_contradicts_the_target_is_copied_and_parked_there(new_file: New) -> None:
+async def test_an_episode_whose_type_contradicts_the_target_is_copied_and_folded_under_other_names(
+    new_file: New,
+) -> None:
     source, target = new_file(), new_file()
     await notes(target, "a text")
     number = declared("NoteAction", "note_action", field("text", "integer", 2))
-    script = hand_written(1)
-    for sequence, each in enumerate(script.records, 1):
-        if b"parameters" in each.payload and each.payload.count(b'"text"'):
-            payload = (
-                b'{"kind":"action","parent":3,"designator":"%s","parameters":{"text":5}}' % name_of(number).encode()
-            )
-            script.records[sequence - 1] = each._replace(payload=payload)
-    await append_and_fold(source, [*declarations(number), *declarations_as_records(target), *script.records])
+    script = Script(1)
+    script.put(NodeStarted("action", None, name_of(number), {"text": 5}))
+    await append_and_fold(source, [*declarations(number), *script.records])
     (done,) = (await copy_episodes(source, target)).episodes
-    assert done.damage is None
-    assert done.stopped is not None
+    assert (done.damage, done.stopped) == (None, None)
     assert logs_of(target)[done.id] == logs_of(source)[done.id]
-    async with Reading.open(target) as reading:
-        assert await texts(reading) == ["a text"]
+    rows = ask(target, "SELECT text, text_integer FROM note_action ORDER BY id")
+    assert rows == [("a text", None), (None, 5)]
 
 
 # --- wrong use --------------------------------------------------------------------------------------------------------
