@@ -124,9 +124,11 @@ class DynamicClasses:
             identities.pop(class_.__mapper__.polymorphic_identity, None)
         self._classes.clear()
         # Shared mappers cache their loading paths, also those through generated classes, which keeps the classes alive.
-        # The caches are rebuilt when needed; SQLAlchemy clears them in the same way when a subclass is mapped.
+        # The caches are rebuilt when needed; SQLAlchemy clears them in the same way when a subclass is mapped. A loader
+        # option that a program keeps refers to the cache itself, so the cache is emptied and not only replaced.
         for mapper in Base.registry.mappers:
-            vars(mapper).pop("_path_registry", None)
+            if (paths := vars(mapper).get("_path_registry")) is not None:
+                paths._cache.clear()  # noqa: SLF001  as below
             mapper._expire_memoizations()  # noqa: SLF001  there is no public way, and classes would never be freed
 
     # --- generating classes -----------------------------------------------------------------------------------
