@@ -5,6 +5,7 @@ import signal
 import sqlite3
 import subprocess
 import time
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -225,7 +226,7 @@ def test_ctrl_c_in_a_plan_that_never_suspends_ends_the_episode_as_interrupted(
 
 def test_a_database_of_another_program_is_left_unchanged(folder: Path) -> None:
     other = folder / "other.db"
-    with sqlite3.connect(other) as connection:
+    with closing(sqlite3.connect(other)) as connection, connection:
         connection.execute("CREATE TABLE recipe (name TEXT)")
     connection.close()
     before = other.read_bytes()
@@ -260,7 +261,7 @@ def test_a_database_in_a_folder_without_write_permission_is_reported_with_its_pa
 
 def test_a_database_of_a_newer_version_is_refused(folder: Path) -> None:
     assert pycrorm("run", "plans.py", cwd=folder).returncode == 0
-    with sqlite3.connect(folder / "pycrorm.db") as connection:
+    with closing(sqlite3.connect(folder / "pycrorm.db")) as connection, connection:
         connection.execute("UPDATE pycrorm_log SET format = 99")
     connection.close()
     for arguments in (["run", "plans.py"], ["episodes"]):

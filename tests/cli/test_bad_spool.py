@@ -5,6 +5,7 @@ import sqlite3
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -179,7 +180,8 @@ def test_the_same_event_with_other_bytes_is_damage_and_both_are_kept(folder: Pat
     recorder = left_in(spool, folder)
     shutil.copytree(recorder, folder / "kept" / recorder.name)
     assert pycrorm("writer", "--once", cwd=folder).returncode == 0
-    with sqlite3.connect(folder / "pycrorm.db") as connection:  # by an operator who bypasses the log's own refusal
+    # An operator bypasses the log's own refusal.
+    with closing(sqlite3.connect(folder / "pycrorm.db")) as connection, connection:
         connection.executescript(
             "DROP TRIGGER event_is_not_updated;"
             "UPDATE event SET payload = replace(payload, '\"b\"', '\"B\"') WHERE sequence = 5"

@@ -6,6 +6,7 @@ import json
 import os
 import sqlite3
 import subprocess
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -74,7 +75,7 @@ def lab(tmp_path: Path) -> Path:
 
 
 def ask(folder: Path, question: str) -> list[Any]:
-    with sqlite3.connect(folder / "pycrorm.db") as connection:
+    with closing(sqlite3.connect(folder / "pycrorm.db")) as connection, connection:
         result = connection.execute(question).fetchall()
     connection.close()
     return result

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -44,7 +45,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def samples(folder: Path) -> list[str]:
-    with sqlite3.connect(folder / "pycrorm.db") as database:
+    with closing(sqlite3.connect(folder / "pycrorm.db")) as database, database:
         return [channel for (channel,) in database.execute("SELECT channel FROM state_sample")]
 
 

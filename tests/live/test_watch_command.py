@@ -9,6 +9,7 @@ import stat
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from unittest import mock
 
@@ -150,7 +151,7 @@ def test_the_server_answers_its_own_pages_and_no_others(watch: Callable[..., Wat
 def test_a_damaged_episode_is_said_to_be_so(watch: Callable[..., Watch], folder: Path, tmp_path: Path) -> None:
     with robot_in(tmp_path) as robot:
         robot.start("one")
-    with sqlite3.connect(tmp_path / "pycrorm.db") as database:
+    with closing(sqlite3.connect(tmp_path / "pycrorm.db")) as database, database:
         for (trigger,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'trigger'").fetchall():
             database.execute(f"DROP TRIGGER {trigger}")
         database.execute("UPDATE event SET payload = '{' WHERE episode = 1 AND sequence = 1")

@@ -5,6 +5,7 @@ import os
 import sqlite3
 import subprocess
 import sys
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -38,7 +39,7 @@ async def test_flushed_records_are_in_the_tables_and_in_the_database_file(tmp_pa
             await NoteActionPerformable("a").perform()
             await memory.flush()
             assert await texts(memory) == ["a"]
-            with sqlite3.connect(tmp_path / "memory.db") as plain:
+            with closing(sqlite3.connect(tmp_path / "memory.db")) as plain, plain:
                 rows = plain.execute("SELECT text, status FROM note_action JOIN task_tree_node USING (id)").fetchall()
                 assert rows == [("a", "SUCCEEDED")]
             plain.close()

@@ -15,6 +15,7 @@ import signal
 import sqlite3
 import subprocess
 import sys
+from contextlib import closing
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -107,7 +108,7 @@ async def test_events_that_are_drained_twice_are_stored_once(tmp_path: Path) -> 
 
 def contents(folder: Path) -> dict[str, list[Any]]:
     """Return every row of every table of the file."""
-    with sqlite3.connect(folder / "memory.db") as file:
+    with closing(sqlite3.connect(folder / "memory.db")) as file, file:
         tables = [name for (name,) in file.execute("SELECT name FROM sqlite_schema WHERE type = 'table'")]
         rows = {name: sorted(file.execute(f'SELECT * FROM "{name}"'), key=repr) for name in tables}
     file.close()
@@ -343,7 +344,7 @@ async def test_all_rows_of_an_episode_are_found_by_an_index(tmp_path: Path) -> N
     async with recorded(tmp_path):
         with lab():
             await NavigateActionPerformable(WITHIN_REACH).perform()
-    with sqlite3.connect(tmp_path / "memory.db") as file:
+    with closing(sqlite3.connect(tmp_path / "memory.db")) as file, file:
         asked_of = 0
         for mapper in Base.registry.mappers:
             mapped: Any = mapper.class_

@@ -4,6 +4,7 @@ import json
 import resource
 import shutil
 import sqlite3
+from contextlib import closing
 from pathlib import Path
 
 import msgspec
@@ -89,7 +90,7 @@ def test_all_episodes_are_a_table_with_pages_behind_it(recorded: Path, tmp_path:
 
 def test_a_damaged_episode_has_a_row_with_the_reason_and_the_others_their_pages(recorded: Path, tmp_path: Path) -> None:
     shutil.copy(recorded / "pycrorm.db", tmp_path / "copy.db")
-    with sqlite3.connect(tmp_path / "copy.db") as database:
+    with closing(sqlite3.connect(tmp_path / "copy.db")) as database, database:
         for (trigger,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'trigger'").fetchall():
             database.execute(f"DROP TRIGGER {trigger}")
         database.execute("UPDATE event SET payload = '{' WHERE episode = 2 AND sequence = 5")

@@ -5,6 +5,7 @@ import json
 import re
 import shutil
 import sqlite3
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -115,7 +116,7 @@ async def test_failures_are_compared_first_and_a_large_memory_compares_fewer(
 async def test_a_memory_without_cases_of_this_version_has_pages_without_them(
     url: str, tmp_path: Path, change: str
 ) -> None:
-    with sqlite3.connect(copy_of(url, tmp_path)) as database:
+    with closing(sqlite3.connect(copy_of(url, tmp_path))) as database, database:
         database.execute(change)
     async with Reading.open(f"sqlite:///{tmp_path / 'memory.db'}") as reading:
         await report(reading, 2, tmp_path / "page.html")
@@ -123,7 +124,7 @@ async def test_a_memory_without_cases_of_this_version_has_pages_without_them(
 
 
 async def test_a_page_says_that_its_cases_are_damaged(url: str, tmp_path: Path) -> None:
-    with sqlite3.connect(copy_of(url, tmp_path)) as database:
+    with closing(sqlite3.connect(copy_of(url, tmp_path))) as database, database:
         (table,) = database.execute("SELECT name FROM sqlite_master WHERE name LIKE 'zz_%_recall_column%'").fetchone()
         database.execute(f"UPDATE {table} SET data = x'00'")
     async with Reading.open(f"sqlite:///{tmp_path / 'memory.db'}") as reading:
@@ -141,7 +142,7 @@ async def test_pages_of_one_report_lead_to_each_other_and_to_no_page_that_is_mis
         await report(reading, 2, tmp_path / "alone.html")
     assert in_page(tmp_path / "all.pages" / "episode-2.html")["pages"] == {"1": "episode-1.html"}
     assert in_page(tmp_path / "alone.html")["pages"] == {}
-    with sqlite3.connect(copy_of(url, tmp_path)) as database:
+    with closing(sqlite3.connect(copy_of(url, tmp_path))) as database, database:
         database.execute("DROP TRIGGER event_is_not_updated")
         database.execute("UPDATE event SET payload = '{' WHERE episode = 1 AND sequence = 3")
     async with Reading.open(f"sqlite:///{tmp_path / 'memory.db'}") as reading:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import sqlite3
+from contextlib import closing
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -67,7 +68,7 @@ async def test_schema_creation(tmp_path: Path) -> None:
     """All tables exist before the first perform, under their lower-case names."""
     async with Memory.open(url_of(tmp_path)):
         pass
-    with sqlite3.connect(tmp_path / "memory.db") as file:
+    with closing(sqlite3.connect(tmp_path / "memory.db")) as file, file:
         present = {name for (name,) in file.execute("SELECT name FROM sqlite_schema WHERE type IN ('table', 'view')")}
     file.close()
     assert {
@@ -262,7 +263,7 @@ async def test_open_and_closeAction(tmp_path: Path) -> None:
 
 
 async def test_view_creation(planned: Recorded) -> None:
-    with sqlite3.connect(planned.folder / "memory.db") as file:
+    with closing(sqlite3.connect(planned.folder / "memory.db")) as file, file:
         kinds = file.execute("SELECT type FROM sqlite_schema WHERE name = 'PickUpWithContextView'").fetchall()
         columns = [name for _, name, *_ in file.execute("PRAGMA table_info('PickUpWithContextView')")]
     file.close()
