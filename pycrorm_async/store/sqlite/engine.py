@@ -186,10 +186,20 @@ class Cursor:
 
 
 async def _connect(uri: str, busy_timeout_s: float) -> aiosqlite.Connection:
+    opened: list[sqlite3.Connection] = []
+
     def connector() -> sqlite3.Connection:
-        return sqlite3.connect(
-            uri, uri=True, isolation_level=None, timeout=busy_timeout_s, cached_statements=_CACHED_STATEMENTS
+        opened.append(
+            sqlite3.connect(
+                uri,
+                uri=True,
+                isolation_level=None,
+                timeout=busy_timeout_s,
+                cached_statements=_CACHED_STATEMENTS,
+                check_same_thread=False,
+            )
         )
+        return opened[0]
 
     connection = Connection(connector, _ROWS_AT_ONCE)
     connection.patience_s = busy_timeout_s
@@ -198,9 +208,11 @@ async def _connect(uri: str, busy_timeout_s: float) -> aiosqlite.Connection:
     try:
         return await connection
     except BaseException:
-        # The thread reports its end to this loop; if the loop were closed by then, it would print a traceback.
-        while thread.is_alive():  # noqa: ASYNC110 - the thread sets no event
-            await asyncio.sleep(0.001)
+        # The thread reports its end to this loop; if the loop were closed by then, it would print a traceback. The
+        # driver drops what the thread opened after the task had been cancelled, and does not close it.
+        thread.join()
+        for each in opened:
+            each.close()
         raise
 
 
