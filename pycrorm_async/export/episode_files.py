@@ -1,7 +1,12 @@
-"""Write episodes in the formats that hold the course of a world, from their events and not from the tables."""
+"""Write episodes in the formats that hold the course of a world, from their events and not from the tables.
+
+A thread does each long step, and a cancelled task waits for its end: a writer that is closed, or a file that is
+deleted, while a thread still writes would crash the process or leave a file.
+"""
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
@@ -17,8 +22,8 @@ from pycrorm_async.export.recorded_episode import read_episode
 from pycrorm_async.export.rerun_file import write_rerun
 from pycrorm_async.export.scene_frames import scene_objects
 from pycrorm_async.export.selection import CoveredEpisode
-from pycrorm_async.export.writing_thread import in_thread
 from pycrorm_async.query.reading import Reading
+from pycrorm_async.writer.drain import run_to_completion
 
 if TYPE_CHECKING:
     from pycrorm_async.progress_bar import ProgressCallback
@@ -57,15 +62,15 @@ async def write_lerobot(
     dataset = LeRobotFolder(folder, fps=options.fps)
     for each in episodes:
         episode = await read_episode(reading, each)
-        frames = await in_thread(frames_of, episode, options.clock, options.fps)
+        frames = await run_to_completion(asyncio.to_thread(frames_of, episode, options.clock, options.fps))
         pictures = None
         if options.images is not None:
             pictures = np.stack(await draw_frames(reading, episode, frames, options.images))
-        await in_thread(dataset.add, episode, frames, pictures)
+        await run_to_completion(asyncio.to_thread(dataset.add, episode, frames, pictures))
         done += each.events
         if progress is not None:
             progress(done, total)
-    await in_thread(dataset.finish)
+    await run_to_completion(asyncio.to_thread(dataset.finish))
     return dataset.frames
 
 
@@ -82,5 +87,7 @@ async def write_scene(
     episode = await read_episode(reading, episodes[0])
     objects = await scene_objects(reading, episode)
     if file_format == "rrd":
-        return await in_thread(write_rerun, episode, objects, path)
-    return await in_thread(lambda: write_mcap(episode, objects, path, clock=options.clock, fps=options.fps))
+        return await run_to_completion(asyncio.to_thread(write_rerun, episode, objects, path))
+    return await run_to_completion(
+        asyncio.to_thread(lambda: write_mcap(episode, objects, path, clock=options.clock, fps=options.fps))
+    )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from base64 import b64encode
 from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
@@ -10,8 +11,8 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import msgspec
 
-from pycrorm_async.export.writing_thread import in_thread
 from pycrorm_async.query.frames.arrow_batches import needed_pyarrow
+from pycrorm_async.writer.drain import run_to_completion
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -37,7 +38,7 @@ async def write_rows(
             if schema is None:
                 schema = batch.schema
                 write = stack.enter_context(_WRITERS[file_format](path, schema, json_columns))
-            await in_thread(write, batch)
+            await run_to_completion(asyncio.to_thread(write, batch))
             rows += batch.num_rows
             report_rows(rows)
     return rows, schema
