@@ -62,9 +62,21 @@ def trip(number: int, *, arm: str, x: float, fails: bool) -> Script:
     return script
 
 
+def cups(number: int, *places: float) -> Script:
+    """Return an episode that adds cups of one name, and moves the first one last."""
+    script = Script(number)
+    script.put(EpisodeStarted("cups", "me", "host", "1", "3.11"))
+    added = [script.put(ObjectAdded("cup", "CUP", pose(x))) for x in places]
+    script.put(ObjectAdded("cup 2", "CUP", pose(9)))
+    script.put(ObjectMoved(added[0], "cup", "CUP", pose(places[0] + 0.5)))
+    script.put(EpisodeEnded("SUCCEEDED"))
+    return script
+
+
 @pytest.fixture(scope="module")
 def filled_url(module_database_url: str) -> str:
     scripts = [trip(1, arm="LEFT", x=2, fails=False), trip(2, arm="RIGHT", x=3, fails=True), *RANDOM]
+    scripts += [cups(5, 1, 2, 3), cups(6, 1, 4)]
     records = [*TYPES, *(record for each in scripts for record in each.records)]
     run_in_own_loop(append_and_fold(module_database_url, records))
     return module_database_url
@@ -87,7 +99,7 @@ async def test_two_runs_of_one_plan_do_not_differ_although_their_times_do(readin
     compared = await reading.diff(3, 4)
     assert [(each.of, each.where) for each in compared.differences] == [("episode", "description")]
     assert compared.same_nodes == compared.first.nodes > 5
-    assert not await reading.diff("last", 4)
+    assert not await reading.diff("last", 6)
 
 
 async def test_each_difference_has_its_place_and_both_values(reading: Reading) -> None:
@@ -120,6 +132,14 @@ async def test_each_difference_has_its_place_and_both_values(reading: Reading) -
     frame = compared.frame()
     assert frame["where"].tolist() == [each.where for each in compared.differences]
     assert compared.same_nodes == 0
+
+
+async def test_objects_of_one_name_correspond_in_the_order_they_were_added(reading: Reading) -> None:
+    compared = await reading.diff(5, 6)
+    assert [each for each in compared.differences if each.of == "object"] == [
+        Difference("object", "cup 2", "place", "(2.000, 0.000, 0.000)", "(4.000, 0.000, 0.000)"),
+        Difference("object", "cup 3", "only in first", "(3.000, 0.000, 0.000)", None),
+    ]
 
 
 async def test_an_unknown_or_impossible_episode_is_refused(reading: Reading) -> None:

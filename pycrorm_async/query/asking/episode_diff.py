@@ -1,16 +1,17 @@
 """Compare two episodes: what surrounded them, their task trees, and where their objects were at the end.
 
 Nodes correspond by their path: the types from the root down, with numbers among siblings of one type, as in
-`root > PickUpAction > MoveTCPMotion 2`. Parameters are compared by value: a reference to an object by the object's
-name, a pose without the time at which it was made, and numbers to six decimals. Durations differ in every run and are
-not compared.
+`root > PickUpAction > MoveTCPMotion 2`, and objects by their name, with numbers among those of one name in the order
+they were added. Parameters are compared by value: a reference to an object by the object's name, a pose without the
+time at which it was made, and numbers to six decimals. Durations differ in every run and are not compared.
 """
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import msgspec
 from sqlalchemy import Select, func, select
@@ -23,8 +24,6 @@ from pycrorm_async.query.parameter_text import parameters_text
 if TYPE_CHECKING:
     from pycrorm_async.query.reading import Reading
 
-__all__ = ["Difference", "EpisodeDiff", "diff_episodes"]
-
 _SAME = 6
 """Decimals to which numbers are compared, and positions in m."""
 
@@ -35,7 +34,7 @@ class Difference:
 
     Attributes:
         of: `episode`, `node` or `object`.
-        where: the fact's name, the node's path, or the object's name.
+        where: the fact's name, the node's path, or the object's name, as in `cup` and `cup 2`.
         what: `only in first`, `only in second`, or what differs: `status`, `reason`, `parameter arm`, `place` …
         first, second: the values, as texts.
         first_node, second_node: ids of the nodes.
@@ -102,10 +101,7 @@ async def diff_episodes(reading: Reading, first: AskedEpisode, second: AskedEpis
     """Compare two episodes of one memory. Raises `UnknownEpisode`."""
     one, other = [await reading.episode(episode_name(each)) for each in (first, second)]
     trees = [await reading.tree(each) for each in (one, other)]
-    places = [
-        {row.name: (row.x, row.y, row.z) for row in await reading.rows(_last_places(each.number), simulated=True)}
-        for each in (one, other)
-    ]
+    places = [_by_name(await reading.rows(_last_places(each.number), simulated=True)) for each in (one, other)]
     nodes, same = _node_differences(*trees)
     differences = (*_fact_differences(one, other), *nodes, *_place_differences(*places))
     return EpisodeDiff(one, other, differences, same)
@@ -166,7 +162,9 @@ def _node_differences(first: Sequence[NodeSummary], second: Sequence[NodeSummary
     return differences, same
 
 
-_Path = tuple[tuple[str, int], ...]
+_Nth: TypeAlias = tuple[str, int]
+"""A name, and the number among those of that name."""
+_Path: TypeAlias = tuple[_Nth, ...]
 
 
 def _by_path(nodes: Sequence[NodeSummary]) -> dict[_Path, NodeSummary]:
@@ -206,7 +204,11 @@ def _differences_of(path: _Path, one: NodeSummary, other: NodeSummary) -> Iterat
 
 
 def _path_text(path: _Path) -> str:
-    return " > ".join(name if nth == 1 else f"{name} {nth}" for name, nth in path)
+    return " > ".join(_nth_text(*each) for each in path)
+
+
+def _nth_text(name: str, nth: int) -> str:
+    return name if nth == 1 else f"{name} {nth}"
 
 
 def _value_text(name: str, value: Any) -> str:
@@ -242,20 +244,32 @@ def _last_places(number: int) -> Select[*tuple[Any, ...]]:
         select(Object.name, Pose.x, Pose.y, Pose.z)
         .join(Pose, (Pose.id == Object.pose_id) & (Pose.process_metadata_id == Object.process_metadata_id))
         .where(Object.id.in_(last), Object.process_metadata_id == number)
-        .order_by(Object.id)
+        .order_by(Object.identity_id)
     )
 
 
-def _place_differences(
-    first: Mapping[str, tuple[float, ...]], second: Mapping[str, tuple[float, ...]]
-) -> Iterator[Difference]:
-    for name in dict.fromkeys([*first, *second]):
-        one, other = first.get(name), second.get(name)
+_Place: TypeAlias = tuple[float, float, float]
+
+
+def _by_name(rows: Iterable[Any]) -> dict[_Nth, _Place]:
+    """Return the places of objects by their name and their number among the objects of that name."""
+    times: Counter[str] = Counter()
+    places = {}
+    for each in rows:
+        times[each.name] += 1
+        places[each.name, times[each.name]] = (each.x, each.y, each.z)
+    return places
+
+
+def _place_differences(first: Mapping[_Nth, _Place], second: Mapping[_Nth, _Place]) -> Iterator[Difference]:
+    for key in dict.fromkeys([*first, *second]):
+        one, other = first.get(key), second.get(key)
         if _comparable(list(one or ())) != _comparable(list(other or ())):
-            yield Difference("object", name, _presence(one, other) or "place", _place_text(one), _place_text(other))
+            what = _presence(one, other) or "place"
+            yield Difference("object", _nth_text(*key), what, _place_text(one), _place_text(other))
 
 
-def _place_text(place: Sequence[float] | None) -> str | None:
+def _place_text(place: _Place | None) -> str | None:
     return None if place is None else "(" + ", ".join(f"{each:.3f}" for each in place) + ")"
 
 
