@@ -53,8 +53,9 @@ def picture(
 
     async def write(reading: Reading) -> Path:
         number = (await reading.episode(episode)).number
-        png = await draw(reading, number, at=at, width=width, height=height, yaw_deg=yaw, pitch_deg=pitch, focus=focus)
         path = out if out is not None else Path(f"episode-{number}.png")
+        refuse_existing(path, force=force)
+        png = await draw(reading, number, at=at, width=width, height=height, yaw_deg=yaw, pitch_deg=pitch, focus=focus)
         write_file(png, path, force=force)
         return path
 

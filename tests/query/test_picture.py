@@ -142,6 +142,8 @@ def test_the_command_writes_a_file_and_replaces_none(url: str, tmp_path: Path) -
     refused = CliRunner().invoke(app(), command)
     assert refused.exit_code == 2
     assert "exists: add --force" in refused.stderr
+    before_drawing = CliRunner().invoke(app(), [*command, "--at", "e1"])
+    assert "exists: add --force" in before_drawing.stderr, "the moment, which has nothing to draw, is refused later"
     assert CliRunner().invoke(app(), [*command, "--force"]).exit_code == 0
     wrong = CliRunner().invoke(app(), [*command[:-1], str(tmp_path / "other.png"), "--at", "noon"])
     assert (wrong.exit_code, "--at takes seconds" in wrong.stderr) == (2, True)
