@@ -43,7 +43,7 @@ def test_the_tree_is_walked_from_the_current_row_and_says_it(chrome: Browser, pa
         tab.press("ArrowLeft")
         assert tab.ask(f"{CURRENT}.getAttribute('aria-expanded')") == "false"
         tab.press("ArrowLeft")
-        assert tab.ask("pycrormPage.selected.name") == "plan"
+        assert tab.ask("pycrormPage.selected.name") == "root"
         tab.press("ArrowRight")
         assert tab.ask("pycrormPage.selected.name") == "ParkArmsAction"
         places = f"['aria-level', 'aria-posinset', 'aria-setsize'].map((each) => {CURRENT}.getAttribute(each))"

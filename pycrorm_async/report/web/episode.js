@@ -199,7 +199,7 @@ export class Node {
     Object.assign(this, { episode, start, parent, kind, type, children: [], isRootFailure: false, holdsFailure: false });
     this.depth = parent === null ? 0 : parent.depth + 1;
     this.place = 1;
-    this.name = type || (kind === "root" ? "plan" : kind);
+    this.name = type || kind;
   }
 
   became(end, status, reason, message) {
