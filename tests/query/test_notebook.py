@@ -2,25 +2,30 @@
 
 from __future__ import annotations
 
+import math
 import re
 import zlib
 from base64 import b64encode
+from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from html.parser import HTMLParser
 from itertools import pairwise
 
+import msgspec
 import numpy as np
 import pytest
 
 from pycrorm_async import Memory, world_of
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.types import DescriptionDeclared
+from pycrorm_async.events.values import BlobReference, BoxValue, MeshValue
 from pycrorm_async.plan import NavigateAction, simulated_robot
 from pycrorm_async.query.asking.episode_diff import Difference, EpisodeDiff
-from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary, RobotSummary
+from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary
 from pycrorm_async.query.notebook.listings import Episodes, TaskTree
 from pycrorm_async.query.notebook.memory_view import memory_html
+from pycrorm_async.query.running_episodes import RobotSummary
 from pycrorm_async.query.scene.link_frames import link_frames
 from pycrorm_async.query.scene.object_model import object_model
 from pycrorm_async.query.scene.outlines import outlines
@@ -29,6 +34,7 @@ from pycrorm_async.query.sql.read_only import SqlResult
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
 from pycrorm_async.world.models.courier import courier_urdf
+from tests.mesh_files import binary_stl
 
 START = datetime(2026, 3, 1, 12, tzinfo=UTC)
 HOSTILE = "</details></script><script>alert(1)</script>\u202e\"'& <img src=x onerror=alert(1)>"
@@ -251,6 +257,50 @@ def test_links_are_drawn_where_bullet_has_them() -> None:
             for (a, b), c in zip(pairwise(each.corners), each.corners[2:], strict=False)
         ]
         assert min(turns) > 0  # counterclockwise and convex
+
+
+ROUND = """<robot name="round">
+  <link name="tube"><visual><geometry><cylinder radius="0.5" length="2"/></geometry></visual></link>
+  <link name="ball"><visual><geometry><sphere radius="0.25"/></geometry></visual></link>
+  <link name="pill"><visual><geometry><capsule radius="0.5" length="2"/></geometry></visual></link>
+  <joint name="a" type="fixed"><parent link="tube"/><child link="ball"/><origin xyz="0 0 3"/></joint>
+  <joint name="b" type="fixed"><parent link="tube"/><child link="pill"/><origin xyz="0 0 6"/></joint>
+</robot>"""
+
+
+def area(corners: Sequence[tuple[float, float]]) -> float:
+    return math.fsum(a * d - c * b for (a, b), (c, d) in pairwise([*corners, corners[0]])) / 2
+
+
+@pytest.mark.parametrize(
+    ("turn", "areas"),
+    [
+        ([0, 0, 0, 1], [(1.0, 0.25 * math.pi), (3.25, math.pi / 16), (7.5, 0.25 * math.pi)]),
+        ([0.5**0.5, 0, 0, 0.5**0.5], [(0.25, math.pi / 16), (0.5, 2.0), (0.5, 2 + 0.25 * math.pi)]),
+    ],
+    ids=["upright", "lying"],
+)
+def test_round_shapes_have_round_outlines(turn: list[float], areas: list[tuple[float, float]]) -> None:
+    then = moment(ObjectThen(1, 1, "round", "GENERIC_OBJECT", Pose([1, 2, 0], turn), {}, None, "round"))
+    world = replace(then.world, descriptions={"round": described(ROUND)})
+    drawn = [(round(each.top, 6), area(each.corners)) for each in outlines(world)]
+    assert sorted(drawn) == [pytest.approx(each, rel=0.01) for each in areas]
+
+
+@pytest.mark.parametrize("content", [binary_stl(), b"torn"], ids=["read", "unreadable"])
+def test_a_mesh_has_its_own_outline_where_the_moment_has_its_file(content: bytes) -> None:
+    blob = BlobReference("ab", "model/stl", len(content))
+    mesh = MeshValue("part.stl", sha256="ab", size=len(content), content=blob)
+    geometry = f'<geometry><mesh filename="{mesh.reference}"/></geometry>'
+    urdf = f'<robot name="p"><link name="p"><visual>{geometry}</visual></link></robot>'
+    boxes = {"p": BoxValue((0, 0, 0), (1, 1, 1))}
+    description = msgspec.structs.replace(described(urdf), meshes=(mesh,), boxes=boxes)
+    lying = Pose([0, 0, 0], [0.5**0.5, 0, 0, 0.5**0.5])
+    then = moment(ObjectThen(1, 1, "pyramid", "GENERIC_OBJECT", lying, {}, None, "p"))
+    world = replace(then.world, descriptions={"p": description})
+    with_file = replace(world, meshes={"ab": content})
+    areas = [area(each.corners) for every in (world, with_file) for each in outlines(every)]
+    assert areas == [pytest.approx(1.0), pytest.approx(0.5 if content != b"torn" else 1.0)]
 
 
 def test_a_map_of_a_world_of_any_size_is_bounded() -> None:
