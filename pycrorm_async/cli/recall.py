@@ -179,6 +179,7 @@ def _document(found: Answer) -> dict[str, Any]:
     return {
         "cue": str(found.cue),
         "considered": found.considered,
+        "left_out": found.cue.left_out,
         "never_seen": [list(each) for each in found.never_seen],
         "joined": list(found.joined),
         "success": None if success is None else success._asdict(),

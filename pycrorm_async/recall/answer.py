@@ -260,6 +260,8 @@ class Answer(Sequence[RecalledCase]):
         lines = [head, *([f"  {self.success}"] if self.success else [])]
         if self.reasons:
             lines.append(f"  reasons: {', '.join(f'{name} {count}' for name, count in self.reasons)}")
+        if self.cue.left_out:
+            lines.append(f"  left out: {self.cue.left_out} features of the action that weigh least")
         if self.joined:
             lines.append(f"  renamed: counts the cases of {' and '.join(self.joined)}")
         lines += [f"  never seen: {feature}={word}" for feature, word in self.never_seen]

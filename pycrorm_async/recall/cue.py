@@ -51,6 +51,7 @@ class Cue:
         simulated: whether simulations are answers too.
         k: the number of cases of the answer.
         minimum: the lowest score of an answer, 0 to 1. A case that shares nothing with the cue is none.
+        left_out: the number of features that the case which the cue was made from has, and the cue has not.
     """
 
     type: str | None = None
@@ -67,6 +68,7 @@ class Cue:
     simulated: bool = False
     k: int = 20
     minimum: float = 0.0
+    left_out: int = 0
 
     def __str__(self) -> str:
         """Return the cue as `pycrorm recall` takes it."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Sequence
+from dataclasses import replace
 from typing import Any, Final
 
 import numpy as np
@@ -12,8 +13,7 @@ from pycrorm_async.events.ids import SLOT_NODE, row_id
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.recall.answer import Answer, Compared, RecalledCase, answer
 from pycrorm_async.recall.blocks import Group
-from pycrorm_async.recall.case import FEATURES_MAX, Case
-from pycrorm_async.recall.cue import Cue
+from pycrorm_async.recall.case import Case
 from pycrorm_async.recall.library import CaseLibrary
 from pycrorm_async.recall.reading.case_reader import CaseReader
 from pycrorm_async.recall.reading.cue_arguments import cue_like
@@ -111,10 +111,7 @@ def _cases_of(library: CaseLibrary, episode: int, starts: Collection[int]) -> li
 
 def _earlier(case: Case, library: CaseLibrary) -> Answer:
     """Return the cases most like this one that started before it."""
-    has, near = cue_like(case)
-    has = tuple(pair for pair in has if pair[0] not in library.left_out)[:FEATURES_MAX]
-    cue = Cue(type=case.type, has=has, near=near, before_us=case.started_us, simulated=case.simulated, k=COUNTED)
-    return answer(cue, library)
+    return answer(replace(cue_like(case, library), before_us=case.started_us, k=COUNTED), library)
 
 
 def _entry(found: Answer, texts: _Texts) -> dict[str, Any]:

@@ -8,10 +8,12 @@ import pytest
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.ids import row_id
+from pycrorm_async.recall.answer import answer
 from pycrorm_async.recall.blocks import WORDS_MAX, Block
-from pycrorm_async.recall.case import Case
+from pycrorm_async.recall.case import FEATURES_MAX, Case
 from pycrorm_async.recall.cue import K_MAX, Cue, Wanted, check_cue, numbers_of, symbols_of
 from pycrorm_async.recall.library import CaseLibrary
+from pycrorm_async.recall.reading.cue_arguments import cue_like
 from pycrorm_async.world.enums import Arms, ObjectType
 from tests.recall.random_cases import random_cases
 
@@ -106,3 +108,21 @@ def test_a_feature_with_too_many_words_is_refused_by_its_name() -> None:
 def test_a_cue_reads_as_the_command_takes_it() -> None:
     cue = Cue(type=TYPE, has=(("arm", "LEFT"),), near=(Wanted("height", 0.93, 0.1),), lacks=(("near", "BOWL"),))
     assert str(cue) == "PickUpAction arm=LEFT height~0.93±0.1 not:near=BOWL"
+
+
+def test_a_case_with_too_many_features_is_compared_by_those_that_weigh_most_and_the_others_are_counted() -> None:
+    numbers = {f"n{number:03}": 1.0 for number in range(60)}
+    common, rare = [f"common {number:03}" for number in range(150)], [f"rare {number:03}" for number in range(150)]
+    others = [Case(row_id(1, n, 0), n, "A", {"near": tuple(common)}, numbers, "FAILED") for n in range(1, 100)]
+    crowded = Case(row_id(1, 100, 0), 100, "A", {"near": (*common, *rare), "arm": "LEFT"}, numbers, "FAILED")
+    library = CaseLibrary([Block.of([*others, crowded])])
+    cue = cue_like(crowded, library)
+    assert (len(cue.has) + len(cue.near), cue.left_out) == (FEATURES_MAX, 361 - FEATURES_MAX)
+    words = [word for _, word in cue.has]
+    assert set(rare) | {"LEFT"} <= set(words)
+    assert len(cue.near) == 60, "a number weighs more than a word that almost every case has"
+    check_cue(cue, library)
+    assert "  left out: 105 features of the action that weigh least" in answer(cue, library).why().splitlines()
+    plain = cue_like(others[0], library)
+    assert (len(plain.has), len(plain.near), plain.left_out) == (150, 60, 0)
+    assert "left out" not in answer(plain, library).why()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from typing import Any, NamedTuple, TypeAlias
 
@@ -15,9 +16,10 @@ from pycrorm_async.query.as_of import AnyEpisode
 from pycrorm_async.query.named_queries import EpisodeSummary
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.recall.answer import RecalledCase
-from pycrorm_async.recall.case import RESERVED, Case
+from pycrorm_async.recall.case import FEATURES_MAX, RESERVED, Case
 from pycrorm_async.recall.cue import Cue, Wanted, closest, shortened, symbols_of, word
 from pycrorm_async.recall.library import CaseLibrary
+from pycrorm_async.recall.search import weights_of
 from pycrorm_async.store.episode_lookup import episode_named
 
 AnyCase: TypeAlias = "Case | RecalledCase | int"
@@ -113,10 +115,27 @@ async def make_cue(
     )
 
 
-def cue_like(case: Case) -> tuple[tuple[tuple[str, str], ...], tuple[Wanted, ...]]:
-    """Return the situation of a case as `has` and `near`, without its outcome and without the name of its object."""
-    pairs = {name: value for name, value in case.symbols.items() if name not in RESERVED | _OF_EACH_CASE}
-    return symbols_of(pairs), tuple(Wanted(name, value) for name, value in sorted(case.numbers.items()))
+def cue_like(case: Case, library: CaseLibrary) -> Cue:
+    """Return the situation of a case as a cue, without its outcome and without the name of its object.
+
+    Of more features than a cue can have, those that weigh least are left out, and counted.
+    """
+    unused = RESERVED | _OF_EACH_CASE | library.left_out
+    has = symbols_of({name: value for name, value in case.symbols.items() if name not in unused})
+    near = tuple(Wanted(name, value) for name, value in sorted(case.numbers.items()))
+    cue = Cue(type=case.type, has=has, near=near, simulated=case.simulated)
+    features = [*has, *near]
+    if len(features) <= FEATURES_MAX:
+        return cue
+    weights = [*weights_of(cue, library).words, *(1.0 for _ in near)]
+    heaviest = sorted(range(len(features)), key=lambda index: -weights[index])[:FEATURES_MAX]
+    kept = {features[index] for index in heaviest}
+    return replace(
+        cue,
+        has=tuple(each for each in has if each in kept),
+        near=tuple(each for each in near if each in kept),
+        left_out=len(features) - FEATURES_MAX,
+    )
 
 
 def dtype_of(designator: str | type | None) -> str | None:

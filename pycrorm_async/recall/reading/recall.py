@@ -10,6 +10,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from importlib import import_module
 from numbers import Real
 from types import MappingProxyType
@@ -128,14 +129,13 @@ class Recall:
     async def like(self, case: AnyCase, *, k: int = 20, simulated: bool = False) -> Answer:
         """Return the actions whose situation was most like that of a case, which is left out itself.
 
-        The name of its object is not compared. Raises `CallerError` for a node without a case.
+        The name of its object is not compared. Of more than 256 words and numbers, those that weigh least are left out,
+        and the answer says how many. Raises `CallerError` for a node without a case.
         """
         library = await self._reader.library()
         found = case_of(case, library)
-        has, near = cue_like(found)
-        has = tuple(pair for pair in has if pair[0] not in library.left_out)
-        conditions = Conditions(prohibit=[found], k=k, simulated=simulated or found.simulated)
-        cue = await make_cue(library, EpisodeNames(self._reading), found.type, has, near, (), conditions)
+        cue = cue_like(found, library)
+        cue = replace(cue, prohibit=frozenset({found.node}), k=k, simulated=simulated or found.simulated)
         return self._answer(cue, library)
 
     async def similar_to_now(
