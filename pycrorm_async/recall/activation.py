@@ -60,15 +60,6 @@ def activation(ages_s: NDArray[np.float64]) -> float:
     return float(np.log(total))
 
 
-def activation_by_node(library: CaseLibrary, now_us: int) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Return all nodes, ascending, and the activation of the way of each."""
-    ways = [_ways_of(name, library, now_us) for name in library.types]
-    nodes = np.concatenate([each.nodes for each in ways] or [_NO_NODES])
-    values = np.concatenate([np.repeat(each.activations, each.sizes) for each in ways] or [np.zeros(0)])
-    order = np.argsort(nodes)
-    return nodes[order], values[order]
-
-
 def forgotten(library: CaseLibrary, *, threshold: float, now_us: int) -> Forgotten:
     """Return the cases whose ways have an activation below the threshold. Nothing is deleted."""
     nodes, count = [], 0

@@ -13,7 +13,7 @@ verified it to 1e-6 m and 1e-6 rad. Collisions, with the robot itself or with ob
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
@@ -100,15 +100,9 @@ def solve(
     root = robot.root_pose(base)
     if not isinstance(description, PR2Description):
         return _solve_chain(robot, description, arm, target, root, torso_height, limits)
-    arm_description = _one_arm(description.arms, description, arm)
-    bounds = _bounds(arm_description, limits)
-    if limits is Limits.HARD:
-        bounds = [
-            _narrow(bound, robot.joint_limits(name)) for name, bound in zip(arm_description.joints, bounds, strict=True)
-        ]
     height = robot.joint_position(description.torso_joint) if torso_height is None else torso_height
-    reach = _reach(description, arm_description, target, root=root, torso_height=height)
-    return _solve(arm_description, arm, target, reach, bounds, limits)
+    narrower = robot.joint_limits if limits is Limits.HARD else None
+    return solve_from(description, arm, target, base=root, torso_height=height, limits=limits, narrower=narrower)
 
 
 def solve_from(
@@ -119,10 +113,12 @@ def solve_from(
     base: Pose,
     torso_height: float,
     limits: Limits = Limits.SOFT,
+    narrower: Callable[[str], tuple[float, float]] | None = None,
 ) -> dict[str, float]:
     """Solve as `solve` does, for a root link at `base` and the torso at `torso_height` m; needs no world.
 
-    The torso height is not checked against its limits. The rolls of forearm and wrist are in [-π, π].
+    The torso height is not checked against its limits. The rolls of forearm and wrist are in [-π, π]. `narrower`
+    returns the limits of a joint in a loaded model, which narrow the described ones.
 
     >>> from pycrorm_async.world.robots.robot_description import PR2
     >>> target = Pose([0.6, 0.2, 0.9])
@@ -131,8 +127,11 @@ def solve_from(
     True
     """
     arm_description = _one_arm(description.arms, description, arm)
+    bounds = _bounds(arm_description, limits)
+    if narrower is not None:
+        bounds = [_narrow(each, narrower(name)) for name, each in zip(arm_description.joints, bounds, strict=True)]
     reach = _reach(description, arm_description, target, root=base, torso_height=torso_height)
-    return _solve(arm_description, arm, target, reach, _bounds(arm_description, limits), limits)
+    return _solve(arm_description, arm, target, reach, bounds, limits)
 
 
 def _solve_chain(
