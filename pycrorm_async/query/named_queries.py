@@ -19,8 +19,6 @@ from pycrorm_async.query.running_episodes import RobotSummary, robots_of
 from pycrorm_async.store.episode_lookup import number_named
 from pycrorm_async.task_status import TaskStatus
 
-__all__ = ["EpisodeSummary", "NodeSummary", "RobotSummary", "SimulatingNode", "episodes", "episode_named", "task_tree"]
-
 
 @dataclass(frozen=True)
 class SimulatingNode:

@@ -13,9 +13,6 @@ from pycrorm_async.query.asking.columns import checked_count, containing, limite
 from pycrorm_async.query.asking.failure_words import classes_meant_by
 from pycrorm_async.query.asking.question import EpisodeNumber
 
-__all__ = ["failures_by_cause", "root_failures", "steps_before_failures"]
-
-
 _WORDS_MAX = 30
 """Bounds the words of a search: each is a condition on four columns, and SQLite takes a thousand."""
 

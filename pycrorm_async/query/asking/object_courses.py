@@ -10,8 +10,6 @@ from pycrorm_async.orm import Attachment, Detection, JointChange, Object, Object
 from pycrorm_async.query.asking.columns import limited
 from pycrorm_async.query.asking.question import EpisodeNumber
 
-__all__ = ["moves_of", "object_history"]
-
 _OBJECT, _POSE, _NODE = Object.__table__, Pose.__table__, TaskTreeNode.__table__
 
 

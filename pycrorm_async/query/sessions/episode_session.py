@@ -26,8 +26,6 @@ from pycrorm_async.orm.base import EPISODE
 from pycrorm_async.orm.loading.batch_loads import KEYS, load_related
 from pycrorm_async.query.sessions.load_on_access import LoadOnAccess
 
-__all__ = ["EpisodeSession"]
-
 
 class _MapReference(ref[IdentityMap]):
     """The reference to a session's identity map that each of its objects holds; keeps `session` alive with them."""
