@@ -10,9 +10,10 @@ from pycrorm_async.store.address import DatabaseAddress
 
 
 def mcp(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None) -> None:
-    """Serve the memory to an agent by the Model Context Protocol (extra [mcp]); nothing is ever written.
+    """Serve the memory to an agent by the Model Context Protocol; nothing is ever written.
 
-    The agent's program starts this command; `pycrorm_async/integrations/README.md` says how to enter it there.
+    Needs the extra 'mcp'. The agent's program starts this command; `pycrorm_async/integrations/README.md` shows how to
+    enter it there.
     """
     from pycrorm_async.integrations.mcp_server import memory_server  # here, because it needs the extra
 

@@ -31,7 +31,10 @@ def plot(
         typer.Option(help="Shares of successes in cells, or each row as a point; auto: points for up to 500 rows."),
     ] = "auto",
     bins: Annotated[
-        int | None, typer.Option(min=1, max=200, help="Ranges of a numeric column at most; default: by the rows.")
+        int | None,
+        typer.Option(
+            min=1, max=200, help="Divide a numeric column into at most so many ranges; default: more for more rows."
+        ),
     ] = None,
     out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The file to write: .png, .svg or .pdf.")] = Path(
         "success.png"

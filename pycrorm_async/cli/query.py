@@ -26,8 +26,10 @@ def query(
     form: Annotated[
         Literal["table", "csv", "json"], typer.Option("--format", help="csv prints the rows while the query runs.")
     ] = "table",
-    limit: Annotated[int, typer.Option(metavar="ROWS", min=0, help="Rows at most; 0: any number.")] = _ROWS,
-    megabytes: Annotated[float, typer.Option(metavar="MB", help="Size of the rows at most.")] = 16.0,
+    limit: Annotated[
+        int, typer.Option(metavar="ROWS", min=0, help="Return at most this many rows; 0: any number.")
+    ] = _ROWS,
+    megabytes: Annotated[float, typer.Option(metavar="MB", help="Return at most this size of rows.")] = 16.0,
     seconds: Annotated[float, typer.Option(metavar="S", help="Time that the database may take.")] = 10.0,
     url: UrlOption = DEFAULT_URL,
     spool: SpoolOption = None,

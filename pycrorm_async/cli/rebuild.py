@@ -47,15 +47,15 @@ def rebuild(
     """Rebuild all tables and views from the log, or those of the named projections, while recording continues.
 
     The new tables are built as a new generation beside the current one and replace it in one transaction, once they
-    contain at least as many events. Run it again to continue an interrupted rebuild. It needs no code of a plan, only
-    that of the projections; a projection whose code is not available is skipped.
+    contain at least as many events. Run it again to continue an interrupted rebuild. It needs the code of the
+    projections, but of no plan; a projection whose code is not available is skipped.
     """
     given_projections = load_projections(projection or ())
     projections = {each.name: each for each in (*given_projections, *installed_projections(given_projections))}
     collect_seldom()
     chosen = asyncio.run(_choose(url, names or [], projections))
     summaries = {name: asyncio.run(_rebuild(url, workers, projections.get(name))) for name in chosen}
-    # Those of this package are made with the tables, and are only named where they were asked for.
+    # Projections of this package are rebuilt with the tables, so they are listed only if the user names them.
     built_in = {name for name, each in projections.items() if isinstance(each, PackedProjection)}
     shown = [name for name in summaries if name not in built_in or name in (names or ())]
     if as_json:

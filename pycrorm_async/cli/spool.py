@@ -117,7 +117,7 @@ def rebind(
     file_access: FileAccessOption = "owner",
     as_json: JsonOption = False,
 ) -> int:
-    """Bind a spool to the database at the URL, after its own was deleted or replaced, and store the spool's events.
+    """Bind a spool to the database at the URL, after its own database was deleted or replaced, and store its events.
 
     Creates the database if it does not exist. Deletes no event before it is stored. An episode whose first events were
     only in the deleted database cannot be stored: its events stay in the spool as dead letters, and the exit code is 1.

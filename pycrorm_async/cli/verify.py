@@ -50,7 +50,7 @@ def verify(
 ) -> int:
     """Check the log for damage, fold it again, and compare the result with the tables row by row.
 
-    Changes nothing; recording and folding may continue. Exit code 0 if no problem is result; 1 if tables differ from
+    Changes nothing; recording and folding may continue. Exit code 0 if there is no problem; 1 if tables differ from
     the log or are of an older version (`pycrorm rebuild` replaces them), if an episode is parked or refused, or if a
     designator type has no tables or a view is left out; 4 if the log is damaged, or differs from its digests or from
     those of --digests.

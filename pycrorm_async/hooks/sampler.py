@@ -8,8 +8,8 @@ before a moment are the state at that moment, up to `change_min`, and the state 
 Periodic samples are taken by a thread, because a plan that never suspends would starve a task. The thread starts with
 the first motion, sleeps while no motion runs, and ends at `close`. The first and the last sample are taken in the
 plan's thread, by `begin` and `end`. The thread reads only values that the world keeps in Python, never Bullet, which
-belongs to the plan's thread. It never waits for room: if the spool has none without its reserve, the sample is counted
-in `omitted`, and the next one holds all changes since the last written sample.
+belongs to the plan's thread. It never waits for room: if the spool has only its reserve left, the sample is counted in
+`omitted`, and the next one holds all changes since the last written sample.
 
 One condition variable guards the running motions. All samples are taken while it is held, so no sample follows the end
 of its motion, and `renumbering` keeps samples out while an episode moves to a follow-up. Its lock is reentrant, because

@@ -5,10 +5,10 @@ builds one event and puts it into the queue at once, so the values are those of 
 order of the changes. The rows of the objects, and what happens if an event cannot be written, are those of
 `ObjectRows`.
 
-The recorder starts with `ObjectAdded` and `ObjectAttached` for the present state of the world. `continue_at` is out of
-reach meanwhile, and while `empty` removes the objects, because a follow-up episode would start with the state of a
-world that is incomplete. Otherwise a change whose sequence reaches `continue_at` calls `continue_` after it has been
-recorded; that replaces this recorder by one for the follow-up.
+The recorder starts with `ObjectAdded` and `ObjectAttached` for the present state of the world. A change whose sequence
+reaches `continue_at` calls `continue_` after it has been recorded; that replaces this recorder by one for the follow-up
+episode. While the present state is recorded, and while `empty` removes the objects, no sequence reaches `continue_at`,
+because the follow-up would start with the state of an incomplete world.
 """
 
 from __future__ import annotations

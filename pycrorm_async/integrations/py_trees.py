@@ -8,7 +8,8 @@ first child. An activation ends when the behaviour is not RUNNING any more. A be
 once, tick after tick, as a condition does, remains one node; so a tick that changes nothing writes nothing. `_pending`
 holds behaviours that repeat their outcome after the activation of their parent has ended: the visit of the parent shows
 that it repeats its outcome too, or a change shows that they belong to a new activation of it. py_trees does not visit
-what it stops, so open activations that are not RUNNING are looked for before each tick and after one with a change.
+a behaviour that it stops, so the visitor searches the open activations for those that are not RUNNING any more, before
+each tick and after a tick with a change.
 """
 
 from __future__ import annotations
@@ -49,7 +50,7 @@ _KNOWN_MAX: Final = 10_000
 
 
 class _Activation:
-    """An activation of a behaviour; `node` stands for it in the episode. `ticks` counts those not recorded yet."""
+    """An activation of a behaviour; `node` is its node in the episode, `ticks` counts its ticks not recorded yet."""
 
     __slots__ = ("behaviour", "is_open", "node", "parent", "status", "ticks")
 

@@ -21,15 +21,15 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-class _Holding(threading.local):
-    """How many locks this thread holds or takes, and whether it is a thread of the memory."""
+class _ThreadState(threading.local):
+    """The number of locks that this thread holds or waits for, and whether it is a thread of the memory."""
 
     def __init__(self) -> None:
         self.depth = 0
         self.is_of_memory = threading.current_thread().name.startswith(THREAD_NAME_PREFIX)
 
 
-_holding = _Holding()
+_this_thread = _ThreadState()
 
 
 class OrderedCalls:
@@ -40,10 +40,10 @@ class OrderedCalls:
         self._lock = threading.Lock()
 
     def run(self, call: Callable[[], object]) -> None:
-        """Run a call after those that came before; it must not raise."""
+        """Run a call, which must not raise, after all earlier ones."""
         self._waiting.append(call)
-        waits = not _holding.depth and not _holding.is_of_memory
-        _holding.depth += 1  # before the lock, so that a call made while it is taken does not wait for it
+        waits = not _this_thread.depth and not _this_thread.is_of_memory
+        _this_thread.depth += 1  # before the lock, so that a call made while it is taken does not wait for it
         try:
             while (waits or self._waiting) and self._lock.acquire(blocking=waits):
                 waits = False
@@ -53,7 +53,7 @@ class OrderedCalls:
                 finally:
                     self._lock.release()
         finally:
-            _holding.depth -= 1
+            _this_thread.depth -= 1
 
 
 class CountingEpisode(Protocol):

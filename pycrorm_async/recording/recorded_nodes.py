@@ -1,8 +1,9 @@
 """`RecordedNodes` writes the nodes of an episode of any executive, its beginning, its end and its follow-ups.
 
 Theory of operation. Each method first copies its arguments, which may run any code of the caller, and then has
-`OrderedCalls` write them; so a call is whole, and the parent of a node is known when the node starts, whichever thread
-started it. The episode may be continued in between; then `_now` renews what refers to rows. Nothing raises into the
+`OrderedCalls` write them; so no other call comes between the events of one, and a node's parent has started before it,
+whichever threads start them. If the episode is continued after the copy, `_now` replaces references to rows of the
+former episode. Nothing raises into the
 caller: what goes wrong, and what comes after the end of the episode, is counted in `Memory.status`. `_nodes` holds the
 open nodes by key, `_ended` the last ones that ended, because a child may start after the end of its parent.
 """
@@ -96,7 +97,7 @@ class RecordedNodes(EpisodeWriter[_Node]):
         self._episodes.close(self, failure)
 
     def _write(self, what: str, write: Callable[[], int]) -> None:
-        """Have `write` called after the calls before; it returns the sequence of what it wrote, 0 for nothing."""
+        """Call `write` after all earlier calls; it returns the sequence of the event that it wrote, 0 for none."""
         self._calls.run(lambda: self._written(what, write))
 
     def _written(self, what: str, write: Callable[[], int]) -> None:
@@ -106,7 +107,7 @@ class RecordedNodes(EpisodeWriter[_Node]):
             self._episodes.continue_episode(self)
 
     def _now(self, value: Any, prepared: EpisodeId) -> Any:
-        """Return a value that was copied while the episode had this id, with the rows that are in force now."""
+        """Return a value that was copied when the episode had the id `prepared`, with references to current rows."""
         return value if prepared == self.id else self._objects.renewed(value)
 
     # --- nodes ------------------------------------------------------------------------------------------------

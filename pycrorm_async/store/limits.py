@@ -45,8 +45,8 @@ def events_warning(episode: EpisodeRow) -> str | None:
         return None
     share = episode.head * 100 // SEQUENCE_MAX
     return (
-        f"episode {episode.number} ({episode.id}) has {episode.head:,} of {SEQUENCE_MAX:,} events ({share} %): it goes"
-        " on in a follow-up episode before its last one"
+        f"episode {episode.number} ({episode.id}) has {episode.head:,} of {SEQUENCE_MAX:,} events ({share} %): it"
+        " continues in a follow-up episode before the last of these"
     )
 
 

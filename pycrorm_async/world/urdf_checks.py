@@ -105,6 +105,7 @@ def _numbers(element: Element) -> Iterator[float]:
 
 
 def _climb(link: str, above: dict[str, str]) -> None:
+    """Raise `_Fault` if the links above this one form a cycle."""
     passed = {link}
     while link in above:
         link = above[link]
@@ -122,6 +123,6 @@ def _unique(kind: str, names: Iterable[str]) -> None:
 
 
 def joined_link(joint: Element, end: str) -> str:
-    """Return the link at an end of a joint, `parent` or `child`; empty if the joint names none."""
+    """Return the name of the link at an end of a joint, `parent` or `child`; empty if the joint names none."""
     element = joint.find(end)
     return "" if element is None else element.get("link", "")

@@ -104,5 +104,5 @@ async def test_status_and_log_warn_once_nine_tenths_of_an_episodes_sequences_are
     assert len(caplog.messages) == 1
     (warning,) = await log.limits_near()
     assert warning.startswith("episode 1 (")
-    assert "has 60,397,978 of 67,108,863 events (90 %): it goes on in a follow-up episode" in warning
+    assert "has 60,397,978 of 67,108,863 events (90 %): it continues in a follow-up episode" in warning
     await log.close()

@@ -59,6 +59,9 @@ class MoveMotion(BaseMotion):
 class MoveTCPMotion(BaseMotion):
     """Move the tool frame of one arm to a pose in the map.
 
+    Attributes:
+        allow_gripper_collision: whether the gripper may be in an object at the goal, where collisions are checked.
+
     Raises:
         IKError: the pose is out of reach.
         CapabilityAbsenceFailure, IllPosedGoalFailure: the robot has no such arm; `arm` is BOTH.

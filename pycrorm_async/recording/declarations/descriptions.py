@@ -72,8 +72,9 @@ class _Declared(NamedTuple):
 class Descriptions:
     """The descriptions that one memory has declared.
 
-    The queue repeats the latest ones in each segment, an eighth of it. Half as much counts as put here; another is put
-    again before it is used. So each segment with an object also has the object's description.
+    The queue repeats the latest descriptions at the start of each segment, in at most an eighth of it. This class keeps
+    the names of the latest ones up to half of that (`_put`), and puts any other again before an object refers to it. So
+    each segment with an object also has the object's description.
     """
 
     def __init__(self, sink: DescriptionSink, settings: Settings, missing: MissingValues) -> None:
@@ -90,7 +91,7 @@ class Descriptions:
         self._put_bytes = 0
 
     def declare(self, described: Described) -> str | None:
-        """Return the fingerprint of the object's description, which is in the queue then.
+        """Put the object's description into the queue unless it is there, and return its fingerprint.
 
         An exception is counted as a missing value, because adding an object must not fail; it returns None then.
         """

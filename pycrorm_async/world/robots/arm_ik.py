@@ -22,7 +22,9 @@ from pycrorm_async.world.robots.robot_description import Bounds, PR2Arm
 Floats = NDArray[np.float64]
 PAN, LIFT, ROLL, ELBOW, FOREARM_ROLL, FLEX, WRIST_ROLL = range(7)
 ROUNDING = 1e-9
+"""Bounds the rounding error of a margin (rad) or a cosine; a posture beyond a limit by less counts as inside."""
 _TINY = 1e-12
+"""Replaces a length of 0 m in a divisor, where the result then does not matter."""
 
 
 class Reach(NamedTuple):
