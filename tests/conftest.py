@@ -7,6 +7,8 @@ import os
 import signal
 import sys
 from collections.abc import AsyncIterator, Generator, Iterator
+from contextlib import suppress
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from types import SimpleNamespace
@@ -95,6 +97,24 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 gc.disable()  # until all tests are collected: nothing becomes garbage while modules are imported
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection(session: pytest.Session) -> None:
+    """Import the tests in each test process in another order, so that they share the work of compiling them.
+
+    Each would otherwise compile every file of a fresh clone, 5 s of CPU time, while the others compile the same one.
+    """
+    own = getattr(session.config, "workerinput", None)
+    folders = [Path(each) for each in session.config.args if Path(each).is_dir()]
+    if own is None or not folders:
+        return
+    files = sorted({file for folder in folders for file in folder.resolve().rglob("test_*.py")})
+    first = len(files) * int(own["workerid"].removeprefix("gw")) // own["workercount"]
+    for file in files[first:] + files[:first]:
+        name = ".".join(file.relative_to(session.config.rootpath).with_suffix("").parts)
+        with suppress(Exception, pytest.skip.Exception):  # the collection imports it again, and reports the error
+            import_module(name)
 
 
 def pytest_configure() -> None:
