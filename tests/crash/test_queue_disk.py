@@ -65,6 +65,28 @@ async def test_a_failed_sync_refuses_all_records_but_those_synced_before(tmp_pat
     ]
 
 
+async def test_a_sync_that_would_succeed_after_a_failed_one_does_not_hide_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    queue = make(tmp_path, settings=SLOW)
+    queue.put_nowait(started(), b"{}")
+    await queue.synced_to()
+    queue.put_nowait(node(), b"dropped by the kernel")
+    fdatasync, failures = os.fdatasync, [OSError(errno.EIO, os.strerror(errno.EIO))]
+
+    def fail_once(descriptor: int) -> None:  # as Linux does: the next call no longer knows of the lost pages
+        if failures:
+            queue.put_nowait(node(), b"put meanwhile")
+            raise failures.pop()
+        fdatasync(descriptor)
+
+    monkeypatch.setattr(os, "fdatasync", fail_once)
+    with pytest.raises(SpoolUnavailable, match="Input/output error"):
+        await queue.synced_to()
+    queue.release()  # the sync thread takes its last turn
+    assert (queue.written, queue.synced) == (3, 1)
+
+
 async def test_a_failed_sync_ends_the_wait_of_the_writer(tmp_path: Path) -> None:
     queue = make(tmp_path, settings=SLOW)
     waiting = asyncio.ensure_future(queue.get_batch(events_max=10, bytes_max=2**20, age_s_max=1000.0))

@@ -2,8 +2,9 @@
 
 import asyncio
 import shutil
+import sqlite3
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, closing
 from pathlib import Path
 
 import msgspec
@@ -111,6 +112,26 @@ async def test_a_database_that_is_missing_is_a_fault_until_it_exists(tmp_path: P
             robot.end("one")
         with pytest.raises(UnknownEpisode):
             await follower.feed("7")
+
+
+async def test_an_event_that_cannot_be_read_is_a_fault_of_the_feed_behind_what_was_read(tmp_path: Path) -> None:
+    with robot_in(tmp_path) as robot:
+        for key in "ab":
+            robot.start(key)
+            robot.end(key)
+    with closing(sqlite3.connect(tmp_path / "pycrorm.db")) as database, database:
+        for (trigger,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'trigger'").fetchall():
+            database.execute(f"DROP TRIGGER {trigger}")
+        starts = "SELECT sequence FROM event WHERE type = 'NodeStarted' ORDER BY sequence"
+        _root, _first, (second,) = database.execute(starts)
+        database.execute("UPDATE event SET payload = '{' WHERE sequence = ?", (second,))
+    follower = LogFollower(DatabaseAddress.parse(url_of(tmp_path)))
+    feed = await follower.feed("1")
+    assert feed.fault is not None
+    assert f"event {second}: " in feed.fault
+    assert feed.last == second - 1
+    assert len((await feed.document(await follower.log()))["nodes"][0]) == 2  # the root and the first
+    await follower.close()
 
 
 async def test_a_full_page_says_so_and_another_begins_behind_it(

@@ -20,13 +20,26 @@ from pycrorm_async.events.envelope import LOST, Record
 from pycrorm_async.events.ids import episode_text
 from pycrorm_async.queue import Spool, open_dead
 from pycrorm_async.queue.files.drain_status import Progress
+from pycrorm_async.queue.files.frame import EVENT, Frame, encode
 from pycrorm_async.queue.files.names import PROGRESS
 from pycrorm_async.queue.files.scan import scan
-from pycrorm_async.queue.files.segment import SEGMENT_BYTES_MAX, read_segment, segment_numbers
+from pycrorm_async.queue.files.segment import SEGMENT_BYTES_MAX, read_segment, salt_of, segment_numbers
 from pycrorm_async.queue.live.capacity import Capacity
 from pycrorm_async.queue.maintenance.inspection import inspect_recorder, inspect_spool
 from pycrorm_async.queue.maintenance.repair import repair_folder
-from tests.queue.factories import DECLARED, RECORDER, SMALL, FolderWriter, node, recover, started
+from tests.queue.factories import (
+    DECLARED,
+    RECORDER,
+    SMALL,
+    WALL_NS,
+    FolderWriter,
+    episode,
+    lost,
+    node,
+    overwrite,
+    recover,
+    started,
+)
 from tests.queue.forged_segments import change_a_frame, change_the_header
 
 
@@ -74,6 +87,16 @@ def test_a_declaration_that_no_database_accepts_is_damage_and_the_folder_can_be_
             scan(author.folder, RECORDER)
         assert repair_folder(author.folder) is not None
         assert scan(author.folder, RECORDER).cut.position == 0
+
+
+async def test_an_intact_record_behind_a_missing_position_is_a_torn_tail(tmp_path: Path) -> None:
+    author = FolderWriter(tmp_path)
+    author.put(started(1))
+    author.sync()
+    behind = Frame(EVENT, 1, 3, 1, WALL_NS, 1, episode(2), b"EpisodeStarted", b"{}")
+    overwrite(author.segments[-1], author.end, encode(behind, salt_of(RECORDER, 1)))
+    assert scan(author.folder, RECORDER).cut.position == 1
+    assert await recover(author.folder) == [author.records[0], lost(2, 1, 2)]
 
 
 async def recovered(folder: Path) -> tuple[list[Record], PycrormError | None]:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import subprocess
 import sys
 import threading
 from collections.abc import Callable
 from enum import Enum
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 
@@ -17,6 +18,7 @@ from pycrorm_async import Memory, Settings, recover
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.values import EpisodeStatus, FailureValue, ObjectReference, PoseValue, RobotValue, SeenValue
 from pycrorm_async.plan.failures import NavigationGoalInCollision
+from pycrorm_async.recording import recorded_nodes
 from pycrorm_async.recording.recorded_episode import RecordedEpisode
 from pycrorm_async.recording.recording import Recording
 from pycrorm_async.sync_memory import SyncMemory
@@ -57,6 +59,16 @@ def test_a_move_to_the_last_pose_writes_nothing_and_one_to_no_pose_is_counted(tm
     assert last is not None
     assert "expected a PoseValue, got None" in last
     assert [each["pose"]["position"] for each in events(tmp_path, "ObjectMoved")] == [[1.0, 2.0, 4.0]]
+
+
+def test_a_joint_at_its_last_position_is_not_written_again(tmp_path: Path) -> None:
+    def write(_: Recording, episode: RecordedEpisode) -> None:
+        episode.object_added("r", "robot", "ROBOT", HERE, {"torso": 0.2})
+        for joints in ({"torso": 0.2}, {"torso": 0.2, "elbow": 1.0}, {"elbow": 1.0}, {"torso": 0.3, "elbow": 1.0}):
+            episode.joints_moved("r", joints)
+
+    assert faults_of(tmp_path, write) == (0, None)
+    assert [each["joints"] for each in events(tmp_path, "JointsMoved")] == [{"elbow": 1.0}, {"torso": 0.3}]
 
 
 def test_a_tree_written_by_threads_has_the_parents_that_they_named(tmp_path: Path) -> None:
@@ -183,6 +195,18 @@ def test_an_end_without_a_start_is_counted(tmp_path: Path) -> None:
     assert "no open node has the key 'never'" in last
 
 
+def test_an_unknown_status_is_counted_and_the_node_ends_with_an_error(tmp_path: Path) -> None:
+    def write(recording: Recording, episode: RecordedEpisode) -> None:
+        episode.start(1, recording.type("action", "Step"))
+        episode.end(1, cast("Any", "DONE"))
+
+    total, last = faults_of(tmp_path, write)
+    assert total == 1
+    assert last is not None
+    assert "'DONE' is not a status" in last
+    assert [row[2] for row in nodes(tmp_path)] == ["ERROR"]
+
+
 def test_a_key_in_use_ends_its_first_node_lost_and_starts_the_second(tmp_path: Path) -> None:
     def write(recording: Recording, episode: RecordedEpisode) -> None:
         kind = recording.type("action", "Twice")
@@ -194,6 +218,8 @@ def test_a_key_in_use_ends_its_first_node_lost_and_starts_the_second(tmp_path: P
 
     assert faults_of(tmp_path, write)[0] == 1
     assert [row[2] for row in nodes(tmp_path)] == ["LOST", "SUCCEEDED", "SUCCEEDED"]
+    ends = [(each["node"], each["status"]) for each in events(tmp_path, "NodeEnded")]
+    assert ends == [(3, "LOST"), (5, "SUCCEEDED"), (7, "SUCCEEDED"), (2, "SUCCEEDED")]  # each as it happened
     assert_verified(tmp_path)
 
 
@@ -229,6 +255,25 @@ def test_what_a_start_returned_names_its_node_long_after_its_end(tmp_path: Path)
         " JOIN job AS child ON child.id = node.id"
     )
     assert ask(tmp_path / "memory.db", of_observation) == ask(tmp_path / "memory.db", of_child) == [(0,)]
+
+
+def test_nodes_that_start_below_ended_ones_do_not_keep_all_of_these(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recorded_nodes, "_ENDED_MAX", 3)
+    kept: list[int] = []
+
+    def write(recording: Recording, episode: RecordedEpisode) -> None:
+        step = recording.type("action", "Step")
+        for key in range(20):
+            episode.start(key, step, parent=key - 1 if key else None)
+            episode.end(key)
+        everything = gc.get_objects()
+        kept.append(sum(type(each) is recorded_nodes._Node and each.declared is step for each in everything))
+
+    assert faults_of(tmp_path, write) == (0, None)
+    assert kept == [3]
+    assert len(nodes(tmp_path)) == 20
 
 
 def test_nodes_open_at_the_end_are_lost_and_counted_once(tmp_path: Path) -> None:
