@@ -90,10 +90,10 @@ def counted(what: str) -> Callable[[Callable[Concatenate[E, P], R]], Callable[Co
     return wrap
 
 
-def noted(emitter: Any, what: str, read: Callable[[], R]) -> R | None:
-    """Return what `read` returns; count what it raises and return None."""
+def noted(emitter: Any, what: str, read: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> R | None:
+    """Return what `read` returns for these arguments; count what it raises and return None."""
     try:
-        return read()
+        return read(*args, **kwargs)
     except KeyboardInterrupt:
         raise
     except BaseException as error:  # noqa: BLE001  the code of an executive's values may raise anything

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Hashable, Mapping, Sequence
 from enum import Enum
-from functools import partial
 from types import TracebackType
 from typing import Literal, Self
 
@@ -128,7 +127,7 @@ class RecordedEpisode(RecordedNodes):
 
         Ask again for each value: it is the row of now, and another one when the episode has been continued.
         """
-        return noted(self.emitter, "ObjectAdded", lambda: self._objects.reference(key))
+        return noted(self.emitter, "ObjectAdded", self._objects.reference, key)
 
     # --- observations -----------------------------------------------------------------------------------------
 
@@ -153,7 +152,7 @@ class RecordedEpisode(RecordedNodes):
         node: Hashable | None = None,
     ) -> None:
         """Record a result of perception; `object_type` is the type searched for."""
-        copied = (noted(self.emitter, "ObjectDetected", partial(struct_of, each, SeenValue)) for each in seen)
+        copied = (noted(self.emitter, "ObjectDetected", struct_of, each, SeenValue) for each in seen)
         percepts = [each for each in copied if each is not None]
         event = struct_of(ObjectDetected(source, object_type), ObjectDetected)
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from functools import partial
-from typing import Any, get_args
+from typing import Any, ParamSpec, get_args
 
 from msgspec.structs import replace
 
@@ -38,6 +38,7 @@ from pycrorm_async.recording.writing.episode_opening import EpisodeOpening
 from pycrorm_async.recording.writing.episode_writer import EpisodeWriter
 from pycrorm_async.recording.writing.open_episodes import OpenEpisodes
 
+P = ParamSpec("P")
 _ENDED_MAX = 1_000
 """Bounds the keys of ended nodes that a child can still name as its parent."""
 
@@ -87,7 +88,7 @@ class RecordedNodes(EpisodeWriter[_Node]):
         `status` is for a failure whose class only the executive knows: FAILED, ERROR or INTERRUPTED.
         """
         if not self.emitter.is_closed:
-            self._calls.run(lambda: self._close(failure, status))
+            self._calls.run(partial(self._close, failure, status))
 
     def _close(self, failure: BaseException | None, status: EpisodeStatus | None) -> None:
         if self._nodes and failure is None and not self.closed:
@@ -96,14 +97,14 @@ class RecordedNodes(EpisodeWriter[_Node]):
             self._end_status = status
         self._episodes.close(self, failure)
 
-    def _write(self, what: str, write: Callable[[], int]) -> None:
+    def _write(self, what: str, write: Callable[P, int], *args: P.args, **kwargs: P.kwargs) -> None:
         """Call `write` after all earlier calls; it returns the sequence of the event that it wrote, 0 for none."""
-        self._calls.run(lambda: self._written(what, write))
+        self._calls.run(partial(self._written, what, write, *args, **kwargs))
 
-    def _written(self, what: str, write: Callable[[], int]) -> None:
+    def _written(self, what: str, write: Callable[P, int], *args: P.args, **kwargs: P.kwargs) -> None:
         if self.closed:
             self._note(what, f"episode {self} has ended")
-        elif (noted(self.emitter, what, write) or 0) >= self.continue_at:
+        elif (noted(self.emitter, what, write, *args, **kwargs) or 0) >= self.continue_at:
             self._episodes.continue_episode(self)
 
     def _now(self, value: Any, prepared: EpisodeId) -> Any:
@@ -137,10 +138,9 @@ class RecordedNodes(EpisodeWriter[_Node]):
         hash(key)
         missing: dict[str, str] = {}
         prepared = self.id
-        read = partial(self._values.parameters, type, missing=missing)
-        values = noted(self.emitter, "NodeStarted", lambda: read(dict(parameters))) or {}
+        values = noted(self.emitter, "NodeStarted", self._values.parameters, type, parameters, missing) or {}
         node = _Node(key, type, values)
-        self._write("NodeStarted", lambda: self._start_node(node, parent, robot, missing, prepared))
+        self._write("NodeStarted", self._start_node, node, parent, robot, missing, prepared)
         return node
 
     def _start_node(
@@ -151,7 +151,7 @@ class RecordedNodes(EpisodeWriter[_Node]):
             self._note("NodeStarted", f"the key {clean_repr(key)} starts a second node before the first has ended")
             self._end_node(self._nodes[key], NodeEnded(self._nodes[key].sequence, "LOST"))
         node.parent = self._find(parent, "NodeStarted")
-        node.robot = noted(self.emitter, "NodeStarted", lambda: self._robot(robot))
+        node.robot = noted(self.emitter, "NodeStarted", self._robot, robot)
         node.parameters = self._now(node.parameters, prepared)
         self._write_start(node, missing, continues=None)
         self._nodes[key] = node
@@ -196,17 +196,18 @@ class RecordedNodes(EpisodeWriter[_Node]):
             self._note("NodeEnded", f"{clean_repr(status)} is not a status ({', '.join(END_STATUSES)})")
             status = "ERROR"
         prepared = self.id
-        value = noted(self.emitter, "NodeEnded", lambda: self._values.failure(failure)) if failure is not None else None
+        value = noted(self.emitter, "NodeEnded", self._values.failure, failure) if failure is not None else None
         encoded = self._values.any(result) if result is not None else None
+        self._write("NodeEnded", self._end_open, key, status, value, encoded, prepared)
 
-        def write() -> int:
-            node = self._nodes.get(key)
-            if node is None:
-                raise CallerError(f"no open node has the key {clean_repr(key)}")
-            self._end_node(node, NodeEnded(node.sequence, status, value, self._now(encoded, prepared)))
-            return 0  # an end continues no episode
-
-        self._write("NodeEnded", write)
+    def _end_open(
+        self, key: Hashable, status: NodeStatus, failure: FailureValue | None, result: Any, prepared: EpisodeId
+    ) -> int:
+        node = self._nodes.get(key)
+        if node is None:
+            raise CallerError(f"no open node has the key {clean_repr(key)}")
+        self._end_node(node, NodeEnded(node.sequence, status, failure, self._now(result, prepared)))
+        return 0  # an end continues no episode
 
     def _end_node(self, node: _Node, event: NodeEnded) -> None:
         self._close_node(event, node.declared.dtype)
@@ -249,7 +250,7 @@ class RecordedNodes(EpisodeWriter[_Node]):
 
     def end_episode(self, failure: BaseException | None) -> None:
         """Write the end of the episode."""
-        self._calls.run(lambda: noted(self.emitter, "EpisodeEnded", lambda: self._end_now(failure)))
+        self._calls.run(lambda: noted(self.emitter, "EpisodeEnded", self._end_now, failure))
 
     def _end_now(self, failure: BaseException | None) -> None:
         super().end_episode(failure)

@@ -42,10 +42,9 @@ class RecordedValues:
     def parameters(self, declared: DeclaredType, values: Mapping[Any, Any], missing: dict[str, str]) -> dict[str, Any]:
         """Return the parameters by field name; add to `missing` the reason for each that becomes a `MissingValue`."""
         parameters: dict[str, Any] = {}
-        known = set()
+        undeclared = dict(values)
         for field, path, enum in declared.fields:
-            known.add(path[0])
-            value = values.get(path[0])
+            value = undeclared.pop(path[0], None)
             if value is None:
                 continue
             try:
@@ -60,9 +59,9 @@ class RecordedValues:
             except BaseException as error:  # noqa: BLE001  a __float__ of the user's may raise anything
                 missing[field.name] = fault = reading_fault(error)
                 parameters[field.name] = missing_value(fault, value)
-        reasons = {each.path[0]: each.reason for each in declared.undeclared}
-        for name, value in values.items():
-            if value is not None and name not in known:
+        for name, value in undeclared.items():
+            if value is not None:
+                reasons = {each.path[0]: each.reason for each in declared.undeclared}
                 text = clean(name) if isinstance(name, str) else clean_repr(name)
                 missing[text] = reason = reasons.get(name, f"{declared.dtype} was declared without this field")
                 parameters[text] = missing_value(reason, value)
