@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
-from pycrorm_async.cli.output import moment, print_json, print_table, stdout
+from pycrorm_async.cli.output import moment, note, print_json, print_table, stdout
 from pycrorm_async.cli.reading import read_memory
 from pycrorm_async.cli.since import parse_since
 from pycrorm_async.cli.tree import simulated_by
@@ -57,6 +57,10 @@ def episodes(
     summaries = read_memory(url, spool, lambda reading: reading.episodes(choice, simulated=simulated))
     if as_json:
         print_json(summaries)
+        return
+    if not summaries:
+        chosen = choice != EpisodeChoice()
+        note("no episode is like this" if chosen else "no episode yet: record one with `pycrorm run` or `pycrorm demo`")
         return
     numbers = {e.id: e.number for e in summaries}
     columns: tuple[str, ...] = ("episode", "started", "took", "status", "nodes", "failed", "description")

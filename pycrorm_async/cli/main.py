@@ -24,11 +24,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
-from rich.logging import RichHandler
 from typer.exceptions import TyperException
 
 from pycrorm_async import __version__
-from pycrorm_async.cli.output import problem, stdout
+from pycrorm_async.cli.output import LogLines, problem, stdout
 from pycrorm_async.errors import (
     CallerError,
     DamageError,
@@ -38,7 +37,6 @@ from pycrorm_async.errors import (
     FlushTimeout,
     PycrormError,
 )
-from pycrorm_async.progress_bar import stderr
 
 
 def exit_code(error: PycrormError) -> int:
@@ -169,8 +167,7 @@ def _words() -> list[str]:
 def main() -> None:
     """Run the console script `pycrorm`."""
     _open_closed_streams()
-    handler = RichHandler(console=stderr, show_time=False, show_path=False)
-    logging.basicConfig(level=logging.WARNING, format="%(message)s", handlers=[handler])
+    logging.basicConfig(level=logging.WARNING, format="%(message)s", handlers=[LogLines()])
     # After an interruption the pool drops a connection whose event loop is closed, and would log a long traceback.
     logging.getLogger("sqlalchemy.pool").setLevel(logging.CRITICAL)
     for stream in (sys.stdout, sys.stderr):

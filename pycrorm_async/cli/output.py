@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import sys
 from collections.abc import Iterable, Mapping, Sequence
@@ -43,6 +44,15 @@ def note(line: str) -> None:
     stderr.print(f"[dim]{escape(line)}[/]")
 
 
+class LogLines(logging.Handler):
+    """Prints each message of a log as one line on stderr, above a progress bar."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Print one message."""
+        style = "bold red" if record.levelno >= logging.ERROR else "yellow"
+        stderr.print(f"[{style}]{record.levelname:<8}[/] {escape(self.format(record))}")
+
+
 def print_json(document: Any) -> None:
     """Print the JSON document of a `--json` call on stdout."""
     encoded = msgspec.json.encode(document, enc_hook=str)
@@ -52,7 +62,8 @@ def print_json(document: Any) -> None:
 def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
     """Print a table; columns of numbers are right-aligned."""
     rows = [tuple(row) for row in rows]
-    table = Table(title=title, title_justify="left", title_style="bold", header_style="bold")
+    stdout.print(f"[bold]{escape(title)}[/]")  # not the title of the table, which is wrapped to the table's width
+    table = Table(header_style="bold")
     for index, name in enumerate(columns):
         numeric = bool(rows) and all(isinstance(row[index], int | float) for row in rows)
         table.add_column(name, justify="right" if numeric else "left", overflow="fold")

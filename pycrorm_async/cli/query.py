@@ -54,7 +54,8 @@ def query(
         if as_json or form == "json":
             print_json(_document(result))
         else:
-            print_table(f"{len(result.rows)} rows", result.columns, ([*map(_cell, row)] for row in result.rows))
+            count = f"{len(result.rows):,} row{'s' * (len(result.rows) != 1)}"
+            print_table(count, result.columns, ([*map(_cell, row)] for row in result.rows))
     if more:
         note(
             f"the query has more rows: these are the first, up to {limit or 'any number of'} rows and {megabytes:g} MB;"

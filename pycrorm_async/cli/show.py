@@ -79,13 +79,14 @@ def _provenance(summary: EpisodeSummary, *, full: bool) -> dict[str, str | None]
     """Return what the episode was recorded with, as far as it is known."""
     commit, clock = summary.git_commit, summary.clock_synchronized
     kept = "synchronized" if clock else "not synchronized"
+    error_ns = None if summary.clock_error_us is None else summary.clock_error_us * 1_000
     return {
         "plan": f"{summary.plan} (sha256 {summary.plan_sha256[:12]})" if summary.plan_sha256 else summary.plan,
         "commit": f"{commit[:12]}{' and uncommitted changes' if summary.git_dirty else ''}" if commit else None,
         "world": summary.world,
         "settings": _pairs(summary.settings),
         "libraries": _pairs(summary.libraries) if full else None,
-        "clock": f"{kept}, estimated error {summary.clock_error_us:,} µs" if clock is not None else None,
+        "clock": f"{kept}, estimated error {duration(error_ns)}" if clock is not None else None,
     }
 
 

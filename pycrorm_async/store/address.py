@@ -10,10 +10,12 @@ The program chooses the driver; a URL written for another driver (`_SCHEMES`) me
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from urllib.parse import unquote
 
 from sqlalchemy import URL, make_url
 from sqlalchemy.exc import ArgumentError
@@ -39,6 +41,9 @@ _SCHEMES = {
 
 _HARMLESS = frozenset({"host", "port", "user", *postgresql.TLS})
 """Query parameters that locate a server and are not secret."""
+
+_BEYOND_ASCII = re.compile("(?:%[89A-F][0-9A-F])+")
+"""Escaped letters that are not ASCII, which a URL may have unescaped."""
 
 _VALID_URLS = (
     "valid URLs: sqlite:///memory.db (a file here), sqlite:////data/memory.db (a file by its absolute path),"
@@ -136,7 +141,8 @@ class DatabaseAddress:
     def __str__(self) -> str:
         # Most query parameters are left out, because drivers accept passwords there.
         public_query = {name: value for name, value in self._url.query.items() if name in postgresql.WHERE}
-        return self._url.set(query=public_query).render_as_string(hide_password=True).replace("%2F", "/")
+        url = self._url.set(query=public_query).render_as_string(hide_password=True)
+        return _BEYOND_ASCII.sub(lambda escaped: unquote(escaped[0]), url.replace("%2F", "/"))
 
     def __repr__(self) -> str:
         return f"DatabaseAddress({str(self)!r})"

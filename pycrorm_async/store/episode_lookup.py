@@ -28,8 +28,14 @@ def number_named(name: str, ids: Mapping[int, str], *, listed: int) -> int:
     if len(numbers) > 1:
         raise UnknownEpisode(f"{len(numbers)} episodes have an id that begins with {name!r}: give more of it")
     if not numbers:
-        raise UnknownEpisode(f"there is no episode {name!r} (`pycrorm episodes` lists the {listed} there are)")
+        raise UnknownEpisode(f"there is no episode {name!r} ({_present(listed)})")
     return numbers[0]
+
+
+def _present(listed: int) -> str:
+    if listed == 0:
+        return "this memory has none yet: record one with `pycrorm run` or `pycrorm demo`"
+    return f"`pycrorm episodes` lists {'the one there is' if listed == 1 else f'the {listed} there are'}"
 
 
 async def episode_named(log: EventLog, name: str) -> EpisodeRow:

@@ -88,6 +88,12 @@ def make_file(path: Path, name: str, access: FileAccess, *, belongs_to: str | No
     except FileExistsError:
         if path.is_dir():
             raise DatabaseUnavailable(f"{name} cannot be opened: Is a directory ({path})") from None
+        if not os.access(real, os.W_OK):
+            reason = "this user may only read it: record with a user who may write it, or name another file"
+            raise DatabaseUnavailable(f"{name} cannot be written: {reason}") from None
+    except FileNotFoundError as error:
+        reason = f"{error.strerror} ({path}): create the folder {path.parent} first"
+        raise DatabaseUnavailable(f"{name} cannot be opened: {reason}") from error
     except OSError as error:
         raise DatabaseUnavailable(f"{name} cannot be opened: {error.strerror} ({path})") from error
 

@@ -1,5 +1,6 @@
 """Bad input: one line that names the fault, the documented exit code, and no loss of recorded events."""
 
+import json
 import os
 import signal
 import sqlite3
@@ -257,6 +258,41 @@ def test_a_database_in_a_folder_without_write_permission_is_reported_with_its_pa
         assert done.returncode == 3
     (folder / "pycrorm.db-wal").rmdir()
     assert len(answer("episodes", cwd=folder)) == 1
+
+
+def without_rights(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    """Run the command as a user whom the modes of files bind, as they do not bind root."""
+    bound = ["setpriv", "--bounding-set=-dac_override,-dac_read_search"] if os.geteuid() == 0 else []
+    command = [*bound, *COMMAND, *arguments]
+    return subprocess.run(command, cwd=cwd, env=environment(), capture_output=True, text=True, timeout=60, check=False)
+
+
+def test_a_file_that_may_only_be_read_is_refused_before_the_plan_runs_and_can_be_read(folder: Path) -> None:
+    assert pycrorm("run", "plans.py", cwd=folder).returncode == 0
+    (folder / "pycrorm.db").chmod(0o444)
+    done = without_rights("run", "plans.py", cwd=folder)
+    reason = "this user may only read it: record with a user who may write it, or name another file"
+    assert one_line_of(done) == f"pycrorm: sqlite:///pycrorm.db cannot be written: {reason}"
+    assert (done.returncode, done.stdout) == (3, "")
+    assert json.loads(without_rights("episodes", "--json", cwd=folder).stdout)[0]["number"] == 1
+    for each in folder.glob("pycrorm.db-*"):
+        each.unlink()
+    folder.chmod(0o555)
+    done = without_rights("episodes", cwd=folder)
+    folder.chmod(0o755)
+    assert "the file must be readable and its folder writable" in one_line_of(done)
+    assert done.returncode == 3
+
+
+def test_a_memory_without_episodes_says_so_and_how_to_record_one(folder: Path) -> None:
+    assert pycrorm("writer", "--once", "--url", "sqlite:///new.db", cwd=folder).returncode == 0
+    how = "record one with `pycrorm run` or `pycrorm demo`"
+    done = pycrorm("show", "last", "--url", "sqlite:///new.db", cwd=folder)
+    assert one_line_of(done) == f"pycrorm: there is no episode 'last' (this memory has none yet: {how})"
+    done = pycrorm("episodes", "--url", "sqlite:///new.db", cwd=folder)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", f"no episode yet: {how}\n")
+    done = pycrorm("episodes", "--status", "FAILED", "--url", "sqlite:///new.db", cwd=folder)
+    assert (done.stdout, done.stderr) == ("", "no episode is like this\n")
 
 
 def test_a_database_of_a_newer_version_is_refused(folder: Path) -> None:

@@ -176,7 +176,7 @@ def test_dead_letters_are_reported_with_their_place_by_status_and_inspect(tmp_pa
     )
     [inspected] = answer("spool", "inspect", spool, cwd=folder)["recorders"]
     assert (inspected["name"], inspected["types"]) == (place.name, {"NodeStarted": 1})
-    assert pycrorm("episodes", cwd=folder).stderr == ""  # unchanged each time
+    assert pycrorm("episodes", "--json", cwd=folder).stderr == ""  # unchanged each time
     once = answer("writer", "--once", cwd=folder, code=1)
     assert list(once["stopped"].values()) == ["events 1 to 4 did not arrive before event 5"]
     assert place.exists()

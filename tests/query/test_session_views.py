@@ -260,7 +260,7 @@ async def test_a_simulated_episode_is_found_by_name_and_the_last_episode_is_a_re
         assert (await reading.episode("2")).simulated
         assert (await reading.episode(episode_text(Script(2).episode))).number == 2
         assert (await reading.episode("last")).number == 1
-        with pytest.raises(UnknownEpisode, match="lists the 1 there are"):
+        with pytest.raises(UnknownEpisode, match="lists the one there is"):
             await reading.episode("3")
 
 
@@ -286,5 +286,5 @@ async def test_a_memory_of_simulations_alone_has_no_last_episode(log: EventLog) 
     await store_and_fold(log, everything(1, THOUGHT))
     async with Reading.open_address(log.address) as reading:
         assert await reading.episodes() == []
-        with pytest.raises(UnknownEpisode, match="lists the 0 there are"):
+        with pytest.raises(UnknownEpisode, match="this memory has none yet: record one with"):
             await reading.episode("last")

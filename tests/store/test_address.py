@@ -95,6 +95,12 @@ async def test_an_engine_never_makes_a_missing_file(tmp_path: Path) -> None:
     assert not address.path.exists()
 
 
+def test_letters_beyond_ascii_are_shown_as_they_are_and_signs_of_a_url_are_not(tmp_path: Path) -> None:
+    address = DatabaseAddress.parse(f"sqlite:///{tmp_path}/Ümläute 50%25 #.db")
+    assert str(address) == f"sqlite:///{tmp_path}/Ümläute 50%25 %23.db"
+    assert DatabaseAddress.parse(str(address)).path == address.path
+
+
 async def test_a_path_may_contain_characters_that_a_url_must_escape(tmp_path: Path) -> None:
     address = DatabaseAddress.parse(f"sqlite:///{tmp_path}/50%25 of%3F a #memory.db")
     assert address.path == tmp_path / "50% of? a #memory.db"

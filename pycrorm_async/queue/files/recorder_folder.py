@@ -56,7 +56,8 @@ def wrap_os_errors(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         where = Path(os.fsdecode(error.filename)) if isinstance(error.filename, str | bytes) else path
-        raise SpoolUnavailable(where, error.strerror or str(error)) from error
+        hint = "; make it writable, or name another folder with --spool" if isinstance(error, PermissionError) else ""
+        raise SpoolUnavailable(where, f"{error.strerror or error}{hint}") from error
 
 
 def folder_error(folder: Path, error: Exception) -> PycrormError:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import ssl
@@ -126,7 +127,8 @@ def _text(fault: BaseException) -> str:
         return f"the server's certificate is not accepted: {cause.verify_message}"
     if isinstance(cause, OSError) and not isinstance(cause, ssl.SSLError) and cause.strerror is not None:
         number = cause.errno or 0  # errors of name look-ups have negative numbers
-        return f"cannot be reached: {os.strerror(number) if number > 0 else cause.strerror}"
+        hint = ": start the server, or correct the URL" if number == errno.ECONNREFUSED else ""
+        return f"cannot be reached: {os.strerror(number) if number > 0 else cause.strerror}{hint}"
     message = " ".join(str(cause).split())
     if isinstance(cause, TimeoutError):
         return message or "no answer in time"

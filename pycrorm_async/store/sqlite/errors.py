@@ -27,6 +27,13 @@ _UNAVAILABLE = {
 }
 
 
+_READ_ONLY_FOLDER = {
+    sqlite3.SQLITE_READONLY_DIRECTORY,
+    sqlite3.SQLITE_READONLY_CANTINIT,
+    sqlite3.SQLITE_READONLY_CANTLOCK,
+}
+
+
 def translate_error(fault: BaseException | None, database: str) -> PycrormError:
     """Return the error of this package to raise instead of the driver's."""
     code = getattr(fault, "sqlite_errorcode", None)
@@ -36,10 +43,10 @@ def translate_error(fault: BaseException | None, database: str) -> PycrormError:
         return DatabaseUnavailable(f"{database}: {fault}")
     primary = code & 0xFF
     if primary == sqlite3.SQLITE_NOTADB:
-        return DatabaseForeign(f"{database} is not a database: SQLite cannot read it")
+        return DatabaseForeign(f"{database} is not a database: SQLite cannot read it; name another file")
     if primary == sqlite3.SQLITE_CORRUPT:
         return DamageError(f"{database} is damaged: {fault}")
-    if primary == sqlite3.SQLITE_CANTOPEN:
+    if primary == sqlite3.SQLITE_CANTOPEN or code in _READ_ONLY_FOLDER:
         return DatabaseUnavailable(
             f"{database} cannot be opened: the file must be readable and its folder writable,"
             " because SQLite creates files beside it, also for reading"
