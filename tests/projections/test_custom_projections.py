@@ -19,11 +19,14 @@ from pycrorm_async.events.types import EpisodeStarted, NodeEnded, NodeStarted
 from pycrorm_async.memory import Memory
 from pycrorm_async.projections.custom.projection import Changes, Event, Projection
 from pycrorm_async.projections.custom.projection_rows import CustomRows
-from pycrorm_async.projections.custom.projection_tables import states
+from pycrorm_async.projections.custom.projection_tables import CustomFoldDefinition, states
 from pycrorm_async.projections.fold.column_values import CannotFold
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.rebuild import Rebuild, claimed
 from pycrorm_async.projections.replaced_tables import clear
+from pycrorm_async.projections.run.batch_fold import BatchFold
+from pycrorm_async.projections.run.targets import SideTarget
+from pycrorm_async.projections.schema.generations import PROJECTION, read_generation
 from pycrorm_async.projections.schema.user_views import UserView
 from pycrorm_async.projections.verify.row_comparison import Difference
 from pycrorm_async.projections.verify.verify import verify
@@ -171,6 +174,28 @@ async def test_two_concurrent_processes_fold_every_event_once(log: EventLog) -> 
     finally:
         await other.close()
     assert Counter(await visible_rows(log)) == Counter(each for episode in range(1, 21) for each in rows_of(episode))
+
+
+async def test_a_batch_that_another_process_has_folded_meanwhile_is_not_written(log: EventLog) -> None:
+    script = tries()
+    await folded(log, [*declarations(PICK_UP), *script.records[:4]], GraspRate())
+    await folded(log, script.records[4:])  # a process that folds the memory's own tables only
+    other = await EventLog.open(log.address, create=True)
+    try:
+        folds = []
+        for each in (log, other):
+            async with each.reading() as connection:
+                generation = await read_generation(connection, f"{PROJECTION}grasp_rate")
+            assert generation is not None
+            target = SideTarget(each, f"{PROJECTION}grasp_rate", "grasp_rate", GraspRate.version)
+            folds.append(BatchFold(each, target, generation, CustomFoldDefinition(GraspRate())))
+            await folds[-1].prepare(await target.unfolded(100, after=0, reached={}))
+        assert [await each.write() for each in folds] == [len(script.records) - 4, 0]
+    finally:
+        await other.close()
+    assert await visible_rows(log) == rows_of(1)
+    [state] = await states(log, [GraspRate()])
+    assert (state.behind, state.parked) == (0, {})
 
 
 class NoLeftHand(GraspRate):

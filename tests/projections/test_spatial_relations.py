@@ -204,6 +204,30 @@ async def test_an_object_has_the_size_of_its_description_and_not_of_its_type(log
 
 
 @pytest.mark.slow
+async def test_relations_end_at_their_distances_and_an_environment_is_no_neighbour(log: EventLog) -> None:
+    declared_, tidying = Declared(), Tidying()
+    crate = declared_.description(box_urdf("crate", "0.4 0.4 0.3"))
+    block = declared_.description(box_urdf("block", "0.1 0.1 0.1"))
+    picked = {}
+    for number, (kind, ahead, height) in enumerate(
+        [
+            ("GENERIC_OBJECT", 0.0, 0.35 + 0.019),
+            ("GENERIC_OBJECT", 0.0, 0.35 + 0.021),
+            ("GENERIC_OBJECT", 0.25 + 0.099, 0.1),
+            ("GENERIC_OBJECT", 0.25 + 0.101, 0.1),
+            ("ENVIRONMENT", 0.25 + 0.05, 0.1),
+        ]
+    ):
+        tidying.add(f"crate {number}", kind, 50 + 10 * number, 50, 0.15, description=crate)
+        tidying.add(f"block {number}", "GENERIC_OBJECT", 50 + 10 * number + ahead, 50, height, description=block)
+        picked[number] = tidying.pick_up(f"block {number}")
+    assert await relations(log, tidying, declared_) == {
+        picked[0]: {("on", "crate 0", "crate 0")},
+        picked[2]: {("next to", "crate 2", "crate 2")},
+    }
+
+
+@pytest.mark.slow
 async def test_an_object_is_in_a_sliding_part_of_a_recorded_description(log: EventLog) -> None:
     declared_, tidying = Declared(), Tidying()
     box = '<collision><geometry><box size="{}"/></geometry></collision>'

@@ -155,6 +155,13 @@ async def test_a_figure_has_a_text_in_each_cell_or_a_point_for_each_row(url: str
     own.savefig(io.BytesIO())
 
 
+def test_a_cell_of_fewer_than_five_rows_is_hatched() -> None:
+    arms = Values("arm", np.array([0.0] * 4 + [1.0] * 5), ("left", "right"))
+    drawn = success_figure(samples([1.0] * 9, arms, [True] * 9), kind="heatmap")
+    hatched = [each for each in drawn.axes[0].patches if each.get_hatch()]
+    assert [each.get_y() for each in hatched] == [0]  # type: ignore[attr-defined]
+
+
 def test_without_matplotlib_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     imported = builtins.__import__
 

@@ -142,6 +142,15 @@ def test_what_the_robot_holds_and_what_is_near_follows_the_world() -> None:
     ]
 
 
+def test_near_ends_at_half_a_metre() -> None:
+    script = CaseScript()
+    milk, bowl = script.add("milk", "MILK", pose()), script.add("bowl", "BOWL", pose(0.5))
+    script.end(script.fetch(milk))
+    script.put(ObjectMoved(bowl, "bowl", "BOWL", pose(0.501)))
+    script.end(script.fetch(milk))
+    assert [each.symbols.get("near") for each in cases_of(script)] == [("BOWL",), None]
+
+
 def test_an_object_outside_of_the_recorded_world_has_what_its_value_says() -> None:
     script = CaseScript()
     believed = {"dtype": "BelieveObject", "name": "cup", "object_type": "JEROEN_CUP"}

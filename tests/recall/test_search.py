@@ -15,7 +15,7 @@ from pycrorm_async.recall.blocks import Block, Group
 from pycrorm_async.recall.case import Case, bounded_case
 from pycrorm_async.recall.cue import Cue, Wanted
 from pycrorm_async.recall.library import CaseLibrary
-from pycrorm_async.recall.search import WEIGHT_MAX, Found, Weights, search, weights_of
+from pycrorm_async.recall.search import Found, Weights, search, weights_of
 from tests.recall.random_cases import STATUSES, TYPES, WORDS, random_cases
 
 CASES = [bounded_case(case) for case in random_cases(400, seed=1)]
@@ -65,7 +65,7 @@ def brute_force(cue: Cue, cases: list[Case]) -> Answer:
         if cue.type in (None, case.type) and (cue.as_of_us is None or ended_by(case, cue.as_of_us))
     ]
     weights = [
-        min(WEIGHT_MAX, math.log((len(counted) + 1) / (sum(has(case, *pair) for case in counted) + 1)) + 0.1)
+        min(3.0, math.log((len(counted) + 1) / (sum(has(case, *pair) for case in counted) + 1)) + 0.1)
         for pair in cue.has
     ]
     whole = sum(weights, start=0.0) + len(cue.near) or 1.0
@@ -175,7 +175,7 @@ def test_a_word_that_no_case_has_cannot_hide_a_case_that_matches_all_else() -> N
     cue = Cue(type="A", has=(("arm", "LEFT"), ("object_type", "CACTUS")))
     weights = weights_of(cue, library)
     assert weights.never_seen == (("object_type", "CACTUS"),)
-    assert weights.words == pytest.approx((0.1, WEIGHT_MAX))
+    assert weights.words == pytest.approx((0.1, 3.0))
 
 
 def test_a_common_cue_ends_in_the_newest_rows(monkeypatch: pytest.MonkeyPatch) -> None:

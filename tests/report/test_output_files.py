@@ -1,0 +1,56 @@
+"""A file or folder has its name only when it is complete and on the disk."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from pycrorm_async.report.output_files import new_folder, write_file
+
+
+class WatchedSyncs:
+    """Notes, for each sync, the file or folder, its bytes, and whether the target has its name already."""
+
+    def __init__(self, target: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.noted: list[tuple[str, bytes | None, bool]] = []
+        fsync = os.fsync
+
+        def watched(descriptor: int) -> None:
+            path = Path(f"/proc/self/fd/{descriptor}").readlink()
+            content = path.read_bytes() if path.is_file() else None
+            self.noted.append((path.name, content, target.exists()))
+            fsync(descriptor)
+
+        monkeypatch.setattr(os, "fsync", watched)
+
+
+@pytest.mark.parametrize("force", [False, True])
+def test_a_file_is_synced_before_it_gets_its_name_and_its_folder_afterwards(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, force: bool
+) -> None:
+    target = tmp_path / "rows.csv"
+    syncs = WatchedSyncs(target, monkeypatch)
+    write_file(b"all of it", target, force=force)
+    assert [(content, named) for _, content, named in syncs.noted] == [(b"all of it", False), (None, True)]
+    assert syncs.noted[-1][0] == tmp_path.name
+    assert [each.name for each in tmp_path.iterdir()] == ["rows.csv"]
+
+
+def test_all_files_of_a_folder_are_synced_before_it_gets_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    target = tmp_path / "set"
+    syncs = WatchedSyncs(target, monkeypatch)
+    with new_folder(target, force=False, marker="info") as written:
+        (written / "info").write_bytes(b"1")
+        (written / "data").mkdir()
+        (written / "data" / "rows").write_bytes(b"2")
+    *before, after = syncs.noted
+    assert {name: content for name, content, _ in before} | {written.name: None} == {
+        "info": b"1",
+        "data": None,
+        "rows": b"2",
+        written.name: None,
+    }
+    assert [named for *_, named in before] == [False] * 4
+    assert (after[0], after[2]) == (tmp_path.name, True)
