@@ -64,9 +64,6 @@ def _with_exit_code(verb: Callable[..., int | None]) -> Callable[..., None]:
         except PycrormError as error:
             problem(str(error))
             code = exit_code(error)
-        except KeyboardInterrupt:
-            problem("interrupted; all events recorded so far are kept")
-            code = 130
         except BrokenPipeError:  # the reader closed the pipe, as `head` does; Python's final flush would raise again
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             code = 0
@@ -85,6 +82,7 @@ def _print_version(requested: bool) -> None:  # noqa: FBT001  typer passes it by
 
 
 _STDERR = 2
+_INTERRUPTED = 130
 _HELP = "Episodic memory for robots: record plans as events and query them as tables."
 _VERBS = (
     "demo",
@@ -178,7 +176,7 @@ def main() -> None:
         command = app(next(iter(_words()[1:]), None))
     except KeyboardInterrupt:  # while the verb's module was being loaded
         problem("interrupted before the command started")
-        sys.exit(130)
+        sys.exit(_INTERRUPTED)
     gc.freeze()
     gc.enable()
     try:
@@ -186,6 +184,8 @@ def main() -> None:
     except TyperException as error:
         _print_usage_error(error)
         code = 2
+    if code == _INTERRUPTED:  # typer turns a KeyboardInterrupt into this code, also one while it reads the arguments
+        problem("interrupted; all events recorded so far are kept")
     sys.exit(code)
 
 

@@ -15,18 +15,31 @@ from pathlib import Path
 import pytest
 
 from pycrorm_async.cli.interruption import interrupt_on_termination
-from tests.commands import answer, pycrorm
+from tests.commands import answer, pycrorm, run_script
 
 LOADING = """
 import builtins, os, signal, sys
-load = builtins.__import__
+load, interrupting = builtins.__import__, sys.argv[1]
 def interrupted(name, *rest, **options):
-    if name == "pycrorm_async.memory":
+    if name == interrupting:
         os.kill(os.getpid(), signal.SIGINT)
     return load(name, *rest, **options)
 builtins.__import__ = interrupted
+from pycrorm_async.__main__ import main
 sys.argv = ["pycrorm", "run", "plan.py"]
-from pycrorm_async.cli.main import main
+main()
+"""
+
+READING_ARGUMENTS = """
+import os, signal, sys
+from typer.core import TyperGroup
+read = TyperGroup.parse_args
+def interrupted(*arguments):
+    os.kill(os.getpid(), signal.SIGINT)
+    return read(*arguments)
+TyperGroup.parse_args = interrupted
+sys.argv = ["pycrorm", "run", "plan.py"]
+from pycrorm_async.__main__ import main
 main()
 """
 
@@ -106,11 +119,18 @@ def test_a_plan_whose_database_is_unavailable_at_its_end_is_interrupted_by_ctrl_
     assert [node["status"] for node in answer("show", "1", cwd=tmp_path)["tree"]] == ["SUCCEEDED", "SUCCEEDED"]
 
 
-def test_an_interrupt_during_loading_is_one_line(tmp_path: Path) -> None:
+@pytest.mark.parametrize("module", ["typer", "pycrorm_async.memory"])
+def test_an_interrupt_during_loading_is_one_line(tmp_path: Path, module: str) -> None:
     done = subprocess.run(
-        [sys.executable, "-c", LOADING], cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False
+        [sys.executable, "-c", LOADING, module], cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False
     )
     assert (done.returncode, done.stderr) == (130, "pycrorm: interrupted before the command started\n")
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_interrupt_while_the_arguments_are_read_is_one_line(tmp_path: Path) -> None:
+    done = run_script(READING_ARGUMENTS, cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (130, "pycrorm: interrupted; all events recorded so far are kept\n")
     assert not list(tmp_path.iterdir())
 
 
