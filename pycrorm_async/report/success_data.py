@@ -14,7 +14,6 @@ from pycrorm_async.query.success.samples import success_samples
 from pycrorm_async.query.success.success_table import Axis, SuccessTable, success_table
 
 _PAIRS = (("relative_x", "relative_y"), ("arm", "grasp"))
-_METRES = ("relative_x", "relative_y")
 
 
 async def success_documents(reading: Reading, numbers: Collection[int]) -> list[dict[str, Any]]:
@@ -40,7 +39,7 @@ def _axis(axis: Axis) -> dict[str, Any]:
     """Return the name, the labels of the cells or the texts of the edges between them, and the number of cells."""
     return {
         "name": axis.name,
-        "unit": "m" if axis.name in _METRES else "",
+        "unit": axis.unit,
         "labels": axis.labels,
         "edges": [axis.text(each) for each in axis.edges],
         "cells": axis.cells,

@@ -19,7 +19,8 @@ from typer.testing import CliRunner
 from pycrorm_async import Memory, UserView
 from pycrorm_async.cli.main import app
 from pycrorm_async.errors import CallerError, MissingExtra
-from pycrorm_async.orm import Action
+from pycrorm_async.orm import Action, PickUpWithContextView
+from pycrorm_async.orm.documentation.descriptions import unit_of
 from pycrorm_async.query.success import figure as figures
 from pycrorm_async.query.success.figure import success_figure
 from pycrorm_async.query.success.interval import interval_95
@@ -107,6 +108,16 @@ async def test_a_view_is_a_class_a_name_a_view_of_the_users_own_or_a_select(url:
         times = await success_samples(memory.reading, "start_time", "duration", Action)
         assert times.x.is_time
         assert 1.6e9 < times.x.numbers.min() < 4e9
+
+
+async def test_the_labels_of_a_picture_have_the_units_that_the_schema_has(url: str) -> None:
+    async with Memory.open(url) as memory:
+        timed = await memory.plot_success("start_time", "duration", of=Action)
+        speeds = await memory.plot_success("speed", "tool", of="TryAction")
+    labels = [(each.axes[0].get_xlabel(), each.axes[0].get_ylabel()) for each in (timed, speeds)]
+    assert labels == [("start_time, UTC", "duration, s"), ("speed", "tool")]
+    columns = ("relative_x", "object_z", "torso_height", "height_over_torso", "arm", "id")
+    assert [unit_of(PickUpWithContextView.__table__.c[each]) for each in columns] == ["m", "m", "m", "m", "", ""]
 
 
 @pytest.mark.parametrize(

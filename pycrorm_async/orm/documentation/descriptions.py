@@ -22,9 +22,11 @@ from pycrorm_async.orm.base import EPISODE, Base
 from pycrorm_async.orm.designators import Action, Designator, Language, Motion
 from pycrorm_async.orm.types import JsonText, Moment
 
-__all__ = ["ViewDescription", "comments", "describe", "described"]
+__all__ = ["ViewDescription", "comments", "describe", "described", "unit_of"]
 
 _TIME = "µs since 1970-01-01 00:00 UTC"
+_UNIT = re.compile(r"(?:^|, | in )(m|rad|s|kg|ns)(?=[,;:]|$)")
+"""The unit in the text of a column, as in `of the robot, m` and `s; null while it runs`."""
 _ENTRY = re.compile(r"^    (\w+(?:, \w+)*): (.*)$")
 _OF_LOADING = re.compile(r"[Ll]oaded|load them|awaitable_attrs|selectinload|undefer|[Ll]ikewise|has the field instead")
 _COURSES = (Action, Motion, Language)
@@ -109,6 +111,14 @@ def describe(class_: Any) -> ViewDescription:
     references = {str(column.name): key.target_fullname for column in table.columns for key in column.foreign_keys}
     built_in = class_.__module__.startswith("pycrorm_async.orm.")
     return ViewDescription(table.name, class_.__name__, _sentence(class_.__doc__), columns, references, built_in)
+
+
+def unit_of(column: Any) -> str:
+    """Return the unit of a column of a mapped class, such as m; empty if it has none or none is known."""
+    mappers = Base.registry.mappers
+    class_ = next((each.class_ for each in mappers if each.local_table is getattr(column, "table", None)), None)
+    unit = None if class_ is None else _UNIT.search(describe(class_).columns.get(column.name, ""))
+    return "" if unit is None else unit[1]
 
 
 def _unmapped(view: str) -> Iterable[str]:

@@ -49,8 +49,8 @@ def success_figure(
         _draw_points(axes, samples)
     else:
         _draw_cells(axes, table)
-    axes.set_xlabel(_plain(samples.x.name))
-    axes.set_ylabel(_plain(samples.y.name))
+    axes.set_xlabel(_label(samples.x))
+    axes.set_ylabel(_label(samples.y))
     axes.set_title(_title(table), fontsize=10, loc="left")
     drawn: Figure = axes.get_figure(root=True)  # type: ignore[assignment]
     return drawn
@@ -76,6 +76,12 @@ def _figure_type() -> type[Figure]:
             return buffer.getvalue()
 
     return NotebookFigure
+
+
+def _label(values: Values) -> str:
+    """Return the name of a column with its unit; times are shown in UTC."""
+    unit = "UTC" if values.is_time else values.unit
+    return _plain(f"{values.name}, {unit}" if unit else values.name)
 
 
 def _title(table: SuccessTable) -> str:

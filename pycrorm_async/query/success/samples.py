@@ -14,6 +14,7 @@ from sqlalchemy.orm import DeclarativeBase
 
 from pycrorm_async import orm
 from pycrorm_async.errors import CallerError
+from pycrorm_async.orm.documentation.descriptions import unit_of
 from pycrorm_async.query.frames.columns import FrameColumn, columns_of
 from pycrorm_async.query.parameter_text import one_line
 from pycrorm_async.query.reading import Reading
@@ -40,12 +41,14 @@ class Values(NamedTuple):
         numbers: of a numeric column; of another one the indices of `categories`.
         categories: in the order of an axis; empty for a numeric column.
         is_time: whether the numbers are seconds since 1970, UTC.
+        unit: of the numbers, such as m; empty if it is not known.
     """
 
     name: str
     numbers: NDArray[np.float64]
     categories: tuple[str, ...] = ()
     is_time: bool = False
+    unit: str = ""
 
 
 class Samples(NamedTuple):
@@ -137,8 +140,9 @@ def _values(of: FrameColumn, values: Sequence[Any]) -> Values:
         return _categories(of.name, map(str, values))
     if kind in _CATEGORIES:
         return _categories(of.name, (str(bool(each)) if kind == "bool" else str(each) for each in values))
-    scale = 1e-6 if kind == "time" else 1.0
-    return Values(of.name, np.array(values, dtype=float) * scale, is_time=kind == "time")
+    if kind == "time":
+        return Values(of.name, np.array(values, dtype=float) * 1e-6, is_time=True)
+    return Values(of.name, np.array(values, dtype=float), unit=unit_of(of.expression))
 
 
 def _categories(name: str, values: Iterable[str]) -> Values:

@@ -26,12 +26,14 @@ class Axis(NamedTuple):
     Attributes:
         labels: of the categories; empty for a numeric column.
         edges: of the ranges, one more than there are cells; empty for categories.
+        unit: of the edges; empty if it is not known.
     """
 
     name: str
     labels: tuple[str, ...] = ()
     edges: tuple[float, ...] = ()
     is_time: bool = False
+    unit: str = ""
 
     @property
     def cells(self) -> int:
@@ -124,7 +126,7 @@ def _axis(values: Values, bins: int) -> tuple[Axis, NDArray[np.int64]]:
     last = max(math.ceil(high / step), first + 1)
     edges = tuple(index * step for index in range(first, last + 1))
     cells = np.clip(np.floor(values.numbers / step).astype(np.int64) - first, 0, last - first - 1)
-    return Axis(values.name, edges=edges, is_time=values.is_time), cells
+    return Axis(values.name, edges=edges, is_time=values.is_time, unit=values.unit), cells
 
 
 def _round_step(width: float) -> float:
