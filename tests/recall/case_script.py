@@ -81,8 +81,7 @@ def cases_of(*scripts: Script, first_number: int = 1) -> list[Case]:
     rows = batch()
     assert isinstance(rows, CaseBatch)
     for number, script in enumerate(scripts, first_number):
-        for event in script.stored(number):
-            rows.fold(event)
+        assert rows.fold(script.stored(number)) is None
     return in_order(Block.of(rows.cases).cases()) if rows.cases else []
 
 

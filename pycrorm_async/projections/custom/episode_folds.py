@@ -16,9 +16,10 @@ in the cache or in one batch.
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from operator import attrgetter
+from typing import Final, Protocol, TypeAlias
 
 from pycrorm_async.events.types import EpisodeEnded
 from pycrorm_async.projections.custom.projection import EpisodeFold, EpisodeProjection
@@ -32,6 +33,15 @@ With more open episodes than this, those that were not folded for the longest ti
 _PAGE_EVENTS: Final = 2_000
 """Bounds the events that are read at once to restore a fold."""
 _ENDED: Final = EpisodeEnded.__name__
+_TYPE: Final = attrgetter("type")
+Refused: TypeAlias = tuple[int, Exception]
+"""The first event that a fold cannot read, by its sequence, with the exception."""
+
+
+class _Read(Protocol):
+    """Gives events of one episode to a fold; with `kept` False discards what it makes of them."""
+
+    def __call__(self, fold: EpisodeFold, events: Sequence[StoredEvent], *, kept: bool = True) -> Refused | None: ...
 
 
 @dataclass(slots=True)
@@ -43,13 +53,10 @@ class _OpenFold:
     has_ended: bool = False
     fault: str | None = None
 
-    def next(self, stored: StoredEvent) -> EpisodeFold:
-        """Return the fold for the next event. Raises `CannotFold` if it could not be restored."""
-        if self.fault is not None:
-            raise CannotFold(self.fault)
-        self.reached = stored.sequence
-        self.has_ended = self.has_ended or stored.type == _ENDED
-        return self.fold
+    def advance(self, events: Sequence[StoredEvent]) -> None:
+        """Note that the fold has read these events."""
+        self.reached = events[-1].sequence
+        self.has_ended = self.has_ended or _ENDED in map(_TYPE, events)
 
 
 class EpisodeFolds:
@@ -84,18 +91,11 @@ class BatchOfFolds:
 
     Args:
         folds: those that earlier batches left.
-        reads: the types of events that a fold gets; None for all.
-        read: gives an event to a fold.
+        read: gives events to a fold.
     """
 
-    def __init__(
-        self,
-        folds: EpisodeFolds,
-        reads: Collection[str] | None,
-        read: Callable[[EpisodeFold, StoredEvent], object],
-    ) -> None:
+    def __init__(self, folds: EpisodeFolds, read: _Read) -> None:
         self._folds = folds
-        self._reads = reads
         self._read = read
         self._taken: dict[int, _OpenFold] = {}
 
@@ -110,20 +110,22 @@ class BatchOfFolds:
                 page = Span(span.number, fold.reached, min(fold.reached + _PAGE_EVENTS, span.after))
                 fold.fault = self._read_again(fold, await log.spans([page]), page.last)
 
-    def fold_of(self, stored: StoredEvent) -> EpisodeFold:
-        """Return the fold of an event's episode, which must get this event next. Raises `CannotFold`.
-
-        After an exception of the fold the caller discards it.
-        """
-        taken = self._taken.get(stored.number)
+    def fold(self, events: Sequence[StoredEvent]) -> Refused | None:
+        """Give the next events of an episode to its fold, which is dropped if it cannot fold one of them."""
+        first = events[0]
+        taken = self._taken.get(first.number)
         if taken is None:
-            assert stored.sequence == 1, "a batch that continues an episode restores its fold first"
-            taken = self._taken[stored.number] = _OpenFold(self._folds.projection.episode())
-        return taken.next(stored)
-
-    def discard(self, number: int) -> None:
-        """Drop the fold of an episode, because one of its events could not be folded."""
-        self._taken.pop(number, None)
+            assert first.sequence == 1, "a batch that continues an episode restores its fold first"
+            taken = self._taken[first.number] = _OpenFold(self._folds.projection.episode())
+        if taken.fault is not None:
+            refused: Refused | None = (first.sequence, CannotFold(taken.fault))
+        else:
+            refused = self._read(taken.fold, events)
+        if refused is None:
+            taken.advance(events)
+        else:
+            del self._taken[first.number]
+        return refused
 
     def give_back(self) -> None:
         """Keep the folds for the next batch."""
@@ -132,15 +134,11 @@ class BatchOfFolds:
 
     def _read_again(self, fold: _OpenFold, events: Sequence[StoredEvent], last: int) -> str | None:
         """Fold events up to `last` whose rows are written already; return the reason if that is not possible."""
-        for stored in events:
-            if stored.sequence != fold.reached + 1:
-                break
-            try:
-                read = fold.next(stored)
-                if self._reads is None or stored.type in self._reads:
-                    self._read(read, stored)
-            except CannotFold as reason:
-                return f"event {stored.sequence}, read again: {reason}"
-            except Exception as error:  # noqa: BLE001 - user code; the reason parks the episode
-                return f"event {stored.sequence}, read again: {type(error).__name__}: {error}"
+        whole = [each for sequence, each in enumerate(events, fold.reached + 1) if each.sequence == sequence]
+        if whole and (refused := self._read(fold.fold, whole, kept=False)) is not None:
+            sequence, fault = refused
+            raised = "" if isinstance(fault, CannotFold) else f"{type(fault).__name__}: "
+            return f"event {sequence}, read again: {raised}{fault}"
+        if whole:
+            fold.advance(whole)
         return None if fold.reached == last else f"event {fold.reached + 1} is missing in the log"

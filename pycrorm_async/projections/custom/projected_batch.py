@@ -9,7 +9,7 @@ from typing import Any
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.events.types import DesignatorTypeDeclared
-from pycrorm_async.projections.custom.episode_folds import BatchOfFolds, EpisodeFolds
+from pycrorm_async.projections.custom.episode_folds import BatchOfFolds, EpisodeFolds, Refused
 from pycrorm_async.projections.custom.projection import EpisodeProjection, Projection
 from pycrorm_async.projections.fold.column_values import CannotFold
 from pycrorm_async.store.log import EventLog
@@ -37,39 +37,32 @@ class ProjectedBatch(ABC):
         self._reads = None if reads is None else frozenset(each.__name__ for each in reads)
         self._folds: BatchOfFolds | None = None
         if isinstance(projection, EpisodeProjection):
-            self._folds = BatchOfFolds(EpisodeFolds(projection) if folds is None else folds, self._reads, self.made)
+            self._folds = BatchOfFolds(EpisodeFolds(projection) if folds is None else folds, self._read)
 
     async def restore(self, log: EventLog, spans: Sequence[Span]) -> None:
         """Restore the folds of the episodes that this batch continues."""
         if self._folds is not None:
             await self._folds.restore(log, spans)
 
-    def fold(self, event: StoredEvent) -> None:
-        """Add what the projection makes of this event. Raises `CannotFold`, and then has added nothing."""
-        try:
-            fold = self._projection.fold if self._folds is None else self._folds.fold_of(event)
-            if self._reads is not None and event.type not in self._reads:
-                return
-            try:
-                made = self.made(fold, event)
-            except CannotFold:
-                raise
-            except Exception as error:
-                raise CannotFold(f"{self._projection.name} raised {type(error).__name__}: {error}") from error
-            if made:
-                self.add(event, made)
-        except CannotFold:
-            if self._folds is not None:
-                self._folds.discard(event.number)
-            raise
+    def fold(self, events: Sequence[StoredEvent]) -> tuple[int, str] | None:
+        """Add what the projection makes of consecutive events of an episode, as `Batch.fold` does."""
+        refused = self._read(self._projection.fold, events) if self._folds is None else self._folds.fold(events)
+        if refused is None:
+            return None
+        sequence, fault = refused
+        raised = "" if isinstance(fault, CannotFold) else f"{self._projection.name} raised {type(fault).__name__}: "
+        return sequence, f"{raised}{fault}"
+
+    def _read(self, fold: Any, events: Sequence[StoredEvent], *, kept: bool = True) -> Refused | None:
+        reads = self._reads
+        return self.add(fold, events if reads is None else [each for each in events if each.type in reads], kept=kept)
 
     @abstractmethod
-    def made(self, fold: Any, event: StoredEvent) -> Sequence[Any]:
-        """Return what a fold of the projection makes of an event. Raises `CannotFold`."""
+    def add(self, fold: Any, events: Sequence[StoredEvent], *, kept: bool) -> Refused | None:
+        """Add what a fold of the projection makes of events of an episode, or with `kept` False discard it.
 
-    @abstractmethod
-    def add(self, event: StoredEvent, made: Sequence[Any]) -> None:
-        """Add what the fold made of one event. Raises `CannotFold`, and then has added nothing."""
+        Returns the first event that cannot be folded, with the exception, and then has added nothing of it.
+        """
 
     async def ready(self, engine: AsyncEngine, generation: int) -> None:  # noqa: ARG002 - for subclasses
         """Leave the folds of the episodes to the next batch. Subclasses prepare their statements, too."""

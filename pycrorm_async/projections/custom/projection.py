@@ -66,11 +66,15 @@ class Event(NamedTuple):
         return in_slot(row(self.number, sequence), slot)
 
 
+Changed: TypeAlias = list[tuple[bool, str, int, dict[str, Any]]]
+"""Changes of rows: whether one is inserted, table, id, columns."""
+
+
 class Changes:
     """The row changes of one event. An event may change rows of its own episode only."""
 
     def __init__(self) -> None:
-        self.all: list[tuple[bool, str, int, dict[str, Any]]] = []
+        self.all: Changed = []
 
     def insert(self, table: str, id: int, /, **columns: Any) -> None:  # noqa: A002
         """Insert a new row; omitted columns are null."""

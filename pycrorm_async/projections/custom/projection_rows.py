@@ -10,10 +10,11 @@ from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 from pycrorm_async.bulk_records import make
 from pycrorm_async.events.codec import unwritable
 from pycrorm_async.events.types import DesignatorTypeDeclared, NodeStarted
-from pycrorm_async.projections.custom.episode_folds import EpisodeFolds
+from pycrorm_async.projections.custom.episode_folds import EpisodeFolds, Refused
 from pycrorm_async.projections.custom.projected_batch import ProjectedBatch
 from pycrorm_async.projections.custom.projection import (
     OF_EVERY_TABLE,
+    Changed,
     Changes,
     EpisodeFold,
     Event,
@@ -49,25 +50,31 @@ class CustomRows(ProjectedBatch):
         self._updates: dict[str, dict[int, dict[str, Any]]] = {name: {} for name in self._columns}
         self._insertion: Insertion = None
 
-    def made(self, fold: EpisodeFold, event: StoredEvent) -> Sequence[Any]:
-        """Return the changes of rows that a fold makes of an event. Raises `CannotFold`."""
-        changes = Changes()
-        fold(self._event(event), changes)
-        return changes.all
+    def add(self, fold: EpisodeFold, events: Sequence[StoredEvent], *, kept: bool) -> Refused | None:
+        """Add the changes of rows that a fold makes of events, if both databases store their values alike."""
+        for event in events:
+            changes = Changes()
+            try:
+                fold(self._event(event), changes)
+                if kept and changes.all:
+                    self._add(event.number, changes.all)
+            except Exception as fault:  # noqa: BLE001 - user code; the reason parks the episode
+                return event.sequence, fault
+        return None
 
-    def add(self, event: StoredEvent, made: Sequence[Any]) -> None:
-        """Add the changes of one event, if both databases store their values alike. Raises `CannotFold`."""
+    def _add(self, number: int, changes: Changed) -> None:
+        """Add the changes of one event. Raises `CannotFold`, and then has added none."""
         new: set[tuple[str, int]] = set()
         checked = []
-        for inserts, table, id_, columns in made:
-            checked.append((inserts, table, id_, self._checked(event, table, id_, columns)))
+        for inserts, table, id_, columns in changes:
+            checked.append((inserts, table, id_, self._checked(number, table, id_, columns)))
             if inserts and ((table, id_) in new or id_ in self._inserts[table]):
                 raise CannotFold(f"{table} has a row {id_} already")
             if inserts:
                 new.add((table, id_))
         for inserts, table, id_, values in checked:
             if inserts:
-                self._inserts[table][id_] = {"id": id_, "process_metadata_id": event.number, **values}
+                self._inserts[table][id_] = {"id": id_, "process_metadata_id": number, **values}
                 self._updates[table].pop(id_, None)  # an update before the insert had no row, so it has no effect
             elif id_ in self._inserts[table]:
                 self._inserts[table][id_] |= values
@@ -120,11 +127,11 @@ class CustomRows(ProjectedBatch):
         time_us = microseconds(wall_ns)
         return make(Event, (number, sequence, time_us, monotonic_ns, happening, dtype, parameters, declaration))
 
-    def _checked(self, event: StoredEvent, table: str, id_: Any, values: Mapping[str, Any]) -> dict[str, Any]:
+    def _checked(self, number: int, table: str, id_: Any, values: Mapping[str, Any]) -> dict[str, Any]:
         columns = self._columns.get(table)
         if columns is None:
             raise CannotFold(f"{self._projection.name} has no table {table!r}")
-        if not isinstance(id_, int) or id_ >> 31 != event.number:
+        if not isinstance(id_, int) or id_ >> 31 != number:
             raise CannotFold(f"{table}: {id_!r} is no row of this episode: use event.id or event.row(sequence)")
         for name in values:
             if name not in columns or name in OF_EVERY_TABLE:

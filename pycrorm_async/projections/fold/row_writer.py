@@ -12,6 +12,7 @@ import sqlalchemy
 from sqlalchemy import column, select, text
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
+from pycrorm_async.projections.fold.column_values import CannotFold
 from pycrorm_async.projections.fold.fold import fold
 from pycrorm_async.projections.fold.link_boxes import insert_link_boxes
 from pycrorm_async.projections.fold.parameters import Designators
@@ -64,8 +65,14 @@ class TableRows:
             async with log.reading() as connection:
                 self._uuids = await uuids_of(connection, starting)
 
-    def fold(self, event: StoredEvent) -> None:
-        fold(event, self._designators, self._rows)
+    def fold(self, events: Sequence[StoredEvent]) -> tuple[int, str] | None:
+        designators, rows = self._designators, self._rows
+        for event in events:
+            try:
+                fold(event, designators, rows)
+            except CannotFold as reason:
+                return event.sequence, str(reason)
+        return None
 
     async def ready(self, engine: AsyncEngine, generation: int) -> None:
         name_episodes(self._rows, self._uuids)

@@ -22,14 +22,11 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby
-from operator import attrgetter
 from typing import NamedTuple, Protocol
 
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.errors import LogDamaged
-from pycrorm_async.projections.fold.column_values import CannotFold
 from pycrorm_async.projections.fold.parameters import Designators
 from pycrorm_async.projections.fold.row_writer import TableRows
 from pycrorm_async.projections.schema.generations import Generation, Hold
@@ -82,8 +79,11 @@ class Batch(Protocol):
         """Prepare for folding these spans, by reading what the fold needs of the events before them."""
         ...
 
-    def fold(self, event: StoredEvent) -> None:
-        """Add the rows of an event. Raises `CannotFold`, and then has added none."""
+    def fold(self, events: Sequence[StoredEvent]) -> tuple[int, str] | None:
+        """Add the rows of consecutive events of an episode, at least one.
+
+        Returns the first event that cannot be folded, with the reason; of it and those behind it, no row is added.
+        """
         ...
 
     async def ready(self, engine: AsyncEngine, generation: int) -> None:
@@ -309,27 +309,35 @@ async def _fold_all(
     """Fold the events of these spans into `rows`, in order; return the new checkpoints and the episodes to park."""
     steps: list[Progress] = []
     parked: dict[int, str] = {}
+    folded = _SLICE_EVENTS  # since this yielded to the event loop
     for span, part in _by_span(spans, events):
-        last = span.after
-        for place, event in enumerate(part):
-            if place % _SLICE_EVENTS == 0:
+        for first in range(0, len(part), _SLICE_EVENTS):
+            if folded >= _SLICE_EVENTS:
                 await asyncio.sleep(0)
-            sequence = event.sequence
-            if sequence != last + 1:
-                break
-            try:
-                rows.fold(event)
-            except CannotFold as reason:
+                folded = 0
+            some = part[first : first + _SLICE_EVENTS]
+            folded += len(some)
+            if (refused := rows.fold(some)) is not None:
+                sequence, reason = refused
+                last = sequence - 1
                 parked[span.number] = f"event {sequence}: {reason}"
                 break
-            last = sequence
-        if last < span.last and span.number not in parked:
-            parked[span.number] = f"event {last + 1} is missing in the log"
+        else:
+            last = span.after + len(part)
+            if last < span.last:
+                parked[span.number] = f"event {last + 1} is missing in the log"
         steps.append((span.number, span.after, last))
     return steps, parked
 
 
-def _by_span(spans: Sequence[Span], events: Sequence[StoredEvent]) -> Iterator[tuple[Span, list[StoredEvent]]]:
-    """Pair each span with its events, which may be none; each episode has one span."""
-    events_by_number = {number: list(part) for number, part in groupby(events, key=attrgetter("number"))}
-    return ((span, events_by_number.get(span.number, [])) for span in spans)
+def _by_span(spans: Sequence[Span], events: Sequence[StoredEvent]) -> Iterator[tuple[Span, Sequence[StoredEvent]]]:
+    """Pair each span with its events up to the first that is missing; each episode has one span."""
+    first = 0
+    for span in spans:
+        part = events[first : first + span.last - span.after]
+        if part and part[-1].number != span.number:  # some are missing, so it has events of the next span
+            part = [each for each in part if each.number == span.number]
+        first += len(part)
+        if part and part[-1].sequence != span.after + len(part):
+            part = [each for sequence, each in enumerate(part, span.after + 1) if each.sequence == sequence]
+        yield span, part

@@ -11,7 +11,6 @@ from pycrorm_async.projections.custom.packed_projection import PackedProjection
 from pycrorm_async.projections.custom.projection import Projection
 from pycrorm_async.projections.custom.projection_rows import CustomRows
 from pycrorm_async.projections.custom.projection_tables import CustomFoldDefinition, fault_in_version, layout_of
-from pycrorm_async.projections.fold.column_values import CannotFold
 from pycrorm_async.projections.run import checkpoints
 from pycrorm_async.projections.run.batch_fold import Batch
 from pycrorm_async.projections.schema.core_columns import OWN
@@ -122,18 +121,10 @@ async def _fold_again(connection: AsyncConnection, rows: Batch, span: Span, limi
     """Fold an episode again; return the first event that cannot be folded, with the reason."""
     for after in range(0, span.last, limit):
         page = Span(span.number, after, min(after + limit, span.last))
-        sequence = after
-        for event in await dialect_of(connection).spans(connection, [page]):
-            sequence += 1
-            if event.sequence != sequence:
-                break
-            try:
-                rows.fold(event)
-            except CannotFold as reason:
-                return sequence, str(reason)
-        else:
-            if sequence == page.last:
-                continue
-            sequence += 1
-        return sequence, "it is missing in the log"
+        events = await dialect_of(connection).spans(connection, [page])
+        whole = [each for sequence, each in enumerate(events, after + 1) if each.sequence == sequence]
+        if whole and (refused := rows.fold(whole)) is not None:
+            return refused
+        if after + len(whole) < page.last:
+            return after + len(whole) + 1, "it is missing in the log"
     return None

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.events.types import DesignatorTypeDeclared
-from pycrorm_async.projections.custom.episode_folds import EpisodeFolds
+from pycrorm_async.projections.custom.episode_folds import EpisodeFolds, Refused
 from pycrorm_async.projections.custom.packed_projection import PackedProjection
 from pycrorm_async.projections.custom.projected_batch import ProjectedBatch
 from pycrorm_async.recall.blocks import Block
@@ -29,11 +29,15 @@ class CaseBatch(ProjectedBatch):
         self.cases: list[Case] = []
         self._insertion: Insertion = None
 
-    def made(self, fold: EpisodeCases, event: StoredEvent) -> Sequence[Case]:
-        return fold.read(event, self._declared.get)
-
-    def add(self, event: StoredEvent, made: Sequence[Case]) -> None:  # noqa: ARG002 - of the base class
-        self.cases += made
+    def add(self, fold: EpisodeCases, events: Sequence[StoredEvent], *, kept: bool) -> Refused | None:
+        read, declaration_of = fold.read, self._declared.get
+        cases = self.cases if kept else []
+        for event in events:
+            try:
+                cases += read(event, declaration_of)
+            except Exception as fault:  # noqa: BLE001 - the reason parks the episode
+                return event.sequence, fault
+        return None
 
     async def ready(self, engine: AsyncEngine, generation: int) -> None:
         await super().ready(engine, generation)
