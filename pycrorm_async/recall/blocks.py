@@ -9,8 +9,10 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cached_property
+from operator import itemgetter
 from typing import Any, Final, Generic, TypeVar
 
 import numpy as np
@@ -109,7 +111,7 @@ class Block:
     @classmethod
     def of(cls, cases: Iterable[Case]) -> Block:
         """Make a block of cases, each as `bounded_case` returns it."""
-        rows = [case if _has_few_features(case) else bounded_case(case) for case in cases]
+        rows = [case if len(case.symbols) + len(case.numbers) <= FEATURES_MAX else bounded_case(case) for case in cases]
         counts = Counter(case.type for case in rows)
         sizes = {name: counts[name] for name in sorted(counts)}
         codes = {name: code for code, name in enumerate(sizes)}
@@ -276,8 +278,9 @@ def _spreads(
 def _values_by_feature(situations: Sequence[Mapping[str, Any]]) -> Mapping[str, Sequence[Any]]:
     """Return the values of each feature of the situations, None where one does not have it."""
     names = tuple(situations[0])
-    if all(map(names.__eq__, map(tuple, situations))):  # as of most types, whose fields are always set
-        return dict(zip(names, zip(*(each.values() for each in situations), strict=True), strict=True))
+    if len(names) > 1 and {*map(len, situations)} == {len(names)}:  # as of most types, whose fields are always set
+        with suppress(KeyError):
+            return dict(zip(names, zip(*map(itemgetter(*names), situations), strict=True), strict=True))
     features = frozenset[str]().union(*situations)
     return {feature: [each.get(feature) for each in situations] for feature in features}
 
@@ -308,7 +311,3 @@ def _without_long_dictionaries(block: Block) -> Block:
     texts = {name: each for name, each in block.texts.items() if name not in long}
     columns = block.nodes, block.started_us, block.parents
     return Block(block.sizes, *columns, texts, block.numbers, block.left_out | long)
-
-
-def _has_few_features(case: Case) -> bool:
-    return len(case.symbols) + len(case.numbers) <= FEATURES_MAX

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, EpisodeId
@@ -106,6 +106,28 @@ def size_of(spans: Sequence[Span]) -> int:
     8
     """
     return sum(each.last - each.after for each in spans)
+
+
+def pages_of(spans: Sequence[Span], limit: int) -> Iterator[list[Span]]:
+    """Divide spans into pages of at most `limit` events, in their order.
+
+    >>> [*pages_of([Span(1, 0, 7), Span(2, 3, 4)], 5)]
+    [[Span(number=1, after=0, last=5)], [Span(number=1, after=5, last=7), Span(number=2, after=3, last=4)]]
+    """
+    page: list[Span] = []
+    left = limit
+    for number, first, last in spans:
+        after = first
+        while after < last:
+            part = Span(number, after, min(last, after + left))
+            page.append(part)
+            left -= part.last - after
+            after = part.last
+            if not left:
+                yield page
+                page, left = [], limit
+    if page:
+        yield page
 
 
 def beyond(behind: Sequence[EpisodeRow], reached: Mapping[int, int]) -> list[EpisodeRow]:

@@ -24,6 +24,7 @@ from pycrorm_async.projections.custom.projection_tables import CustomFoldDefinit
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.rebuild import Rebuild, claimed
 from pycrorm_async.projections.replaced_tables import clear
+from pycrorm_async.projections.run import batch_fold
 from pycrorm_async.projections.run.batch_fold import BatchFold
 from pycrorm_async.projections.run.targets import SideTarget
 from pycrorm_async.projections.schema.generations import PROJECTION, read_generation
@@ -205,9 +206,11 @@ class NoLeftHand(GraspRate):
             raise ZeroDivisionError("no right hand")
 
 
+@pytest.mark.parametrize("page_events", [4, 10_000])
 async def test_a_fold_that_raises_stops_its_episode_and_no_other(
-    log: EventLog, caplog: pytest.LogCaptureFixture
+    log: EventLog, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch, page_events: int
 ) -> None:
+    monkeypatch.setattr(batch_fold, "_PAGE_EVENTS", page_events)
     left = [each for each in TRIES if each[0] == "LEFT"]
     records = [*declarations(PICK_UP), *mixed(tries(1), tries(2, many=left))]
     await folded(log, records, NoLeftHand())

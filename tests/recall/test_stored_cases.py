@@ -23,6 +23,7 @@ from pycrorm_async.projections.custom.projection_tables import states
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.rebuild import Rebuild, claimed
 from pycrorm_async.projections.replaced_tables import clear
+from pycrorm_async.projections.run import batch_fold
 from pycrorm_async.projections.schema.generations import PROJECTION, read_generation
 from pycrorm_async.projections.verify.findings import VerifyResult
 from pycrorm_async.projections.verify.verify import verify
@@ -77,18 +78,19 @@ async def test_cases_do_not_depend_on_batches_restarts_processes_or_merges(
     log: EventLog, monkeypatch: pytest.MonkeyPatch, *, in_turn: bool
 ) -> None:
     small_blocks(monkeypatch)
+    monkeypatch.setattr(batch_fold, "_PAGE_EVENTS", 11)
     random = Random(7)
     scripts = [random_script(number, random, actions=40) for number in range(1, 60 if in_turn else 13)]
     records = [each for first in range(0, len(scripts), 4) for each in mixed(*scripts[first : first + 4])]
     await log.append(TYPES)
-    projectors = [await projector_of(log, batch_events=15)]  # which makes batches of 30 for cases
+    projectors = [await projector_of(log, batch_events=8)]  # which makes batches of 32 for cases
     while records:
         size = random.randint(20, 90)
         await log.append(records[:size])
         del records[:size]
         if random.random() < 0.2:  # a restart, or another process beside the first
             kept = projectors[: random.randint(0, 1)]
-            projectors = [*kept, await projector_of(log, batch_events=random.randint(5, 60) // 2)]
+            projectors = [*kept, await projector_of(log, batch_events=random.randint(5, 60) // 4)]
         if random.random() < 0.7:
             await random.choice(projectors).catch_up()
     await asyncio.gather(*(each.catch_up() for each in projectors))
@@ -295,7 +297,7 @@ async def test_a_damaged_block_stops_the_merge_with_its_reason_and_no_other_fold
 
 
 def _die(url: str, place: str, last: int) -> None:
-    """Fold twelve events at a time, and die where a function of `stored_blocks` is called for that time."""
+    """Fold 24 events at a time, and die where a function of `stored_blocks` is called for that time."""
     count, real = 0, getattr(stored_blocks, place)
 
     def counted(*arguments: object) -> object:
@@ -307,7 +309,7 @@ def _die(url: str, place: str, last: int) -> None:
 
     async def fold() -> None:
         log = await EventLog.open(DatabaseAddress.parse(url), create=True)
-        await (await projector_of(log, batch_events=12)).catch_up()
+        await (await projector_of(log, batch_events=6)).catch_up()
 
     with pytest.MonkeyPatch.context() as patch:
         small_blocks(patch)

@@ -86,7 +86,7 @@ def events_of_batch(projection: Projection, batch_events: int) -> int:
 
     A packed projection writes a few rows only, so that most of a transaction's cost does not depend on its events.
     """
-    return 2 * batch_events if isinstance(projection, PackedProjection) else batch_events
+    return 4 * batch_events if isinstance(projection, PackedProjection) else batch_events
 
 
 async def make_projection_tables(connection: AsyncConnection, projection: Projection, key: str) -> Generation:

@@ -11,9 +11,10 @@ from typing import Any
 
 import msgspec
 
-from pycrorm_async.events.codec import UnknownShape, decode
+from pycrorm_async.events.codec import Decoder, UnknownShape
 from pycrorm_async.events.ids import SLOT_ROBOT_POSE
 from pycrorm_async.events.types import (
+    EVENT_TYPES,
     EpisodeEnded,
     EpisodeStarted,
     EpisodeTagged,
@@ -31,6 +32,7 @@ from pycrorm_async.events.types import (
     Observed,
     StateSampled,
 )
+from pycrorm_async.events.upcasters import UPCASTERS
 from pycrorm_async.projections.fold.column_values import (
     UNCHANGED,
     CannotFold,
@@ -82,15 +84,12 @@ def fold_happening(event: StoredEvent, happening: Happening, designators: Design
 
 def happening_of(event: StoredEvent) -> Happening:
     """Decode the payload of an episode's event, for every fold. Raises `CannotFold`, `UndecodablePayload`."""
-    _, _, type_, version, _, _, payload = event
-    if type_ not in _FOLDS:
-        raise CannotFold(f"{type_} is not an event this version knows")
     try:
-        return decode(type_, payload, version)
+        return _decode(event.type, event.payload, event.version)
     except UnknownShape as reason:
         raise CannotFold(str(reason)) from None
     except msgspec.DecodeError as error:
-        raise UndecodablePayload(f"{type_} cannot be decoded: {error}") from None
+        raise UndecodablePayload(f"{event.type} cannot be decoded: {error}") from None
 
 
 # --- episodes -------------------------------------------------------------------------------------------------
@@ -376,3 +375,6 @@ _FOLDS: dict[str, Callable[[StoredEvent, Any, Designators, Rows], None]] = {
     "StateSampled": _state_sampled,
     "Observed": _observed,
 }
+_decode = Decoder(
+    {name: EVENT_TYPES[name] for name in _FOLDS}, {key: each for key, each in UPCASTERS.items() if key[0] in _FOLDS}
+).decode

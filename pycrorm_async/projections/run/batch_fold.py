@@ -36,10 +36,12 @@ from pycrorm_async.projections.schema.union import unite
 from pycrorm_async.store.dialect import Progress, RowRefused
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.stored import Span, StoredEvent, size_of
+from pycrorm_async.store.stored import Span, StoredEvent, pages_of, size_of
 
 _REASON_LENGTH_MAX = 2_000
 """Bounds the characters of the reason for parking an episode: `status` shows it, and a value may have megabytes."""
+_PAGE_EVENTS = 10_000
+"""Bounds the events that are read at once, and so their memory; all of a batch, unless it makes few rows."""
 _SLICE_EVENTS = 100
 """The events folded between two yields to the event loop, some 0.4 ms."""
 
@@ -124,7 +126,6 @@ class _PreparedBatch:
     """
 
     spans: Sequence[Span]
-    events: Sequence[StoredEvent]
     types: _Types
     rows: Batch
     number: int
@@ -183,10 +184,7 @@ class BatchFold:
     async def prepare(self, spans: Sequence[Span]) -> BatchPreview:
         """Read and fold these events, yielding to the event loop at intervals. Writes nothing."""
         self._prepared = None
-        events = await self._log.spans(spans)
-        if not self._target.parks_gaps and len(events) < size_of(spans):
-            raise await _damage(self._log, spans, events)
-        self._prepared = batch = await self._folded(spans, events)
+        self._prepared = batch = await self._folded(spans)
         return BatchPreview(batch.count, {number: now for number, _, now in batch.steps}, not batch.parked)
 
     async def write(self) -> int:
@@ -199,19 +197,30 @@ class BatchFold:
 
     async def write_in(self, connection: AsyncConnection, spans: Sequence[Span]) -> bool:
         """Fold in the caller's transaction, which must be rolled back if this returns False or raises `RowRefused`."""
-        batch = await self._folded(spans, await self._log.spans(spans))
+        batch = await self._folded(spans)
         generation = await self._generation(connection, batch)
         if generation is not None and generation.layout != batch.types.layout:
             return False
         return await self._write_rows(connection, batch, generation) is not None
 
-    async def _folded(self, spans: Sequence[Span], events: Sequence[StoredEvent]) -> _PreparedBatch:
+    async def _folded(self, spans: Sequence[Span]) -> _PreparedBatch:
+        """Read and fold these events, a page at a time, so that the events of a large batch never are in memory."""
         types = await self._types_now()
         rows, number = types.batch(), self.generation.number
         await rows.restore(self._log, spans)
-        steps, parked = await _fold_all(spans, events, rows)
+        reached = {each.number: each.after for each in spans}
+        parked: dict[int, str] = {}
+        for page in pages_of(spans, _PAGE_EVENTS):
+            wanted = [each for each in page if each.number not in parked]
+            events = await self._log.spans(wanted)
+            if not self._target.parks_gaps and len(events) < size_of(wanted):
+                raise await _damage(self._log, wanted, events)
+            steps, reasons = await _fold_all(wanted, events, rows)
+            reached |= {number: now for number, _, now in steps}
+            parked |= reasons
         await rows.ready(self._log.engine, number)
-        return _PreparedBatch(spans, events, types, rows, number, steps, parked)
+        steps = [(each.number, each.after, reached[each.number]) for each in spans]
+        return _PreparedBatch(spans, types, rows, number, steps, parked)
 
     async def _write(self, batch: _PreparedBatch) -> int:
         try:
@@ -226,7 +235,7 @@ class BatchFold:
             if grown:  # some tables of this batch do not exist: the caller folds it again for those that do
                 return 0
         except RowRefused as refusal:
-            return await self._isolate(batch.spans, batch.events, refusal)
+            return await self._isolate(batch.spans, refusal)
         return batch.count
 
     async def _generation(self, connection: AsyncConnection, batch: _PreparedBatch) -> Generation | None:
@@ -256,7 +265,7 @@ class BatchFold:
         return generation
 
     async def _types_now(self) -> _Types:
-        """Read the declarations. Called after the events are read, because each is stored before its first use."""
+        """Read the declarations. They include those of all stored events: each is stored before its first use."""
         payloads = await self._log.declarations()
         types = self._types
         if types is None or types.revision != self.generation.revision or types.payloads != payloads:
@@ -265,22 +274,21 @@ class BatchFold:
             self._types = types
         return types
 
-    async def _isolate(self, spans: Sequence[Span], events: Sequence[StoredEvent], refusal: RowRefused) -> int:
+    async def _isolate(self, spans: Sequence[Span], refusal: RowRefused) -> int:
         """Fold the batch in smaller parts until the refused row's event is alone, and park its episode there."""
         if len(spans) > 1:
-            return sum([await self._write(await self._folded([span], part)) for span, part in _by_span(spans, events)])
+            return sum([await self._write(await self._folded([each])) for each in spans])
         span = spans[0]
-        if len(events) > 1:
+        if size_of(spans) > 1:
             # The second half is folded only if the first is whole, so that no event is folded behind the refused one.
-            middle = len(events) // 2
-            cut = events[middle - 1].sequence
-            count = await self._write(await self._folded([span._replace(last=cut)], events[:middle]))
-            if count < middle:
+            middle = (span.after + span.last) // 2
+            count = await self._write(await self._folded([span._replace(last=middle)]))
+            if count < middle - span.after:
                 return count
-            return count + await self._write(await self._folded([span._replace(after=cut)], events[middle:]))
+            return count + await self._write(await self._folded([span._replace(after=middle)]))
         async with self._log.writing() as connection:
-            reason = f"event {events[0].sequence}: the database refuses it: {refusal}"
-            await self._target.park(connection, events[0].number, _writable(reason))
+            reason = f"event {span.last}: the database refuses it: {refusal}"
+            await self._target.park(connection, span.number, _writable(reason))
         return 0
 
 

@@ -30,14 +30,7 @@ class CaseBatch(ProjectedBatch):
         self._insertion: Insertion = None
 
     def add(self, fold: EpisodeCases, events: Sequence[StoredEvent], *, kept: bool) -> Refused | None:
-        read, declaration_of = fold.read, self._declared.get
-        cases = self.cases if kept else []
-        for event in events:
-            try:
-                cases += read(event, declaration_of)
-            except Exception as fault:  # noqa: BLE001 - the reason parks the episode
-                return event.sequence, fault
-        return None
+        return fold.read(events, self._declared.get, self.cases if kept else [])
 
     async def ready(self, engine: AsyncEngine, generation: int) -> None:
         await super().ready(engine, generation)

@@ -1,7 +1,7 @@
 """Make a case (`recall.case`) of each action of one episode when it ends: its situation at the start, its outcome.
 
->>> cases = EpisodeCases()
->>> [case for event in events for case in cases.read(event, declarations.get)]
+>>> cases: list[Case] = []
+>>> EpisodeCases().read(events, declarations.get, cases)
 
 The fold is pure, and its memory grows with the nodes that run and the objects in the world. Besides the features of
 `situation` a case has `inside`, the type of the nearest action around it, and `after` and `after_status`, type and
@@ -10,12 +10,11 @@ status of the action that ended last inside the same action. All features are kn
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Final, TypeAlias
 
 from pycrorm_async.bulk_records import make
-from pycrorm_async.events.ids import SLOT_NODE, row_id
 from pycrorm_async.events.types import (
     DesignatorTypeDeclared,
     EpisodeEnded,
@@ -28,7 +27,8 @@ from pycrorm_async.events.types import (
     ObjectMoved,
     ObjectRemoved,
 )
-from pycrorm_async.projections.fold.column_values import is_missing, microseconds
+from pycrorm_async.projections.custom.episode_folds import Refused
+from pycrorm_async.projections.fold.column_values import is_missing, row
 from pycrorm_async.projections.fold.fold import happening_of
 from pycrorm_async.projections.fold.world_fold import WorldFold
 from pycrorm_async.recall.case import Case
@@ -58,6 +58,7 @@ class _Action:
     """An action that runs, with the situation in which it started.
 
     Attributes:
+        node: id of its node.
         scope: the nearest action around it; None outside any.
         after: type and status of the action that ended last inside it.
     """
@@ -73,17 +74,16 @@ class _Action:
     after: tuple[str, str] | None = None
     has_ended: bool = False
 
-    def case(self, number: int, status: str, reason: str | None = None, duration_s: float | None = None) -> Case:
-        """Return its case in the episode of this number."""
-        node, parent = row_id(number, self.node, SLOT_NODE), None
-        if self.scope is not None:
-            parent = row_id(number, self.scope.node, SLOT_NODE)
-        situation = self.time_us, self.type, self.symbols, self.numbers
-        return make(Case, (node, *situation, status, reason, duration_s, parent, self.simulated))
+    def case(self, status: str, reason: str | None = None, duration_s: float | None = None) -> Case:
+        """Return its case."""
+        scope = self.scope
+        parent = scope.node if scope is not None else None
+        outcome = status, reason, duration_s, parent, self.simulated
+        return make(Case, (self.node, self.time_us, self.type, self.symbols, self.numbers, *outcome))
 
 
 class EpisodeCases:
-    """The cases of one episode, event by event.
+    """The cases of one episode, from its first event on.
 
     Args:
         types: the feature fields by fingerprint, which the folds of several episodes share.
@@ -92,42 +92,57 @@ class EpisodeCases:
     def __init__(self, types: dict[str, FeatureFields] | None = None) -> None:
         self._types = {} if types is None else types
         self._world = WorldFold()
-        self._scopes: dict[int, _Action | None] = {}
-        """The nearest action of each node that runs, itself included; None outside any."""
+        self._running: dict[int, _Action] = {}
+        """The actions that run."""
+        self._scopes: dict[int, _Action] = {}
+        """The nearest action around each other node that runs, without those outside any."""
         self._after: tuple[str, str] | None = None
         self._simulated = False
 
-    def read(self, event: StoredEvent, declaration_of: DeclarationOf) -> Sequence[Case]:
-        """Apply the next event; return the cases of the actions that it ends. Raises `CannotFold`."""
-        match happening_of(event):
-            case NodeStarted() as started:
-                self._start(event, started, declaration_of)
-            case NodeEnded() as ended:
-                return self._end(event, ended)
-            case EpisodeStarted(simulated=simulated):
-                self._simulated = simulated
-            case EpisodeEnded(status=status):
-                running = [each for node, each in self._scopes.items() if each is not None and each.node == node]
-                self._scopes.clear()
-                return [each.case(event.number, status) for each in running] if status == "LOST" else ()
-            case happening:
-                self._world.read(event.sequence, happening)
-        return ()
+    def read(self, events: Iterable[StoredEvent], declaration_of: DeclarationOf, cases: list[Case]) -> Refused | None:
+        """Apply the next events, of the types in `READS`; append the cases of the actions that they end to `cases`.
+
+        Returns the first event that cannot be folded, with the exception; those behind it are not applied.
+        """
+        for event in events:
+            try:
+                happening = happening_of(event)
+                if isinstance(happening, NodeStarted):
+                    self._start(event, happening, declaration_of)
+                elif isinstance(happening, NodeEnded):
+                    action = self._running.pop(happening.node, None)
+                    if action is not None:
+                        cases.append(self._end(action, happening, event.monotonic_ns))
+                    else:
+                        self._scopes.pop(happening.node, None)
+                elif isinstance(happening, EpisodeStarted):
+                    self._simulated = happening.simulated
+                elif isinstance(happening, EpisodeEnded):
+                    if happening.status == "LOST":
+                        cases += [each.case("LOST") for each in self._running.values()]
+                    self._running.clear()
+                    self._scopes.clear()
+                else:
+                    self._world.read(event.sequence, happening)
+            except Exception as fault:  # noqa: BLE001 - of a payload of any content; the caller parks the episode
+                return event.sequence, fault
+        return None
 
     def _start(self, event: StoredEvent, started: NodeStarted, declaration_of: DeclarationOf) -> None:
-        node = event.sequence
-        scope = self._scopes.get(started.parent) if started.parent is not None else None
-        self._scopes[node] = scope
-        if started.kind != "action" or started.designator is None:
-            return
-        fields = self._types.get(started.designator)
+        number, sequence, _, _, wall_ns, monotonic_ns, payload = event
+        parent = started.parent
+        scope = self._running.get(parent) or self._scopes.get(parent) if parent is not None else None
+        fields = None
+        if started.kind == "action" and started.designator is not None:
+            fields = self._types.get(started.designator)
+            if fields is None and (declaration := declaration_of(started.designator)) is not None:
+                fields = self._types[started.designator] = FeatureFields.of(declaration)
         if fields is None:
-            declaration = declaration_of(started.designator)
-            if declaration is None:
-                return
-            fields = self._types[started.designator] = FeatureFields.of(declaration)
+            if scope is not None:
+                self._scopes[sequence] = scope
+            return
         parameters = started.parameters
-        if b'"missing"' in event.payload:
+        if b'"missing"' in payload:
             parameters = {name: each for name, each in parameters.items() if not is_missing(each)}
         symbols, numbers = situation(fields, parameters, started.robot, self._world)
         after = self._after
@@ -140,10 +155,10 @@ class EpisodeCases:
         if after is not None:
             symbols["after"], symbols["after_status"] = after
         simulated = self._simulated or started.simulated
-        self._scopes[node] = _Action(
-            node,
-            microseconds(event.wall_ns),
-            event.monotonic_ns,
+        self._running[sequence] = _Action(
+            row(number, sequence),
+            wall_ns // 1000,
+            monotonic_ns,
             fields.dtype,
             scope,
             symbols,
@@ -151,15 +166,13 @@ class EpisodeCases:
             simulated,
         )
 
-    def _end(self, event: StoredEvent, ended: NodeEnded) -> Sequence[Case]:
-        action = self._scopes.pop(ended.node, None)
-        if action is None or action.node != ended.node:
-            return ()
+    def _end(self, action: _Action, ended: NodeEnded, monotonic_ns: int) -> Case:
+        status, failure = ended.status, ended.failure
         action.has_ended = True
         if action.scope is None:
-            self._after = action.type, ended.status
+            self._after = action.type, status
         else:
-            action.scope.after = action.type, ended.status
-        duration_s = (event.monotonic_ns - action.monotonic_ns) / 1e9 if ended.status != "LOST" else None
-        reason = ended.failure.type.rpartition(".")[2] if ended.failure is not None else None
-        return (action.case(event.number, ended.status, reason, duration_s),)
+            action.scope.after = action.type, status
+        duration_s = (monotonic_ns - action.monotonic_ns) / 1e9 if status != "LOST" else None
+        reason = failure.type.rpartition(".")[2] if failure is not None else None
+        return action.case(status, reason, duration_s)

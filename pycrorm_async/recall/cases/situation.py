@@ -111,8 +111,9 @@ def _add_robot(
     for name, features in fields.poses:
         if (value := parameters.get(name)) is not None and value["frame"] == robot.pose.frame:
             x, y, z, yaw = features
-            numbers[x], numbers[y], numbers[z] = _position_in(value["position"], robot.pose)
-            numbers[yaw] = _yaw_in(value["orientation"], robot.pose.orientation)
+            numbers[x], numbers[y], numbers[z], numbers[yaw] = _pose_in(
+                value["position"], value["orientation"], robot.pose
+            )
 
 
 class _Seen(NamedTuple):
@@ -150,8 +151,9 @@ def _add_object(symbols: Symbols, numbers: Numbers, seen: _Seen, robot: RobotVal
         numbers["height"] = height - robot.pose.position[2] - robot.torso_height
     x, y, _, _ = seen.pose.orientation
     if 1 - 2 * (x * x + y * y) >= _UPRIGHT_MIN:
-        numbers["stand_x"], numbers["stand_y"], _ = _position_in(robot.pose.position, seen.pose)
-        numbers["stand_yaw"] = _yaw_in(robot.pose.orientation, seen.pose.orientation)
+        numbers["stand_x"], numbers["stand_y"], _, numbers["stand_yaw"] = _pose_in(
+            robot.pose.position, robot.pose.orientation, seen.pose
+        )
 
 
 def _add_surroundings(
@@ -181,23 +183,21 @@ def _is_near(each: WorldObject, target: WorldObject) -> bool:
     return (x - to_x) ** 2 + (y - to_y) ** 2 + (z - to_z) ** 2 <= _NEAR_M**2
 
 
-def _position_in(position: Sequence[float], frame: PoseValue) -> tuple[float, float, float]:
-    """Return a position in the frame of a pose."""
-    (x, y, z, w), (at_x, at_y, at_z) = frame.orientation, frame.position
+def _pose_in(
+    position: Sequence[float], orientation: Sequence[float], frame: PoseValue
+) -> tuple[float, float, float, float]:
+    """Return x, y, z and yaw of a pose in the frame of another; orientations are quaternions xyzw."""
+    (fx, fy, fz, fw), (at_x, at_y, at_z) = frame.orientation, frame.position
     dx, dy, dz = position[0] - at_x, position[1] - at_y, position[2] - at_z
-    turned_x, turned_y, turned_z = y * dz - z * dy - w * dx, z * dx - x * dz - w * dy, x * dy - y * dx - w * dz
-    return (
-        dx + 2 * (y * turned_z - z * turned_y),
-        dy + 2 * (z * turned_x - x * turned_z),
-        dz + 2 * (x * turned_y - y * turned_x),
-    )
-
-
-def _yaw_in(orientation: Sequence[float], frame: Sequence[float]) -> float:
-    """Return the yaw of an orientation in the frame of another; both are quaternions xyzw."""
-    (x, y, z, w), (fx, fy, fz, fw) = orientation, frame
+    turned_x, turned_y, turned_z = fy * dz - fz * dy - fw * dx, fz * dx - fx * dz - fw * dy, fx * dy - fy * dx - fw * dz
+    x, y, z, w = orientation
     qx = fw * x - fx * w - fy * z + fz * y
     qy = fw * y + fx * z - fy * w - fz * x
     qz = fw * z - fx * y + fy * x - fz * w
     qw = fw * w + fx * x + fy * y + fz * z
-    return atan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz))
+    return (
+        dx + 2 * (fy * turned_z - fz * turned_y),
+        dy + 2 * (fz * turned_x - fx * turned_z),
+        dz + 2 * (fx * turned_y - fy * turned_x),
+        atan2(2 * (qw * qz + qx * qy), 1 - 2 * (qy * qy + qz * qz)),
+    )

@@ -20,7 +20,6 @@ from pycrorm_async.errors import CallerError, EpisodeParked
 from pycrorm_async.events.codec import encode
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, EpisodeId, episode_text, parse_episode_id, row_id, row_key
 from pycrorm_async.events.types import EpisodeEnded
-from pycrorm_async.projections.fold.column_values import CannotFold
 from pycrorm_async.recall.case import Case
 from pycrorm_async.recall.cases.episode_cases import READS, EpisodeCases
 from pycrorm_async.recording.writing.emitter import Emitter
@@ -139,11 +138,10 @@ class ProcessCases:
         running.has_ended = running.has_ended or stored.type == EpisodeEnded.__name__
         if stored.type not in _READS:
             return ()
-        try:
-            return running.fold.read(stored, self._feed.declaration)
-        except CannotFold:  # the fold of the tables parks the episode, with the reason
-            running.has_ended = True
-            return ()
+        cases: list[Case] = []
+        if running.fold.read([stored], self._feed.declaration, cases) is not None:
+            running.has_ended = True  # the fold of the tables parks the episode, with the reason
+        return cases
 
     async def _numbered(self) -> list[Case]:
         """Return the cases of the episodes that have a number by now, and drop those episodes that have ended."""

@@ -164,7 +164,10 @@ class SQLite:
         except sqlite3.DataError:  # together too large for one SQLite value
             parts = [part for span in spans for part in _parts_of(span, 1)]
             rows = await driver.rows_in_turn(sql.SELECT_SPAN, parts)
-        return [event for part, row in zip(parts, rows, strict=True) for event in _events(part.number, *row)]
+        events: list[StoredEvent] = []
+        for part, row in zip(parts, rows, strict=True):
+            events += _events(part.number, *row)
+        return events
 
     async def declarations(self, connection: AsyncConnection) -> list[bytes]:
         return [bytes(row[0]) for row in await connection.exec_driver_sql(sql.SELECT_DECLARATIONS)]
@@ -303,18 +306,19 @@ def _parts_of(span: Span, events_max: int) -> Iterator[Span]:
         yield Span(span.number, after, min(after + events_max, span.last))
 
 
-def _events(number: int, heads: str, payloads: bytes | None) -> Iterator[StoredEvent]:
+def _events(number: int, heads: str, payloads: bytes | None) -> list[StoredEvent]:
     try:
         rows = _HEADS.decode(heads)
     except msgspec.DecodeError as error:
         raise DamageError(f"events of episode {number} are damaged: {error}") from None
-    start = 0
+    end = 0
     payloads = payloads or b""  # NULL for no events, and for empty payloads only
+    events: list[StoredEvent] = []
     for sequence, type_name, version, wall_ns, monotonic_ns, length in rows:
-        end = start + length
+        start, end = end, end + length
         values = (number, sequence, type_name, version, wall_ns, monotonic_ns, payloads[start:end])
-        yield make(StoredEvent, values)
-        start = end
+        events.append(make(StoredEvent, values))
+    return events
 
 
 async def _driver(connection: AsyncConnection) -> Connection:
