@@ -130,9 +130,9 @@ class _PyCRAMPlans:
         seams.around(plan, "perform", self._whole_plan)
         seams.around(used.ActionDescription, "perform", self._nested_action)
         for expression in (used.SequentialNode, used.TryInOrderNode, used.RepeatNode, used.MonitorNode):
-            seams.around(expression, "perform", self._expression)
+            seams.around(expression, "perform", self._performed)
         for expression in (used.ParallelNode, used.TryAllNode):
-            seams.around(expression, "perform", self._expression)
+            seams.around(expression, "perform", self._performed)
         seams.around(used.ParallelNode, "_lang_call", self._branch)
         seams.around(used.UseProspectionWorld, "__exit__", self._leave_prospection)
         self._world.connect()
@@ -147,10 +147,10 @@ class _PyCRAMPlans:
     def _node_started(self, node: Any) -> None:
         used, nodes = self._pycram, self._thread.nodes
         if isinstance(node, used.ActionNode):
-            nodes.append(RunningNode(node, self._episodes.present(), None, "action"))
+            nodes.append(RunningNode(node, self._episodes.present(), "action", is_description=True))
         elif isinstance(node, used.ResolvedActionNode):
-            if nodes and nodes[-1].key is None:
-                nodes[-1].is_resolved = True
+            if nodes:
+                nodes[-1].is_description = False
             self._start(node, "action", node.designator_ref)
         elif isinstance(node, used.MotionNode):
             self._start(node, "motion", node.designator_ref)
@@ -159,8 +159,10 @@ class _PyCRAMPlans:
 
     @guarded
     def _node_ended(self, node: Any) -> None:
-        started = next((each for each in reversed(self._thread.nodes) if each.of is node), None)
-        if started is None:
+        for started in reversed(self._thread.nodes):
+            if started.of is node:
+                break
+        else:
             return
         statuses = self._pycram.TaskStatus
         if node.status is statuses.SUCCEEDED:
@@ -172,7 +174,7 @@ class _PyCRAMPlans:
     def _start(self, of: Any, kind: RecordedKind, designator: Any) -> RunningNode:
         self._world.flush()
         values, type_ = self._values.parameters(designator), type(designator)
-        node = RunningNode(of, self._episodes.present(), next(self._keys), kind)
+        node = RunningNode(of, self._episodes.present(), kind)
         self._write_start(node, type_, values)
         self._thread.nodes.append(node)
         return node
@@ -189,7 +191,8 @@ class _PyCRAMPlans:
         is_fresh = node.kind == "action" or episode is not self._episodes.real
         robot = self._values.robot(episode) if is_fresh else self._values.robot_key()
         episode.wait_for_room()
-        episode.start(node.key, declared, values, parent=self._episodes.cause(episode), robot=robot)
+        cause = self._episodes.cause(episode)
+        node.key = episode.start(next(self._keys), declared, values, parent=cause, robot=robot)
 
     def _end(
         self, node: RunningNode, status: NodeStatus, failure: BaseException | None = None, result: Any = None
@@ -200,8 +203,7 @@ class _PyCRAMPlans:
         while nodes and (inner := nodes.pop()) is not node:
             if inner.key is not None:
                 inner.episode.end(inner.key, "ERROR", failure)
-        if node.key is None and not node.is_resolved and status != "SUCCEEDED":
-            node.key = next(self._keys)
+        if node.is_description and status != "SUCCEEDED":
             self._write_start(node, node.of.action, self._values.options(node.of))
         if node.key is not None:
             if type(getattr(node.of, "designator_ref", None)).__name__ == "DetectingMotion" and result:
@@ -227,10 +229,7 @@ class _PyCRAMPlans:
             return call()  # of the node that has just started
         return self._performed(call, action, "action")
 
-    def _expression(self, call: Callable[[], Any], expression: Any) -> Any:
-        return self._performed(call, expression, "language")
-
-    def _performed(self, call: Callable[[], Any], designator: Any, kind: RecordedKind) -> Any:
+    def _performed(self, call: Callable[[], Any], designator: Any, kind: RecordedKind = "language") -> Any:
         node = self._begin(designator, kind)
         if node is None:
             return call()

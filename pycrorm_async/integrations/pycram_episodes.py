@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Hashable
 from typing import Any
 
 from pycrorm_async.events.values import PoseValue
@@ -13,14 +14,23 @@ from pycrorm_async.recording.recording import Recording
 
 
 class RunningNode:
-    """A node that runs: PyCRAM's node, or the action that another one performs, and the key that it is recorded under.
+    """A node that runs: PyCRAM's node, or the action that another one performs; `key` stands for it in its episode.
 
     A description of an action has no key: what it resolves to is recorded, or the description once it has failed.
     """
 
-    def __init__(self, of: Any, episode: RecordedEpisode, key: int | None, kind: RecordedKind) -> None:
-        self.of, self.episode, self.key, self.kind = of, episode, key, kind
-        self.is_resolved = False
+    def __init__(self, of: Any, episode: RecordedEpisode, kind: RecordedKind, *, is_description: bool = False) -> None:
+        self.of, self.episode, self.kind, self.is_description = of, episode, kind, is_description
+        self.key: Hashable | None = None
+
+
+class Change:
+    """The last pose of an object and the last positions of its joints that a motion has set."""
+
+    def __init__(self, of: Any) -> None:
+        self.of = of
+        self.pose: PoseValue | None = None
+        self.joints: dict[str, float] = {}
 
 
 class _Thread(threading.local):
@@ -28,8 +38,7 @@ class _Thread(threading.local):
 
     def __init__(self) -> None:
         self.nodes: list[RunningNode] = []
-        self.poses: dict[int, tuple[Any, PoseValue]] = {}
-        self.joints: dict[int, tuple[Any, dict[str, float]]] = {}
+        self.changes: dict[int, Change] = {}
 
 
 class PyCRAMEpisodes:
@@ -85,7 +94,7 @@ class PyCRAMEpisodes:
         """Return the episode of a world; None for a prospection world in which no node has run."""
         return self._simulation if world.is_prospection_world else self.real
 
-    def cause(self, episode: RecordedEpisode) -> int | None:
+    def cause(self, episode: RecordedEpisode) -> Hashable | None:
         """Return the key of the innermost node of this thread in an episode; None without one."""
         for each in reversed(self.thread.nodes):  # a generator would take twice as long
             if each.key is not None and each.episode is episode:

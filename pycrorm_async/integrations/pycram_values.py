@@ -56,6 +56,7 @@ class PyCRAMValues:
         self.pycram: PyCRAM = SimpleNamespace(**{name: getattr(module, name) for name, module in modules.items()})
         used = self.pycram
         self._names: dict[type, tuple[str, ...]] = {}
+        self._poses = (used.PoseStamped, used.Pose)
         self._field_types: tuple[tuple[type, ItemType], ...] = (
             (Enum, "enum"),  # before `int`, which some of PyCRAM's enums are
             (bool, "boolean"),
@@ -73,7 +74,12 @@ class PyCRAMValues:
 
     def parameters(self, designator: Any) -> dict[str, Any]:
         """Return the parameters of an action, a motion or an expression by the names of their fields."""
-        used = self.pycram
+        used, names = self.pycram, self._names_of(type(designator))
+        if names:
+            values = {name: getattr(designator, name) for name in names}
+            if isinstance(designator, used.MoveTorsoAction):
+                values["position"] = self._torso_goal(designator)
+            return _with_grasp(values)
         if isinstance(designator, used.RepeatNode):
             return {"times": designator.repeat}
         if isinstance(designator, used.MonitorNode):
@@ -84,18 +90,16 @@ class PyCRAMValues:
                 "function": _function_name(designator.function),
                 "arguments": {key: repr(each) for key, each in designator.kwargs.items()},
             }
-        if not isinstance(designator, used.ActionDescription | used.BaseMotion):
-            return {}
-        values = {name: getattr(designator, name) for name in self._names_of(type(designator))}
-        if isinstance(designator, used.MoveTorsoAction):
-            values["position"] = self._torso_goal(designator)
-        return _with_grasp(values)
+        return {}
 
     def _names_of(self, designator: type) -> tuple[str, ...]:
+        """Return the names of the parameters of a type of action or motion; none of another type."""
         names = self._names.get(designator)
         if names is None:
-            fields = (each.name for each in dataclasses.fields(designator) if each.init)
-            names = self._names[designator] = tuple(each for each in fields if not each.startswith("_"))
+            has_fields = issubclass(designator, (self.pycram.ActionDescription, self.pycram.BaseMotion))
+            fields = dataclasses.fields(designator) if has_fields else ()
+            names = tuple(each.name for each in fields if each.init and not each.name.startswith("_"))
+            self._names[designator] = names
         return names
 
     def _torso_goal(self, action: Any) -> float | None:
@@ -148,6 +152,8 @@ class PyCRAMValues:
         if type(value) in _AS_THEY_ARE or isinstance(value, Enum):
             return value
         used = self.pycram
+        if isinstance(value, self._poses):
+            return self.pose(value)
         if isinstance(value, used.Object):
             return episode.reference(self.key(value)) or ObjectValue("Object", value.name, self.object_type(value))
         if isinstance(value, used.Link):
@@ -157,8 +163,6 @@ class PyCRAMValues:
         if isinstance(value, used.ObjectDesignatorDescription):
             types = [self._type_name(each) for each in value.types or ()]
             return ObjectValue("BelieveObject", ", ".join(value.names or types), types[0] if types else None)
-        if isinstance(value, used.PoseStamped | used.Pose):
-            return self.pose(value)
         if isinstance(value, type):
             return value.__name__
         return value.tolist() if isinstance(value, np.ndarray | np.generic) else value

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import Any
 
 from pycrorm_async.events.values import SeenValue
-from pycrorm_async.integrations.pycram_episodes import PyCRAMEpisodes, RunningNode
+from pycrorm_async.integrations.pycram_episodes import Change, PyCRAMEpisodes, RunningNode
 from pycrorm_async.integrations.pycram_values import PyCRAMValues
 from pycrorm_async.integrations.seams import Seams, guarded
 
@@ -54,18 +54,21 @@ class PyCRAMWorld:
     @guarded
     def _object_moved(self, world: Any, moved: Any, pose: Any) -> None:
         if self._episodes.of(world) is not None:
-            self._episodes.thread.poses[id(moved)] = (moved, self._values.pose(pose))
+            self._change(moved).pose = self._values.pose(pose)
             self._flush_unless_moving()
 
     @guarded
     def _joint_moved(self, world: Any, joint: Any, position: float) -> None:
         if self._episodes.of(world) is not None:
-            owner, joints = joint.object, self._episodes.thread.joints
-            moved = joints.get(id(owner))
-            if moved is None:
-                joints[id(owner)] = moved = (owner, {})
-            moved[1][joint.name] = float(position)
+            self._change(joint.object).joints[joint.name] = float(position)
             self._flush_unless_moving()
+
+    def _change(self, changed: Any) -> Change:
+        changes = self._episodes.thread.changes
+        change = changes.get(id(changed))
+        if change is None:
+            changes[id(changed)] = change = Change(changed)
+        return change
 
     @guarded
     def _attached(self, parent: Any, child: Any, *_: Any, **__: Any) -> None:
@@ -99,14 +102,15 @@ class PyCRAMWorld:
     def flush(self) -> None:
         """Record what this thread has changed in the world."""
         thread = self._episodes.thread
-        if not thread.poses and not thread.joints:
+        if not thread.changes:
             return
-        poses, thread.poses, joints, thread.joints = thread.poses, {}, thread.joints, {}
-        for moved, pose in poses.values():
-            episode, key = self._episodes.of(moved.world), self._values.key(moved)
-            if episode is not None and episode.reference(key) is not None:
-                episode.object_moved(key, pose, node=self._episodes.cause(episode))
-        for moved, positions in joints.values():
-            episode, key = self._episodes.of(moved.world), self._values.key(moved)
-            if episode is not None and episode.reference(key) is not None:
-                episode.joints_moved(key, positions, node=self._episodes.cause(episode))
+        changes, thread.changes = thread.changes, {}
+        for change in changes.values():
+            episode, key = self._episodes.of(change.of.world), self._values.key(change.of)
+            if episode is None or episode.reference(key) is None:
+                continue
+            cause = self._episodes.cause(episode)
+            if change.pose is not None:
+                episode.object_moved(key, change.pose, node=cause)
+            if change.joints:
+                episode.joints_moved(key, change.joints, node=cause)
