@@ -15,6 +15,7 @@ from pycrorm_async.errors import EpisodeRefused, InternalError, SpoolClosed, Spo
 from pycrorm_async.events.envelope import Heading, Record
 from pycrorm_async.queue import RecorderQueue, Spool
 from pycrorm_async.queue.files.locks import FileLock
+from pycrorm_async.queue.files.segment import Segment
 from pycrorm_async.recording.writing.event_sink import EventSink
 from pycrorm_async.settings import Settings
 from pycrorm_async.writer.ports import Source
@@ -425,3 +426,19 @@ async def test_an_interrupt_in_the_middle_of_a_put_leaves_a_whole_queue(tmp_path
     assert [each.position for each in records] == list(range(1, len(records) + 1))
     assert [each.sequence for each in records] == list(range(1, len(records) + 1))
     assert returned + 1 <= len(records) <= returned + 1 + INTERRUPTS
+
+
+async def test_after_a_sync_as_many_bytes_are_made_writable_as_the_records_before_took(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    touched: list[tuple[int, int]] = []
+    monkeypatch.setattr(Segment, "touch", lambda _segment, start, end: touched.append((start, end)))
+    queue = make(tmp_path, settings=Settings(sync_interval_ms=3_600_000))
+    queue.put_nowait(started(), b"{}")
+    await queue.synced_to()
+    before = queue.bytes_spooled
+    queue.put_nowait(node(), b"1" * 1_000)
+    await queue.synced_to()
+    end = queue.bytes_spooled
+    queue.release()
+    assert touched[:2] == [(before, 2 * before), (end, 2 * end - before)]

@@ -1,5 +1,8 @@
 """A segment's header is read whole or not at all, and a segment file has all its blocks before its first use."""
 
+import mmap
+import os
+import resource
 import struct
 import zlib
 from pathlib import Path
@@ -103,3 +106,30 @@ def test_files_with_other_names_are_not_segments(tmp_path: Path) -> None:
     ):
         (tmp_path / name).touch()
     assert segment_numbers(tmp_path) == [2, 100_000_001]
+
+
+def page_faults_of_writes(segment: Segment, pages: range) -> int:
+    before = resource.getrusage(resource.RUSAGE_THREAD).ru_minflt
+    for page in pages:
+        segment.buffer[page * mmap.PAGESIZE] = 1
+    return resource.getrusage(resource.RUSAGE_THREAD).ru_minflt - before
+
+
+@pytest.mark.skipif(
+    tuple(map(int, os.uname().release.split(".")[:2])) < (5, 14), reason="this kernel makes no pages writable ahead"
+)
+def test_writes_into_touched_bytes_take_no_page_fault(tmp_path: Path) -> None:
+    segment = Segment.allocate(tmp_path, number=1, size=64 * mmap.PAGESIZE)
+    segment.touch(5, 32 * mmap.PAGESIZE)
+    assert segment.buffer[:] == bytes(64 * mmap.PAGESIZE)
+    assert page_faults_of_writes(segment, range(32)) < 8
+    assert page_faults_of_writes(segment, range(32, 64)) >= 32
+    segment.close()
+
+
+def test_touching_beyond_the_end_of_a_segment_has_no_effect(tmp_path: Path) -> None:
+    segment = Segment.allocate(tmp_path, number=1, size=mmap.PAGESIZE)
+    for start, end in ((0, 2**30), (mmap.PAGESIZE - 1, 2**30), (mmap.PAGESIZE, 2**30), (0, 0)):
+        segment.touch(start, end)
+    assert segment.path.read_bytes() == bytes(mmap.PAGESIZE)
+    segment.close()

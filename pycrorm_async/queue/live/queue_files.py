@@ -231,6 +231,7 @@ class QueueFiles:
         if self._note_missing((*span.segments, committed)):
             return
         self._appender.end_sync(span)
+        self._appender.touch_ahead()
         self._safe_number = span.segments[-1].number
         self._synced = span.position
         if self._drain_status is not None:
