@@ -20,6 +20,7 @@ from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.commands import fork_child
 from tests.databases import Server, server_in_memory
+from tests.long_modules import long_modules_first
 from tests.report.browser import Browser, browser, chromium
 from tests.soak_turns import current_commit, place_of, turn_of
 
@@ -127,8 +128,19 @@ def pytest_configure() -> None:
         )  # otherwise the commands of the tests would ignore Ctrl-C too
 
 
-@pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+@pytest.hookimpl(wrapper=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> Generator[None, None, None]:
+    """Keep of the soak only the requested turn, and after the others of this hook let processes begin with long tests.
+
+    pytest-randomly shuffles before this, and pytest deselects by marks at the `yield`.
+    """
+    _select(config, items)
+    yield
+    if (own := getattr(config, "workerinput", None)) is not None:
+        items[:] = long_modules_first(items, own["workercount"])
+
+
+def _select(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Mark the variants that `soak_on` names as soak, and keep of the soak only the requested turn."""
     for item in items:
         variants = (

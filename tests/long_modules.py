@@ -1,0 +1,45 @@
+"""Begin each test process with modules whose tests take long, so that none is left alone with one at the end."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+import pytest
+
+LONGEST: Final = """
+    integrations/pycram/test_plans crash/test_crash_points crash/test_stopped_daemon learning/test_experiment
+    crash/test_cancelled cli/test_learn learning/test_recorded_policy promises/test_defects_of_storage
+    crash/test_many_machines operations/test_faulty_workers crash/test_rebuild_kill projections/test_rebuild
+    promises/test_public_types operations/test_daemonic_process plan/test_base_clearance plan/test_opening_poses
+    memory/test_restored_database store/test_postgresql_faults crash/test_queue_kill crash/test_daemon_kill
+    bench/test_quick world/test_arm_ik_against_optik memory/test_base_link copying/test_copy
+""".split()
+"""The modules with a test of 5 s or more, the longest first. Most tests of a run take less than 0.1 s."""
+
+_TESTS: Final = Path(__file__).parent
+
+
+def long_modules_first(items: Sequence[pytest.Item], processes: int) -> list[pytest.Item]:
+    """Return the tests in equal shares, one for each process, that begin with a part of the long modules.
+
+    pytest-xdist gives each process a share at once, and a process that has finished its own a part of another's end.
+    """
+    modules: dict[str, list[pytest.Item]] = {}
+    for item in items:
+        modules.setdefault(_name(item.path), []).append(item)
+    long = [modules.pop(name) for name in LONGEST if name in modules]
+    rest = [item for module in modules.values() for item in module]
+    ordered: list[pytest.Item] = []
+    for share in range(processes):
+        size = (len(items) - len(ordered)) // (processes - share)
+        own = [item for module in long[share::processes] for item in module]
+        short = max(size - len(own), 0)
+        ordered += own + rest[:short]
+        del rest[:short]
+    return ordered + rest
+
+
+def _name(path: Path) -> str:
+    return path.relative_to(_TESTS).with_suffix("").as_posix() if path.is_relative_to(_TESTS) else str(path)
