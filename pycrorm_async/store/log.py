@@ -34,7 +34,7 @@ from pycrorm_async.store.digests.digest_table import RunningDigests, last_digest
 from pycrorm_async.store.digests.episode_digest import DigestRow
 from pycrorm_async.store.limits import EVENTS_MANY, events_warning, number_warning
 from pycrorm_async.store.schema import make_file, make_or_migrate, must_exist, recognise
-from pycrorm_async.store.sqlite.engine import BEGIN
+from pycrorm_async.store.sqlite.engine import BEGIN, READ
 from pycrorm_async.store.stored import (
     NOTHING_KNOWN,
     Basis,
@@ -70,7 +70,7 @@ class EventLog:
         self.engine = engine
         self.log_id = log_id
         self._process = os.getpid()
-        self._reads = engine.execution_options(**{BEGIN: "BEGIN"})
+        self._reads = engine.execution_options(**{BEGIN: READ})
         self._dialect = dialect_of(engine)
         self._file = _identity(address.path) if address.is_sqlite and writable else None
         self._write_turn = asyncio.Lock() if address.is_sqlite else None

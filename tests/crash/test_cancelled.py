@@ -185,7 +185,7 @@ async def test_an_opening_that_is_cancelled_at_any_await_leaves_no_lock_held(dat
         return was_cancelled
 
     await life()
-    await at_every_await(round_)
+    await at_every_await(round_, awaits_min=20)
     async with opened(database_url, tmp_path / "spool") as destination:
         await writer_of(kept_source(script_of(1)), destination).run()
     verify_stored_in_order(database_url, script_of(1))

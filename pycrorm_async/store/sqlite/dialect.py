@@ -62,10 +62,10 @@ class SQLite:
         """Do nothing: a writing transaction holds the write lock from its beginning."""
 
     async def find_log(self, connection: AsyncConnection, name: str) -> LogIdentity | None:
-        names = set((await connection.exec_driver_sql(tables.TABLE_NAMES)).scalars())
-        if not names:
+        tables_and_logs: Sequence[int] = (await connection.exec_driver_sql(tables.COUNT_TABLES)).one()
+        if tables_and_logs[0] == 0:
             return None
-        if "pycrorm_log" not in names:
+        if tables_and_logs[1] == 0:
             raise DatabaseForeign(f"{name} is a database of another program: it has tables but no pycrorm_log")
         return LogIdentity._make((await connection.exec_driver_sql(tables.READ_LOG)).one())
 

@@ -11,12 +11,14 @@ import asyncio
 import sqlite3
 import time
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Self, TypeVar
 
 import aiosqlite
 from sqlalchemy import URL, event
 from sqlalchemy import Connection as SyncConnection
+from sqlalchemy.engine.interfaces import IsolationLevel
 from sqlalchemy.ext.asyncio import AsyncEngine, create_async_engine
 from sqlalchemy.pool import AsyncAdaptedQueuePool, ConnectionPoolEntry
 
@@ -25,6 +27,7 @@ _T = TypeVar("_T")
 BEGIN = "sqlite_begin"
 """Execution option: the statement that begins a transaction; None sends no statement."""
 
+READ = "BEGIN"
 _WRITE = "BEGIN IMMEDIATE"
 USE_WAL = "PRAGMA journal_mode = WAL"
 """The file keeps the mode, so it is set once, outside a transaction, and never on a foreign database."""
@@ -47,13 +50,15 @@ def make_engine(path: Path, *, read_only: bool, busy_timeout_s: float) -> AsyncE
         URL.create("sqlite+aiosqlite", database=str(path)),
         async_creator=lambda: _connect(uri, busy_timeout_s),
         poolclass=_Pool,
-        execution_options={BEGIN: "BEGIN" if read_only else _WRITE},
+        execution_options={BEGIN: READ if read_only else _WRITE},
         hide_parameters=True,
     )
     event.listen(engine.sync_engine, "begin", _begin)
     event.listen(engine.sync_engine, "invalidate", _roll_back)
     if not read_only:
         event.listen(engine.sync_engine, "connect", _set_write_pragmas)
+    # SQLAlchemy would query the first connection, which has the default.
+    engine.dialect.get_default_isolation_level = _isolation_level  # type: ignore[method-assign]
     return engine
 
 
@@ -87,6 +92,10 @@ class Connection(aiosqlite.Connection):
     patience_s = 0.0
     """Bounds the wait of a writing transaction for the write lock."""
     _end: tuple[asyncio.Future[Any] | None] | None = None
+    _begins = False
+    """True between the beginning of a reading transaction and its first statement."""
+    _is_idle = True
+    """False while the thread may be running a function, also one that a cancelled task does not wait for any more."""
 
     def stop(self) -> asyncio.Future[Any] | None:
         if self._end is None:
@@ -96,10 +105,42 @@ class Connection(aiosqlite.Connection):
     def cursor(self) -> Cursor:  # type: ignore[override]
         return Cursor(self)
 
+    def begin_to_read(self) -> None:
+        """Begin a reading transaction with the next statement, because only a statement takes the snapshot."""
+        self._begins = True
+
     async def visit(self, work: Callable[[sqlite3.Connection], _T]) -> _T:
         """Run a function in the connection's thread."""
-        result: _T = await self._execute(work, self._conn)  # type: ignore[no-untyped-call]
+        begins, self._begins = self._begins, False
+        result: _T = await self._execute(partial(_begin_and, work) if begins else work, self._conn)
         return result
+
+    async def _execute(self, fn: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+        self._is_idle = False
+        try:
+            result = await super()._execute(fn, *args, **kwargs)  # type: ignore[no-untyped-call]
+        except Exception:
+            self._is_idle = True
+            raise
+        self._is_idle = True
+        return result
+
+    async def create_function(self, *args: Any, **kwargs: Any) -> None:
+        """Create a function without a visit: SQLAlchemy does so before the first statement."""
+        self._conn.create_function(*args, **kwargs)
+
+    async def commit(self) -> None:
+        if self._is_in_transaction():
+            await super().commit()
+
+    async def rollback(self) -> None:
+        if self._is_in_transaction():
+            await super().rollback()
+
+    def _is_in_transaction(self) -> bool:
+        """Return False if a visit would change nothing: SQLAlchemy rolls back each connection that it gets back."""
+        self._begins = False
+        return not self._is_idle or self._conn.in_transaction
 
     async def execute_in_turn(self, statements: Iterable[tuple[str, tuple[Any, ...]]]) -> None:
         """Execute statements, generated lazily, in one visit to the thread. Raises as `sqlite3` does."""
@@ -185,7 +226,7 @@ class Cursor:
             cursor.close()
 
 
-async def _connect(uri: str, busy_timeout_s: float) -> aiosqlite.Connection:
+async def _connect(uri: str, busy_timeout_s: float) -> Connection:
     opened: list[sqlite3.Connection] = []
 
     def connector() -> sqlite3.Connection:
@@ -206,7 +247,7 @@ async def _connect(uri: str, busy_timeout_s: float) -> aiosqlite.Connection:
     thread = connection._thread  # noqa: SLF001 - as SQLAlchemy does; aiosqlite has no public attribute
     thread.daemon = True
     try:
-        return await connection
+        await connection
     except BaseException:
         # The thread reports its end to this loop; if the loop were closed by then, it would print a traceback. The
         # driver drops what the thread opened after the task had been cancelled, and does not close it.
@@ -214,6 +255,7 @@ async def _connect(uri: str, busy_timeout_s: float) -> aiosqlite.Connection:
         for each in opened:
             each.close()
         raise
+    return connection
 
 
 def _wait_for_turn(connection: sqlite3.Connection, statement: str, patience_s: float) -> sqlite3.Cursor:
@@ -237,17 +279,27 @@ def _wait_for_turn(connection: sqlite3.Connection, statement: str, patience_s: f
         connection.execute(f"PRAGMA busy_timeout = {int(patience_s * 1000)}")
 
 
+def _begin_and(work: Callable[[sqlite3.Connection], _T], connection: sqlite3.Connection) -> _T:
+    connection.execute(READ)
+    return work(connection)
+
+
 def _begin(connection: SyncConnection) -> None:
     statement = connection.get_execution_options()[BEGIN]
-    if statement is not None:
+    if statement == READ:
+        driver = connection.connection.driver_connection
+        assert isinstance(driver, Connection)
+        driver.begin_to_read()
+    elif statement is not None:
         connection.exec_driver_sql(statement)
 
 
 def _set_write_pragmas(connection: Any, _record: Any) -> None:
-    cursor = connection.cursor()
-    for pragma in _WRITE_PRAGMAS:
-        cursor.execute(pragma)
-    cursor.close()
+    connection.run_async(lambda driver: driver.execute_in_turn((each, ()) for each in _WRITE_PRAGMAS))
+
+
+def _isolation_level(dbapi_conn: object) -> IsolationLevel:  # noqa: ARG001  SQLAlchemy's name
+    return "SERIALIZABLE"
 
 
 def _roll_back(connection: Any, _record: Any, _fault: BaseException | None) -> None:

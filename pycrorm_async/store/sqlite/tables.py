@@ -113,8 +113,9 @@ CREATE TABLE IF NOT EXISTS pycrorm_digest (
 )
 """Created when a log is opened for writing. Not part of the format: older programs still use the log."""
 
-TABLE_NAMES = (
-    "SELECT name FROM sqlite_master WHERE type IN ('table', 'view') AND name NOT LIKE 'sqlite\\_%' ESCAPE '\\'"
+COUNT_TABLES = (
+    "SELECT count(*), total(name = 'pycrorm_log') FROM sqlite_master"
+    " WHERE type IN ('table', 'view') AND name NOT LIKE 'sqlite\\_%' ESCAPE '\\'"
 )
 HAS_TABLE = "SELECT 1 FROM sqlite_master WHERE type = 'table' AND name = ?"
 READ_LOG = "SELECT id, format FROM pycrorm_log"
