@@ -132,9 +132,7 @@ class LogFollower:
     async def close(self) -> None:
         """Close the connections to the database."""
         log, self._log = self._log, None
-        await self.overview.close()
-        if log is not None:
-            await log.close()
+        await _close(self.overview, log)
 
     async def log(self) -> EventLog:
         """Return the open log. Raises `DatabaseUnavailable`, `DatabaseForeign`."""
@@ -143,14 +141,14 @@ class LogFollower:
             if self._log is not None and file == self._file:
                 return self._log
             opened = await EventLog.open(self.address, create=False)  # fails as long as there is none
-            if self._log is not None:
-                await self.close()
+            former, self._log, self._file = self._log, opened, file  # before a wait, which may be cancelled
+            if former is not None:
+                overview, self.overview = self.overview, LiveOverview(self.address)
                 self._feeds.clear()
                 self._growing.clear()
                 self.began, self._newest = 0, None
-                self.overview = LiveOverview(self.address)
                 self.epoch += 1
-            self._log, self._file = opened, file
+                await _close(overview, former)
             return opened
 
     def _identity(self) -> tuple[int, int] | None:
@@ -226,3 +224,11 @@ class LogFollower:
         if self.overview.listeners:
             changed = await self.overview.catch_up(log, rows.values()) or changed
         return changed
+
+
+async def _close(overview: LiveOverview, log: EventLog | None) -> None:
+    try:
+        await overview.close()
+    finally:
+        if log is not None:
+            await log.close()

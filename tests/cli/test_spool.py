@@ -10,7 +10,7 @@ from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import parse_episode_id
 from pycrorm_async.queue.sources.dead_letters import DeadLetters
 from tests.commands import Started, answer, one_line_of, pycrorm
-from tests.queue.factories import overwrite
+from tests.queue.factories import FolderWriter, overwrite, started
 
 pytestmark = pytest.mark.slow
 
@@ -135,6 +135,15 @@ def test_a_live_plans_spool_is_reported_and_not_repaired(tmp_path: Path) -> None
     assert "stop its process first" in one_line_of(damaged)
     assert refused.returncode == 3
     assert "its recorder is alive" in one_line_of(refused)
+
+
+def test_a_folder_of_a_newer_format_is_named_and_exits_with_3(tmp_path: Path) -> None:
+    author = FolderWriter(tmp_path / "spool")
+    author.put(started())
+    overwrite(author.segments[0], 8, b"\x02")
+    done = pycrorm("spool", "inspect", tmp_path / "spool", cwd=tmp_path)
+    assert done.returncode == 3
+    assert "is in format 2 of a newer program; this one reads format 1" in one_line_of(done)
 
 
 @pytest.mark.parametrize("verb", ["inspect", "repair"])

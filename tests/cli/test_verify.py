@@ -4,16 +4,22 @@ from __future__ import annotations
 
 import asyncio
 import sqlite3
+from collections.abc import Sequence
 from pathlib import Path
 from urllib.parse import urlsplit
 
 import pytest
+from sqlalchemy import BigInteger, column, select, table
 
+from pycrorm_async.events.envelope import Record
+from pycrorm_async.projections.projector import Projector
+from pycrorm_async.projections.schema.user_views import UserView
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.postgresql.roles import GRANTS
 from tests.commands import answer, one_line_of, pycrorm
 from tests.databases import Server, ask, ask_to_change, change_each
+from tests.projections.event_script import declarations, declared
 from tests.projections.verify_cases import fold_in_batches, full, opened, visible_tables
 from tests.store.factories import declaration
 
@@ -97,6 +103,41 @@ def test_of_many_findings_the_first_are_shown_and_all_are_counted(folder: Path) 
     assert lines[20] == f"and {count - 20} more"
     document = answer("verify", cwd=folder, code=1)
     assert (document["drift"], len(document["differences"])) == (count, min(count, 100))
+
+
+async def test_a_type_without_tables_exits_with_1(folder: Path) -> None:
+    url = f"sqlite:///{folder}/pycrorm.db"
+    ask_to_change(url, "CREATE TABLE walk_action (mine TEXT)")
+    log = await opened(url)
+    await fold_records(log, [*declarations(declared("WalkAction", "walk_action")), *full(4).records])
+    await log.close()
+    done = pycrorm("verify", cwd=folder)
+    assert (done.returncode, done.stderr) == (1, "")
+    assert done.stdout.startswith("no tables: 'WalkAction': ")
+    assert done.stdout.endswith("0 episodes are stopped, 1 types have no tables, no other problem\n")
+
+
+async def test_a_view_that_is_left_out_exits_with_1(folder: Path) -> None:
+    url = f"sqlite:///{folder}/pycrorm.db"
+    log = await opened(url)
+    ask_to_change(url, "CREATE TABLE plans (process_metadata_id BIGINT)")
+    plans = table("plans", column("process_metadata_id", BigInteger()))
+    view = UserView("planned", select(plans.c.process_metadata_id), materialised=True)
+    await Projector(log, views=[view]).open()
+    ask_to_change(url, "DROP TABLE plans")
+    await fold_records(log, full(4).records)
+    await log.close()
+    done = pycrorm("verify", cwd=folder)
+    assert (done.returncode, done.stderr) == (1, "")
+    assert done.stdout.startswith("no view: planned: ")
+    assert " 1 views are left out, no other problem\n" in done.stdout
+
+
+async def fold_records(log: EventLog, records: Sequence[Record]) -> None:
+    projector = Projector(log)
+    await projector.open()
+    await log.append(records)
+    await projector.catch_up()
 
 
 def test_an_impossible_verification_is_one_line(folder: Path) -> None:

@@ -4,7 +4,7 @@ import asyncio
 import shutil
 import sqlite3
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager, closing
+from contextlib import asynccontextmanager, closing, suppress
 from pathlib import Path
 
 import msgspec
@@ -13,6 +13,7 @@ import pytest
 from pycrorm_async.errors import UnknownEpisode
 from pycrorm_async.live import follower as following
 from pycrorm_async.live.follower import LogFollower
+from pycrorm_async.live.overview import LiveOverview
 from pycrorm_async.live.server import LiveServer, listen
 from pycrorm_async.memory import Memory
 from pycrorm_async.query.reading import Reading
@@ -38,6 +39,14 @@ async def until(holds: Callable[[], bool]) -> None:
     async with asyncio.timeout(20):
         while not holds():  # noqa: ASYNC110  the follower has no event for its listeners
             await asyncio.sleep(0.05)
+
+
+def open_files() -> list[str]:
+    paths = []
+    for each in Path("/proc/self/fd").iterdir():
+        with suppress(FileNotFoundError):  # the descriptor of this listing
+            paths.append(str(each.readlink()))
+    return paths
 
 
 def url_of(folder: Path) -> str:
@@ -97,6 +106,33 @@ async def test_a_replaced_database_begins_a_new_epoch(tmp_path: Path) -> None:
                     await follower.changed_since(turn, 1)
         assert (await follower.feed("1")).id != feed.id
         assert follower.fault is None
+
+
+async def test_one_that_is_cancelled_while_it_replaces_its_database_leaves_no_file_open(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with robot_in(tmp_path):
+        pass
+    follower = LogFollower(DatabaseAddress.parse(url_of(tmp_path)))
+    await follower.log()
+    for each in tmp_path.glob("pycrorm.db*"):
+        shutil.rmtree(each) if each.is_dir() else each.unlink()
+    with robot_in(tmp_path, "another"):
+        pass
+    closes = asyncio.Event()
+
+    async def close_without_end(_: LiveOverview) -> None:
+        closes.set()
+        await asyncio.Event().wait()
+
+    with monkeypatch.context() as slow:
+        slow.setattr(LiveOverview, "close", close_without_end)
+        replacing = asyncio.create_task(follower.log())
+        await closes.wait()
+        replacing.cancel()
+        await asyncio.wait([replacing])
+    await follower.close()
+    assert [each for each in open_files() if each.startswith(str(tmp_path / "pycrorm.db"))] == []
 
 
 async def test_a_database_that_is_missing_is_a_fault_until_it_exists(tmp_path: Path) -> None:
