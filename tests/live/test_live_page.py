@@ -100,7 +100,7 @@ def test_a_page_says_that_its_server_died_and_continues_when_it_is_back(
             page.wait_for("pycrormPage.episode.nodes.length === 3")
             assert page.ask("untouched")
             assert page.ask("pycrormPage.episode.nodes.map((each) => each.status)") == ["RUNNING", "FAILED", "RUNNING"]
-            assert page.ask("document.querySelector('.row.lit.is-running .name').textContent") == "plan"
+            assert page.ask("document.querySelector('.row.lit.is-running .name').textContent") == "root"
             page.ask("pycrormPage.panels.open('details')")
             assert "so far" in page.ask("document.querySelector('.panel').textContent")
             assert page.ask("pycrormPage.bodies.of(pycrormPage.episode.objects[0]).group.position.x") == 0.5
