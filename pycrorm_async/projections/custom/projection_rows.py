@@ -136,10 +136,10 @@ class CustomRows(ProjectedBatch):
         for name in values:
             if name not in columns or name in OF_EVERY_TABLE:
                 raise CannotFold(f"{table} has no column {name!r} to fill")
-        return {name: _value(f"{table}.{name}", columns[name], each) for name, each in values.items()}
+        return {name: _value(table, name, columns[name], each) for name, each in values.items()}
 
 
-def _value(place: str, storage: Storage, value: Any) -> Any:
+def _value(table: str, name: str, storage: Storage, value: Any) -> Any:
     """Return the value as the column stores it. Raises `CannotFold` where SQLite would accept it and change it."""
     if value is None:
         return None
@@ -148,7 +148,7 @@ def _value(place: str, storage: Storage, value: Any) -> Any:
             try:
                 return json_text(value)
             except (TypeError, ValueError) as error:
-                raise CannotFold(f"{place}: {error}") from None
+                raise CannotFold(f"{table}.{name}: {error}") from None
         case "text":
             fits = isinstance(value, str)
         case "boolean":
@@ -158,10 +158,10 @@ def _value(place: str, storage: Storage, value: Any) -> Any:
         case _:
             fits = isinstance(value, int) and not isinstance(value, bool) and abs(value) <= _INTEGER_MAX
     if not fits:
-        raise CannotFold(f"{place}: {repr(value)[:80]} is not of the declared type {storage}")
+        raise CannotFold(f"{table}.{name}: {repr(value)[:80]} is not of the declared type {storage}")
     if storage == "real":
         value = float(value)
     fault = unwritable(value)
     if fault is not None:
-        raise CannotFold(f"{place}: {fault}")
+        raise CannotFold(f"{table}.{name}: {fault}")
     return value

@@ -1,11 +1,11 @@
 """Fold batches of events into a generation, writing rows and checkpoints in one transaction.
 
-Theory of operation. A batch has two phases. `prepare` reads the events and the declarations and folds them into rows in
-memory; it holds no lock and writes nothing. `write` opens a transaction, locks the generation's row, compares number
-and revision of the generation and the checkpoint of each episode with those that `prepare` assumed, and only then
-writes rows and checkpoints. If anything differs, because another process folded the same events or changed the tables,
-it rolls back and returns 0, and the caller reads the events again. So any number of processes may fold one memory:
-every event is folded exactly once, and rows and checkpoints never disagree.
+Theory of operation. A batch has two phases. `prepare` reads the declarations and then the events, a page at a time, and
+folds them into rows in memory; it holds no lock and writes nothing. `write` opens a transaction, locks the generation's
+row, compares number and revision of the generation and the checkpoint of each episode with those that `prepare`
+assumed, and only then writes rows and checkpoints. If anything differs, because another process folded the same events
+or changed the tables, it rolls back and returns 0, and the caller reads the events again. So any number of processes
+may fold one memory: every event is folded exactly once, and rows and checkpoints never disagree.
 
 A declaration that the generation has no tables for makes the write transaction exclusive and grows the tables first
 (`growth`). If the database creates only some of them, the growth is committed, the batch is not, and it is folded
