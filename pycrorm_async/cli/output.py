@@ -11,6 +11,7 @@ from datetime import datetime
 from typing import Any
 
 import msgspec
+from rich.cells import cell_len
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -19,6 +20,11 @@ from pycrorm_async.progress_bar import stderr
 
 _WIDTH_PIPED = 160
 """Width of tables in characters if stdout is not a terminal; wide enough to keep most rows on one line."""
+
+_WORD_MAX = 24
+"""Bounds the longest word of a column for which a table needs room: ids and paths may be broken."""
+_READABLE = 0.75
+"""A table has at least this part of the width that its words need; with less, most words are broken."""
 
 stdout = Console(highlight=False, width=None if sys.stdout and sys.stdout.isatty() else _WIDTH_PIPED)
 
@@ -60,9 +66,13 @@ def print_json(document: Any) -> None:
 
 
 def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    """Print a table; columns of numbers are right-aligned."""
+    """Print a table; columns of numbers are right-aligned. In a narrow terminal print blocks."""
     rows = [tuple(row) for row in rows]
     stdout.print(f"[bold]{escape(title)}[/]")  # not the title of the table, which is wrapped to the table's width
+    if stdout.width < _READABLE * _width_of_words(columns, rows):
+        for row in rows:
+            _print_block(columns, row)
+        return
     table = Table(header_style="bold")
     for index, name in enumerate(columns):
         numeric = bool(rows) and all(isinstance(row[index], int | float) for row in rows)
@@ -70,6 +80,22 @@ def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[obje
     for row in rows:
         table.add_row(*(_cell(value) for value in row))
     stdout.print(table)
+
+
+def _width_of_words(columns: Sequence[str], rows: Sequence[Sequence[object]]) -> int:
+    """Return the width of a table whose columns have room for their longest words."""
+    return 1 + sum(
+        3 + min(_WORD_MAX, max(cell_len(word) for value in (name, *cells) for word in _cell(value).split() or [""]))
+        for name, *cells in zip(columns, *rows, strict=True)
+    )
+
+
+def _print_block(columns: Sequence[str], row: Sequence[object]) -> None:
+    """Print a row as a line for each value that is not empty, and an empty line."""
+    for name, value in zip(columns, row, strict=True):
+        if value not in (None, ""):
+            stdout.print(f"  [dim]{name:<{max(map(len, columns))}}[/] {_cell(value)}", soft_wrap=True)
+    stdout.print()
 
 
 def print_line(text: object) -> None:

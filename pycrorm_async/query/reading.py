@@ -42,7 +42,7 @@ from pycrorm_async.query.sessions.episode_session import EpisodeSession
 from pycrorm_async.query.sessions.load_on_access import LoadOnAccess
 from pycrorm_async.query.snapshot import Moment
 from pycrorm_async.query.sql.read_only import DEFAULT_LIMITS, ReadOnlySql, SqlLimits, SqlResult, SqlRows
-from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.address import DatabaseAddress, no_tables
 from pycrorm_async.store.log import EventLog
 
 if TYPE_CHECKING:
@@ -387,5 +387,5 @@ async def _generation(log: EventLog) -> Generation:
         async with log.engine.connect() as connection:
             generation = await current_generation(connection)
     if generation is None:
-        raise DatabaseUnavailable(f"{log.address} has a log but no tables yet: run `pycrorm writer --once`")
+        raise DatabaseUnavailable(no_tables(log.address))
     return generation

@@ -156,3 +156,8 @@ def _sqlite_path(url: URL) -> Path | None:
     if url.database in ("", ":memory:") or url.database.startswith("file:"):
         raise UnknownUrl(f"{url.database!r} is not a path; {_VALID_URLS}")
     return Path(url.database).absolute()
+
+
+def no_tables(address: DatabaseAddress) -> str:
+    """Return the reason why a log without tables cannot be read, with the command that makes them."""
+    return f"{address} has a log but no tables yet: run `pycrorm writer --once --url {address.to_type}`"

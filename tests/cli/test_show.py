@@ -68,6 +68,21 @@ def test_the_list_of_episodes_names_their_robots_on_a_terminal_wide_enough(
     assert (("robots" in printed), ("pr2" in printed)) == (robots, robots)
 
 
+def test_a_table_that_would_break_words_is_a_block_for_each_row(
+    ridden: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    url = f"sqlite:///{ridden / 'pycrorm.db'}"
+    monkeypatch.setattr(stdout, "width", 40)
+    episodes(url)
+    lines = capsys.readouterr().out.splitlines()
+    assert "  episode     1" in lines
+    assert lines[-2].startswith("  description Take the milk")
+    assert "┃" not in "".join(lines)
+    monkeypatch.setattr(stdout, "width", 80)
+    episodes(url)
+    assert "┃ episode ┃" in capsys.readouterr().out
+
+
 def after_a_ride(place: Path, plan: str, code: int) -> Path:
     (place / "ride.py").write_text(PLANS)
     done = pycrorm("run", f"ride.py:{plan}", cwd=place)

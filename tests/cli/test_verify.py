@@ -162,7 +162,7 @@ def test_a_log_without_tables_and_a_database_without_a_memory_are_one_line_each(
     other.commit()
     other.close()
     for name, reason in (
-        ("bare", "has no tables yet: run `pycrorm writer --once`"),
+        ("bare", "bare.db has a log but no tables yet: run `pycrorm writer --once --url sqlite:///bare.db`"),
         ("other", "is a database of another program"),
         ("none", "does not exist"),
     ):

@@ -162,7 +162,7 @@ async def test_a_memory_that_is_missing_or_has_no_tables_is_unavailable(log: Eve
     with pytest.raises(DatabaseUnavailable):
         async with Reading.open(f"sqlite:///{tmp_path}/nothing.db"):
             pass
-    with pytest.raises(DatabaseUnavailable, match="has a log but no tables yet: run `pycrorm writer --once`"):
+    with pytest.raises(DatabaseUnavailable, match="has a log but no tables yet: run `pycrorm writer --once --url "):
         async with Reading.open_address(log.address):
             pass
 

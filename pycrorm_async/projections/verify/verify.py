@@ -35,6 +35,7 @@ from pycrorm_async.projections.verify.findings import StoppedEpisode, VerifyResu
 from pycrorm_async.projections.verify.parts import EpisodeRange, Place, Unreadable
 from pycrorm_async.projections.verify.row_comparison import Comparison, Range
 from pycrorm_async.projections.verify.verify_custom import check_of, uncompared_projections
+from pycrorm_async.store.address import no_tables
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import EpisodeRow, Span, StoredEvent
@@ -200,7 +201,7 @@ class _TablesCheck:
     async def comparison(self, connection: AsyncConnection) -> Comparison:
         generation = await current_generation(connection)
         if generation is None:
-            raise DatabaseUnavailable(f"{self._log.address} has no tables yet: run `pycrorm writer --once`")
+            raise DatabaseUnavailable(no_tables(self._log.address))
         if self._comparison is None or self._comparison.generation != generation:
             self._comparison = Comparison(generation, self._dialect.stored_column)
         return self._comparison

@@ -20,6 +20,7 @@ from pycrorm_async.orm.documentation.descriptions import ViewDescription, descri
 from pycrorm_async.projections.schema.generations import current_generation
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.suggestions import nearest
+from pycrorm_async.store.address import no_tables
 
 CORE_VIEWS = (
     "process_metadata",
@@ -78,7 +79,7 @@ async def read_schema(reading: Reading, names: Sequence[str] = ()) -> list[View]
             generation = await current_generation(connection)
             columns = await connection.run_sync(_columns)
     if generation is None:
-        raise DatabaseUnavailable(f"{log.address} has no tables yet: run `pycrorm writer --once`")
+        raise DatabaseUnavailable(no_tables(log.address))
     present = sorted(generation.views.keys() & columns.keys())
     for name in names:
         if name not in present:
