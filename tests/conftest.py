@@ -130,7 +130,7 @@ def pytest_configure() -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> Generator[None, None, None]:
-    """Keep of the soak only the requested turn, and after the others of this hook let processes begin with long tests.
+    """Keep of the soak only the requested turn, and after the others of this hook run long tests early.
 
     pytest-randomly shuffles before this, and pytest deselects by marks at the `yield`.
     """

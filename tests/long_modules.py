@@ -1,8 +1,12 @@
-"""Begin each test process with modules whose tests take long, so that none is left alone with one at the end."""
+"""Run modules whose tests take long in the first half of each test process, so that none is left with one at the end.
+
+They are not run one after the other, because many of their tests wait: processes that all wait leave the cores idle.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import islice
 from pathlib import Path
 from typing import Final
 
@@ -22,23 +26,24 @@ _TESTS: Final = Path(__file__).parent
 
 
 def long_modules_first(items: Sequence[pytest.Item], processes: int) -> list[pytest.Item]:
-    """Return the tests in equal shares, one for each process, that begin with a part of the long modules.
+    """Return the tests in equal shares, one for each process, with the long modules among the first half of each.
 
-    pytest-xdist gives each process a share at once, and a process that has finished its own a part of another's end.
+    pytest-xdist gives each process a share at once, and a process that has finished its own the end of another's.
     """
     modules: dict[str, list[pytest.Item]] = {}
     for item in items:
         modules.setdefault(_name(item.path), []).append(item)
     long = [modules.pop(name) for name in LONGEST if name in modules]
-    rest = [item for module in modules.values() for item in module]
+    rest = iter([item for module in modules.values() for item in module])
     ordered: list[pytest.Item] = []
     for share in range(processes):
-        size = (len(items) - len(ordered)) // (processes - share)
-        own = [item for module in long[share::processes] for item in module]
-        short = max(size - len(own), 0)
-        ordered += own + rest[:short]
-        del rest[:short]
-    return ordered + rest
+        start, own = len(ordered), long[share::processes]
+        size = (len(items) - start) // (processes - share)
+        between = max(size - sum(map(len, own)), 0) // max(2 * len(own), 1)
+        for module in own:
+            ordered += [*module, *islice(rest, between)]
+        ordered += islice(rest, max(start + size - len(ordered), 0))
+    return [*ordered, *rest]
 
 
 def _name(path: Path) -> str:

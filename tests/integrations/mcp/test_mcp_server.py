@@ -59,6 +59,14 @@ async def agent_of(url: str) -> AsyncIterator[Agent]:
         yield Agent(client)
 
 
+@asynccontextmanager
+async def agent_in_process(url: str) -> AsyncIterator[Agent]:
+    """Return an agent of a server in this process, because importing takes one of its own two seconds."""
+    with DatabaseAddress.parse(url).located() as address:
+        async with Client(memory_server(address)) as client:
+            yield Agent(client)
+
+
 @pytest.fixture(scope="module")
 def url(module_database_url: str) -> str:
     """The URL of a memory with two episodes; on PostgreSQL of a login that can only read."""
@@ -102,7 +110,7 @@ async def test_an_agent_asks_with_every_tool(url: str) -> None:
 
 
 async def test_a_wrong_call_is_an_error_of_the_tool_in_one_line(url: str) -> None:
-    async with agent_of(url) as agent:
+    async with agent_in_process(url) as agent:
         assert await agent.refused("show", episode=99) == (
             "there is no episode '99' (`pycrorm episodes` lists the 2 there are)"
         )
@@ -130,10 +138,7 @@ async def test_every_answer_is_bounded_however_long_the_recorded_texts_are(tmp_p
                 for node in reversed(range(40)):
                     recorded.end(node, "FAILED", long)
         memory.flush()
-    with DatabaseAddress.parse(url).located() as address:
-        server = memory_server(address)
-    async with Client(server) as client:
-        agent = Agent(client)
+    async with agent_in_process(url) as agent:
         calls: list[tuple[str, dict[str, Any]]] = [
             ("episodes", {"limit": 200}), ("show", {"nodes": 300}), ("why_failed", {"limit": 100}),
             ("at", {"when": "e40"}), ("compare", {"first": 1, "second": 2, "limit": 300}),
