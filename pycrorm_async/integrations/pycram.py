@@ -187,9 +187,9 @@ class _PyCRAMPlans:
             dtype = type_.__name__.removesuffix("Node")
             declared = self._types[type_] = self.seams.recording.type(node.kind, dtype, fields, bases=bases)
         episode = node.episode
-        # The pose of an action is asked of the world, which physics may have changed; a motion follows at once.
-        is_fresh = node.kind == "action" or episode is not self._episodes.real
-        robot = self._values.robot(episode) if is_fresh else self._values.robot_key()
+        # Asking Bullet for pose and torso takes as long as recording the event, so it is done where they may differ.
+        is_recorded = episode is self._episodes.real and (self._world.is_followed or node.kind == "motion")
+        robot = self._values.robot_key() if is_recorded else self._values.robot(episode)
         episode.wait_for_room()
         cause = self._episodes.cause(episode)
         node.key = episode.start(next(self._keys), declared, values, parent=cause, robot=robot)

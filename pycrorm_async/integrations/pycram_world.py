@@ -16,12 +16,17 @@ from pycrorm_async.integrations.seams import Seams, guarded
 
 
 class PyCRAMWorld:
-    """Observes the worlds of this process."""
+    """Observes the worlds of this process.
+
+    Attributes:
+        is_followed: whether all that has moved was seen; False once physics or a restored state may have moved more.
+    """
 
     def __init__(self, seams: Seams, values: PyCRAMValues, episodes: PyCRAMEpisodes) -> None:
         self.seams = seams
         self._values = values
         self._episodes = episodes
+        self.is_followed = True
 
     def connect(self) -> None:
         """Add the seams."""
@@ -30,6 +35,8 @@ class PyCRAMWorld:
         self.seams.around(used.World, "remove_object", self._remove_object)
         self.seams.after(used.BulletWorld, "reset_object_base_pose", self._object_moved)
         self.seams.after(used.BulletWorld, "_reset_joint_position", self._joint_moved)
+        for unseen in ("step", "set_realtime", "restore_physics_simulator_state"):
+            self.seams.after(used.BulletWorld, unseen, self._moved_unseen)
         self.seams.after(used.Object, "attach", self._attached)
         self.seams.after(used.Object, "detach", self._detached)
 
@@ -69,6 +76,10 @@ class PyCRAMWorld:
         if change is None:
             changes[id(changed)] = change = Change(changed)
         return change
+
+    @guarded
+    def _moved_unseen(self, *_: Any, **__: Any) -> None:
+        self.is_followed = False
 
     @guarded
     def _attached(self, parent: Any, child: Any, *_: Any, **__: Any) -> None:

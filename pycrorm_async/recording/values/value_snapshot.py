@@ -171,7 +171,7 @@ def _encode_member(value: Any, enum: type[Enum] | None, references: References) 
         return _encode_text(value, None, references)  # the name of a member of another executive's enum
     if enum is not None and not isinstance(value, enum):
         raise UnrecordableValue(f"{clean_repr(value)} is not a member of {enum.__name__}")
-    name = value.name
+    name = value._name_ if isinstance(value, Enum) else value.name  # `Enum.name` takes ten times as long
     if not isinstance(name, str):
         raise UnrecordableValue(f"{clean_repr(value)} is not a named member of {type(value).__name__}")
     writable: str = _require_writable(name)

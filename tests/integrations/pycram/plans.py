@@ -24,6 +24,7 @@ _WORLDS = start_pycram(FOLDER / "home")
 
 from pycram.datastructures.enums import (  # noqa: E402  the resources must be there before
     Arms,
+    DetectionTechnique,
     Grasp,
     GripperState,
     TorsoState,
@@ -32,6 +33,7 @@ from pycram.datastructures.pose import GraspDescription, PoseStamped  # noqa: E4
 from pycram.datastructures.world import UseProspectionWorld, World  # noqa: E402
 from pycram.designator import ActionDescription  # noqa: E402
 from pycram.designators.action_designator import (  # noqa: E402
+    DetectActionDescription,
     MoveAndPickUpActionDescription,
     MoveTorsoActionDescription,
     NavigateActionDescription,
@@ -337,6 +339,30 @@ def world_inside() -> Facts:
     return {}
 
 
+def restored_state() -> Facts:
+    """Restore a state of Bullet after a drive, which moves the robot and its torso back without PyCRAM's methods."""
+    World.robot.set_pose(pose(0, 0))
+    with remember(url("restored_state"), description="Back again"):
+        MoveTorsoActionDescription(TorsoState.LOW).perform()
+        state = World.current_world.save_physics_simulator_state()
+        MoveTorsoActionDescription(TorsoState.HIGH).perform()
+        NavigateActionDescription(pose(0.2, 0.3), True).perform()
+        SetGripperActionDescription(Arms.LEFT, GripperState.OPEN).perform()
+        World.current_world.restore_physics_simulator_state(state)
+        SetGripperActionDescription(Arms.LEFT, GripperState.CLOSE).perform()
+    return {}
+
+
+def held_and_seen() -> Facts:
+    """Begin with the milk in the gripper, and detect it."""
+    carton = milk()
+    World.robot.attach(carton, "l_gripper_tool_frame")
+    with remember(url("held_and_seen"), description="Held and seen"):
+        DetectActionDescription(DetectionTechnique.ALL).perform()
+    World.robot.detach(carton)
+    return {}
+
+
 def seams() -> list[str]:
     """Return the methods and callbacks of PyCRAM that are not its own."""
     from pycram import designator, language, plan
@@ -379,6 +405,8 @@ PLANS: tuple[Callable[[], Facts], ...] = (
     top_grasp,
     others,
     refusals,
+    restored_state,
+    held_and_seen,
     world_inside,
     pick_and_place,  # last: PyCRAM's own database changes its classes
 )

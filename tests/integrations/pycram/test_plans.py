@@ -341,6 +341,7 @@ def test_every_expression_of_the_language_is_a_node_with_its_outcome(run: Run) -
               MoveGripperMotion SUCCEEDED
     """)
     assert run.rows("language", "SELECT times FROM repeat") == [(2,)]
+    assert run.rows("language", "SELECT condition, interval_s FROM monitor") == [("language.<locals>.<lambda>", 0.1)]
     assert (
         run.rows("language", "SELECT function, result FROM code JOIN task_tree_node ON action_id = code.id")
         == [("language.<locals>.doubled", "2")] * 2
@@ -394,6 +395,27 @@ def test_a_world_made_inside_the_block_is_seen_from_its_first_object_to_its_end(
         "SELECT name FROM object_removal JOIN object ON object.id = object_id ORDER BY object_removal.id",
     )
     assert removed == [("milk",), ("floor",), ("pr2",)]
+
+
+def test_what_moves_without_pycrams_methods_is_asked_of_the_world_at_the_next_action(run: Run) -> None:
+    states = run.rows(
+        "restored_state",
+        "SELECT round(position.x, 6), round(position.y, 6), round(node.torso_height, 6) FROM task_tree_node AS node"
+        " JOIN pose ON pose.id = node.robot_pose_id JOIN position ON position.id = pose.position_id"
+        " WHERE node.dtype = 'SetGripperAction' ORDER BY node.id",
+    )
+    assert states == [(0.2, 0.3, 0.3), (0.0, 0.0, 0.0)]
+
+
+def test_what_the_robot_holds_at_the_beginning_and_what_it_detects_are_recorded(run: Run) -> None:
+    assert run.rows("held_and_seen", "SELECT kind, link, node_id FROM attachment") == [
+        ("attached", "l_gripper_tool_frame", None)
+    ]
+    assert run.rows(
+        "held_and_seen",
+        "SELECT node.dtype, detection.name, obj_type, object_id IS NOT NULL FROM detection"
+        " JOIN task_tree_node AS node ON node.id = node_id",
+    ) == [("DetectingMotion", "milk", "MILK", 1)]
 
 
 def start_endless(folder: Path, writer: str = "thread") -> subprocess.Popen[str]:
