@@ -23,6 +23,7 @@ from pycrorm_async.operations.fold_requests import Assignment
 from pycrorm_async.operations.rebuild import rebuild_memory
 from pycrorm_async.orm import Action, PickUpAction, TaskTreeNode
 from pycrorm_async.projections import rebuild as steps
+from pycrorm_async.projections import replaced_tables
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.rebuild import Rebuild, claimed
 from pycrorm_async.projections.run.batch_fold import _fold_all
@@ -422,6 +423,13 @@ async def test_an_event_missing_from_the_log_is_damage_and_ends_the_rebuild(tmp_
 # --- PostgreSQL alone -------------------------------------------------------------------------------------------------
 
 
+@pytest.fixture
+def few_attempts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let a rebuild leave tables in use after two attempts to drop them, instead of seven in 6 s."""
+    monkeypatch.setattr(replaced_tables, "_DROP_PAUSES_S", (0.0, 0.1))
+
+
+@pytest.mark.usefixtures("few_attempts")
 async def test_a_reader_in_a_transaction_continues_and_the_next_rebuild_drops_its_tables(server: Server) -> None:
     url = server.new_database()
     await append_and_fold(url, [*TYPES, *picking(1).records])
@@ -438,6 +446,7 @@ async def test_a_reader_in_a_transaction_continues_and_the_next_rebuild_drops_it
     assert traces(url) == []
 
 
+@pytest.mark.usefixtures("few_attempts")
 async def test_a_foreign_view_on_the_tables_keeps_them_and_is_reported(server: Server) -> None:
     url = server.new_database()
     await append_and_fold(url, [*TYPES, *picking(1).records])
