@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import multiprocessing
 import os
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from contextlib import suppress
@@ -162,6 +163,9 @@ async def _fold(
         done += count
         report_progress("rebuilding", done, max(total, done))
 
+    if workers > 1 and multiprocessing.current_process().daemon:
+        _log.warning("a daemonic process of multiprocessing cannot start fold workers; it folds without them")
+        workers = 1
     if workers > 1:
         assignment = Assignment(url, log.log_id, busy_timeout_s=_busy_timeout_s(log.address))
         await _run_workers(assignment, workers, report)

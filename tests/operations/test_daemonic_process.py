@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 import multiprocessing
 from pathlib import Path
 
@@ -16,7 +17,8 @@ from tests.table_comparison import differences, tables_of
 pytestmark = pytest.mark.slow
 
 
-def rebuild_with_two_workers(url: str) -> None:
+def rebuild_with_two_workers(url: str, output: str) -> None:
+    logging.basicConfig(filename=output, format="%(message)s", level="WARNING")
     asyncio.run(rebuild_memory(url, workers=2))
 
 
@@ -24,8 +26,12 @@ def test_a_rebuild_in_a_daemonic_process_folds_without_workers(tmp_path: Path) -
     url = f"sqlite:///{tmp_path}/memory.db"
     asyncio.run(append_and_fold(url, [*TYPES, *picking(1).records]))
     before = tables_of(url)
-    process = multiprocessing.get_context("spawn").Process(target=rebuild_with_two_workers, args=(url,), daemon=True)
+    arguments = (url, f"{tmp_path}/log")
+    process = multiprocessing.get_context("spawn").Process(target=rebuild_with_two_workers, args=arguments, daemon=True)
     process.start()
     process.join(120)
     assert process.exitcode == 0
     assert differences(before, tables_of(url)) == []
+    assert (tmp_path / "log").read_text() == (  # once, and without waiting to try again
+        "a daemonic process of multiprocessing cannot start fold workers; it folds without them\n"
+    )
