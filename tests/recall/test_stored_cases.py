@@ -75,12 +75,12 @@ def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.slow
 async def test_cases_do_not_depend_on_batches_restarts_processes_or_merges(
-    log: EventLog, monkeypatch: pytest.MonkeyPatch, *, in_turn: bool
+    log: EventLog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     small_blocks(monkeypatch)
     monkeypatch.setattr(batch_fold, "_PAGE_EVENTS", 11)
     random = Random(7)
-    scripts = [random_script(number, random, actions=40) for number in range(1, 60 if in_turn else 13)]
+    scripts = [random_script(number, random, actions=40) for number in range(1, 13)]
     records = [each for first in range(0, len(scripts), 4) for each in mixed(*scripts[first : first + 4])]
     await log.append(TYPES)
     projectors = [await projector_of(log, batch_events=8)]  # which makes batches of 32 for cases
