@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import sqlite3
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,6 +17,7 @@ from pycrorm_async.errors import DatabaseUnavailable
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.sqlite.errors import translate_error
 from pycrorm_async.writer.drain import Drain
 from pycrorm_async.writer.retry import Backoff
 from tests.databases import ask
@@ -64,6 +66,15 @@ def small_disk(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Small
     disk = SmallDisk(tmp_path, mounted=request.param == "mounted")
     yield disk
     disk.release()
+
+
+@pytest.mark.parametrize("code", [sqlite3.SQLITE_IOERR_SHMSIZE, sqlite3.SQLITE_IOERR_WRITE])
+def test_a_disk_without_room_for_the_files_of_sqlite_is_named_as_the_cause(code: int) -> None:
+    fault = sqlite3.OperationalError("disk I/O error")
+    fault.sqlite_errorcode = code
+    error = translate_error(fault, "sqlite:///memory.db")
+    assert isinstance(error, DatabaseUnavailable)
+    assert str(error).startswith("sqlite:///memory.db: disk I/O error: the disk may be full; SQLite needs some space")
 
 
 async def test_a_database_on_a_full_disk_is_unavailable_and_stores_everything_once_when_there_is_space(

@@ -68,7 +68,8 @@ async def test_a_wrong_password_is_refused(
 ) -> None:
     error = await refused(server.url(guarded, user="guarded", password=password), caplog)
     assert type(error) is DatabaseUnavailable
-    assert str(error).endswith('password authentication failed for user "guarded"')
+    how = "put the right password into PYCRORM_URL or ~/.pgpass"
+    assert str(error).endswith(f'password authentication failed for user "guarded": {how}')
     assert f"@/{guarded}?host={server.folder}: " in str(error)
 
 
@@ -85,7 +86,7 @@ async def test_an_unknown_login_or_one_without_permission_is_refused(
 async def test_a_missing_database_is_refused(server: Server, create: bool, caplog: pytest.LogCaptureFixture) -> None:
     error = await refused(server.url("nothing", password="s3cr"), caplog, create=create)
     assert type(error) is DatabaseUnavailable
-    assert str(error).endswith('database "nothing" does not exist')
+    assert str(error).endswith('database "nothing" does not exist: create it with `createdb`, or correct the URL')
 
 
 @pytest.mark.parametrize(

@@ -120,6 +120,13 @@ def _code(fault: BaseException) -> str:
     return getattr(fault, "sqlstate", None) or getattr(fault.__cause__, "sqlstate", None) or ""
 
 
+_HINTS = {
+    "28P01": ": put the right password into PYCRORM_URL or ~/.pgpass",
+    "3D000": ": create it with `createdb`, or correct the URL",
+}
+"""The next step by SQLSTATE."""
+
+
 def _text(fault: BaseException) -> str:
     """Return the driver's message in one line, without class names."""
     cause = fault.__cause__ if isinstance(fault.__cause__, asyncpg.PostgresError | OSError) else fault
@@ -132,4 +139,4 @@ def _text(fault: BaseException) -> str:
     message = " ".join(str(cause).split())
     if isinstance(cause, TimeoutError):
         return message or "no answer in time"
-    return message or type(cause).__name__
+    return f"{message or type(cause).__name__}{_HINTS.get(_code(fault), '')}"

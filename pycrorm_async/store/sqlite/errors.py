@@ -33,6 +33,8 @@ _READ_ONLY_FOLDER = {
     sqlite3.SQLITE_READONLY_CANTLOCK,
 }
 
+_DISK_FULL = {sqlite3.SQLITE_IOERR_SHMSIZE, sqlite3.SQLITE_IOERR_SHMMAP, sqlite3.SQLITE_IOERR_WRITE}
+
 
 def translate_error(fault: BaseException | None, database: str) -> PycrormError:
     """Return the error of this package to raise instead of the driver's."""
@@ -50,6 +52,10 @@ def translate_error(fault: BaseException | None, database: str) -> PycrormError:
         return DatabaseUnavailable(
             f"{database} cannot be opened: the file must be readable and its folder writable,"
             " because SQLite creates files beside it, also for reading"
+        )
+    if code in _DISK_FULL:
+        return DatabaseUnavailable(
+            f"{database}: {fault}: the disk may be full; SQLite needs some space beside the file, also for reading"
         )
     if primary in _UNAVAILABLE:
         return DatabaseUnavailable(f"{database}: {fault}")
