@@ -96,7 +96,7 @@ class RecordedObjects(ObjectRows[Hashable]):
     def is_at(self, key: Hashable, pose: object) -> bool:
         """Whether the last pose of an object is this one; False if there is none of this key."""
         known = self._objects.get(key)
-        return known is not None and isinstance(pose, Pose | PoseValue) and _place(known.pose) == _place(pose)
+        return known is not None and isinstance(pose, (Pose, PoseValue)) and _are_at_one_place(known.pose, pose)
 
     def add(self, key: Hashable, added: RecordedObject, node: int | None) -> int:
         """Write that an object entered the world; of a known key, its new pose and joints."""
@@ -127,7 +127,7 @@ class RecordedObjects(ObjectRows[Hashable]):
         """Write a new pose of an object, if it has changed."""
         known, reference = self._objects[key], self._references[key]
         last = known.pose
-        if _place(pose) == _place(last):
+        if _are_at_one_place(pose, last):
             return 0
         sequence = self._put(
             lambda: ObjectMoved(reference.object, known.name, known.object_type, pose, node),
@@ -163,5 +163,5 @@ class RecordedObjects(ObjectRows[Hashable]):
         return self._put_removed(key, lambda: node)
 
 
-def _place(pose: Pose | PoseValue) -> tuple[object, object, object]:
-    return pose.position, pose.orientation, pose.frame
+def _are_at_one_place(pose: Pose | PoseValue, other: Pose | PoseValue) -> bool:
+    return pose.position == other.position and pose.orientation == other.orientation and pose.frame == other.frame

@@ -43,6 +43,7 @@ from pycram.designators.action_designator import (  # noqa: E402
     SetGripperActionDescription,
 )
 from pycram.designators.motion_designator import MoveGripperMotion, MoveTCPMotion  # noqa: E402
+from pycram.designators.object_designator import BelieveObject  # noqa: E402
 from pycram.failures import PlanFailure  # noqa: E402
 from pycram.language import (  # noqa: E402
     CodePlan,
@@ -56,9 +57,10 @@ from pycram.language import (  # noqa: E402
 from pycram.plan import Plan  # noqa: E402
 from pycram.process_module import simulated_robot  # noqa: E402
 from pycram.world_concepts.world_object import Object  # noqa: E402
-from pycrap.ontologies import Milk, Robot  # noqa: E402
+from pycrap.ontologies import Cereal, Milk, Robot  # noqa: E402
 
 from pycrorm_async.integrations.pycram import remember  # noqa: E402
+from pycrorm_async.integrations.pycram_values import PyCRAMValues  # noqa: E402
 from pycrorm_async.settings import Writer  # noqa: E402
 
 leave_out_mesh_checks()
@@ -363,6 +365,23 @@ def held_and_seen() -> Facts:
     return {}
 
 
+def kinds_of_objects() -> Facts:
+    """Convert what stands for an object; its concept has another name in this package."""
+    carton = Object("cereal", Cereal, "cereal.urdf", pose=pose(0, 2, 0.5))
+    kinds = (
+        carton,
+        carton.links["cereal_link"],
+        BelieveObject(names=["milk"], types=[Milk]),
+        BelieveObject(types=[Milk]),
+    )
+    with remember(url("kinds_of_objects"), description="Kinds of objects") as episode:
+        values = [PyCRAMValues().value(each, episode) for each in kinds]
+        carton.remove()
+        values.append(PyCRAMValues().value(carton, episode))
+    names = ("dtype", "name", "object_type")
+    return {"values": [[type(each).__name__, *(getattr(each, name, None) for name in names)] for each in values]}
+
+
 def seams() -> list[str]:
     """Return the methods and callbacks of PyCRAM that are not its own."""
     from pycram import designator, language, plan
@@ -407,6 +426,7 @@ PLANS: tuple[Callable[[], Facts], ...] = (
     refusals,
     restored_state,
     held_and_seen,
+    kinds_of_objects,
     world_inside,
     pick_and_place,  # last: PyCRAM's own database changes its classes
 )

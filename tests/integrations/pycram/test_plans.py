@@ -418,6 +418,18 @@ def test_what_the_robot_holds_at_the_beginning_and_what_it_detects_are_recorded(
     ) == [("DetectingMotion", "milk", "MILK", 1)]
 
 
+def test_what_stands_for_an_object_is_recorded_as_its_row_a_part_or_a_belief(run: Run) -> None:
+    assert run.facts["kinds_of_objects"]["values"] == [
+        ["ObjectReference", None, None, None],
+        ["ObjectValue", "ObjectPart", "cereal_link", "BREAKFAST_CEREAL"],
+        ["ObjectValue", "BelieveObject", "milk", "MILK"],
+        ["ObjectValue", "BelieveObject", "MILK", "MILK"],
+        ["ObjectValue", "Object", "cereal", "BREAKFAST_CEREAL"],
+    ]
+    described = "SELECT obj_type, color, description_fingerprint IS NOT NULL FROM object WHERE name = 'cereal'"
+    assert run.rows("kinds_of_objects", described) == [("BREAKFAST_CEREAL", "[1.0,1.0,1.0,1.0]", 1)]
+
+
 def start_endless(folder: Path, writer: str = "thread") -> subprocess.Popen[str]:
     command = [str(make_environment()), *PLANS, str(folder), "endless", writer]
     return subprocess.Popen(
