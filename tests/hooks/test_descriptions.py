@@ -58,6 +58,7 @@ async def test_a_description_is_encoded_once(monkeypatch: pytest.MonkeyPatch) ->
     assert compressed == [len(box(7))]
 
 
+@pytest.mark.slow
 async def test_a_description_is_put_again_when_many_others_were_put_since() -> None:
     with recorder_case(Settings(segment_bytes=2**21)) as case, case.episode(), BulletWorld():
         Object("first", ObjectType.GENERIC_OBJECT, box(0))

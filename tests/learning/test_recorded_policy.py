@@ -18,6 +18,7 @@ from pycrorm_async.orm import BatchRolloutAction, LearnPolicyAction, ProcessMeta
 SMALL = Experiment(rollouts=600, evaluate=30, held_out=30, rounds=2)
 
 
+@pytest.mark.slow
 async def test_a_recorded_policy_is_read_back_by_its_name(database_url: str, tmp_path: Path) -> None:
     policy = default_policy()
     async with Memory.open(database_url, spool=tmp_path / "spool") as memory:

@@ -168,6 +168,7 @@ def test_a_terminal_shows_the_tree_of_an_episode_to_its_end(folder: Path) -> Non
     assert "DriveAction  target=(1.00, 2.00, 0.00)  FAILED" in done.stdout
 
 
+@pytest.mark.slow
 def test_a_pipe_gets_the_whole_tree_and_an_end_of_line(tmp_path: Path) -> None:
     with robot_in(tmp_path) as robot:
         for number in range(40):
@@ -190,6 +191,7 @@ def test_a_terminal_waits_for_the_first_episode_and_follows_it(tmp_path: Path) -
     assert "DriveAction  target=(1.00, 2.00, 0.00)  SUCCEEDED" in out
 
 
+@pytest.mark.slow
 def test_a_terminal_shows_what_each_robot_does_until_it_is_interrupted(tmp_path: Path) -> None:
     screen, terminal = os.openpty()
     with robot_in(tmp_path) as robot, os.fdopen(screen, "rb", buffering=0) as output:

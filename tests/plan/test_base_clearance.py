@@ -206,6 +206,7 @@ async def test_what_lies_on_the_base_counts_as_the_base_does(scene: Scene) -> No
     assert scene.world.save_state() == before
 
 
+@pytest.mark.slow
 def test_places_in_collision_are_refused_with_the_obstacle_and_only_where_collisions_count(scene: Scene) -> None:
     def reasons() -> set[str]:
         with Recording().listening() as recording:

@@ -106,6 +106,7 @@ async def test_within_hard_limits_an_arm_reaches_what_soft_limits_forbid(scene: 
         await stretched.perform()
 
 
+@pytest.mark.slow
 async def test_locations_are_resolved_within_the_limits_of_the_chosen_robot(scene: Scene) -> None:
     """From above at 0.6 m with the torso down: not within soft limits."""
     from_above = Pose([0, 3, 0.6], [0, 1, 0, 1])

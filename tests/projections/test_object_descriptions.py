@@ -113,6 +113,7 @@ async def test_designator_types_are_read_without_the_descriptions(filled: str) -
 
 
 @pytest.mark.soak_on("postgresql")
+@pytest.mark.slow
 async def test_a_copy_and_a_rebuild_have_the_same_descriptions(filled: str, tmp_path: Path) -> None:
     target = f"sqlite:///{tmp_path / 'copy.db'}"
     await copy_episodes(filled, target)

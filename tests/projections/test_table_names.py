@@ -29,6 +29,7 @@ async def assert_verified(url: str) -> None:
     assert result.episodes > 0
 
 
+@pytest.mark.slow
 async def test_the_tables_of_a_generation_come_last_in_a_list_of_names(tmp_path: Path) -> None:
     url = f"sqlite:///{tmp_path}/memory.db"
     await append_and_fold(url, [*TYPES, *picking(1).records])
@@ -42,6 +43,7 @@ async def test_the_tables_of_a_generation_come_last_in_a_list_of_names(tmp_path:
 
 
 @pytest.mark.empty_database
+@pytest.mark.slow
 async def test_tables_with_former_names_are_used_until_a_rebuild_replaces_them(
     database_url: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

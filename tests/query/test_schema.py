@@ -80,6 +80,7 @@ async def test_the_readme_shows_the_diagram_of_three_views(tmp_path: Path) -> No
         assert as_mermaid(await read_schema(reading, ["pick_up_action", "object", "pose"])) == shown
 
 
+@pytest.mark.slow
 def test_the_command_prints_text_json_and_a_diagram(url: str, tmp_path: Path) -> None:
     done = pycrorm("schema", "pose", "--json", "--url", url, cwd=tmp_path)
     [pose] = json.loads(done.stdout)

@@ -136,6 +136,7 @@ def found(cue: Cue, library: CaseLibrary) -> Answer:
 
 
 @pytest.mark.parametrize("first_rows", [4_096, 7])
+@pytest.mark.slow
 def test_random_cues_find_the_cases_of_brute_force_in_its_order(
     first_rows: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -50,6 +50,7 @@ async def test_a_digest_is_kept_at_the_end_of_each_block_and_of_the_episode(log:
 
 
 @pytest.mark.parametrize("size", [1, 299, 300, 301, 400])
+@pytest.mark.slow
 async def test_each_tag_behind_the_end_has_a_digest(log: EventLog, database_url: str, size: int) -> None:
     tagged = [record(episode(1), at, kind="EpisodeTagged", payload=b'{"added":["a"]}') for at in (7, 301, 302)]
     records = [*whole(episode(1), 300), *tagged[1:]]
@@ -68,6 +69,7 @@ def test_the_digest_of_three_events_stays_the_same_for_ever() -> None:
 
 
 @pytest.mark.parametrize("size", [1, pytest.param(7, marks=pytest.mark.soak), 255, 256, 257, 599])
+@pytest.mark.slow
 async def test_the_sizes_of_batches_make_no_difference(log: EventLog, database_url: str, size: int) -> None:
     records = whole(episode(1), 600)
     for start in range(0, 600, size):

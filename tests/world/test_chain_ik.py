@@ -137,6 +137,7 @@ def test_an_arm_without_a_joint_is_refused() -> None:
         ArmDescription(joints=(), tool_frame="tool_frame")
 
 
+@pytest.mark.slow
 def test_the_general_solver_reaches_what_the_closed_form_reaches() -> None:
     general = RobotDescription(
         name="pr2",
