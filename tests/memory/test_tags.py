@@ -28,6 +28,7 @@ from pycrorm_async.store.postgresql.roles import GRANTS
 from tests.commands import answer, one_line_of, pycrorm
 from tests.databases import Server, ask
 from tests.memory.note_actions import NoteActionPerformable
+from tests.projections.verify_cases import TYPES, full
 from tests.table_comparison import differences, tables_of
 
 pytestmark = pytest.mark.slow
@@ -249,6 +250,19 @@ async def test_an_unknown_episode_cannot_be_tagged(tmp_path: Path) -> None:
     async with Memory.open(f"sqlite:///{tmp_path}/memory.db") as memory:
         with pytest.raises(UnknownEpisode):
             await memory.tag("last", "good")
+
+
+async def test_an_episode_that_lacks_events_cannot_be_tagged(tmp_path: Path) -> None:
+    address = DatabaseAddress.parse(f"sqlite:///{tmp_path}/memory.db")
+    records = full(1).records
+    log = await EventLog.open(address, create=True)
+    await log.append([*TYPES, *records])
+    await log.append([records[-1]._replace(sequence=len(records) + 3)])  # the two events before it are lost
+    with pytest.raises(CallerError, match=r"episode 1 cannot be tagged, because events of it are missing: events \d+"):
+        await tag_episode(address, "1", ("good",), ())
+    [row] = await log.episodes()
+    await log.close()
+    assert row.head == len(records)
 
 
 async def test_a_recorders_role_tags_and_a_readers_role_does_not(server: Server, tmp_path: Path) -> None:

@@ -54,6 +54,8 @@ class RandomEpisode(Script):
             self._rows[name] = ObjectReference(added, added)
         runs = number % 5 == 0
         self._children(root, dice.randrange(2, 6), depth=0, open_=runs)
+        for name in [*self._rows][: dice.randrange(3)]:
+            self.put(ObjectRemoved(self._rows.pop(name), root))
         if not runs:
             self.put(NodeEnded(root, "SUCCEEDED"))
             self.put(EpisodeEnded(dice.choice(["SUCCEEDED", "FAILED"])))

@@ -111,3 +111,32 @@ async def test_a_recorder_inserts_digests_and_appends_without_them_where_it_may_
     assert await log.last_digests() == {}
     await log.close()
     assert [tuple(each) for each in ask(url, "SELECT episode, sequence FROM pycrorm.pycrorm_digest")] == [(2, 256)]
+
+
+async def test_the_roles_have_no_right_to_change_the_log_but_these(server: Server) -> None:
+    url = server.new_database()
+    await (await make_log(url)).close()
+    grant(url)
+    log_of = "relnamespace = 'pycrorm'::regnamespace AND grantee::regrole::text LIKE 'pycrorm%'"
+    tables = f"SELECT grantee::regrole::text, privilege_type, relname FROM pg_class, aclexplode(relacl) WHERE {log_of}"
+    inserted = {
+        ("INSERT", name)
+        for name in ("event", "episode", "pycrorm_declaration", "pycrorm_incarnation", "pycrorm_blob", "pycrorm_digest")
+    }
+    changes = {tuple(each) for each in ask(url, tables) if each[1] != "SELECT"}
+    assert changes == {
+        (role, *each)
+        for role in ("pycrorm_recorder", "pycrorm_folder")
+        for each in (*inserted, ("USAGE", "episode_number"))
+    }
+    columns = (
+        "SELECT grantee::regrole::text, privilege_type, relname || '.' || attname FROM pg_class"
+        f" JOIN pg_attribute ON attrelid = pg_class.oid, aclexplode(attacl) WHERE {log_of}"
+    )
+    appended = {("UPDATE", f"episode.{name}") for name in ("head", "ended_wall_ns", "refused")}
+    assert {tuple(each) for each in ask(url, columns)} == {
+        *(("pycrorm_recorder", *each) for each in appended),
+        *(("pycrorm_folder", *each) for each in appended),
+        ("pycrorm_folder", "UPDATE", "episode.folded"),
+        ("pycrorm_folder", "UPDATE", "episode.parked"),
+    }
