@@ -128,7 +128,7 @@ async def test_blocks_are_merged_as_they_grow(log: EventLog) -> None:
 async def test_cases_are_folded_at_intervals_unless_a_caller_waits_for_them(
     log: EventLog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pycrorm_async.projections.custom.projection_tables._CHECK_S", 3600.0)
+    monkeypatch.setattr("pycrorm_async.projections.custom.projection_tables._CHECK_S", 60.0)
     script = CaseScript()
     await log.append([*TYPES, *script.records])
     projector = await projector_of(log)
