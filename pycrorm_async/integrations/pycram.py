@@ -129,9 +129,8 @@ class _PyCRAMPlans:
         seams.callback(plan.add_on_end_callback, plan.remove_on_end_callback, self._node_ended)
         seams.around(plan, "perform", self._whole_plan)
         seams.around(used.ActionDescription, "perform", self._nested_action)
-        for expression in (used.SequentialNode, used.TryInOrderNode, used.RepeatNode, used.MonitorNode):
-            seams.around(expression, "perform", self._performed)
-        for expression in (used.ParallelNode, used.TryAllNode):
+        sequences = (used.SequentialNode, used.TryInOrderNode, used.RepeatNode, used.MonitorNode)
+        for expression in (*sequences, used.ParallelNode, used.TryAllNode):
             seams.around(expression, "perform", self._performed)
         seams.around(used.ParallelNode, "_lang_call", self._branch)
         seams.around(used.UseProspectionWorld, "__exit__", self._leave_prospection)
