@@ -40,6 +40,8 @@ async def plan():
         await TransportAction(milk, [Arms.LEFT], [Pose([1.3, 0.45, 0.9])]).resolve().perform()
 '''
 WORDS = "pycrormStream.badge.textContent"
+UNANSWERED = "EventSource = class { readyState = 0; addEventListener() {} close() {} };"
+"""A server that has not answered yet."""
 
 
 class Quiet(http.server.SimpleHTTPRequestHandler):
@@ -86,6 +88,9 @@ def test_a_page_says_that_its_server_died_and_continues_when_it_is_back(
     with robot_in(tmp_path) as robot:
         robot.start("one")
         server = watch("--port", "0", "last")
+        with chrome.open(server.address, script=UNANSWERED) as page:
+            assert page.ask(WORDS) == "… connecting"
+            assert page.ask("document.getElementById('stream').textContent") == ""
         with chrome.open(server.address) as page:
             page.wait_for(f"{WORDS} === '● live'")
             page.ask("globalThis.untouched = true")

@@ -18,7 +18,7 @@ class Stream {
     if (live.list) this.note.before(element("a", { href: live.list }, "all episodes"));
     this.badge.addEventListener("click", () => this.view.follow?.(!this.view.following));
     this.view.onFollow = () => this.#show();
-    this.connected = false;
+    this.connected = null; // until the server answers, or cannot be reached
     this.heard = performance.now();
     if (this.view.follow && !/^#e\d+$/.test(location.hash)) this.view.follow(true);
     setInterval(() => this.#watch(), RETRY_MS);
@@ -80,9 +80,9 @@ class Stream {
   #show() {
     const { episode, following } = this.view;
     const ended = episode !== undefined && episode.status !== "RUNNING";
-    const words = !this.connected ? "✗ no server" : this.fault ? "… waiting" : ended ? "■ ended" : following === false ? "○ follow" : "● live";
+    const words = this.connected === null ? "… connecting" : !this.connected ? "✗ no server" : this.fault ? "… waiting" : ended ? "■ ended" : following === false ? "○ follow" : "● live";
     if (this.badge.textContent !== words) this.badge.textContent = words;
-    this.badge.className = this.connected && !this.fault ? "" : "is-failed";
+    this.badge.className = this.connected === false || this.fault ? "is-failed" : "";
     this.badge.title = following ? "stay at this moment" : "follow the last moment";
     this.badge.disabled = this.view.follow === undefined;
     this.note.replaceChildren(...this.#notes(episode, ended));
@@ -90,7 +90,7 @@ class Stream {
 
   #notes(episode, ended) {
     const notes = [];
-    if (!this.connected) notes.push(recorded("The server cannot be reached; this page continues when it is back."));
+    if (this.connected === false) notes.push(recorded("The server cannot be reached; this page continues when it is back."));
     if (this.fault) notes.push(recorded(this.fault));
     if (episode?.full && episode.head > episode.last) {
       const from = new URL(location.href);
