@@ -7,7 +7,7 @@ from typing import Annotated
 import typer
 
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
-from pycrorm_async.cli.output import note, print_json, print_line, print_table, stdout
+from pycrorm_async.cli.output import counted, note, print_json, print_line, print_table, stdout
 from pycrorm_async.cli.reading import read_memory
 from pycrorm_async.query.named_queries import EpisodeSummary
 from pycrorm_async.query.parameter_text import duration
@@ -49,9 +49,10 @@ def diff(
     ]
     if rows:
         print_table("Differences", ("of", "where", "what", "A", "B"), rows)
-    note(f"{len(rows)} differences; {compared.same_nodes} nodes are the same")
+    note(f"{counted(len(rows), 'difference')}; nodes that are the same: {compared.same_nodes:,}")
 
 
 def _line(episode: EpisodeSummary) -> str:
     took = duration(episode.duration_ns) or "not ended"
-    return f"episode {episode.number}, {episode.description}: {episode.status}, {took}, {episode.nodes} nodes"
+    nodes = counted(episode.nodes, "node")
+    return f"episode {episode.number}, {episode.description}: {episode.status}, {took}, {nodes}"

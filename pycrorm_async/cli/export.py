@@ -12,7 +12,7 @@ import typer
 
 from pycrorm_async.cli.interruption import interrupt_on_termination
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
-from pycrorm_async.cli.output import note, print_json, print_line
+from pycrorm_async.cli.output import counted, note, print_json, print_line
 from pycrorm_async.cli.pending_events import note_pending_events
 from pycrorm_async.cli.since import parse_since
 from pycrorm_async.errors import CallerError
@@ -151,6 +151,7 @@ def _print(exported: Exported, *, as_json: bool) -> None:
         print_json({"file": exported.path, "format": manifest.file_format, **counts, "files": manifest.files})
         return
     print_line(exported.path)
-    note(f"It has {exported.rows:,} rows of {exported.episodes} episodes; {exported.path}.manifest.json describes it.")
+    content = f"{counted(exported.rows, 'row')} of {counted(exported.episodes, 'episode')}"
+    note(f"It has {content}; {exported.path}.manifest.json describes it.")
     if exported.left_out:
         note(f"{exported.left_out} episodes are left out, because they run or are not in the tables yet.")

@@ -111,6 +111,15 @@ def print_facts(title: str, facts: Mapping[str, object]) -> None:
             stdout.print(f"  [dim]{name:<9}[/] {_cell(value)}")
 
 
+def counted(number: int, noun: str) -> str:
+    """Format a number of objects.
+
+    >>> counted(1, "row"), counted(1_200, "row")
+    ('1 row', '1,200 rows')
+    """
+    return f"{number:,} {noun}{'' if number == 1 else 's'}"
+
+
 def moment(when: datetime) -> str:
     """Format a moment in UTC to the second."""
     return when.strftime("%Y-%m-%d %H:%M:%S")

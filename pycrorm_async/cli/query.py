@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 import typer
 
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
-from pycrorm_async.cli.output import note, print_json, print_table
+from pycrorm_async.cli.output import counted, note, print_json, print_table
 from pycrorm_async.cli.reading import read_memory
 from pycrorm_async.errors import CallerError
 from pycrorm_async.query.reading import Reading
@@ -54,8 +54,7 @@ def query(
         if as_json or form == "json":
             print_json(_document(result))
         else:
-            count = f"{len(result.rows):,} row{'s' * (len(result.rows) != 1)}"
-            print_table(count, result.columns, ([*map(_cell, row)] for row in result.rows))
+            print_table(counted(len(result.rows), "row"), result.columns, ([*map(_cell, row)] for row in result.rows))
     if more:
         note(
             f"the query has more rows: these are the first, up to {limit or 'any number of'} rows and {megabytes:g} MB;"

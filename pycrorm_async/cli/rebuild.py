@@ -10,7 +10,7 @@ import typer
 
 from pycrorm_async.bulk_records import collect_seldom
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, ProjectionOption, SpoolOption, UrlOption
-from pycrorm_async.cli.output import note, print_json, stdout
+from pycrorm_async.cli.output import counted, note, print_json, stdout
 from pycrorm_async.cli.pending_events import note_pending_events
 from pycrorm_async.errors import CallerError
 from pycrorm_async.operations.rebuild import RebuildSummary, projections_of, rebuild_memory, rebuild_projection
@@ -65,9 +65,10 @@ def rebuild(
     for name, each in summaries.items():
         if not as_json and name in shown:
             rate = each.events / max(each.seconds, 1e-9)
+            folded = f"{counted(each.events, 'event')} of {counted(each.episodes, 'episode')}"
             stdout.print(
-                f"{f'{name}, ' if name in projections else ''}generation {each.generation}: {each.events} events of"
-                f" {each.episodes} episodes in {duration(int(each.seconds * 1e9))}, {rate:,.0f} events/s"
+                f"{f'{name}, ' if name in projections else ''}generation {each.generation}: {folded}"
+                f" in {duration(int(each.seconds * 1e9))}, {rate:,.0f} events/s"
             )
         if each.left:
             note(

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
-from pycrorm_async.cli.output import note, print_json, print_line, problem
+from pycrorm_async.cli.output import counted, note, print_json, print_line, problem
 from pycrorm_async.cli.reading import read_memory
 from pycrorm_async.errors import CallerError
 from pycrorm_async.report.write import overview
@@ -65,7 +65,8 @@ def _write_overview(out: Path, tags: list[str], url: str, spool: Path | None, *,
         print_json({"file": written.path, **counts, "unreadable": written.unreadable})
     else:
         print_line(written.path)
-        note(f"It has {written.episodes} episodes; pages of {written.pages} are in {out.stem}.pages beside it.")
+        episodes = counted(written.episodes, "episode")
+        note(f"It has {episodes}; pages of {written.pages} are in {out.stem}.pages beside it.")
     for number, reason in written.unreadable.items():
         problem(f"episode {number} has no page: {reason}")
     return 1 if written.unreadable else 0

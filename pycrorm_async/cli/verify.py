@@ -13,7 +13,7 @@ import typer
 
 from pycrorm_async.bulk_records import collect_seldom
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, ProjectionOption, SpoolOption, UrlOption
-from pycrorm_async.cli.output import note, print_json, stdout
+from pycrorm_async.cli.output import counted, note, print_json, stdout
 from pycrorm_async.cli.pending_events import note_pending_events
 from pycrorm_async.errors import CallerError
 from pycrorm_async.operations.destination import shared_address
@@ -136,7 +136,8 @@ def _print(result: VerifyResult) -> None:
             " in a copy made with `pycrorm copy` they have one",
             soft_wrap=True,
         )
-    checked = f"{result.events} events of {result.episodes} episodes and {result.rows} rows: "
+    folded = f"{counted(result.events, 'event')} of {counted(result.episodes, 'episode')}"
+    checked = f"{folded} and {counted(result.rows, 'row')}: "
     if result.damage:
         stdout.print(f"{checked}the log is damaged; copy its intact events to another memory with `pycrorm copy`")
     elif result.drift:

@@ -23,7 +23,7 @@ from pycrorm_async.cli.options import (
     SpoolOption,
     UrlOption,
 )
-from pycrorm_async.cli.output import note, print_json, problem, stdout
+from pycrorm_async.cli.output import counted, note, print_json, problem, stdout
 from pycrorm_async.errors import DamageError, SpoolDamaged
 from pycrorm_async.operations.daemon import serve
 from pycrorm_async.operations.fold_workers import WORKERS, forked
@@ -71,7 +71,7 @@ def writer(
     if as_json:
         print_json(summary._asdict())
     else:
-        note(f"stopped after {summary.records} events of {summary.recorders} recorders")
+        note(f"stopped after {counted(summary.records, 'event')} of {counted(summary.recorders, 'recorder')}")
     return 0
 
 

@@ -55,7 +55,7 @@ def test_a_rebuild_needs_no_code_of_the_plan_and_reports_what_it_made(tmp_path: 
     assert traces(url) == []
     rebuilt = pycrorm("rebuild", cwd=tmp_path)
     assert (rebuilt.returncode, rebuilt.stderr) == (0, "")
-    assert rebuilt.stdout.startswith("generation 1003: 6 events of 1 episodes in ")
+    assert rebuilt.stdout.startswith("generation 1003: 6 events of 1 episode in ")
 
 
 def test_an_episode_that_cannot_be_folded_is_reported_and_is_a_problem(tmp_path: Path) -> None:

@@ -60,7 +60,7 @@ def test_a_plan_beside_a_daemon_is_in_the_database_at_its_end(folder: Path, daem
     name = appeared.split()[1]
     assert appeared == f"recorder {name} appeared"
     assert ended == f"recorder {name} has ended; 11 events stored"
-    assert goodbye == "stopped after 11 events of 1 recorders"
+    assert goodbye == "stopped after 11 events of 1 recorder"
     assert [path for path in (folder / "pycrorm.db.spool").iterdir() if path.is_dir() and path.name != "stored"] == []
 
 

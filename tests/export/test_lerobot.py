@@ -163,7 +163,11 @@ def test_a_folder_that_cannot_be_completed_leaves_the_one_before(tmp_path: Path)
             {},
             r"episode 3 has the robot courier with other joints than pr2 of episode 1 \(.* …\): export them into",
         ),
-        ([3], {"clock": "time", "fps": 1}, r"episode 3 has 1 frames by time, and LeRobot needs two: a higher --fps"),
+        (
+            [3],
+            {"clock": "time", "fps": 1},
+            "episode 3 has 1 frame by time, and LeRobot needs two: give a higher --fps",
+        ),
         ([1], {"clock": "sun"}, "the clock is event or time, not 'sun'"),
         ([1], {"images": (0, 240)}, r"an image is 16 to 2000 pixels wide and high, not \(0, 240\)"),
         ([1], {"fps": 0}, "frames per second are between 1 and 1000, not 0"),

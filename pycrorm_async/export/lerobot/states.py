@@ -59,10 +59,10 @@ def frames_of(episode: RecordedEpisode, clock: Clock, fps: int) -> Frames:
     chosen = changed if clock == "event" else list(_resampled(episode, changed, fps))
     if len(chosen) < 2:
         last = changed[-1][0].since_ns - changed[0][0].since_ns if changed else 0
-        remedy = f"a higher --fps: the robot was there for {last / 1e9:.3f} s" if clock == "time" else "leave it out"
-        raise CallerError(
-            f"episode {episode.number} has {len(chosen)} frames by {clock}, and LeRobot needs two: {remedy}"
-        )
+        there = f"give a higher --fps, because the robot was there for {last / 1e9:.3f} s, or --clock event"
+        remedy = there if clock == "time" else "leave it out"
+        count = f"{len(chosen)} frame{'' if len(chosen) == 1 else 's'}"
+        raise CallerError(f"episode {episode.number} has {count} by {clock}, and LeRobot needs two: {remedy}")
     at = [when for when, _ in chosen]
     states = np.array([state for _, state in chosen], dtype=np.float32)
     return Frames(robot.model or robot.name, channels, states, at, list(_subtasks(episode.nodes, at)))
