@@ -324,7 +324,7 @@ async def test_an_upcaster_serves_fold_rebuild_and_snapshots_of_older_events(
     names = "SELECT name FROM object ORDER BY id"
     assert ask(golden, names) == [("milk",), ("pr2",), ("milk",)]
     later = Decoder(EVENT_TYPES | {"ObjectAdded": Weighed}, STEPS)
-    monkeypatch.setattr(fold, "decode", later.decode)
+    monkeypatch.setattr(fold, "_decode", later.decode)
     await rebuild_memory(golden)
     assert ask(golden, names) == [("MILK",), ("PR2",), ("milk",)]
     async with Reading.open(golden) as reading:

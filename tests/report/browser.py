@@ -109,9 +109,17 @@ class Tab:
 
     def wait_for(self, condition: str, timeout_s: float = 60) -> None:
         deadline = time.monotonic() + timeout_s
-        while not self.ask(condition):
+        while not self._is_true(condition):
             assert time.monotonic() < deadline, f"{condition} did not become true; {self.problems()}"
             time.sleep(0.05)
+
+    def _is_true(self, condition: str) -> bool:
+        try:
+            return bool(self.ask(condition))
+        except AssertionError as error:
+            if "navigated or closed" in str(error):  # the page that was asked gave way to the next one meanwhile
+                return False
+            raise
 
     def settle(self) -> None:
         """Wait until the page has drawn twice."""
