@@ -12,6 +12,7 @@ import msgspec
 from pycrorm_async.cli.durability import Durability, durability, print_durability, summarise_kept_segments
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
 from pycrorm_async.cli.output import moment, note, print_json, print_table, problem, stdout
+from pycrorm_async.cli.pending_events import note_pending_events
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import DatabaseError
 from pycrorm_async.operations.destination import shared_address
@@ -168,6 +169,8 @@ def status(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None, as_json: Jso
             stdout.print(f"The projection {projection.name}, version {projection.version}, {lag}.", markup=False)
         for warning in state.warnings:
             note(f"warning: {warning}")
+        if not has_daemon:
+            note_pending_events(url, spool)
     if fault is not None:
         problem(fault)
         return 3

@@ -75,7 +75,11 @@ def test_the_environment_may_select_the_writer_and_without_a_daemon_nothing_is_l
     [recorder] = document["recorders"]
     assert (recorder["alive"], recorder["drained"], document["daemon"]) == (False, "nobody", False)
     assert "does not exist" in document["database"]
+    shown = pycrorm("status", cwd=folder)
+    assert "1 dead recorder left events" in shown.stderr
+    assert "run `pycrorm writer --once --url sqlite:///" in shown.stderr
     assert answer("writer", "--once", cwd=folder)["events_stored"] == 11
+    assert pycrorm("status", cwd=folder).stderr == ""
     assert len(answer("episodes", cwd=folder)) == 1
 
 

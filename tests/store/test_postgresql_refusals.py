@@ -77,9 +77,10 @@ async def test_an_unknown_login_or_one_without_permission_is_refused(
     server: Server, caplog: pytest.LogCaptureFixture
 ) -> None:
     error = await refused(server.url(user="stranger", password="s3cr"), caplog)
-    assert str(error).endswith('role "stranger" does not exist')
+    how = "correct the user in the URL, or let the server's administrator create or admit it"
+    assert str(error).endswith(f'role "stranger" does not exist: {how}')
     error = await refused(server.url(user="pg_monitor", password="s3cr"), caplog)
-    assert str(error).endswith('role "pg_monitor" is not permitted to log in')
+    assert str(error).endswith(f'role "pg_monitor" is not permitted to log in: {how}')
 
 
 @pytest.mark.parametrize("create", [True, False])

@@ -121,6 +121,7 @@ def _code(fault: BaseException) -> str:
 
 
 _HINTS = {
+    "28000": ": correct the user in the URL, or let the server's administrator create or admit it",
     "28P01": ": put the right password into PYCRORM_URL or ~/.pgpass",
     "3D000": ": create it with `createdb`, or correct the URL",
 }
