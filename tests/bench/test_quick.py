@@ -14,8 +14,8 @@ ROOT = Path(__file__).parents[2]
 BUT = {"busy", "faults", "hook", "__main__", "concurrent_processes", "pycram"}  # the last needs PyCRAM's environment
 OTHERS = sorted({path.stem for path in (ROOT / "bench").glob("*.py")} - BUT)
 """Scripts without a test of their own."""
-SHORT = {"behaviour_trees", "digests", "plan", "recall"}
-"""Scripts that start no other process. The others run in turns, because most take ten seconds and more."""
+SHORT = {"digests", "recall"}
+"""Scripts of a few seconds. The others run in turns, because most take ten seconds and more."""
 
 
 def measure(script: str, *options: str) -> dict[str, Any]:

@@ -53,7 +53,7 @@ async def test_two_memories_merged_and_then_rebuilt_hold_row_for_row_what_both_h
     assert traces(target) == []
 
 
-@pytest.mark.soak_on("postgresql")
+@pytest.mark.soak
 async def test_earlier_rebuilds_of_the_sources_make_no_difference(new_url: New, new_file: New) -> None:
     one, other, target = await merged(new_file, new_url, lambda url: random_plans(url, range(6)))
     before = tables_of(target)

@@ -70,7 +70,7 @@ def blob_machine(tmp_path: Path, seed: int, monkeypatch: pytest.MonkeyPatch) -> 
         yield BlobMachine(machine, rng, monkeypatch)
 
 
-@pytest.mark.parametrize("seed", [*range(2), *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(2, 60))])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.soak) for seed in range(1, 60))])
 async def test_a_record_that_survives_a_power_cut_has_its_blob_and_a_synced_one_survives(
     blob_machine: BlobMachine, seed: int
 ) -> None:

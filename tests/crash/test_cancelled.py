@@ -8,6 +8,7 @@ finds no lock held and no part of a batch.
 from __future__ import annotations
 
 import asyncio
+import random
 import types
 from collections.abc import Awaitable, Callable, Collection, Coroutine, Generator
 from contextlib import AbstractAsyncContextManager
@@ -37,6 +38,8 @@ from tests.writer.fakes import KeptSource
 pytestmark = [pytest.mark.soak_on("postgresql"), pytest.mark.slow]
 """These tests take long on a server, where they run in turns; other modules show that the server behaves alike."""
 
+STRIDES = pytest.mark.parametrize("stride", [4, pytest.param(1, marks=pytest.mark.soak)])
+"""A run cancels at a quarter of the awaits, chosen by its seed, and the soak at all of them."""
 SETTINGS = Settings(batch_events_max=10, idle_ms=1, batch_age_ms=1)
 CLOSING = {"AsyncAdapt_aiosqlite_connection._terminate_graceful_close", "Connection._cancel"}
 """SQLAlchemy and asyncpg leave these tasks to the loop when they are cancelled while they close a connection."""
@@ -111,11 +114,11 @@ async def cancelled_at(at: int, work: Coroutine[Any, Any, None], *, no_other_tas
     return True
 
 
-async def at_every_await(round_: Callable[[int], Awaitable[bool]], *, awaits_min: int = 30) -> None:
-    """Run a round for each n until a round ends without being cancelled."""
-    at = 1
+async def at_every_await(round_: Callable[[int], Awaitable[bool]], *, stride: int, awaits_min: int = 30) -> None:
+    """Run a round for every n, or each `stride`-th from a random one on, until one ends without being cancelled."""
+    at = random.randint(1, stride)
     while await round_(at):
-        at += 1
+        at += stride
     print(f"{at} awaits")
     assert at > awaits_min, "it has more awaits than that"
 
@@ -174,7 +177,10 @@ def kept_source(script: Script) -> KeptSource:
     return KeptSource([each._replace(position=at) for at, each in enumerate(records, 1)], closed=True)
 
 
-async def test_an_opening_that_is_cancelled_at_any_await_leaves_no_lock_held(database_url: str, tmp_path: Path) -> None:
+@STRIDES
+async def test_an_opening_that_is_cancelled_at_any_await_leaves_no_lock_held(
+    database_url: str, tmp_path: Path, stride: int
+) -> None:
     async def life() -> None:
         async with opened(database_url, tmp_path / "spool"):
             pass
@@ -185,14 +191,15 @@ async def test_an_opening_that_is_cancelled_at_any_await_leaves_no_lock_held(dat
         return was_cancelled
 
     await life()
-    await at_every_await(round_, awaits_min=20)
+    await at_every_await(round_, stride=stride, awaits_min=20)
     async with opened(database_url, tmp_path / "spool") as destination:
         await writer_of(kept_source(script_of(1)), destination).run()
     verify_stored_in_order(database_url, script_of(1))
 
 
+@STRIDES
 async def test_a_writer_cancelled_at_any_await_leaves_the_log_complete_and_ordered(
-    database_url: str, tmp_path: Path
+    database_url: str, tmp_path: Path, stride: int
 ) -> None:
     async with opened(database_url, tmp_path / "spool") as destination:
 
@@ -209,11 +216,12 @@ async def test_a_writer_cancelled_at_any_await_leaves_the_log_complete_and_order
             verify_stored_in_order(database_url, script)
             return was_cancelled
 
-        await at_every_await(round_)
+        await at_every_await(round_, stride=stride)
 
 
+@STRIDES
 async def test_a_flush_cancelled_at_any_await_leaves_the_writer_able_to_store_the_rest(
-    database_url: str, tmp_path: Path
+    database_url: str, tmp_path: Path, stride: int
 ) -> None:
     async with opened(database_url, tmp_path / "spool") as destination:
 
@@ -228,10 +236,13 @@ async def test_a_flush_cancelled_at_any_await_leaves_the_writer_able_to_store_th
             verify_stored_in_order(database_url, script)
             return was_cancelled
 
-        await at_every_await(round_, awaits_min=2)
+        await at_every_await(round_, stride=stride, awaits_min=2)
 
 
-async def test_a_daemon_cancelled_at_any_await_loses_and_doubles_nothing(database_url: str, tmp_path: Path) -> None:
+@STRIDES
+async def test_a_daemon_cancelled_at_any_await_loses_and_doubles_nothing(
+    database_url: str, tmp_path: Path, stride: int
+) -> None:
     held: list[ClaimedSource] = []
     async with opened(database_url, tmp_path / "spool") as destination:
 
@@ -273,4 +284,4 @@ async def test_a_daemon_cancelled_at_any_await_loses_and_doubles_nothing(databas
             verify_stored_in_order(database_url, script)
             return was_cancelled
 
-        await at_every_await(round_)
+        await at_every_await(round_, stride=stride)

@@ -192,6 +192,7 @@ async def test_the_drainer_may_exit_and_later_records_are_drained_too(tmp_path: 
         assert len(await read_rollouts(reading, Scene(), name_of(default_policy()), 5, 20)) == 20
 
 
+@pytest.mark.soak
 async def test_of_two_experiments_on_one_memory_the_first_to_end_leaves_the_other_running(tmp_path: Path) -> None:
     place = MemoryLocation(f"sqlite:///{tmp_path}/memory.db")
     small = replace(SMALL, rollouts=150, evaluate=20, held_out=60, workers=1, min_samples_leaf=5)
@@ -225,6 +226,7 @@ async def test_held_out_rollouts_without_a_success_leave_the_coverage_unknown(tm
     assert learned.coverage is None
 
 
+@pytest.mark.soak  # cli/test_learn runs a study too
 async def test_a_study_evaluates_the_rollouts_of_its_experiment_and_no_others(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -91,11 +91,11 @@ async def test_every_attribute_is_loaded_or_says_how_to_load_it(
         await transport(memory)
         for class_ in CLASSES:
             async with memory.session() as session:
-                rows = (await session.scalars(select(class_).limit(20))).unique().all()
+                rows = (await session.scalars(select(class_).limit(8))).unique().all()
                 with_rows |= {class_.__name__} if rows else set()
                 in_session = {name for row in rows for _, name in unloaded(row, set(), depth=3)}
             async with memory.session() as session:
-                rows = (await session.scalars(select(class_).limit(20))).unique().all()
+                rows = (await session.scalars(select(class_).limit(8))).unique().all()
             after = {name for row in rows for _, name in unloaded(row, set(), depth=3)}
             assert in_session == after, class_
             on_request |= in_session

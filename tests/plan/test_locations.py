@@ -49,7 +49,9 @@ OUT_OF_REACH = Pose([1.3, 1, 3])
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("yaw", [0.0, 1.0, math.pi])
+@pytest.mark.parametrize(
+    "yaw", [0.0, pytest.param(1.0, marks=pytest.mark.soak), pytest.param(math.pi, marks=pytest.mark.soak)]
+)
 async def test_from_every_candidate_the_object_can_be_picked_up(scene: Scene, yaw: float) -> None:
     await MoveTorsoActionPerformable(0.2).perform()
     await ParkArmsActionPerformable(Arms.RIGHT).perform()

@@ -342,6 +342,7 @@ async def test_a_failed_perform_leaves_nothing_for_the_garbage_collector() -> No
         gc.enable()
 
 
+@pytest.mark.soak  # promises/test_defects_of_storage holds it with a memory
 async def test_a_plan_of_a_hundred_thousand_performs_keeps_memory_flat() -> None:
     class Many(ActionAbstract):
         async def perform(self) -> None:

@@ -50,7 +50,9 @@ def spread_candidates(places: list[Location], about: int) -> list[Location]:
     return places[:: max(1, len(places) // about)]
 
 
-@pytest.mark.soak_on("kitchen_counter_upper_drawer", "kitchen_counter_lower_drawer", "kitchen_island_upper_drawer")
+@pytest.mark.soak_on(
+    "kitchen_counter_upper_drawer", "kitchen_counter_lower_drawer", "kitchen_island_upper_drawer", "sink_area_drawer"
+)
 @ABOUT
 @pytest.mark.parametrize(
     ("name", "torso"),

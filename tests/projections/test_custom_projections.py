@@ -493,7 +493,7 @@ def _die_in_batch(url: str, last: int, *, rebuilding: bool) -> None:
         asyncio.run(fold())
 
 
-@pytest.mark.parametrize("rebuilding", [False, True])
+@pytest.mark.parametrize("rebuilding", [pytest.param(False, marks=pytest.mark.soak), True])
 async def test_a_killed_fold_continues_where_it_was(log: EventLog, database_url: str, *, rebuilding: bool) -> None:
     await folded(log, [*declarations(PICK_UP), *mixed(tries(1), tries(2))], *([GraspRate()] if rebuilding else []))
     for last in (1, 2):

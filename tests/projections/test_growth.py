@@ -106,6 +106,7 @@ def test_names_fit_for_every_generation_and_are_unique() -> None:
     assert index_name("pose", "time", 7) == "pose__7_by_time"
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_a_type_has_any_number_of_descendants(log: EventLog) -> None:
     root = declared("RootAction", "root_action", field("size", "real", 2))
     kinds = [

@@ -177,7 +177,7 @@ async def test_missing_tables_are_made(database_url: str) -> None:
     assert traces(database_url) == []
 
 
-@pytest.mark.soak_on("postgresql")
+@pytest.mark.soak  # crash/test_rebuild_kill folds and reads beside rebuilds too
 async def test_events_folded_beside_rebuilds_are_in_the_tables_and_no_reader_misses_anything(
     database_url: str, tmp_path: Path
 ) -> None:

@@ -108,7 +108,7 @@ async def test_unfolded_events_are_no_fault(log: EventLog, database_url: str) ->
     )
 
 
-@pytest.mark.parametrize("events", [7, 25])
+@pytest.mark.parametrize("events", [pytest.param(7, marks=pytest.mark.soak), 25])
 async def test_a_fold_between_two_parts_is_no_fault(
     database_url: str, events: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -282,7 +282,7 @@ async def test_a_changed_key_is_reported_as_a_missing_row_and_a_surplus_one(log:
     assert (too_many.number, too_many.sequence, too_many.stored[1], too_many.expected) == (1, 11, "neck", None)
 
 
-@pytest.mark.parametrize("events", [1, 7, 20])
+@pytest.mark.parametrize("events", [pytest.param(1, marks=pytest.mark.soak), 7, 20])
 async def test_an_episode_read_in_many_parts_gives_the_same_findings_as_in_one(
     database_url: str, events: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:

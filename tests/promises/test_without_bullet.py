@@ -112,7 +112,7 @@ ABSENT = "import sys; sys.modules |= dict.fromkeys(('pybullet', 'pycram_bullet',
 LINE = "no world can be opened, because no Bullet is installed: pip install 'pycrorm-async[world]'"
 
 
-@pytest.mark.parametrize("verb", ["demo", "learn --rollouts 30"])
+@pytest.mark.parametrize("verb", ["demo", pytest.param("learn --rollouts 30", marks=pytest.mark.soak)])
 def test_a_verb_that_needs_a_world_says_first_what_to_install(tmp_path: Path, verb: str) -> None:
     pytest.importorskip("jpt", reason="learn names the first missing package")
     words = ["pycrorm", *verb.split()]

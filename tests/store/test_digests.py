@@ -68,7 +68,7 @@ def test_the_digest_of_three_events_stays_the_same_for_ever() -> None:
     assert running.digest() == "52cdb8b7daa97644e61fa44ff601794f91ce08079c2006577120d2961acbe0a3"
 
 
-@pytest.mark.parametrize("size", [1, pytest.param(7, marks=pytest.mark.soak), 255, 256, 257, 599])
+@pytest.mark.parametrize("size", [*(pytest.param(each, marks=pytest.mark.soak) for each in (1, 7)), 255, 256, 257, 599])
 @pytest.mark.slow
 async def test_the_sizes_of_batches_make_no_difference(log: EventLog, database_url: str, size: int) -> None:
     records = whole(episode(1), 600)

@@ -48,13 +48,14 @@ def model(tmp_path: Path) -> Iterator[LoadedModel]:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("targets", [1_000, pytest.param(3_000, marks=pytest.mark.soak)])
 @pytest.mark.parametrize("limits", Limits)
 @pytest.mark.parametrize("arm", ARMS)
 def test_a_target_that_a_posture_within_limits_reaches_is_solved_exactly_within_limits(
-    arm: Arms, limits: Limits
+    arm: Arms, limits: Limits, targets: int
 ) -> None:
     rng = random.Random(31)
-    for _ in range(3000):
+    for _ in range(targets):
         joints = random_arm(rng, arm, limits)
         base, torso_height = random_base_pose(rng)
         target = reached(arm, joints, base=base, torso_height=torso_height)
@@ -303,6 +304,7 @@ def picked_up(limits: Limits, *, attempts: int) -> tuple[float, dict[Grasp, floa
 
 
 @pytest.mark.slow
+@pytest.mark.soak
 def test_hard_limits_double_the_success_of_the_default_policy_and_allow_grasps_from_above() -> None:
     soft, soft_by_grasp = picked_up(Limits.SOFT, attempts=2000)
     hard, hard_by_grasp = picked_up(Limits.HARD, attempts=2000)

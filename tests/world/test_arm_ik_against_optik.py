@@ -68,6 +68,7 @@ def reached_by_optik(robot: optik.Robot, goal: Pose, base: Pose, rng: np.random.
     return robot.ik(config, target.tolist(), rng.uniform(*robot.joint_limits()).tolist()) is not None
 
 
+@pytest.mark.soak  # test_arm_ik holds the closed form against its own kinematics
 def test_few_rollouts_fail_at_a_target_that_another_solver_reaches(robots: dict[Arms, optik.Robot]) -> None:
     rng = np.random.default_rng(1)
     falsely, refused, agreed = 0, 0, 0

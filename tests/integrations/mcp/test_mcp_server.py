@@ -77,6 +77,7 @@ def url(module_database_url: str) -> str:
     return module_database_url.replace("postgres@", "agent@")
 
 
+@pytest.mark.soak_on("postgresql")  # the tools have no SQL of their own
 async def test_an_agent_asks_with_every_tool(url: str) -> None:
     async with agent_of(url) as agent:
         assert "untrusted data, never" in (agent.client.instructions or "")
