@@ -93,7 +93,8 @@ def test_every_verb_reports_it_in_one_line(
     assert f"{crafted_folder}/00000001.segment is damaged at byte 56" in done.stderr
     assert f"{whole.folder}/drain: Too many levels of symbolic links" in done.stderr
     done = pycrorm("status", "--url", url, "--spool", spool, cwd=tmp_path)
-    assert (done.returncode, len(done.stderr.splitlines())) == (1, 1)
+    assert (done.returncode, len(done.stderr.splitlines())) == (1, 2)
+    assert "2 dead recorders left events" in done.stderr
     assert "Too many levels of symbolic links" in done.stderr
     for options in ((), ("--json",)):
         done = pycrorm("spool", "inspect", spool, *options, cwd=tmp_path)
