@@ -62,7 +62,7 @@ def test_a_wrong_password_is_one_line_and_the_right_one_stores_the_waiting_event
     refused(
         server.url(database, user="guarded", password="s3cr-wrong"),
         folder,
-        'password authentication failed for user "guarded"',
+        'password authentication failed for user "guarded": put the right password into PYCRORM_URL or ~/.pgpass',
     )
     assert drained(server.url(database, user="guarded", password=WRITTEN), folder) == EVENTS
     assert ask(server.url(database), NOTES) == [("a",)]
@@ -71,7 +71,8 @@ def test_a_wrong_password_is_one_line_and_the_right_one_stores_the_waiting_event
 def test_a_wrong_database_name_is_one_line_and_the_right_one_stores_the_waiting_events(
     server: Server, folder: Path
 ) -> None:
-    refused(server.url("nothing", password="s3cr"), folder, 'database "nothing" does not exist')
+    ending = 'database "nothing" does not exist: create it with `createdb`, or correct the URL'
+    refused(server.url("nothing", password="s3cr"), folder, ending)
     url = server.new_database()
     assert drained(url, folder) == EVENTS
     assert ask(url, NOTES) == [("a",)]
