@@ -224,7 +224,7 @@ asyncio.run(main(sys.argv[1]))
 """
 
 
-@pytest.mark.parametrize("window_nodes", [4_000, pytest.param(10_000, marks=pytest.mark.soak)])
+@pytest.mark.parametrize("window_nodes", [2_000, pytest.param(10_000, marks=pytest.mark.soak)])
 async def test_a_long_plan_costs_less_than_a_hundred_bytes_of_memory_a_node(tmp_path: Path, window_nodes: int) -> None:
     done = await in_a_process(GROWING, url_of(tmp_path), str(window_nodes), **ALLOCATING)
     assert done.returncode == 0, done.stderr
