@@ -51,8 +51,8 @@ def measure(folder: Path, pairs: int, only: str | None = None) -> dict[str, Any]
     from pycram.process_module import simulated_robot
 
     from pycrorm_async.integrations.pycram import remember
-    from pycrorm_async.queue.live import delegated_writer
     from pycrorm_async.settings import Settings
+    from pycrorm_async.writer import delegated_writer
 
     delegated_writer._UNDRAINED_S = 0.0  # noqa: SLF001  each block would wait 2 s for a daemon
     leave_out_mesh_checks()

@@ -201,7 +201,13 @@ class EpisodeParked(DatabaseError):
 
 
 class FlushTimeout(DatabaseError):
-    """`flush` did not finish in time; the events emitted so far are safe in the spool."""
+    """`flush` or closing did not finish within `limit_s`; the events recorded so far are safe in the spool."""
+
+    def __init__(self, limit_s: float, reason: str | None = None) -> None:
+        because = "" if reason is None else f" ({reason})"
+        super().__init__(f"not finished after {limit_s:g} s{because}; everything recorded is safe in the spool")
+        self.limit_s = limit_s
+        self.reason = reason
 
 
 # --- damage ---------------------------------------------------------------------------------------------------

@@ -38,7 +38,6 @@ from pycrorm_async.projections.schema.user_views import UserView
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.queue.files.locks import call_in_forked_child
 from pycrorm_async.queue.files.spool import Spool
-from pycrorm_async.queue.live.delegated_writer import DelegatedWriter
 from pycrorm_async.queue.live.recorder_queue import RecorderQueue
 from pycrorm_async.recall.experience import PickUpExperience
 from pycrorm_async.recording.recording import Recording
@@ -49,6 +48,7 @@ from pycrorm_async.settings import Settings, Writer
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.sync_memory import SyncMemory
+from pycrorm_async.writer.delegated_writer import DelegatedWriter
 from pycrorm_async.writer.writer_thread import WriterThread
 
 __all__ = ["Memory", "MemoryStatus"]

@@ -15,7 +15,6 @@ from pycrorm_async.plan.execution.observer import recorder
 from pycrorm_async.plan.execution.unawaited_performs import called_performs
 from pycrorm_async.plan.experience import experience
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.queue.live.delegated_writer import DelegatedWriter
 from pycrorm_async.queue.live.recorder_queue import RecorderQueue
 from pycrorm_async.recall.experience import PickUpExperience
 from pycrorm_async.recording.recording import Recording
@@ -24,6 +23,7 @@ from pycrorm_async.recording.writing.emitter import Emitter, Faults
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.world.observers import watcher
 from pycrorm_async.writer.background_writer import WriterState
+from pycrorm_async.writer.delegated_writer import DelegatedWriter
 from pycrorm_async.writer.writer_thread import WriterThread
 
 

@@ -146,9 +146,8 @@ class SyncMemory:
         try:
             self._await(self._memory.flush(), timeout_s)
         except TimeoutError as error:
-            raise FlushTimeout(
-                f"not finished after {timeout_s:g} s; everything recorded is safe in the spool"
-            ) from error
+            assert timeout_s is not None, "only a limited wait ends"
+            raise FlushTimeout(timeout_s) from error
 
     @property
     def ask(self) -> Ask[SyncQuestion]:

@@ -15,7 +15,7 @@ from typing import NamedTuple, TypeVar
 from pycrorm_async.errors import DatabaseUnavailable, EpisodeParked, FlushTimeout, InternalError
 from pycrorm_async.settings import Settings
 from pycrorm_async.writer.drain import Drain, DrainState, run_to_completion
-from pycrorm_async.writer.patience import Patience
+from pycrorm_async.writer.patience import TOO_MANY_EVENTS, Patience, PatienceEnded
 from pycrorm_async.writer.ports import Destination, Source
 from pycrorm_async.writer.retry import PATIENT, retry
 
@@ -101,16 +101,12 @@ class LiveWriter:
         Raises the error that stopped appending, `EpisodeParked` for episodes that stopped since `run` began, and
         `FlushTimeout` after `flush_timeout_s` without progress.
         """
-        timeout_s = self._settings.flush_timeout_s
-        flushing = asyncio.create_task(self._flush(position), name="pycrorm flush")
+        patience = Patience(self._settings.flush_timeout_s, progress=lambda: self.progress)
         try:
-            if not await Patience(timeout_s, progress=lambda: self.progress).wait(flushing):
-                raise FlushTimeout(self._not_in_time(timeout_s))
-            flushing.result()
-        finally:
-            if not flushing.done():
-                flushing.cancel()
-                await asyncio.wait([flushing])
+            await patience.run(self._flush(position), name="pycrorm flush")
+        except PatienceEnded:
+            reason = self._drain.state.away or self._fold_error or TOO_MANY_EVENTS
+            raise FlushTimeout(patience.limit_s, reason) from None
 
     async def _flush(self, position: int) -> None:
         reached = await self._drain.reached(position)
@@ -134,12 +130,6 @@ class LiveWriter:
             fold_error=self._fold_error,
             adoption_errors=tuple(self._adoption_errors),
         )
-
-    def _not_in_time(self, timeout_s: float) -> str:
-        reason = (
-            self._drain.state.away or self._fold_error or "more events than could be stored and folded in that time"
-        )
-        return f"not finished after {timeout_s:g} s ({reason}); everything recorded is safe in the spool"
 
     def _note_failure(self, error: Exception) -> None:
         """Note that appending has stopped for good; log it now, because the next flush may be far away."""

@@ -1,11 +1,13 @@
 """Define the writer's two ends: a source of synced records, and a log that stores them with the tables behind it.
 
-A writer beside a plan needs `Source` and `Destination`; a daemon needs `ClaimedSource`, `Log` and `Tables`.
+A writer beside a plan needs `Source` and `Destination`; a daemon needs `ClaimedSource`, `Log` and `Tables`; a plan that
+waits for a daemon needs `OfferedQueue`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping, Sequence
+from pathlib import Path
 from typing import NamedTuple, Protocol, TypeAlias
 
 from pycrorm_async.events.envelope import Record
@@ -134,6 +136,56 @@ class ClaimedSource(Source, Protocol):
 
         Returns the outcome for a report; None if not all records could be stored. Raises `SpoolUnavailable`.
         """
+        ...
+
+
+class DrainReasons(Protocol):
+    """The reasons that a drainer in another process gives: why it stopped, why it waits, which episodes stopped."""
+
+    @property
+    def failure(self) -> str | None: ...
+    @property
+    def unavailable(self) -> str | None: ...
+    @property
+    def stopped(self) -> Mapping[str, str]: ...
+
+
+class ExternalDrain(Protocol):
+    """How far a drainer in another process has got: the stored and visible positions, and its reasons."""
+
+    @property
+    def stored(self) -> int: ...
+    @property
+    def folded(self) -> int: ...
+    @property
+    def note(self) -> DrainReasons: ...
+
+
+class OfferedQueue(Protocol):
+    """The recorder's side of a queue that another process drains."""
+
+    @property
+    def folder(self) -> Path:
+        """The folder of the queue, in its spool."""
+        ...
+
+    @property
+    def written(self) -> int:
+        """Position of the last record put."""
+        ...
+
+    @property
+    def is_drained(self) -> bool:
+        """True while a process drains the queue. Raises `FilesError`."""
+        ...
+
+    @property
+    def external_drain_status(self) -> ExternalDrain | None:
+        """The status that the drainer published last; None if this process drains the queue itself."""
+        ...
+
+    async def synced_to(self, position: int | None = None) -> None:
+        """Wait until the records up to this position, by default all, are on the disk. Raises `SpoolUnavailable`."""
         ...
 
 

@@ -27,7 +27,7 @@ from contextlib import AbstractAsyncContextManager, AsyncExitStack
 from pycrorm_async.errors import DatabaseUnavailable, FlushTimeout
 from pycrorm_async.settings import Settings
 from pycrorm_async.writer.background_writer import LiveWriter, WriterState
-from pycrorm_async.writer.patience import Patience
+from pycrorm_async.writer.patience import TOO_MANY_EVENTS, Patience
 from pycrorm_async.writer.ports import Destination, Source
 
 _STOP_S = 10.0
@@ -140,11 +140,8 @@ class WriterThread:
         return Patience(self._settings.flush_timeout_s, progress=lambda: writer.progress)
 
     def _timeout_error(self) -> FlushTimeout:
-        reason = self.state.queue.away or "more events than could be stored and folded in that time"
-        return FlushTimeout(
-            f"closed after {self._settings.flush_timeout_s:g} s with work left ({reason});"
-            " everything recorded is safe in the spool"
-        )
+        reason = self.state.queue.away or TOO_MANY_EVENTS
+        return FlushTimeout(self._settings.flush_timeout_s, f"closed with work left: {reason}")
 
     def _request_stop(self, *, cancel: bool) -> None:
         if self._ended.done() or self._loop is None or self._stop is None or self._work is None:

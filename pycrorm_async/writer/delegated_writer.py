@@ -8,9 +8,9 @@ import math
 from collections.abc import Callable
 
 from pycrorm_async.errors import DatabaseError, EpisodeParked, FlushTimeout
-from pycrorm_async.queue.files.drain_status import DrainStatus
-from pycrorm_async.queue.live.recorder_queue import RecorderQueue
 from pycrorm_async.settings import Settings
+from pycrorm_async.writer.patience import TOO_MANY_EVENTS, Patience, PatienceEnded
+from pycrorm_async.writer.ports import ExternalDrain, OfferedQueue
 
 _log = logging.getLogger("pycrorm_async")
 _POLL_S = 0.01
@@ -23,7 +23,7 @@ Longer than a daemon takes to find a new queue."""
 class DelegatedWriter:
     """The counterpart of `WriterThread` for a queue that a daemon drains. Belongs to the plan's loop."""
 
-    def __init__(self, queue: RecorderQueue, settings: Settings) -> None:
+    def __init__(self, queue: OfferedQueue, settings: Settings) -> None:
         self._queue = queue
         self._settings = settings
         self._drained_s = asyncio.get_running_loop().time()
@@ -36,10 +36,7 @@ class DelegatedWriter:
         """
         hindrance = await self._wait(position, undrained_s_max=math.inf, on_poll=self._raise_failure)
         if hindrance is not None:
-            raise FlushTimeout(
-                f"not finished after {self._settings.flush_timeout_s:g} s ({hindrance});"
-                " everything recorded is safe in the spool"
-            )
+            raise FlushTimeout(self._settings.flush_timeout_s, hindrance)
         self._raise_stopped()
 
     async def close(self) -> None:
@@ -59,22 +56,29 @@ class DelegatedWriter:
         self, position: int, *, undrained_s_max: float, on_poll: Callable[[], None] = lambda: None
     ) -> str | None:
         """Wait until the records up to this position are visible; return the hindrance if the wait reached a limit."""
-        loop, before = asyncio.get_running_loop(), self._status.stored
-        last, since_s = self._progress, loop.time()
+        before = self._status.stored
+        patience = Patience(self._settings.flush_timeout_s, progress=lambda: self._progress)
+        try:
+            visible = await patience.run(self._poll(position, undrained_s_max, on_poll), name="pycrorm wait for daemon")
+        except PatienceEnded:
+            visible = False
+        return None if visible else self._hindrance(before)
+
+    async def _poll(self, position: int, undrained_s_max: float, on_poll: Callable[[], None]) -> bool:
+        """Return True when the records up to this position are visible, False when none drains them for too long."""
+        loop = asyncio.get_running_loop()
         while self._status.folded < position:
             on_poll()
             now_s = loop.time()
             if self._status.note.unavailable is None and self._queue.is_drained:
                 self._drained_s = now_s
-            if self._progress != last:
-                last, since_s = self._progress, now_s
-            if now_s - self._drained_s > undrained_s_max or now_s - since_s > self._settings.flush_timeout_s:
-                return self._hindrance(before)
+            if now_s - self._drained_s > undrained_s_max:
+                return False
             await asyncio.sleep(_POLL_S)
-        return None
+        return True
 
     @property
-    def _status(self) -> DrainStatus:
+    def _status(self) -> ExternalDrain:
         status = self._queue.external_drain_status
         assert status is not None, "the queue is offered to a daemon"
         return status
@@ -103,11 +107,7 @@ class DelegatedWriter:
             return "no process drains this spool: start `pycrorm writer`"
         if status.note.unavailable is not None:
             return f"the daemon reports that the database is unavailable: {status.note.unavailable}"
-        return (
-            "the daemon makes no progress"
-            if status.stored == before
-            else "more events than could be stored and folded in that time"
-        )
+        return "the daemon makes no progress" if status.stored == before else TOO_MANY_EVENTS
 
     def _raise_stopped(self) -> None:
         stopped = dict(self._status.note.stopped)
