@@ -19,7 +19,7 @@ _APPLICATION = "pycrorm"
 
 
 def write_rerun(episode: RecordedEpisode, objects: dict[int, SceneObject], path: Path) -> int:
-    """Write the file and return the number of changes in it. Raises `MissingExtra`."""
+    """Write the file and return the number of changes in it. Raises `MissingExtra`; `OSError` if the disk is full."""
     os.environ.setdefault("RERUN_ANALYTICS", "0")  # its first start would print a notice and ask a server
     try:
         import rerun as rr
@@ -27,7 +27,8 @@ def write_rerun(episode: RecordedEpisode, objects: dict[int, SceneObject], path:
         raise MissingExtra("rerun recordings need rerun-sdk: pip install 'pycrorm-async[rerun]'") from None
 
     recording = rr.RecordingStream(_APPLICATION, recording_id=episode.id)
-    recording.save(path)
+    # Not `save`, whose thread only logs that the disk is full. The changes below take more memory than the file.
+    encoded = recording.memory_recording()
     recording.send_recording_name(f"episode {episode.number}: {episode.description}")
     recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     entities: dict[str, str] = {MAP: "world"}
@@ -54,6 +55,7 @@ def write_rerun(episode: RecordedEpisode, objects: dict[int, SceneObject], path:
     count += _send_removals(rr, recording, episode, objects, entities)
     count += _send_plan(rr, recording, episode)
     recording.flush()
+    path.write_bytes(encoded.drain_as_bytes())
     recording.disconnect()
     return count
 

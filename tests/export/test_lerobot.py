@@ -18,6 +18,7 @@ from pycrorm_async import Reading
 from pycrorm_async.errors import CallerError
 from pycrorm_async.export.export import export, export_again
 from pycrorm_async.report.output_files import new_folder
+from tests.full_disk import files_of_at_most
 
 SCHEMA = json.loads(Path(__file__).with_name("lerobot_v3.json").read_text())
 
@@ -138,6 +139,12 @@ async def test_a_data_set_is_replaced_only_when_asked_and_only_by_its_kind(datas
     with pytest.raises(CallerError, match="is not such a data set"):
         await export(reading, 1, other, file_format="lerobot", force=True)
     assert (other / "mine").exists()
+
+
+async def test_a_full_disk_leaves_no_data_set(reading: Reading, tmp_path: Path) -> None:
+    with files_of_at_most(40_000), pytest.raises(OSError, match="File too large"):
+        await export(reading, 1, tmp_path / "set", file_format="lerobot")  # the file of episodes is larger
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_a_folder_that_cannot_be_completed_leaves_the_one_before(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import sys
 from pathlib import Path
 from typing import Any
@@ -14,11 +15,13 @@ from sqlalchemy import select
 
 from pycrorm_async import Memory, Reading
 from pycrorm_async.errors import CallerError, MissingExtra
+from pycrorm_async.export import episode_files
 from pycrorm_async.export.export import export, export_again
 from pycrorm_async.orm import TaskTreeNode
 from pycrorm_async.query.scene.link_frames import link_frames
 from pycrorm_async.query.scene.object_model import object_model
 from pycrorm_async.world.queries.bounding_boxes import rotation_matrix
+from tests.full_disk import files_of_at_most
 
 Frames = dict[str, tuple[str, list[float], list[float]]]
 """Each frame with its parent, translation and rotation."""
@@ -157,6 +160,26 @@ async def test_without_its_library_the_error_names_the_extra(
     extra = {"rrd": "rerun"}.get(suffix, suffix)
     with pytest.raises(MissingExtra, match=rf"pip install 'pycrorm-async\[{extra}\]'"):
         await export(reading, 1, tmp_path / f"one.{suffix}")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("suffix", "function", "size"),
+    [("rrd", "write_rerun", 4_000), ("rrd", "write_rerun", 400_000), ("mcap", "write_mcap", 10_000)],
+)
+async def test_a_full_disk_leaves_no_file(
+    reading: Reading, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str, function: str, size: int
+) -> None:
+    write = getattr(episode_files, function)
+
+    @functools.wraps(write)
+    def write_on_a_small_disk(*args: Any, **options: Any) -> Any:  # only here, because SQLite needs space to read
+        with files_of_at_most(size):
+            return write(*args, **options)
+
+    monkeypatch.setattr(episode_files, function, write_on_a_small_disk)
+    with pytest.raises(OSError, match="File too large"):
+        await export(reading, 1, tmp_path / f"a.{suffix}")
     assert list(tmp_path.iterdir()) == []
 
 
