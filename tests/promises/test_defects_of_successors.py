@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import ast
 import asyncio
+import functools
+import operator
 import sys
 import tomllib
 from dataclasses import dataclass, field
@@ -34,6 +36,7 @@ from pycrorm_async.plan import (
 )
 from pycrorm_async.plan import MoveTorsoAction as MoveTorso
 from pycrorm_async.plan import NavigateAction as Navigate
+from pycrorm_async.query.recorded_designator import NotPerformable
 from pycrorm_async.recording.writing.event_feed import RecordedEvent
 from pycrorm_async.world import Arms, BulletWorld, Grasp, Pose
 from tests.memory.note_actions import NoteActionPerformable
@@ -178,18 +181,24 @@ async def test_every_stored_node_can_be_turned_back_into_its_designator(tmp_path
         with lab() as scene:
             performed.append(PickUpActionPerformable(scene.milk, Arms.LEFT, Grasp.FRONT))
             performed.append(PlaceActionPerformable(scene.milk, Arms.LEFT, Pose([1.3, 0.95, 0.9])))
-            for each in performed:
-                await each.perform()
-            resting, joints = scene.milk.pose, scene.robot.joint_positions()
-    rows = await results_of(tmp_path, select(Designator).where(Designator.kind == "action").order_by(Designator.id))
-    assert [type(row).__name__ for row in rows] == [type(each).dtype for each in performed]
-    assert len(await nodes_of(tmp_path)) == 1 + 5 + 1 + 1 + 1 + 5 + 3
-    # From the rows alone the same plan runs again, in a new world, with the same outcome.
-    with lab() as again:
-        for row in rows:
-            await performable_of(row).perform()
-        assert again.milk.pose.distance(resting) < 1e-9
-        assert again.robot.joint_positions() == pytest.approx(joints, abs=1e-9)
+            await functools.reduce(operator.add, performed).perform()
+            resting, joints, standing = scene.milk.pose, scene.robot.joint_positions(), scene.robot.pose
+    rows = await results_of(tmp_path, select(Designator).order_by(Designator.id))
+    assert len(await nodes_of(tmp_path)) == 1 + len(rows) == 1 + 1 + 5 + 1 + 1 + 1 + 5 + 3
+    language, *others = rows
+    assert [type(row).__name__ for row in others if row.kind == "action"] == [type(each).dtype for each in performed]
+    with pytest.raises(NotPerformable, match="Sequential is an expression"):  # its operands are rows
+        performable_of(language)
+    # From the rows alone the same actions run again, and the same motions, in new worlds, with the same outcome.
+    for kind in ("action", "motion"):
+        with lab() as again:
+            for row in others:
+                if row.kind == kind:
+                    await performable_of(row).perform()
+            assert again.robot.joint_positions() == pytest.approx(joints, abs=1e-9)
+            assert again.robot.pose.distance(standing) < 1e-9
+            if kind == "action":  # motions alone do not attach the milk
+                assert again.milk.pose.distance(resting) < 1e-9
 
 
 async def test_alternatives_that_all_fail_are_a_failure(tmp_path: Path) -> None:
