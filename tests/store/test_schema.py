@@ -194,12 +194,15 @@ async def test_a_process_that_opens_a_new_log_waits_for_another_that_makes_it(
     assert ask(address.path, "PRAGMA journal_mode") == [("wal",)]
 
 
-async def test_four_logs_that_are_made_concurrently_all_exist(tmp_path: Path) -> None:
-    for number in range(100):
+@pytest.mark.parametrize("rounds", [20, pytest.param(200, marks=pytest.mark.soak)])
+async def test_four_tasks_that_make_a_log_concurrently_make_one(tmp_path: Path, rounds: int) -> None:
+    for number in range(rounds):
         address = DatabaseAddress.parse(f"sqlite:///{tmp_path}/{number}.db")
         logs = await asyncio.gather(*(EventLog.open(address, create=True) for _ in range(4)))
         for each in logs:
             await each.close()
+        assert ask(address.path, "SELECT id FROM pycrorm_log") == [(logs[0].log_id,)]
+        assert {each.log_id for each in logs} == {logs[0].log_id}
 
 
 @pytest.mark.parametrize(
