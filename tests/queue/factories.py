@@ -6,6 +6,7 @@ import shutil
 from pathlib import Path
 
 from pycrorm_async.clock import Clock
+from pycrorm_async.errors import SpoolFull
 from pycrorm_async.events.envelope import Heading, Record
 from pycrorm_async.events.ids import EpisodeId, episode_id, episode_text
 from pycrorm_async.queue import DeadSource, LiveSource, RecorderQueue, open_dead
@@ -27,6 +28,11 @@ SMALL = Settings(
     spool_reserve_bytes=2 * 4096,
     record_bytes_max=2048,
 )
+
+# Every node takes 976 bytes. The first segment holds the start and 3 nodes, each other segment 3: 24 in 8 segments. The
+# reserve is 8192 bytes: of the last three segments (3 x 3856) 3376 may be used, which hold 3 nodes.
+ORDINARY, ALL = 18, 24
+PAYLOAD = b"x" * 900
 
 RECORDER = episode_id(1_700_000_000_000_000_000, b"recorder..")
 
@@ -63,6 +69,17 @@ def lost(position: int, number: int, sequence: int) -> Record:
 
 def make(spool: Path, *, settings: Settings = SMALL, clock: Clock = STILL, offered: bool = False) -> RecorderQueue:
     return RecorderQueue.create(spool, settings=settings, clock=clock, recorder=RECORDER, offered=offered)
+
+
+def fill(queue: RecorderQueue, *, reserved: bool = False) -> int:
+    """Put nodes until the queue refuses one; return their number."""
+    count = 0
+    while True:
+        try:
+            queue.put_nowait(node(), PAYLOAD, reserved=reserved)
+        except SpoolFull:
+            return count
+        count += 1
 
 
 def crashed_copy(queue: RecorderQueue, spool: Path) -> Path:

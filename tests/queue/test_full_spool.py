@@ -15,22 +15,19 @@ from pycrorm_async.errors import CallerError, SpoolClosed, SpoolFull, SpoolStuck
 from pycrorm_async.queue import RecorderQueue
 from pycrorm_async.queue.files.segment import Segment
 from pycrorm_async.queue.live.gc_safe_lock import GcSafeLock
-from tests.queue.factories import DECLARED, SMALL, FolderWriter, drain, make, node, started
-
-# Every node takes 976 bytes. The first segment holds the start and 3 nodes, each other segment 3: 24 in 8 segments. The
-# reserve is 8192 bytes: of the last three segments (3 x 3856) 3376 may be used, which hold 3 nodes.
-ORDINARY, ALL = 18, 24
-PAYLOAD = b"x" * 900
-
-
-def fill(queue: RecorderQueue, *, reserved: bool = False) -> int:
-    count = 0
-    while True:
-        try:
-            queue.put_nowait(node(), PAYLOAD, reserved=reserved)
-        except SpoolFull:
-            return count
-        count += 1
+from tests.queue.factories import (
+    ALL,
+    DECLARED,
+    ORDINARY,
+    PAYLOAD,
+    SMALL,
+    FolderWriter,
+    drain,
+    fill,
+    make,
+    node,
+    started,
+)
 
 
 @pytest.fixture

@@ -19,11 +19,15 @@ from pycrorm_async.events.envelope import Record
 from pycrorm_async.queue import LiveSource, RecorderQueue, Spool, open_dead
 from pycrorm_async.queue.files.drain_status import DrainStatus, Progress, RecorderStatus
 from tests.queue.factories import (
+    ALL,
     DECLARED,
+    ORDINARY,
+    PAYLOAD,
     SMALL,
     drain,
     ended,
     episode,
+    fill,
     lost,
     make,
     node,
@@ -32,7 +36,6 @@ from tests.queue.factories import (
     recover,
     started,
 )
-from tests.queue.test_full_spool import ALL, ORDINARY, PAYLOAD, fill
 
 ROOT = Path(__file__).parents[2]
 

@@ -1,4 +1,7 @@
-"""The contract of a source, for a recorder's own queue, a live recorder's folder, and a dead one's."""
+"""The contract of a source, for a recorder's own queue, a live recorder's folder, and a dead one's.
+
+A daemon claims the folders of the last two: they have the methods of a `ClaimedSource` as well.
+"""
 
 from __future__ import annotations
 
@@ -12,11 +15,12 @@ import pytest
 from pycrorm_async.errors import SpoolStuck
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.queue import DeadSource, LiveSource, RecorderQueue, Spool, open_dead
+from pycrorm_async.queue.files.drain_status import DrainNote, DrainStatus
 from pycrorm_async.queue.files.frame import EVENT
 from pycrorm_async.queue.files.scan import survey
 from pycrorm_async.queue.files.segment import read_segment, segment_path
-from tests.queue.factories import RECORDER, crashed_copy, ended, make, node, started
-from tests.queue.test_full_spool import fill
+from pycrorm_async.writer.ports import ClaimedSource, Source
+from tests.queue.factories import RECORDER, crashed_copy, ended, episode, fill, make, node, started
 
 AnySource = RecorderQueue | LiveSource | DeadSource
 Opened = TypeVar("Opened")
@@ -78,12 +82,25 @@ def scene(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[SourceCase
     case.end()
 
 
-async def batch(source: AnySource, *, events_max: int = 1000, bytes_max: int = 2**22) -> list[Record]:
+@pytest.fixture(params=["living", "dead"])
+def claimable(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[SourceCase]:
+    case = SourceCase(request.param, tmp_path)
+    yield case
+    case.end()
+
+
+def claim(case: SourceCase) -> ClaimedSource:
+    source = case.source()
+    assert not isinstance(source, RecorderQueue)
+    return source
+
+
+async def batch(source: Source, *, events_max: int = 1000, bytes_max: int = 2**22) -> list[Record]:
     async with asyncio.timeout(60):
-        return await source.get_batch(events_max=events_max, bytes_max=bytes_max, age_s_max=0.05)
+        return list(await source.get_batch(events_max=events_max, bytes_max=bytes_max, age_s_max=0.05))
 
 
-async def rest(source: AnySource) -> list[Record]:
+async def rest(source: Source) -> list[Record]:
     """Return all further records of a closed queue."""
     records: list[Record] = []
     while some := await batch(source):
@@ -102,6 +119,10 @@ def dead_letters(spool: Path) -> list[int]:
     [kept] = [each.path for each in Spool(spool).recorders() if each.refused is not None]
     survey(kept, RECORDER, on_frame=lambda _, frame: sequences.append(frame.sequence) if frame.kind == EVENT else None)
     return sequences
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
 async def eventually(reached: Callable[[], bool]) -> None:
@@ -189,7 +210,7 @@ async def test_a_refused_record_becomes_one_dead_letter_however_often_it_is_refu
     assert dead_letters(scene.folder.parent) == list(range(1, 11))
 
 
-async def test_a_source_that_fails_wakes_the_producers_that_wait_for_space(scene: SourceCase) -> None:
+async def test_a_source_that_fails_wakes_the_producers_of_its_recorder_that_wait_for_space(scene: SourceCase) -> None:
     scene.queue.put_nowait(started(), b"{}")
     fill(scene.queue)
     await scene.queue.synced_to()
@@ -197,9 +218,13 @@ async def test_a_source_that_fails_wakes_the_producers_that_wait_for_space(scene
     waiting = asyncio.create_task(scene.queue.room())
     await asyncio.sleep(0.1)
     assert not waiting.done()
+    before = contents(scene.folder)
     source.fail("the first reason")
     source.fail("another reason")
-    if scene.kind == "dead":  # no producer waits for the records of a dead recorder
+    if scene.kind == "dead":  # the producer is the recorder of which the test copied the folder
+        assert contents(scene.folder) == before
+        await asyncio.sleep(0.1)
+        assert not waiting.done()
         waiting.cancel()
         return
     with pytest.raises(SpoolStuck, match="the first reason"):
@@ -215,3 +240,107 @@ async def test_a_source_can_be_released_twice_and_frees_the_folder_for_the_next(
     source.release()
     scene.queue.close()
     assert positions(await rest(scene.source())) == list(range(1, len(SIZES) + 1))
+
+
+# --- claimed by a daemon ----------------------------------------------------------------------------------------------
+
+
+async def test_a_finished_source_ends_behind_the_records_that_were_synced_before(claimable: SourceCase) -> None:
+    await claimable.record()
+    source = claim(claimable)
+    source.finish()
+    await claimable.record([0, 0])
+    assert positions(await rest(source)) == list(range(1, len(SIZES) + 1))
+    assert await batch(source) == []
+
+
+async def test_the_next_source_begins_behind_its_stored_position(claimable: SourceCase) -> None:
+    await claimable.record()
+    source = claim(claimable)
+    assert source.stored == 0
+    await batch(source, events_max=30)
+    await source.acknowledge(25)
+    assert source.stored == 25
+    again = claim(claimable)
+    assert (0 < again.stored <= 25) if claimable.kind == "dead" else (again.stored == 25)
+    assert positions(await batch(again, events_max=1)) == [again.stored + 1]
+
+
+async def test_visibility_and_the_state_of_the_database_are_published_to_a_living_recorder(
+    claimable: SourceCase,
+) -> None:
+    await claimable.record()
+    source = claim(claimable)
+    await batch(source)
+    await source.acknowledge(20)
+    before = contents(claimable.folder)
+    source.mark_unavailable("the server restarts")
+    source.mark_visible(5, {"an episode": "a gap"})
+    status = claimable.queue.external_drain_status
+    if claimable.kind == "dead":
+        assert contents(claimable.folder) == before
+        assert status is None
+        return
+    note = DrainNote(unavailable="the server restarts", stopped={"an episode": "a gap"})
+    assert status == DrainStatus(stored=20, folded=5, note=note)
+    source.mark_unavailable(None)
+    source.mark_visible(3, {})
+    assert claimable.queue.external_drain_status == DrainStatus(stored=20, folded=5)
+
+
+async def test_the_next_source_knows_what_a_living_recorder_waits_to_see(claimable: SourceCase) -> None:
+    await claimable.record()
+    source = claim(claimable)
+    assert source.invisible == {}
+    await batch(source)
+    await source.acknowledge(20)
+    source.mark_visible(5, {})
+    waited_for = {episode(1): 20} if claimable.kind == "living" else {}
+    again = claim(claimable)
+    assert again.invisible == waited_for
+    if claimable.kind == "dead":  # supplies the records again
+        await batch(again)
+    again.mark_visible(20, {})
+    assert claim(claimable).invisible == {}
+
+
+async def test_a_source_knows_whether_its_recorder_lives(claimable: SourceCase) -> None:
+    await claimable.record()
+    source = claim(claimable)
+    assert source.is_alive == (claimable.kind == "living")
+    claimable.queue.release()
+    assert not source.is_alive
+
+
+async def test_a_released_source_has_an_outcome_when_all_records_are_stored(claimable: SourceCase) -> None:
+    await claimable.record()
+    claimable.queue.close()
+    source = claim(claimable)
+    await source.acknowledge(positions(await batch(source, events_max=30))[-1] - 1)
+    assert source.release() is None
+    source = claim(claimable)
+    records = await rest(source)
+    await source.acknowledge(records[-1].position)
+    assert source.release() == ("has ended" if claimable.kind == "living" else "is recovered")
+
+
+async def test_dead_letters_are_a_source_that_keeps_what_is_refused_again(claimable: SourceCase) -> None:
+    await claimable.record()
+    claimable.queue.close()
+    source = claim(claimable)
+    records = await rest(source)
+    assert source.dead_letter(records[:3])
+    await source.acknowledge(records[-1].position)
+    assert not source.holds_dead_letters
+    source.release()
+    claimable.queue.release()
+    [kept] = [each.path for each in Spool(claimable.folder.parent).recorders() if each.refused is not None]
+    letters: ClaimedSource = _present(open_dead(kept))
+    assert letters.holds_dead_letters
+    refused = await rest(letters)
+    assert [(each.sequence, each.payload) for each in refused][:3] == [
+        (each.sequence, each.payload) for each in records[:3]
+    ]
+    assert not letters.dead_letter(refused)
+    assert letters.release() is None
+    assert dead_letters(claimable.folder.parent) == [1, 2, 3]

@@ -61,7 +61,9 @@ class LiveSource:
         visible = min(before.stored, before.folded)
         self._reader = Reader(Place(folder, recorder, self._start_of(visible)))
         self.invisible: dict[EpisodeId, int] = {}
-        self._reader.skip_to(min(before.stored, progress.recorded().synced), on_records=self._note_invisible)
+        stored = min(before.stored, progress.recorded().synced)
+        self._reader.skip_to(min(visible, stored))
+        self._reader.skip_to(stored, on_records=self._note_invisible)
         self._until: int | None = None
         self._alive_checked_s = 0.0
         progress.write_drain_status(self._status)
