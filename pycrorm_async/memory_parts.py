@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, Self
 from pycrorm_async.clock import Clock
 from pycrorm_async.connected_var import ConnectedVar, set_inside
 from pycrorm_async.errors import CallerError, PycrormError
-from pycrorm_async.hooks.observations import Observations
+from pycrorm_async.hooks.observations import Observations, observations
 from pycrorm_async.hooks.plan_recorder import Recorder
 from pycrorm_async.plan.execution.observer import recorder
 from pycrorm_async.plan.execution.unawaited_performs import called_performs
@@ -70,6 +70,7 @@ class Parts(NamedTuple):
             (watcher, self.recorder),
             (called_performs, self.recorder.calls),
             (experience, self.experience),
+            (observations, self.observations),
         )
 
 

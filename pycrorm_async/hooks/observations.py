@@ -7,9 +7,12 @@ recording at the same event.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
+from pycrorm_async.connected_var import ConnectedVar
 from pycrorm_async.errors import Unrecordable
+from pycrorm_async.events.blobs import Blob
 from pycrorm_async.hooks.plan_recorder import Recorder
 from pycrorm_async.plan.task_tree import TaskTreeNode, current_node
 from pycrorm_async.recording.writing.emitter import Emitter
@@ -24,10 +27,16 @@ class Observations:
         self._emitter = emitter
         self._recorder = recorder
         self._full: EpisodeWriter[Any] | None = None  # that has no room for observations of other threads
+        self._kept: set[tuple[str, str]] = set()
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether the memory is closed, or belongs to the process that forked this one."""
+        return self._emitter.is_closed
 
     def observe(self, name: str, values: object, *, node: TaskTreeNode | None) -> None:
         """Record values under this name. Raises `Unrecordable` with `on_unrecordable="refuse"` only."""
-        if self._emitter.is_closed:
+        if self.is_closed:
             return
         try:
             self._observe(name, values, node)
@@ -36,7 +45,21 @@ class Observations:
         except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
             self._emitter.note_fault("Observed", error)
 
-    def _observe(self, name: str, values: object, node: TaskTreeNode | None) -> None:
+    def keep(self, name: str, key: str, content: Callable[[], Blob]) -> None:
+        """Record a content that nodes name by this key, once for all episodes of the memory.
+
+        Outside an episode nothing is recorded; the next call tries again, also where the spool had no room.
+        """
+        if self.is_closed or (name, key) in self._kept or self._recorder.episode_here() is None:
+            return
+        try:
+            if self._observe(name, {key: content()}, None):
+                self._kept.add((name, key))
+        except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
+            self._emitter.note_fault("Observed", error)
+
+    def _observe(self, name: str, values: object, node: TaskTreeNode | None) -> int:
+        """Return the sequence of the event; 0 if it was counted as missing."""
         own = self._recorder.episode_here()
         episode: EpisodeWriter[Any] | None
         if node is not None:
@@ -48,10 +71,15 @@ class Observations:
         if episode is None or (episode is not own and episode is self._full):
             reason = "no episode is open" if episode is None else "its episode has no more room for observations"
             self._emitter.missing.note("observation", name_of(name), reason)
-            return
+            return 0
         sequence = put_observation(self._emitter, episode, name, values, episode.node_or_root(node), may_refuse=True)
         if sequence >= episode.continue_at:
             if episode is own:
                 self._recorder.continue_episode(own)
             else:
                 self._full = episode
+        return sequence
+
+
+observations: ConnectedVar[Observations] = ConnectedVar("observations")
+"""The observations of the memory that records this context; None without an open memory."""

@@ -12,11 +12,13 @@ from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from sqlalchemy import select
+
 from pycrorm_async.errors import CallerError, InternalError
 from pycrorm_async.learning.policies.default_policy import default_policy
 from pycrorm_async.learning.policies.policy import PickUpChoice, Policy
 from pycrorm_async.learning.policies.policy_file import name_of
-from pycrorm_async.learning.policies.recorded_policy import policy_contents, record_policy
+from pycrorm_async.learning.policies.recorded_policy import record_policy
 from pycrorm_async.learning.policies.tree import check_leaf, learn
 from pycrorm_async.learning.rollouts import recorded_rollouts
 from pycrorm_async.learning.rollouts.recorded_rollouts import tally_of
@@ -25,6 +27,7 @@ from pycrorm_async.learning.rollouts.rollouts import Tally
 from pycrorm_async.learning.rollouts.scene import Scene
 from pycrorm_async.memory import Memory
 from pycrorm_async.operations.recovery import recover
+from pycrorm_async.orm import LearnPolicyAction
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.world.enums import Arms, Grasp
 
@@ -203,7 +206,7 @@ class _PhaseRunner:
         seeds = [experiment.seed + number for number in range(rounds)]
         scene, policies = str(experiment.scene), [each.policy for each in self.phases[:rounds]]
         async with self._reading.session() as session:
-            if await session.scalar(policy_contents(name).limit(1)) is not None:
+            if await session.scalar(select(LearnPolicyAction.id).where(LearnPolicyAction.policy == name).limit(1)):
                 return
             training = recorded_rollouts.episodes_question(scene=scene, seeds=seeds, policies=policies)
             episodes = list(await session.scalars(training))

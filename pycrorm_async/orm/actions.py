@@ -165,12 +165,17 @@ class FaceAtAction(PoseParameter, Action):
 
 
 class MoveAndPickUpAction(PoseParameter, ObjectDesignatorParameter, Action):
-    """Drive to a place, face the object and pick it up."""
+    """Drive to a place, face the object and pick it up.
+
+    Attributes:
+        policy: name of the policy that chose place, arm and grasp; None if none did.
+    """
 
     __tablename__ = "move_and_pick_up_action"
 
     arm: Mapped[Arms]
     grasp: Mapped[Grasp]
+    policy: Mapped[str | None]
 
     pose_id: Mapped[int] = mapped_column("standing_position_id", ForeignKey("pose.id"), sort_order=-1)
     standing_position_id: Mapped[int] = synonym("pose_id")
@@ -181,11 +186,12 @@ class BatchRolloutAction(Action):
     """Try one action many times, each chosen by a policy (`pycrorm_async.learning.batch_rollout`).
 
     Attributes:
-        policy: its name, which describes it.
+        policy: its name, for `read_policy`.
         scene: a description of the world.
         seed: of the random numbers; seed and index determine a rollout.
         first: the index of the first rollout; later ones count on from it.
         count: the number of rollouts requested; an interrupted batch has fewer children.
+        arms, grasps: names of those to which the policy was limited; empty if it was not.
     """
 
     __tablename__ = "batch_rollout_action"
@@ -195,6 +201,14 @@ class BatchRolloutAction(Action):
     seed: Mapped[int]
     first: Mapped[int]
     count: Mapped[int]
+
+    @property
+    def arms(self) -> list[str]:
+        return self.entries("arms")
+
+    @property
+    def grasps(self) -> list[str]:
+        return self.entries("grasps")
 
 
 class LearnPolicyAction(Action):

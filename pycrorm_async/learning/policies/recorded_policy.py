@@ -1,7 +1,8 @@
 """Record learned policies in the memory, and read them back by name.
 
-Rollouts name their policy by the hash of its content (`name_of`), so a run stays explainable when its policy file has
-been overwritten: the content is a blob of the memory, under a node that names the training episodes and settings.
+Rollouts and sampled pick-ups name their policy by the hash of its content (`name_of`), so a run stays explainable when
+its policy file has been overwritten: they record the content as a blob of the memory. `record_policy` records it under
+a node that also names the training episodes and settings.
 
 >>> await record_policy(memory, policy, episodes=memory.recent_episodes, successes=158, min_samples_leaf=25)
 >>> same = await read_policy(memory.reading, name_of(policy))
@@ -12,10 +13,11 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
-from sqlalchemy import Select, select
+from sqlalchemy import Select, or_, select
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.blobs import Blob
+from pycrorm_async.hooks.observations import observations
 from pycrorm_async.learning.policies.policy import Policy
 from pycrorm_async.learning.policies.policy_file import decode_policy, encode_policy, name_of
 from pycrorm_async.memory import Memory
@@ -76,13 +78,21 @@ async def record_policy(
     return name
 
 
+def keep_policy(name: str, policy: Policy) -> None:
+    """Record the content of a policy that is used, in the open episode; once for each opened memory."""
+    here = observations.get()
+    if here is not None:
+        here.keep(_OBSERVATION, name, lambda: Blob(encode_policy(policy), _MEDIA_TYPE))
+
+
 def policy_contents(name: str) -> Select[str | None]:
     """Select the hash of the blob that holds the content of the policy with this name, the latest first."""
     return (
         select(ObservationValue.blob)
         .join(Observation, Observation.id == ObservationValue.id)
-        .join(LearnPolicyAction, LearnPolicyAction.id == Observation.node_id)
-        .where(LearnPolicyAction.policy == name, Observation.name == _OBSERVATION, ObservationValue.blob.is_not(None))
+        .outerjoin(LearnPolicyAction, LearnPolicyAction.id == Observation.node_id)
+        .where(Observation.name == _OBSERVATION, ObservationValue.blob.is_not(None))
+        .where(or_(ObservationValue.key == name, LearnPolicyAction.policy == name))
         .order_by(Observation.id.desc())
     )
 
@@ -93,5 +103,5 @@ async def read_policy(reading: Reading, name: str) -> Policy:
         hash_ = await session.scalar(policy_contents(name).limit(1))
     blob = await reading.blob(hash_) if hash_ is not None else None
     if blob is None:
-        raise CallerError(f"the memory holds no policy {name!r}; `LearnPolicyAction` has the names of those it holds")
+        raise CallerError(f"the memory holds no policy {name!r}: `MoveAndPickUpAction.policy` names those it holds")
     return decode_policy(blob.content)

@@ -12,6 +12,7 @@ from pycrorm_async.learning.policies.default_policy import default_policy
 from pycrorm_async.learning.policies.evidence import Evidence
 from pycrorm_async.learning.policies.policy import ARMS, PickUpChoice, Policy
 from pycrorm_async.learning.policies.policy_file import name_of
+from pycrorm_async.learning.policies.recorded_policy import keep_policy
 from pycrorm_async.learning.rollouts.feasible_places import free_and_visible
 from pycrorm_async.orm import PickUpWithContextView
 from pycrorm_async.plan.actions.basic import MoveAndPickUpPerformable
@@ -49,6 +50,9 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
         samples: number of alternatives.
         rng: random generator; None means a new one with an unpredictable seed.
 
+    Each alternative names the policy as passed, before arms and grasps limit it (`policy_name`). The first alternative
+    in an episode records the policy's content, once for each opened memory (`read_policy`).
+
     Raises `ImpossibleCondition` if the policy gives these arms or grasps no probability, `CallerError` if
     samples < 1.
     """
@@ -67,18 +71,18 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
         if samples < 1:
             raise CallerError(f"samples must be >= 1, got {samples}")
         self.target = target.resolve() if isinstance(target, ObjectDesignatorDescription) else designator_of(target)
-        self._arms = frozenset(arms) if arms is not None else None
-        evidence = Evidence(
-            arms=self._arms,
+        self.allowed = evidence = Evidence(
+            arms=frozenset(arms) if arms is not None else None,
             grasps=frozenset(grasps) if grasps is not None else None,
         )
-        policy = default_policy() if policy is None else policy
+        self._passed_policy = policy = default_policy() if policy is None else policy
+        self.policy_name = name_of(policy)
         self.policy: Policy = policy if evidence == Evidence() else policy.condition(evidence)
         self.samples = samples
         self._rng = np.random.default_rng() if rng is None else rng
 
     def __repr__(self) -> str:
-        return f"MoveAndPickUp({self.target.name!r}, policy={name_of(self.policy)})"
+        return f"MoveAndPickUp({self.target.name!r}, policy={self.policy_name})"
 
     @staticmethod
     def query_for_database() -> Select[Arms, Grasp, float, float, float | None]:
@@ -125,7 +129,7 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
 
     def _strong_enough(self) -> frozenset[Arms] | None:
         """Return the allowed arms that lift the object; None if that does not rule one out."""
-        allowed = ARMS if self._arms is None else tuple(self._arms)
+        allowed = ARMS if self.allowed.arms is None else tuple(self.allowed.arms)
         lifting = lifting_arms(require_robot(), allowed, self.target)
         return frozenset(lifting) if len(lifting) < len(allowed) else None
 
@@ -144,16 +148,23 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
 
     def choices(self) -> Iterator[PickUpChoice]:
         """Yield the choices of `__iter__`."""
+        self.keep_policy()
         yield from self._likeliest_first(self.grounded())
 
     def from_mode(self) -> Iterator[MoveAndPickUpPerformable]:
         """Yield samples from around the mode of the grounded policy only. Raises `ObjectUnreachable`."""
+        self.keep_policy()
         yield from map(self.chosen, self._likeliest_first(self.grounded().mode()))
 
     def plain(self) -> Iterator[MoveAndPickUpPerformable]:
         """Yield samples in the order they are drawn, without regard to obstacles and visibility."""
+        self.keep_policy()
         for choice in self.policy_here().sample(self._rng, self.samples):
             yield self.chosen(choice)
+
+    def keep_policy(self) -> None:
+        """Record the policy's content in the open episode, once for each opened memory."""
+        keep_policy(self.policy_name, self._passed_policy)
 
     def _likeliest_first(self, policy: Policy) -> Iterator[PickUpChoice]:
         choices = self._clear_choices(policy)
@@ -197,7 +208,9 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
             raise ObjectUnreachable(message, self.target.name)
         x, y, z = (pose @ Pose((choice.relative_x, choice.relative_y, 0.0))).position
         standing_position = Pose((x - z * up.x / up.z, y - z * up.y / up.z, base_height_m()))
-        return MoveAndPickUpPerformable(standing_position, self.target, choice.arm, choice.grasp)
+        return MoveAndPickUpPerformable(
+            standing_position, self.target, choice.arm, choice.grasp, policy=self.policy_name
+        )
 
 
 def _around(height: float) -> tuple[float, float]:

@@ -106,7 +106,7 @@ class RecalledPickUp(ActionDescription[RecalledPickUpPerformable]):
             while (best := await self._best(source, region, clearance, tried)) is not None:
                 choice, way = best
                 tried.add(choice)
-                yield self._performable_of(choice, "recall", way.score)
+                yield self._performable_of(choice, "recall", expected=way.score)
         for description, chosen_by in self._otherwise:
             try:
                 choices = [*description.choices()]
@@ -115,7 +115,7 @@ class RecalledPickUp(ActionDescription[RecalledPickUpPerformable]):
                     raise
                 continue  # a learned policy may know no way at this height
             for each in choices:
-                yield self._performable_of(each, chosen_by, None)
+                yield self._performable_of(each, chosen_by, policy=description.policy_name)
 
     async def _best(
         self, source: Experience, region: Region, clearance: BaseClearance | None, tried: set[PickUpChoice]
@@ -143,9 +143,9 @@ class RecalledPickUp(ActionDescription[RecalledPickUpPerformable]):
         return None
 
     def _performable_of(
-        self, choice: PickUpChoice, chosen_by: str, expected: float | None
+        self, choice: PickUpChoice, chosen_by: str, *, expected: float | None = None, policy: str | None = None
     ) -> RecalledPickUpPerformable:
         move = self._default.chosen(choice)
         return RecalledPickUpPerformable(
-            move.standing_position, move.object_designator, move.arm, move.grasp, chosen_by, expected
+            move.standing_position, move.object_designator, move.arm, move.grasp, chosen_by, expected, policy=policy
         )

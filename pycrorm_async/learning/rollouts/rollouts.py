@@ -21,7 +21,6 @@ import numpy as np
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.learning.policies.policy import Policy
-from pycrorm_async.learning.policies.policy_file import name_of
 from pycrorm_async.learning.rollouts.move_and_pick_up import MoveAndPickUp
 from pycrorm_async.plan.current_robot import require_world
 from pycrorm_async.plan.designator import ActionAbstract
@@ -104,7 +103,10 @@ async def batch_rollout(
         for begin, length in slices:
             if stop():
                 break
-            batch = BatchRolloutActionPerformable(name_of(action.policy), scene, seed, begin, length, run)
+            arms, grasps = (
+                sorted(each.name for each in members or ()) for members in (action.allowed.arms, action.allowed.grasps)
+            )
+            batch = BatchRolloutActionPerformable(action.policy_name, scene, seed, begin, length, arms, grasps, run)
             async with _episode_of(each_in, batch):
                 await batch.perform()
     return tally
@@ -146,11 +148,14 @@ class BatchRolloutActionPerformable(ActionAbstract):
     seed: int
     first: int
     count: int
+    arms: list[str] = field(default_factory=list)
+    grasps: list[str] = field(default_factory=list)
     _run: _Run | None = field(default=None, repr=False, compare=False)
 
     async def perform(self) -> None:
         run = self._run
         assert run is not None, "only batch_rollout creates and performs a batch"
+        run.action.keep_policy()
         for index in self._indexes(run):
             choice = run.policy.sample(randomness(self.seed, index))[0]
             try:

@@ -10,7 +10,7 @@ Descriptions with alternatives are in `actions.descriptions`.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar
 
 from pycrorm_async.plan.current_robot import require_robot
@@ -229,7 +229,11 @@ class FaceAtPerformable(CheckedAction):
 
 @dataclass
 class MoveAndPickUpPerformable(CheckedAction):
-    """Drive to a place, face the object from there, and pick it up."""
+    """Drive to a place, face the object from there, and pick it up.
+
+    Attributes:
+        policy: name of the policy that chose place, arm and grasp; None if none did.
+    """
 
     concept: ClassVar[str | None] = "Fetching"
 
@@ -237,6 +241,7 @@ class MoveAndPickUpPerformable(CheckedAction):
     object_designator: ObjectDesignator | Object
     arm: Arms
     grasp: Grasp
+    policy: str | None = field(default=None, kw_only=True)
 
     def resources(self) -> frozenset[Resource]:
         return reaching(self.arm) | {Resource.HEAD}

@@ -47,7 +47,7 @@ _BUILT_IN: Final[dict[str, dict[str, _Columns]]] = {
         "CloseAction": {**_OBJECT, **_ARM},
         "GraspingAction": {**_ARM, "object_desig_id": "object"},
         "FaceAtAction": {"pose_id": "pose"},
-        "MoveAndPickUpAction": {"standing_position_id": "pose", **_OBJECT, **_ARM, "grasp": "text"},
+        "MoveAndPickUpAction": {"standing_position_id": "pose", **_OBJECT, **_ARM, "grasp": "text", "policy": "text"},
         "BatchRolloutAction": {
             "policy": "text",
             "scene": "text",
