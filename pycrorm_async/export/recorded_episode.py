@@ -70,6 +70,7 @@ class RecordedEpisode:
     """The events of an episode up to its head when it was chosen.
 
     Attributes:
+        events: all of them, in order.
         objects: each object's `ObjectAdded`, by identity, the sequence of that event.
         changes: of the world, in order; an object's first one adds it.
         nodes: in the order in which they started.
@@ -80,6 +81,7 @@ class RecordedEpisode:
     description: str = ""
     status: str = "RUNNING"
     started_wall_ns: int = 0
+    events: list[When] = field(default_factory=list)
     objects: dict[int, ObjectAdded] = field(default_factory=dict)
     changes: list[Change] = field(default_factory=list)
     nodes: list[ExportedNode] = field(default_factory=list)
@@ -117,6 +119,7 @@ class _EpisodeFold:
         if event.sequence == 1:
             self._begin_ns, self.episode.started_wall_ns = event.monotonic_ns, event.wall_ns
         when = When(event.sequence, event.monotonic_ns - self._begin_ns, event.wall_ns)
+        self.episode.events.append(when)
         match happening:
             case EpisodeStarted():
                 self.episode.description = happening.description

@@ -16,9 +16,21 @@ from pyarrow import parquet
 
 from pycrorm_async import Reading
 from pycrorm_async.errors import CallerError
+from pycrorm_async.events.types import (
+    EpisodeEnded,
+    EpisodeStarted,
+    NodeEnded,
+    NodeStarted,
+    ObjectAdded,
+    ObjectMoved,
+    ObjectRemoved,
+)
+from pycrorm_async.events.values import ObjectReference
 from pycrorm_async.export.export import export, export_again
 from pycrorm_async.report.output_files import new_folder
 from tests.full_disk import files_of_at_most
+from tests.projections.event_script import NAVIGATE, SAYING, Script, declarations, name_of, pose
+from tests.projections.factories import append_and_fold
 
 SCHEMA = json.loads(Path(__file__).with_name("lerobot_v3.json").read_text())
 
@@ -108,6 +120,40 @@ async def test_by_time_a_frame_holds_the_state_in_force(reading: Reading, tmp_pa
     info = json.loads((tmp_path / "time/meta/info.json").read_text())
     assert info["fps"] == 200
     assert (await export_again(reading, tmp_path / "time.manifest.json")).same
+
+
+async def test_by_time_a_frame_names_the_action_that_runs_while_the_robot_stands_still(tmp_path: Path) -> None:
+    script = Script()
+    put = script.put
+    put(EpisodeStarted("drive and talk", "me", "host", "1.0", "3.11"))  # 1
+    root = put(NodeStarted("root"))  # 2
+    robot = put(ObjectAdded("pr2", "ROBOT", pose()))  # 3: the first frame
+    for x in (1, 2):
+        drive = put(NodeStarted("action", root, name_of(NAVIGATE), {"target_location": pose(x)}))  # 4, 11
+        put(ObjectMoved(robot, "pr2", "ROBOT", pose(x), drive))  # 5, 12
+        put(NodeEnded(drive, "SUCCEEDED"))  # 6, 13
+        if x == 1:
+            talk = put(NodeStarted("action", root, name_of(SAYING), {"text": "hi"}))  # 7
+            put(ObjectAdded("cup", "CUP", pose()))  # 8
+            put(NodeEnded(talk, "SUCCEEDED"))  # 9
+            put(ObjectAdded("bowl", "BOWL", pose()))  # 10
+    put(ObjectRemoved(ObjectReference(robot, robot)))  # 14
+    put(NodeEnded(root, "SUCCEEDED"))
+    put(EpisodeEnded("SUCCEEDED"))
+    url = f"sqlite:///{tmp_path}/memory.db"
+    await append_and_fold(url, [*declarations(NAVIGATE, SAYING), *script.records])
+    async with Reading.open(url) as reading:
+        await export(reading, 1, tmp_path / "set", file_format="lerobot", clock="time", fps=2)
+    frames = pd.read_parquet(tmp_path / "set/data")
+    subtasks = pd.read_parquet(tmp_path / "set/meta/subtasks.parquet").index
+    assert frames.time_s.tolist() == [each / 2 for each in range(4, 25)]  # an event a second, the first one at 0
+    assert frames.event.tolist() == [each // 2 for each in range(6, 27)]
+    assert frames["observation.state"].str[0].tolist() == [0] * 4 + [1] * 14 + [2] * 3
+    names = ["idle"] * 2 + ["NavigateAction"] * 4 + ["idle"] * 2 + ["SayingAction"] * 4 + ["idle"] * 4
+    assert subtasks[frames.subtask_index].tolist() == [*names, *["NavigateAction"] * 4, "idle"]
+    plan = pd.read_parquet(tmp_path / "set/meta/plan.parquet")
+    ranges = plan.dataset_from_index.tolist(), plan.dataset_to_index.tolist()
+    assert ranges == ([0, 2, 8, 16], [21, 6, 12, 20])
 
 
 @pytest.mark.slow

@@ -186,7 +186,7 @@ class LeRobotFolder:
             begin = int(np.searchsorted(sequences, node.sequence, side="left"))
             end = len(sequences)
             if node.end is not None:
-                end = int(np.searchsorted(sequences, node.end.sequence, side="right"))
+                end = int(np.searchsorted(sequences, node.end.sequence, side="left"))
             self._plan.append(
                 {
                     "episode_index": number,

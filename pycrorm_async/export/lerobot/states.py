@@ -34,7 +34,7 @@ class Frames(NamedTuple):
         robot: the model of the robot, or its name.
         channels: names of the numbers of a state: 7 of the base (m, quaternion), then the joints (rad, m) by name.
         states: one row for each frame.
-        at: the last event of each frame.
+        at: the last event of each frame; by time at the time of the frame.
         subtasks: the innermost running action of each frame, with the names of its objects.
     """
 
@@ -56,10 +56,11 @@ def frames_of(episode: RecordedEpisode, clock: Clock, fps: int) -> Frames:
     robot = episode.objects[robots[0]]
     channels = (*BASE, *sorted(robot.joints))
     changed = list(_states(episode, robots[0], channels))
-    chosen = changed if clock == "event" else list(_resampled(episode, changed, fps))
+    while_there = _events_with(episode, robots[0])
+    chosen = changed if clock == "event" else list(_resampled(episode.number, while_there, changed, fps))
     if len(chosen) < 2:
-        last = changed[-1][0].since_ns - changed[0][0].since_ns if changed else 0
-        there = f"give a higher --fps, because the robot was there for {last / 1e9:.3f} s, or --clock event"
+        stay_ns = while_there[-1].since_ns - while_there[0].since_ns
+        there = f"give a higher --fps, because the robot was there for {stay_ns / 1e9:.3f} s, or --clock event"
         remedy = there if clock == "time" else "leave it out"
         count = f"{len(chosen)} frame{'' if len(chosen) == 1 else 's'}"
         raise CallerError(f"episode {episode.number} has {count} by {clock}, and LeRobot needs two: {remedy}")
@@ -91,25 +92,29 @@ def _states(
             yield change.when, now
 
 
+def _events_with(episode: RecordedEpisode, identity: int) -> list[When]:
+    """Return the events from the one that added the robot to the last one before its removal."""
+    removals = (each.when.sequence for each in episode.changes if each.removed and each.object == identity)
+    removal = next(removals, None)
+    return [each for each in episode.events if identity <= each.sequence and (not removal or each.sequence < removal)]
+
+
 def _resampled(
-    episode: RecordedEpisode, changed: Sequence[tuple[When, tuple[float, ...]]], fps: int
+    episode: int, events: Sequence[When], changed: Sequence[tuple[When, tuple[float, ...]]], fps: int
 ) -> Iterator[tuple[When, tuple[float, ...]]]:
-    """Yield the state in force at each multiple of 1 / fps, up to the episode's last change of the world."""
-    if not changed:
-        return
-    begin_ns, end_ns = changed[0][0].since_ns, episode.changes[-1].when.since_ns
+    """Yield the last event and the state in force at each multiple of 1 / fps, from the first event to the last."""
+    begin_ns, end_ns = events[0].since_ns, events[-1].since_ns
     count = (end_ns - begin_ns) * fps // _SECOND_NS + 1
     if count > _FRAMES_MAX:
-        raise CallerError(
-            f"episode {episode.number} would have {count:,} frames at {fps} per second: give a lower --fps"
-        )
-    current = 0
+        raise CallerError(f"episode {episode} would have {count:,} frames at {fps} per second: give a lower --fps")
+    event = state = 0
     for frame in range(count):
         since_ns = begin_ns + frame * _SECOND_NS // fps
-        while current + 1 < len(changed) and changed[current + 1][0].since_ns <= since_ns:
-            current += 1
-        when, state = changed[current]
-        yield When(when.sequence, since_ns, when.wall_ns), state
+        while event + 1 < len(events) and events[event + 1].since_ns <= since_ns:
+            event += 1
+        while state + 1 < len(changed) and changed[state + 1][0].sequence <= events[event].sequence:
+            state += 1
+        yield events[event]._replace(since_ns=since_ns), changed[state][1]
 
 
 def _subtasks(nodes: Sequence[ExportedNode], at: Sequence[When]) -> Iterator[str]:
