@@ -30,6 +30,7 @@ from pycrorm_async.events.ids import SLOT_FIRST_FIELD
 from pycrorm_async.events.types import DesignatorTypeDeclared
 from pycrorm_async.events.values import FieldDeclared
 from pycrorm_async.plan.designator import Designator
+from pycrorm_async.plan.protocols import Performable
 from pycrorm_async.recording.declarations.declared_type import DeclaredType, Field, Undeclared
 from pycrorm_async.recording.declarations.known_types import KnownTypes
 from pycrorm_async.recording.declarations.known_types import type_text as type_text_of
@@ -69,7 +70,7 @@ class Declarations:
         self._classes_by_name: dict[str, weakref.ref[type]] = {}
         self._classes_by_alias: dict[str, weakref.ref[type]] = {}
 
-    def of(self, designator: type[Designator], on_new: Callable[[DeclaredType], None]) -> DeclaredType:
+    def of(self, designator: type[Performable], on_new: Callable[[DeclaredType], None]) -> DeclaredType:
         """Return the declaration of a class; before returning it for the first time, call `on_new` with it."""
         cached = self._declared.get(designator)
         if cached is not None:
@@ -84,7 +85,7 @@ class Declarations:
         self._declared[designator] = declared
         return declared
 
-    def _new(self, designator: type[Designator]) -> DeclaredType:
+    def _new(self, designator: type[Performable]) -> DeclaredType:
         try:
             declared = declared_type(
                 designator,
@@ -106,7 +107,7 @@ class Declarations:
             raise DeclarationRefused(_path(designator), fault)
         return _without_type(designator, declared.fields, declared.undeclared, fault)
 
-    def _fault_in_names(self, designator: type[Designator], declared: DeclaredType) -> str | None:
+    def _fault_in_names(self, designator: type[Performable], declared: DeclaredType) -> str | None:
         """Return the reason why another live class already has the dtype or table name; None if none has."""
         if not designator.__module__.startswith(OUR_PACKAGE):
             for other in _built_in_classes(designator.dtype):
@@ -147,7 +148,7 @@ def _descendants(root: type) -> typing.Iterator[Any]:
 
 
 def declared_type(
-    designator: type[Designator],
+    designator: type[Performable],
     *,
     strict: bool = True,
     field_types: Mapping[str, str] | None = None,
@@ -206,7 +207,7 @@ def declared_type(
 
 
 def _without_type(
-    designator: type[Designator], fields: tuple[Field, ...], undeclared: tuple[Undeclared, ...], fault: str
+    designator: type[Performable], fields: tuple[Field, ...], undeclared: tuple[Undeclared, ...], fault: str
 ) -> DeclaredType:
     """Build the record of a class that cannot be declared: its nodes keep their parameters, but have no type."""
     dtype = cut(clean(designator.dtype), _REASON_MAX)
@@ -236,7 +237,7 @@ def _declarable_fields(
             undeclared.append(Undeclared(name, field.path, fault))
 
 
-def _bases(designator: type[Designator]) -> tuple[str, ...]:
+def _bases(designator: type[Performable]) -> tuple[str, ...]:
     """Return the dtypes of the base classes, nearest first, without the abstract roots of the plan layer."""
     return tuple(
         base.dtype
@@ -246,7 +247,7 @@ def _bases(designator: type[Designator]) -> tuple[str, ...]:
 
 
 def _aliases_or_fault(
-    designator: type[Designator], classes_by_alias: Mapping[str, weakref.ref[type]]
+    designator: type[Performable], classes_by_alias: Mapping[str, weakref.ref[type]]
 ) -> tuple[tuple[str, ...], str | None]:
     """Return the aliases of a class; if one of them is not allowed, return no aliases and the reason."""
     try:
@@ -257,7 +258,7 @@ def _aliases_or_fault(
     return (aliases, None) if fault is None else ((), fault)
 
 
-def _aliases(designator: type[Designator]) -> tuple[str, ...]:
+def _aliases(designator: type[Performable]) -> tuple[str, ...]:
     """Read the class attribute `aliases`, the classes_by_alias names of this type; a subclass does not inherit them."""
     aliases = vars(designator).get("aliases", ())
     if dataclasses.is_dataclass(designator) and "aliases" in {each.name for each in dataclasses.fields(designator)}:
@@ -273,7 +274,7 @@ def _aliases(designator: type[Designator]) -> tuple[str, ...]:
     return tuple(aliases)
 
 
-def _fault_in_alias(alias: str, designator: type[Designator]) -> str | None:
+def _fault_in_alias(alias: str, designator: type[Performable]) -> str | None:
     if fault_in_dtype(alias) is not None:
         return "is not a name (letters, digits and single underscores)"
     if alias == designator.dtype:

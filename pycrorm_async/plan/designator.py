@@ -23,7 +23,7 @@ from pycrorm_async.plan.execution.node_execution import is_wrapped, wrap_perform
 from pycrorm_async.plan.field_types import check_properties
 from pycrorm_async.plan.language.operators import Composable
 from pycrorm_async.plan.language.resources import NOTHING, Resource
-from pycrorm_async.plan.task_tree import NodeKind
+from pycrorm_async.plan.protocols import NodeKind
 
 
 class Designator(Composable, ABC):

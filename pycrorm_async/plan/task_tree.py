@@ -10,14 +10,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any
 
+from pycrorm_async.plan.protocols import NodeKind, Performable
 from pycrorm_async.task_status import TaskStatus
-
-if TYPE_CHECKING:
-    from pycrorm_async.plan.designator import Designator
-
-NodeKind = Literal["root", "action", "motion", "language"]
 
 
 class TaskTreeNode:
@@ -48,7 +44,7 @@ class TaskTreeNode:
 
     def __init__(
         self,
-        designator: Designator | None,
+        designator: Performable | None,
         kind: NodeKind,
         parent: TaskTreeNode | None,
         started_ns: int,

@@ -28,7 +28,7 @@ from pycrorm_async.plan.motions.motions import (
     MoveMotion,
     MoveTCPMotion,
 )
-from pycrorm_async.plan.motions.process_modules import collisions_count
+from pycrorm_async.plan.motions.robot_choice import collisions_count
 from pycrorm_async.plan.object_designators import ObjectDesignator, designator_of, in_world
 from pycrorm_async.world.enums import Arms, Grasp, GripperState
 from pycrorm_async.world.objects import Object

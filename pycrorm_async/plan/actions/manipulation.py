@@ -17,7 +17,7 @@ from pycrorm_async.plan.geometry.grasp_poses import HOLD_DISTANCE_M_MAX, approac
 from pycrorm_async.plan.geometry.gripper_checks import check_fits, check_free, check_takable, take
 from pycrorm_async.plan.language.resources import Resource, reaching
 from pycrorm_async.plan.motions.motions import ClosingMotion, MoveGripperMotion, MoveTCPMotion, OpeningMotion
-from pycrorm_async.plan.motions.process_modules import collisions_count
+from pycrorm_async.plan.motions.robot_choice import collisions_count
 from pycrorm_async.plan.object_designators import ObjectDesignator, ObjectPart, in_world
 from pycrorm_async.world.enums import Arms, GripperState
 from pycrorm_async.world.objects import Object

@@ -23,7 +23,7 @@ from pycrorm_async.plan.geometry.gripper_checks import check_fits, check_takable
 from pycrorm_async.plan.language.resources import Resource, reaching
 from pycrorm_async.plan.locations.designators import CostmapLocation
 from pycrorm_async.plan.motions.motions import DetectingMotion
-from pycrorm_async.plan.motions.process_modules import collisions_count
+from pycrorm_async.plan.motions.robot_choice import collisions_count
 from pycrorm_async.plan.object_designators import ObjectDesignator, in_world
 from pycrorm_async.world.enums import Arms, Grasp
 from pycrorm_async.world.objects import Object

@@ -8,12 +8,8 @@ from __future__ import annotations
 
 from contextvars import ContextVar
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:
-    from pycrorm_async.plan.designator import Designator
-    from pycrorm_async.plan.language.monitor_watch import Watch
-    from pycrorm_async.plan.language.resource_arbiter import Arbiter, Claim
+from pycrorm_async.plan.protocols import Gate, Hold, Interrupter, Performable
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,16 +22,16 @@ class ExecutionContext:
         claim: the claim of the nearest ancestor that holds parts of the robot; its `parent` leads to the others.
     """
 
-    watches: tuple[Watch, ...] = ()
-    arbiter: Arbiter | None = None
-    claim: Claim | None = None
+    watches: tuple[Interrupter, ...] = ()
+    arbiter: Gate | None = None
+    claim: Hold | None = None
 
     @property
     def interrupted(self) -> bool:
         """Whether an enclosing monitor has interrupted its operand."""
         return any(watch.fired for watch in self.watches)
 
-    async def enter(self, designator: Designator) -> Claim | None:
+    async def enter(self, designator: Performable) -> Hold | None:
         """Check the monitors, then wait for the parts of the robot that the designator needs.
 
         The caller releases the returned claim, if there is one, when the node has ended.
@@ -49,7 +45,7 @@ class ExecutionContext:
                 await watch.check()
         if self.arbiter is None:
             return None
-        return await self.arbiter.claim(designator, self)
+        return await self.arbiter.claim(designator)
 
 
 execution_context: ContextVar[ExecutionContext | None] = ContextVar("execution_context", default=None)

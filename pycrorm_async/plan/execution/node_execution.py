@@ -38,7 +38,7 @@ import inspect
 import sys
 from collections.abc import Callable, Coroutine
 from contextvars import ContextVar, Token
-from typing import TYPE_CHECKING, Any
+from typing import Any
 from weakref import ref
 
 from pycrorm_async.clock import monotonic_ns
@@ -46,11 +46,9 @@ from pycrorm_async.plan.exceptions import is_plan_failure
 from pycrorm_async.plan.execution.execution_context import ExecutionContext, execution_context
 from pycrorm_async.plan.execution.observer import recorder
 from pycrorm_async.plan.execution.unawaited_performs import Unstarted, called_performs
+from pycrorm_async.plan.protocols import Performable
 from pycrorm_async.plan.task_tree import TaskTreeNode, collecting, current_node
 from pycrorm_async.task_status import TaskStatus
-
-if TYPE_CHECKING:
-    from pycrorm_async.plan.designator import Designator
 
 YIELD_INTERVAL_NS = 20_000_000
 """Longest time a plan runs without yielding to the event loop, 20 ms. A plan that never suspends would otherwise block
@@ -71,7 +69,7 @@ def wrap_perform(perform: Callable[[Any], Coroutine[Any, Any, Any]]) -> Callable
     run = _with_node(perform)
 
     @functools.wraps(perform)
-    def performed(self: Designator) -> Coroutine[Any, Any, Any]:
+    def performed(self: Performable) -> Coroutine[Any, Any, Any]:
         calls = called_performs.get()
         if calls is None:
             return run(self, None)
@@ -100,7 +98,7 @@ def _with_node(  # noqa: C901  one function, because a call costs more than most
     """Return `perform` with the steps of a node around it."""
 
     @functools.wraps(perform)
-    async def run(self: Designator, unstarted: Unstarted | None) -> Any:
+    async def run(self: Performable, unstarted: Unstarted | None) -> Any:
         if unstarted:
             unstarted[0].waiting -= 1
             unstarted.clear()
@@ -151,7 +149,7 @@ def _with_node(  # noqa: C901  one function, because a call costs more than most
     return run
 
 
-def _is_overridden(designator: Designator, perform: Callable[..., Any]) -> bool:
+def _is_overridden(designator: Performable, perform: Callable[..., Any]) -> bool:
     """Return whether the designator's class has another `perform`, which called this one through `super()`."""
     return getattr(type(designator).perform, "__wrapped__", None) is not perform
 

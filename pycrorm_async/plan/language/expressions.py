@@ -29,7 +29,7 @@ from pycrorm_async.plan.language.operators import Composable
 from pycrorm_async.plan.language.outcome import Attempt, Outcome, attempt, combine_failures
 from pycrorm_async.plan.language.resource_arbiter import Arbiter
 from pycrorm_async.plan.language.task_branches import join_tasks, raise_errors
-from pycrorm_async.plan.task_tree import NodeKind
+from pycrorm_async.plan.protocols import NodeKind
 
 Operand: TypeAlias = Designator | ActionDescription[Any]
 

@@ -30,16 +30,14 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Iterator
 from contextvars import Token
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 from pycrorm_async.plan.execution.execution_context import ExecutionContext, execution_context
 from pycrorm_async.plan.failures import ResourceDeadlock
 from pycrorm_async.plan.language.resources import Resource
+from pycrorm_async.plan.protocols import Hold, Performable
 from pycrorm_async.world.observers import current_world
 from pycrorm_async.world.robots.acting_robot import acting_robot
-
-if TYPE_CHECKING:
-    from pycrorm_async.plan.designator import Designator
 
 Part: TypeAlias = tuple[Any, Resource]
 """A part of one robot."""
@@ -50,7 +48,7 @@ class Claim:
 
     __slots__ = ("_arbiter", "_token", "designator", "granted", "parent", "parts")
 
-    def __init__(self, arbiter: Arbiter, designator: Designator, parts: frozenset[Part], parent: Claim | None) -> None:
+    def __init__(self, arbiter: Arbiter, designator: Performable, parts: frozenset[Part], parent: Hold | None) -> None:
         self.designator = designator
         self.parts = parts
         self.parent = parent
@@ -59,7 +57,7 @@ class Claim:
         self._arbiter = arbiter
         self._token: Token[ExecutionContext | None] | None = None
 
-    def above(self) -> Iterator[Claim]:
+    def above(self) -> Iterator[Hold]:
         """Yield the claims of the ancestor nodes, nearest first."""
         each = self.parent
         while each is not None:
@@ -89,14 +87,16 @@ class Arbiter:
         self._holding: list[Claim] = []
         self._waiting: list[Claim] = []
 
-    async def claim(self, designator: Designator, context: ExecutionContext) -> Claim | None:
-        """Wait until the designator's parts are free and hold them; None if it needs none.
+    async def claim(self, designator: Performable) -> Claim | None:
+        """Wait until the designator's parts are free and hold them in this context; None if it needs none.
 
         Raises `ResourceDeadlock` if the wait would never end.
         """
         resources = designator.resources()
         if not resources or asyncio.get_running_loop() is not self.loop:
             return None
+        context = execution_context.get()
+        assert context is not None, "an arbiter belongs to an execution context"
         world = current_world.get()
         robot = (acting_robot(world) or world) if world is not None else None
         claim = Claim(self, designator, frozenset((robot, resource) for resource in resources), context.claim)
@@ -156,7 +156,7 @@ class Arbiter:
         earlier = self._waiting[: self._waiting.index(claim)]
         return [each for each in earlier if each.parts & claim.parts]
 
-    def _waits_for(self, waiter: Claim, ends: set[Claim]) -> bool:
+    def _waits_for(self, waiter: Claim, ends: set[Hold]) -> bool:
         """Return whether `waiter` can be granted, or may be, only after one of `ends` has ended."""
         ahead, seen = [waiter], set()
         while ahead:
@@ -171,7 +171,7 @@ class Arbiter:
             ahead += self._earlier_rivals(each)
         return False
 
-    def _waiting_in(self, holder: Claim) -> list[Claim]:
+    def _waiting_in(self, holder: Hold) -> list[Claim]:
         """Return the claims that wait inside the holder, which cannot end before they do."""
         return [each for each in self._waiting if holder in each.above()]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection
 
 from pycrorm_async.plan.current_robot import CurrentRobot, require_robot, require_world
-from pycrorm_async.plan.motions.process_modules import collisions_count
+from pycrorm_async.plan.motions.robot_choice import collisions_count
 from pycrorm_async.world.pose import Pose
 from pycrorm_async.world.queries.costmaps import Costmap
 from pycrorm_async.world.queries.footprints import Obstacles, footprint_of

@@ -19,7 +19,7 @@ from pycrorm_async.plan.errors import NoRobotHere
 from pycrorm_async.plan.geometry.grasp_poses import pick_up_poses, place_pose, retract
 from pycrorm_async.plan.geometry.gripper_checks import lifting_arms
 from pycrorm_async.plan.locations.base_clearance import BaseClearance, base_clearance
-from pycrorm_async.plan.motions.process_modules import chosen_limits
+from pycrorm_async.plan.motions.robot_choice import chosen_limits
 from pycrorm_async.plan.object_designators import ObjectLike, in_world, pose_of
 from pycrorm_async.world.enums import Arms, Grasp
 from pycrorm_async.world.observers import current_world

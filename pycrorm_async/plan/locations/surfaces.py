@@ -6,7 +6,7 @@ import random
 from collections.abc import Iterator
 
 from pycrorm_async.plan.execution.observer import Refusal
-from pycrorm_async.plan.motions.process_modules import collisions_count
+from pycrorm_async.plan.motions.robot_choice import collisions_count
 from pycrorm_async.plan.object_designators import ObjectLike, in_world
 from pycrorm_async.world.objects import Object
 from pycrorm_async.world.pose import Pose, Quaternion, Vector, yaw_quaternion

@@ -17,7 +17,7 @@ from pycrorm_async.plan.errors import ResolutionError
 from pycrorm_async.plan.exceptions import reaching_for
 from pycrorm_async.plan.language.resources import NOTHING, Resource, arms, moving, reaching
 from pycrorm_async.plan.motions.perception import report_perception
-from pycrorm_async.plan.motions.process_modules import chosen_robot
+from pycrorm_async.plan.motions.robot_choice import execute
 from pycrorm_async.plan.object_designators import ObjectDesignator, ObjectPart
 from pycrorm_async.world.enums import Arms, GripperState, ObjectType
 from pycrorm_async.world.objects import Object
@@ -52,7 +52,7 @@ class MoveMotion(BaseMotion):
         return frozenset({Resource.BASE})
 
     async def perform(self) -> None:
-        await chosen_robot(self, "navigate").navigate(self)
+        await execute(self, "navigate")
 
 
 @dataclass
@@ -80,7 +80,7 @@ class MoveTCPMotion(BaseMotion):
 
     async def perform(self) -> None:
         with reaching_for(self._object_name):
-            await chosen_robot(self, "move_tcp").move_tcp(self)
+            await execute(self, "move_tcp")
 
 
 @dataclass
@@ -95,7 +95,7 @@ class LookingMotion(BaseMotion):
         return frozenset({Resource.HEAD})
 
     async def perform(self) -> None:
-        await chosen_robot(self, "looking").looking(self)
+        await execute(self, "looking")
 
 
 @dataclass
@@ -112,7 +112,7 @@ class MoveGripperMotion(BaseMotion):
         return arms(self.gripper)
 
     async def perform(self) -> None:
-        await chosen_robot(self, "move_gripper").move_gripper(self)
+        await execute(self, "move_gripper")
 
 
 @dataclass
@@ -132,7 +132,7 @@ class MoveArmJointsMotion(BaseMotion):
         return left | arms(Arms.RIGHT) if self.right_arm_poses else left
 
     async def perform(self) -> None:
-        await chosen_robot(self, "move_arm_joints").move_arm_joints(self)
+        await execute(self, "move_arm_joints")
 
 
 @dataclass
@@ -165,7 +165,7 @@ class MoveJointsMotion(BaseMotion):
         return moving(self.names, description) if description is not None else NOTHING
 
     async def perform(self) -> None:
-        await chosen_robot(self, "move_joints").move_joints(self)
+        await execute(self, "move_joints")
 
 
 @dataclass
@@ -183,7 +183,7 @@ class DetectingMotion(BaseMotion):
         return frozenset({Resource.HEAD})
 
     async def perform(self) -> ObjectDesignator:
-        looking = chosen_robot(self, "detecting").detecting(self)
+        looking = execute(self, "detecting")
         return await report_perception(looking, source="camera", object_type=self.object_type)
 
 
@@ -196,7 +196,7 @@ class WorldStateDetectingMotion(BaseMotion):
     object_type: ObjectType
 
     async def perform(self) -> ObjectDesignator:
-        asking = chosen_robot(self, "world_state_detecting").world_state_detecting(self)
+        asking = execute(self, "world_state_detecting")
         return await report_perception(asking, source="world_state", object_type=self.object_type)
 
 
@@ -220,7 +220,7 @@ class OpeningMotion(BaseMotion):
 
     async def perform(self) -> None:
         with reaching_for(self.object_part.name):
-            await chosen_robot(self, "open").open(self)
+            await execute(self, "open")
 
 
 @dataclass
@@ -237,7 +237,7 @@ class ClosingMotion(BaseMotion):
 
     async def perform(self) -> None:
         with reaching_for(self.object_part.name):
-            await chosen_robot(self, "close").close(self)
+            await execute(self, "close")
 
 
 @dataclass
@@ -268,4 +268,4 @@ class AccessingMotion(BaseMotion):
 
     async def perform(self) -> None:
         with reaching_for(self.drawer_handle):
-            await chosen_robot(self, "accessing").accessing(self)
+            await execute(self, "accessing")

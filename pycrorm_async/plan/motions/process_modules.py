@@ -9,31 +9,25 @@ to the mechanical stops.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from contextvars import ContextVar
-from types import TracebackType
-from typing import TYPE_CHECKING, Protocol, Self, cast
+from typing import Protocol
 
-from pycrorm_async.plan.errors import NoRobotChosen
 from pycrorm_async.plan.execution.observer import Seen
-from pycrorm_async.plan.failures import CapabilityAbsenceFailure
+from pycrorm_async.plan.motions.motions import (
+    AccessingMotion,
+    ClosingMotion,
+    DetectingMotion,
+    LookingMotion,
+    MoveArmJointsMotion,
+    MoveGripperMotion,
+    MoveJointsMotion,
+    MoveMotion,
+    MoveTCPMotion,
+    OpeningMotion,
+    WorldStateDetectingMotion,
+)
+from pycrorm_async.plan.motions.robot_choice import RobotChoice
 from pycrorm_async.plan.motions.simulated_robot import SimulatedModules
 from pycrorm_async.world.robots.robot_description import Limits
-
-if TYPE_CHECKING:
-    from pycrorm_async.plan.designator import BaseMotion
-    from pycrorm_async.plan.motions.motions import (
-        AccessingMotion,
-        ClosingMotion,
-        DetectingMotion,
-        LookingMotion,
-        MoveArmJointsMotion,
-        MoveGripperMotion,
-        MoveJointsMotion,
-        MoveMotion,
-        MoveTCPMotion,
-        OpeningMotion,
-        WorldStateDetectingMotion,
-    )
 
 
 class MovingModules(Protocol):
@@ -74,10 +68,7 @@ class ProcessModules(MovingModules, Protocol):
     async def accessing(self, motion: AccessingMotion) -> None: ...
 
 
-_chosen: ContextVar[tuple[ChosenRobot, ...]] = ContextVar("_chosen", default=())
-
-
-class ChosenRobot:
+class ChosenRobot(RobotChoice):
     """A choice of process modules; inside its `with` block they execute the motions of the context.
 
     Args:
@@ -91,22 +82,7 @@ class ChosenRobot:
     def __init__(
         self, name: str, modules: MovingModules, *, limits: Limits = Limits.SOFT, collisions: bool = False
     ) -> None:
-        self.name = name
-        self.modules = modules
-        self.limits = limits
-        self.collisions = collisions
-
-    def __enter__(self) -> Self:
-        _chosen.set((*_chosen.get(), self))
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        _chosen.set(_chosen.get()[:-1])
-
-    def __repr__(self) -> str:
-        return f"<{self.name} robot>"
+        super().__init__(name, modules, limits=limits, collisions=collisions)
 
 
 def simulated_robot_within(limits: Limits, *, collisions: bool = False) -> ChosenRobot:
@@ -131,33 +107,3 @@ def simulated_robot_within(limits: Limits, *, collisions: bool = False) -> Chose
 
 simulated_robot = simulated_robot_within(Limits.SOFT)
 """The robot of the current world, moved kinematically: instantly, exactly, without physics."""
-
-
-def chosen_robot(motion: BaseMotion, module: str) -> ProcessModules:
-    """Return the modules of the innermost choice, which have the method of that name.
-
-    Raises:
-        NoRobotChosen: no robot is chosen in this context.
-        CapabilityAbsenceFailure: the modules lack the method.
-    """
-    chosen = _chosen.get()
-    if not chosen:
-        raise NoRobotChosen(type(motion).__name__)
-    robot = chosen[-1]
-    if not hasattr(robot.modules, module):
-        name = type(motion).__name__
-        message = f"the {robot.name} robot cannot do {name}: {type(robot.modules).__name__} has no method {module!r}"
-        raise CapabilityAbsenceFailure(message, robot.name, name)
-    return cast("ProcessModules", robot.modules)
-
-
-def chosen_limits() -> Limits:
-    """Return the arm limits of the innermost choice; soft limits without a choice."""
-    chosen = _chosen.get()
-    return chosen[-1].limits if chosen else Limits.SOFT
-
-
-def collisions_count() -> bool:
-    """Return whether collisions count for the innermost choice; False without a choice."""
-    chosen = _chosen.get()
-    return bool(chosen) and chosen[-1].collisions

@@ -7,7 +7,6 @@ none.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
 
 from pycrorm_async.plan.current_robot import CurrentRobot, check_in_map, require_robot
 from pycrorm_async.plan.execution.observer import Seen
@@ -31,6 +30,19 @@ from pycrorm_async.plan.geometry.articulation import (
 from pycrorm_async.plan.geometry.grasp_poses import HOLD_DISTANCE_M_MAX, distance_to_box
 from pycrorm_async.plan.geometry.gripper_checks import check_same_world
 from pycrorm_async.plan.motions.looking import head_joints
+from pycrorm_async.plan.motions.motions import (
+    AccessingMotion,
+    ClosingMotion,
+    DetectingMotion,
+    LookingMotion,
+    MoveArmJointsMotion,
+    MoveGripperMotion,
+    MoveJointsMotion,
+    MoveMotion,
+    MoveTCPMotion,
+    OpeningMotion,
+    WorldStateDetectingMotion,
+)
 from pycrorm_async.plan.motions.perception import objects_in_world, seen_by_camera
 from pycrorm_async.plan.object_designators import ObjectPart
 from pycrorm_async.world.enums import Arms
@@ -39,21 +51,6 @@ from pycrorm_async.world.pose import Pose
 from pycrorm_async.world.queries.collision_queries import collisions_at
 from pycrorm_async.world.robots.kinematics import Unreachable, solve
 from pycrorm_async.world.robots.robot_description import Drive, Limits
-
-if TYPE_CHECKING:
-    from pycrorm_async.plan.motions.motions import (
-        AccessingMotion,
-        ClosingMotion,
-        DetectingMotion,
-        LookingMotion,
-        MoveArmJointsMotion,
-        MoveGripperMotion,
-        MoveJointsMotion,
-        MoveMotion,
-        MoveTCPMotion,
-        OpeningMotion,
-        WorldStateDetectingMotion,
-    )
 
 
 class SimulatedModules:

@@ -12,7 +12,7 @@ from msgspec.structs import replace
 from pycrorm_async.events.codec import NotEncodable, encoded_bytes
 from pycrorm_async.events.types import NodeStarted
 from pycrorm_async.events.values import MissingValue
-from pycrorm_async.plan.designator import Designator
+from pycrorm_async.plan.protocols import Performable
 from pycrorm_async.recording.declarations.declared_type import DeclaredType
 from pycrorm_async.recording.values.event_fitting import fits
 from pycrorm_async.recording.values.texts import reading_fault
@@ -25,7 +25,7 @@ _MISSING_BYTES = 400
 
 
 def read_parameters(
-    designator: Designator, declared: DeclaredType, references: References, missing: dict[str, str]
+    designator: Performable, declared: DeclaredType, references: References, missing: dict[str, str]
 ) -> dict[str, Any]:
     """Read the parameters of a designator as JSON values by field name.
 
@@ -53,7 +53,7 @@ def read_parameters(
 
 
 def _read_undeclared(
-    designator: Designator, declared: DeclaredType, parameters: dict[str, Any], missing: dict[str, str]
+    designator: Performable, declared: DeclaredType, parameters: dict[str, Any], missing: dict[str, str]
 ) -> None:
     for field, path, undeclared in declared.undeclared:
         value: Any = designator
