@@ -6,7 +6,8 @@ that is not performable immediately and names it.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
     from pycrorm_async.plan.language.expressions import Parallel, Repeat, Sequential, TryAll, TryInOrder
@@ -24,41 +25,29 @@ class Composable:
 
     def __add__(self, other: Composable) -> Sequential:
         """Perform this one, then the other."""
-        from pycrorm_async.plan.language.expressions import Sequential
-
-        return Sequential(self, other)
+        return _expressions().sequential(self, other)
 
     def __sub__(self, other: Composable) -> TryInOrder:
         """Perform this one, and the other only if it fails."""
-        from pycrorm_async.plan.language.expressions import TryInOrder
-
-        return TryInOrder(self, other)
+        return _expressions().try_in_order(self, other)
 
     def __or__(self, other: Composable) -> Parallel:
         """Perform both in parallel; both must succeed."""
-        from pycrorm_async.plan.language.expressions import Parallel
-
-        return Parallel(self, other)
+        return _expressions().parallel(self, other)
 
     def __xor__(self, other: Composable) -> TryAll:
         """Perform both in parallel; one must succeed."""
-        from pycrorm_async.plan.language.expressions import TryAll
-
-        return TryAll(self, other)
+        return _expressions().try_all(self, other)
 
     def __mul__(self, times: int) -> Repeat:
         """Perform this one `times` times."""
-        from pycrorm_async.plan.language.expressions import Repeat
-
-        return Repeat(self, times)
+        return _expressions().repeat(self, times)
 
     __rmul__ = __mul__
 
     def __rshift__(self, monitor: Monitor) -> Monitor:
         """Perform this one until it ends or the monitor's condition holds."""
-        from pycrorm_async.plan.language.monitor import watch_operand
-
-        return watch_operand(self, monitor)
+        return _expressions().watch_operand(self, monitor)
 
     # Python calls these only if the left operand lacks the operator, so it is not performable: the constructors raise.
 
@@ -75,6 +64,21 @@ class Composable:
         return Composable.__xor__(other, self)
 
     def __rrshift__(self, other: Composable) -> Monitor:
-        from pycrorm_async.plan.language.monitor import watch_operand
+        return _expressions().watch_operand(other, self)
 
-        return watch_operand(other, self)
+
+class _Expressions(NamedTuple):
+    sequential: type[Sequential]
+    try_in_order: type[TryInOrder]
+    parallel: type[Parallel]
+    try_all: type[TryAll]
+    repeat: type[Repeat]
+    watch_operand: Callable[[Composable, Composable], Monitor]
+
+
+def _expressions() -> _Expressions:
+    """Import the expressions when an operator is used: they are designators, whose base class is `Composable`."""
+    from pycrorm_async.plan.language.expressions import Parallel, Repeat, Sequential, TryAll, TryInOrder
+    from pycrorm_async.plan.language.monitor import watch_operand
+
+    return _Expressions(Sequential, TryInOrder, Parallel, TryAll, Repeat, watch_operand)
