@@ -6,6 +6,7 @@ fields. The sequence of `ObjectAdded` identifies an object, that of `NodeStarted
 
 from __future__ import annotations
 
+import hashlib
 import zlib
 from base64 import b64decode
 from typing import Any, ClassVar, Literal
@@ -154,10 +155,11 @@ class DescriptionDeclared(Happening, frozen=True):
     `zlib.decompress(base64.b64decode(payload["urdf"])).decode()` is the URDF as text.
 
     Attributes:
-        urdf: the URDF, compressed with zlib, in base64. The name of a mesh file is `sha256:` and the hash of the file's
-            content, or `missing:` and the file's name; `MeshValue.reference` is the same text.
+        urdf: the URDF, compressed with zlib, in base64, without texture files. The name of a mesh file is `sha256:` and
+            the hash of its content, or `missing:` and its own name; `MeshValue.reference` is the same text.
         meshes: the mesh files, each once.
-        boxes: for each link with a mesh, the box around its collision shapes, in the link's frame.
+        boxes: for each link with a mesh, the box around its collision shapes, in the link's frame; around its visual
+            ones if it has none.
         link_boxes: for each link that is fixed or slides; links that turn have none.
         missing: the reason if the description could not be recorded; `urdf` is empty then.
     """
@@ -175,6 +177,11 @@ class DescriptionDeclared(Happening, frozen=True):
             return zlib.decompressobj().decompress(b64decode(self.urdf), _URDF_BYTES_MAX).decode()
         except zlib.error as error:
             raise ValueError(f"the URDF cannot be decompressed: {error}") from error
+
+    @property
+    def text_sha256(self) -> str:
+        """SHA-256 of the text, thus of the URDF and of its meshes' contents, however meshes and text were recorded."""
+        return hashlib.sha256(self.text.encode()).hexdigest()
 
 
 class ObjectAdded(Happening, frozen=True):

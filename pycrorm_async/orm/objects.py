@@ -102,13 +102,22 @@ class ObjectDescription(Base):
         return self.declared.text
 
     @property
+    def text_sha256(self) -> str:
+        """SHA-256 of the URDF as text, thus also of its meshes' contents.
+
+        It is the same for one model in all memories, whereas `fingerprint` identifies what was recorded of it, with
+        the mesh files or without.
+        """
+        return self.declared.text_sha256
+
+    @property
     def meshes(self) -> tuple[MeshValue, ...]:
         """The mesh files: name, hash, size."""
         return self.declared.meshes
 
     @property
     def boxes(self) -> dict[str, BoxValue]:
-        """For each link with a mesh, the box around its collision shapes, in the link's frame (m)."""
+        """For each link with a mesh, the box around its collision shapes, else its visual ones, in its frame (m)."""
         return self.declared.boxes
 
     @property

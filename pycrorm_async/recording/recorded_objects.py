@@ -5,7 +5,7 @@ It keeps the last reported state of each object, because a follow-up episode beg
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Mapping
+from collections.abc import Collection, Hashable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -46,6 +46,9 @@ class _Described(NamedTuple):
 
     def box_in_link(self, link: str) -> BoundingBox | None:  # noqa: ARG002  the port's signature
         return None
+
+    def visual_boxes(self, links: Collection[str]) -> dict[str, BoundingBox]:  # noqa: ARG002  as above
+        return {}
 
 
 class RecordedObjects(ObjectRows[Hashable]):

@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 import tempfile
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 from pycrorm_async.world.bullet_loader import captured, engine
@@ -186,6 +187,21 @@ class Body:
     def _paint(self, color: Color) -> None:
         for number in self._link_numbers.values():
             engine().changeVisualShape(self.number, number, rgbaColor=color, physicsClientId=self.client)
+
+
+def visual_boxes(urdfs: Mapping[str, str], client: int) -> dict[str, BoundingBox]:
+    """Return the box around the only link of each of these, by name; without those that Bullet does not load.
+
+    Each is loaded and removed again.
+    """
+    boxes: dict[str, BoundingBox] = {}
+    for link, urdf in urdfs.items():
+        with suppress(DescriptionNotLoadable):
+            body = Body(link, urdf, client, None, None)
+            body.unload()
+            if (box := body.box_in_link(link)) is not None:
+                boxes[link] = box
+    return boxes
 
 
 def _load(name: str, urdf: str, client: int) -> int:

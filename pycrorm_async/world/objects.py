@@ -10,11 +10,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from pycrorm_async.world.bullet_body import Body, Color
+from pycrorm_async.world.bullet_body import Body, Color, visual_boxes
 from pycrorm_async.world.enums import Arms, JointType, ObjectType
 from pycrorm_async.world.errors import (
     AttachmentRefused,
@@ -29,6 +29,7 @@ from pycrorm_async.world.errors import (
 )
 from pycrorm_async.world.models.catalog import built_in_urdf
 from pycrorm_async.world.models.inertia import described_mass_kg
+from pycrorm_async.world.models.mesh_boxes import visuals_as_collisions
 from pycrorm_async.world.observers import current_world
 from pycrorm_async.world.pose import COORDINATE_MAX, Pose
 from pycrorm_async.world.queries.bounding_boxes import BoundingBox
@@ -192,11 +193,12 @@ class Object:
         return box
 
     def box_in_link(self, link: str) -> BoundingBox | None:
-        """Return the box along the axes of the link's own frame around its collision shapes; None without any.
-
-        Raises `UnknownLink`.
-        """
+        """Return the box around a link's collision shapes, in its own frame; None without any. Raises `UnknownLink`."""
         return self.body.box_in_link(self._check_link(link))
+
+    def visual_boxes(self, links: Collection[str]) -> dict[str, BoundingBox]:
+        """Return the boxes around the visual shapes of links, in their frames, where Bullet can load the shapes."""
+        return visual_boxes(visuals_as_collisions(self.description_text, links), self.body.client)
 
     @property
     def mass_kg(self) -> float | None:

@@ -123,7 +123,7 @@ def link_poses(world: BulletWorld) -> dict[str, list[float]]:
     }
 
 
-async def recorded(url: str, robot: Path, settings: Settings) -> tuple[dict[str, list[float]], Missing]:
+async def recorded(url: str, robot: Path | str, settings: Settings) -> tuple[dict[str, list[float]], Missing]:
     """Record the robot beside a milk that it carries; return the poses of all links."""
     async with Memory.open(url, settings=settings) as memory:
         async with memory.episode(description="seen"):
@@ -184,6 +184,43 @@ async def test_the_boxes_of_an_arm_cover_its_meshes_and_the_files_give_the_meshe
                         if meshes:
                             for corner, expected in zip(each.bounding_box(link), whole[link], strict=True):
                                 assert corner == pytest.approx(expected, abs=1e-5)
+
+
+HULL = """<robot name="v"><material name="coat"><texture filename="{folder}/coat.png"/></material>
+<link name="base"><collision><geometry><box size="0.1 0.1 0.1"/></geometry></collision></link>
+<link name="hull"><visual><origin xyz="1 0 0"/>
+<geometry><mesh filename="{folder}/{mesh}" scale="0.1 0.1 0.1"/></geometry><material name="skin">
+<texture filename="{folder}/skin.png"/></material></visual></link>
+<joint name="j" type="fixed"><parent link="base"/><child link="hull"/></joint></robot>"""
+"""A robot with a link that has a visual mesh and no collision shape, and with textures."""
+
+
+async def test_a_link_with_only_a_visual_mesh_is_seen_again_as_its_box_and_textures_are_counted(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path / 'm.db'}"
+    (tmp_path / "wedge.obj").write_text(wedge(3))
+    for name in ("coat", "skin"):
+        (tmp_path / f"{name}.png").write_bytes(b"no picture")
+    _, missing = await recorded(url, HULL.format(folder=tmp_path, mesh="wedge.obj"), Settings())
+    assert (missing.total, missing.last) == (2, "DescriptionDeclared.textures: skin.png: textures are not recorded")
+    (tmp_path / "wedge.obj").unlink()
+    async with Reading.open(url) as reading:
+        then = await reading.as_of("last", sequence=3)
+    (description,) = [each for each in then.world.descriptions.values() if each.meshes]
+    assert str(tmp_path) not in description.text
+    low, high = description.boxes["hull"].min, description.boxes["hull"].max
+    assert (*low, *high) == pytest.approx((1, 0, 0, 1.1, 0.2, 0.3), abs=2e-6)
+    with world_of(then) as world:
+        assert dict(world.assumed) == {}
+        hull = world.object("arm").description_text.partition('name="hull"')[2].partition("</link>")[0]
+    assert '<box size="0.1 0.2 0.3"' in hull
+
+
+async def test_a_visual_mesh_without_a_box_is_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Object, "visual_boxes", lambda *_: {})
+    (tmp_path / "wedge.obj").write_text(wedge(3))
+    robot = HULL.format(folder=tmp_path, mesh="wedge.obj").replace("<texture", "<!-- texture").replace('png"/>', "-->")
+    _, missing = await recorded(f"sqlite:///{tmp_path / 'm.db'}", robot, Settings())
+    assert (missing.total, missing.last) == (1, "DescriptionDeclared.boxes: the meshes of these links have none: hull")
 
 
 DIES = """
@@ -259,6 +296,17 @@ async def test_objects_of_an_older_version_have_assumed_shapes_and_say_so(tmp_pa
     with world:
         assert [(each.name, each.color) for each in world.objects] == [("milk", None), ("pr2", None)]
         assert world.object("pr2").joint_position("torso_lift_joint") == 0.3
+
+
+async def test_one_robot_has_one_hash_wherever_it_is_and_however_its_meshes_are_recorded(tmp_path: Path) -> None:
+    descriptions = []
+    for meshes in ("boxes", "files"):
+        url = f"sqlite:///{tmp_path / meshes}.db"
+        await recorded(url, made_arm(tmp_path / meshes), Settings(record_meshes=meshes))  # type: ignore[arg-type]
+        async with Reading.open(url) as reading, reading.session() as session:
+            descriptions += [each for each in await session.scalars(select(ObjectDescription)) if each.meshes]
+    assert len({each.fingerprint for each in descriptions}) == 2
+    assert len({each.text_sha256 for each in descriptions}) == 1
 
 
 @pytest.mark.soak_on("postgresql")

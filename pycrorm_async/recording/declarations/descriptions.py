@@ -10,7 +10,7 @@ import base64
 import hashlib
 import os
 import zlib
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
@@ -22,7 +22,7 @@ from pycrorm_async.recording.values.missing_values import MissingValues
 from pycrorm_async.recording.values.texts import clean, cut, message_of
 from pycrorm_async.settings import Settings
 from pycrorm_async.world.models.link_boxes import link_boxes
-from pycrorm_async.world.models.mesh_boxes import mesh_files, meshed_links, with_mesh_files
+from pycrorm_async.world.models.mesh_boxes import mesh_files, meshed_links, with_mesh_files, without_textures
 from pycrorm_async.world.queries.bounding_boxes import BoundingBox
 
 _KNOWN_MAX = 1_000
@@ -58,6 +58,10 @@ class Described(Protocol):
     def links(self) -> Collection[str]: ...
     def box_in_link(self, link: str) -> BoundingBox | None:
         """Return the box around the collision shapes of a link, in its frame; None if it has none."""
+        ...
+
+    def visual_boxes(self, links: Collection[str]) -> Mapping[str, BoundingBox]:
+        """Return the boxes around the visual shapes of these links, in their frames, as far as they are known."""
         ...
 
 
@@ -134,13 +138,19 @@ class Descriptions:
         meshes = {file: self._mesh(Path(file)) for file in files}
         meshed = meshed_links(text) if files else ()
         solid = {link: box for link in described.links if (box := described.box_in_link(link)) is not None}
-        boxes = {link: _box_value(solid[link]) for link in meshed if link in solid}
+        seen = described.visual_boxes([link for link in meshed if link not in solid])
+        boxes = {link: _box_value(box) for link in meshed if (box := solid.get(link) or seen.get(link)) is not None}
         placed = tuple(LinkBoxValue(*each) for each in link_boxes(text, solid))
+        text, textures = without_textures(text)
         if meshes:
             text = with_mesh_files(text, {file: mesh.reference for file, mesh in meshes.items()})
         packed = base64.b64encode(zlib.compress(text.encode())).decode()
         event = DescriptionDeclared(packed, tuple(dict.fromkeys(meshes.values())), boxes, placed)
         missing = [("meshes", f"{mesh.name}: {mesh.missing}") for mesh in event.meshes if mesh.missing is not None]
+        bare = [clean(link) for link in meshed if link not in boxes]
+        if bare and not self._with_files:
+            missing.append(("boxes", cut(f"the meshes of these links have none: {', '.join(bare)}", _REASON_MAX)))
+        missing += [("textures", f"{clean(texture)}: textures are not recorded") for texture in textures]
         try:
             payload = encode(event, bytes_max=self._record_bytes_max)
         except NotEncodable as error:

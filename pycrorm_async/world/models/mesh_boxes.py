@@ -5,7 +5,8 @@ With the boxes an object keeps its links, joints and poses without any file.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
+from pathlib import PurePath
 from xml.etree.ElementTree import Element, SubElement, fromstring, tostring
 
 from pycrorm_async.world.models.primitives import numbers
@@ -25,6 +26,34 @@ def mesh_files(urdf: str) -> tuple[str, ...]:
 def meshed_links(urdf: str) -> tuple[str, ...]:
     """Return the names of the links that have a mesh."""
     return tuple(link.get("name", "") for link in _parsed(urdf).iter("link") if link.find(".//mesh") is not None)
+
+
+def visuals_as_collisions(urdf: str, links: Collection[str]) -> dict[str, str]:
+    """Return for each of these links a URDF of this link alone, in which the visual shapes are collision shapes."""
+    alone: dict[str, str] = {}
+    for link in _parsed(urdf).iter("link"):
+        name = link.get("name", "")
+        if name in links:
+            robot = Element("robot", name=name)
+            shape = SubElement(robot, "link", name=name)
+            for visual in link.findall("visual"):
+                copied = SubElement(shape, "collision")
+                copied.extend(each for each in visual if each.tag in ("origin", "geometry"))
+            alone[name] = tostring(robot, encoding="unicode")
+    return alone
+
+
+def without_textures(urdf: str) -> tuple[str, tuple[str, ...]]:
+    """Return the URDF without the texture files of its materials, and their names, each once."""
+    if "<texture" not in urdf:
+        return urdf, ()
+    robot = _parsed(urdf)
+    textures = [(each, texture) for each in robot.iter("material") for texture in each.findall("texture")]
+    for material, texture in textures:
+        material.remove(texture)
+    return tostring(robot, encoding="unicode"), tuple(
+        dict.fromkeys(PurePath(texture.get("filename", "")).name for _, texture in textures)
+    )
 
 
 def with_mesh_files(urdf: str, names: Mapping[str, str]) -> str:
