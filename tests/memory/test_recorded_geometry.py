@@ -302,7 +302,7 @@ async def test_one_robot_has_one_hash_wherever_it_is_and_however_its_meshes_are_
     descriptions = []
     for meshes in ("boxes", "files"):
         url = f"sqlite:///{tmp_path / meshes}.db"
-        await recorded(url, made_arm(tmp_path / meshes), Settings(record_meshes=meshes))  # type: ignore[arg-type]
+        await recorded(url, made_arm(tmp_path / meshes), Settings(record_meshes=meshes))
         async with Reading.open(url) as reading, reading.session() as session:
             descriptions += [each for each in await session.scalars(select(ObjectDescription)) if each.meshes]
     assert len({each.fingerprint for each in descriptions}) == 2
