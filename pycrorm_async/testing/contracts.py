@@ -1,4 +1,4 @@
-"""Check the contracts of custom projections and of designators, on a real memory in a folder of the test.
+"""Check the contracts of custom projections, designators and executives, on a real memory in a folder of the test.
 
 rows = await check_projection(GraspRate(), plan, tmp_path)
 assert [row["arm"] for row in rows["grasp_try"]] == ["LEFT"]
@@ -6,7 +6,9 @@ assert [row["arm"] for row in rows["grasp_try"]] == ["LEFT"]
 
 from __future__ import annotations
 
+import asyncio
 import dataclasses
+import inspect
 from collections.abc import Awaitable, Callable, Mapping
 from datetime import datetime
 from enum import Enum
@@ -19,15 +21,18 @@ from pycrorm_async.errors import CallerError
 from pycrorm_async.memory import Memory
 from pycrorm_async.operations.destination import shared_address
 from pycrorm_async.operations.rebuild import rebuild_projection
+from pycrorm_async.orm import TaskTreeNode
 from pycrorm_async.plan import ActionAbstract
 from pycrorm_async.projections.custom.projection import Projection, columns_of
 from pycrorm_async.projections.custom.projection_tables import states
 from pycrorm_async.projections.verify.verify import verify
 from pycrorm_async.query.reading import Reading
+from pycrorm_async.recording.recording import Recording
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.log import EventLog
+from pycrorm_async.task_status import TaskStatus
 
-__all__ = ["check_designator", "check_projection"]
+__all__ = ["check_designator", "check_executive", "check_projection"]
 
 Rows: TypeAlias = Mapping[str, list[dict[str, Any]]]
 
@@ -89,6 +94,48 @@ async def check_designator(designator: ActionAbstract, folder: Path) -> Any:
             expected = value.name if isinstance(value, Enum) and not isinstance(stored, Enum) else value
             assert stored == expected, f"{field.name} is {stored!r} in the table instead of {expected!r}"
     return row
+
+
+async def check_executive(drive: Callable[[Recording], object], folder: Path) -> list[TaskTreeNode]:
+    """Let an executive record into a new memory, and check that nothing is missing, open or out of order.
+
+    `drive` gets the `Memory.recording`, opens episodes with it and closes them. A coroutine function is awaited; an
+    ordinary function runs in another thread, because a start may block. What it raises is not caught.
+
+    >>> nodes = await check_executive(lambda recording: my_integration(recording, my_tree), tmp_path)
+    >>> assert [(node.dtype, node.status.name) for node in nodes] == [("PickUpAction", "SUCCEEDED")]
+
+    Returns the nodes but the roots of the episodes, in the order of their starts. The memory stays in
+    `sqlite:///{folder}/executive.db`, for further queries.
+
+    Raises:
+        AssertionError: a call was counted as a fault, a value is missing, a node or an episode did not end, no node
+            was recorded, the order of the events is not legal, or a second fold of the log makes other rows.
+    """
+    url = f"sqlite:///{folder}/executive.db"
+    async with Memory.open(url) as memory:
+        running = await asyncio.to_thread(drive, memory.recording)
+        if inspect.isawaitable(running):
+            await running
+        faults, missing = memory.status.faults, memory.status.missing
+        await memory.flush()
+        async with memory.session() as session:
+            nodes = list(await session.scalars(select(TaskTreeNode).order_by(TaskTreeNode.id)))
+    assert not faults.total, f"{faults.total} faults were counted, the last one: {faults.last}"
+    assert not missing.total, f"{missing.total} values are missing, the last one: {missing.last}"
+    for each in nodes:
+        what = "an episode" if each.dtype is None else f"node {each.id}, a {each.dtype},"
+        assert each.status not in (TaskStatus.RUNNING, TaskStatus.LOST), f"{what} did not end: it is {each.status.name}"
+    log = await EventLog.open(shared_address(url), create=False)
+    try:
+        second = await verify(log)
+    finally:
+        await log.close()
+    findings = [*second.damages, *second.stopped, *second.differences]
+    assert not findings, f"the log or the tables are wrong: {findings[0]}"
+    nodes = [each for each in nodes if each.dtype is not None]
+    assert nodes, "no node was recorded"
+    return nodes
 
 
 async def _rows_of(projection: Projection, url: str) -> Rows:

@@ -28,7 +28,3 @@ class FakeClock:
         """Advance both clocks."""
         self._wall_ns += round(seconds * 1e9)
         self._monotonic_ns += round(seconds * 1e9)
-
-    def set_wall(self, moment: datetime) -> None:
-        """Set the wall clock alone, also back, as an administrator or NTP does."""
-        self._wall_ns = int(moment.timestamp()) * 10**9 + moment.microsecond * 1_000

@@ -46,6 +46,7 @@ TIDY, LIFTER, STEREO, CELLS = python_of("pycrorm_async/plan/README.md")
 COURSE, PLOTTED, AROUND, ROBOTS, BEGAN, FRAMES, ASKED, TAGGED, SEEN, THEN, AGAIN, RATE, TRIES, FOLLOWED = python_of(
     "pycrorm_async/query/README.md"
 )
+(CHECKED,) = python_of("pycrorm_async/recording/README.md")
 (EXPORTED,) = python_of("pycrorm_async/export/README.md")
 (RECALLED,) = python_of("pycrorm_async/recall/README.md")
 BETTER, REPEATED, ORIGINS = python_of("pycrorm_async/learning/README.md")
@@ -146,6 +147,12 @@ def test_the_percepts_of_a_users_robot_are_in_the_table(tmp_path: Path) -> None:
             ("milk", 1.31, 0.92, "stereo", 0),
             ("milk?", 1.2, 0.31, "stereo", 1),
         ]
+
+
+async def test_the_test_of_an_integration_passes(tmp_path: Path) -> None:
+    names: dict[str, Any] = {}
+    exec(CHECKED, names)
+    await names["test_my_executive_is_recorded"](tmp_path)
 
 
 async def test_the_queries_have_answers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

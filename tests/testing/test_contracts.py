@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import random
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import pytest
 from sqlalchemy import select
@@ -16,9 +19,11 @@ from pycrorm_async.errors import CallerError, Unrecordable
 from pycrorm_async.orm import TaskTreeNode
 from pycrorm_async.plan import ActionAbstract
 from pycrorm_async.projections.custom.projection import Changes, Event
-from pycrorm_async.testing.contracts import check_designator, check_projection
+from pycrorm_async.recording.recording import Recording
+from pycrorm_async.testing.contracts import check_designator, check_executive, check_projection
 from pycrorm_async.testing.fake_clock import FakeClock
 from pycrorm_async.world import Arms
+from tests.databases import ask_to_change
 
 pytest_plugins = ["pycrorm_async.testing.fixtures"]
 
@@ -96,6 +101,68 @@ class Bare(ActionAbstract):
 async def test_a_designator_that_is_no_dataclass_is_refused(tmp_path: Path) -> None:
     with pytest.raises(CallerError, match=r"Bare is not a dataclass"):
         await check_designator(Bare(), tmp_path)
+
+
+def walk(recording: Recording, *, ends: Any = "SUCCEEDED", speed: object = 0.5) -> None:
+    drive = recording.type("motion", "Drive", {"speed": float})
+    with recording.episode(description="a walk") as episode:
+        episode.start("job", recording.type("action", "Walk"))
+        episode.start("go", drive, {"speed": speed}, parent="job")
+        if ends:
+            episode.end("go", ends)
+        episode.end("job", "SUCCEEDED")
+
+
+async def test_an_executive_that_holds_its_contract_returns_its_nodes(tmp_path: Path) -> None:
+    async def walk_in_loop(recording: Recording) -> None:
+        await asyncio.to_thread(walk, recording, ends="FAILED")
+
+    for drive, status in (walk, "SUCCEEDED"), (walk_in_loop, "FAILED"):
+        folder = tmp_path / status
+        folder.mkdir()
+        nodes = await check_executive(drive, folder)
+        assert [(each.dtype, each.status.name) for each in nodes] == [("Walk", "SUCCEEDED"), ("Drive", status)]
+        assert nodes[1].parent_id == nodes[0].id
+
+
+def leave_open(recording: Recording) -> None:
+    recording.episode(description="never closed").start("go", recording.type("motion", "Drive"))
+
+
+def record_nothing(recording: Recording) -> None:
+    recording.episode(description="empty").close()
+
+
+@pytest.mark.parametrize(
+    ("drive", "message"),
+    [
+        (partial(walk, ends=""), "1 faults were counted, the last one: .*nodes open at the end of episode"),
+        (partial(walk, ends="DONE"), "1 faults were counted, the last one: .*DONE"),
+        (partial(walk, speed="fast"), r"1 values are missing, the last one: Drive\.speed: "),
+        (leave_open, "an episode did not end: it is RUNNING"),
+        (record_nothing, "no node was recorded"),
+    ],
+)
+async def test_an_executive_that_breaks_its_contract_is_reported(
+    drive: Callable[[Recording], None], message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(AssertionError, match=message):
+        await check_executive(drive, tmp_path)
+
+
+async def test_tables_that_differ_from_a_second_fold_are_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def falsify(memory: Memory) -> None:
+        await flush(memory)
+        ask_to_change(
+            tmp_path / "executive.db", "UPDATE zz_task_tree_node__1001 SET status = 'FAILED' WHERE dtype = 'Drive'"
+        )
+
+    flush = Memory.flush
+    monkeypatch.setattr(Memory, "flush", falsify)
+    with pytest.raises(AssertionError, match=r"the log or the tables are wrong: .*FAILED"):
+        await check_executive(walk, tmp_path)
 
 
 async def test_the_memory_of_a_test_records_events_and_refuses_invalid_values(memory: Memory) -> None:

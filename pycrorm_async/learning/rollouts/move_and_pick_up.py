@@ -152,7 +152,10 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
         yield from self._likeliest_first(self.grounded())
 
     def from_mode(self) -> Iterator[MoveAndPickUpPerformable]:
-        """Yield samples from around the mode of the grounded policy only. Raises `ObjectUnreachable`."""
+        """Yield samples from around the mode of the grounded policy only, as the thesis' `iter_with_mode` does.
+
+        Raises `ObjectUnreachable`.
+        """
         self.keep_policy()
         yield from map(self.chosen, self._likeliest_first(self.grounded().mode()))
 

@@ -62,7 +62,10 @@ class Expression(Designator):
         return True
 
     def simplify(self) -> Self:
-        """Return the expression itself: nested expressions such as `a + (b + c)` are flattened when they are built."""
+        """Return the expression itself, for plans written for PyCRAM, which call it.
+
+        Nested expressions such as `a + (b + c)` are flattened when they are built.
+        """
         return self
 
     def __repr__(self) -> str:

@@ -23,6 +23,8 @@ from pycrorm_async import Memory, Settings
 from pycrorm_async.integrations import callbacks
 from pycrorm_async.integrations.callbacks import RememberedRuns
 from pycrorm_async.plan.failures import NavigationGoalNotReached
+from pycrorm_async.recording.recording import Recording
+from pycrorm_async.testing.contracts import check_executive
 from tests.databases import ask
 from tests.integrations.callbacks.agents import agent, call, pick_up, request
 from tests.recording.recorded_memory import assert_verified, nodes, url_of
@@ -58,17 +60,24 @@ def _stream(runs: RememberedRuns) -> None:
 
 
 @pytest.mark.parametrize("run", [_invoke, _ainvoke, _stream])
-def test_an_agent_is_a_tree_of_chains_models_and_tools(tmp_path: Path, run: Any) -> None:
-    status = remembered(tmp_path, run)
-    assert sorted(each for each in nodes(tmp_path) if each[0] != "Chain") == [
-        ("ModelCall", "Chain", "SUCCEEDED", None),
-        ("ModelCall", "Chain", "SUCCEEDED", None),
-        ("drive", "Chain", "SUCCEEDED", None),
-        ("pick_up", "Chain", "SUCCEEDED", None),
+async def test_an_agent_is_a_tree_of_chains_models_and_tools(tmp_path: Path, run: Any) -> None:
+    def drive(recording: Recording) -> None:
+        with RememberedRuns(recording) as runs:
+            run(runs)
+
+    recorded = {each.id: each for each in await check_executive(drive, tmp_path)}
+    assert sorted(
+        (each.dtype, recorded[each.parent_id].dtype, each.status.name)
+        for each in recorded.values()
+        if each.parent_id is not None and each.dtype not in (None, "Chain")
+    ) == [
+        ("ModelCall", "Chain", "SUCCEEDED"),
+        ("ModelCall", "Chain", "SUCCEEDED"),
+        ("drive", "Chain", "SUCCEEDED"),
+        ("pick_up", "Chain", "SUCCEEDED"),
     ]
     named = "SELECT name FROM chain WHERE name IN ('LangGraph', 'model', 'tools') ORDER BY id"
-    assert ask(tmp_path / "memory.db", named) == [("LangGraph",), ("model",), ("tools",), ("model",)]
-    assert (status.faults.total, status.missing.total) == (0, 0)
+    assert ask(tmp_path / "executive.db", named) == [("LangGraph",), ("model",), ("tools",), ("model",)]
 
 
 def test_prompts_answers_and_token_counts_are_recorded(tmp_path: Path) -> None:
