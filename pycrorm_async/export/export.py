@@ -302,7 +302,7 @@ async def _described(
     reading: Reading, covered: tuple[CoveredEpisode, ...], file_format: FileFormat, options: EpisodeOptions, rows: int
 ) -> Manifest:
     log = await reading.log()
-    packages = {"lerobot": ("pyarrow", "pandas"), "mcap": ("mcap", "foxglove-sdk"), "rrd": ("rerun-sdk",)}
+    packages = {"lerobot": ("pyarrow",), "mcap": ("mcap", "foxglove-sdk"), "rrd": ("rerun-sdk",)}
     return Manifest(
         kind="episodes",
         names=tuple(each.id for each in covered),

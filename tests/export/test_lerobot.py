@@ -5,12 +5,14 @@ from __future__ import annotations
 import errno
 import io
 import json
+import sys
 from pathlib import Path
 from typing import Any
 
 import matplotlib.image
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 import pytest
 from pyarrow import parquet
 
@@ -93,6 +95,19 @@ async def test_the_frames_are_the_recorded_states_with_task_and_subtask(dataset:
             label = subtasks.index[frame.subtask_index]
             assert label.split(" ")[0] == (running[-1].dtype if running else "idle")
     assert "PickUpAction milk" in subtasks.index
+
+
+async def test_it_is_written_without_pandas_and_has_the_index_that_pandas_reads(
+    reading: Reading, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pa.array(np.zeros(1))  # pyarrow looks for pandas once, and takes the None below for a module
+    with monkeypatch.context() as without:
+        without.setitem(sys.modules, "pandas", None)
+        await export(reading, 1, tmp_path / "set", file_format="lerobot")
+    for name in ("task", "subtask"):
+        names = pd.read_parquet(tmp_path / f"set/meta/{name}s.parquet")
+        assert (names.index.name, [*names.columns]) == (name, [f"{name}_index"])
+        assert names[f"{name}_index"].tolist() == [*range(len(names))]
 
 
 def test_the_plan_has_every_node_with_its_frames_and_failure(dataset: Path) -> None:

@@ -1,4 +1,4 @@
-"""Write the files of a LeRobot data set: `meta/` and `data/`, in version 3.0, with pyarrow and pandas alone.
+"""Write the files of a LeRobot data set: `meta/` and `data/`, in version 3.0, with pyarrow alone.
 
 Each frame has `observation.state` and `action`, the state of the next frame (the last one repeats its own), the event
 and the time behind it, and the subtask. `meta/plan.parquet` is ours: every node of the plans, with its first and last
@@ -234,10 +234,16 @@ def _write_json(path: Path, document: Any) -> None:
 
 def _write_names(path: Path, name: str, numbers: dict[str, int]) -> None:
     """Write names and their numbers as pandas does, with the names as index, because LeRobot reads them so."""
-    import pandas as pd
+    pa = needed_pyarrow()
+    from pyarrow import parquet
 
-    frame = pd.DataFrame({f"{name}_index": list(numbers.values())}, index=pd.Index(list(numbers), name=name))
-    frame.to_parquet(path, engine="pyarrow")
+    columns = [
+        {"name": each, "field_name": each, "pandas_type": type_, "numpy_type": numpy_type, "metadata": None}
+        for each, type_, numpy_type in ((f"{name}_index", "int64", "int64"), (name, "unicode", "object"))
+    ]
+    table = pa.table({f"{name}_index": pa.array(numbers.values(), pa.int64()), name: pa.array(numbers, pa.string())})
+    index = msgspec.json.encode({"index_columns": [name], "column_indexes": [], "columns": columns})
+    parquet.write_table(table.replace_schema_metadata({"pandas": index}), path)
 
 
 def _write_rows(path: Path, rows: list[dict[str, Any]]) -> None:
