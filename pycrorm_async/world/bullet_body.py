@@ -22,7 +22,7 @@ from pycrorm_async.world.enums import JointType
 from pycrorm_async.world.errors import DescriptionNotLoadable, UnknownLink
 from pycrorm_async.world.pose import IDENTITY, Pose, Quaternion, Vector, product, rotated
 from pycrorm_async.world.queries.bounding_boxes import BoundingBox, Frame, Solid, box_around, solids_of
-from pycrorm_async.world.robots.joint_chain import Joint, along, divided
+from pycrorm_async.world.robots.joint_chain import Joint, along, chains, divided
 
 Color = tuple[float, float, float, float]
 """Red, green, blue, opacity, each 0 to 1."""
@@ -30,6 +30,8 @@ Color = tuple[float, float, float, float]
 _ROOT = -1  # Bullet's number of a body's first link
 _MOVABLE = (JointType.REVOLUTE, JointType.CONTINUOUS, JointType.PRISMATIC)
 _ENDLESS = (-math.inf, math.inf)
+_STATES_MAX = 127
+"""Bullet returns no frames of links for a body with more joints than this, but it moves the links."""
 _AT_ORIGIN: Frame = (Vector(0.0, 0.0, 0.0), IDENTITY)
 
 
@@ -55,6 +57,7 @@ class Body:
         self._inertial: dict[int, Frame] = {}  # Bullet places a link by its centre of mass, in the link's frame
         self._inertial_back: dict[int, Frame] = {}
         self._read()
+        self._chains = chains(urdf) if len(self._joint_numbers) > _STATES_MAX else {}
         self.base = base or self.root
         """The link whose frame is the body's pose."""
         if self.base not in self._link_numbers:
@@ -63,7 +66,7 @@ class Body:
         self._to_base: tuple[Joint, ...] = divided(urdf, "", base)[1] if self.base != self.root else ()
         self.pose = self.root_pose = Pose()
         self.solids: dict[str, tuple[Solid, ...]] = {
-            link: solids_of(engine(), client, self.number, number, self._inertial[number])
+            link: solids_of(engine(), client, self.number, number, self._inertial[number], self._placed_at_load(link))
             for link, number in self._link_numbers.items()
         }
         if color is not None:
@@ -112,6 +115,8 @@ class Body:
 
     def link_frame_at(self, link: str, positions: Mapping[str, float]) -> Frame:
         """Return the link's frame in "map" at these joint positions; sets the joints in Bullet and restores them."""
+        if self._chains:
+            return self._frame_by_chain(link, {**self.positions, **positions})
         current = {joint: self.positions[joint] for joint in positions}
         try:
             self._turn_in_bullet(positions)
@@ -122,6 +127,8 @@ class Body:
     def box(self, links: Iterable[str]) -> BoundingBox | None:
         """Return the box around the shapes of these links; None if they have no shapes."""
         shaped = [link for link in links if self.solids[link]]
+        if self._chains:
+            return box_around((self._frame_by_chain(link, self.positions), self.solids[link]) for link in shaped)
         numbers = [number for link in shaped if (number := self._link_numbers[link]) != _ROOT]
         states: Sequence[Any] = ()
         if numbers:
@@ -151,11 +158,24 @@ class Body:
         engine().resetJointStatesMultiDof(self.number, numbers, values, physicsClientId=self.client)
 
     def _frame_in_bullet(self, link: str) -> Frame:
+        if self._chains:
+            return self._frame_by_chain(link, self.positions)
         number = self._link_numbers[link]
         if number == _ROOT:
             return self.root_pose.position, self.root_pose.orientation
         state = engine().getLinkState(self.number, number, computeForwardKinematics=True, physicsClientId=self.client)
         return self._link_frame(number, state)
+
+    def _frame_by_chain(self, link: str, positions: Mapping[str, float]) -> Frame:
+        placed = self.root_pose @ along(self._chains[link], positions)
+        return placed.position, placed.orientation
+
+    def _placed_at_load(self, link: str) -> Frame | None:
+        """Return Bullet's frame of a link after loading, when the root link is at the origin; None if Bullet does."""
+        if not self._chains:
+            return None
+        frame = along(self._chains[link], {})
+        return _compose((frame.position, frame.orientation), self._inertial[self._link_numbers[link]])
 
     def _link_frame(self, number: int, state: Sequence[Any]) -> Frame:
         # Bullet returns the link's own frame in single precision; its inertial frame has double precision.
@@ -208,7 +228,7 @@ def _load(name: str, urdf: str, client: int) -> int:
     """Load URDF text with all its links and a fixed base, and return Bullet's number of the body."""
     bullet = engine()
     with tempfile.NamedTemporaryFile("w", suffix=".urdf", encoding="utf-8") as file:
-        file.write(urdf)
+        file.write(urdf.replace("><", ">\n<"))  # Bullet reads no line of more than 1,023 characters
         file.flush()
         with captured() as output:
             try:

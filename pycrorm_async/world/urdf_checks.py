@@ -53,7 +53,7 @@ class _Fault(Exception):
 def _find_mesh(reference: str, folder: Path) -> Path:
     """Return the path of a mesh file. Raises `_Fault` if it does not exist."""
     if reference.startswith("package://"):
-        relative = reference.removeprefix("package://")
+        relative = reference.removeprefix("package://").lstrip("/")
         candidates = [above / relative for above in (folder, *folder.parents)]
     else:
         candidates = [folder / reference.removeprefix("file://")]

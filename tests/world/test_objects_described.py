@@ -50,7 +50,9 @@ def test_a_changed_file_is_read_again(world: BulletWorld, tmp_path: Path) -> Non
     assert "tower" in Object("after", ObjectType.GENERIC_OBJECT, file).links
 
 
-@pytest.mark.parametrize("reference", ["package://parts/meshes/wedge.obj", "../meshes/wedge.obj"])
+@pytest.mark.parametrize(
+    "reference", ["package://parts/meshes/wedge.obj", "package:///parts/meshes/wedge.obj", "../meshes/wedge.obj"]
+)
 def test_meshes_are_searched_beside_the_file_and_in_packages_above_it(
     world: BulletWorld, tmp_path: Path, reference: str
 ) -> None:
@@ -61,6 +63,33 @@ def test_meshes_are_searched_beside_the_file_and_in_packages_above_it(
     file.write_text(with_mesh(reference))
     box = Object("wedge", ObjectType.GENERIC_OBJECT, file, Pose([0, 0, 1])).bounding_box()
     np.testing.assert_allclose(box, [(1, 0, 1), (1.1, 0.2, 1.3)], atol=1e-3)
+
+
+def test_a_robot_of_more_joints_than_bullet_reports_has_the_poses_and_boxes_of_all_links(
+    world: BulletWorld, tmp_path: Path
+) -> None:
+    (tmp_path / "wedge.obj").write_text(WEDGE)
+    mesh = f'<geometry><mesh filename="{tmp_path}/wedge.obj" scale="0.1 0.1 0.1"/></geometry>'
+    body = '<inertial><origin xyz="0.5 0 0"/><mass value="1"/><inertia ixx="1" iyy="1" izz="1"/></inertial>'
+    two_meshes = f'<collision>{mesh}</collision><collision><origin xyz="1 0 0"/>{mesh}</collision>'
+    for count in (127, 128, 140):  # Bullet reports the links of a body with 127 joints, and no more
+        links = "".join(f'<link name="{each}">{body}</link>' for each in range(count))
+        joints = "".join(
+            f'<joint name="j{each}" type="{"fixed" if each else "revolute"}"><parent link="{each}"/>'
+            f'<child link="{each + 1}"/><origin xyz="0.1 0 0"/><axis xyz="0 0 1"/>'
+            '<limit lower="-2" upper="2" effort="1" velocity="1"/></joint>'
+            for each in range(count)
+        )
+        text = f'<robot name="snake">{links}<link name="{count}">{body}{two_meshes}</link>{joints}</robot>'
+        snake = Object(f"snake {count}", ObjectType.ROBOT, text, Pose([1, 2, 3]))  # its text is one line
+        ahead = snake.bounding_box(f"{count}")
+        end = 1 + 0.1 * count
+        np.testing.assert_allclose(ahead, [(end, 2, 3), (end + 1.1, 2.2, 3.3)], atol=5e-3)
+        assert snake.link_pose_at(f"{count}", {"j0": np.pi / 2}).distance(Pose([1.1, 1.9 + 0.1 * count, 3])) < 1e-9
+        snake.set_joint_position("j0", np.pi / 2)
+        assert snake.link_pose(f"{count}").distance(Pose([1.1, 1.9 + 0.1 * count, 3])) < 1e-9
+        side = snake.bounding_box(f"{count}")
+        np.testing.assert_allclose(side, [(0.9, 1.9 + 0.1 * count, 3), (1.1, 3 + 0.1 * count, 3.3)], atol=5e-3)
 
 
 def two_joints(first: str, second: str) -> str:

@@ -84,10 +84,12 @@ _BALL = _GRID[np.linalg.norm(_GRID, axis=1) < 1]
 _CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 
 
-def solids_of(bullet: Any, client: int, body: int, link: int, inertial: Frame) -> tuple[Solid, ...]:
+def solids_of(
+    bullet: Any, client: int, body: int, link: int, inertial: Frame, placed: Frame | None = None
+) -> tuple[Solid, ...]:
     """Return the collision shapes of one link in the link's frame; `inertial` is Bullet's frame relative to it.
 
-    Call it before the body is moved from the pose at which it was loaded.
+    `placed` is Bullet's frame in "map", for a body of which Bullet does not return it. Call it before the body is moved from the pose at which it was loaded.
     """
     shapes = bullet.getCollisionShapeData(body, link, physicsClientId=client)
     rotation, position = rotation_matrix(inertial[1]), np.array(inertial[0])
@@ -98,7 +100,7 @@ def solids_of(bullet: Any, client: int, body: int, link: int, inertial: Frame) -
             # Bullet returns the vertices of a link's first convex shape only, in the link's inertial frame.
             vertices = bullet.getMeshData(body, link, physicsClientId=client)[1] if index == 0 else ()
             if not vertices:
-                return (_bullet_box(bullet, client, body, link, inertial),)
+                return (_bullet_box(bullet, client, body, link, inertial, placed),)
             solids.append(Solid(np.array(vertices) @ rotation.T + position))
         else:
             solids += _primitive(bullet, kind, size, rotation @ centre + position, rotation @ turn)
@@ -117,12 +119,12 @@ def _primitive(bullet: Any, kind: int, size: Sequence[float], centre: Array, rot
     return []
 
 
-def _bullet_box(bullet: Any, client: int, body: int, link: int, inertial: Frame) -> Solid:
+def _bullet_box(bullet: Any, client: int, body: int, link: int, inertial: Frame, placed: Sequence[Any] | None) -> Solid:
     """Return Bullet's own box around a link, a few millimetres too large, for meshes without accessible vertices."""
     low, high = bullet.getAABB(body, link, physicsClientId=client)
-    if link < 0:
+    if placed is None and link < 0:
         placed = bullet.getBasePositionAndOrientation(body, physicsClientId=client)
-    else:
+    elif placed is None:
         placed = bullet.getLinkState(body, link, physicsClientId=client)
     corners = (np.array(low) + np.array(high)) / 2 + _CORNERS * (np.array(high) - np.array(low)) / 2
     in_inertial = (corners - np.array(placed[0])) @ rotation_matrix(placed[1])

@@ -62,6 +62,24 @@ def divided(urdf: str, base_link: str, tool_link: str) -> tuple[tuple[Joint, ...
     return tuple(path[:begin]), tuple(path[begin:])
 
 
+def chains(urdf: str) -> dict[str, tuple[Joint, ...]]:
+    """Return for each link the joints from the root to it."""
+    robot = fromstring(urdf)  # noqa: S314  loaded by the caller's own process, and checked before
+    below: dict[str, list[Element]] = {}
+    for each in robot.findall("joint"):
+        below.setdefault(joined_link(each, "parent"), []).append(each)
+    children = {joined_link(each, "child") for joints in below.values() for each in joints}
+    names = (link.get("name", "") for link in robot.findall("link"))
+    paths: dict[str, tuple[Joint, ...]] = {name: () for name in names if name not in children}
+    pending = [*paths]
+    for link in pending:
+        for each in below.get(link, ()):
+            joint = _joint(each)
+            paths[joint.child] = (*paths[link], joint)
+            pending.append(joint.child)
+    return paths
+
+
 def _joint(element: Element) -> Joint:
     kind = _MOVABLE.get(element.get("type", ""), JointType.FIXED)
     axis, limit = element.find("axis"), element.find("limit")
