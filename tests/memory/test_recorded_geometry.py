@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import shutil
@@ -296,6 +297,25 @@ async def test_objects_of_an_older_version_have_assumed_shapes_and_say_so(tmp_pa
     with world:
         assert [(each.name, each.color) for each in world.objects] == [("milk", None), ("pr2", None)]
         assert world.object("pr2").joint_position("torso_lift_joint") == 0.3
+
+
+async def test_a_mesh_that_changed_with_its_size_and_its_time_kept_is_hashed_again(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path / 'm.db'}"
+    hashes = []
+    async with Memory.open(url) as memory:
+        async with memory.episode(description="changed"):
+            with BulletWorld():
+                for height in (3, 5):
+                    robot = made_arm(tmp_path, height)
+                    os.utime(tmp_path / "meshes" / "wedge.obj", (1, 1))
+                    hashes.append(hashlib.sha256((tmp_path / "meshes" / "wedge.obj").read_bytes()).hexdigest())
+                    Object(f"arm {height}", ObjectType.GENERIC_OBJECT, robot)
+        await memory.flush()
+        async with memory.session() as session:
+            descriptions = {each.fingerprint: each for each in await session.scalars(select(ObjectDescription))}
+            rows = (await session.scalars(select(ObjectRow).order_by(ObjectRow.id))).all()
+    recorded_meshes = [mesh for row in rows for mesh in descriptions[row.description_fingerprint or ""].meshes]
+    assert [mesh.sha256 for mesh in recorded_meshes] == hashes
 
 
 async def test_one_robot_has_one_hash_wherever_it_is_and_however_its_meshes_are_recorded(tmp_path: Path) -> None:

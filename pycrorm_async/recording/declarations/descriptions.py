@@ -36,7 +36,7 @@ _OWNER = DescriptionDeclared.__name__
 
 _MEDIA_TYPES = {".stl": "model/stl", ".obj": "model/obj", ".dae": "model/vnd.collada+xml"}
 
-_Stats = tuple[tuple[int, int] | None, ...]
+_Stats = tuple[tuple[int, int, int, int] | None, ...]
 
 
 class DescriptionSink(Protocol):
@@ -181,12 +181,13 @@ class Descriptions:
         return MeshValue(name, blob.hash, blob.size, blob)
 
 
-def _stat(file: str) -> tuple[int, int] | None:
+def _stat(file: str) -> tuple[int, int, int, int] | None:
+    """Return what differs after any change of a file; a program can set the time of its content, but not the other."""
     try:
         status = os.stat(file)  # noqa: PTH116  a fifth of the time of Path.stat
     except OSError:
         return None
-    return status.st_mtime_ns, status.st_size
+    return status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns
 
 
 def _box_value(box: BoundingBox) -> BoxValue:
