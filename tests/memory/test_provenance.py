@@ -6,6 +6,7 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -45,7 +46,8 @@ async def test_an_episode_holds_source_libraries_settings_and_clock(database_url
         assert each.settings == {"sync_interval_ms": 20, "on_full": "fail"}
         assert each.libraries is not None
         assert each.libraries["numpy"] == version("numpy")
-        assert {"msgspec", "SQLAlchemy", *INSTALLED_BULLETS} <= set(each.libraries)
+        assert {"msgspec", "SQLAlchemy", "optik-py", *INSTALLED_BULLETS} <= set(each.libraries)
+        assert ("pyjpt" in each.libraries) is (find_spec("jpt") is not None)  # it has no wheel for every Python
         assert each.clock_synchronized is (quality.synchronized if quality else None)
     assert "password" not in str(episode.settings)
 

@@ -13,10 +13,11 @@ from typing import Any, NamedTuple
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock, clock_quality
 from pycrorm_async.settings import Settings
 
-_LIBRARIES = tuple(
-    "pycrorm-async pycram-robotics pybullet pycram-bullet numpy msgspec SQLAlchemy aiosqlite asyncpg".split()
+_LIBRARIES = (
+    *"pycrorm-async pycram-robotics pybullet pycram-bullet optik-py pyjpt".split(),
+    *"numpy msgspec SQLAlchemy aiosqlite asyncpg".split(),
 )
-"""The packages whose versions are recorded: those that act in the world, encode events and store them."""
+"""The packages whose versions are recorded: those that act in the world, learn, encode events and store them."""
 
 
 class PlanSource(NamedTuple):
