@@ -113,7 +113,10 @@ def run(
     tags = checked_tags(tag or ())
     loaded = load_plan(plan)
     if tags and loaded.takes_memory:
-        raise CallerError(f"--tag cannot be used: {loaded.name} takes the memory and opens its own episodes")
+        raise CallerError(
+            f"--tag cannot be used: {loaded.name} takes the memory and opens its own episodes: pass"
+            " `memory.episode(tags=[...])` there, or tag them afterwards with `pycrorm tag`"
+        )
     memory = Memory.open(
         url,
         spool=spool,

@@ -15,8 +15,11 @@ from pycrorm_async.cli.snapshot_view import print_snapshot
 from pycrorm_async.cli.tree import print_tree, simulated_by
 from pycrorm_async.query.as_of import parse_moment
 from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary
-from pycrorm_async.query.parameter_text import duration
+from pycrorm_async.query.parameter_text import duration, one_line
 from pycrorm_async.query.reading import Reading
+
+_DIGITS_MAX = 12
+"""Bounds the digits of a hash, which are enough to compare it by eye; `--full` prints all."""
 
 
 def show(
@@ -32,7 +35,7 @@ def show(
         bool, typer.Option("--events", help="Print the events of each node's start and end, as in e6-e11.")
     ] = False,
     full: Annotated[
-        bool, typer.Option("--full", help="Print texts, lists and joints in full; --json always does.")
+        bool, typer.Option("--full", help="Print texts, lists, hashes and numbers in full; --json always does.")
     ] = False,
     url: UrlOption = DEFAULT_URL,
     spool: SpoolOption = None,
@@ -77,12 +80,15 @@ def _show(episode: str, url: str, spool: Path | None, *, events: bool, full: boo
 
 def _provenance(summary: EpisodeSummary, *, full: bool) -> dict[str, str | None]:
     """Return what the episode was recorded with, as far as it is known."""
-    commit, clock = summary.git_commit, summary.clock_synchronized
+    digits_max = None if full else _DIGITS_MAX
+    commit, source, clock = summary.git_commit, summary.plan_sha256, summary.clock_synchronized
     kept = "synchronized" if clock else "not synchronized"
     error_ns = None if summary.clock_error_us is None else summary.clock_error_us * 1_000
     return {
-        "plan": f"{summary.plan} (sha256 {summary.plan_sha256[:12]})" if summary.plan_sha256 else summary.plan,
-        "commit": f"{commit[:12]}{' and uncommitted changes' if summary.git_dirty else ''}" if commit else None,
+        "plan": f"{summary.plan} (sha256 {one_line(source, digits_max)})" if source else summary.plan,
+        "commit": f"{one_line(commit, digits_max)}{' and uncommitted changes' if summary.git_dirty else ''}"
+        if commit
+        else None,
         "world": summary.world,
         "settings": _pairs(summary.settings),
         "libraries": _pairs(summary.libraries) if full else None,

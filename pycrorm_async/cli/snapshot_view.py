@@ -18,7 +18,8 @@ _JOINTS_MAX = 3
 def print_snapshot(snapshot: Moment, requested: str, *, events: bool = False, full: bool = False) -> None:
     """Print the episode's facts, its task tree, and a table of the objects in the world.
 
-    With `full` no text is cut, and the objects have their colours and the fingerprints of their descriptions.
+    With `full` no text is cut and no number rounded, and the objects have their orientations, their colours and the
+    fingerprints of their descriptions.
     """
     print_facts(
         f"Episode {snapshot.number}: {snapshot.description}",
@@ -32,7 +33,7 @@ def print_snapshot(snapshot: Moment, requested: str, *, events: bool = False, fu
             "status": snapshot.status,
             "simulated": "yes" if snapshot.simulated else None,
             "running": _running_text(snapshot),
-            "robot": "; ".join(map(_robot_text, snapshot.world.robots)) or None,
+            "robot": "; ".join(_robot_text(each, full=full) for each in snapshot.world.robots) or None,
         },
     )
     print_tree(snapshot.tree, events=events, full=full)
@@ -40,7 +41,9 @@ def print_snapshot(snapshot: Moment, requested: str, *, events: bool = False, fu
         columns = ("object", "type", "x", "y", "z", "heading", "attached to", "joints")
         print_table("World", columns, [_row(each, full=full) for each in snapshot.world.objects])
         if full:
-            print_table("Shapes", ("object", "color", "description"), map(_shape_row, snapshot.world.objects))
+            print_table(
+                "Shapes", ("object", "orientation", "color", "description"), map(_shape_row, snapshot.world.objects)
+            )
     if snapshot.observations:
         observed = [_observed_row(name, each, full=full) for name, each in snapshot.observations.items()]
         print_table("Observations", ("name", "at", "event", "values"), observed)
@@ -50,7 +53,12 @@ def _observed_row(name: str, observation: ObservationThen, *, full: bool) -> tup
     values = observation.values
     if not isinstance(values, dict) or BLOB_KEY in values:
         values = {"value": values}
-    return name, f"{observation.time_s:.3f} s", f"e{observation.sequence}", parameters_text(values, full=full)
+    return (
+        name,
+        f"{observation.time_s:.3f} s",
+        f"e{observation.sequence}",
+        parameters_text(values, full=full, exact=full),
+    )
 
 
 def _running_text(snapshot: Moment) -> str:
@@ -63,31 +71,39 @@ def _running_text(snapshot: Moment) -> str:
     return text
 
 
-def _robot_text(robot: RobotThen) -> str:
-    x, y, _ = robot.pose.position
-    torso = f", torso at {robot.torso_height:.3f} m" if robot.torso_height is not None else ""
-    return f"{robot.name} at ({x:.3f}, {y:.3f}), heading {_degrees(robot.pose.yaw)}{torso}"
+def _robot_text(robot: RobotThen, *, full: bool) -> str:
+    x, y, _ = (_number(each, full=full) for each in robot.pose.position)
+    torso = f", torso at {_number(robot.torso_height, full=full)} m" if robot.torso_height is not None else ""
+    return f"{robot.name} at ({x}, {y}), heading {_degrees(robot.pose.yaw, full=full)}{torso}"
 
 
 def _row(each: ObjectThen, *, full: bool) -> tuple[object, ...]:
     parent = each.attached_to
     attached = " ".join(filter(None, parent)) if parent is not None else ""
     joints = _joints_text(each, full=full)
-    return each.name, each.object_type, *each.pose.position, _degrees(each.pose.yaw), attached, joints
+    position = (str(value) if full else value for value in each.pose.position)  # the table rounds numbers
+    return each.name, each.object_type, *position, _degrees(each.pose.yaw, full=full), attached, joints
 
 
 def _shape_row(each: ObjectThen) -> tuple[object, ...]:
-    color = " ".join(f"{part:g}" for part in each.color) if each.color is not None else ""
-    return each.name, color, each.description_fingerprint or "not recorded"
+    color = " ".join(map(str, each.color)) if each.color is not None else ""
+    return each.name, " ".join(map(str, each.pose.orientation)), color, each.description_fingerprint or "not recorded"
 
 
-def _degrees(angle: float) -> str:
-    return f"{math.degrees(angle):.1f}°"
+def _degrees(angle: float, *, full: bool) -> str:
+    degrees = math.degrees(angle)
+    return f"{degrees}°" if full else f"{degrees:.1f}°"
+
+
+def _number(value: float, *, full: bool) -> str:
+    return str(value) if full else f"{value:.3f}"
 
 
 def _joints_text(each: ObjectThen, *, full: bool) -> str:
     """List the joints whose position is not 0."""
-    positions = [f"{joint} {position:.3f}" for joint, position in each.joints.items() if position != 0.0]
+    positions = [
+        f"{joint} {_number(position, full=full)}" for joint, position in each.joints.items() if position != 0.0
+    ]
     listed = positions if full else positions[:_JOINTS_MAX]
     more = f" and {len(positions) - len(listed)} more" if len(positions) > len(listed) else ""
     return ", ".join(listed) + more

@@ -52,7 +52,7 @@ def tree_of(
 def _line(node: NodeSummary, *, events: bool, full: bool) -> Text:
     line = Text.from_markup(escape(node.dtype or node.kind))
     if node.parameters:
-        line.append(f"  {parameters_text(node.parameters, full=full)}", style="dim")
+        line.append(f"  {parameters_text(node.parameters, full=full, exact=full)}", style="dim")
     line.append(f"  {node.status}", style=_STYLES.get(node.status, "red"))
     line.append(f"  {duration(node.duration_ns)}", style="dim")
     if events:

@@ -13,30 +13,42 @@ _TEXT_MAX = 60
 """Bounds the characters of a text parameter, so that a node fits on one line."""
 
 
-def parameters_text(parameters: Mapping[str, Any], *, full: bool = False) -> str:
-    """Format parameters on one line; with `full`, long texts, lists, dicts and reasons of missing values too.
+def parameters_text(parameters: Mapping[str, Any], *, full: bool = False, exact: bool = False) -> str:
+    """Format parameters on one line.
+
+    With `full` nothing is cut; with `exact` no number is rounded, and poses have their orientation.
 
     >>> parameters_text({"arm": "LEFT", "target": {"position": [0.6, 0.4, 0.0], "orientation": [0, 0, 0, 1]}})
     'arm=LEFT target=(0.60, 0.40, 0.00)'
     """
-    return " ".join(f"{name}={_value_text(value, full=full)}" for name, value in parameters.items())
+    return " ".join(f"{name}={_value_text(value, full=full, exact=exact)}" for name, value in parameters.items())
 
 
-def _value_text(value: Any, *, full: bool) -> str:
+def _value_text(value: Any, *, full: bool, exact: bool) -> str:
     if isinstance(value, dict) and "position" in value:
+        if exact:
+            return _pose_text(value)
         return "(" + ", ".join(f"{round(each, 2) + 0.0:.2f}" for each in value["position"]) + ")"
     if isinstance(value, dict) and BLOB_KEY in value:
-        return f"{value.get('media_type')} of {value.get('size')} bytes"
+        content = f", sha256 {value[BLOB_KEY]}" if full else ""
+        return f"{value.get('media_type')} of {value.get('size')} bytes{content}"
     if isinstance(value, dict) and value.get("name"):
         return str(value["name"])
     if isinstance(value, dict) and "missing" in value:
         return f"? ({one_line(value['missing'], None)})" if full else "?"
     if isinstance(value, float):
-        return f"{value:g}"
+        return repr(value) if exact else f"{value:g}"
     if isinstance(value, dict | list):
         count = "1 entry" if len(value) == 1 else f"{len(value)} entries"
         return msgspec.json.encode(value).decode() if full else count
     return one_line(value, None if full else _TEXT_MAX)
+
+
+def _pose_text(pose: Mapping[str, Any]) -> str:
+    """Format a pose with all digits, its orientation as x, y, z, w."""
+    position, orientation = (f"({', '.join(map(str, pose.get(part) or ()))})" for part in ("position", "orientation"))
+    frame = f" in {pose['frame']}" if pose.get("frame", "map") != "map" else ""
+    return f"{position} turned {orientation}{frame}"
 
 
 def one_line(text: object, characters_max: int | None) -> str:

@@ -92,6 +92,9 @@ async def leaves():
     await NoteActionPerformable("a").perform()
     sys.exit(5)
 
+async def opening(memory):
+    pass
+
 async def endless():
     """Never suspends."""
     while True:
@@ -125,6 +128,11 @@ def folder(tmp_path: Path) -> Path:
         (["run", "plans.py:none"], 2, "plans.py has no function 'none'; its async functions: plan,"),
         (["run", "plans.py:sync"], 2, "plans.py:sync is not an async function: write `async def sync()`"),
         (["run", "plans.py:greedy"], 2, "plans.py:greedy takes memory, world: a plan takes the memory or no argument"),
+        (
+            ["run", "plans.py:opening", "--tag", "a"],
+            2,
+            "pass `memory.episode(tags=[...])` there, or tag them afterwards",
+        ),
         (["run", "turtle.py"], 2, "turtle.py has the name of a standard or already loaded module"),
         (["writer", "--once", "--url", "sqlite://"], 2, "sqlite:// exists only in its own process"),
         (["run", "plans.py", "--spool", "plans.py"], 3, "plans.py"),

@@ -83,7 +83,8 @@ def test_run_records_the_source_and_show_and_episodes_print_it(repository: Path)
     (repository / "myplan.py").write_text(PLAN + "\n")
     assert pycrorm("run", "myplan.py", "--on-full", "fail", cwd=repository).returncode == 0
     text = pycrorm("show", "last", "--full", cwd=repository).stdout
-    assert f"commit    {commit[:12]} and uncommitted changes" in text
+    assert f"commit    {commit} and uncommitted changes" in text
+    assert f"(sha256 {digest[:12]}…)" in pycrorm("show", "1", cwd=repository).stdout
     assert "on_full fail" in text
     assert all(f"{name} 3" in text for name in INSTALLED_BULLETS)
     assert os.sep not in json.dumps(shown[0]["libraries"])

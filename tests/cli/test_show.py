@@ -10,6 +10,7 @@ import pytest
 
 from pycrorm_async.cli.episodes import episodes
 from pycrorm_async.cli.output import stdout
+from pycrorm_async.world import Pose
 from tests.commands import answer, one_line_of, pycrorm
 from tests.databases import ask
 
@@ -123,7 +124,11 @@ def test_a_moment_is_drawn_with_its_tree_and_its_world(ridden: Path) -> None:
     full = pycrorm("show", "1", "--at", "#9", "--full", cwd=ridden).stdout
     rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in full.splitlines() if "│" in line]
     fingerprints = ask(ridden / "pycrorm.db", "SELECT description_fingerprint FROM object WHERE id = identity_id")
-    assert rows[-2:] == [["pr2", "", fingerprints[0][0]], ["milk", "", fingerprints[1][0]]]
+    turned = " ".join(map(str, Pose([0, 0, 0], [0, 0, 1, 1]).orientation))
+    assert rows[-2:] == [["pr2", turned, "", fingerprints[0][0]], ["milk", turned, "", fingerprints[1][0]]]
+    assert f"target_location=(2.0, 3.0, 0.0) turned ({turned.replace(' ', ', ')})" in "".join(
+        line.replace("│  ", "") for line in full.splitlines()
+    )
 
 
 def test_a_moment_is_one_document(ridden: Path) -> None:
@@ -252,7 +257,7 @@ def test_a_json_document_is_never_shortened(failed: Path) -> None:
 
 
 def test_full_lists_every_joint_of_the_world(failed: Path) -> None:
-    joints = "head_pan_joint 0.200", "head_tilt_joint 0.300", "l_elbow_flex_joint -0.400", "torso_lift_joint 0.100"
+    joints = "head_pan_joint 0.2", "head_tilt_joint 0.3", "l_elbow_flex_joint -0.4", "torso_lift_joint 0.1"
     cut, full = (
         "".join(line.split("│")[-2].strip() for line in pycrorm(*words, cwd=failed).stdout.splitlines() if "│ " in line)
         for words in (("show", "1", "--at", "#7"), ("show", "1", "--at", "#7", "--full"))
