@@ -8,8 +8,8 @@
 `figures.jsonl` has one line for each run: the JSON that the script printed, its command, its duration, versions,
 hardware, and the load of the machine before and after. A repeated run replaces its line, so single figures can be
 measured again. `figures.md` shows all figures and the budgets of the design. The lines are also printed. The exit code
-is 1 if a script failed. The extras `[test,learning,bench]` are required; if a library is not installed, the page says
-that its comparison is missing.
+is 1 if a script failed. The extras `[test,learning,bench]` are required; if a library is not installed, the page marks
+its comparison as missing.
 """
 
 from __future__ import annotations

@@ -15,8 +15,8 @@ counted. All choose free places from which the object is seen, the default polic
 remembers the tries at three heights, without furniture and collisions, and has its first tries in the kitchen.
 
 *Varied.* A memory that is empty at first, in which every try is recorded at once and is not flushed. Each scene has the
-milk at 0.5 to 1.4 m, the torso at 0 to 0.3 m, one given arm, and a robot that can stand in a third of the circle around
-the object only. One try a scene; the first-try success of each 200 scenes, and the number of different ways (arm,
+milk at 0.5 to 1.4 m, the torso at 0 to 0.3 m, one given arm, and a robot with free places in only a third of the circle
+around the object. One try a scene; the first-try success of each 200 scenes, and the number of different ways (arm,
 grasp, place to 1 cm) that served in the last 200, because where one way serves everywhere nothing is generalised.
 
 The script prints one JSON line; the tables are on stderr. The robot is kinematic, and collisions count in the

@@ -11,7 +11,7 @@ for `eventsourcing` (1,000 on PostgreSQL). Plain SQL writes the rows of our log,
 *Into a durable queue*: events are put one by one, each until it survives the death of the process. The cost of
 encoding, checksum and memory copy alone is a lower bound for every queue.
 
-All contenders take turns. If a library is not installed, its figure says so (`pip install '.[bench]'`). The script
+All contenders take turns. A library that is not installed is reported as missing (`pip install '.[bench]'`). The script
 prints one JSON line: events a second (median, minimum, maximum), and our rate divided by theirs.
 """
 

@@ -7,7 +7,7 @@
 `python -m tests.integrations.pycram.environment` makes that environment. A plan of 19 nodes (park, raise the torso,
 pick up, drive, place) is performed twice inside `remember` and twice without, in pairs of alternating order. The first
 plan also declares the types of its nodes, which happens once; opening and closing the memory is not measured. The
-measurement is `time.thread_time` of the plan's thread: wall times would say nothing, because other programs run.
+measurement is `time.thread_time` of the plan's thread: wall times would be useless, because other programs run.
 OpenBLAS gets one thread, because the plan's thread otherwise spins until another one has had its turn, which took up
 to twice the plan's own time on a busy machine. The garbage of the plans is collected before each of them, so that both
 kinds pay for their own; what was there before the first is left out, because its collection would take longer than a

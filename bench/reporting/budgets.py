@@ -12,7 +12,7 @@ Lines = Mapping[str, Mapping[str, Any]]
 
 
 class Verdict(NamedTuple):
-    """A measured value as text; `met` says if the budget is met, and is None if nothing was measured."""
+    """A measured value as text; `met` is True if the budget is met, and None if nothing was measured."""
 
     measured: str
     met: bool | None
