@@ -54,7 +54,7 @@ class PycrormError(Exception):
 
 
 class CallerError(PycrormError):
-    """The call cannot be carried out with these arguments; the message says what to change."""
+    """The call cannot be carried out with these arguments; the message names the change that is needed."""
 
 
 class UnknownUrl(CallerError):

@@ -26,7 +26,7 @@ from pycrorm_async.recording.writing.event_feed import BUFFER_EVENTS, EventStrea
 
 
 class RecordingMemory(ReadableMemory, ABC):
-    """What records in a memory, beside its queries. Each method raises `CallerError` while the memory is not open."""
+    """The recording methods of a memory. Each raises `CallerError` while the memory is not open."""
 
     _unadopted: dict[str, PycrormError]
     _reported: set[str]

@@ -8,7 +8,7 @@ __all__ = ["TaskStatus"]
 
 
 class TaskStatus(Enum):
-    """How far a node got."""
+    """The status of a node: running, or the way in which it ended."""
 
     RUNNING = "RUNNING"
     SUCCEEDED = "SUCCEEDED"

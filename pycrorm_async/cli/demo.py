@@ -189,7 +189,7 @@ async def _query(memory: Memory, number: int, saying: Any) -> list[tuple[str, Se
             [(p.id, p.position.x, p.position.y, p.position.z, p.frame) for p in object_poses],
         ),
         (
-            "What did the robot say?  select(memory.mapped(SayingActionPerformable))",
+            "What has the robot spoken?  select(memory.mapped(SayingActionPerformable))",
             ("id", "dtype", "text"),
             [(s.id, s.dtype, s.text) for s in sayings],
         ),

@@ -25,7 +25,7 @@ def diff(
 ) -> None:
     """Compare two episodes: what surrounded them, their task trees, and the last places of their objects.
 
-    Nodes correspond by the types from the root down. A node that only one of them has stands for the nodes below it.
+    Nodes correspond by the types from the root down. A node that only one episode has is listed without its children.
     SQL reads the rows (`--sql`); the comparison is made in Python.
     """
     compared = read_memory(url, spool, lambda reading: reading.diff(first, second))

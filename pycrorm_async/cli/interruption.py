@@ -74,7 +74,7 @@ class Interruption:
 
     @property
     def requested(self) -> bool:
-        """Whether a signal arrived."""
+        """True once a signal has arrived."""
         return self._count > 0
 
     def plan_ended(self) -> None:

@@ -35,7 +35,7 @@ def query(
     spool: SpoolOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Run one query in SQL that can only read: nothing it says can change the memory or the machine.
+    """Run one read-only query in SQL: no statement can change the memory or the machine.
 
     On PostgreSQL the login in the URL must have no more rights than the role pycrorm_reader. Times are integers, µs
     since 1970-01-01 UTC; columns that end in _ns are ns of the robot's monotonic clock.

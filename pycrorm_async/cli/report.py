@@ -44,7 +44,7 @@ def report(
 ) -> int:
     """Write an episode as one HTML page that opens offline: task tree, Gantt chart, 3D scene, failures.
 
-    Exit code 1 if --all met an episode whose events cannot be read; its row says so, and all others have their pages.
+    Exit code 1 if --all met an episode whose events cannot be read; its row has the error, and all others have pages.
     """
     if every == (episode is not None):
         raise CallerError("name an episode, for example `pycrorm report last`, or write all of them with --all")

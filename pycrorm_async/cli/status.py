@@ -32,7 +32,7 @@ from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 
 RUNNING_MAX = 20
-"""Bounds the running episodes that are listed: a simulator may have hundreds, and the newest say most."""
+"""Bounds the running episodes that are listed: a simulator may have hundreds, and the newest matter most."""
 _DRAINED_BY = {"itself": "itself", "another": "another process", "nobody": "no process"}
 """The table's words for the values of `RecorderState.drained`, which are part of the `--json` document."""
 

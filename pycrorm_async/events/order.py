@@ -71,7 +71,7 @@ class OrderCheck:
         """The parent of each open node."""
         self._any_node = False
         self._kinds = bytearray()
-        """For each sequence, one byte: `_NODE` or `_OBJECT` if that event created one, else 0."""
+        """One byte for each sequence: `_NODE` or `_OBJECT` if that event created one, else 0."""
 
     def read(self, sequence: int, event: Happening) -> list[Finding]:
         """Read the next event and return its findings, damage before remarks; empty if the event is in order."""

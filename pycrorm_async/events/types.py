@@ -191,7 +191,7 @@ class ObjectAdded(Happening, frozen=True):
         joints: in rad or m.
         node: added the object; None if none did, or if it was in the world before the episode.
         description: fingerprint of the `DescriptionDeclared`; None in events of older versions.
-        color: red, green, blue, opacity, 0 to 1; None if the description alone says it.
+        color: red, green, blue, opacity, 0 to 1; None if only the description has it.
         model, serial: of a robot with a `RobotDescription`: the model's name, and what distinguishes robots of one
             model, if it is known.
         mass_kg: as given, or the sum of the masses in the description; None if it is not known.

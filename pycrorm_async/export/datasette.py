@@ -33,7 +33,7 @@ _NEWEST = ("id", "node_id", "process_metadata_id", "global_position", "number")
 """Columns by which the newest rows come first, the first that a table has."""
 _TIMES = " Times are integers, in µs since 1970-01-01 00:00 UTC, and durations are in s."
 _TEXT, _NUMBER = "pycrorm-value-", 200_000_000
-"""Stand in the SQL of a question for a text and for numbers (m) that Datasette asks for."""
+"""Placeholders (a text, numbers in m) in a question's SQL that become Datasette parameters."""
 
 
 async def datasette_metadata(reading: Reading) -> dict[str, Any]:

@@ -165,7 +165,7 @@ async def export_again(
         path: of the new file; by default the export is only compared.
         statement: the select or question, for an export of one that was not named.
 
-    If episodes are missing, nothing is made and `differences` says so. Raises as `export` does.
+    If episodes are missing, nothing is made and `differences` lists them. Raises what `export` raises.
     """
     before = read_manifest(Path(manifest))
     log = await reading.log()

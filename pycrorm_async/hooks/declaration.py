@@ -128,7 +128,7 @@ def _conflict(
 
 
 _built_in_declarations: dict[str, DesignatorTypeDeclared] = {}
-"""Those that were asked for, by dtype: deriving one takes a millisecond."""
+"""Cache of derived declarations, by dtype; deriving one takes a millisecond."""
 
 
 def built_in_declaration(dtype: str) -> DesignatorTypeDeclared | None:

@@ -102,7 +102,7 @@ class Episode(EpisodeWriter[TaskTreeNode]):
 
     @property
     def acts_in_recorded_world(self) -> bool:
-        """Whether the current world of this context is the recorded world, and not a second one."""
+        """True if the current world of this context is the recorded world, not a second one."""
         if self.world is None:
             return False
         current = current_world.get()

@@ -31,7 +31,7 @@ class Observations:
 
     @property
     def is_closed(self) -> bool:
-        """Whether the memory is closed, or belongs to the process that forked this one."""
+        """True if the memory is closed, or belongs to the process that forked this one."""
         return self._emitter.is_closed
 
     def observe(self, name: str, values: object, *, node: TaskTreeNode | None) -> None:

@@ -78,7 +78,7 @@ class Recorder:
 
     @property
     def is_closed(self) -> bool:
-        """Whether the memory is closed, or belongs to the process that forked this one."""
+        """True if the memory is closed, or belongs to the process that forked this one."""
         return self._emitter.is_closed
 
     # --- episodes ---------------------------------------------------------------------------------------------

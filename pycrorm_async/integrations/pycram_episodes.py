@@ -14,7 +14,7 @@ from pycrorm_async.recording.recording import Recording
 
 
 class RunningNode:
-    """A node that runs: PyCRAM's node, or the action that another one performs; `key` stands for it in its episode.
+    """A node that runs: PyCRAM's node, or the action that another one performs; `key` names it in its episode.
 
     A description of an action has no key: what it resolves to is recorded, or the description once it has failed.
     """

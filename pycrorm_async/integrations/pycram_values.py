@@ -140,7 +140,7 @@ class PyCRAMValues:
         return next((name for each, name in self._field_types if issubclass(kind, each)), "text")
 
     def status(self, failure: BaseException | None) -> NodeStatus:
-        """Return the status of a node that this exception left; None stands for a failure that PyCRAM does not name."""
+        """Return the status of a node that this exception left; None means a failure that PyCRAM does not name."""
         if failure is None or isinstance(failure, self.pycram.PlanFailure):
             return "FAILED"
         return "ERROR" if isinstance(failure, Exception) else "CANCELLED"  # SystemExit, too: a world exits at Ctrl-C

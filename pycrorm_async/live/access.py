@@ -31,7 +31,7 @@ HEADERS: Final[Mapping[str, str]] = {
     "referrer-policy": "no-referrer",
     "x-content-type-options": "nosniff",
 }
-"""Of every answer; the page itself has the rest of the Content-Security-Policy."""
+"""The headers of every answer; the page itself contains the rest of the Content-Security-Policy."""
 
 
 def refusal(path: str, headers: Mapping[str, str], token: str) -> str | None:

@@ -19,11 +19,11 @@ _FAILED = frozenset({"FAILED", "ERROR"})
 _TEXT_MAX = 200
 """Bounds the characters of a description, and of the text of what runs now."""
 _NODES_IN_FULL = 2
-"""Of so many innermost nodes the text of what runs now has the parameters."""
+"""Bounds the innermost nodes that are shown with parameters."""
 
 
 class Activity:
-    """What an episode does, as far as its events were read.
+    """The present activity of an episode, up to the last event that was read.
 
     Attributes:
         last: sequence of the last event that was read.

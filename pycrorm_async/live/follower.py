@@ -27,7 +27,7 @@ from pycrorm_async.store.stored import EpisodeRow
 _INTERVAL_S = 0.05
 _IDLE_INTERVAL_S = 0.15
 _IDLE_TURNS = 40
-"""After so many turns without a change the log is asked less often, to spare the robot's processor."""
+"""The turns without a change after which the log is queried less often, to spare the robot's processor."""
 _RETRY_S = 0.5
 """Delays the next attempt if the database does not answer."""
 _FEEDS_MAX = 8

@@ -25,7 +25,7 @@ _PAGE_EVENTS = 2_000
 
 
 class LiveOverview:
-    """What each episode does now.
+    """The present activity of each running episode.
 
     Attributes:
         listeners: number of pages that follow it.

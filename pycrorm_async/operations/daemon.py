@@ -84,7 +84,7 @@ async def serve(
         folders = _Folders(place, destination.log_id, address, stored)
         assignment = Assignment(url, destination.log_id, projections, recall=settings.recall)
         workers = await stack.enter_async_context(
-            FoldWorkers(fold_workers, assignment, settings=settings, say=report, note=note, forked=forked)
+            FoldWorkers(fold_workers, assignment, settings=settings, report=report, note=note, forked=forked)
         )
         tables: Tables = FoldWorkerTables(destination, workers) if fold_workers else destination
         return await Daemon(destination, tables, folders, settings=settings, report=report).run(stop)

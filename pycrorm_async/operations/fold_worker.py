@@ -94,7 +94,7 @@ class FoldWorker:
         assignment: Assignment,
         *,
         settings: Settings,
-        say: Callable[[str], None],
+        report: Callable[[str], None],
         note: Callable[[], None],
         clock: Clock,
         forked: ChildProcess | None,
@@ -106,7 +106,7 @@ class FoldWorker:
             self.wanted.set()
         self._assignment = assignment
         self._settings = settings
-        self._say = say
+        self._report = report
         self._note = note
         self._clock = clock
         self._forked = forked
@@ -166,7 +166,7 @@ class FoldWorker:
             deaths = 1 if now_s() - began_s >= self._settings.fold_worker_healthy_s else deaths + 1
             pause_s = backoff.pause_s(deaths, 1.0)
             assert pause_s is not None, "there is no last attempt"
-            self._say(f"{name} {reason}; restarting it in {pause_s:g} s")
+            self._report(f"{name} {reason}; restarting it in {pause_s:g} s")
             restart_ns = self._clock.wall_ns() + int(pause_s * 1e9)
             self._change("restarting", pid=None, reason=reason, restart_wall_ns=restart_ns)
             await asyncio.sleep(pause_s)
@@ -245,7 +245,7 @@ class FoldWorker:
                 process.kill()
             case "report" if not is_reported:
                 left_s = settings.fold_worker_stopped_s - stopped_s
-                self._say(
+                self._report(
                     f"fold worker {self.state.number} (pid {process.pid}) is stopped while it {activity};"
                     f" replacing it in {left_s:.1f} s unless it continues"
                 )
@@ -254,7 +254,7 @@ class FoldWorker:
                 self._continue()
 
     def _continue(self) -> None:
-        self._say(f"fold worker {self.state.number} (pid {self.state.pid}) continues")
+        self._report(f"fold worker {self.state.number} (pid {self.state.pid}) continues")
         self._change("running" if self.is_ready else "starting")
 
     def _change(self, state: str | None = None, **values: object) -> None:

@@ -1,6 +1,6 @@
 """Start the fold workers of a daemon, which fold while it appends, or those of a rebuild.
 
-    async with FoldWorkers(2, assignment, settings=settings, say=say, note=note) as workers:
+    async with FoldWorkers(2, assignment, settings=settings, report=report, note=note) as workers:
         tables = FoldWorkerTables(destination, workers)
 
 Theory of operation. A worker is a process (`fold_worker`) with one connection to its parent, a daemon or a rebuild. The
@@ -50,7 +50,7 @@ class FoldWorkers:
 
     Args:
         forked: the first processes, if the command forked them; a worker without one is started when it is needed.
-        say: called with one line for each death, stop and continuation.
+        report: called with one line for each death, stop and continuation.
         note: called with the states of all workers when one has changed.
     """
 
@@ -60,7 +60,7 @@ class FoldWorkers:
         assignment: Assignment,
         *,
         settings: Settings,
-        say: Callable[[str], None],
+        report: Callable[[str], None],
         note: Callable[[Sequence[FoldWorkerState]], None],
         forked: Sequence[ChildProcess] = (),
         clock: Clock = SYSTEM_CLOCK,
@@ -72,7 +72,9 @@ class FoldWorkers:
         self._workers: list[FoldWorker] = []
         for number, first in zip(range(1, count + 1), [*forked, *[None] * count], strict=False):
             self._workers.append(
-                FoldWorker(number, assignment, settings=settings, say=say, note=self._note, clock=clock, forked=first)
+                FoldWorker(
+                    number, assignment, settings=settings, report=report, note=self._note, clock=clock, forked=first
+                )
             )
 
     async def __aenter__(self) -> Self:

@@ -178,7 +178,7 @@ async def _fold(
 async def _run_workers(assignment: Assignment, count: int, report: Callable[[int], None]) -> None:
     """Fold with worker processes, a share each; return when all shares are folded or have failed."""
     async with (
-        FoldWorkers(count, assignment, settings=Settings(), say=_log.warning, note=lambda _: None) as workers,
+        FoldWorkers(count, assignment, settings=Settings(), report=_log.warning, note=lambda _: None) as workers,
         asyncio.TaskGroup() as group,
     ):
         for part, worker in enumerate(workers):

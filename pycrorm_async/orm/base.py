@@ -302,7 +302,7 @@ class ProcessMetaData(Base):
     failure_type: Mapped[str | None]
     failure_message: Mapped[str | None]
     simulated: Mapped[bool]
-    """Whether it is a simulation, performed in a copy of the world."""
+    """True for a simulation, performed in a copy of the world."""
     thought_by: Mapped[str | None]
     """UUID of the episode that performed this simulation."""
     thought_by_node: Mapped[int | None]
@@ -320,10 +320,10 @@ class ProcessMetaData(Base):
     settings: Mapped[dict[str, Any] | None] = mapped_column(JsonText())
     """The settings that differ from their defaults."""
     clock_synchronized: Mapped[bool | None]
-    """Whether a time service kept the wall clock; `clock_error_us` is its estimated error, µs."""
+    """True if a time service kept the wall clock; `clock_error_us` is its estimated error, µs."""
     clock_error_us: Mapped[int | None]
     episode_metadata: Mapped[dict[str, Any] | None] = mapped_column("metadata", JsonText())
-    """In SQL `metadata`, a name of an attribute that SQLAlchemy keeps for itself."""
+    """The metadata of the executive; the column is `metadata`, a name that SQLAlchemy reserves as an attribute."""
     tag_rows: Mapped[list[Any]] = relationship("EpisodeTag", viewonly=True, order_by="EpisodeTag.tag")
     tags = property(lambda self: [each.tag for each in self.tag_rows], doc="The tags, in alphabetical order.")
     _robots: Mapped[list[EpisodeRobot]] = relationship(viewonly=True, order_by="EpisodeRobot.id")

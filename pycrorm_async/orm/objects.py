@@ -98,7 +98,7 @@ class ObjectDescription(Base):
 
     @property
     def urdf(self) -> str:
-        """The URDF; the name of a mesh file is `sha256:` and the hash of its content. Empty if `missing` says why."""
+        """The URDF, empty if `missing` is not. The name of a mesh file is `sha256:` and the hash of its content."""
         return self.declared.text
 
     @property
@@ -117,7 +117,7 @@ class ObjectDescription(Base):
 
     @property
     def boxes(self) -> dict[str, BoxValue]:
-        """For each link with a mesh, the box around its collision shapes, else its visual ones, in its frame (m)."""
+        """The box around each link's collision shapes, else its visual ones, in its frame (m); of links with a mesh."""
         return self.declared.boxes
 
     @property
@@ -132,8 +132,8 @@ class Object(RowOfEvent, Base):
     Attributes:
         identity_id: its first row, from when it was added; None for an object outside the world.
         joints: positions (rad or m) when it was added; None in later rows.
-        color: red, green, blue, opacity, 0 to 1, when it was added; None in later rows, and if its description alone
-            says it.
+        color: red, green, blue, opacity, 0 to 1, when it was added; None in later rows, and if only its description
+            has it.
         description_fingerprint: fingerprint of its description when it was added; None in later rows.
         model, serial: of a robot with a `RobotDescription`, when it was added; None in later rows.
         mass_kg: when it was added; None in later rows, and if it is not known.

@@ -116,7 +116,7 @@ class RootFailure(RowOfEvent, Base):
 
 
 class SpatialRelation(Base):
-    """What an object was on, in or next to when it was picked up, or after it was placed.
+    """A spatial relation of an object when it was picked up, or after it was placed.
 
     `projections.schema.views.spatial_relation_view` defines the relations.
 

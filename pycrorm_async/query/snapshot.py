@@ -49,7 +49,7 @@ class ObjectThen:
         joints: rad or m, by name.
         attached_to: name and link of the object that it moves with; the link is None for the base link.
         description_fingerprint: of its description in `WorldThen.descriptions`; None in episodes of older versions.
-        color: red, green, blue, opacity, 0 to 1; None if the description alone says it.
+        color: red, green, blue, opacity, 0 to 1; None if only the description has it.
         model, serial: of a robot with a `RobotDescription`; None in episodes of older versions.
         mass_kg: None if it is not known.
         base_link: None for the root link.

@@ -1,4 +1,4 @@
-"""The answer to a cue: the cases most like it, why each is, and what they say together.
+"""The answer to a cue: the cases most like it, the reasons for each, and their success rate.
 
 >>> answer = await memory.recall(type=PickUpAction, has={"object_type": "MILK"}, near={"height": 0.93})
 >>> answer.success
@@ -31,7 +31,7 @@ _TRIED = ("SUCCEEDED", "FAILED", "ERROR")
 
 
 class Rate(NamedTuple):
-    """How many of some cases succeeded, with the interval of Wilson that contains their true share in 95 of 100."""
+    """The number of successes among some cases, with the 95 % Wilson interval of their share, from `low` to `high`."""
 
     share: float
     low: float
@@ -70,7 +70,7 @@ class Compared(NamedTuple):
 
 
 class Typical(NamedTuple):
-    """What a feature was like in the cases of an answer, each counted by its score.
+    """The summary of one feature over the cases of an answer, weighted by their scores.
 
     Attributes:
         value: the mean of numbers, the commonest word.
@@ -84,7 +84,7 @@ class Typical(NamedTuple):
 
 
 class Surroundings(Protocol):
-    """What happened around a case."""
+    """Protocol that finds the neighbours of a case in its episode, and the state of the memory when it started."""
 
     async def next(self, case: Case) -> Case | None: ...
     async def previous(self, case: Case) -> Case | None: ...
@@ -221,7 +221,7 @@ class Answer(Sequence[RecalledCase]):
 
     @property
     def success(self) -> Rate | None:
-        """How many of the cases succeeded; None if none of them ran to its end."""
+        """The success rate of the cases; None if none of them ran to its end."""
         return success_of(each.case for each in self.cases)
 
     @property
@@ -255,7 +255,7 @@ class Answer(Sequence[RecalledCase]):
         return Typical(value, None, score / whole if whole else 0.0)
 
     def why(self) -> str:
-        """Return what the answer says, as lines of text."""
+        """Return the answer's summary, as lines of text."""
         head = f"{len(self)} of {self.considered:,} cases for {self.cue}"
         lines = [head, *([f"  {self.success}"] if self.success else [])]
         if self.reasons:
@@ -270,7 +270,7 @@ class Answer(Sequence[RecalledCase]):
     __str__ = why
 
     def table(self) -> tuple[tuple[str, ...], list[tuple[object, ...]]]:
-        """Return the header and the rows of a table for people."""
+        """Return the header and the rows of the table that commands and notebooks print."""
         header = ("score", "type", "episode", "event", "started", "status", "reason", "differs")
         rows: list[tuple[object, ...]] = [
             (

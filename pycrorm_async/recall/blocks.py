@@ -23,7 +23,10 @@ from pycrorm_async.recall.case import FEATURES_MAX, RESERVED, Case, bounded_case
 from pycrorm_async.recall.columns import Numbers, Sets, Symbols, joined_numbers, joined_words
 
 WORDS_MAX: Final = 16_384
-"""Bounds the words of a feature in a memory. A feature with more of them names single cases and likens none."""
+"""Bounds the words of a feature in a memory.
+
+A feature with more of them identifies single cases, so it cannot show that two are similar.
+"""
 EPISODE_SHIFT: Final = row_id(1, 0, 0).bit_length() - 1
 """The bits of a node's id below its episode's number."""
 

@@ -217,7 +217,7 @@ class Numbers:
 def joined_words(
     columns: Sequence[Symbols | Sets | None], sizes: Sequence[int], words: Words | None = None
 ) -> Symbols | Sets:
-    """Put columns of one feature below each other; where there is none, that many cases do not have the feature.
+    """Put columns of one feature below each other; for a missing column, that many cases without the feature are added.
 
     `words` is a dictionary that contains those of all columns; by default it is made.
     """
@@ -236,7 +236,7 @@ def joined_words(
 
 
 def joined_numbers(columns: Sequence[Numbers | None], sizes: Sequence[int]) -> Numbers:
-    """Put columns of one number below each other; where there is none, that many cases do not have it."""
+    """Put columns of one number below each other; for a missing column, that many cases without it are added."""
     values = [
         np.full(size, np.nan, np.float32) if column is None else column.values
         for column, size in zip(columns, sizes, strict=True)

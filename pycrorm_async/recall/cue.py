@@ -1,7 +1,7 @@
-"""A cue says which cases are sought: features that they share, as far as possible, and conditions that they fulfil.
+"""A cue describes the cases to recall: features that they share, as far as possible, and conditions that they fulfil.
 
 `has` and `near` make cases similar; a case without some of them has a lower score. Type, `lacks`, times, episodes and
-`prohibit` are conditions: a case that does not fulfil them is no answer.
+`prohibit` are conditions: a case that does not fulfil them is left out.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _LISTED = 12
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """A number that a cue wants; tolerance None stands for the spread of this number among the cases of the type."""
+    """A wanted number; tolerance None means the standard deviation of this number among the cases of the type."""
 
     feature: str
     value: float
@@ -45,13 +45,13 @@ class Cue:
         lacks, requires: pairs of feature and word that a case must not have, and that it must have.
         before_us, after_us: a case starts before the one, and at or after the other.
         during_us: start and end of an interval in which a case starts and ends.
-        as_of_us: a case has ended by then, and what is rare is counted among those that had.
+        as_of_us: a case has ended by then; word frequencies count only cases that had ended by then.
         episodes: numbers of episodes; None for all.
-        prohibit: ids of nodes that are no answer.
+        prohibit: ids of nodes whose cases are left out.
         simulated: whether simulations are answers too.
         k: the number of cases of the answer.
-        minimum: the lowest score of an answer, 0 to 1. A case that shares nothing with the cue is none.
-        left_out: the number of features that the case which the cue was made from has, and the cue has not.
+        minimum: the lowest score of an answer, 0 to 1. Cases with score 0 are left out.
+        left_out: the number of features of the original case that the cue does not have, for a cue made from a case.
     """
 
     type: str | None = None
@@ -105,7 +105,7 @@ def word(value: object) -> str:
 
 
 def closest(name: str, valid: Iterable[str]) -> str:
-    """Return the end of an error's line: the names that are most like this one, or else some of those there are.
+    """Return the end of an error's line: the names most like this one, or else some of the valid ones.
 
     >>> closest("graps", ["arm", "grasp", "height"])
     '; did you mean grasp?'
@@ -116,13 +116,13 @@ def closest(name: str, valid: Iterable[str]) -> str:
     return question or listed
 
 
-# --- what a cue cannot be -------------------------------------------------------------------------------------
+# --- invalid cues ---------------------------------------------------------------------------------------------
 
 
 def check_cue(cue: Cue, library: CaseLibrary) -> None:
     """Raise `CallerError` for a cue that no memory, or not this one, can answer; the message is one line.
 
-    A type or a word that never occurred is no error: the answer says so.
+    A type or a word that never occurred is no error: `Answer.never_seen` lists it.
     """
     if cue.type is None and not (cue.has or cue.near or cue.lacks):
         raise CallerError("the cue is empty: give a type, or features in `has`, `near` or `lacks`")

@@ -24,8 +24,8 @@ ANGLE_TOLERANCE = 0.5
 class CaseLibrary:
     """The cases of a memory at one moment. Blocks that are added make a new library.
 
-    `type` None stands for the cases of all types in each method. A type that was renamed is one type, under each of its
-    names; its cases have the present one.
+    `type` None means the cases of all types in each method. A renamed type is found by any of its names; its cases
+    carry the present name.
 
     Args:
         blocks: the cases.
@@ -164,12 +164,15 @@ class CaseLibrary:
 
 
 def _exceeds(dictionaries: Sequence[Words]) -> bool:
-    """Return whether there are more than `WORDS_MAX` words. Most often their numbers say so without a union."""
+    """Return whether there are more than `WORDS_MAX` words.
+
+    Checks the sum of sizes first, because it usually decides without building the union.
+    """
     return sum(map(len, dictionaries)) > WORDS_MAX and len({*chain.from_iterable(dictionaries)}) > WORDS_MAX
 
 
 def _standard_deviation(groups: Sequence[Group], feature: str) -> float:
-    """Add up what each group has about the middle of all numbers, so that hardly anything cancels."""
+    """Compute the standard deviation from sums about the midrange, to avoid cancellation."""
     ranges = [_cached(group, ("range", feature), lambda group: _range(group, feature)) for group in groups]
     ranges = [each for each in ranges if each is not None]
     if not ranges:

@@ -37,7 +37,7 @@ NEAR_M: Final = 0.1
 _WAYS_MAX: Final = 500
 """Bounds the ways with one arm and grasp that are scored; those that succeeded nearest in height are taken."""
 _DIGITS: Final = 6
-"""Of lengths and angles: cases have float32, which does not reach further, and 0.3 is 0.3 again."""
+"""Decimals to which lengths and angles are rounded, because cases store float32."""
 _SAME: Final = 1e-4
 """The resolution, in m and rad, at which two ways count as equal."""
 
@@ -70,8 +70,8 @@ class Tries(NamedTuple):
 def tries_of(library: CaseLibrary, types: Iterable[str], object_type: ObjectType, arm: Arms | None) -> Tries:
     """Return the latest tries of these types with such an object, and with this arm.
 
-    Left out are simulations, what neither succeeded nor failed, and tries of which the place is not known, as with an
-    object that lay on its side.
+    Leaves out simulations, tries that neither succeeded nor failed, and tries without a known place, as with an object
+    that lay on its side.
     """
     groups = [group for type_ in types for group in library.groups(type_)]
     parts = [part for group in groups if (part := _tries(group, object_type, arm)) is not None]

@@ -42,7 +42,7 @@ _FIRST_ROWS: Final = 4_096
 
 
 class Weights(NamedTuple):
-    """What each feature of a cue weighs in one library.
+    """The weights of a cue's features in one library.
 
     Attributes:
         pairs, words: the pairs in `has`, and the weight of each.
@@ -92,7 +92,7 @@ class Found(NamedTuple):
 
 
 def weights_of(cue: Cue, library: CaseLibrary) -> Weights:
-    """Return what each feature of the cue weighs, counted within its type."""
+    """Return the weight of each feature of the cue, counted within its type."""
     cases, seen = library.size(cue.type), []
     if cue.as_of_us is None:
         seen = [library.seen(cue.type, feature, value) for feature, value in cue.has]

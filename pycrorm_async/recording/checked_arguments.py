@@ -49,7 +49,7 @@ def pose_of(pose: Pose | PoseValue) -> PoseValue:
 
 
 def _are_plain(joints: dict[Any, Any]) -> bool:
-    """Whether all names are ASCII texts and all positions finite floats, so that nothing of them must change."""
+    """Return whether all names are ASCII texts and all positions finite floats, so that none of them must change."""
     if set(map(type, joints)) != {str} or set(map(type, joints.values())) != {float}:
         return False
     names = "".join(joints)

@@ -34,8 +34,8 @@ class RecordedEpisode(RecordedNodes):
     ...     episode.end("a")
 
     Keys are any hashable values, `id(node)` for example; a key can be used again after its node has ended. Nothing
-    raises: what cannot be recorded is counted in `Memory.status` and logged. `node` is always the key of the node that
-    did it; None stands for the root of the episode.
+    raises: what cannot be recorded is counted in `Memory.status` and logged. `node` is always the key of the acting
+    node; None means the root of the episode.
     """
 
     def __enter__(self) -> Self:

@@ -125,8 +125,8 @@ class RecordedNodes(EpisodeWriter[_Node]):
     ) -> Hashable:
         """Record that a node started; return it.
 
-        As `parent` and `node` the returned value stands for the key, also long after the node has ended and its key
-        names another one.
+        The returned value can be passed as `parent` and `node` in place of the key, also long after the node has ended
+        and its key names another one.
 
         Args:
             key: names the node from now on. If an open node has it, that one ends LOST, and is counted.
@@ -220,7 +220,7 @@ class RecordedNodes(EpisodeWriter[_Node]):
             self._ended.popitem(last=False)
 
     def is_open(self, key: Hashable) -> bool:
-        """Whether a node with this key has started and not ended."""
+        """Return whether a node with this key has started and not ended."""
         return bool(noted(self.emitter, "NodeStarted", lambda: key in self._nodes))
 
     def node_reference(self, key: Hashable | None = None) -> NodeReference:
@@ -298,7 +298,7 @@ class RecordedNodes(EpisodeWriter[_Node]):
         return None
 
     def _find(self, key: Hashable | None, what: str) -> _Node | None:
-        """Return the node that a key or the value of `start` stands for; count a key that no node has."""
+        """Return the node of a key, or of a value that `start` returned; count a key that no node has."""
         if key is None or isinstance(key, _Node):
             return key
         node = noted(self.emitter, what, lambda: self._nodes.get(key) or self._ended.get(key))

@@ -71,7 +71,7 @@ class RecordedObjects(ObjectRows[Hashable]):
                 self._renewed[before.object] = now
 
     def holds(self, reference: ObjectReference | None) -> bool:
-        """Whether this episode has such a row; True for None."""
+        """Return whether this episode has such a row; True for None."""
         if reference is None:
             return True
         return reference.object in self._identities and reference.object <= reference.row <= self.last
@@ -97,7 +97,7 @@ class RecordedObjects(ObjectRows[Hashable]):
         return RobotValue(known.pose, known.object_type, torso, self._references.get(key), known.name)
 
     def is_at(self, key: Hashable, pose: object) -> bool:
-        """Whether the last pose of an object is this one; False if there is none of this key."""
+        """Return whether the last pose of an object is this one; False if no object has this key."""
         known = self._objects.get(key)
         return known is not None and isinstance(pose, (Pose, PoseValue)) and _are_at_one_place(known.pose, pose)
 

@@ -20,9 +20,9 @@ _LOCKED_AFTER_S = 60.0
 
 
 def refuse_existing(path: Path, *, force: bool, folder: bool = False) -> None:
-    """Raise `CallerError` for a name that cannot be written: one that exists, without `force`, or has no folder.
+    """Raise `CallerError` if the file cannot be written: it exists and `force` is False, or its folder is missing.
 
-    A folder is refused also with `force`, unless `folder` says that one may be written.
+    A folder is refused also with `force`, unless `folder` is True.
     """
     if path.is_dir() and not folder:
         raise CallerError(f"{path} is a folder: give the name of a file in it")

@@ -66,7 +66,7 @@ class Texts:
 
     def __init__(self) -> None:
         self.sequence = 0
-        """Of the event that is being read."""
+        """The sequence of the event that is being read."""
         self._numbers: dict[str, int] = {"": 0}
         self._first_used: list[int] = [0]
 

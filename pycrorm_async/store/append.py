@@ -85,7 +85,7 @@ class Appending:
     async def write(self, connection: AsyncConnection) -> Stored:
         """Append the batch in the caller's transaction.
 
-        Raises `LogWentBack` if the log holds less than the basis says, and `LogDamaged` if another event is stored
+        Raises `LogWentBack` if the log holds less than `basis` states, and `LogDamaged` if another event is stored
         under a record's key; the caller must then roll back.
         """
         batch, dialect = self._batch, self._dialect

@@ -126,7 +126,7 @@ class Blobs:
             await asyncio.to_thread(digest.update, each.content)
         if count < parts:
             return "is missing" if not count else f"is incomplete: {count} of {parts} parts are stored"
-        return None if digest.hexdigest() == name else "has another content than its hash says"
+        return None if digest.hexdigest() == name else "has a content that does not match its hash"
 
     async def _parts(self, name: str) -> AsyncIterator[_Part]:
         part, parts = 0, 1

@@ -141,7 +141,7 @@ class EventLog:
         return dict((await self.store(records)).refusals)
 
     async def store(self, records: Sequence[Record], basis: Basis = NOTHING_KNOWN) -> Stored:
-        """As `append`, but raises `LogWentBack`, and stores nothing, if the log holds less than the basis says."""
+        """Append, but raise `LogWentBack`, and store nothing, if the log holds less than `basis` states."""
         if not records:
             return Stored({}, {})
         with self.translated():

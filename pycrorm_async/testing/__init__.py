@@ -2,7 +2,7 @@
 
     pytest_plugins = ["pycrorm_async.testing.fixtures"]     # in conftest.py: the fixtures `memory` and `clock`
 
-`contracts` checks what a projection, a designator or an executive must hold, `fake_clock` is a clock that stands still
-until a test advances it, and `postgresql_proxy` makes the faults of a network before a PostgreSQL server. Needs pytest
-and pytest-asyncio for `fixtures`, and nothing but this package for the others.
+`contracts` checks the contracts of projections, designators and executives, `fake_clock` is a clock that advances only
+when a test advances it, and `postgresql_proxy` makes network faults in front of a PostgreSQL server. `fixtures` needs
+pytest and pytest-asyncio; the other modules need this package only.
 """

@@ -43,7 +43,8 @@ async def check_projection(projection: Projection, plan: Callable[[], Awaitable[
     Returns the rows of each table of the projection, ordered by id. What the plan raises is not caught.
 
     Raises:
-        AssertionError: the projection stopped at an event, or a second fold of the log differs; the message says where.
+        AssertionError: the projection stopped at an event, or a second fold of the log differs, at the place in the
+            message.
         CallerError: the projection has no valid name, version or tables.
     """
     columns_of(projection)
@@ -75,7 +76,7 @@ async def check_designator(designator: ActionAbstract, folder: Path) -> Any:
 
     Raises:
         AssertionError: the action has no row, or a field has another value in it.
-        DeclarationRefused, Unrecordable: the class or a field cannot be recorded; the message says which and why.
+        DeclarationRefused, Unrecordable: the class or a field cannot be recorded; the message names it and the reason.
     """
     if not dataclasses.is_dataclass(designator):
         raise CallerError(f"{type(designator).__name__} is not a dataclass, so its fields cannot be compared")

@@ -94,7 +94,7 @@ class Proxy:
         self._arm(pattern, lambda link: link.end(reset=False))
 
     def swallow_reply_to(self, pattern: bytes) -> None:
-        """When a client sends this for the first time, let the server do it and close before it replies."""
+        """Let the server execute this when a client sends it for the first time, and close before the reply."""
         self._arm(pattern, _Link.swallow)
 
     def falsify(self, original: bytes, replacement: bytes) -> None:

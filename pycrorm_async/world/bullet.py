@@ -128,7 +128,7 @@ class BulletWorld:
 
     @property
     def entered(self) -> bool:
-        """Whether the world is entered and not left yet."""
+        """True while the world is entered and not left."""
         return self._client is not None
 
     @property

@@ -9,7 +9,7 @@ from typing import Any, cast
 class Arms(IntEnum):
     """An arm of the robot; BOTH for actions that move the left and the right one.
 
-    A robot's description says which of these it has; the only arm of a robot may be LEFT or RIGHT. Further arms have a
+    A robot's description lists which of these it has; the only arm of a robot may be LEFT or RIGHT. Further arms have a
     name of their own (`named`), with which they are recorded.
     """
 
@@ -87,7 +87,7 @@ class JointType(IntEnum):
 
 
 class WorldMode(Enum):
-    """Whether Bullet opens a window: GUI does, DIRECT does not."""
+    """The mode of Bullet: GUI opens a window, DIRECT does not."""
 
     GUI = "GUI"
     DIRECT = "DIRECT"

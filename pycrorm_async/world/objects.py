@@ -75,7 +75,7 @@ class Object:
     body: Body
     """The body in Bullet, for this package only: moving it notifies no observer."""
     copy_of: Object | None
-    """In a copied world, the object of the original world that this one is a copy of."""
+    """The object of the original world of which this one is a copy; None outside copied worlds."""
 
     def __init__(
         self,
@@ -204,8 +204,8 @@ class Object:
     def mass_kg(self) -> float | None:
         """The given mass, else that of the description; None if it is not known.
 
-        A description says it for objects that grippers lift, not for robots and environments, whose models often have
-        masses that no one has weighed.
+        The description counts for objects that grippers lift, not for robots and environments, whose models often have
+        guessed masses.
         """
         if self._mass_kg is not None or self.object_type in (ObjectType.ROBOT, ObjectType.ENVIRONMENT):
             return self._mass_kg

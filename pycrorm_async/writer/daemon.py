@@ -267,7 +267,7 @@ class Daemon:
                 self._report(f"recorder {tracker.source.name}: {error}")
 
     def _report_if_new(self, line: str, about: str) -> None:
-        """Say a line unless it was the last one about this subject."""
+        """Report a line unless it was the last one about this subject."""
         if self._last_lines.get(about) != line:
             self._last_lines[about] = line
             self._report(line)

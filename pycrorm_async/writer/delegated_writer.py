@@ -32,7 +32,7 @@ class DelegatedWriter:
         """Wait until the records up to this position are stored and visible in the tables.
 
         Raises `EpisodeParked` for episodes of this queue that stopped, `DatabaseError` if the drainer had to stop, and
-        `FlushTimeout` after `flush_timeout_s` without progress; its message says whether a process drains the queue.
+        `FlushTimeout` after `flush_timeout_s` without progress; its message states whether a process drains the queue.
         """
         hindrance = await self._wait(position, undrained_s_max=math.inf, on_poll=self._raise_failure)
         if hindrance is not None:

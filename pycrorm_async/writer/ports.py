@@ -111,7 +111,7 @@ class ClaimedSource(Source, Protocol):
 
     @property
     def invisible(self) -> Mapping[EpisodeId, int]:
-        """By episode, the last sequence that earlier sources stored and that was not visible when this one began."""
+        """The last sequence, by episode, that earlier sources stored and that was not visible when this one began."""
         ...
 
     @property
@@ -151,7 +151,7 @@ class DrainReasons(Protocol):
 
 
 class ExternalDrain(Protocol):
-    """How far a drainer in another process has got: the stored and visible positions, and its reasons."""
+    """The progress of a drainer in another process: its stored and visible positions, and its reasons."""
 
     @property
     def stored(self) -> int: ...

@@ -56,7 +56,7 @@ class Backoff:
 
 
 PATIENT = Backoff(first_s=0.1, longest_s=10.0)
-"""For writers: retries never end, because the queue keeps recording events on disk."""
+"""The backoff of writers: retries never end, because the queue keeps recording events on disk."""
 
 BRIEF = Backoff(first_s=0.1, longest_s=1.0, attempts_max=5)
-"""For commands that a user waits for: five attempts."""
+"""The backoff of commands that a user waits for: five attempts."""

@@ -355,7 +355,7 @@ async def test_verify_names_the_event_whose_blob_is_missing_or_has_other_bytes(
     result = await verified(database_url)
     assert [str(each) for each in result.damages] == [
         f"episode 1, event 3: refers to blob {one}, which is missing",
-        f"episode 1, event 4: refers to blob {two}, which has another content than its hash says",
+        f"episode 1, event 4: refers to blob {two}, which has a content that does not match its hash",
     ]
     if not database_url.startswith("postgresql"):
         done = pycrorm("verify", "--url", database_url, cwd=tmp_path)

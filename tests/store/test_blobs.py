@@ -106,7 +106,7 @@ async def test_a_blob_with_other_bytes_and_an_incomplete_one_are_faults(
     await log.append([observed(1, CONTENT)])
     assert await log.blobs.fault(NAME) is None
     await log.blobs.add(BlobReference("1" * 64, "a/b", 50), CONTENT)
-    assert await log.blobs.fault("1" * 64) == "has another content than its hash says"
+    assert await log.blobs.fault("1" * 64) == "has a content that does not match its hash"
     assert await log.blobs.read_blob("1" * 64) is None
     async with log.writing() as connection:
         await connection.execute(

@@ -23,7 +23,7 @@ from pycrorm_async.query.scene.picture import png
 
 MARKER = "meta/info.json"
 DEFAULT_FPS = 10
-"""Of frames by event it is nominal: LeRobot needs one."""
+"""Frames per second; nominal if there is one frame for each event, because LeRobot requires a value."""
 _CHUNK_FILES = 1000
 _FILE_MEGABYTES = 100
 _VECTORS = ("observation.state", "action")

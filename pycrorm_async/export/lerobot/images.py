@@ -1,4 +1,4 @@
-"""Draw the scene at each frame of an episode, from the recorded geometry, with one camera that stands still.
+"""Draw the scene at each frame of an episode, from the recorded geometry, with one fixed camera.
 
 The camera looks from the side at all places where the robot is. A picture of 320 x 240 takes about 0.1 s of CPU time.
 """
@@ -36,7 +36,7 @@ _EVENTS_AT_ONCE = 64
 
 
 def check_size(size: ImageSize) -> None:
-    """Raise `CallerError` for a size that no picture has."""
+    """Raise `CallerError` for a size outside the range that a picture can have."""
     if not all(_SIDE_LEAST <= each <= _SIDE_MOST for each in size):
         raise CallerError(f"an image is {_SIDE_LEAST} to {_SIDE_MOST} pixels wide and high, not {size!r}")
 

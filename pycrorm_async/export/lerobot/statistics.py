@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Statistics: TypeAlias = dict[str, NDArray[Any]]
-"""By the name of a statistic, one number for each channel of a feature; of `count` one number."""
+"""The numbers of each statistic by its name: one for each channel of a feature, or a single one for `count`."""
 
 _QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 

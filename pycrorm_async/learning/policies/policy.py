@@ -36,7 +36,7 @@ class PickUpChoice(NamedTuple):
     """One way to pick an object up.
 
     Attributes:
-        relative_x, relative_y: where the robot's base stands, m, in the object's own frame.
+        relative_x, relative_y: position of the robot's base, m, in the object's own frame.
     """
 
     arm: Arms

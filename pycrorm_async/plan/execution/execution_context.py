@@ -28,7 +28,7 @@ class ExecutionContext:
 
     @property
     def interrupted(self) -> bool:
-        """Whether an enclosing monitor has interrupted its operand."""
+        """True if an enclosing monitor has interrupted its operand."""
         return any(watch.fired for watch in self.watches)
 
     async def enter(self, designator: Performable) -> Hold | None:

@@ -38,10 +38,10 @@ def check_takable(robot: CurrentRobot, arm: Arms, target: Object) -> None:
 
 
 def lifting_arms(robot: CurrentRobot, among: Iterable[Arms], target: ObjectLike) -> tuple[Arms, ...]:
-    """Return the arms of `among` that lift the object; all of them if none does, so that the action says why.
+    """Return the arms of `among` that lift the object; all of them if none does, so that the action names the reason.
 
-    All of them also for a part of an object, and for an object that is not in the world. An arm that the robot lacks is
-    among them, because the action says that too.
+    Returns all of them also for a part of an object, and for an object that is not in the world. An arm that the robot
+    lacks is returned too, because the action then fails with that reason.
     """
     arms, described = tuple(among), robot.description.arms
     if isinstance(target, ObjectPart):

@@ -58,7 +58,7 @@ class Expression(Designator):
 
     @property
     def is_complete(self) -> bool:
-        """Whether it can be an operand; False for a `Monitor` without an operand."""
+        """True if it can be an operand; False for a `Monitor` without an operand."""
         return True
 
     def simplify(self) -> Self:

@@ -43,7 +43,7 @@ class Watch:
         return ExecutionContext((*outside.watches, self), outside.arbiter, outside.claim)
 
     async def check(self) -> None:
-        """If the condition holds, interrupt the task and raise `CancelledError`."""
+        """Interrupt the task and raise `CancelledError` if the condition holds."""
         holds, error = await self._evaluate()
         if holds and self._fire(error):
             raise asyncio.CancelledError("interrupted by a monitor")

@@ -83,8 +83,8 @@ def _arms(robot: CurrentRobot, arm: Arms | None, target: Pose | ObjectLike) -> A
 def _cells(costmap: Costmap, robots: list[CurrentRobot], *, every: bool) -> Iterator[Pose]:
     """Yield the middles of the cells to search: the best ones, or with `every` all of them.
 
-    The best cells are as near to the target as a PR2 stands. For other robots, whose arms reach from other distances,
-    they are spread over the whole map, best first.
+    The best cells are as near to the target as is usual for a PR2. For other robots, whose arms reach from other
+    distances, the cells are spread over the whole map, best first.
     """
     if all(isinstance(robot.description, PR2Description) for robot in robots):
         return islice(costmap.ranked(), None if every else CELLS_MAX)

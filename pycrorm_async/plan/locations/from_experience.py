@@ -168,7 +168,7 @@ class _ExperienceLocation(LocationDesignator):
 
 
 def _upright_pose(base: Pose, height_m: float) -> Pose | None:
-    """Move the base pose to this height; None if it leans, because the object lies and the recorded ones stood."""
+    """Move the base pose to this height; None if it leans, because the object lies and recorded ones were upright."""
     if rotated(base.orientation, (0.0, 0.0, 1.0)).z < _UPRIGHT_MIN:
         return None
     return Pose((base.position.x, base.position.y, height_m), yaw_quaternion(base.yaw), base.frame)

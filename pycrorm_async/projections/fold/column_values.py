@@ -30,7 +30,7 @@ _SCALARS: dict[str, tuple[type, ...]] = {
 }
 
 AS_IT_IS: Mapping[str, type] = {kind: types[0] for kind, types in _SCALARS.items()}
-"""By field type, the Python type whose values are stored unchanged."""
+"""The Python type whose values are stored unchanged, by field type."""
 
 
 class CannotFold(ValueError):

@@ -300,7 +300,7 @@ class _Syntax:
     dialect: Dialect = field(compare=False)
     name: str
     backslash: str
-    """As a literal. PostgreSQL has a setting by which it is doubled."""
+    """The SQL literal of a backslash; a setting of PostgreSQL doubles it."""
 
 
 def _syntax_of(dialect: Dialect) -> _Syntax:

@@ -258,8 +258,7 @@ def _duration(nodes: Table) -> ColumnElement[Any]:
 
 
 def _course(nodes: Table) -> tuple[ColumnElement[Any], ...]:
-    """Return the columns that say when a node was performed, by time and by event, by which robot, for which node, and
-    how it ended."""
+    """Return the columns of a node's course: start and end by time and by event, robot, parent, and outcome."""
     times = nodes.c.start_time, nodes.c.end_time, _duration(nodes)
     ended = nodes.c.reason, nodes.c.failure_message, nodes.c.result
     return nodes.c.status, *times, *ended, *_sequence(nodes), nodes.c.end_sequence, nodes.c.robot, nodes.c.parent_id

@@ -27,7 +27,7 @@ from pycrorm_async.projections.schema.layout import STORED_AS, Contradiction, La
 
 
 class Fitted(NamedTuple):
-    """How a declaration that contradicts others is kept.
+    """A declaration that contradicts others, fitted into the tables under names of its own.
 
     Attributes:
         own_names: the names under which events have the values of renamed fields, by the fields' names in the tables.
@@ -127,7 +127,7 @@ def _with_other_fields(layout: Layout, declared: DesignatorTypeDeclared) -> tupl
 
 
 def _fits(columns: Mapping[str, tuple[str, Storage]], field: FieldDeclared) -> bool:
-    """Whether a field needs no column, or one that is new, or that has its storage."""
+    """Return whether a field needs no column, a new column, or a column that has its storage."""
     storage = STORED_AS.get(field.type)
     return storage is None or columns.get(field.column.lower(), (field.column, storage)) == (field.column, storage)
 

@@ -148,7 +148,7 @@ class Ask(Generic[Q]):
         robot: str | None = None,
         limit: int | None = None,
     ) -> Q:
-        """List the pick-ups that succeeded: object, arm, grasp, and where the robot stood."""
+        """List the pick-ups that succeeded: object, arm, grasp, and the robot's base pose."""
         make = partial(
             actions.successful_pick_ups,
             object_=object,

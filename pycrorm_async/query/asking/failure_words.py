@@ -1,4 +1,4 @@
-"""Words by which people search for failures: no word stem connects `cannot reach` with `unreachable`.
+"""Map search words to failure classes, because no word stem connects `cannot reach` with `unreachable`.
 
 A failure is searched by its columns (object, arm, reason, message), not by one bag of words: the milk's failure must
 not answer to `cereal` because the episode's description names both.

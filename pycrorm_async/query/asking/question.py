@@ -27,7 +27,7 @@ EpisodeNumber: TypeAlias = "int | ColumnElement[int]"
 
 @dataclass(frozen=True)
 class QuestionPlan:
-    """What a question asks: its name, the episodes that it names, and how its select is made of their numbers."""
+    """The parts of a question: its name, the episodes that it names, and the function that selects by their numbers."""
 
     name: str
     episodes: tuple[AskedEpisode, ...]

@@ -70,7 +70,7 @@ def moment(when: datetime) -> str:
 
 
 def left_out(count: int, what: str = "") -> str:
-    """Return the line that says how much a view leaves out."""
+    """Return the line with the number of items that a view leaves out."""
     return quiet(f"… {count:,} more{' ' if what else ''}{what}")
 
 

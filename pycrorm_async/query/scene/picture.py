@@ -155,7 +155,7 @@ def _camera(
 def _visible(world: RecordedWorld, camera: Camera, radius: float, actors: Sequence[Object]) -> float:
     """Return how well the actors are visible: the sum of the logarithms, so that small ones count as much as robots.
 
-    What stands between the camera and the framed objects, such as a wall, costs as much as it covers.
+    An object between the camera and the framed objects, such as a wall, costs as much as it covers.
     """
     picture = photograph(world, camera, 80, 60, smooth=False)
     covered = float((picture.depths < camera.distance_m - 1.2 * radius).mean())

@@ -1,1 +1,1 @@
-"""Describe the views of a memory: for people and programs that write SQL."""
+"""Describe the views of a memory, for users and programs that write SQL."""

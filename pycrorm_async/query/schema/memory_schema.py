@@ -47,7 +47,7 @@ class Column:
 
     Attributes:
         type: as the database names it; empty where SQLite has none, as for an expression.
-        text: its meaning and unit; empty if its name says it.
+        text: its meaning and unit; empty if its name is enough.
         refers_to: the column whose value it has, such as `pose.id`.
     """
 

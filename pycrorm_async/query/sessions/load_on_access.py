@@ -2,7 +2,7 @@
 
 Theory of operation. Reading `action.arm` is no coroutine, so the loop of the session cannot wait for the database
 meanwhile, and the session's connection belongs to that loop. So the load runs in a loop of its own, in a thread, on
-another connection, and the reader waits for it as for any function: the loop of the reader stands still until then, for
+another connection, and the reader waits for it as for any function: the loop of the reader is blocked until then, for
 the time of a query or two. The session is used by that thread alone, because its own loop waits. Each load has the
 database's state of now, as each statement has in a session of PostgreSQL. The engine keeps no connection between two
 loads, because a connection belongs to the loop that opened it; a lock makes the loads of several threads take turns.

@@ -1,1 +1,1 @@
-"""Run SQL that people or programs wrote by hand, and let it only read."""
+"""Run SQL that a user or a program wrote, on connections that can only read."""

@@ -1,7 +1,7 @@
 """Run one query on a PostgreSQL server, on a connection that can only read.
 
 **Theory of operation.** A read-only transaction is not enough: as a superuser, `pg_read_file` reads files of the server
-and COPY … TO PROGRAM runs programs in it. So four walls stand behind each other:
+and COPY … TO PROGRAM runs programs on it. Four independent checks apply:
 
 1. The login has no more rights than `pycrorm_reader` (`_RIGHTS`). SET ROLE then leads nowhere.
 2. The text is prepared, so it is one statement, and becomes the query of a cursor: PostgreSQL takes nothing but SELECT,

@@ -47,7 +47,7 @@ _REFUSALS = (sqlite3.SQLITE_ERROR, sqlite3.SQLITE_AUTH, sqlite3.SQLITE_TOOBIG, s
 _NO_ROOM = (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR_WRITE)
 """Codes of a temporary file that cannot grow, because a reader writes no other."""
 _FAULT_VALUES = 5
-"""Values of a message that says why the query ended."""
+"""The values in a message that has the reason for which the query ended."""
 _TOO_MUCH = "the query needs more {} than it may use: select or sort less"
 
 

@@ -24,7 +24,7 @@ Kind: TypeAlias = Literal["auto", "heatmap", "scatter"]
 _POINTS_MAX = 500
 """Up to this many rows, `auto` draws two numeric columns as points."""
 _FEW = 5
-"""A cell of fewer rows is hatched, because its rate says little."""
+"""A cell of fewer rows is hatched, because its rate is uncertain."""
 _CELLS_WITH_INTERVAL, _CELLS_WITH_COUNT, _CELLS_WITH_RATE = 40, 300, 600
 _TICKS_MAX = 14
 _BLUE, _ORANGE = "#0072b2", "#d55e00"

@@ -16,7 +16,7 @@ from pycrorm_async.query.success.samples import Samples, Values
 _BINS_MAX = 200
 _BINS_LEAST, _BINS_USUAL = 4, 16
 _ROWS_A_CELL = 5
-"""By default there are so few ranges that a cell has this many rows on average."""
+"""The rows that a cell has on average, from which the default number of ranges follows."""
 _DAY_S, _MINUTE_S = 86_400, 60
 
 

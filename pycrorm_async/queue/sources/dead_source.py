@@ -85,7 +85,7 @@ class DeadSource:
     invisible: Mapping[EpisodeId, int] = {}
 
     def __init__(self, folder: Path, recorder: EpisodeId, locks: ExitStack, stored: StoredSegments | None) -> None:
-        """For `open_dead`; takes the locks over, unless it raises."""
+        """Called by `open_dead` only. Takes over the locks, unless it raises."""
         self.folder = folder
         self.name = folder.name
         self.lost: tuple[Record, ...] = ()
@@ -150,7 +150,7 @@ class DeadSource:
                 self._delete_segment(segment_path(self.folder, number))
 
     def dead_letter(self, records: Sequence[Record]) -> bool:
-        """As `RecorderQueue.dead_letter`; False for records that are dead letters already, which stay here."""
+        """Implement `RecorderQueue.dead_letter`; return False for records that are dead letters already; these stay."""
         if self.holds_dead_letters:
             return False
         self._dead_letters.put(records)

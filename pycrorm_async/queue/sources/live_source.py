@@ -49,7 +49,7 @@ class LiveSource:
     holds_dead_letters = False
 
     def __init__(self, folder: Path, recorder: EpisodeId, drain: FileLock, progress: Progress) -> None:
-        """For `take`, which holds the lock. Raises as `take` does."""
+        """Called by `take` only, which holds the lock. Raises what `take` raises."""
         self.folder = folder
         self.name = folder.name
         self._recorder = recorder
@@ -128,7 +128,7 @@ class LiveSource:
             self._write_status(self._status._replace(stored=position))
 
     def dead_letter(self, records: Sequence[Record]) -> bool:
-        """As `RecorderQueue.dead_letter`."""
+        """Implement `RecorderQueue.dead_letter`."""
         self._dead_letters.put(records)
         return True
 

@@ -41,7 +41,7 @@ class OwnSource:
         return self._drain is not None
 
     async def get_batch(self, *, events_max: int, bytes_max: int, age_s_max: float) -> list[Record]:
-        """As `RecorderQueue.get_batch`."""
+        """Implement `RecorderQueue.get_batch`."""
         while True:
             try:
                 self._switch_folder()
@@ -55,7 +55,7 @@ class OwnSource:
                     raise self._queue.failure or error from None
 
     def dead_letter(self, records: Sequence[Record]) -> None:
-        """As `RecorderQueue.dead_letter`."""
+        """Implement `RecorderQueue.dead_letter`."""
         self._dead_letters.put(records)
 
     def release(self) -> None:

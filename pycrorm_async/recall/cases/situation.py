@@ -7,13 +7,13 @@
 | `near` | types of the objects within 0.5 m of this object |
 | `held` | types of the objects attached to the robot |
 | texts, enum members, booleans | by field; `True` and `False` for a boolean |
-| `stand_x`, `stand_y`, `stand_yaw` | pose of the robot in the frame of an object that stands upright |
+| `stand_x`, `stand_y`, `stand_yaw` | pose of the robot in the frame of an upright object |
 | `torso`, `object_z`, `height` | position of the torso, height of the object, and over the torso |
 | integers, reals | by field |
 | `<field>_x`, `_y`, `_z`, `_yaw` | a pose in the robot's frame |
 
-A parameter with a name that means something else, such as `status`, is the feature `status_parameter`. Times, lists
-and dicts are no features. The robot and the environment are never near.
+A parameter with a reserved name, such as `status`, becomes the feature `status_parameter`. Times, lists and dicts are
+not features. `near` never contains the robot or the environment.
 """
 
 from __future__ import annotations

@@ -130,7 +130,7 @@ class Recall:
         """Return the actions whose situation was most like that of a case, which is left out itself.
 
         The name of its object is not compared. Of more than 256 words and numbers, those that weigh least are left out,
-        and the answer says how many. Raises `CallerError` for a node without a case.
+        and the answer has their number. Raises `CallerError` for a node without a case.
         """
         library = await self._reader.library()
         found = case_of(case, library)
@@ -150,7 +150,7 @@ class Recall:
     ) -> Answer:
         """Return the actions of a class whose situation was most like the present one of an object.
 
-        Compared are its type, what is near it, its height, the stand of the robot that acts, and its torso.
+        Compares the object's type, neighbourhood and height, and the base pose and torso of the acting robot.
 
         Args:
             target: an object in a world, or its designator.

@@ -159,7 +159,7 @@ class Descriptions:
         return _Declared(fingerprint(payload, _OWNER), payload, tuple(missing))
 
     def _mesh(self, file: Path) -> MeshValue:
-        """Hash a mesh file, and put its content as a blob if the settings say so."""
+        """Hash a mesh file, and put its content as a blob if the settings ask for files."""
         name = clean(file.name)
         try:
             with file.open("rb") as opened:

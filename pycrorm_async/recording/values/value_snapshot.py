@@ -50,7 +50,7 @@ class UnrecordableValue(ValueError):
 
 
 class RefusedValue:
-    """Stands for a value that an executive's own conversion refused; it is recorded as missing for this reason."""
+    """Replaces a value that an executive's own conversion refused; it is recorded as missing for this reason."""
 
     def __init__(self, reason: str) -> None:
         self.reason = reason

@@ -101,7 +101,7 @@ class EpisodeWriter(ABC, Generic[N]):
 
     @abstractmethod
     def _has_ended(self, node: N) -> bool:
-        """Whether the executive has ended a node whose end is not written."""
+        """Return whether the executive has ended a node whose end is not written yet."""
 
     @abstractmethod
     def _restart_node(self, node: N, sequence: int) -> int:

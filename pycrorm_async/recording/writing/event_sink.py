@@ -33,7 +33,7 @@ class EventSink(Protocol):
 
     @property
     def full(self) -> bool:
-        """Whether the queue would refuse an event without `reserved` now."""
+        """True if the queue would refuse an event without `reserved` now."""
         ...
 
     def room(self) -> Awaitable[None]:

@@ -35,7 +35,7 @@ class PlanSource(NamedTuple):
 
 
 class Provenance(NamedTuple):
-    """What the episodes of one memory are recorded with.
+    """The program, settings and clock with which the episodes of one memory are recorded.
 
     Attributes:
         source: the plan's source, if the program that started it has read it.

@@ -13,7 +13,7 @@ writer waits for a busy plan more often."""
 _SHAPED_ROWS: Final = 64
 """Rows from which a statement with its own VALUES shape pays off."""
 _NOTHING: Final = bytearray()
-"""Stands for None, which NULLIF restores."""
+"""The value bound in place of None, which NULLIF restores."""
 
 
 def inserts(table: str, columns: Sequence[str], rows: Sequence[tuple[Any, ...]]) -> Iterator[tuple[str, Any]]:

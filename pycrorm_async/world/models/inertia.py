@@ -11,7 +11,7 @@ from xml.etree.ElementTree import fromstring
 def described_mass_kg(urdf: str) -> float | None:
     """Return the sum of the masses of all links, kg; None if no link has one, or if one is not a number.
 
-    A sum of 0 is None too, because a model whose masses are 0 does not say them.
+    Returns None also for a sum of 0, which means that the model leaves the masses out.
     """
     robot = fromstring(urdf)  # noqa: S314  loaded by the caller's own process, and checked before
     try:

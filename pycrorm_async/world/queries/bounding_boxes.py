@@ -51,7 +51,7 @@ class Solid:
     radius: float = 0.0
     axis: Array | None = None
     is_box: bool = False
-    """If True, the points are in the order of `_CORNERS`."""
+    """True if the points are in the order of `_CORNERS`."""
 
     def box(self, rotation: Array, position: Array) -> tuple[Array, Array]:
         """Return the lowest and the highest corner for a link's frame at this rotation matrix and position."""

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from pycrorm_async.world.pose import Pose
 
 TOUCH_M = 1e-3
-"""Penetrations up to this depth count as contact, not as collision: an object standing on a table has one."""
+"""Penetrations up to this depth count as contact, not as collision: an object on a table has one."""
 
 
 def collisions_at(

@@ -67,7 +67,7 @@ def met_towards(
 ) -> list[Object | None]:
     """Return the first object on each ray from the eye into the object's shapes: the object itself or an occluder.
 
-    None stands for the floor. The list is empty for an object without shapes.
+    None means the floor. The list is empty for an object without shapes.
     """
     obj.check_present()
     points = [point for link, solids in obj.body.solids.items() if solids for point in _inner_points(obj, link)]

@@ -1,4 +1,4 @@
-"""Say which robot of a world acts in a context: `with robot_acting(robot):`. Without it the world's first robot acts.
+"""Set the robot that acts in a context: `with robot_acting(robot):`. Without it the world's first robot acts.
 
 Choices nest, end with their block, and are inherited by tasks that start inside, so that each of several tasks can
 move a robot of its own.

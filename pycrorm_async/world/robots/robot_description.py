@@ -40,7 +40,7 @@ class Bounds(NamedTuple):
 
 
 class Drive(Enum):
-    """How the base moves. A fixed base cannot navigate."""
+    """The kinematics of the base. A fixed base cannot navigate."""
 
     OMNIDIRECTIONAL = "OMNIDIRECTIONAL"
     DIFFERENTIAL = "DIFFERENTIAL"
@@ -298,7 +298,7 @@ COURIER = RobotDescription(
                     }
                 ),
                 opening_m=0.09,
-                payload_kg=3.0,  # assumed: no such robot was built; arms of its size are said to lift as much
+                payload_kg=3.0,  # assumed, as no such robot was built; arms of its size are rated for as much
                 park=MappingProxyType(dict(zip(_COURIER_JOINTS, (0.0, -1.9, 2.5, 0.0, 0.9, 0.0), strict=True))),
             )
         }

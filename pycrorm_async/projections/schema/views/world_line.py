@@ -1,8 +1,8 @@
 """Compose the line that describes the world of an episode whose end did not describe it.
 
 `EpisodeEnded` describes the world that was entered inside an episode. An episode that runs, that is LOST, or that
-version 0.1.0 recorded has no such description, but its log has the objects. An event at the entry could only say that
-the world is empty, because objects are added afterwards.
+version 0.1.0 recorded has no such description, but its log has the objects. An event at the entry could only describe
+an empty world, because objects are added afterwards.
 """
 
 from __future__ import annotations
