@@ -259,7 +259,7 @@ def _aliases_or_fault(
 
 
 def _aliases(designator: type[Performable]) -> tuple[str, ...]:
-    """Read the class attribute `aliases`, the classes_by_alias names of this type; a subclass does not inherit them."""
+    """Read the class attribute `aliases`, the former names of this type; a subclass does not inherit them."""
     aliases = vars(designator).get("aliases", ())
     if dataclasses.is_dataclass(designator) and "aliases" in {each.name for each in dataclasses.fields(designator)}:
         return ()

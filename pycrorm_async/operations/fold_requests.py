@@ -1,10 +1,10 @@
 """Answer the requests of a daemon or of a rebuild in the process of a fold worker, until the connection ends.
 
-`FoldWorker` starts this process with a connection. The process receives an `Assignment`, answers
-`READY`, and then answers each request once. For a daemon, `Prepare` and `Write` fold a batch of events in two steps,
-and `FoldRest` refreshes materialised views and folds custom projections. For a rebuild, `FoldShare` folds a batch of
-the worker's share of the episodes. The process opens the database at the first request, has at most one open
-transaction, and none between requests. An exception in a request becomes a `Failure`, and the process continues.
+`FoldWorker` starts this process with a connection. The process receives an `Assignment`, answers `READY`, and then
+answers each request once. For a daemon, `Prepare` and `Write` fold a batch of events in two steps, and `FoldRest`
+refreshes materialised views and folds custom projections. For a rebuild, `FoldShare` folds a batch of the worker's
+share of the episodes. The process opens the database at the first request, has at most one open transaction, and none
+between requests. An exception in a request becomes a `Failure`, and the process continues.
 
 Its parent alone ends it (`processes`), and the kernel kills it when the parent dies, so that no worker outlives the
 daemon, not even a stopped one.
@@ -46,7 +46,7 @@ class Assignment(NamedTuple):
 
 
 class Prepare(NamedTuple):
-    """Read and fold these events; answered with an `BatchPreview`."""
+    """Read and fold these events; answered with a `BatchPreview`."""
 
     spans: Sequence[Span]
 

@@ -1,4 +1,12 @@
-"""Errors of a plan's author; failures of a running plan are in `pycrorm_async.plan.failures`."""
+"""Errors in the code of a plan: designators that are declared or used in a wrong way.
+
+Three modules share the exceptions of plans. `errors` has the mistakes of a plan's author, which are a `CallerError` and
+need a change of code. `failures` has the outcomes of actions, such as an unreachable object, which a plan catches to
+try an alternative. `exceptions` defines no class; its functions classify and describe any exception.
+
+A *description*, such as `NavigateAction([pose_1, pose_2])`, lists alternatives. `resolve()` chooses one and returns a
+*designator*, such as `NavigateActionPerformable(pose_1)`, which can be performed.
+"""
 
 from __future__ import annotations
 
@@ -66,4 +74,4 @@ class NoRobotChosen(CallerError):
 
 
 class NoRobotHere(CallerError):
-    """The call needs a robot that has a robot description, and there is none."""
+    """The call needs an acting robot with a robot description in the current world."""

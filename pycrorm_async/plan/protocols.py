@@ -64,9 +64,9 @@ class Interrupter(Protocol):
 
     @property
     def fired(self) -> bool:
-        """Whether it has interrupted the plan."""
+        """True once it has interrupted the plan."""
         ...
 
     async def check(self) -> None:
-        """If the condition holds, interrupt the plan and raise `CancelledError`."""
+        """Interrupt the plan and raise `CancelledError` if the condition holds."""
         ...

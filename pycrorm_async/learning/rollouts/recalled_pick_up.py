@@ -24,7 +24,7 @@ from pycrorm_async.plan.object_designators import ObjectDesignatorDescription, O
 from pycrorm_async.world.enums import Arms, Grasp
 
 _EVIDENCE_MIN = 0.5
-"""The evidence below which nothing like a way was tried: a success 12 cm higher or lower, and nothing else."""
+"""The least evidence for an alternative: that of one success at a height 12 cm away."""
 
 
 @dataclass
@@ -44,9 +44,9 @@ class RecalledPickUp(ActionDescription[RecalledPickUpPerformable]):
     """A description whose alternatives for moving to an object and picking it up are those of earlier tries.
 
     Each alternative is the way with the highest expected success at the object's height over the lifted torso. The
-    tries of this process count as soon as they have ended, so that a failure also makes the ways like it less likely.
-    Ways that are expected to succeed less often than an average try, or that nothing like was tried of, are left out;
-    after the last one the samples of the policy follow, as in `MoveAndPickUp`, and then those of the default policy.
+    tries of this process count as soon as they have ended, so that a failure also makes similar ways less likely.
+    Leaves out ways that are expected to succeed less often than an average try, and ways without a similar try; after
+    the last one the samples of the policy follow, as in `MoveAndPickUp`, and then those of the default policy.
 
     >>> await Retry(RecalledPickUp(milk, policy=learned), max_tries=20).perform()
 
@@ -58,7 +58,7 @@ class RecalledPickUp(ActionDescription[RecalledPickUpPerformable]):
         samples: number of each policy's samples.
         rng: random generator of the policies; None means a new one with an unpredictable seed.
 
-    Raises as `MoveAndPickUp` does. A base is only sent to free places from which the object is seen.
+    Raises what `MoveAndPickUp` raises. The robot drives only to free places from which the object is visible.
     """
 
     def __init__(
@@ -94,7 +94,7 @@ class RecalledPickUp(ActionDescription[RecalledPickUpPerformable]):
         raise ObjectUnreachable(f"there is no way to pick up {self.target.name} here", self.target.name)
 
     def __iter__(self) -> Iterator[RecalledPickUpPerformable]:
-        """Refuse: a memory is asked between two alternatives."""
+        """Raise `CallerError`, because the memory is queried between two alternatives."""
         raise CallerError("a recalled pick-up asks the memory: iterate with `async for`, or `await …resolve()`")
 
     async def __aiter__(self) -> AsyncIterator[RecalledPickUpPerformable]:

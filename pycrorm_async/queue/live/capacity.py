@@ -64,7 +64,7 @@ class Capacity(NamedTuple):
 
     @property
     def descriptions_bytes_max(self) -> int:
-        """The bytes of the descriptions that a segment repeats at most: an eighth, so that they delay nothing much."""
+        """Bounds the bytes of descriptions that a segment repeats: an eighth; by default 1 MiB, written in 0.4 ms."""
         return self.segment_bytes // 8
 
     def room_to_declare(self, *, episodes: int, declared: int) -> int:

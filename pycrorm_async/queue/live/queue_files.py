@@ -8,10 +8,9 @@ written by one thread, except those a producer or the consumer only sets to requ
 notification.
 
 A turn does the following, in this order. It syncs the blobs and records put so far, appends a commit frame and syncs
-that. Then
-it compares the files it holds with those in the folder, because syncing a deleted file succeeds, and only then advances
-`_synced`. It exchanges positions with the drainer of another process. It deletes the segments whose records are all
-stored, and prepares the next segment.
+that. Then it compares the files it holds with those in the folder, because syncing a deleted file succeeds, and only
+then advances `_synced`. It exchanges positions with the drainer of another process. It deletes the segments whose
+records are all stored, and prepares the next segment.
 
 If a file was deleted or replaced, the queue is *displaced*: `_synced` stays, `synced_to` raises, and the turn moves the
 queue to another folder (`relocation.py`). It retries with growing pauses until the move succeeds or the queue is

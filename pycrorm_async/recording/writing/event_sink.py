@@ -1,4 +1,4 @@
-"""The hooks define this port, which a queue implements: put an event from the caller's thread, without awaiting."""
+"""`EventSink` is the port of `recording` that a queue implements: put an event from any thread, without awaiting."""
 
 from __future__ import annotations
 
