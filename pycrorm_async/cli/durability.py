@@ -1,4 +1,10 @@
-"""This module reports durability: the machines that hold stored events, and the period that could be stored again."""
+"""Report durability: the machines that hold stored events, and the period whose events could be stored again.
+
+Events are *stored* when the database has committed them. A failover, or the restore of a backup, can lose stored
+events: the log then *went back*, and each time it did is an `Incarnation` of the log. Two sources can store the lost
+events again. A recorder that still runs has its last events in its queue. The segments, which are the queue's files,
+are kept below `spool/stored` for a while after all their events were stored.
+"""
 
 from __future__ import annotations
 
@@ -31,9 +37,11 @@ class KeptSegments:
 
 @dataclass(frozen=True)
 class Durability:
-    """The database's report: the machines that hold each stored event, and each time it lost stored events.
+    """The database's report on stored events.
 
-    The database loses stored events, or "goes back", after a failover or when a backup is restored.
+    Attributes:
+        stored_on: number of machines that hold each stored event, and the names of the synchronous standbys.
+        went_back: each time at which the log was noticed to have lost stored events.
     """
 
     stored_on: StoredOn
@@ -41,7 +49,7 @@ class Durability:
 
 
 def summarise_kept_segments(spool: Path) -> KeptSegments:
-    """Summarise the stored segments kept in a spool. Raises `SpoolUnavailable`."""
+    """Summarise the segments kept in a spool after their events were stored. Raises `SpoolUnavailable`."""
     with wrap_os_errors(spool):
         segments = kept_segments(spool)
     return KeptSegments(
@@ -62,7 +70,7 @@ def print_durability(kept: KeptSegments, durability: Durability | None) -> None:
         stdout.print(f"A stored event is on {machines} machine{'s' * (machines > 1)}{replicas}.", markup=False)
     if kept.since is None:
         stdout.print(
-            "No stored segments are kept; after a data loss, only events of living recorders can be stored again.",
+            "No stored segments are kept; after a data loss, only events of running recorders can be stored again.",
             markup=False,
         )
     else:

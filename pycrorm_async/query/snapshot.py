@@ -1,4 +1,7 @@
-"""Define the snapshot of an episode at one moment: its task tree and its world, as plain values.
+"""`Moment` is the snapshot of an episode after one of its events: its task tree and its world, as plain values.
+
+The classes named `…Then` are the parts of a `Moment`. Ids lead back to the tables: each change of an object is a row of
+`orm.Object` with an `id` of its own, and all rows of one object share its `identity_id`, the id of the first.
 
 >>> moment = await memory.as_of("last", time=12.5)
 >>> [node.dtype for node in moment.running]
@@ -27,7 +30,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class NodeThen(NodeSummary):
-    """A node at that moment: RUNNING and without an end if it ended later. `thoughts` is empty.
+    """A node at that moment: RUNNING and without an end if it ended later.
+
+    The inherited `thoughts`, the simulations that the node performed, is always empty: a snapshot reads one episode.
 
     Attributes:
         start_s, end_s: since the episode's start; `end_s` is None while it runs, and if it is LOST.
@@ -42,8 +47,9 @@ class ObjectThen:
     """An object at that moment.
 
     Attributes:
-        id, identity_id: of its current row and of its first row in `orm.Object`. An object that is removed and added
-            again under its old name has a new identity.
+        id: of its row in `orm.Object` at that moment.
+        identity_id: of its first row, from when it was added. An object that is removed and added again under its old
+            name has a new identity.
         object_type: name of the member of `ObjectType`.
         pose: of its base link's frame, in "map".
         joints: rad or m, by name.
@@ -95,7 +101,7 @@ class WorldThen:
         objects: in the order they were added.
         robot: the first of type ROBOT.
         descriptions: the descriptions of the objects, by fingerprint.
-        meshes: contents of their mesh files, by SHA-256: those that are recorded, if the snapshot was asked for them.
+        meshes: contents of their recorded mesh files, by SHA-256; empty unless the snapshot was requested with them.
         robots: all of type ROBOT, in the order they were added.
     """
 
@@ -160,10 +166,11 @@ class Moment:
     """The state of an episode after one of its events, until the next one.
 
     Attributes:
-        number, id: of the episode: in this database, its UUID.
-        simulated: whether it is a simulation, performed in a copy of the world.
+        number: of the episode in this database.
+        id: the episode's UUID.
+        simulated: True for a simulation, performed in a copy of the world.
         sequence: of that event, the last one included.
-        time_s: of that event, since the episode's start by the monotonic clock.
+        time_s: of that event, in s since the episode's start by the monotonic clock.
         at: of that event, by the wall clock.
         status: of the episode at that moment.
         tree: the nodes that had started, each before its children, children in the order they started.
