@@ -153,7 +153,7 @@ def test_a_package_with_an_invalid_projection_is_reported_in_a_line_and_the_othe
     assert done.returncode == 0
     said = [line.partition("the projection ")[2].strip() for line in done.stderr.splitlines()]
     assert said == [
-        "a of an installed package is left out: lab:Strange is no projection: derive from pycrorm_async.Projection",
+        "a of an installed package is left out: lab:Strange is not a projection: derive from pycrorm_async.Projection",
         "b of an installed package is left out: ModuleNotFoundError: No module named 'nowhere'",
         "d of an installed package is left out: the projection NoTables: it has no tables: set `tables`",
     ]
@@ -195,10 +195,10 @@ def test_status_reports_what_a_projection_cannot_fold_and_which_version_is_not_f
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["rebuild", "--projection", "lab"], "'lab' names no projection: write module:Class"),
+        (["rebuild", "--projection", "lab"], "'lab' does not name a projection: write module:Class"),
         (["verify", "--projection", "nowhere:At"], "nowhere cannot be imported: ModuleNotFoundError"),
         (["writer", "--once", "--projection", "lab:Absent"], "lab has no 'Absent'"),
-        (["rebuild", "--projection", "lab:Strange"], "lab:Strange is no projection"),
+        (["rebuild", "--projection", "lab:Strange"], "lab:Strange is not a projection"),
         (["rebuild", "--projection", "lab:NoTables"], "it has no tables"),
         (["rebuild", "--projection", "lab:Weighed", "--projection", "lab:Picky"], "two projections have the name"),
         (["rebuild", "scales"], "unknown projection 'scales'; known: tables"),

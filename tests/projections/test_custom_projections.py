@@ -378,7 +378,7 @@ class Wrong(Projection):
         ([("wrong_row", row(1), {"said": "a\x00"})], "wrong_row.said: the text holds U\\+0000"),
         ([("wrong_row", row(1), {"is_it": 1})], "wrong_row.is_it: 1 is not of the declared type boolean"),
         ([("wrong_row", row(1), {"order": object()})], "wrong_row.order: .*unsupported"),
-        ([("wrong_row", row(1, number=2), {})], "wrong_row: 4294967328 is no row of this episode"),
+        ([("wrong_row", row(1, number=2), {})], "wrong_row: 4294967328 is not a row of this episode"),
         ([("wrong_row", row(1), {}), ("wrong_row", row(1), {})], "wrong_row has a row 2147483680 already"),
     ],
 )

@@ -32,7 +32,7 @@ def validate_projections(projections: Sequence[Projection]) -> tuple[Projection,
     names: set[str] = set()
     for each in projections:
         if not isinstance(each, Projection):
-            raise CallerError(f"{each!r} is no projection: pass an instance of a class that derives from Projection")
+            raise CallerError(f"{each!r} is not a projection: pass an instance of a class that derives from Projection")
         columns_of(each)
         if each.name in names:
             raise CallerError(f"two projections have the name {each.name!r}: rename one")
@@ -50,7 +50,7 @@ def load_projections(references: Sequence[str]) -> tuple[Projection, ...]:
 def _load_projection(reference: str) -> Projection:
     module_name, _, class_name = reference.partition(":")
     if not module_name or not class_name:
-        raise CallerError(f"{reference!r} names no projection: write module:Class")
+        raise CallerError(f"{reference!r} does not name a projection: write module:Class")
     try:
         module = importlib.import_module(module_name)
     except Exception as error:
@@ -63,7 +63,7 @@ def _load_projection(reference: str) -> Projection:
 def _instance(kind: Any, reference: str) -> Projection:
     """Create and validate an instance of this class. Raises `CallerError`."""
     if not isinstance(kind, type) or not issubclass(kind, Projection):
-        raise CallerError(f"{reference} is no projection: derive from pycrorm_async.Projection")
+        raise CallerError(f"{reference} is not a projection: derive from pycrorm_async.Projection")
     try:
         projection = kind()
     except Exception as error:
@@ -75,9 +75,7 @@ def _instance(kind: Any, reference: str) -> Projection:
 def installed_projections(projections: Sequence[Projection], *, own: bool = True) -> tuple[Projection, ...]:
     """Return the installed projections whose names these do not have, with those of this package if `own` is true.
 
-    A faulty one is logged and left out.
-
-    What is installed while the process runs is not found, as a new version of a loaded module is not.
+    A faulty one is logged and left out. A package that is installed while the process runs is not found.
     """
     names = {each.name for each in projections}
     installed = [each for each in own_projections() if own and each.name not in names]

@@ -1,4 +1,8 @@
-"""Collect the rows of a custom projection for one batch, checked so that every database stores the same values."""
+"""Collect the rows of a custom projection for one batch, checked so that every database stores the same values.
+
+`ProjectedBatch`, the base class, gives the events of each episode to the right fold and adds the projection's name to
+its faults. `CustomRows` executes the fold of one event at a time, checks the changes of rows, and writes them.
+"""
 
 from __future__ import annotations
 
@@ -51,7 +55,12 @@ class CustomRows(ProjectedBatch):
         self._insertion: Insertion = None
 
     def add(self, fold: EpisodeFold, events: Sequence[StoredEvent], *, kept: bool) -> Refused | None:
-        """Add the changes of rows that a fold makes of events, if both databases store their values alike."""
+        """Add the changes of rows that a fold makes of events, if both databases store their values alike.
+
+        With `kept` False the fold only reads the events, to restore its state: their rows are in the tables already.
+        Returns None, or the sequence of the first event that could not be folded, with the exception; none of the
+        changes of that event are added then, and its episode is parked.
+        """
         for event in events:
             changes = Changes()
             try:
@@ -63,7 +72,7 @@ class CustomRows(ProjectedBatch):
         return None
 
     def _add(self, number: int, changes: Changed) -> None:
-        """Add the changes of one event. Raises `CannotFold`, and then has added none."""
+        """Add the changes of one event to the rows of the batch. Raises `CannotFold`, and then has added none."""
         new: set[tuple[str, int]] = set()
         checked = []
         for inserts, table, id_, columns in changes:
@@ -122,7 +131,7 @@ class CustomRows(ProjectedBatch):
             if declaration is None:
                 raise CannotFold(f"the designator type {happening.designator} was never declared")
             dtype, parameters = declaration.dtype, happening.parameters
-            if b'"missing"' in payload:
+            if b'"missing"' in payload:  # only then can a parameter be a `MissingValue`, so most events skip the copy
                 parameters = {name: None if is_missing(each) else each for name, each in parameters.items()}
         time_us = microseconds(wall_ns)
         return make(Event, (number, sequence, time_us, monotonic_ns, happening, dtype, parameters, declaration))
@@ -131,8 +140,8 @@ class CustomRows(ProjectedBatch):
         columns = self._columns.get(table)
         if columns is None:
             raise CannotFold(f"{self._projection.name} has no table {table!r}")
-        if not isinstance(id_, int) or id_ >> 31 != number:
-            raise CannotFold(f"{table}: {id_!r} is no row of this episode: use event.id or event.row(sequence)")
+        if not isinstance(id_, int) or id_ >> 31 != number:  # the upper bits of a row id, as `row_id` packs them
+            raise CannotFold(f"{table}: {id_!r} is not a row of this episode: use event.id or event.row(sequence)")
         for name in values:
             if name not in columns or name in OF_EVERY_TABLE:
                 raise CannotFold(f"{table} has no column {name!r} to fill")
