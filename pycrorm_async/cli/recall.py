@@ -79,19 +79,19 @@ def recall(
     async def query(reading: Reading) -> tuple[Answer, tuple[str, ...]]:
         memory = Recall.of(reading)
         if like is not None:
-            found = await memory.like(await _node(reading, like), k=k, simulated=simulated)
+            answer = await memory.like(await _node(reading, like), k=k, simulated=simulated)
         else:
-            found = await memory(
+            answer = await memory(
                 parsed.type, has=parsed.has, near=parsed.near, lacks=parsed.lacks, only=parsed.only, **conditions
             )
-        return found, await memory.types()
+        return answer, await memory.types()
 
-    found, types = read_memory(url, spool, query)
-    _note_unknown(found.cue.type, types)
+    answer, types = read_memory(url, spool, query)
+    _note_unknown(answer.cue.type, types)
     if as_json:
-        print_json(_document(found))
+        print_json(_document(answer))
     else:
-        _print(found, why=why)
+        _print(answer, why=why)
 
 
 class _Parsed(NamedTuple):
@@ -115,15 +115,15 @@ def _parse(words: list[str]) -> _Parsed:
         match = _TERM.fullmatch(each)
         if match is None:
             if parsed.type is not None:
-                raise CallerError(f"{each[:60]!r} is no feature: write FEATURE=TEXT or FEATURE~NUMBER")
+                raise CallerError(f"{each[:60]!r} is not a feature: write FEATURE=TEXT or FEATURE~NUMBER")
             parsed = parsed._replace(type=each)
         elif match["sign"] == "=":
             pairs = {"not:": parsed.lacks, "only:": parsed.only}.get(match["how"] or "", parsed.has)
             pairs.setdefault(match["feature"], []).append(match["value"])
         elif match["how"]:
-            raise CallerError(f"{each[:60]!r}: a number can only be sought, as height~0.93")
+            raise CallerError(f"{each[:60]!r}: only texts can be excluded or required; write a number as height~0.93")
         elif match["feature"] in parsed.near:
-            raise CallerError(f"{match['feature']} is given twice: an action has one")
+            raise CallerError(f"{match['feature']} is given twice: give one number")
         else:
             parsed.near[match["feature"]] = tuple(
                 _number(part, each) for part in re.split(r"±|\+-", match["value"], maxsplit=1)
@@ -135,13 +135,15 @@ def _number(text: str, term: str) -> float:
     try:
         return float(text)
     except ValueError:
-        raise CallerError(f"{term[:60]!r}: {text[:40]!r} is no number: write FEATURE~NUMBER or FEATURE=TEXT") from None
+        raise CallerError(
+            f"{term[:60]!r}: {text[:40]!r} is not a number: write FEATURE~NUMBER or FEATURE=TEXT"
+        ) from None
 
 
 async def _node(reading: Reading, like: str) -> int:
     match = _NODE.fullmatch(like)
     if match is None or int(match["sequence"]) > SEQUENCE_MAX:
-        raise CallerError(f"--like {like[:60]!r} is no action: write EPISODE/EVENT, as in 3/115 or last/e115")
+        raise CallerError(f"--like {like[:60]!r} is not an action: write EPISODE/EVENT, as in 3/115 or last/e115")
     return row_id((await reading.episode(match["episode"])).number, int(match["sequence"]), 0)
 
 
@@ -153,11 +155,11 @@ def _note_unknown(dtype: str | None, types: tuple[str, ...]) -> None:
 # --- printing -------------------------------------------------------------------------------------------------
 
 
-def _print(found: Answer, *, why: bool) -> None:
+def _print(answer: Answer, *, why: bool) -> None:
     if why:
-        for each in found:
+        for each in answer:
             stdout.print(each.why(), markup=False, highlight=False)
-    elif found:
+    elif answer:
         columns = ("score", "status", "reason", "started", "differs", "see")
         rows = [
             (
@@ -168,23 +170,23 @@ def _print(found: Answer, *, why: bool) -> None:
                 each.difference(),
                 f"pycrorm show {each.case.episode} --at e{each.case.sequence}",
             )
-            for each in found
+            for each in answer
         ]
-        print_table(f"Most like {found.cue}", columns, rows)
-    stdout.print(found.why(), markup=False, highlight=False)
+        print_table(f"Most like {answer.cue}", columns, rows)
+    stdout.print(answer.why(), markup=False, highlight=False)
 
 
-def _document(found: Answer) -> dict[str, Any]:
-    success = found.success
+def _document(answer: Answer) -> dict[str, Any]:
+    success = answer.success
     return {
-        "cue": str(found.cue),
-        "considered": found.considered,
-        "left_out": found.cue.left_out,
-        "never_seen": [list(each) for each in found.never_seen],
-        "joined": list(found.joined),
+        "cue": str(answer.cue),
+        "considered": answer.considered,
+        "left_out": answer.cue.left_out,
+        "never_seen": [list(each) for each in answer.never_seen],
+        "joined": list(answer.joined),
         "success": None if success is None else success._asdict(),
-        "reasons": dict(found.reasons),
-        "cases": [_case(each) for each in found],
+        "reasons": dict(answer.reasons),
+        "cases": [_case(each) for each in answer],
     }
 
 

@@ -64,9 +64,9 @@ class Compared(NamedTuple):
 
     def __str__(self) -> str:
         """Return it as `height: wanted 0.93, was 0.9 (0.03 off, tolerance 0.1)`."""
-        found = "not known" if self.found is None else f"was {_text(self.found)}"
+        actual = "not known" if self.found is None else f"was {_text(self.found)}"
         off = "" if self.difference is None else f" ({self.difference:.3g} off, tolerance {self.tolerance:.3g})"
-        return f"{self.feature}: wanted {_text(self.wanted)}, {found}{off}"
+        return f"{self.feature}: wanted {_text(self.wanted)}, {actual}{off}"
 
 
 class Typical(NamedTuple):
@@ -241,7 +241,7 @@ class Answer(Sequence[RecalledCase]):
         """
         chosen = [each for each in self.cases if status in (None, each.case.status)]
         whole = math.fsum(each.score for each in chosen)
-        numbers = [(found, each.score) for each in chosen if isinstance(found := _found(each.case, feature), float)]
+        numbers = [(number, each.score) for each in chosen if isinstance(number := _found(each.case, feature), float)]
         if numbers:
             return _blended(numbers, whole, angle=is_angle(feature))
         words: dict[str, float] = {}
@@ -371,9 +371,9 @@ def _has(value: object, word: str) -> bool:
 
 
 def _missed(compared: Compared) -> str:
-    found = "not known" if compared.found is None else _text(compared.found)
+    actual = "not known" if compared.found is None else _text(compared.found)
     off = "" if compared.difference is None else f" ({compared.difference:.3g} off)"
-    return f"{compared.feature} {found}{off}"
+    return f"{compared.feature} {actual}{off}"
 
 
 def _text(value: str | tuple[str, ...] | float) -> str:

@@ -123,17 +123,17 @@ def _texts(
     if kind not in ("symbol8", "symbol16", "set8", "set16"):
         raise ValueError(f"feature {feature!r} has the unknown kind {kind!r}")
     dictionary = _decoded(words, _Dictionary)
-    known, types = Words(dictionary.words), tuple(dictionary.types)
+    vocabulary, types = Words(dictionary.words), tuple(dictionary.types)
     count = _count(feature, dictionary.types, groups)
     dtype = "<u1" if kind.endswith("8") else "<u2"
     if kind.startswith("symbol"):
         codes = _array(data, dtype, count)
-        _validate_codes(feature, codes, known)
-        return Spread(types, Symbols(known, codes))
+        _validate_codes(feature, codes, vocabulary)
+        return Spread(types, Symbols(vocabulary, codes))
     sizes = _array(data[:count], "<u1", count)
     codes = _array(data[count:], dtype, int(sizes.sum(dtype=np.int64)))
-    _validate_codes(feature, codes, known)
-    return Spread(types, Sets(known, sizes, codes))
+    _validate_codes(feature, codes, vocabulary)
+    return Spread(types, Sets(vocabulary, sizes, codes))
 
 
 def _validate_codes(feature: str, codes: NDArray[Any], words: Words) -> None:

@@ -51,7 +51,7 @@ class Group:
     texts: Mapping[str, Symbols | Sets]
     numbers: Mapping[str, Numbers]
     caches: dict[object, Any] = field(default_factory=dict, repr=False)
-    """Holds what a search computes of this group once."""
+    """Counts and sums of this group, computed at the first search; `CaseLibrary` and `joined_words` own the keys."""
 
     def __len__(self) -> int:
         """Return the number of cases."""

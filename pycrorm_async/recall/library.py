@@ -1,4 +1,10 @@
-"""All cases that a reader holds, as blocks, with what a search counts of them: words, spreads and sizes by type."""
+"""`CaseLibrary` holds all cases of a memory, and counts what a search weighs: words, spreads and sizes by type.
+
+A *case* is an action that has ended, with its outcome. Its situation consists of *features* (`cases/situation.py`),
+which are texts or numbers; the value of a text is a *word*. A *cue* (`cue.py`) is the words and numbers that a search
+looks for. Cases are stored as columns in *blocks*, and the cases of one type in a block are a *group* (`blocks.py`).
+The *spread* of a number is its standard deviation among the cases of a type.
+"""
 
 from __future__ import annotations
 
@@ -22,14 +28,16 @@ ANGLE_TOLERANCE = 0.5
 
 
 class CaseLibrary:
-    """The cases of a memory at one moment. Blocks that are added make a new library.
+    """The cases of a memory at one moment, which never change: a reader makes a new library when it has more blocks.
 
     `type` None means the cases of all types in each method. A renamed type is found by any of its names; its cases
-    carry the present name.
+    carry the present name. Counts are cached in the library, and those of one group in `Group.caches`, which belong to
+    the block and therefore serve the next library too. No lock protects the caches.
 
     Args:
         blocks: the cases.
-        names: the present names of types, by all their names. A name that is missing is a present one.
+        names: the present name of each renamed type, by every name that it has or had. A name that is missing is a
+            present one.
     """
 
     def __init__(self, blocks: Sequence[Block] = (), names: Mapping[str, str] = MappingProxyType({})) -> None:
@@ -64,7 +72,10 @@ class CaseLibrary:
         return tuple(sorted(name for name in self.recorded_types if self._is(name, type)))
 
     def joins(self, names: Mapping[str, str]) -> bool:
-        """Return whether these names differ from its own for a type of which it has cases."""
+        """Return whether these names give any type another present name than the library's own names do.
+
+        The reader then makes a new library, in which the cases of the renamed types belong together.
+        """
         return any(names.get(each, each) != self.present_name(each) for each in {*names, *self._names, *self.types})
 
     def present_name(self, name: str) -> str:
@@ -76,7 +87,7 @@ class CaseLibrary:
 
     @cached_property
     def left_out(self) -> frozenset[str]:
-        """The features with more than `WORDS_MAX` words, which are not compared."""
+        """The text features with more than `WORDS_MAX` words, which are not compared."""
         words: dict[str, list[Words]] = {}
         for block in self.blocks:
             for name, spread in block.texts.items():
@@ -110,7 +121,7 @@ class CaseLibrary:
         return len(self) if type is None else self.types.get(self.present_name(type), 0)
 
     def seen(self, type: str | None, feature: str, word: str) -> int:  # noqa: A002
-        """Return the number of cases of a type that have a word."""
+        """Return the number of cases of a type whose text feature has this word."""
         total, key = 0, ("counts", feature)
         for group in self.groups(type):
             column = group.texts.get(feature)
@@ -140,7 +151,8 @@ class CaseLibrary:
     def tolerance(self, type: str | None, feature: str) -> float:  # noqa: A002
         """Return the tolerance of a number for which the cue has none: its standard deviation, to two digits.
 
-        It is rounded, so that it does not depend on the order in which the blocks are added up.
+        It is rounded, so that it does not depend on the order in which the blocks are added up. A number that is the
+        same in all cases has the deviation 0, by which no distance can be divided; its tolerance is 1.0.
         """
         if is_angle(feature):
             return ANGLE_TOLERANCE
@@ -151,7 +163,7 @@ class CaseLibrary:
         return spread if spread > 0 else 1.0
 
     def find(self, node: int) -> Case | None:
-        """Return the case of a node."""
+        """Return the case of a node; None if it has none."""
         for group in self.groups():
             rows = np.flatnonzero(group.nodes == node)
             if rows.size:

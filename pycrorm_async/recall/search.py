@@ -124,15 +124,17 @@ def search(cue: Cue, library: CaseLibrary, weights: Weights) -> list[Found]:
             last = best[-1] if len(best) == cue.k else None
             if last is not None and (bound, int(group.started_us[rows.start])) < last[:2]:
                 break
-            found = _found(group, rows, cue, weights, max(lowest, last.steps if last is not None else 0), bound)
+            candidates = _found(group, rows, cue, weights, max(lowest, last.steps if last is not None else 0), bound)
             best = (
-                heapq.nlargest(cue.k, [*best, *found], key=_order) if best else sorted(found, key=_order, reverse=True)
+                heapq.nlargest(cue.k, [*best, *candidates], key=_order)
+                if best
+                else sorted(candidates, key=_order, reverse=True)
             )
     return best
 
 
-def _order(found: Found) -> tuple[int, int, int]:
-    return found[:3]
+def _order(case: Found) -> tuple[int, int, int]:
+    return case[:3]
 
 
 def _parts(group: Group, cue: Cue) -> Iterator[slice]:

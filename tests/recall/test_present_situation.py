@@ -71,7 +71,7 @@ async def test_the_present_has_the_features_of_the_case_that_starts_now() -> Non
                 assert slow.never_seen == (("slowly", "False"),)
                 assert len(slow) == 1
             milk.remove()
-            with pytest.raises(CallerError, match="is no object in a world"):
+            with pytest.raises(CallerError, match="is not an object in a world"):
                 await memory.recall.similar_to_now(milk, InspectActionPerformable)
-            with pytest.raises(CallerError, match="is no class of designators"):
+            with pytest.raises(CallerError, match="is not a designator class"):
                 await memory.recall.similar_to_now(robot, int)

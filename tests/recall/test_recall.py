@@ -88,10 +88,10 @@ async def test_conditions_hold_for_every_action_of_the_answer(recall: Recall) ->
 
 BAD: dict[str, tuple[dict[str, Any], type[Exception], str]] = {
     "naive": ({"before": datetime(2026, 1, 1)}, CallerError, "has no time zone"),  # noqa: DTZ001
-    "no moment": ({"after": "yesterday"}, CallerError, "'yesterday' is no moment"),
+    "no moment": ({"after": "yesterday"}, CallerError, "'yesterday' is not a moment"),
     "episode": ({"episode": 77}, UnknownEpisode, "there is no episode '77'"),
-    "node": ({"before": 2**40}, CallerError, "there is no case of event 0 of episode 512"),
-    "negative node": ({"before": -1}, CallerError, "there is no case of -1"),
+    "node": ({"before": 2**40}, CallerError, "there is not a case of event 0 of episode 512"),
+    "negative node": ({"before": -1}, CallerError, "there is not a case of -1"),
     "tag": ({"tag": "kitchn"}, CallerError, "no episode has the tag 'kitchn'; did you mean kitchen?"),
     "robot": ({"robot": "pr2"}, CallerError, "has a feature 'robot'"),
     "order": ({"before": "2026-01-01", "after": "2026-01-02"}, CallerError, "`before` is not later than `after`"),
@@ -103,7 +103,7 @@ BAD: dict[str, tuple[dict[str, Any], type[Exception], str]] = {
     "a list of features": ({"has": ["arm"]}, CallerError, "features are given as ['arm']: give a dictionary"),
     "a long feature": ({"has": {"x" * 1_000_000: "y"}}, CallerError, "... (1,000,002 characters)"),
     "three moments": ({"during": ("2026-01-01",) * 3}, CallerError, "`during` takes a case, or two moments, got 3"),
-    "a name as case": ({"prohibit": ["1/20"]}, CallerError, "'1/20' is no case: give one of an answer"),
+    "a name as case": ({"prohibit": ["1/20"]}, CallerError, "'1/20' is not a case: give one of an answer"),
     "one prohibited": ({"prohibit": 5}, CallerError, "`prohibit` takes a list of cases"),
 }
 
@@ -119,11 +119,11 @@ async def test_a_condition_that_cannot_be_is_refused_in_one_line(
 
 
 async def test_other_wrong_arguments_are_refused_in_one_line(recall: Recall) -> None:
-    with pytest.raises(CallerError, match="3 is no type: give a designator class"):
+    with pytest.raises(CallerError, match="3 is not a type: give a designator class"):
         await recall(3)  # type: ignore[arg-type]
     with pytest.raises(CallerError, match="give the type of the actions"):
         await recall.follows(None)  # type: ignore[arg-type]
-    with pytest.raises(CallerError, match="'1/20' is no case"):
+    with pytest.raises(CallerError, match="'1/20' is not a case"):
         await recall.like("1/20")  # type: ignore[arg-type]
     with pytest.raises(CallerError, match="activation must be a number, got 'often'"):
         await recall.forget("often")  # type: ignore[arg-type]

@@ -33,15 +33,15 @@ class CaseCheck(ProjectionCheck):
         self._blocks: dict[int, Block | None] = {}
 
     async def differences(
-        self, connection: AsyncConnection, comparison: Comparison, rows: Batch, made: EpisodeRange
+        self, connection: AsyncConnection, comparison: Comparison, rows: Batch, episodes: EpisodeRange
     ) -> Sequence[Difference]:
         assert isinstance(rows, CaseBatch)
         number = comparison.generation.number
-        end = EPISODE_NUMBER_MAX + 1 if made.end is None else made.end
+        end = EPISODE_NUMBER_MAX + 1 if episodes.end is None else episodes.end
         headings = [
             each
             for each in await read_headings(connection, number)
-            if each.episode_min < end and each.episode_max >= made.first
+            if each.episode_min < end and each.episode_max >= episodes.first
         ]
         blocks = [block for each in headings if (block := await self._block(connection, number, each)) is not None]
         left_out = frozenset().union(*(each.left_out for each in blocks))
@@ -50,7 +50,7 @@ class CaseCheck(ProjectionCheck):
         stored: dict[int, Case] = {}
         differences: list[Difference] = []
         for block in blocks:
-            for case in _without(left_out, _of_episodes(block, made.first, end)):
+            for case in _without(left_out, _of_episodes(block, episodes.first, end)):
                 self.result.rows += 1
                 if case.node in stored:
                     differences.append(_difference(case.node, "blocks with it", 2, 1))

@@ -42,8 +42,11 @@ class StoredBlocks(NamedTuple):
 class BlockSource(Protocol):
     """The blocks of a memory."""
 
-    async def read(self, generation: int, known: Collection[int]) -> StoredBlocks:
-        """Return the numbers of all blocks, and those blocks that are not known to a reader of this generation."""
+    async def read(self, generation: int, block_numbers: Collection[int]) -> StoredBlocks:
+        """Return the numbers of all blocks, and the blocks that a reader lacks.
+
+        The reader has the blocks with these numbers of this generation; of another generation it gets all blocks.
+        """
         ...
 
     async def present_names(self) -> Mapping[str, str]:
@@ -114,11 +117,11 @@ class CaseReader:
         """Hide the cases whose ways have an activation below the threshold now, and no others, from this reader."""
         async with self._reading:
             hidden, self._hidden = self._hidden, np.zeros(0, np.int64)
-            found = forgotten(await self._read(changed=hidden.size > 0), threshold=threshold, now_us=now_us)
-            self._hidden = hidden if dry_run else found.nodes
+            cases = forgotten(await self._read(changed=hidden.size > 0), threshold=threshold, now_us=now_us)
+            self._hidden = hidden if dry_run else cases.nodes
             if self._hidden.size:
                 await self._read(changed=True)
-            return found
+            return cases
 
     async def _read(self, *, changed: bool = False) -> CaseLibrary:
         running, unnumbered = await self._running.new()

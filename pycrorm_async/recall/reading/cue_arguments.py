@@ -150,7 +150,7 @@ def dtype_of(designator: str | type | None) -> str | None:
     if isinstance(dtype, str):
         return dtype
     if not isinstance(designator, type):
-        raise CallerError(f"{shortened(designator)} is no type: give a designator class, or the name of one")
+        raise CallerError(f"{shortened(designator)} is not a type: give a designator class, or the name of one")
     return word(designator).removeprefix("ORM")
 
 
@@ -163,7 +163,7 @@ def aliases_of(designator: str | type | None) -> tuple[str, ...]:
 def node_of(case: AnyCase) -> int:
     """Return the id of the node of a case. Raises `CallerError` for anything else."""
     if not isinstance(case, int | Case | RecalledCase):
-        raise CallerError(f"{shortened(case)} is no case: give one of an answer, or the id of its node")
+        raise CallerError(f"{shortened(case)} is not a case: give one of an answer, or the id of its node")
     return case if isinstance(case, int) else case.node
 
 
@@ -192,12 +192,12 @@ def case_of(case: AnyCase, library: CaseLibrary) -> Case:
     if isinstance(case, RecalledCase):
         return case.case
     case = node_of(case)
-    found = library.find(case)
-    if found is None:
+    stored = library.find(case)
+    if stored is None:
         key = row_key(case) if 0 < case < 2**53 else None
         place = f"event {key.sequence} of episode {key.number}" if key is not None else f"{case}"
-        raise CallerError(f"there is no case of {place}: it is no action, or it has not ended, or it does not exist")
-    return found
+        raise CallerError(f"there is no case of {place}: it does not exist, is not an action, or has not ended")
+    return stored
 
 
 def _start(when: When, library: CaseLibrary) -> int:
@@ -218,7 +218,7 @@ def _moment_us(when: datetime | str) -> int:
             moment = datetime.fromisoformat(when)
         except ValueError:
             raise CallerError(
-                f"{when[:40]!r} is no moment: give one as in 2026-11-20 or 2026-11-20T14:30+01:00"
+                f"{when[:40]!r} is not a moment: give one as in 2026-11-20 or 2026-11-20T14:30+01:00"
             ) from None
         when = moment if moment.utcoffset() is not None else moment.replace(tzinfo=UTC)
     if when.utcoffset() is None:

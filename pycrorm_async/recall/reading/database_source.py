@@ -26,15 +26,15 @@ class DatabaseSource:
         self._reading = reading
         self._numbers: tuple[int, Select[Any]] | None = None
 
-    async def read(self, generation: int, known: Collection[int]) -> StoredBlocks:
+    async def read(self, generation: int, block_numbers: Collection[int]) -> StoredBlocks:
         """Return the blocks in one snapshot.
 
         Raises `DatabaseUnavailable` for a memory without a table of cases, `TablesOutdated` for one of another version,
         `DamageError` for a block whose bytes were changed.
         """
         log = await self._reading.log()
-        if await self._is_unchanged(log, generation, known):
-            return StoredBlocks(generation, frozenset(known), {})
+        if await self._is_unchanged(log, generation, block_numbers):
+            return StoredBlocks(generation, frozenset(block_numbers), {})
         async with log.snapshot() as connection:
             tables = await read_generation(connection, _KEY)
             if tables is None:
@@ -48,13 +48,13 @@ class DatabaseSource:
                     f" `pycrorm rebuild {CaseProjection.name}`"
                 )
             numbers = frozenset(each.number for each in await read_headings(connection, tables.number))
-            wanted = numbers.difference(known if tables.number == generation else ())
+            wanted = numbers.difference(block_numbers if tables.number == generation else ())
             added = await read_blocks(connection, tables.number, sorted(wanted)) if wanted else {}
         return StoredBlocks(tables.number, numbers, added)
 
-    async def _is_unchanged(self, log: EventLog, generation: int, known: Collection[int]) -> bool:
-        """Return whether the blocks of this generation are those that are known; False also where it was dropped."""
-        if not known:
+    async def _is_unchanged(self, log: EventLog, generation: int, block_numbers: Collection[int]) -> bool:
+        """Return whether this generation has exactly these blocks; False also if it was dropped."""
+        if not block_numbers:
             return False
         if self._numbers is None or self._numbers[0] != generation:
             self._numbers = generation, select_numbers(_KEY, generation)
@@ -62,7 +62,9 @@ class DatabaseSource:
             async with log.reading() as connection:
                 rows = (await connection.execute(self._numbers[1])).all()
             generations = {(number, version) for number, version, _ in rows}
-            return generations == {(generation, CaseProjection.version)} and {block for _, _, block in rows} == {*known}
+            return generations == {(generation, CaseProjection.version)} and {block for _, _, block in rows} == {
+                *block_numbers
+            }
         return False
 
     async def present_names(self) -> Mapping[str, str]:

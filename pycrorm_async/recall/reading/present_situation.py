@@ -29,7 +29,7 @@ def present_situation(target: Object | ObjectDesignator, action: str | type) -> 
     """
     body = target.world_object if isinstance(target, ObjectDesignator) else target
     if not isinstance(body, Object) or body not in body.world.objects:
-        raise CallerError(f"{target!r} is no object in a world, so nothing can be compared with its situation")
+        raise CallerError(f"{target!r} is not an object in a world, so it has no situation: add it to a world first")
     fields = FeatureFields.of(_declaration(action))
     # Events refer to objects by the sequence that added them: number the objects as an episode that began now would.
     sequences = {each: number for number, each in enumerate(body.world.objects, 1)}
@@ -44,7 +44,7 @@ def _declaration(action: str | type) -> DesignatorTypeDeclared:
         return declared_type(action, strict=False).declaration
     declaration = built_in_declaration(dtype_of(action) or "")
     if declaration is None:
-        raise CallerError(f"{action!r} is no class of designators, as PickUpAction is")
+        raise CallerError(f"{action!r} is not a designator class: give one, such as PickUpAction")
     return declaration
 
 

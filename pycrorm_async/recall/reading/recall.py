@@ -133,9 +133,9 @@ class Recall:
         and the answer has their number. Raises `CallerError` for a node without a case.
         """
         library = await self._reader.library()
-        found = case_of(case, library)
-        cue = cue_like(found, library)
-        cue = replace(cue, prohibit=frozenset({found.node}), k=k, simulated=simulated or found.simulated)
+        original = case_of(case, library)
+        cue = cue_like(original, library)
+        cue = replace(cue, prohibit=frozenset({original.node}), k=k, simulated=simulated or original.simulated)
         return self._answer(cue, library)
 
     async def similar_to_now(
@@ -161,9 +161,9 @@ class Recall:
         dtype = dtype_of(action)
         library = await self._reader.library(dtype, aliases_of(action))
         symbols, numbers = present_situation(target, action)
-        known = library.texts(dtype) | library.numbers(dtype)
-        symbols = {name: each for name, each in symbols.items() if name in known and name != "object_name"}
-        wanted = {name: each for name, each in numbers.items() if name in known}
+        features = library.texts(dtype) | library.numbers(dtype)
+        symbols = {name: each for name, each in symbols.items() if name in features and name != "object_name"}
+        wanted = {name: each for name, each in numbers.items() if name in features}
         words = symbols_of({**symbols, **has}), numbers_of({**wanted, **near})
         cue = await make_cue(library, EpisodeNames(self._reading), dtype, *words, (), Conditions(k=k, **conditions))
         return self._answer(cue, library)
@@ -228,8 +228,8 @@ class Recall:
 
     async def moment(self, case: AnyCase) -> Moment:
         """Return the task tree and the world as they were when an action started; see `Reading.as_of`."""
-        found = await self.case(case)
-        return await self._reading.as_of(found.episode, sequence=found.sequence)
+        action = await self.case(case)
+        return await self._reading.as_of(action.episode, sequence=action.sequence)
 
     async def follows(
         self,
@@ -252,14 +252,14 @@ class Recall:
         return sequences.follows(dtype, **wanted)
 
 
-def frame_of(found: Answer) -> pd.DataFrame:
+def frame_of(recalled: Answer) -> pd.DataFrame:
     """Return an answer as a data frame. Raises `MissingExtra` without pandas."""
     try:
         pandas = import_module("pandas")
     except ImportError:
         raise MissingExtra("frames need pandas: pip install 'pycrorm-async[frames]'") from None
     rows = []
-    for each in found:
+    for each in recalled:
         case = each.case
         outcome = {"status": case.status, "reason": case.reason, "duration": case.duration_s}
         place: dict[str, Any] = {
