@@ -67,7 +67,7 @@ def verbs() -> tuple[str, ...]:
 
 def _verb(name: str) -> Callable[..., None]:
     question = getattr(Ask, name)
-    given = [each for each in inspect.signature(question).parameters.values() if each.name != "self"]
+    declared = [each for each in inspect.signature(question).parameters.values() if each.name != "self"]
 
     def run(
         *,
@@ -88,7 +88,7 @@ def _verb(name: str) -> Callable[..., None]:
 
     parameters = [
         each.replace(kind=inspect.Parameter.KEYWORD_ONLY, annotation=_option(each), default=each.default)
-        for each in given
+        for each in declared
     ]
     shared = {
         "sql": (_SqlOption, False),

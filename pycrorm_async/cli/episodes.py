@@ -60,7 +60,11 @@ def episodes(
         return
     if not summaries:
         chosen = choice != EpisodeChoice()
-        note("no episode is like this" if chosen else "no episode yet: record one with `pycrorm run` or `pycrorm demo`")
+        note(
+            "no episode matches these options; `pycrorm episodes` lists all"
+            if chosen
+            else "no episode yet: record one with `pycrorm run` or `pycrorm demo`"
+        )
         return
     numbers = {e.id: e.number for e in summaries}
     columns: tuple[str, ...] = ("episode", "started", "took", "status", "nodes", "failed", "description")

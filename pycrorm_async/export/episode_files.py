@@ -37,13 +37,13 @@ class EpisodeOptions(NamedTuple):
     images: ImageSize | None = None
 
     def check(self) -> None:
-        """Raise `CallerError` for another clock, or a rate that no robot has."""
+        """Raise `CallerError` for an unknown clock, and for a rate or an image size out of range."""
         if self.clock not in ("event", "time"):
-            raise CallerError(f"the clock is event or time, not {self.clock!r}")
+            raise CallerError(f"clock must be 'event' or 'time', got {self.clock!r}")
         if self.images is not None:
             check_size(self.images)
         if not 1 <= self.fps <= 1000:
-            raise CallerError(f"frames per second are between 1 and 1000, not {self.fps}")
+            raise CallerError(f"fps must be 1 to 1000, got {self.fps}")
 
 
 async def write_lerobot(

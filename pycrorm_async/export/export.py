@@ -183,7 +183,7 @@ async def export_again(
     with tempfile.TemporaryDirectory(prefix="pycrorm-export-") as folder:
         target = Path(path) if path is not None else Path(folder, "export")
         file_format: Any = before.file_format
-        made = await export(
+        exported = await export(
             reading,
             what,
             target,
@@ -193,7 +193,7 @@ async def export_again(
             progress=progress,
             **before.options,
         )
-    now = made.manifest
+    now = exported.manifest
     differences += _changes("version of", before.versions, now.versions)
     differences += _changes("type of the column", before.columns, now.columns)
     if before.tables != now.tables:
@@ -203,7 +203,7 @@ async def export_again(
     same = [*before.files.values()] == [*now.files.values()]
     if before.file_format == "rrd":  # whose chunks have random ids
         same = not differences
-    return Remade(same, tuple(differences), made if path is not None else None)
+    return Remade(same, tuple(differences), exported if path is not None else None)
 
 
 def _named_by(

@@ -55,11 +55,11 @@ def manifest_path(path: Path) -> Path:
 
 
 def read_manifest(path: Path) -> Manifest:
-    """Read a manifest. Raises `CallerError` for a file that is none, or of a newer version."""
+    """Read a manifest. Raises `CallerError` for another file, and for a manifest of a newer version."""
     try:
         manifest = msgspec.json.decode(path.read_bytes(), type=Manifest)
     except (OSError, msgspec.DecodeError) as error:
-        raise CallerError(f"{path} is no manifest of an export: {error}") from None
+        raise CallerError(f"{path} is not a manifest of an export: {error}") from None
     if manifest.format > Manifest.__struct_defaults__[0]:
         raise CallerError(f"{path} has the version {manifest.format}: use a newer pycrorm")
     return manifest

@@ -131,10 +131,10 @@ def _question(reading: Reading, name: str, arguments: Mapping[str, Any]) -> Ques
     missing = [each.name for each in valid.values() if each.default is each.empty and each.name not in arguments]
     if missing:
         raise CallerError(f"{name} needs {', '.join(missing)}: give it as an argument (--with {missing[0]}=...)")
-    given = dict(arguments)
-    if isinstance(given.get("since"), str):  # from a manifest
-        given["since"] = datetime.fromisoformat(given["since"])
-    question: Question = ask(**given)
+    values = dict(arguments)
+    if isinstance(values.get("since"), str):  # from a manifest
+        values["since"] = datetime.fromisoformat(values["since"])
+    question: Question = ask(**values)
     return question
 
 
@@ -157,8 +157,8 @@ async def _asked(
         covered, simulated, left_out = *of_names, 0
     else:
         (covered, left_out), simulated = await _complete(reading), False
-    given = {name: _recorded(value) for name, value in arguments.items()}
-    return Selection(kind, question.name, question.statement, covered, simulated, left_out, given)
+    recorded = {name: _recorded(value) for name, value in arguments.items()}
+    return Selection(kind, question.name, question.statement, covered, simulated, left_out, recorded)
 
 
 async def _view(reading: Reading, name: str, mapper: Mapper[Any] | None, chosen: Sequence[str]) -> Selection:

@@ -300,7 +300,7 @@ def test_a_memory_without_episodes_says_so_and_how_to_record_one(folder: Path) -
     done = pycrorm("episodes", "--url", "sqlite:///new.db", cwd=folder)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", f"no episode yet: {how}\n")
     done = pycrorm("episodes", "--status", "FAILED", "--url", "sqlite:///new.db", cwd=folder)
-    assert (done.stdout, done.stderr) == ("", "no episode is like this\n")
+    assert (done.stdout, done.stderr) == ("", "no episode matches these options; `pycrorm episodes` lists all\n")
 
 
 def test_a_database_of_a_newer_version_is_refused(folder: Path) -> None:

@@ -156,7 +156,7 @@ async def test_what_differs_from_the_manifest_is_named(either: Reading, tmp_path
     assert remade.differences == (f"episode 2 ({ID[:-1]}9) is not in this memory",)
     for broken in ("{}", "not json"):
         file.write_text(broken)
-        with pytest.raises(CallerError, match="is no manifest of an export"):
+        with pytest.raises(CallerError, match="is not a manifest of an export"):
             await export_again(either, file)
 
 

@@ -188,7 +188,7 @@ async def test_a_full_disk_leaves_no_file(
     [
         ([1, 2], {}, "a file of the format mcap holds one episode, not 2"),
         ("action", {}, "the format mcap holds whole episodes, and action is a view"),
-        ([1], {"clock": "sun"}, "the clock is event or time, not 'sun'"),
+        ([1], {"clock": "sun"}, "clock must be 'event' or 'time', got 'sun'"),
     ],
 )
 async def test_what_a_scene_file_cannot_hold_is_named(

@@ -38,7 +38,7 @@ _EVENTS_AT_ONCE = 64
 def check_size(size: ImageSize) -> None:
     """Raise `CallerError` for a size outside the range that a picture can have."""
     if not all(_SIDE_LEAST <= each <= _SIDE_MOST for each in size):
-        raise CallerError(f"an image is {_SIDE_LEAST} to {_SIDE_MOST} pixels wide and high, not {size!r}")
+        raise CallerError(f"images must be {_SIDE_LEAST} to {_SIDE_MOST} pixels wide and high, got {size!r}")
 
 
 async def draw_frames(

@@ -60,8 +60,8 @@ def frames_of(episode: RecordedEpisode, clock: Clock, fps: int) -> Frames:
     chosen = changed if clock == "event" else list(_resampled(episode.number, while_there, changed, fps))
     if len(chosen) < 2:
         stay_ns = while_there[-1].since_ns - while_there[0].since_ns
-        there = f"give a higher --fps, because the robot was there for {stay_ns / 1e9:.3f} s, or --clock event"
-        remedy = there if clock == "time" else "leave it out"
+        time_remedy = f"give a higher --fps, because the robot was there for {stay_ns / 1e9:.3f} s, or --clock event"
+        remedy = time_remedy if clock == "time" else "leave it out"
         count = f"{len(chosen)} frame{'' if len(chosen) == 1 else 's'}"
         raise CallerError(f"episode {episode.number} has {count} by {clock}, and LeRobot needs two: {remedy}")
     at = [when for when, _ in chosen]

@@ -30,11 +30,11 @@ class _Bar(NamedTuple):
 def gantt(nodes: Sequence[NodeSummary], axis: Axis = "events") -> Drawing:
     """Return a chart of the nodes over their events, or over time in s. Raises `CallerError` for another axis.
 
-    Robots of a kinematic world jump, so that many nodes take no time; over events each is as wide as what it did. A
-    node that has not ended extends to the end of the chart.
+    Robots of a kinematic world jump, so that many nodes take no time; over events each is as wide as its number of
+    events. A node that has not ended extends to the end of the chart.
     """
     if axis not in get_args(Axis):
-        raise CallerError(f"a chart has the axis 'events' or 'time', not {axis!r}")
+        raise CallerError(f"axis must be 'events' or 'time', got {axis!r}")
     bars = _bars(shown_nodes(nodes), by_time=axis == "time")
     first = min((each.start for each in bars), default=0.0)
     last = max((each.end for each in bars), default=0.0)
