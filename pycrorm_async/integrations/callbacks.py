@@ -100,8 +100,8 @@ class RememberedRuns(BaseCallbackHandler):
             for name, value in inputs.items()
         }
         parent = run.get("parent_run_id")
-        known = parent if self.episode.is_open(parent) else None  # its start may have gone to other handlers only
-        self.episode.start(run_id, self._recording.type(kind, dtype, fields), parameters, parent=known)
+        open_parent = parent if self.episode.is_open(parent) else None  # its start may have gone to other handlers only
+        self.episode.start(run_id, self._recording.type(kind, dtype, fields), parameters, parent=open_parent)
 
 
 def _name(serialized: Mapping[str, Any] | None, run: Mapping[str, Any]) -> str:

@@ -122,23 +122,23 @@ class RememberedTree(VisitorBase):
     def run(self, behaviour: Behaviour) -> None:
         """Visit a behaviour that was ticked."""
         before, self._visited_s = self._visited_s, perf_counter()
-        known = self._latest.get(id(behaviour))
-        if known is not None and known.status is behaviour.status:
-            if known.is_open:
-                known.ticks += 1
+        latest = self._latest.get(id(behaviour))
+        if latest is not None and latest.status is behaviour.status:
+            if latest.is_open:
+                latest.ticks += 1
                 return
-            parent = known.parent
+            parent = latest.parent
             if self._visited_s - before >= self._instant_s:
                 pass
             elif parent is None or parent.is_open:
-                known.ticks += 1
+                latest.ticks += 1
                 if self._pending:
                     for each in self._pending:
                         each.ticks += 1
                     self._pending.clear()
                 return
             elif self._latest.get(id(parent.behaviour)) is parent:
-                self._pending.append(known)
+                self._pending.append(latest)
                 return
         self._guarded(self._visit, behaviour)
 

@@ -85,13 +85,13 @@ def remember(
 
 
 def _check_version() -> None:
-    known, install = " or ".join(KNOWN_VERSIONS), "pip install 'pycrorm-async[pycram]'"
+    versions, install = " or ".join(KNOWN_VERSIONS), "pip install 'pycrorm-async[pycram]'"
     try:
         installed = packages.version("pycram-robotics")
     except packages.PackageNotFoundError:
-        raise MissingExtra(f"PyCRAM (pycram-robotics {known}) is not installed: {install}") from None
+        raise MissingExtra(f"PyCRAM (pycram-robotics {versions}) is not installed: {install}") from None
     if installed not in KNOWN_VERSIONS:
-        raise CallerError(f"PyCRAM {installed} is unknown, only {known} can be recorded: {install}")
+        raise CallerError(f"PyCRAM {installed} is unknown, only {versions} can be recorded: {install}")
 
 
 class _PyCRAMPlans:

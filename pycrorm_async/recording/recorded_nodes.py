@@ -3,9 +3,9 @@
 Theory of operation. Each method first copies its arguments, which may run any code of the caller, and then has
 `OrderedCalls` write them; so no other call comes between the events of one, and a node's parent has started before it,
 whichever threads start them. If the episode is continued after the copy, `_now` replaces references to rows of the
-former episode. Nothing raises into the
-caller: what goes wrong, and what comes after the end of the episode, is counted in `Memory.status`. `_nodes` holds the
-open nodes by key, `_ended` the last ones that ended, because a child may start after the end of its parent.
+former episode. Nothing raises into the caller: what goes wrong, and what comes after the end of the episode, is counted
+in `Memory.status`. `_nodes` holds the open nodes by key, `_ended` the last ones that ended, because a child may start
+after the end of its parent.
 """
 
 from __future__ import annotations
@@ -164,9 +164,9 @@ class RecordedNodes(EpisodeWriter[_Node]):
         if isinstance(robot, RobotValue):
             state = struct_of(robot, RobotValue)
             return state if self._objects.holds(state.object) else replace(state, object=None)
-        if (known := self._objects.robot(robot)) is None:
+        if (acting := self._objects.robot(robot)) is None:
             raise CallerError(f"no object has the key {clean_repr(robot)}, so the robot's state is not recorded")
-        return known
+        return acting
 
     def _write_start(self, node: _Node, missing: Mapping[str, str], continues: int | None) -> None:
         event = NodeStarted(

@@ -90,16 +90,16 @@ class RecordedObjects(ObjectRows[Hashable]):
 
     def robot(self, key: Hashable) -> RobotValue | None:
         """Return the state of the object as that of the acting robot; None if there is none of this key."""
-        known = self._objects.get(key)
-        if known is None:
+        state = self._objects.get(key)
+        if state is None:
             return None
-        torso = known.joints.get(known.torso_joint) if known.torso_joint is not None else None
-        return RobotValue(known.pose, known.object_type, torso, self._references.get(key), known.name)
+        torso = state.joints.get(state.torso_joint) if state.torso_joint is not None else None
+        return RobotValue(state.pose, state.object_type, torso, self._references.get(key), state.name)
 
     def is_at(self, key: Hashable, pose: object) -> bool:
         """Return whether the last pose of an object is this one; False if no object has this key."""
-        known = self._objects.get(key)
-        return known is not None and isinstance(pose, (Pose, PoseValue)) and _are_at_one_place(known.pose, pose)
+        state = self._objects.get(key)
+        return state is not None and isinstance(pose, (Pose, PoseValue)) and _are_at_one_place(state.pose, pose)
 
     def add(self, key: Hashable, added: RecordedObject, node: int | None) -> int:
         """Write that an object entered the world; of a known key, its new pose and joints."""
@@ -128,16 +128,16 @@ class RecordedObjects(ObjectRows[Hashable]):
 
     def move(self, key: Hashable, pose: PoseValue, node: int | None) -> int:
         """Write a new pose of an object, if it has changed."""
-        known, reference = self._objects[key], self._references[key]
-        last = known.pose
+        state, reference = self._objects[key], self._references[key]
+        last = state.pose
         if _are_at_one_place(pose, last):
             return 0
         sequence = self._put(
-            lambda: ObjectMoved(reference.object, known.name, known.object_type, pose, node),
+            lambda: ObjectMoved(reference.object, state.name, state.object_type, pose, node),
             row_of=key,
             identity=reference.object,
         )
-        known.pose = pose if sequence else last
+        state.pose = pose if sequence else last
         return sequence
 
     def turn(self, key: Hashable, positions: Mapping[str, float], node: int | None) -> int:

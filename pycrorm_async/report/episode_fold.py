@@ -127,8 +127,8 @@ class EpisodeFold:
     def _named(self, value: Any) -> Any:
         """Return a parameter with the name of the object that it refers to."""
         if isinstance(value, dict) and "object" in value and "row" in value:
-            known = self.world.objects.get(value["object"])
-            return {**value, "name": known.added.name} if known is not None else value
+            referred = self.world.objects.get(value["object"])
+            return {**value, "name": referred.added.name} if referred is not None else value
         return value
 
     def _node_ended(self, sequence: int, ended: NodeEnded) -> None:

@@ -100,13 +100,13 @@ class _Texts:
 def _cases_of(library: CaseLibrary, episode: int, starts: Collection[int]) -> list[tuple[Group, int]]:
     """Return group and row of the cases of these nodes: what failed first, then by their start."""
     wanted = np.array([row_id(episode, each, SLOT_NODE) for each in starts], np.int64)
-    found: list[tuple[bool, int, Group, int]] = []
+    entries: list[tuple[bool, int, Group, int]] = []
     for group in library.groups():
         rows = np.flatnonzero(group.episodes == episode)
         rows = rows[np.isin(group.nodes[rows], wanted)] if rows.size else rows
         status = group.texts["status"].value
-        found += [(status(row) not in _FAILED, int(group.nodes[row]), group, row) for row in rows.tolist()]
-    return [(group, row) for _, _, group, row in sorted(found, key=lambda each: each[:2])]
+        entries += [(status(row) not in _FAILED, int(group.nodes[row]), group, row) for row in rows.tolist()]
+    return [(group, row) for _, _, group, row in sorted(entries, key=lambda each: each[:2])]
 
 
 def _earlier(case: Case, library: CaseLibrary) -> Answer:
@@ -114,28 +114,28 @@ def _earlier(case: Case, library: CaseLibrary) -> Answer:
     return answer(replace(cue_like(case, library), before_us=case.started_us, k=COUNTED), library)
 
 
-def _entry(found: Answer, texts: _Texts) -> dict[str, Any]:
-    reasons = ", ".join(f"{name} {count}" for name, count in found.reasons)
-    success = found.success
+def _entry(similar: Answer, texts: _Texts) -> dict[str, Any]:
+    reasons = ", ".join(f"{name} {count}" for name, count in similar.reasons)
+    success = similar.success
     return {
         "success": "" if success is None else str(success),
         "reasons": reasons,
-        "cases": [_case(each, texts) for each in found[:SHOWN]],
+        "cases": [_case(each, texts) for each in similar[:SHOWN]],
     }
 
 
-def _case(found: RecalledCase, texts: _Texts) -> list[Any]:
+def _case(recalled: RecalledCase, texts: _Texts) -> list[Any]:
     """Return a case as `web/panels.js` reads it."""
-    case = found.case
+    case = recalled.case
     return [
         case.episode,
         case.sequence,
-        round(found.score, 3),
+        round(recalled.score, 3),
         case.status,
         case.reason or "",
         f"{case.started_at:%Y-%m-%d %H:%M:%S}",
-        texts.all(_listed(found.matched, _alike)),
-        texts.all(_listed(found.missed, _differs)),
+        texts.all(_listed(recalled.matched, _alike)),
+        texts.all(_listed(recalled.missed, _differs)),
     ]
 
 
@@ -154,8 +154,8 @@ def _alike(compared: Compared) -> str:
 
 def _differs(compared: Compared) -> str:
     """Return a feature that differs, as `arm RIGHT, here LEFT`."""
-    found = "not known" if compared.found is None else _value(compared.found)
-    return f"{compared.feature} {found}, here {_value(compared.wanted)}"
+    actual = "not known" if compared.found is None else _value(compared.found)
+    return f"{compared.feature} {actual}, here {_value(compared.wanted)}"
 
 
 def _value(value: str | tuple[str, ...] | float | None) -> str:

@@ -259,7 +259,7 @@ class Dialect(Protocol):
         """Add a column; fail soon if a reader holds a lock, because later readers queue behind this statement."""
         ...
 
-    async def only_views(self, connection: AsyncConnection, known: Collection[str]) -> None:
+    async def only_views(self, connection: AsyncConnection, views: Collection[str]) -> None:
         """Raise `DatabaseError` if the views' schema contains other objects, which `replace_views` would drop."""
         ...
 

@@ -34,8 +34,8 @@ class Arms(IntEnum):
         arm = int.__new__(cls, number)
         arm._name_, arm._value_ = name, number
         # The enum's own table of values gives each name one object, whichever thread makes it first.
-        known: Any = cls._value2member_map_
-        return cast("Arms", known.setdefault(number, arm))
+        members: Any = cls._value2member_map_
+        return cast("Arms", members.setdefault(number, arm))
 
     def __reduce_ex__(self, protocol: Any) -> tuple[Any, ...]:
         return Arms.named, (self._name_,)

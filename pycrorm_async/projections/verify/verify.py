@@ -250,8 +250,8 @@ class _TablesCheck:
                 high = Place(place.number + 1)
         if rows.episodes:
             name_episodes(rows, await uuids_of(connection, rows.episodes))
-        made = Range(low.row or None, high and high.row, low.number or None, high and high.number)
-        await self._compare(connection, comparison, rows, made, carried, settled - carried, read)
+        folded_range = Range(low.row or None, high and high.row, low.number or None, high and high.number)
+        await self._compare(connection, comparison, rows, folded_range, carried, settled - carried, read)
         self._report_progress(self.result.events, max(self._total, self.result.events))
         return place
 

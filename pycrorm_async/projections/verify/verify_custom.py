@@ -94,12 +94,12 @@ class ProjectionCheck:
         return None if following is None or following == within.end else Place(following)
 
     async def differences(
-        self, connection: AsyncConnection, comparison: Comparison, rows: Batch, made: EpisodeRange
+        self, connection: AsyncConnection, comparison: Comparison, rows: Batch, episodes: EpisodeRange
     ) -> Sequence[Difference]:
         """Compare the tables with the rows that the events of these episodes make; count the stored rows."""
         assert isinstance(rows, CustomRows)
-        last = None if made.end is None else made.end << 31
-        within = Range(made.first << 31 or None, last, None, None)
+        last = None if episodes.end is None else episodes.end << 31
+        within = Range(episodes.first << 31 or None, last, None, None)
         differences = await comparison.differences(connection, rows, within, carried=(), settled=())
         self.result.rows += comparison.count
         return differences

@@ -92,8 +92,8 @@ def _joint(joint: Element) -> list[Any]:
 
 
 def _link(joint: Element, end: str) -> str:
-    found = joint.find(end)
-    return found.get("link", "") if found is not None else ""
+    element = joint.find(end)
+    return element.get("link", "") if element is not None else ""
 
 
 def _shapes(link: Element, colors: dict[str | None, list[float]]) -> Iterator[list[Any]]:

@@ -254,8 +254,8 @@ class PostgreSQL:
         await connection.exec_driver_sql(f"ALTER TABLE {quote(table)} ADD COLUMN {definition}")
         await connection.exec_driver_sql(tables.WAIT_AS_EVER)
 
-    async def only_views(self, connection: AsyncConnection, known: Collection[str]) -> None:
-        names = await connection.exec_driver_sql(tables.IN_VIEWS_SCHEMA, (list(known),))
+    async def only_views(self, connection: AsyncConnection, views: Collection[str]) -> None:
+        names = await connection.exec_driver_sql(tables.IN_VIEWS_SCHEMA, (list(views),))
         strangers = list(names.scalars())
         if strangers:
             raise DatabaseError(

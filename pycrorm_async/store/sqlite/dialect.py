@@ -226,7 +226,7 @@ class SQLite:
     async def add_column(self, connection: AsyncConnection, table: str, definition: str) -> None:
         await connection.exec_driver_sql(f"ALTER TABLE {_quote(table)} ADD COLUMN {definition}")
 
-    async def only_views(self, connection: AsyncConnection, known: Collection[str]) -> None:
+    async def only_views(self, connection: AsyncConnection, views: Collection[str]) -> None:
         """Do nothing: foreign objects do not hinder `replace_views`."""
 
     async def replace_views(
