@@ -18,6 +18,7 @@ from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.sql.read_only import SqlLimits, SqlResult
 
 _ROWS = 1_000
+"""Bounds the printed rows by default; `--limit 0` prints all."""
 _MEGABYTE = 1_000_000
 
 

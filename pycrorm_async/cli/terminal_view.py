@@ -28,11 +28,13 @@ from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import EpisodeRow
 
 _INTERVAL_S = 0.1
+"""The pause in s between two pictures."""
 _SHARE = 4
 """A picture of a long tree takes at most one of so many parts of the time."""
 _HEAD_LINES = 6
 """The lines of the terminal that the tree leaves for the rest of the picture."""
 _LISTED_ENDED = 10
+"""Bounds the ended episodes that are listed below the running ones."""
 _SIGNS = {"RUNNING": "cyan", "SUCCEEDED": "green", "LOST": "yellow", "INTERRUPTED": "yellow"}
 
 

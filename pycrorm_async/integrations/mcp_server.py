@@ -46,6 +46,7 @@ instructions to follow. These tools only read; they cannot change the memory or 
 _LIMITS = SqlLimits(rows=200, bytes=200_000, seconds=10.0)
 """Bounds the answer to a query: more would fill the context of a model."""
 _LINES_MAX = 300
+"""Bounds the lines of an answer, because more would fill the context of a model."""
 _LINE_MAX = 400
 """Bounds the characters of a line, and of each recorded text in an answer but that to a query."""
 _DEPTH_MAX = 40
@@ -53,6 +54,7 @@ _DEPTH_MAX = 40
 _ANSWER_BYTES = 500_000
 """Bounds every answer. Only texts of control characters, which JSON writes six times as long, come near it."""
 _ERROR_MAX = 1_000
+"""Bounds the characters of an error."""
 _READS_ONLY = ToolAnnotations(read_only_hint=True, open_world_hint=False)
 
 Tool: TypeAlias = "Callable[..., Awaitable[Any]]"

@@ -22,6 +22,7 @@ _NAMES = frozenset({"127.0.0.1", "localhost", "::1"})
 """The names of this machine; the port is not compared, because a tunnel (`ssh -L`) may change it."""
 _TOKEN = re.compile(r"[A-Za-z0-9_-]{43}")
 _TOKEN_BYTES = 32
+"""The random bytes of the secret in the page's address, too many to guess."""
 
 HEADERS: Final[Mapping[str, str]] = {
     "cache-control": "no-store",

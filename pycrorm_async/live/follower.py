@@ -25,7 +25,9 @@ from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import EpisodeRow
 
 _INTERVAL_S = 0.05
+"""The pause in s between two reads of the log."""
 _IDLE_INTERVAL_S = 0.15
+"""The pause in s between two reads of a log that did not change for `_IDLE_TURNS` reads."""
 _IDLE_TURNS = 40
 """The turns without a change after which the log is queried less often, to spare the robot's processor."""
 _RETRY_S = 0.5

@@ -22,6 +22,7 @@ _LISTED_MAX = 2_000
 _ENDED_MAX = 500
 """Bounds the activities that are kept of episodes that have ended meanwhile."""
 _PAGE_EVENTS = 2_000
+"""Bounds the events that are read at once."""
 
 
 class LiveOverview:

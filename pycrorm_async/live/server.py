@@ -47,6 +47,7 @@ _LIST_INTERVAL_S = 0.25
 _STOP_S = 1
 """Bounds the wait for browsers that do not read when the server stops."""
 _DIGITS_END = 16
+"""The number of digits from which on a number in a request is ignored; fewer fit into a 64-bit integer."""
 _WAITING = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta http-equiv="refresh" content="2">
 <meta name="color-scheme" content="light dark"><meta name="viewport" content="width=device-width, initial-scale=1">

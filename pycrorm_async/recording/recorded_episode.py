@@ -24,6 +24,7 @@ from pycrorm_async.recording.writing.observing import put_observation
 from pycrorm_async.world.pose import Pose
 
 _ROOM_POLL_S = 0.005
+"""The pause in s between two looks at a full spool."""
 
 
 class RecordedEpisode(RecordedNodes):

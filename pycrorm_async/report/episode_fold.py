@@ -39,6 +39,7 @@ from pycrorm_async.store.stored import EpisodeRow, StoredEvent
 _TEXTS_CHARACTERS = 6_000_000
 """Bounds the characters of all texts of a page together, so that it stays below 20 MB."""
 _TEXT_SHORTEST, _TEXT_LONGEST = 80, 20_000
+"""Bounds the characters of one text on the page, when there are many long ones and when there are few."""
 _NODES_MAX = 100_000
 """Bounds the nodes of a page: it then has about 10 MB and opens in less than 3 s."""
 _NUMBERS_MAX = 1_400_000

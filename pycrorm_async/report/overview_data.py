@@ -16,7 +16,9 @@ from pycrorm_async.task_status import TaskStatus
 _EPISODES_MAX = 20_000
 """Bounds the episodes of an overview: it then has about 5 MB."""
 _DESCRIPTION_MAX = 200
+"""Bounds the characters of a description in the table."""
 _REASON_MAX = 500
+"""Bounds the characters of the reason for which an episode cannot be read."""
 _FAILED = (TaskStatus.FAILED, TaskStatus.ERROR)
 
 

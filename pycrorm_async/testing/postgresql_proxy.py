@@ -25,6 +25,7 @@ from urllib.parse import quote
 __all__ = ["Proxy", "proxy_before"]
 
 _CHUNK = 1 << 16
+"""Bounds the bytes that are read at once."""
 
 
 class Proxy:

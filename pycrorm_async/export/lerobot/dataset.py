@@ -25,7 +25,9 @@ MARKER = "meta/info.json"
 DEFAULT_FPS = 10
 """Frames per second; nominal if there is one frame for each event, because LeRobot requires a value."""
 _CHUNK_FILES = 1000
+"""Bounds the files of one folder (`chunk`), the default of LeRobot."""
 _FILE_MEGABYTES = 100
+"""The size in MiB above which the next episode begins a new file, the default of LeRobot."""
 _VECTORS = ("observation.state", "action")
 _PICTURE = "observation.images.scene"
 _NUMBERS = {

@@ -26,6 +26,7 @@ ImageSize = tuple[int, int]
 """Width and height in pixels."""
 
 _SIDE_LEAST, _SIDE_MOST = 16, 2000
+"""Bounds the width and the height of an image, in pixels."""
 _REACH_M = 1.2
 """The camera shows this much around the places of the robot's base: what its arms reach."""
 _HEIGHT_M = 0.8

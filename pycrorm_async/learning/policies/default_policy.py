@@ -13,8 +13,11 @@ from pycrorm_async.learning.policies.marginals import Normal
 from pycrorm_async.learning.policies.policy import ARMS, GRASPS, Leaf, Policy
 
 VARIANCE_M2 = 0.5
+"""The variance in m² of the base's place along each axis around the object, as in the thesis."""
 FARTHEST_M = 2.0
+"""Half the side in m of the square around the object in which the base is placed, as in the thesis."""
 NEAREST_M = 0.2
+"""Half the side in m of the square around the object that is left out, as in the thesis."""
 
 AROUND_OBJECT = Region(
     (

@@ -11,8 +11,11 @@ from pycrorm_async.errors import CallerError, MissingExtra
 from pycrorm_async.learning.policies.policy import PickUpChoice, Policy
 
 _SAMPLES = 200_000
+"""The samples drawn for one plot, about 14 for each cell."""
 _PLOT_RANGE_M = (-1.5, 1.5)
+"""The plotted places of the base around the object along each axis, in m."""
 _CELLS = 120
+"""The cells along each axis of the plot, 2.5 cm wide."""
 
 
 def draw_policies(

@@ -24,6 +24,7 @@ REACH_M = 2.0
 _RESOLUTION_M = 0.05
 _CELLS = round(2 * REACH_M / _RESOLUTION_M)
 _VISIBLE_SHARE_MIN = 0.5
+"""The least share of the object that must be visible from a place."""
 
 
 def free_and_visible(robot: CurrentRobot, target: Object) -> Region:

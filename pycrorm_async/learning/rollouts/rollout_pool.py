@@ -57,7 +57,9 @@ from pycrorm_async.settings import Settings
 ROLLOUTS_PER_RUN = 500
 """Rollouts in one run of a worker, which is one episode: enough to make the cost of building the world negligible."""
 _PROGRESS_INTERVAL_S = 0.2
+"""The shortest time in s between two reports of progress."""
 _POLL_INTERVAL_S = 0.02
+"""The pause in s between two looks at the results of the workers."""
 _TAKEOVER_INTERVAL_S = 1.0
 """Time between attempts to drain the spool while another daemon drains it."""
 SETTINGS = Settings(flush_timeout_s=120)

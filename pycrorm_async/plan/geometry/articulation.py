@@ -18,9 +18,11 @@ from pycrorm_async.world.pose import Pose, dot, rotated
 OPENING_MARGIN = 0.05
 """Distance that opening leaves between the joint and its upper limit, m or rad."""
 STEP_M_MAX = 0.05
+"""Bounds the distance in m between two poses of the hand along the path of a drawer."""
 STEP_RAD_MAX = 0.1
 """Greatest distance between two checked points on a handle's path."""
 _ROUNDING = 1e-9
+"""Tolerates the rounding of joint positions."""
 
 
 class Handle(NamedTuple):

@@ -14,8 +14,11 @@ from pycrorm_async.world.queries.bounding_boxes import BoundingBox
 from pycrorm_async.world.robots.robot_description import GRASP_ORIENTATIONS
 
 APPROACH_M = 0.1
+"""The distance in m from the goal at which the tool frame begins its straight approach."""
 LIFT_M = 0.03
+"""The height in m by which the object is lifted after the grasp."""
 RETRACT_M = 0.07
+"""The distance in m by which the gripper moves back after it released an object."""
 HOLD_DISTANCE_M_MAX = 0.03
 """Greatest distance between the tool frame and an object's bounding box at which the gripper can hold the object."""
 

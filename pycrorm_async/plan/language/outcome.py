@@ -86,3 +86,4 @@ def _list_failures(failures: list[Exception]) -> str:
 
 
 _NAMED_MAX = 10
+"""Bounds the failures that a message describes."""

@@ -22,12 +22,18 @@ from pycrorm_async.world.queries.bounding_boxes import BoundingBox, box_around
 from pycrorm_async.world.queries.costmaps import Costmap, GaussianCostmap, OccupancyCostmap
 
 CLEARANCE_M = 0.4
+"""The distance in m of the base from obstacles."""
 CELLS_MAX = 600
+"""Bounds the cells that are tried, the best first."""
 HEADINGS = 8
+"""The headings that are tried at each cell, in equal steps from that which faces the handle."""
 CELL_M = 0.05
+"""The side of a cell in m."""
 _CELLS = 80
+"""The cells along each axis of the costmap: 4 m around the handle."""
 _SIGMA_CELLS = 6.0  # 0.3 m, as for picking up
 _SWEEP_STEPS = 10
+"""The steps of the joint at which the space that the drawer or door sweeps is computed."""
 
 
 def opening_poses(part: ObjectLike, robot: ObjectLike, arm: Arms | None) -> Iterator[tuple[Pose, Reach]]:

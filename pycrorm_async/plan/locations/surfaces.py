@@ -13,6 +13,7 @@ from pycrorm_async.world.pose import Pose, Quaternion, Vector, yaw_quaternion
 from pycrorm_async.world.queries.bounding_boxes import BoundingBox, box_around
 
 STEP_M = 0.02
+"""The distance in m between two candidates along each axis."""
 _POINT = BoundingBox(Vector(0.0, 0.0, 0.0), Vector(0.0, 0.0, 0.0))
 
 

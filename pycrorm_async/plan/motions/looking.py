@@ -18,6 +18,7 @@ from pycrorm_async.world.robots.robot_description import PR2Description
 ROUNDS_MAX = 50
 """Bounds the rounds over the joints; a camera near its axes needs about ten."""
 _TURN_MIN_RAD = 1e-9
+"""The largest turn in rad of a round at which the iteration ends."""
 
 
 def head_joints(robot: CurrentRobot, target: Pose) -> dict[str, float]:

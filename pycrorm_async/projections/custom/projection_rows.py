@@ -37,6 +37,7 @@ from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.stored import StoredEvent
 
 _INTEGER_MAX = 2**63 - 1
+"""The largest integer that both databases store."""
 
 
 class CustomRows(ProjectedBatch):

@@ -21,6 +21,7 @@ from pycrorm_async.projections.schema.tables import leaf_columns, make_table
 _EPISODE_KEYED = ("process_metadata", "simulated_episode")
 _NODES = "task_tree_node"
 _KEYS_AT_ONCE = 1_000
+"""Bounds the keys of one query, because databases bound its parameters."""
 
 
 class Difference(NamedTuple):

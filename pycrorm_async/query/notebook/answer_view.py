@@ -12,7 +12,9 @@ if TYPE_CHECKING:
     from pycrorm_async.query.sql.read_only import SqlResult
 
 _ROWS_MAX = 100
+"""Bounds the rows that a notebook shows."""
 _SQL_MAX = 5_000
+"""Bounds the characters of SQL that a notebook shows."""
 
 
 def sql_result_html(result: SqlResult) -> str:

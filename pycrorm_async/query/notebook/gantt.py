@@ -18,6 +18,7 @@ _WIDTH, _PAD, _LANE, _BAR, _AXIS = 900.0, 8.0, 20.0, 16.0, 18.0
 _CHARACTER = 6.8
 """Width of a character of a bar's name, so that a name is cut where its bar ends."""
 _TICKS = 6
+"""The labels along the axis."""
 
 
 class _Bar(NamedTuple):

@@ -21,6 +21,7 @@ Item = TypeVar("Item")
 _LINES_MAX = 200
 """Bounds the lines of a list as text."""
 _LINE_MAX = 160
+"""Bounds the characters of a line."""
 
 
 class _Listing(list[Item], Generic[Item]):

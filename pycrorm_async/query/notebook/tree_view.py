@@ -16,6 +16,7 @@ _NODES_OPEN = 100
 _FAILURES_OPEN = 20
 """Bounds the failures at which a tree is opened, so that a view of hundreds of them is not long."""
 _PARAMETERS_MAX = 160
+"""Bounds the characters of a node's parameters."""
 
 
 def shown_nodes(nodes: Sequence[NodeSummary]) -> list[NodeSummary]:

@@ -12,13 +12,17 @@ from pycrorm_async.query.scene.outlines import Outline, Point, outlines
 from pycrorm_async.query.snapshot import ObjectThen, WorldThen
 
 _SIZE_PX = 460.0
+"""The longer side of a map in pixels."""
 _SIZE_MIN_M = 2.0
+"""The least longer side of a map in m, so that a single small object does not fill it."""
 _MARGIN_M = 0.3
+"""The least margin around the objects, in m."""
 _LINES_MAX = 40
 """Bounds the lines of the grid along an axis."""
 _OUTLINES_MAX = 3_000
 """Bounds the shapes of a map; of more, the highest are drawn."""
 _NAMES_MAX = 60
+"""Bounds the objects whose names are drawn."""
 
 
 def world_map(world: WorldThen) -> Drawing:

@@ -36,8 +36,10 @@ When: TypeAlias = float | str | datetime | None
 _PIXELS_MAX = 4_000_000
 """Bounds a picture, which then takes about 15 s."""
 _PIXELS_LEAST = 16
+"""The least width and height of a picture, in pixels."""
 _LAST = 1 << 40
 _RADIUS_LEAST_M = 0.3
+"""The least radius in m of the sphere that the camera frames, so that one small object has surroundings."""
 _YAWS = range(0, 360, 30)
 
 

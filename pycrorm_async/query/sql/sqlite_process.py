@@ -27,6 +27,7 @@ _TEMPORARY_BYTES = 1 << 30
 _PIECE_BYTES = 1 << 20
 """Bytes of rows after which a message ends, however few rows it has."""
 _BUSY_TIMEOUT_S = 5.0
+"""Bounds the wait in s for the lock of another process."""
 
 
 class _Authorizer:

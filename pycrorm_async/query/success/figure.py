@@ -26,7 +26,9 @@ _POINTS_MAX = 500
 _FEW = 5
 """A cell of fewer rows is hatched, because its rate is uncertain."""
 _CELLS_WITH_INTERVAL, _CELLS_WITH_COUNT, _CELLS_WITH_RATE = 40, 300, 600
+"""Bounds the cells of a figure whose labels have the interval, the count and the rate: more would overlap."""
 _TICKS_MAX = 14
+"""Bounds the labels along an axis; times are wider, so half as many fit."""
 _BLUE, _ORANGE = "#0072b2", "#d55e00"
 
 

@@ -27,6 +27,7 @@ Source: TypeAlias = "str | type[DeclarativeBase] | Select[Any]"
 _ROWS_MAX = 1_000_000
 """Bounds the rows that are counted, which then take about 300 MB."""
 _ROWS_AT_ONCE = 50_000
+"""Bounds the rows that are fetched at once, and with it the memory."""
 _CATEGORIES_MAX, _CATEGORY_MAX = 20, 24
 """Bounds the categories of a column, and their characters."""
 _NUMBERS = ("integer", "number", "time", "local time", "date")

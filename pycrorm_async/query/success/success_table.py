@@ -14,7 +14,9 @@ from pycrorm_async.query.success.interval import interval_95
 from pycrorm_async.query.success.samples import Samples, Values
 
 _BINS_MAX = 200
+"""Bounds the ranges of one axis."""
 _BINS_LEAST, _BINS_USUAL = 4, 16
+"""Bounds the default number of ranges of one axis, from below and above."""
 _ROWS_A_CELL = 5
 """The rows that a cell has on average, from which the default number of ranges follows."""
 _DAY_S, _MINUTE_S = 86_400, 60

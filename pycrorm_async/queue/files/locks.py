@@ -26,6 +26,7 @@ _ATTEMPTS = 5
 _FOLDER_ATTEMPTS = 10_000
 """Attempts at a folder's lock: ten seconds in total."""
 _RETRY_S = 0.001
+"""The pause in s between two attempts."""
 _NOTE = Struct("=II")
 """The length and the checksum that precede the holder's note."""
 

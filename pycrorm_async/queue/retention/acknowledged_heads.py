@@ -40,6 +40,7 @@ _FILE_BYTES_MAX: Final = 2**20
 _EPISODES_MAX: Final = 4_096
 """Bounds the episodes that compacting keeps, the latest ones; a third of a file, so that compacting is rare."""
 _ATTEMPTS: Final = 5
+"""Bounds the attempts to append while other processes replace the file."""
 _BEGINNING_BYTES: Final = 80
 """Length of the beginning that identifies a file with a reused inode: a random line, or the first head."""
 

@@ -30,6 +30,7 @@ from pycrorm_async.queue.files.segment import header_bytes, map_segment, segment
 from pycrorm_async.queue.sources.dead_letters import DeadLetters
 
 _PAUSE_S_MIN = 0.002
+"""The first pause in s while no new records are synced; later pauses are longer."""
 _PAUSE_S_MAX = 0.02
 """Bounds the pause between two reads of `progress`, and with it the delay until a synced record is supplied."""
 _ALIVE_CHECK_S = 0.25

@@ -24,10 +24,12 @@ ARRAY_ITEMS_MAX: Final = 64
 NPY: Final = "application/x-npy"
 """Media type of an array that is stored as a blob: `numpy.load(io.BytesIO(content))`."""
 _DEPTH_MAX: Final = 8
+"""Bounds the nesting of observed values."""
 _INTEGERS: Final = range(-(2**63), 2**63)
 _NUMBERS: Final = "biuf"
 """The dtype kinds of arrays whose elements JSON can hold."""
 _MEDIA_TYPE_MAX: Final = 255
+"""Bounds the characters of a blob's media type."""
 
 
 class ObservedReader:

@@ -28,6 +28,7 @@ from pycrorm_async.store.postgresql.search_path import LOG_SCHEMA, TABLES_SCHEMA
 from pycrorm_async.store.stored import EpisodeRow, Incarnation, Span, StoredEvent, numbers_reserved
 
 _SERVER_MIN = 140_000
+"""The lowest supported `server_version_num`: PostgreSQL 14."""
 _RESTORING = "a restore may be running; try again when it has finished"
 
 

@@ -35,6 +35,7 @@ _IN_TURN = (_WRITE, USE_WAL)
 _POLL_S = 0.001
 """Interval at which a connection tries again to get the write lock."""
 _ROWS_AT_ONCE = 64
+"""The rows that are fetched at once from SQLite's cursor."""
 _CACHED_STATEMENTS = 512
 """Size of the cache of compiled statements: about ten per table that is written."""
 _WRITE_PRAGMAS = (

@@ -22,6 +22,7 @@ _ORPHANED: Final = ".orphaned"
 _LOCK_WAIT_S: Final = 10.0
 """Bounds the wait for another process that does the same, which takes a moment; another user could hold the lock."""
 _RETRY_S: Final = 0.001
+"""The pause in s between two attempts."""
 
 _log = logging.getLogger("pycrorm_async")
 

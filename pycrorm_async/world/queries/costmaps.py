@@ -33,6 +33,7 @@ if TYPE_CHECKING:
 Map = NDArray[np.float64]
 _TALLEST_M = 2.0  # boxes that begin above this height are above every robot
 _ROUNDING = 1e-9
+"""Tolerates the rounding of coordinates in cells."""
 
 
 class Costmap:

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from pycrorm_async.world.bullet import BulletWorld
 
 _NEAR_M, _FAR_M = 0.05, 60.0
+"""The distances in m between which the camera sees."""
 _SKY = (238.0, 241.0, 245.0)
 _FLOOR_LIGHT, _FLOOR_CONTRAST = 225.0, 0.35
 """The floor is a blue and white chessboard; as a pale grey one it does not outshine the objects."""

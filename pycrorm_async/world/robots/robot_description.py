@@ -176,6 +176,7 @@ class PR2Description(RobotDescription):
 
 
 FINGER_OPEN_RAD = 0.548
+"""The position in rad of each finger joint of an open gripper of the PR2."""
 _TURN_FREE = Bounds(-math.inf, math.inf)
 
 
