@@ -1,1 +1,1 @@
-"""This package implements the command `pycrorm`, one file per verb; results go to stdout, other output to stderr."""
+"""Implement the command `pycrorm`, one file for each verb; results go to stdout, other output to stderr."""

@@ -33,7 +33,7 @@ def plot(
     bins: Annotated[
         int | None,
         typer.Option(
-            min=1, max=200, help="Divide a numeric column into at most so many ranges; default: more for more rows."
+            min=1, max=200, help="Divide a numeric column into at most N ranges; default: more for more rows."
         ),
     ] = None,
     out: Annotated[Path, typer.Option("--out", metavar="FILE", help="The file to write: .png, .svg or .pdf.")] = Path(

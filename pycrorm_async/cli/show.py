@@ -79,7 +79,7 @@ def _show(episode: str, url: str, spool: Path | None, *, events: bool, full: boo
 
 
 def _provenance(summary: EpisodeSummary, *, full: bool) -> dict[str, str | None]:
-    """Return what the episode was recorded with, as far as it is known."""
+    """Return the plan, commit, world, settings and clock of the recording; None for each that is unknown."""
     digits_max = None if full else _DIGITS_MAX
     commit, source, clock = summary.git_commit, summary.plan_sha256, summary.clock_synchronized
     kept = "synchronized" if clock else "not synchronized"

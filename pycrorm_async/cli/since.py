@@ -30,7 +30,7 @@ def parse_since(text: str, now: datetime | None = None) -> datetime:
         moment = datetime.fromisoformat(text.strip())
     except (ValueError, OverflowError):
         raise CallerError(
-            f"{text!r} is no time: write 2026-11-23, '2026-11-23 14:30' (UTC), 2026-11-23T14:30+01:00,"
+            f"{text!r} is not a time: write 2026-11-23, '2026-11-23 14:30' (UTC), 2026-11-23T14:30+01:00,"
             " or an age such as 90min, 12h, 7d, 2w"
         ) from None
     return moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)

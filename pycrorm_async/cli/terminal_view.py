@@ -30,7 +30,7 @@ from pycrorm_async.store.stored import EpisodeRow
 _INTERVAL_S = 0.1
 """The pause in s between two pictures."""
 _SHARE = 4
-"""A picture of a long tree takes at most one of so many parts of the time."""
+"""Drawing takes at most one part in this many of the time, also for a long tree."""
 _HEAD_LINES = 6
 """The lines of the terminal that the tree leaves for the rest of the picture."""
 _LISTED_ENDED = 10
@@ -114,7 +114,7 @@ def _picture(moment: Moment, lines_max: int) -> RenderableType:
 
 
 def in_sight(nodes: Sequence[NodeThen], lines_max: int) -> list[NodeThen]:
-    """Return the nodes to draw on so many lines: those that run, then the newest others, each with all above it."""
+    """Return the nodes to draw on `lines_max` lines: the running ones, then the newest, each with all its parents."""
     by_id = {each.id: each for each in nodes}
     kept: set[int] = set()
     newest = sorted(nodes, key=lambda each: (each.status != "RUNNING", -each.sequence))

@@ -23,8 +23,8 @@ _STYLES = {"SUCCEEDED": "green", "RUNNING": "cyan", "LOST": "yellow", "CANCELLED
 def print_tree(nodes: Sequence[NodeSummary], *, events: bool = False, full: bool = False) -> None:
     """Print the nodes of one episode as a tree; `nodes` lists each parent before its children.
 
-    With `events` each line has the events of the node's start and end. An ellipsis marks each text that is cut; with
-    `full` none is.
+    With `events` each line has the events of the node's start and end. Long texts are cut and end in an ellipsis,
+    unless `full` is True.
     """
     root = tree_of(nodes, events=events, full=full)
     if root is not None:

@@ -1,1 +1,1 @@
-"""The events package defines event types, envelopes, ids and the codec, without I/O, clock or event loop."""
+"""Define event types, envelopes, ids and the codec, without I/O, clock or event loop."""

@@ -1,1 +1,1 @@
-"""Integrations record what other executives perform, through the package `recording`, and answer agents."""
+"""Record the plans of other executives through the package `recording`, and answer the questions of agents."""

@@ -39,7 +39,7 @@ except ImportError as missing:
     raise MissingExtra(f"the live page needs Starlette and uvicorn ({missing}): {install}") from None
 
 PORT = 8137
-"""The port if none was asked for, so that an address keeps its meaning."""
+"""The default port; it is fixed so that a bookmarked address stays valid."""
 _ALIVE_S = 2.0
 """The longest silence of a stream; a page that receives nothing for four times as long has lost the server."""
 _LIST_INTERVAL_S = 0.25

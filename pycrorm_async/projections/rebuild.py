@@ -245,7 +245,7 @@ class Rebuild:
                 await connection.commit()
 
     async def _show_if_complete(self) -> bool:
-        """Switch, unless so many events are missing that all writers would wait for them; return whether it did."""
+        """Switch, unless all writers would have to wait for too many missing events; return whether it did."""
         async with self._log.engine.begin() as connection:
             await dialect_of(connection).lock_log_changes(connection)
             # Every fold shares this row's lock while it writes, so no fold writes to the old tables from here on.

@@ -1,1 +1,1 @@
-"""Recall past situations: which remembered actions are most like this one, and how did they end?"""
+"""Recall past situations: find the remembered actions most like this one, and count how they ended."""

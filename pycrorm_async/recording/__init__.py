@@ -1,1 +1,1 @@
-"""Any executive writes episodes through this package, also our own plan layer."""
+"""Write the episodes of any executive, including those of our own plan layer."""

@@ -57,7 +57,7 @@ def _are_plain(joints: dict[Any, Any]) -> bool:
 
 
 class ArgumentReader:
-    """Copies what describes an object; what it has to leave out is counted in `missing`."""
+    """Copies the arguments that describe an object; counts in `missing` what it has to leave out."""
 
     def __init__(self, missing: MissingValues) -> None:
         self._missing = missing
@@ -94,7 +94,7 @@ class ArgumentReader:
         return clean_repr(text)
 
     def joints_of(self, joints: Mapping[str, float]) -> dict[str, float]:
-        """Copy joint positions; those that are no finite number are counted as missing."""
+        """Copy joint positions; those that are not finite numbers are counted as missing."""
         if not isinstance(joints, Mapping):
             self._missing.note("JointsMoved", "joints", f"they must be positions by name, not {clean_repr(joints)}")
             return {}

@@ -258,7 +258,7 @@ class RecordedNodes(EpisodeWriter[_Node]):
         self._ended.clear()
 
     def change_tags(self, added: Sequence[str], removed: Sequence[str]) -> None:
-        """Write a change of the episode's tags, as `Memory.tag` asks for it. Raises as `EpisodeWriter` does."""
+        """Write a change of the episode's tags, for `Memory.tag`. Raises what `EpisodeWriter.change_tags` raises."""
         raised: list[BaseException] = []
 
         def change() -> None:

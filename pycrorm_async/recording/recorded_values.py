@@ -72,7 +72,7 @@ class RecordedValues:
         return encode_or_missing(self.converted(value), self._references)
 
     def converted(self, value: Any, *, as_object: bool = False, is_item: bool = False) -> Any:
-        """Return the value as the executive converts it; a `RefusedValue` with the reason for one that it cannot.
+        """Return the value as the executive converts it; a `RefusedValue` with the reason if it cannot convert it.
 
         With `as_object` the key of an object becomes a reference to its row.
         """

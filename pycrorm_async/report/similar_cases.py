@@ -77,7 +77,7 @@ class SimilarCases:
         return {"actions": len(cases), "pages": pages, "texts": [*texts.numbers], "nodes": nodes}
 
     def _actions_max(self, cases: int) -> int:
-        """Return how many actions of a page are compared in a memory with so many cases."""
+        """Return the number of actions of a page to compare, in a memory with this many cases."""
         bound = _COMPARED_MAX // max(cases, 1) // max(len(self._pages), 1)
         return min(ACTIONS_MAX, max(ACTIONS_MIN, bound))
 
@@ -98,7 +98,7 @@ class _Texts:
 
 
 def _cases_of(library: CaseLibrary, episode: int, starts: Collection[int]) -> list[tuple[Group, int]]:
-    """Return group and row of the cases of these nodes: what failed first, then by their start."""
+    """Return group and row of the cases of these nodes: the failed ones first, then by their start."""
     wanted = np.array([row_id(episode, each, SLOT_NODE) for each in starts], np.int64)
     entries: list[tuple[bool, int, Group, int]] = []
     for group in library.groups():

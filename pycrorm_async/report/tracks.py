@@ -42,7 +42,7 @@ class Track:
     def columns(self, points_max: int | None = None, *, after: int = 0) -> list[Any]:
         """Return the differences of the sequences, and the values, of the entries behind event `after`.
 
-        Of more than `points_max` entries evenly some are returned.
+        If there are more than `points_max` entries, it returns an evenly spaced selection.
         """
         begin = bisect_right(self.at, after)
         at, values = self.at[begin:], self.values[begin:]

@@ -59,7 +59,7 @@ class _Plan(NamedTuple):
 
 
 class Appending:
-    """One batch and its append; use it once. Without `digests` it stores none."""
+    """One batch and its append; use it once. Digests are stored only if `digests` is given."""
 
     def __init__(
         self,

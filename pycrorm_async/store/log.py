@@ -92,9 +92,9 @@ class EventLog:
     ) -> EventLog:
         """Open the log at a located address.
 
-        With `create` the log is writable, and is created or migrated if necessary. With `belongs_to`, the id of the
-        log that should be there, no log is created in an empty database, because a restore may be running. Without
-        `create` the log is read-only and nothing is written. `file_access` applies to a new SQLite file.
+        With `create` the log is writable, and is created or migrated if necessary; otherwise it is read-only and
+        nothing is written. `belongs_to` is the id of the expected log: if it is given, no log is created in an empty
+        database, because a restore may be running. `file_access` applies to a new SQLite file.
 
         Raises `DatabaseUnavailable` (no such database, or no connection to it) or `DatabaseForeign` (another program's
         or a newer version's).

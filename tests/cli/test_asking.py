@@ -79,7 +79,7 @@ def test_without_a_name_the_questions_are_listed_and_with_sql_the_statement(fold
             marks=pytest.mark.soak,
         ),
         pytest.param(
-            ["episodes", "--since", "yesterday"], "'yesterday' is no time: write 2026-11-23", marks=pytest.mark.soak
+            ["episodes", "--since", "yesterday"], "'yesterday' is not a time: write 2026-11-23", marks=pytest.mark.soak
         ),
         pytest.param(["moves_of"], "missing argument 'name'", marks=pytest.mark.soak),
         pytest.param(["experience_at", "--x", "1"], "missing option '--y'", marks=pytest.mark.soak),
@@ -192,10 +192,10 @@ def test_episodes_are_chosen_by_status_text_start_and_number(folder: Path) -> No
     assert numbers("--since", "1d") == []
     assert numbers("--robot", "pr2") == []
     assert "did you mean RUNNING?" in one_line_of(pycrorm("episodes", "--status", "runing", cwd=folder))
-    assert "is no time" in one_line_of(pycrorm("episodes", "--since", "monday", cwd=folder))
+    assert "is not a time" in one_line_of(pycrorm("episodes", "--since", "monday", cwd=folder))
 
 
 @pytest.mark.parametrize("text", ["", "7", "7 years", "2026-13-01", "9999999d", "999999w"])
 def test_an_impossible_start_is_refused(text: str) -> None:
-    with pytest.raises(CallerError, match="is no time"):
+    with pytest.raises(CallerError, match="is not a time"):
         parse_since(text)

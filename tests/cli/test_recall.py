@@ -118,7 +118,7 @@ WRONG: dict[str, tuple[list[str], dict[str, Any]]] = {
     "there is no episode '77'": ([GRIP], {"episode": "77"}),
     "belong to --follows": ([GRIP], {"reason": "IKError"}),
     "write EPISODE/EVENT": ([], {"like": "1"}),
-    "there is not a case of event 1 of episode 1": ([], {"like": "1/1"}),
+    "there is no case of event 1 of episode 1": ([], {"like": "1/1"}),
     "leave out the type and the features": ([GRIP], {"like": "1/e3"}),
     "--follows takes one type": ([GRIP, "arm=LEFT"], {"follows": True}),
     "arm is a text of 100,000 characters": ([GRIP, f"arm={'x' * 100_000}"], {}),

@@ -90,8 +90,8 @@ BAD: dict[str, tuple[dict[str, Any], type[Exception], str]] = {
     "naive": ({"before": datetime(2026, 1, 1)}, CallerError, "has no time zone"),  # noqa: DTZ001
     "no moment": ({"after": "yesterday"}, CallerError, "'yesterday' is not a moment"),
     "episode": ({"episode": 77}, UnknownEpisode, "there is no episode '77'"),
-    "node": ({"before": 2**40}, CallerError, "there is not a case of event 0 of episode 512"),
-    "negative node": ({"before": -1}, CallerError, "there is not a case of -1"),
+    "node": ({"before": 2**40}, CallerError, "there is no case of event 0 of episode 512"),
+    "negative node": ({"before": -1}, CallerError, "there is no case of -1"),
     "tag": ({"tag": "kitchn"}, CallerError, "no episode has the tag 'kitchn'; did you mean kitchen?"),
     "robot": ({"robot": "pr2"}, CallerError, "has a feature 'robot'"),
     "order": ({"before": "2026-01-01", "after": "2026-01-02"}, CallerError, "`before` is not later than `after`"),
@@ -149,7 +149,7 @@ async def test_from_a_case_one_gets_to_what_was_around_it(recall: Recall) -> Non
     assert await recall.related(parent, "during") == await recall.related(parent.node, Relation.DURING)
     moment = await second.moment()
     assert [node.dtype for node in moment.running if node.dtype is not None] == [FETCH, GRIP]
-    with pytest.raises(CallerError, match="'inside' is no relation; there are before, meets"):
+    with pytest.raises(CallerError, match="'inside' is not a relation: give one of before, meets"):
         await recall.related(parent, "inside")
 
 

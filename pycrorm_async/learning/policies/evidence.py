@@ -72,7 +72,7 @@ class Region:
 
 @dataclass(frozen=True)
 class Evidence:
-    """The conditions that a pick-up must meet; None leaves an attribute unrestricted.
+    """The conditions that a pick-up must fulfil; None leaves an attribute unrestricted.
 
     Attributes:
         arms, grasps: the allowed members.
@@ -99,7 +99,7 @@ class Evidence:
                 raise CallerError(f"evidence on height takes an interval (low, high) in m, got {self.height}")
 
     def __and__(self, other: Evidence) -> Evidence:
-        """Combine both conditions. Two disjoint heights give the empty region, which no pick-up meets."""
+        """Combine both conditions. Two disjoint heights give the empty region, which no pick-up fulfils."""
         region = other.region if self.region is None else self.region
         if self.region is not None and other.region is not None:
             region = self.region & other.region

@@ -197,10 +197,10 @@ class CustomTables:
         return changed
 
     async def fold_next_batch(self, *, now: bool, until_visible: bool = False) -> bool:
-        """Fold a batch of each; return False if none was behind. Without `now` it checks every `_CHECK_S` only.
+        """Fold a batch of each projection; return False if none was behind.
 
-        Those of this package are folded every `_CHECK_S` unless `until_visible` is true, because a batch of a few
-        events costs as much as one of a thousand.
+        Checks only every `_CHECK_S` unless `now` is True. The package's own projections are folded every `_CHECK_S`
+        unless `until_visible` is True, because a batch of a few events costs as much as one of a thousand.
         """
         time_s = asyncio.get_running_loop().time()
         if not self._folded or (not now and time_s < self._checked_s + _CHECK_S):

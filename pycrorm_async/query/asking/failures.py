@@ -142,9 +142,9 @@ def steps_before_failures(
 def _ended_before(node_id: Any, episode: Any, sequence: Any) -> Any:
     """Return the last action or motion before this node that had ended when the event of this sequence happened.
 
-    It reads nodes backwards by their ids, and ends at a node of another episode, which the caller leaves out. To look
-    in one episode alone would be a condition that few nodes meet. PostgreSQL, where it has no statistics, takes it for
-    so rarely met that it would read and sort all nodes of the episode for each failure.
+    It reads nodes backwards by their ids, and ends at a node of another episode, which the caller leaves out. A
+    condition on the episode would be slow: without statistics PostgreSQL estimates that few nodes fulfil it, and reads
+    and sorts all nodes of the episode for each failure.
     """
     earlier = aliased(TaskTreeNode)
     is_step = and_(earlier.kind.in_(("action", "motion")), earlier.end_sequence < sequence)

@@ -27,7 +27,10 @@ EpisodeNumber: TypeAlias = "int | ColumnElement[int]"
 
 @dataclass(frozen=True)
 class QuestionPlan:
-    """The parts of a question: its name, the episodes that it names, and the function that selects by their numbers."""
+    """The parts of a question: its name, the episodes it is about, and the function that makes its select.
+
+    `select_of` takes the numbers of the episodes, in their order.
+    """
 
     name: str
     episodes: tuple[AskedEpisode, ...]

@@ -41,7 +41,7 @@ def triangles_of(name: str, content: bytes) -> Triangles:
     try:
         corners = np.asarray(read(content), dtype=np.float64).reshape(-1, 3, 3).reshape(-1, 3)
     except (ValueError, IndexError, KeyError, ParseError, UnicodeDecodeError) as error:
-        raise ValueError(f"it is no readable {suffix} file: {error}") from error
+        raise ValueError(f"it is not a readable {suffix} file: {error}") from error
     if len(corners) == 0:
         raise ValueError("it has no triangles")
     if len(corners) > 3 * TRIANGLES_MAX:

@@ -63,7 +63,8 @@ def is_locked(path: Path) -> bool:
 def folder_lock(folder: Path) -> Iterator[None]:
     """Hold the lock of a folder: at most one thread of one process at a time is inside the `with` block.
 
-    For short operations only: after ten seconds of waiting raises `TimeoutError`. Raises other `OSError`.
+    Operations inside must be short, because others wait: after ten seconds they raise `TimeoutError`. Raises other
+    `OSError`.
     """
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:

@@ -1,1 +1,1 @@
-"""Record events in the queue of a living recorder."""
+"""Put events into the queue of a running recorder, and sync its files."""

@@ -195,7 +195,7 @@ def _is_enough(count: int, cases: int) -> bool:
 
 
 def _level_of(cases: int) -> int:
-    """Return the greatest level whose blocks have at least so many cases.
+    """Return the level of a block with this many cases.
 
     >>> [_level_of(cases) for cases in (1, 15, 16, 4_095, 4_096, 65_535, 65_536, 131_071)]
     [0, 0, 1, 2, 3, 3, 4, 4]

@@ -1,1 +1,1 @@
-"""Recall from a memory: keep its cases at hand, and ask for those most like a cue, a case or the present."""
+"""Recall from a memory: keep its cases in this process, and search those most like a cue, a case or the present."""

@@ -109,7 +109,7 @@ class Recall:
             before, after: it started before this moment, or before this case; at or after it, or after its end.
             during: it started and ended in this interval, or during this case in the same episode.
             as_of: the answer at this moment: it had ended by then.
-            prohibit: cases that are no answer, as the one that is asked about.
+            prohibit: cases that are left out, such as the one that the cue describes.
             episode, robot, tag: it belongs to this episode or one of these; the robot's name; the episode has the tag.
             simulated: simulations are included.
             k: the number of actions, 1 to 10,000.
@@ -218,12 +218,12 @@ class Recall:
         return (await self._reader.sequences()).parent(await self.case(case))
 
     async def related(self, case: AnyCase, relation: Relation | str) -> list[Case]:
-        """Return the actions of its episode that lie in a relation of Allen to it, as `"during"`, by their start."""
+        """Return the actions of the case's episode that have this relation of Allen to it, ordered by their start."""
         try:
             wanted = Relation(relation)
         except ValueError:
             names = ", ".join(each.value for each in Relation)
-            raise CallerError(f"{relation!r} is no relation; there are {names}") from None
+            raise CallerError(f"{relation!r} is not a relation: give one of {names}") from None
         return (await self._reader.sequences()).related(await self.case(case), wanted)
 
     async def moment(self, case: AnyCase) -> Moment:

@@ -1,1 +1,1 @@
-"""This package converts parameter values to event values, shortens long ones and marks missing ones."""
+"""Convert parameter values to event values: shorten long ones and mark missing ones."""

@@ -42,7 +42,7 @@ def check_arguments(*, description: object, plan: object, seed: object, strict: 
 def read_labels(tags: Iterable[str], metadata: object, emitter: Emitter) -> Labels:
     """Check tags and copy metadata. A value that cannot be recorded is null, and counted as missing.
 
-    Raises `CallerError` for tags that are no list of short texts, and for metadata without text keys.
+    Raises `CallerError` if the tags are not a list of short texts, and for metadata without text keys.
     """
     checked = checked_tags(tags)
     if not isinstance(metadata, Mapping) or not all(isinstance(key, str) for key in metadata):

@@ -263,7 +263,7 @@ def _wait_for_turn(connection: sqlite3.Connection, statement: str, patience_s: f
     """Execute a statement that needs the write lock, and poll until it is free.
 
     SQLite's own wait sleeps longer after each attempt: beside a process that folds all the time, appending took 10.5 µs
-    an event that way and 8.6 this way. For a change of the journal mode SQLite does not wait at all.
+    an event that way and 8.6 this way. SQLite does not wait at all before it changes the journal mode.
     """
     connection.execute("PRAGMA busy_timeout = 0")
     until_s = time.monotonic() + patience_s

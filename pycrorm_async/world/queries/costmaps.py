@@ -81,7 +81,7 @@ class Costmap:
         return list(islice(self.ranked(), count_max))
 
     def ranked(self, *, every: int = 1) -> Iterator[Pose]:
-        """Yield each middle, or one of `every` so many, in the order of `best`.
+        """Yield the middle of each cell, or of one cell in `every`, in the order of `best`.
 
         Poses are made one by one: those of a whole map take 0.3 s, and most searches end at an early one.
         """
@@ -214,7 +214,7 @@ def is_obstacle(box: BoundingBox) -> bool:
 
 
 def ignored_objects(world: BulletWorld, ignore: Iterable[Object] | None) -> set[Object]:
-    """Return the objects that are no obstacles; None means the robot and the objects it carries."""
+    """Return the objects to ignore as obstacles; None means the robot and the objects it carries."""
     if ignore is not None:
         return set(ignore)
     robot = acting_robot(world)
