@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from pycrorm_async.query.reading import Reading
     from pycrorm_async.query.recorded_designator import performable_of
     from pycrorm_async.query.recorded_world import world_of
+    from pycrorm_async.recording.writing.event_feed import RecordedEvent
     from pycrorm_async.settings import Settings
 
 __version__ = "0.1.0"
@@ -37,6 +38,7 @@ __all__ = [
     "Projection",
     "PycrormError",
     "Reading",
+    "RecordedEvent",
     "Settings",
     "UserView",
     "performable_of",
@@ -52,6 +54,7 @@ _MODULES = {
     "Projection": "projections.custom.projection",
     "PycrormError": "errors",
     "Reading": "query.reading",
+    "RecordedEvent": "recording.writing.event_feed",
     "Settings": "settings",
     "UserView": "projections.schema.user_views",
     "performable_of": "query.recorded_designator",

@@ -13,10 +13,9 @@ from pathlib import Path
 
 import pytest
 
-from pycrorm_async import Memory
+from pycrorm_async import Memory, RecordedEvent
 from pycrorm_async.events.types import EpisodeEnded, EpisodeStarted, NodeEnded, NodeStarted, ObjectAdded
 from pycrorm_async.plan import ActionAbstract, PlanFailure
-from pycrorm_async.recording.writing.event_feed import RecordedEvent
 from pycrorm_async.world import BulletWorld, Object, ObjectType
 from tests.databases import ask
 

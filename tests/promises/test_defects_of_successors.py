@@ -21,7 +21,7 @@ import pytest
 from sqlalchemy import select
 
 import pycrorm_async
-from pycrorm_async import Reading, performable_of, world_of
+from pycrorm_async import Reading, RecordedEvent, performable_of, world_of
 from pycrorm_async.events.types import NodeEnded, NodeStarted
 from pycrorm_async.orm import Designator, NavigateAction
 from pycrorm_async.orm import Object as ObjectRow
@@ -37,7 +37,6 @@ from pycrorm_async.plan import (
 from pycrorm_async.plan import MoveTorsoAction as MoveTorso
 from pycrorm_async.plan import NavigateAction as Navigate
 from pycrorm_async.query.recorded_designator import NotPerformable
-from pycrorm_async.recording.writing.event_feed import RecordedEvent
 from pycrorm_async.world import Arms, BulletWorld, Grasp, Pose
 from tests.memory.note_actions import NoteActionPerformable
 from tests.promises.chronicle import joints_of_bullet, numbers
