@@ -1,13 +1,15 @@
-"""A user's program type-checks strictly against the installed package, and its mistakes are reported."""
+"""A user's program type-checks strictly against the wheel of the package, and its mistakes are reported."""
 
 from __future__ import annotations
 
 import os
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import pytest
+from hatchling.builders.wheel import WheelBuilder
 
 from tests.commands import environment
 
@@ -18,17 +20,23 @@ PROGRAM = """\
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from pathlib import Path
 from typing import assert_type
 
 from sqlalchemy import select
 from sqlalchemy.orm import Mapped, selectinload
 
-from pycrorm_async import Memory, MemoryStatus, Projection, Reading, Settings, UserView
+from pycrorm_async import Memory, MemoryStatus, Projection, Reading, RecordedEvent, Settings, UserView
+from pycrorm_async import performable_of, world_of
+from pycrorm_async.events.types import NodeEnded
 from pycrorm_async.orm import AccessingMotion, Action, FaceAtAction, GraspingAction, Monitor
 from pycrorm_async.orm import MoveAndPickUpAction, MoveMotion, NavigateAction, Object as ObjectRow, OpeningMotion
 from pycrorm_async.orm import PickUpAction, PlaceAction, Pose, ProcessMetaData, RootFailure, TaskTreeNode
-from pycrorm_async.plan import TaskStatus
+from pycrorm_async.plan import Designator, TaskStatus
 from pycrorm_async.plan import ActionAbstract, NavigateAction as Navigate, PlanFailure, simulated_robot
+from pycrorm_async.projections.custom.projection import Changes, Event
+from pycrorm_async.testing.contracts import check_designator, check_executive, check_projection
+from pycrorm_async.testing.fake_clock import FakeClock
 from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose as WorldPose
 
 
@@ -153,23 +161,99 @@ async def main() -> Sequence[Action]:
 class Rate(Projection):
     name = "rate"
     version = 1
+
+    def fold(self, event: Event, rows: Changes) -> None:
+        assert_type(event.dtype, str | None)
+        rows.insert("rate", event.id, status="RUNNING")
+
+
+def watch(event: RecordedEvent) -> None:
+    assert_type(event.dtype, str | None)
+    if isinstance(event.happening, NodeEnded):
+        assert_type(event.happening.node, int)
+
+
+async def watched(memory: Memory) -> None:
+    with memory.subscribe(watch) as subscription:
+        assert_type(subscription.left_out, int)
+    async for event in memory.events():
+        assert_type(event, RecordedEvent)
+
+
+async def asked(memory: Memory, row: PickUpAction) -> None:
+    print(await memory.ask.root_failures(object="milk", episode="last"))
+    answer = await memory.recall(PickUpAction, near={"height": 0.5})
+    assert_type(answer[0].score, float)
+    assert_type(len(answer), int)
+    then = await memory.as_of("last", sequence=115)
+    assert_type(then.world.object("milk").pose, WorldPose)
+    with world_of(then) as recorded:
+        assert_type(recorded.object("milk"), Object)
+        assert_type(performable_of(row, grasp=Grasp.TOP), Designator)
+
+
+def walk() -> None:
+    with Memory.sync("sqlite:///memory.db") as memory:
+        drive = memory.recording.type("action", "NavigateAction", {"target_location": WorldPose, "speed": float})
+        with memory.recording.episode(description="a walk", metadata={"executive": "mine"}) as episode:
+            episode.start("go", drive, {"target_location": WorldPose([1, 0, 0]), "speed": 0.5}, robot="base")
+            episode.end("go", "FAILED", "the left wheel slipped")
+        assert_type(memory.status, MemoryStatus)
+
+
+async def checked(memory: Memory, folder: Path) -> None:
+    await check_designator(GreetActionPerformable("Ada"), folder)
+    assert_type(await check_executive(lambda recording: recording.episode().close(), folder), list[TaskTreeNode])
+    rows = await check_projection(Rate(), plan, folder)
+    print(rows["rate"][0]["id"], FakeClock().clock.wall_ns() + 1)
 """
+SETTINGS = """\
+[mypy]
+strict = true
+[mypy-IPython.*,matplotlib.*,PIL.*,rich.*]
+follow_imports = skip
+"""
+"""The user has not installed what draws pictures, which takes mypy longer to read than the package's own modules."""
+
+
+def installed(folder: Path) -> Path:
+    """Unpack the wheel of the package here, as pip does, and return the folder that imports find it in."""
+    [wheel] = WheelBuilder(str(ROOT)).build(directory=str(folder), versions=["standard"])
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(folder / "site")
+    assert (folder / "site" / "pycrorm_async" / "py.typed").exists()  # else an editable installation could be read
+    return folder / "site"
 
 
 def test_a_users_program_is_typed_and_its_mistakes_are_reported(tmp_path: Path) -> None:
     """One call checks both programs, outside the package's folder, because each would read all of SQLAlchemy."""
-    wrong = PROGRAM.replace('GreetActionPerformable("Ada")', "GreetActionPerformable(1)")
-    wrong = wrong.replace("Settings(sync_interval_ms=10)", 'Settings(sync_interval_ms="ten")')
-    wrong = wrong.replace("assert_type(arms, Sequence[Arms])", "assert_type(arms, Sequence[str])")
+    mistakes = {
+        'GreetActionPerformable("Ada") +': "GreetActionPerformable(1) +",
+        "Settings(sync_interval_ms=10)": 'Settings(sync_interval_ms="ten")',
+        "await memory.flush()": "await memory.flsh()",
+        "assert_type(arms, Sequence[Arms])": "assert_type(arms, Sequence[str])",
+        "memory.subscribe(watch)": "memory.subscribe(walk)",
+        "performable_of(row, ": 'performable_of("PickUpAction", ',
+        'episode.end("go", "FAILED"': 'episode.end("go", "BROKEN"',
+    }
+    wrong = PROGRAM
+    for correct, mistake in mistakes.items():
+        assert wrong.count(correct) == 1
+        wrong = wrong.replace(correct, mistake)
     (tmp_path / "right.py").write_text(PROGRAM)
-    (tmp_path / "wrong.py").write_text(wrong.replace("await memory.flush()", "await memory.flsh()"))
-    command = [sys.executable, "-m", "mypy", "--strict", "--cache-dir", os.devnull, "right.py", "wrong.py"]
-    done = subprocess.run(command, cwd=tmp_path, env=environment(), capture_output=True, text=True, check=False)
+    (tmp_path / "wrong.py").write_text(wrong)
+    (tmp_path / "mypy.ini").write_text(SETTINGS)
+    command = [sys.executable, "-m", "mypy", "--cache-dir", os.devnull, "right.py", "wrong.py"]
+    found = environment() | {"PYTHONPATH": str(installed(tmp_path))}
+    done = subprocess.run(command, cwd=tmp_path, env=found, capture_output=True, text=True, check=False)
     *errors, summary = done.stdout.splitlines()
-    assert [(line.partition(":")[0], line.rpartition("[")[2]) for line in errors] == [
+    assert [(line.partition(":")[0], line.rpartition("[")[2]) for line in errors if ": error: " in line] == [
         ("wrong.py", "arg-type]"),
         ("wrong.py", "arg-type]"),
         ("wrong.py", "attr-defined]"),
         ("wrong.py", "assert-type]"),
-    ]
-    assert summary == "Found 4 errors in 1 file (checked 2 source files)"
+        ("wrong.py", "arg-type]"),
+        ("wrong.py", "arg-type]"),
+        ("wrong.py", "arg-type]"),
+    ], done.stdout
+    assert summary == "Found 7 errors in 1 file (checked 2 source files)"
