@@ -39,11 +39,11 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from pycrorm_async.export.export import Exported, FileFormat, Remade
+    from pycrorm_async.export.export import ExportComparison, Exported, FileFormat
     from pycrorm_async.export.lerobot.images import ImageSize
     from pycrorm_async.export.lerobot.states import Clock
     from pycrorm_async.export.selection import Exportable
-    from pycrorm_async.query.scene.picture import When
+    from pycrorm_async.query.scene.picture import MomentReference
     from pycrorm_async.query.success.figure import Kind
     from pycrorm_async.query.success.samples import Source
 
@@ -202,7 +202,7 @@ class ReadableMemory(PartsHolder):
         reading = self._open_parts.reading
         return await write_report(reading, episode, path, force=force, first=first, last=last)
 
-    async def picture(self, episode: AnyEpisode, *, at: When = None, **view: Any) -> bytes:
+    async def picture(self, episode: AnyEpisode, *, at: MomentReference = None, **view: Any) -> bytes:
         """Return the scene of an episode at a moment as PNG, up to the last flush.
 
         >>> Path("scene.png").write_bytes(await memory.picture("last", at="e115"))
@@ -249,7 +249,7 @@ class ReadableMemory(PartsHolder):
         *,
         statement: Question | Select[*tuple[Any, ...]] | None = None,
         force: bool = False,
-    ) -> Remade:
+    ) -> ExportComparison:
         """Make an export again from its manifest and compare; see `pycrorm_async.export.export.export_again`."""
         from pycrorm_async.export.export import export_again
 

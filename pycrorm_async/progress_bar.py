@@ -9,20 +9,20 @@ from typing import Protocol
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-__all__ = ["stderr", "watched", "ProgressCallback"]
+__all__ = ["stderr", "progress_bar", "ProgressCallback"]
 
 stderr = Console(stderr=True, highlight=False, soft_wrap=True)
 """The only console for stderr, because rich redraws a bar below other output only if both use one console."""
 
 
 class ProgressCallback(Protocol):
-    """Reports the amount done and the total; `what` replaces the bar's description."""
+    """Gets the amount done, the total, and what is being done if it changes: a phase, or a result so far."""
 
-    def __call__(self, done: int, total: int, what: str | None = None) -> None: ...
+    def __call__(self, done: int, total: int, what: str | None = None, /) -> None: ...
 
 
 @contextmanager
-def watched(what: str, *, unit: str = "events") -> Iterator[ProgressCallback]:
+def progress_bar(what: str, *, unit: str = "events") -> Iterator[ProgressCallback]:
     """Show a bar inside the context; yields the callback that updates it."""
     bar = Progress(
         TextColumn("{task.description}"),

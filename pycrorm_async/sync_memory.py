@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
     from pycrorm_async.export.export import Exported
     from pycrorm_async.export.selection import Exportable
-    from pycrorm_async.query.scene.picture import When
+    from pycrorm_async.query.scene.picture import MomentReference
 
 __all__ = ["SyncMemory"]
 
@@ -169,7 +169,7 @@ class SyncMemory:
         """Return the task tree and the world at any moment of an episode; see `Memory.as_of`."""
         return self._await(self._memory.as_of(episode, time=time, sequence=sequence))
 
-    def picture(self, episode: AnyEpisode, *, at: When = None, **view: Any) -> bytes:
+    def picture(self, episode: AnyEpisode, *, at: MomentReference = None, **view: Any) -> bytes:
         """Return the scene of an episode at a moment as PNG; see `Memory.picture`."""
         return self._await(self._memory.picture(episode, at=at, **view))
 

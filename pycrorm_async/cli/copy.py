@@ -12,7 +12,7 @@ from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption
 from pycrorm_async.cli.output import print_json, print_table, problem
 from pycrorm_async.cli.pending_events import note_pending_events
 from pycrorm_async.operations.copy import CopySummary, copy_episodes
-from pycrorm_async.progress_bar import watched
+from pycrorm_async.progress_bar import progress_bar
 
 
 def copy(
@@ -57,5 +57,5 @@ def copy(
 
 
 async def _copy(source: str, target: str, episodes: list[str]) -> CopySummary:
-    with watched("copying") as report_progress:
-        return await copy_episodes(source, target, episodes=episodes, watch=report_progress)
+    with progress_bar("copying") as report_progress:
+        return await copy_episodes(source, target, episodes=episodes, report_progress=report_progress)

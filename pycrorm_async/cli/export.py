@@ -16,9 +16,9 @@ from pycrorm_async.cli.output import counted, note, print_json, print_line
 from pycrorm_async.cli.pending_events import note_pending_events
 from pycrorm_async.cli.since import parse_since
 from pycrorm_async.errors import CallerError
-from pycrorm_async.export.export import Exported, Remade, export_again
+from pycrorm_async.export.export import ExportComparison, Exported, export_again
 from pycrorm_async.export.export import export as write_export
-from pycrorm_async.progress_bar import ProgressCallback, stderr, watched
+from pycrorm_async.progress_bar import ProgressCallback, progress_bar, stderr
 from pycrorm_async.query.asking.ask import QUESTIONS, Ask
 from pycrorm_async.query.reading import Reading
 
@@ -86,15 +86,15 @@ def export(
     options["images"] = _size(images)
     options["arguments"] = _arguments(what[0], arguments or [])
 
-    async def write(progress: ProgressCallback | None) -> Exported:
+    async def write(report_progress: ProgressCallback | None) -> Exported:
         async with Reading.open(url) as reading:
             return await write_export(
-                reading, what, target, episodes=episode or (), force=force, progress=progress, **options
+                reading, what, target, episodes=episode or (), force=force, report_progress=report_progress, **options
             )
 
     interrupt_on_termination()
-    with watched("exporting", unit="rows") as progress:
-        exported = asyncio.run(write(progress if stderr.is_terminal else None))
+    with progress_bar("exporting", unit="rows") as report_progress:
+        exported = asyncio.run(write(report_progress if stderr.is_terminal else None))
     note_pending_events(url, spool)
     _print(exported, as_json=as_json)
     return 0
@@ -127,21 +127,22 @@ def _arguments(question: str, pairs: list[str]) -> dict[str, Any]:
 
 
 def _again(manifest: Path, out: Path | None, url: str, spool: Path | None, *, force: bool, as_json: bool) -> int:
-    async def write(progress: ProgressCallback | None) -> Remade:
+    async def write(report_progress: ProgressCallback | None) -> ExportComparison:
         async with Reading.open(url) as reading:
-            return await export_again(reading, manifest, out, force=force, progress=progress)
+            return await export_again(reading, manifest, out, force=force, report_progress=report_progress)
 
     interrupt_on_termination()
-    with watched("exporting", unit="rows") as progress:
-        remade = asyncio.run(write(progress if stderr.is_terminal else None))
+    with progress_bar("exporting", unit="rows") as report_progress:
+        comparison = asyncio.run(write(report_progress if stderr.is_terminal else None))
     note_pending_events(url, spool)
     if as_json:
-        print_json({"same": remade.same, "differences": remade.differences, "file": remade.exported and out})
+        file = comparison.exported and out
+        print_json({"same": comparison.same, "differences": comparison.differences, "file": file})
     else:
-        print_line("the same bytes" if remade.same else "not the same")
-        for each in remade.differences:
+        print_line("the same bytes" if comparison.same else "not the same")
+        for each in comparison.differences:
             print_line(f"  {each}")
-    return 0 if remade.same else 1
+    return 0 if comparison.same else 1
 
 
 def _print(exported: Exported, *, as_json: bool) -> None:

@@ -28,7 +28,7 @@ from pycrorm_async.learning.rollouts.kitchen_trial import KITCHEN, KitchenResult
 from pycrorm_async.learning.rollouts.rollout_pool import MemoryLocation
 from pycrorm_async.learning.rollouts.rollouts import Tally
 from pycrorm_async.learning.rollouts.scene import Scene
-from pycrorm_async.progress_bar import watched
+from pycrorm_async.progress_bar import progress_bar
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.world.bullet_loader import engine
 from pycrorm_async.world.robots.robot_description import Limits
@@ -99,7 +99,7 @@ def learn(
         resume=resume,
     )
     place = MemoryLocation(url, spool)
-    with watched("rollouts", unit="rollouts") as bar:
+    with progress_bar("rollouts", unit="rollouts") as bar:
 
         def report_progress(name: str, done: int, total: int, tally: Tally) -> None:
             rate = f" ({tally.success_rate:.1%} succeed)" if tally.rollouts else ""

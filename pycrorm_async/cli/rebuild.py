@@ -14,7 +14,7 @@ from pycrorm_async.cli.output import counted, note, print_json, stdout
 from pycrorm_async.cli.pending_events import note_pending_events
 from pycrorm_async.errors import CallerError
 from pycrorm_async.operations.rebuild import RebuildSummary, projections_of, rebuild_memory, rebuild_projection
-from pycrorm_async.progress_bar import watched
+from pycrorm_async.progress_bar import progress_bar
 from pycrorm_async.projections.custom.discovery import installed_projections, load_projections
 from pycrorm_async.projections.custom.packed_projection import PackedProjection
 from pycrorm_async.projections.custom.projection import Projection
@@ -97,11 +97,7 @@ async def _choose(url: str, names: list[str], projections: Mapping[str, Projecti
 
 
 async def _rebuild(url: str, workers: int | None, projection: Projection | None) -> RebuildSummary:
-    with watched("rebuilding") as advance:
-
-        def report_progress(phase: str, done: int, total: int) -> None:
-            advance(done, total, phase)
-
+    with progress_bar("rebuilding") as report_progress:
         if projection is not None:
             return await rebuild_projection(url, projection, report_progress=report_progress)
         return await rebuild_memory(url, workers=workers, report_progress=report_progress)

@@ -17,7 +17,7 @@ from pycrorm_async.cli.output import counted, note, print_json, stdout
 from pycrorm_async.cli.pending_events import note_pending_events
 from pycrorm_async.errors import CallerError
 from pycrorm_async.operations.destination import shared_address
-from pycrorm_async.progress_bar import watched
+from pycrorm_async.progress_bar import progress_bar
 from pycrorm_async.projections.custom.discovery import installed_projections, load_projections
 from pycrorm_async.projections.custom.projection import Projection
 from pycrorm_async.projections.verify.digest_check import OutsideDigest
@@ -102,7 +102,7 @@ async def _verify(
     log = await EventLog.open(shared_address(url), create=False)
     try:
         only = None if episode is None else await episode_named(log, episode)
-        with watched("verifying") as report_progress:
+        with progress_bar("verifying") as report_progress:
             result = await verify_log(
                 log, episode=only, projections=projections, digests=digests, report_progress=report_progress
             )

@@ -51,7 +51,7 @@ async def write_lerobot(
     episodes: Sequence[CoveredEpisode],
     folder: Path,
     options: EpisodeOptions,
-    progress: ProgressCallback | None,
+    report_progress: ProgressCallback | None,
 ) -> int:
     """Write the episodes into an empty folder; return the number of frames.
 
@@ -68,8 +68,8 @@ async def write_lerobot(
             pictures = np.stack(await draw_frames(reading, episode, frames, options.images))
         await run_to_completion(asyncio.to_thread(dataset.add, episode, frames, pictures))
         done += each.events
-        if progress is not None:
-            progress(done, total)
+        if report_progress is not None:
+            report_progress(done, total)
     await run_to_completion(asyncio.to_thread(dataset.finish))
     return dataset.frames
 

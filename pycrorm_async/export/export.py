@@ -64,7 +64,7 @@ class Exported(NamedTuple):
     manifest: Manifest
 
 
-class Remade(NamedTuple):
+class ExportComparison(NamedTuple):
     """An export that was made again: whether its files have the same bytes, and one line for each other difference."""
 
     same: bool
@@ -97,7 +97,7 @@ async def export(
     clock: Clock | None = None,
     fps: int | None = None,
     images: ImageSize | None = None,
-    progress: ProgressCallback | None = None,
+    report_progress: ProgressCallback | None = None,
 ) -> Exported:
     """Write rows or episodes to a file that has its name only when it is complete, and its manifest beside it.
 
@@ -114,7 +114,7 @@ async def export(
             frames each second (`time`). Of MCAP: the wall time of the events (`time`, the default), or `fps` events in
             each second (`event`).
         images: of LeRobot: width and height of a picture of the scene at each frame, which needs the extra `world`.
-        progress: gets the number of rows, or events, done and of all.
+        report_progress: gets the number of rows, or events, done and of all.
 
     Raises `CallerError` if the file exists, if nothing has this name, or for a running episode; `UnknownEpisode`;
     `MissingExtra`; `OSError` if the disk is full, and then leaves no file.
@@ -132,12 +132,12 @@ async def export(
                 selection = await select_rows(reading, what, episodes, arguments=arguments)
                 left_out = selection.left_out
                 with new_file(target, force=force) as written:
-                    manifest = await _write_rows(reading, selection, written, chosen, progress)
+                    manifest = await _write_rows(reading, selection, written, chosen, report_progress)
                     manifest = _complete(manifest, {target.name: checksums(written)[written.name]}, described)
             case "lerobot":
                 covered = await _episodes(reading, what, episodes, chosen)
                 with new_folder(target, force=force, marker=MARKER) as written:
-                    frames = await write_lerobot(reading, covered, written, options, progress)
+                    frames = await write_lerobot(reading, covered, written, options, report_progress)
                     manifest = await _described(reading, covered, chosen, options, frames)
                     manifest = _complete(manifest, checksums(written), described)
             case "rrd" | "mcap":
@@ -156,8 +156,8 @@ async def export_again(
     *,
     statement: Question | Select[*tuple[Any, ...]] | None = None,
     force: bool = False,
-    progress: ProgressCallback | None = None,
-) -> Remade:
+    report_progress: ProgressCallback | None = None,
+) -> ExportComparison:
     """Make an export again from the episodes that its manifest names, and compare.
 
     Args:
@@ -178,7 +178,7 @@ async def export_again(
     }
     differences = episode_differences(before.episodes, present)
     if any(each.id not in present for each in before.episodes):
-        return Remade(same=False, differences=tuple(differences), exported=None)
+        return ExportComparison(same=False, differences=tuple(differences), exported=None)
     what, episodes = _named_by(before, statement)
     with tempfile.TemporaryDirectory(prefix="pycrorm-export-") as folder:
         target = Path(path) if path is not None else Path(folder, "export")
@@ -190,7 +190,7 @@ async def export_again(
             file_format=file_format,
             episodes=episodes,
             force=force,
-            progress=progress,
+            report_progress=report_progress,
             **before.options,
         )
     now = exported.manifest
@@ -203,7 +203,7 @@ async def export_again(
     same = [*before.files.values()] == [*now.files.values()]
     if before.file_format == "rrd":  # whose chunks have random ids
         same = not differences
-    return Remade(same, tuple(differences), exported if path is not None else None)
+    return ExportComparison(same, tuple(differences), exported if path is not None else None)
 
 
 def _named_by(
@@ -231,13 +231,13 @@ def _changes(what: str, before: dict[str, str], now: dict[str, str]) -> list[str
 
 
 async def _write_rows(
-    reading: Reading, selection: Selection, path: Path, file_format: RowFormat, progress: ProgressCallback | None
+    reading: Reading, selection: Selection, path: Path, file_format: RowFormat, report_progress: ProgressCallback | None
 ) -> Manifest:
     log = await reading.log()
     columns = columns_of(selection.statement, deferred=True)
     plain = selection.statement.with_only_columns(*(each.expression for each in columns))
     total = 0
-    if progress is not None:
+    if report_progress is not None:
         counted = await reading.dataframe(
             select(func.count().label("rows")).select_from(plain.order_by(None).subquery()),
             to="arrow",
@@ -249,7 +249,7 @@ async def _write_rows(
     )
     async with aclosing(stream) as batches:
         json_columns = frozenset(each.name for each in columns if each.kind == "json")
-        rows, schema = await write_rows(batches, path, file_format, json_columns, _reporting(progress, total))
+        rows, schema = await write_rows(batches, path, file_format, json_columns, _reporting(report_progress, total))
     return Manifest(
         kind=selection.kind,
         names=(selection.name,) if selection.name else tuple(each.id for each in selection.episodes),
@@ -317,8 +317,8 @@ async def _described(
     )
 
 
-def _reporting(progress: ProgressCallback | None, total: int) -> Callable[[int], object]:
-    return lambda rows: progress(rows, total) if progress is not None else None
+def _reporting(report_progress: ProgressCallback | None, total: int) -> Callable[[int], object]:
+    return lambda rows: report_progress(rows, total) if report_progress is not None else None
 
 
 def _sql(statement: Select[*tuple[Any, ...]], dialect: Any) -> str:

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 from pycrorm_async.errors import MissingExtra
 from pycrorm_async.export.lerobot.states import Clock
-from pycrorm_async.export.recorded_episode import RecordedEpisode, When
+from pycrorm_async.export.recorded_episode import EventTime, RecordedEpisode
 from pycrorm_async.export.scene_frames import FrameChange, SceneObject, Shape, frame_changes
 
 _SECOND_NS = 10**9
@@ -26,7 +26,7 @@ _TOPICS = {"/tf": "FrameTransforms", "/scene": "SceneUpdate", "/plan": "Log"}
 class _Message(NamedTuple):
     """A message of a topic. `content` makes the message from its time stamp, which depends on the clock."""
 
-    when: When
+    when: EventTime
     topic: str
     content: Callable[[Any], Any]
 

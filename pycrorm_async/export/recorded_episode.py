@@ -29,7 +29,7 @@ from pycrorm_async.store.stored import StoredEvent
 _BASE = ("base.x", "base.y", "base.z", "base.qx", "base.qy", "base.qz", "base.qw")
 
 
-class When(NamedTuple):
+class EventTime(NamedTuple):
     """An event: its sequence, the ns since the episode's first event, and the wall time in ns."""
 
     sequence: int
@@ -40,7 +40,7 @@ class When(NamedTuple):
 class Change(NamedTuple):
     """A change of an object of the world: its new pose (position, orientation), new joint positions, or its removal."""
 
-    when: When
+    when: EventTime
     object: int
     pose: tuple[float, ...] | None
     joints: Mapping[str, float]
@@ -58,8 +58,8 @@ class ExportedNode:
     dtype: str
     label: str
     parameters: str
-    start: When
-    end: When | None = None
+    start: EventTime
+    end: EventTime | None = None
     status: str = "RUNNING"
     reason: str | None = None
     message: str | None = None
@@ -81,7 +81,7 @@ class RecordedEpisode:
     description: str = ""
     status: str = "RUNNING"
     started_wall_ns: int = 0
-    events: list[When] = field(default_factory=list)
+    events: list[EventTime] = field(default_factory=list)
     objects: dict[int, ObjectAdded] = field(default_factory=dict)
     changes: list[Change] = field(default_factory=list)
     nodes: list[ExportedNode] = field(default_factory=list)
@@ -118,7 +118,7 @@ class _EpisodeFold:
         happening = happening_of(event)
         if event.sequence == 1:
             self._begin_ns, self.episode.started_wall_ns = event.monotonic_ns, event.wall_ns
-        when = When(event.sequence, event.monotonic_ns - self._begin_ns, event.wall_ns)
+        when = EventTime(event.sequence, event.monotonic_ns - self._begin_ns, event.wall_ns)
         self.episode.events.append(when)
         match happening:
             case EpisodeStarted():
@@ -144,7 +144,7 @@ class _EpisodeFold:
 
     def _change(
         self,
-        when: When,
+        when: EventTime,
         identity: int,
         pose: tuple[float, ...] | None,
         joints: Mapping[str, float],
@@ -158,7 +158,7 @@ class _EpisodeFold:
             self._poses[identity] = pose
         self.episode.changes.append(Change(when, identity, pose, joints, removed, sampled))
 
-    def _sampled(self, when: When, sample: StateSampled) -> None:
+    def _sampled(self, when: EventTime, sample: StateSampled) -> None:
         """Apply a sample of the robot's state, which holds the channels that have changed."""
         identity, channels = sample.object.object, sample.channels
         before = self._poses.get(identity)
@@ -168,7 +168,7 @@ class _EpisodeFold:
         joints = {name: value for name, value in channels.items() if name not in _BASE}
         self._change(when, identity, pose, joints, sampled=True)
 
-    def _started(self, when: When, started: NodeStarted) -> None:
+    def _started(self, when: EventTime, started: NodeStarted) -> None:
         dtype = self._dtypes.get(started.designator or "", "") or started.kind
         names = [name for each in started.parameters.values() if (name := self._name_of(each)) is not None]
         named = {
@@ -193,7 +193,7 @@ class _EpisodeFold:
             return added.name
         return None
 
-    def _ended(self, when: When, ended: NodeEnded) -> None:
+    def _ended(self, when: EventTime, ended: NodeEnded) -> None:
         if (node := self._nodes.get(ended.node)) is None:
             raise CannotFold(f"node {ended.node} ends and never started")
         node.status = ended.status

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from pycrorm_async.errors import MissingExtra
-from pycrorm_async.export.recorded_episode import RecordedEpisode, When
+from pycrorm_async.export.recorded_episode import EventTime, RecordedEpisode
 from pycrorm_async.export.scene_frames import MAP, FrameChange, SceneObject, Shape, frame_changes
 
 _APPLICATION = "pycrorm"
@@ -65,16 +65,16 @@ def _part(frame: str) -> str:
     return "".join(each if each.isalnum() or each in "_-." else "_" for each in frame.rpartition("/")[2])
 
 
-def _indexes(rr: Any, whens: Sequence[When]) -> list[Any]:
+def _indexes(rr: Any, whens: Sequence[EventTime]) -> list[Any]:
     return [
         rr.TimeColumn("event", sequence=[each.sequence for each in whens]),
         rr.TimeColumn("time", duration=[each.since_ns / 1e9 for each in whens]),
     ]
 
 
-def _added(episode: RecordedEpisode) -> dict[int, When]:
+def _added(episode: RecordedEpisode) -> dict[int, EventTime]:
     """Return the event that added each object."""
-    added: dict[int, When] = {}
+    added: dict[int, EventTime] = {}
     for each in episode.changes:
         added.setdefault(each.object, each.when)
     return added
@@ -120,7 +120,7 @@ def _send_removals(
 
 def _send_plan(rr: Any, recording: Any, episode: RecordedEpisode) -> int:
     """Send a line for each start and end of a node; return their number."""
-    lines: list[tuple[When, str, str]] = []
+    lines: list[tuple[EventTime, str, str]] = []
     for node in episode.nodes:
         lines.append((node.start, "INFO", f"{node.dtype} started {node.parameters}".rstrip()))
         if node.end is not None:

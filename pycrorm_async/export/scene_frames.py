@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from pycrorm_async.events.codec import description_of
-from pycrorm_async.export.recorded_episode import Change, RecordedEpisode, When
+from pycrorm_async.export.recorded_episode import Change, EventTime, RecordedEpisode
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.scene.link_frames import Frame, joint_frame, link_frames, placed
 from pycrorm_async.query.scene.object_model import assumed_model, object_model, point_model
@@ -27,7 +27,7 @@ _GREY = (0.6, 0.6, 0.6, 1.0)
 class FrameChange(NamedTuple):
     """A frame has a new pose in its parent: translation (m) and quaternion xyzw."""
 
-    when: When
+    when: EventTime
     parent: str
     child: str
     translation: tuple[float, float, float]

@@ -8,12 +8,13 @@ and row ids belong to a database, so the target assigns its own.
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Callable, Iterable, Sequence
+from collections.abc import AsyncIterator, Iterable, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain
 from operator import attrgetter
+from typing import TYPE_CHECKING
 
 import msgspec
 
@@ -31,6 +32,9 @@ from pycrorm_async.store.episode_lookup import episode_named
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import EpisodeRow, StoredEvent
 from pycrorm_async.writer.retry import BRIEF, retry
+
+if TYPE_CHECKING:
+    from pycrorm_async.progress_bar import ProgressCallback
 
 
 @dataclass(frozen=True)
@@ -64,22 +68,19 @@ class CopySummary:
     episodes: tuple[EpisodeCopy, ...]
 
 
-def _unwatched(_done: int, _of: int) -> None: ...
-
-
 async def copy_episodes(
     source: str,
     target: str,
     *,
     episodes: Sequence[str] = (),
     settings: Settings | None = None,
-    watch: Callable[[int, int], None] = _unwatched,
+    report_progress: ProgressCallback = lambda _done, _total, _what=None: None,
 ) -> CopySummary:
     """Copy episodes, given by number in the source, id, first digits of the id or `last`; by default all of them.
 
-    Creates a missing target. Calls `watch` with the number of events done and their total. Damage to one episode does
-    not prevent copying the others. Raises `UnknownEpisode`, `CallerError` if both are the same memory, and as
-    `Memory.open` does; events copied until then stay.
+    Creates a missing target. Calls `report_progress` with the number of events done and their total. Damage to one
+    episode does not prevent copying the others. Raises `UnknownEpisode`, `CallerError` if both are the same memory, and
+    as `Memory.open` does; events copied until then stay.
     """
     source_address, target_address = shared_address(source), shared_address(target)
     log = await EventLog.open(source_address, create=False)
@@ -87,7 +88,7 @@ async def copy_episodes(
         chosen = {row.number: row for row in [await episode_named(log, each) for each in episodes]}
         rows = list(chosen.values()) if episodes else await log.episodes()
         async with _open_target(target_address, log) as (target_log, destination):
-            copier = _Copier(log, target_log, destination, settings or Settings(), watch)
+            copier = _Copier(log, target_log, destination, settings or Settings(), report_progress)
             done = await copier.copy(rows)
     finally:
         await log.close()
@@ -120,13 +121,13 @@ class _Copier:
         target: EventLog,
         destination: LogAndTables,
         settings: Settings,
-        watch: Callable[[int, int], None],
+        report_progress: ProgressCallback,
     ) -> None:
         self._source = source
         self._target = target
         self._destination = destination
         self._settings = settings
-        self._watch = watch
+        self._report_progress = report_progress
         self._done = self._of = 0
         self._batch: dict[EpisodeId, list[StoredEvent]] = {}
         self._batch_events = self._batch_bytes = 0
@@ -196,7 +197,7 @@ class _Copier:
 
     def _progress(self, count: int) -> None:
         self._done += count
-        self._watch(self._done, self._of)
+        self._report_progress(self._done, self._of)
 
     async def _append(self) -> None:
         batch, self._batch, self._batch_events, self._batch_bytes = self._batch, {}, 0, 0

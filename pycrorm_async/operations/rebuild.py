@@ -8,7 +8,7 @@ import multiprocessing
 import os
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from contextlib import suppress
-from typing import NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, NamedTuple
 
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
 from pycrorm_async.errors import DatabaseError
@@ -26,7 +26,8 @@ from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import BUSY_TIMEOUT_S, DatabaseAddress
 from pycrorm_async.store.log import EventLog
 
-ReportProgress: TypeAlias = Callable[[str, int, int], None]
+if TYPE_CHECKING:
+    from pycrorm_async.progress_bar import ProgressCallback
 
 _log = logging.getLogger("pycrorm_async")
 
@@ -66,7 +67,7 @@ async def rebuild_memory(
     *,
     workers: int | None = 1,
     views: Sequence[UserView] = (),
-    report_progress: ReportProgress = lambda _step, _done, _total: None,
+    report_progress: ProgressCallback = lambda _done, _total, _what=None: None,
     clock: Clock = SYSTEM_CLOCK,
 ) -> RebuildSummary:
     """Rebuild the tables of a memory from its log.
@@ -78,7 +79,7 @@ async def rebuild_memory(
             cores are idle, otherwise one. Workers are spawned, so a script must call this with more than one below
             `if __name__ == "__main__":`.
         views: named queries to create beside the tables, in addition to the registered ones.
-        report_progress: called with the current step, the number of events done and their total.
+        report_progress: called with the number of events done, their total and the current step.
         clock: the time source.
 
     Raises `DatabaseUnavailable`; `CallerError` if another rebuild of this memory is running. After an interruption or
@@ -91,7 +92,7 @@ async def rebuild_projection(
     url: str,
     projection: Projection,
     *,
-    report_progress: ReportProgress = lambda _step, _done, _total: None,
+    report_progress: ProgressCallback = lambda _done, _total, _what=None: None,
     clock: Clock = SYSTEM_CLOCK,
 ) -> RebuildSummary:
     """Rebuild the tables of one custom projection, as `rebuild_memory` does. Raises also `DatabaseForeign`."""
@@ -112,7 +113,7 @@ async def _run(
     url: str,
     begin: Callable[[EventLog], Awaitable[Rebuild]],
     workers: int | None,
-    report_progress: ReportProgress,
+    report_progress: ProgressCallback,
     clock: Clock,
 ) -> RebuildSummary:
     address = shared_address(url)
@@ -124,11 +125,11 @@ async def _run(
             await clear(log)
             rebuild = await begin(log)
             await _fold(log, url, rebuild, workers, report_progress)
-            report_progress("showing", 1, 1)
+            report_progress(1, 1, "showing")
             await rebuild.show()
             seconds = (clock.monotonic_ns() - began) / 1e9
             parked = await rebuild.parked()
-            report_progress("clearing up", 1, 1)
+            report_progress(1, 1, "clearing up")
             left = await clear(log)
         episodes, events = await recorded(log)
         ids = {each.number: each.id for each in await log.episodes()} if parked else {}
@@ -149,7 +150,7 @@ def _busy_timeout_s(address: DatabaseAddress) -> float:
 
 
 async def _fold(
-    log: EventLog, url: str, rebuild: Rebuild, workers: int | None, report_progress: ReportProgress
+    log: EventLog, url: str, rebuild: Rebuild, workers: int | None, report_progress: ProgressCallback
 ) -> None:
     _, total = await recorded(log)
     left = await rebuild.left()
@@ -161,7 +162,7 @@ async def _fold(
     def report(count: int) -> None:
         nonlocal done
         done += count
-        report_progress("rebuilding", done, max(total, done))
+        report_progress(done, max(total, done), "rebuilding")
 
     if workers > 1 and multiprocessing.current_process().daemon:
         _log.warning("a daemonic process of multiprocessing cannot start fold workers; it folds without them")

@@ -23,7 +23,7 @@ async def _united(log: EventLog) -> tuple[Union, list[bytes]]:
 async def contradictions(log: EventLog) -> list[str]:
     """Return a line for each declared field and type that contradicts an earlier one, with its name in the tables."""
     united, _ = await _united(log)
-    return [line for each in united.fitted.values() for line in each.lines]
+    return [line for each in united.adjustments.values() for line in each.lines]
 
 
 async def unmade_types(log: EventLog) -> dict[str, str]:

@@ -24,7 +24,7 @@ from pycrorm_async.query.success.interval import interval_95
 from pycrorm_async.recall.case import Case, is_angle
 from pycrorm_async.recall.cue import Cue
 from pycrorm_async.recall.library import CaseLibrary
-from pycrorm_async.recall.search import Found, Weights, search, weights_of
+from pycrorm_async.recall.search import Match, Weights, search, weights_of
 
 _TRIED = ("SUCCEEDED", "FAILED", "ERROR")
 """The statuses of an action that ran to its end. Of one that was cancelled, interrupted or lost nothing is known."""
@@ -97,12 +97,12 @@ class RecalledCase:
     """One case of an answer. It is read from the columns when it is asked for.
 
     Attributes:
-        found: its place in the columns, with its score.
+        match: its place in the columns, with its score.
         cue, weights: what it is compared with.
         memory: finds what happened around it; None for an answer of columns only.
     """
 
-    found: Found
+    match: Match
     cue: Cue
     weights: Weights
     memory: Surroundings | None = field(default=None, repr=False)
@@ -110,17 +110,17 @@ class RecalledCase:
     @property
     def score(self) -> float:
         """Its likeness to the cue, 0 to 1."""
-        return self.found.score
+        return self.match.score
 
     @cached_property
     def case(self) -> Case:
         """The action: its situation, its outcome, its place in the memory."""
-        return self.found.group.case(self.found.row)
+        return self.match.group.case(self.match.row)
 
     @property
     def node(self) -> int:
         """The id of its task-tree node."""
-        return self.found.node
+        return self.match.node
 
     @property
     def symbols(self) -> Mapping[str, str | tuple[str, ...]]:
@@ -241,12 +241,12 @@ class Answer(Sequence[RecalledCase]):
         """
         chosen = [each for each in self.cases if status in (None, each.case.status)]
         whole = math.fsum(each.score for each in chosen)
-        numbers = [(number, each.score) for each in chosen if isinstance(number := _found(each.case, feature), float)]
+        numbers = [(number, each.score) for each in chosen if isinstance(number := _value_of(each.case, feature), float)]
         if numbers:
             return _blended(numbers, whole, angle=is_angle(feature))
         words: dict[str, float] = {}
         for each in chosen:
-            value = _found(each.case, feature)
+            value = _value_of(each.case, feature)
             for word in (value,) if isinstance(value, str) else value if isinstance(value, tuple) else ():
                 words[word] = words.get(word, 0.0) + each.score
         if not words:
@@ -311,11 +311,11 @@ def compare(cue: Cue, case: Case, weights: Weights) -> tuple[Compared, ...]:
     words = [
         Compared(feature, wanted, value, None, None, float(_has(value, wanted)), weight / whole)
         for (feature, wanted), weight in zip(cue.has, weights.words, strict=True)
-        for value in [_found(case, feature)]
+        for value in [_value_of(case, feature)]
     ]
     numbers = []
     for wanted, tolerance in zip(cue.near, weights.tolerances, strict=True):
-        value = _found(case, wanted.feature)
+        value = _value_of(case, wanted.feature)
         difference, similarity = None, 0.0
         if isinstance(value, float):
             difference = abs(value - wanted.value)
@@ -354,7 +354,7 @@ def _blended(numbers: Sequence[tuple[float, float]], whole: float, *, angle: boo
     return Typical(mean, math.sqrt(variance), weight / whole)
 
 
-def _found(case: Case, feature: str) -> str | tuple[str, ...] | float | None:
+def _value_of(case: Case, feature: str) -> str | tuple[str, ...] | float | None:
     match feature:
         case "status":
             return case.status

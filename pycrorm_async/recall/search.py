@@ -76,8 +76,8 @@ class Weights(NamedTuple):
         return total or float(not self.pairs)
 
 
-class Found(NamedTuple):
-    """One case that was found, by its group and row; ordered as an answer is."""
+class Match(NamedTuple):
+    """A case that is like the cue, by its group and row; ordered as an answer is."""
 
     steps: int
     started_us: int
@@ -108,11 +108,11 @@ def weights_of(cue: Cue, library: CaseLibrary) -> Weights:
     return Weights(cue.has, words, cases, tolerances, never_seen)
 
 
-def search(cue: Cue, library: CaseLibrary, weights: Weights) -> list[Found]:
+def search(cue: Cue, library: CaseLibrary, weights: Weights) -> list[Match]:
     """Return the `k` cases most like the cue, the best first."""
     lowest = max(round(cue.minimum * _STEPS), 1 if cue.has or cue.near else 0)
     limit = _bound(weights.reachable, weights.total)
-    best: list[Found] = []
+    best: list[Match] = []
     for group in library.groups(cue.type):
         newest = int(group.started_us[0]), int(group.nodes[0])
         if len(best) == cue.k and (limit, *newest) <= best[-1][:3]:
@@ -124,17 +124,16 @@ def search(cue: Cue, library: CaseLibrary, weights: Weights) -> list[Found]:
             last = best[-1] if len(best) == cue.k else None
             if last is not None and (bound, int(group.started_us[rows.start])) < last[:2]:
                 break
-            candidates = _found(group, rows, cue, weights, max(lowest, last.steps if last is not None else 0), bound)
-            best = (
-                heapq.nlargest(cue.k, [*best, *candidates], key=_order)
-                if best
-                else sorted(candidates, key=_order, reverse=True)
-            )
+            matches = _matches(group, rows, cue, weights, max(lowest, last.steps if last is not None else 0), bound)
+            if best:
+                best = heapq.nlargest(cue.k, [*best, *matches], key=_order)
+            else:
+                best = sorted(matches, key=_order, reverse=True)
     return best
 
 
-def _order(case: Found) -> tuple[int, int, int]:
-    return case[:3]
+def _order(match: Match) -> tuple[int, int, int]:
+    return match[:3]
 
 
 def _parts(group: Group, cue: Cue) -> Iterator[slice]:
@@ -145,7 +144,7 @@ def _parts(group: Group, cue: Cue) -> Iterator[slice]:
     return (rows for rows in (slice(first, middle), slice(middle, last)) if rows.start < rows.stop)
 
 
-def _found(group: Group, rows: slice, cue: Cue, weights: Weights, lowest: int, bound: int) -> list[Found]:
+def _matches(group: Group, rows: slice, cue: Cue, weights: Weights, lowest: int, bound: int) -> list[Match]:
     """Return the best `k` cases of these rows from a score on; none has a score above `bound`."""
     steps = np.rint(_similarity(group, rows, cue, weights) / weights.total * _STEPS).astype(np.int64)
     for condition in _conditions(group, rows, cue):
@@ -160,7 +159,7 @@ def _found(group: Group, rows: slice, cue: Cue, weights: Weights, lowest: int, b
             chosen = np.concatenate([above, equal[: cue.k - above.size]])
     places = rows.start + chosen
     columns = steps[chosen].tolist(), group.started_us[places].tolist(), group.nodes[places].tolist(), places.tolist()
-    return [Found(score, started, node, group, row) for score, started, node, row in zip(*columns, strict=True)]
+    return [Match(score, started, node, group, row) for score, started, node, row in zip(*columns, strict=True)]
 
 
 def _similarity(group: Group, rows: slice, cue: Cue, weights: Weights) -> NDArray[np.float64]:

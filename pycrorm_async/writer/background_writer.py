@@ -41,7 +41,7 @@ class WriterState(NamedTuple):
     adoption_errors: tuple[str, ...]
 
 
-class LiveWriter:
+class BackgroundWriter:
     """The writer of one memory. Runs in one loop, not in the plan's, because a plan may never suspend."""
 
     def __init__(
@@ -58,9 +58,7 @@ class LiveWriter:
         self._settings = settings
         self._randomness = randomness
         self._appended_events = asyncio.Event()
-        self._drain = Drain(
-            source, destination.append, settings=settings, on_append=lambda _: self._appended_events.set()
-        )
+        self._drain = Drain(source, destination.append, settings=settings, on_append=self._note_append)
         self._adopted: list[Drain] = []
         self._adoption_errors: list[str] = []
         self._not_adopted: list[str] = []
@@ -105,7 +103,7 @@ class LiveWriter:
         try:
             await patience.run(self._flush(position), name="pycrorm flush")
         except PatienceEnded:
-            reason = self._drain.state.away or self._fold_error or TOO_MANY_EVENTS
+            reason = self._drain.state.unavailable or self._fold_error or TOO_MANY_EVENTS
             raise FlushTimeout(patience.limit_s, reason) from None
 
     async def _flush(self, position: int) -> None:
@@ -153,14 +151,16 @@ class LiveWriter:
 
     async def _retry(self, operation: Callable[[], Awaitable[_T]]) -> _T:
         """Retry while the database is unavailable; the caller bounds the time."""
-        result = await retry(operation, backoff=PATIENT, on_away=self._note_away, randomness=self._randomness)
+        result = await retry(
+            operation, backoff=PATIENT, on_unavailable=self._mark_unavailable, randomness=self._randomness
+        )
         self._fold_error = None
         return result
 
     def _note_append(self, _: object) -> None:
         self._appended_events.set()
 
-    def _note_away(self, error: DatabaseUnavailable) -> None:
+    def _mark_unavailable(self, error: DatabaseUnavailable) -> None:
         self._fold_error = str(error)
 
     async def _fold_when_idle(self) -> None:

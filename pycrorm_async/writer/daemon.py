@@ -78,7 +78,7 @@ class Daemon:
         self._serving: dict[str, VisibilityTracker] = {}
         self._rests: dict[str, tuple[int, float]] = {}  # by name: number of attempts, time of the next one
         self._appended_events = asyncio.Event()
-        self._away: str | None = None
+        self._unavailable: str | None = None
         self._last_lines: dict[str, str] = {}  # by subject, the last line
         self._recorders = self._records = 0
 
@@ -170,8 +170,8 @@ class Daemon:
             self._report(f"recorder {name} " + ("appeared" if source.is_alive else "is dead: recovering its folder"))
         fault: str | None = None
         try:
-            if self._away is not None:
-                source.mark_unavailable(self._away)
+            if self._unavailable is not None:
+                source.mark_unavailable(self._unavailable)
             await tracker.run()
         except Exception as error:  # noqa: BLE001 - reported and retried; must not stop the other recorders
             fault = _one_line(error)
@@ -250,19 +250,19 @@ class Daemon:
     # --- reports --------------------------------------------------------------------------------------
 
     def _note_lost(self, reason: str) -> None:
-        self._away = reason
+        self._unavailable = reason
         self._report(f"the database is unavailable: {reason}; retrying")
         self._publish_availability()
 
     def _note_back(self, after_s: float) -> None:
-        self._away = None
+        self._unavailable = None
         self._report(f"the database is available again after {after_s:.1f} s")
         self._publish_availability()
 
     def _publish_availability(self) -> None:
         for tracker in self._serving.values():
             try:
-                tracker.source.mark_unavailable(self._away)
+                tracker.source.mark_unavailable(self._unavailable)
             except FilesError as error:
                 self._report(f"recorder {tracker.source.name}: {error}")
 

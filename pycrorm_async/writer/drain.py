@@ -39,7 +39,7 @@ class DrainState(NamedTuple):
         records: number of appended records, with those stored before, without refused ones.
         batches: number of appended batches.
         retries: number of attempts at which the database was unavailable.
-        away: why the database is unavailable at the moment; None if it is available.
+        unavailable: why the database is unavailable at the moment; None if it is available.
         last_error: the latest of these reasons.
         appended: position of the last appended record.
         acknowledged: position up to which the source may delete records.
@@ -50,7 +50,7 @@ class DrainState(NamedTuple):
     records: int = 0
     batches: int = 0
     retries: int = 0
-    away: str | None = None
+    unavailable: str | None = None
     last_error: str | None = None
     appended: int = 0
     acknowledged: int = 0
@@ -132,15 +132,15 @@ class Drain:
         refusals = await retry(
             lambda: run_to_completion(self._append_records(batch)),
             backoff=self._backoff,
-            on_away=self._note_away,
+            on_unavailable=self._mark_unavailable,
             randomness=self._randomness,
             sleep=self._sleep,
         )
-        self.state = self.state._replace(away=None)
+        self.state = self.state._replace(unavailable=None)
         return refusals
 
-    def _note_away(self, error: DatabaseUnavailable) -> None:
-        self.state = self.state._replace(retries=self.state.retries + 1, away=str(error), last_error=str(error))
+    def _mark_unavailable(self, error: DatabaseUnavailable) -> None:
+        self.state = self.state._replace(retries=self.state.retries + 1, unavailable=str(error), last_error=str(error))
 
     async def _safe_position(self, batch: Sequence[Record], refusals: Mapping[EpisodeId, str]) -> int:
         """Keep the refused records of a batch; return the position that may be acknowledged."""

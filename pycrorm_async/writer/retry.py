@@ -20,18 +20,18 @@ async def retry(
     operation: Callable[[], Awaitable[_T]],
     *,
     backoff: Backoff,
-    on_away: Callable[[DatabaseUnavailable], None] = lambda _: None,
+    on_unavailable: Callable[[DatabaseUnavailable], None] = lambda _: None,
     randomness: Callable[[], float] = random.random,
     sleep: Callable[[float], Awaitable[None]] = asyncio.sleep,
 ) -> _T:
-    """Return the operation's result. Calls `on_away` after each failed attempt; raises the error of the last one."""
+    """Return the operation's result. Calls `on_unavailable` after each failed attempt; raises the last one's error."""
     attempt = 0
     while True:
         try:
             return await operation()
         except DatabaseUnavailable as error:
             attempt += 1
-            on_away(error)
+            on_unavailable(error)
             pause_s = backoff.pause_s(attempt, randomness())
             if pause_s is None:
                 raise

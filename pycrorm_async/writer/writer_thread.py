@@ -1,7 +1,7 @@
 """Run the writer inside a plan's process, in a thread with its own loop, and call it from the plan's loop.
 
 **Theory of operation.** A task in the plan's loop would not run: a plan that waits for no real time awaits all the way
-down without ever suspending. So the thread runs its own loop with one `LiveWriter` and opens the database there,
+down without ever suspending. So the thread runs its own loop with one `BackgroundWriter` and opens the database there,
 because a connection belongs to a loop.
 
 The plan's loop and the thread share two futures. `_opened` gets the writer, or the error of opening; `_ended` gets the
@@ -26,7 +26,7 @@ from contextlib import AbstractAsyncContextManager, AsyncExitStack
 
 from pycrorm_async.errors import DatabaseUnavailable, FlushTimeout
 from pycrorm_async.settings import Settings
-from pycrorm_async.writer.background_writer import LiveWriter, WriterState
+from pycrorm_async.writer.background_writer import BackgroundWriter, WriterState
 from pycrorm_async.writer.patience import TOO_MANY_EVENTS, Patience
 from pycrorm_async.writer.ports import Destination, Source
 
@@ -57,7 +57,7 @@ class WriterThread:
         self._open_destination = open_destination
         self._adopt = adopt
         self._settings = settings
-        self._opened: Future[LiveWriter] = Future()
+        self._opened: Future[BackgroundWriter] = Future()
         self._ended: Future[None] = Future()
         self._loop: asyncio.AbstractEventLoop | None = None
         self._work: asyncio.Task[None] | None = None
@@ -79,7 +79,7 @@ class WriterThread:
             raise
 
     async def flush(self, position: int) -> None:
-        """Wait until the records up to this position are stored and visible in the tables; see `LiveWriter.flush`.
+        """Wait until the records up to this position are stored and visible; see `BackgroundWriter.flush`.
 
         During `close` a flush ends with the outcome of `close`.
         """
@@ -94,7 +94,7 @@ class WriterThread:
                 raise
             raise self._timeout_error() from None
 
-    def _begin_flush(self, writer: LiveWriter, position: int) -> Future[None] | None:
+    def _begin_flush(self, writer: BackgroundWriter, position: int) -> Future[None] | None:
         """Start a flush in the thread's loop, which waits for it before it ends; None if the loop is ending."""
         with self._accepting:
             if self._flushes is None:
@@ -140,7 +140,7 @@ class WriterThread:
         return Patience(self._settings.flush_timeout_s, progress=lambda: writer.progress)
 
     def _timeout_error(self) -> FlushTimeout:
-        reason = self.state.queue.away or TOO_MANY_EVENTS
+        reason = self.state.queue.unavailable or TOO_MANY_EVENTS
         return FlushTimeout(self._settings.flush_timeout_s, f"closed with work left: {reason}")
 
     def _request_stop(self, *, cancel: bool) -> None:
@@ -174,7 +174,7 @@ class WriterThread:
         self._stop = asyncio.Event()
         async with AsyncExitStack() as stack:
             destination = await self._open(stack)
-            writer = LiveWriter(self._source, destination, adopt=self._adopt, settings=self._settings)
+            writer = BackgroundWriter(self._source, destination, adopt=self._adopt, settings=self._settings)
             self._opened.set_result(writer)
             try:
                 # A failed writer waits for the request to stop, so that every flush raises its error.

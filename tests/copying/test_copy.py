@@ -208,7 +208,7 @@ async def test_copies_run_beside_a_recorder_of_the_source_and_one_of_the_target(
 
 
 def copy_and_print(source: str, target: str) -> None:
-    asyncio.run(copy_episodes(source, target, settings=SMALL, watch=lambda done, _: print(done)))
+    asyncio.run(copy_episodes(source, target, settings=SMALL, report_progress=lambda done, *_: print(done)))
 
 
 async def test_a_copy_that_is_killed_and_repeated_is_complete(new_url: New, new_file: New) -> None:
@@ -288,13 +288,13 @@ async def test_other_bytes_that_arrive_during_the_copy_are_reported_and_the_othe
     other = [each._replace(monotonic_ns=4) for each in hand_written(2).records]
     progress_calls = 0
 
-    def append_other_bytes(_done: int, _of: int) -> None:  # events were read and are not appended yet
+    def append_other_bytes(*_: object) -> None:  # events were read and are not appended yet
         nonlocal progress_calls
         if progress_calls == 0:
             append_in_own_thread(target, other)
         progress_calls += 1
 
-    done = await copy_episodes(source, target, watch=append_other_bytes)
+    done = await copy_episodes(source, target, report_progress=append_other_bytes)
     assert [each.damage is None for each in done.episodes] == [True, False, True]
     assert done.episodes[1].damage is not None
     assert "another event is stored under this number" in done.episodes[1].damage
@@ -412,7 +412,7 @@ async def test_large_events_are_copied_in_small_batches(new_file: New) -> None:
     await append_and_fold(source, [*records, *run_of(episode(2), 1, 30)], folded=False)
     done: list[int] = []
     await copy_episodes(
-        source, target, settings=Settings(batch_bytes_max=2**20), watch=lambda count, _: done.append(count)
+        source, target, settings=Settings(batch_bytes_max=2**20), report_progress=lambda count, *_: done.append(count)
     )
     assert logs_of(target) == logs_of(source)
     assert done == [250, 500, 750, 1000, 1030]

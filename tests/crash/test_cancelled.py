@@ -27,7 +27,7 @@ from pycrorm_async.operations.recovery import recover
 from pycrorm_async.queue import Spool
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
-from pycrorm_async.writer.background_writer import LiveWriter
+from pycrorm_async.writer.background_writer import BackgroundWriter
 from pycrorm_async.writer.daemon import Daemon
 from pycrorm_async.writer.ports import ClaimedSource, ScanResult
 from tests.databases import ask
@@ -167,8 +167,8 @@ def opened(url: str, spool: Path) -> AbstractAsyncContextManager[LogAndTables]:
     return open_destination(DatabaseAddress.parse(url), Spool(spool), clock=SYSTEM_CLOCK)
 
 
-def writer_of(source: KeptSource, destination: LogAndTables) -> LiveWriter:
-    return LiveWriter(source, destination, adopt=list, settings=SETTINGS)
+def writer_of(source: KeptSource, destination: LogAndTables) -> BackgroundWriter:
+    return BackgroundWriter(source, destination, adopt=list, settings=SETTINGS)
 
 
 def kept_source(script: Script) -> KeptSource:

@@ -120,7 +120,7 @@ async def finished(experiment: Experiment, place: MemoryLocation) -> ExperimentR
     with experiment.scene.entered() as stage:
         action = MoveAndPickUp(stage.target, policy=default_policy())
         undisturbed = await batch_rollout(
-            action, experiment.rollouts, seed=experiment.seed, reset=stage.reset, tell=lambda _: None
+            action, experiment.rollouts, seed=experiment.seed, reset=stage.reset, report_progress=lambda _: None
         )
     assert learned.default.tally == undisturbed
     return learned

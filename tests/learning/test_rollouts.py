@@ -66,7 +66,7 @@ async def test_default_rollouts_succeed_as_often_as_in_the_thesis_and_never_from
         done[grasp] += tally.successes - before
         before = tally.successes
 
-    tally = await rolled_out(5_000, tell=look)
+    tally = await rolled_out(5_000, report_progress=look)
     assert 0.145 < tally.success_rate < 0.17
     assert tally.failures.keys() == {"IKError"}
     assert done[Grasp.TOP] == 0
@@ -82,20 +82,20 @@ async def test_within_hard_limits_twice_as_many_succeed() -> None:
 
 async def test_every_rollout_ends_as_geometry_and_inverse_kinematics_alone_predict() -> None:
     ends: list[int] = []
-    await rolled_out(400, seed=7, tell=lambda tally: ends.append(tally.successes))
+    await rolled_out(400, seed=7, report_progress=lambda tally: ends.append(tally.successes))
     expected = [succeeds(default_policy().sample(np.random.default_rng((7, index)))[0]) for index in range(400)]
     assert np.diff([0, *ends]).astype(bool).tolist() == expected
 
 
 async def test_seed_and_index_determine_a_rollout_in_any_batch_and_any_world() -> None:
     whole: list[int] = []
-    await rolled_out(120, tell=lambda tally: whole.append(tally.successes))
+    await rolled_out(120, report_progress=lambda tally: whole.append(tally.successes))
     pieces: list[int] = []
     for first, count in ((80, 40), (0, 30), (30, 50)):
         np.random.seed(first)  # without influence
         random.seed(first)
         ends: list[int] = []
-        await rolled_out(count, first=first, tell=lambda tally, ends=ends: ends.append(tally.successes))
+        await rolled_out(count, first=first, report_progress=lambda tally, ends=ends: ends.append(tally.successes))
         pieces[first:first] = np.diff([0, *ends]).tolist()
     assert pieces[30:110] != whole  # the order of the pieces is not that of the indexes
     in_order = [*pieces[0:30], *pieces[30:80], *pieces[80:120]]
@@ -179,7 +179,9 @@ async def test_each_rollout_can_be_an_episode_of_its_own(tmp_path: Path) -> None
 async def test_a_stop_request_ends_a_batch_before_the_next_rollout(tmp_path: Path) -> None:
     async with Memory.open(f"sqlite:///{tmp_path}/memory.db", settings=PATIENT) as memory:
         seen: list[int] = []
-        tally = await rolled_out(100, stop=lambda: len(seen) == 7, tell=lambda tally: seen.append(tally.rollouts))
+        tally = await rolled_out(
+            100, stop=lambda: len(seen) == 7, report_progress=lambda tally: seen.append(tally.rollouts)
+        )
         assert tally.rollouts == 7
         frame = await frame_of(memory)
         assert frame["index"].tolist() == list(range(7))

@@ -153,7 +153,7 @@ async def test_workers_that_are_killed_are_restarted_and_the_tables_are_the_same
     await append_and_fold(url, [*TYPES, *(record for records in episodes for record in records)])
     before, killed = tables_of(url), set[int]()
 
-    def kill_once(_step: str, _done: int, _total: int) -> None:
+    def kill_once(_done: int, _total: int, _what: str | None = None) -> None:
         if not killed:
             workers = [each for each in psutil.Process().children() if "spawn_main" in " ".join(each.cmdline())]
             killed.update(each.pid for each in workers)
@@ -289,7 +289,7 @@ async def test_an_interrupted_rebuild_is_continued(database_url: str, monkeypatc
     )
     before = tables_of(database_url)
 
-    def interrupted(what: str, done: int, total: int) -> None:
+    def interrupted(done: int, total: int, what: str | None = None) -> None:
         if done >= total // 2:
             raise EndedError
 
@@ -297,7 +297,7 @@ async def test_an_interrupted_rebuild_is_continued(database_url: str, monkeypatc
         await rebuild_memory(database_url, report_progress=interrupted)
     assert differences(before, tables_of(database_url)) == []
     progress: list[int] = []
-    done = await rebuild_memory(database_url, report_progress=lambda _what, done, _total: progress.append(done))
+    done = await rebuild_memory(database_url, report_progress=lambda done, *_: progress.append(done))
     assert progress[0] > 150
     assert done.generation == 1002
     assert differences(before, tables_of(database_url)) == []
@@ -465,9 +465,7 @@ async def test_a_foreign_table_in_the_schema_of_the_views_is_reported_in_one_lin
     ask_to_change(url, "CREATE TABLE memory.mine (a int)")
     for _ in range(2):
         with pytest.raises(DatabaseError, match=r"memory\.mine does not belong to the memory.*: move it to"):
-            await rebuild_memory(
-                url, report_progress=lambda _what, done, _total: pytest.fail(f"told after {done} events")
-            )
+            await rebuild_memory(url, report_progress=lambda done, *_: pytest.fail(f"told after {done} events"))
         assert ask(url, "SELECT count(*) FROM memory.mine") == [(0,)]
         assert traces(url) == []
     ask_to_change(url, "DROP TABLE memory.mine")

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from pycrorm_async.events.codec import encode
 from pycrorm_async.events.types import DesignatorTypeDeclared
 from pycrorm_async.projections.schema.layout import Layout
-from pycrorm_async.projections.schema.union import Fitted, unite
+from pycrorm_async.projections.schema.union import Adjustment, unite
 from tests.projections.event_script import declared, field, name_of
 
 pytestmark = pytest.mark.slow
@@ -40,7 +40,7 @@ def test_a_field_of_another_type_is_kept_under_its_type_and_the_others_under_the
         ("weight", "weight", 3),
     ]
     line = "NoteAction.text is declared as text and as integer; the integer is kept as text_integer"
-    assert united.fitted == {name_of(NUMBER): Fitted({"text_integer": "text"}, [line])}
+    assert united.adjustments == {name_of(NUMBER): Adjustment({"text_integer": "text"}, [line])}
 
 
 POSE = declared("NoteAction", "note_action", field("about", "pose", 2), field("text", "real", 3))
@@ -61,8 +61,8 @@ def test_one_by_one_in_any_order_gives_the_tables_of_all_at_once(seed: int) -> N
         layout = one_by_one.layout
     for united in (one_by_one, unite(Layout(), payloads)):
         assert united[:3] == (layout, one_by_one.accepted, {})
-        names = {name: each.own_names for name, each in united.fitted.items()}
-        assert names == {name: each.own_names for name, each in one_by_one.fitted.items()}
+        names = {name: each.own_names for name, each in united.adjustments.items()}
+        assert names == {name: each.own_names for name, each in one_by_one.adjustments.items()}
     assert set(one_by_one.accepted) == {name_of(each) for each in EVERY}
 
 
@@ -116,4 +116,4 @@ def test_the_later_declaration_gets_other_names(
 ) -> None:
     united = unite(Layout(), bytes_of(*types))
     assert united.layout.leaves == leaves
-    assert united.fitted[name_of(types[-1])].lines == [line]
+    assert united.adjustments[name_of(types[-1])].lines == [line]

@@ -152,7 +152,7 @@ async def test_a_rebuild_between_two_parts_is_no_fault(
         await rebuilt(other)
         await other.close()
 
-    def record_once(_done: int, _total: int) -> None:
+    def record_once(_done: int, _total: int, _what: str | None = None) -> None:
         nonlocal event
         event += 1
         if event in (2, 5, 6):
@@ -180,7 +180,7 @@ async def test_an_episode_that_grows_between_two_parts_is_no_fault(
         await projector.catch_up()
         await other.close()
 
-    def record_once(_done: int, _total: int) -> None:
+    def record_once(_done: int, _total: int, _what: str | None = None) -> None:
         nonlocal stored
         in_own_loop(record)
         stored += 6

@@ -15,7 +15,7 @@ from pycrorm_async.recall.blocks import Block, Group
 from pycrorm_async.recall.case import Case, bounded_case
 from pycrorm_async.recall.cue import Cue, Wanted
 from pycrorm_async.recall.library import CaseLibrary
-from pycrorm_async.recall.search import Found, Weights, search, weights_of
+from pycrorm_async.recall.search import Match, Weights, search, weights_of
 from tests.recall.random_cases import STATUSES, TYPES, WORDS, random_cases
 
 CASES = [bounded_case(case) for case in random_cases(400, seed=1)]
@@ -181,13 +181,13 @@ def test_a_word_that_no_case_has_cannot_hide_a_case_that_matches_all_else() -> N
 
 def test_a_common_cue_ends_in_the_newest_rows(monkeypatch: pytest.MonkeyPatch) -> None:
     compared = []
-    compare = searching._found
+    compare = searching._matches
 
-    def counted(group: Group, rows: slice, cue: Cue, weights: Weights, lowest: int, bound: int) -> list[Found]:
+    def counted(group: Group, rows: slice, cue: Cue, weights: Weights, lowest: int, bound: int) -> list[Match]:
         compared.append(rows)
         return compare(group, rows, cue, weights, lowest, bound)
 
-    monkeypatch.setattr(searching, "_found", counted)
+    monkeypatch.setattr(searching, "_matches", counted)
     cases = [Case(row_id(1, n, 0), n, "A", {"arm": "LEFT"}, {}, "FAILED") for n in range(1, 10_001)]
     library = CaseLibrary([Block.of(cases[:5_000]), Block.of(cases[5_000:])])
     assert len(found(Cue(type="A", has=(("arm", "LEFT"),), k=10), library)) == 10

@@ -91,7 +91,7 @@ async def test_a_database_on_a_full_disk_is_unavailable_and_stores_everything_on
     running = asyncio.create_task(drain.run())
     while drain.state.retries < 5:  # noqa: ASYNC110
         await asyncio.sleep(0.001)
-    assert "database or disk is full" in (drain.state.away or "")
+    assert "database or disk is full" in (drain.state.unavailable or "")
     assert 0 < len(source.kept) < 1000
     with pytest.raises(DatabaseUnavailable, match="full"):
         await log.append(records)

@@ -111,7 +111,8 @@ def verify_stored_once(direct_url: str, records: list[Record], drain: Drain, sou
     assert stored(direct_url) == expected(records)
     assert source.kept == []
     state = drain.state
-    assert (state.appended, state.acknowledged, state.refused, state.away) == (len(records), len(records), {}, None)
+    assert (state.appended, state.acknowledged) == (len(records), len(records))
+    assert (state.refused, state.unavailable) == ({}, None)
     assert "s3cr" not in (state.last_error or "")
     heads = ask(direct_url, "SELECT head FROM episode ORDER BY id")
     assert heads == [(sum(each.episode == episode(number) for each in records),) for number in (1, 2, 3)]
@@ -209,7 +210,7 @@ async def test_a_server_that_refuses_every_connection_is_unavailable_until_it_ac
         proxy.refuse()
         proxy.cut()
         await until(lambda: drain.state.retries >= 5)
-        assert drain.state.away is not None
+        assert drain.state.unavailable is not None
         proxy.refuse(refusing=False)
 
     drain, source = await drained(url_through_proxy(proxy, direct_url), records, refusing)
@@ -225,7 +226,7 @@ async def test_a_silent_connection_is_closed_and_the_batch_is_sent_through_anoth
     async def silent(drain: Drain) -> None:
         proxy.stall()
         await until(lambda: drain.state.retries >= 2)
-        assert drain.state.away is not None
+        assert drain.state.unavailable is not None
         proxy.reset()
         proxy.flow()
 
@@ -269,7 +270,7 @@ async def test_a_server_killed_repeatedly_under_load_stores_everything_once_in_t
             await until(lambda: drain.state.appended >= enough)  # noqa: B023  awaited at once
             await asyncio.sleep(rng.uniform(0, 0.02))
             await asyncio.to_thread(own_server.kill)
-            await until(lambda: drain.state.away is not None or drain.state.appended == len(records))
+            await until(lambda: drain.state.unavailable is not None or drain.state.appended == len(records))
             acknowledged = drain.state.acknowledged
             await asyncio.to_thread(own_server.start)
             # A batch that was acknowledged before the kill is in the database after the restart.

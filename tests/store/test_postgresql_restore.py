@@ -45,7 +45,7 @@ def run_tool(server: Server, tool: str, *arguments: str) -> None:
 
 def _unavailable(memory: Memory) -> str | None:
     writer = memory.status.writer
-    return None if writer is None else writer.queue.away
+    return None if writer is None else writer.queue.unavailable
 
 
 class Backup:
@@ -90,9 +90,9 @@ async def test_a_writer_waits_while_its_tables_are_dropped_and_restored_step_by_
             if sections:
                 await asyncio.to_thread(backup.restore, *sections)
             await until_refused_again(drain, times=3)
-            assert drain.state.away is not None
+            assert drain.state.unavailable is not None
         await asyncio.to_thread(backup.restore, "post-data")
-    assert drain.state.away is None
+    assert drain.state.unavailable is None
     assert ask(database_url, "SELECT id FROM pycrorm_log") == [(log.log_id,)]
     heads = ask(
         database_url, "SELECT head, (SELECT count(*) FROM event WHERE episode = number) FROM episode ORDER BY 1"

@@ -74,7 +74,7 @@ async def test_a_commit_whose_reply_is_lost_is_stored_once(log: EventLog) -> Non
     await drain.run()
     assert ask(log.address.path, STORED) == [(1, 25, 1, 25)]
     assert source.acknowledgements == [10, 20, 25]
-    assert (drain.state.retries, drain.state.records, drain.state.away) == (3, 25, None)
+    assert (drain.state.retries, drain.state.records, drain.state.unavailable) == (3, 25, None)
     assert drain.state.last_error == "the connection was closed before the reply came"
 
 
@@ -89,7 +89,7 @@ async def test_an_append_to_a_locked_database_is_retried_and_loses_nothing(
 
     async def sleep(pause_s: float) -> None:
         pauses_s.append(pause_s)
-        away.append(drain.state.away)
+        away.append(drain.state.unavailable)
         if len(pauses_s) == 3:
             assert source.acknowledgements == []
             holder.execute("ROLLBACK")

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pycrorm_async.errors import CallerError
-from pycrorm_async.export.recorded_episode import ExportedNode, RecordedEpisode, When
+from pycrorm_async.export.recorded_episode import EventTime, ExportedNode, RecordedEpisode
 
 Clock: TypeAlias = Literal["event", "time"]
 """The axis of the frames."""
@@ -41,7 +41,7 @@ class Frames(NamedTuple):
     robot: str
     channels: tuple[str, ...]
     states: NDArray[np.float32]
-    at: list[When]
+    at: list[EventTime]
     subtasks: list[str]
 
 
@@ -71,7 +71,7 @@ def frames_of(episode: RecordedEpisode, clock: Clock, fps: int) -> Frames:
 
 def _states(
     episode: RecordedEpisode, identity: int, channels: Sequence[str]
-) -> Iterator[tuple[When, tuple[float, ...]]]:
+) -> Iterator[tuple[EventTime, tuple[float, ...]]]:
     """Yield each event that changed the robot's state, and the state after it."""
     index = {name: position for position, name in enumerate(channels)}
     state = [0.0] * len(channels)
@@ -92,7 +92,7 @@ def _states(
             yield change.when, now
 
 
-def _events_with(episode: RecordedEpisode, identity: int) -> list[When]:
+def _events_with(episode: RecordedEpisode, identity: int) -> list[EventTime]:
     """Return the events from the one that added the robot to the last one before its removal."""
     removals = (each.when.sequence for each in episode.changes if each.removed and each.object == identity)
     removal = next(removals, None)
@@ -100,8 +100,8 @@ def _events_with(episode: RecordedEpisode, identity: int) -> list[When]:
 
 
 def _resampled(
-    episode: int, events: Sequence[When], changed: Sequence[tuple[When, tuple[float, ...]]], fps: int
-) -> Iterator[tuple[When, tuple[float, ...]]]:
+    episode: int, events: Sequence[EventTime], changed: Sequence[tuple[EventTime, tuple[float, ...]]], fps: int
+) -> Iterator[tuple[EventTime, tuple[float, ...]]]:
     """Yield the last event and the state in force at each multiple of 1 / fps, from the first event to the last."""
     begin_ns, end_ns = events[0].since_ns, events[-1].since_ns
     count = (end_ns - begin_ns) * fps // _SECOND_NS + 1
@@ -117,7 +117,7 @@ def _resampled(
         yield events[event]._replace(since_ns=since_ns), changed[state][1]
 
 
-def _subtasks(nodes: Sequence[ExportedNode], at: Sequence[When]) -> Iterator[str]:
+def _subtasks(nodes: Sequence[ExportedNode], at: Sequence[EventTime]) -> Iterator[str]:
     """Yield the label of the action that was running last at each of these events."""
     actions = [each for each in nodes if each.kind == "action"]
     running: list[tuple[int, ExportedNode]] = []  # the one that started last comes first

@@ -338,5 +338,5 @@ async def _run(pipe: Connection, job: Job, first: int, count: int, memory: Memor
             reset=stage.reset,
             each_in=memory if job.episode_each else None,
             stop=pipe.poll,  # during a run the parent sends nothing but `stop`
-            tell=report,
+            report_progress=report,
         )

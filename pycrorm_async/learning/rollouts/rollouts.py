@@ -25,7 +25,7 @@ from pycrorm_async.learning.rollouts.move_and_pick_up import MoveAndPickUp
 from pycrorm_async.plan.current_robot import require_world
 from pycrorm_async.plan.designator import ActionAbstract
 from pycrorm_async.plan.failures import PlanFailure
-from pycrorm_async.progress_bar import watched
+from pycrorm_async.progress_bar import progress_bar
 from pycrorm_async.query.success.interval import interval_95
 
 if TYPE_CHECKING:
@@ -77,7 +77,7 @@ async def batch_rollout(
     reset: Callable[[], None] | None = None,
     each_in: Memory | None = None,
     stop: Callable[[], bool] = lambda: False,
-    tell: Callable[[Tally], None] | None = None,
+    report_progress: Callable[[Tally], None] | None = None,
 ) -> Tally:
     """Perform `count` rollouts of the action, each with its own sample of the policy and from the same start.
 
@@ -89,7 +89,7 @@ async def batch_rollout(
         reset: restores the world after each rollout; None moves everything to its original pose with joints at 0.
         each_in: the memory in which each rollout becomes an episode of its own.
         stop: called before each rollout; True ends the batch.
-        tell: called with the results so far after each rollout; None shows a progress bar if stderr is a terminal.
+        report_progress: called with the results so far after each rollout; None shows a bar if stderr is a terminal.
 
     Raises `CallerError` for a count, index or seed below 0. A `PlanFailure` is counted as a failed rollout; any other
     exception ends the batch and is raised.
@@ -97,7 +97,7 @@ async def batch_rollout(
     if min(count, first, seed) < 0:
         raise CallerError(f"count, first and seed of rollouts must be >= 0, got {count}, {first} and {seed}")
     tally = Tally()
-    with _progress_bar(count) if tell is None else nullcontext(tell) as report:
+    with _bar(count) if report_progress is None else nullcontext(report_progress) as report:
         run = _Run(action, action.policy_here(), reset or require_world().reset, stop, tally, report)
         slices = ((index, 1) for index in range(first, first + count)) if each_in is not None else ((first, count),)
         for begin, length in slices:
@@ -113,9 +113,9 @@ async def batch_rollout(
 
 
 @contextmanager
-def _progress_bar(count: int) -> Iterator[Callable[[Tally], None]]:
-    with watched("rollouts", unit="rollouts") as watch:
-        yield lambda tally: watch(tally.rollouts, count, f"{tally.success_rate:.1%} succeed")
+def _bar(count: int) -> Iterator[Callable[[Tally], None]]:
+    with progress_bar("rollouts", unit="rollouts") as report_progress:
+        yield lambda tally: report_progress(tally.rollouts, count, f"{tally.success_rate:.1%} succeed")
 
 
 def _episode_of(memory: Memory | None, batch: BatchRolloutActionPerformable) -> AbstractAsyncContextManager[Any]:

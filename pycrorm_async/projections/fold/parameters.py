@@ -89,7 +89,7 @@ class Designators:
     @classmethod
     def of_union(cls, united: Union) -> Self:
         """Return the folds of these declarations."""
-        own_names = {name: each.own_names for name, each in united.fitted.items()}
+        own_names = {name: each.own_names for name, each in united.adjustments.items()}
         return cls(united.accepted, united.refused, own_names)
 
     def of(self, started: NodeStarted) -> DesignatorFold | None:

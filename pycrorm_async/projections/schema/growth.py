@@ -103,8 +103,8 @@ async def _grow(
 
 def _log_contradictions(united: Union, before: Layout) -> None:
     """Log the contradictions of those declarations that need a column or a table of their own now."""
-    for name, fitted in united.fitted.items():
+    for name, adjustment in united.adjustments.items():
         declared = united.accepted[name]
         columns = before.leaves.get(declared.table)
-        if columns is None or any(own not in columns for own in fitted.own_names):
-            _log.warning("; ".join(fitted.lines))
+        if columns is None or any(own not in columns for own in adjustment.own_names):
+            _log.warning("; ".join(adjustment.lines))

@@ -26,8 +26,8 @@ from pycrorm_async.projections.schema.core_columns import Storage
 from pycrorm_async.projections.schema.layout import STORED_AS, Contradiction, Layout, LayoutConflict
 
 
-class Fitted(NamedTuple):
-    """A declaration that contradicts others, fitted into the tables under names of its own.
+class Adjustment(NamedTuple):
+    """The names of its own under which a declaration that contradicts others is in the tables.
 
     Attributes:
         own_names: the names under which events have the values of renamed fields, by the fields' names in the tables.
@@ -44,20 +44,20 @@ class Union(NamedTuple):
     Attributes:
         accepted: those declarations by fingerprint, with the names that types and fields have in the tables.
         refused: the reasons of refusals, by fingerprint.
-        fitted: by fingerprint, how accepted declarations that contradict others are kept.
+        adjustments: by fingerprint, how accepted declarations that contradict others are kept.
     """
 
     layout: Layout
     accepted: dict[str, DesignatorTypeDeclared]
     refused: dict[str, str]
-    fitted: dict[str, Fitted]
+    adjustments: dict[str, Adjustment]
 
 
 def unite(layout: Layout, payloads: Sequence[bytes]) -> Union:
     """Add to the layout those of these declarations that can have tables."""
     accepted: dict[str, DesignatorTypeDeclared] = {}
     refused: dict[str, str] = {}
-    fitted: dict[str, Fitted] = {}
+    adjustments: dict[str, Adjustment] = {}
     for payload in payloads:
         name = fingerprint(payload)
         if name in layout.unmade:
@@ -68,19 +68,19 @@ def unite(layout: Layout, payloads: Sequence[bytes]) -> Union:
             try:
                 layout = layout.with_declaration(declared)
             except Contradiction as reason:
-                layout, declared, fitted[name] = _fit(layout, declared, reason)
+                layout, declared, adjustments[name] = _fit(layout, declared, reason)
             accepted[name] = declared
         except LayoutConflict as reason:
             refused[name] = str(reason)
         except (UnknownShape, msgspec.DecodeError) as error:  # from a newer version, or damaged
             refused[name] = f"this version cannot read the declaration of its type: {error}"
     unreadable = [fingerprint(each) for each in payloads if not _is_readable(each)]
-    return Union(layout.with_unreadable(unreadable) if unreadable else layout, accepted, refused, fitted)
+    return Union(layout.with_unreadable(unreadable) if unreadable else layout, accepted, refused, adjustments)
 
 
 def _fit(
     layout: Layout, declared: DesignatorTypeDeclared, reason: Contradiction
-) -> tuple[Layout, DesignatorTypeDeclared, Fitted]:
+) -> tuple[Layout, DesignatorTypeDeclared, Adjustment]:
     """Return the layout with a contradicting declaration under other names; raise the reason if none fit."""
     dtype = f"{declared.dtype}{declared.kind.title()}"
     candidates: tuple[tuple[dict[str, Any], list[str]], ...] = (
@@ -92,20 +92,21 @@ def _fit(
         ),
     )
     for changes, lines in candidates:
-        candidate, fitted = _with_other_fields(layout, msgspec.structs.replace(declared, **changes))
+        candidate, adjustment = _with_other_fields(layout, msgspec.structs.replace(declared, **changes))
         with suppress(LayoutConflict):
-            return layout.with_declaration(candidate), candidate, Fitted(fitted.own_names, lines + fitted.lines)
+            all_lines = lines + adjustment.lines
+            return layout.with_declaration(candidate), candidate, Adjustment(adjustment.own_names, all_lines)
     raise reason
 
 
-def _with_other_fields(layout: Layout, declared: DesignatorTypeDeclared) -> tuple[DesignatorTypeDeclared, Fitted]:
+def _with_other_fields(layout: Layout, declared: DesignatorTypeDeclared) -> tuple[DesignatorTypeDeclared, Adjustment]:
     """Rename the fields whose columns contradict those of the type.
 
     A field that fits under neither name is left out; `parameters` of the nodes has its values.
     """
     columns = layout.columns_beside(declared)
     fields = {each.slot: each for each in declared.fields if _fits(columns, each)}
-    fitted = Fitted({}, [])
+    adjustment = Adjustment({}, [])
     for field in declared.fields:
         if field.slot in fields:
             continue
@@ -118,12 +119,12 @@ def _with_other_fields(layout: Layout, declared: DesignatorTypeDeclared) -> tupl
             line = f"{declared.dtype} is declared with the column {column} and with {field.column}"
         if _fits(columns, renamed) and fault_in_fields([*fields.values(), renamed]) is None:
             fields[field.slot] = renamed
-            fitted.own_names[name] = field.name
-            fitted.lines.append(f"{line}; the {field.type} is kept as {name}")
+            adjustment.own_names[name] = field.name
+            adjustment.lines.append(f"{line}; the {field.type} is kept as {name}")
         else:
-            fitted.lines.append(f"{line}; the {field.type} has no column, because {name} is taken too")
+            adjustment.lines.append(f"{line}; the {field.type} has no column, because {name} is taken too")
     ordered = tuple(fields[each.slot] for each in declared.fields if each.slot in fields)
-    return msgspec.structs.replace(declared, fields=ordered), fitted
+    return msgspec.structs.replace(declared, fields=ordered), adjustment
 
 
 def _fits(columns: Mapping[str, tuple[str, Storage]], field: FieldDeclared) -> bool:

@@ -5,9 +5,10 @@ Writes nothing. Each part is read in one snapshot, so that recording and folding
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from itertools import groupby
 from operator import attrgetter
+from typing import TYPE_CHECKING
 
 from sqlalchemy import text
 from sqlalchemy.ext.asyncio import AsyncConnection
@@ -40,6 +41,9 @@ from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import EpisodeRow, Span, StoredEvent
 
+if TYPE_CHECKING:
+    from pycrorm_async.progress_bar import ProgressCallback
+
 _BY_PREFIX = "SELECT fingerprint FROM pycrorm_declaration WHERE substr(fingerprint, 1, 5)"
 _FINGERPRINTS = text(f"{_BY_PREFIX} <> '{DESCRIPTION_PREFIX}' ORDER BY ordinal")
 _DESCRIPTIONS = text(f"{_BY_PREFIX} = '{DESCRIPTION_PREFIX}'")
@@ -71,7 +75,7 @@ async def verify(
     episode: EpisodeRow | None = None,
     projections: Sequence[Projection] = (),
     digests: Iterable[OutsideDigest] = (),
-    report_progress: Callable[[int, int], None] = lambda _done, _total: None,
+    report_progress: ProgressCallback = lambda _done, _total, _what=None: None,
 ) -> VerifyResult:
     """Verify a whole memory, or one episode.
 
@@ -186,9 +190,7 @@ class _TablesCheck:
 
     missing_table = "a table is missing: run `pycrorm rebuild`"
 
-    def __init__(
-        self, log: EventLog, result: VerifyResult, total: int, report_progress: Callable[[int, int], None]
-    ) -> None:
+    def __init__(self, log: EventLog, result: VerifyResult, total: int, report_progress: ProgressCallback) -> None:
         self._log = log
         self._dialect = dialect_of(log.engine)
         self.result = result

@@ -30,7 +30,7 @@ from pycrorm_async.world.objects import Object
 from pycrorm_async.world.pose import Vector
 from pycrorm_async.world.queries.photograph import Camera, photograph
 
-When: TypeAlias = float | str | datetime | None
+MomentReference: TypeAlias = float | str | datetime | None
 """Seconds since the start, `e115` for an event, a wall clock's time; None: the moment before the world is emptied."""
 
 _PIXELS_MAX = 4_000_000
@@ -47,7 +47,7 @@ async def picture(
     reading: Reading,
     episode: AnyEpisode,
     *,
-    at: When = None,
+    at: MomentReference = None,
     width: int = 640,
     height: int = 480,
     yaw_deg: float | None = None,
@@ -88,7 +88,7 @@ async def picture(
     return await asyncio.to_thread(Context().run, _drawn, then, moved, (width, height), yaw_deg, pitch_deg)
 
 
-async def _moment(reading: Reading, episode: AnyEpisode, at: When) -> Moment:
+async def _moment(reading: Reading, episode: AnyEpisode, at: MomentReference) -> Moment:
     if isinstance(at, str):
         time, sequence = parse_moment(at)
         return await reading.as_of(episode, time=time, sequence=sequence, meshes=True)

@@ -29,7 +29,7 @@ from pycrorm_async.queue.files.spool import Spool
 from pycrorm_async.queue.live.capacity import Capacity
 from pycrorm_async.queue.live.notifier import Notifier
 from pycrorm_async.queue.live.queue_files import PROGRESS_INTERVAL_S, QueueFiles
-from pycrorm_async.queue.live.relocatable_appender import Relocated
+from pycrorm_async.queue.live.relocatable_appender import AppenderRelocated
 from pycrorm_async.queue.sources.own_source import OwnSource
 from pycrorm_async.settings import Settings
 
@@ -97,7 +97,7 @@ class RecorderQueue(QueueFiles):
         """
         try:
             return self._appender.put(heading, payload, reserved)
-        except Relocated:  # the queue moved while this thread waited for the lock
+        except AppenderRelocated:  # the queue moved while this thread waited for the lock
             return self.put_nowait(heading, payload, reserved=reserved)
 
     def put_blob(self, content: bytes) -> str:

@@ -31,7 +31,7 @@ _LATE_BYTES: Final = 2**16
 """Bounds the bytes carried while the lock is held and producers wait: half a millisecond of work."""
 
 
-class Relocated(InternalError):
+class AppenderRelocated(InternalError):
     """This appender has handed over to its successor. Never leaves the queue, which retries the put there."""
 
 
@@ -50,7 +50,7 @@ class RelocatableAppender(SyncableAppender):
     def hand_over(
         self, successor: RelocatableAppender, segment: Segment, offset: int, *, switch: Callable[[], None]
     ) -> bool:
-        """Carry the records behind `offset` of this segment, refuse later puts with `Relocated`, and call `switch`.
+        """Carry the records behind `offset` of this segment, refuse later puts (`AppenderRelocated`), call `switch`.
 
         Holds the lock, so producers see one step. Returns False without effect if too many bytes are left for that.
         Raises `SpoolUnavailable` if the mapping does not contain the records that were put.
@@ -96,7 +96,7 @@ class RelocatableAppender(SyncableAppender):
         successor.declarations = self.declarations
         if self._refusal is not None:
             successor.refuse(self._refusal)
-        self._refusal = lambda: Relocated("the queue has moved to another folder")
+        self._refusal = lambda: AppenderRelocated("the queue has moved to another folder")
         switch()
         return True
 

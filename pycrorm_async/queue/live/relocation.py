@@ -8,7 +8,7 @@ mapped. So the sync thread creates the folder of a new recorder, carries all rea
 1. The new folder has an unfinished name, which draining processes ignore.
 2. The records are carried segment by segment, with their positions, sequences and times. Meanwhile producers keep
    putting into the old mapping. The last records are carried under the lock of the old appender, which then refuses
-   puts with `Relocated`; a producer that meets it puts into the new appender.
+   puts with `AppenderRelocated`; a producer that meets it puts into the new appender.
 3. The carried records are synced, and the folder gets its name. If the old folder still exists, the next system call
    deletes its `alive`: only one of the two folders may be recovered, because recovery ends the open episodes.
 4. The rest of the old folder is deleted. The next sync appends the commit frame and acknowledges.

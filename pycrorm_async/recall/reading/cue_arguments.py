@@ -24,7 +24,7 @@ from pycrorm_async.store.episode_lookup import episode_named
 
 AnyCase: TypeAlias = "Case | RecalledCase | int"
 """A case, or the id of its task-tree node."""
-When: TypeAlias = "datetime | str | AnyCase"
+TimeReference: TypeAlias = "datetime | str | AnyCase"
 """A moment: an aware datetime, or a text in ISO 8601, UTC where it has no zone; or a case, for its start or its end."""
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _OF_EACH_CASE = frozenset({"object_name"})
@@ -34,10 +34,10 @@ _OF_EACH_CASE = frozenset({"object_name"})
 class Conditions(NamedTuple):
     """The conditions of a cue, as `Recall` takes them."""
 
-    before: When | None = None
-    after: When | None = None
-    during: AnyCase | tuple[When, When] | None = None
-    as_of: When | None = None
+    before: TimeReference | None = None
+    after: TimeReference | None = None
+    during: AnyCase | tuple[TimeReference, TimeReference] | None = None
+    as_of: TimeReference | None = None
     prohibit: Iterable[AnyCase] = ()
     only: Mapping[str, Any] | None = None
     episode: AnyEpisode | Iterable[AnyEpisode] | None = None
@@ -200,11 +200,11 @@ def case_of(case: AnyCase, library: CaseLibrary) -> Case:
     return stored
 
 
-def _start(when: When, library: CaseLibrary) -> int:
+def _start(when: TimeReference, library: CaseLibrary) -> int:
     return _moment_us(when) if isinstance(when, datetime | str) else case_of(when, library).started_us
 
 
-def _end(when: When, library: CaseLibrary) -> int:
+def _end(when: TimeReference, library: CaseLibrary) -> int:
     """Return the end of a case, rounded up; of a lost one, which has none, its start."""
     if isinstance(when, datetime | str):
         return _moment_us(when)
