@@ -14,7 +14,7 @@ While no worker of a daemon is ready the daemon folds itself, so a worker that c
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from importlib import import_module
 from typing import Final, Self
@@ -165,7 +165,8 @@ class FoldWorkerTables(Tables):
         workers = self._workers.ready
         if not workers:
             folded = await self._destination.fold_next_batch()
-            self._workers.want(folded)
+            if folded:
+                self._workers.want(events=1)
             return folded
         try:
             with self._destination.log.translated():
@@ -174,3 +175,9 @@ class FoldWorkerTables(Tables):
         except FoldWorkerLost:  # reported by the worker's task; the next call uses the other workers
             return True
         return self._has_news
+
+    async def behind(self) -> Mapping[str, int]:
+        return await self._destination.behind()
+
+    async def stopped(self) -> Mapping[str, str]:
+        return await self._destination.stopped()

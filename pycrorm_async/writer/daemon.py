@@ -239,8 +239,8 @@ class Daemon:
 
     async def _publish_visibility(self) -> None:
         before = [(each, each.appended) for each in self._serving.values()]
-        behind = await self._availability.observe(self._log.behind())
-        stopped = await self._availability.observe(self._log.stopped())
+        behind = await self._availability.observe(self._tables.behind())
+        stopped = await self._availability.observe(self._tables.stopped())
         for tracker, appended in before:
             try:
                 tracker.note(appended, behind, stopped)

@@ -68,14 +68,6 @@ class Log(Protocol):
         """Number of committed writing transactions; grows while the database makes progress."""
         return 0
 
-    async def behind(self) -> Mapping[str, int]:
-        """Return the folded sequence, by id, of each episode with events that are not visible yet."""
-        ...
-
-    async def stopped(self) -> Mapping[str, str]:
-        """Return the refused and parked episodes by id, with reasons, at a cost independent of the others."""
-        ...
-
 
 class Destination(Log, Protocol):
     """A log and the tables behind it, for a writer that folds to the end."""
@@ -87,12 +79,27 @@ class Destination(Log, Protocol):
         """
         ...
 
+    async def stopped(self) -> Mapping[str, str]:
+        """Return the refused and parked episodes by id, with reasons, at a cost independent of the others."""
+        ...
+
 
 class Tables(Protocol):
     """The tables behind a log, for a daemon that folds in steps while it appends."""
 
     async def fold_next_batch(self) -> bool:
-        """Fold one batch of events that are not visible yet; False if there was none. Raises as `fold` does."""
+        """Fold one batch of events that are not visible yet; False if there was none.
+
+        Parks an episode that it cannot fold. Raises `DatabaseUnavailable`; then the same call may be repeated.
+        """
+        ...
+
+    async def behind(self) -> Mapping[str, int]:
+        """Return the folded sequence, by id, of each episode with events that are not visible yet."""
+        ...
+
+    async def stopped(self) -> Mapping[str, str]:
+        """Return the refused and parked episodes, as `Destination.stopped` does."""
         ...
 
 

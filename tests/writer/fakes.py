@@ -126,9 +126,6 @@ class CountingFold(Destination):
                     assert await advance_folded(connection, [(row.number, row.folded, row.head) for row in behind])
         return sum(row.head - row.folded for row in behind)
 
-    async def behind(self) -> Mapping[str, int]:
-        return {row.id: row.folded for row in await self.log.behind()}
-
     async def stopped(self) -> Mapping[str, str]:
         return {row.id: row.refused or row.parked or "" for row in await self.log.stopped()}
 
@@ -147,9 +144,6 @@ class ForwardingDestination(Destination):
 
     async def fold(self) -> int:
         return await self._destination.fold()
-
-    async def behind(self) -> Mapping[str, int]:
-        return await self._destination.behind()
 
     async def stopped(self) -> Mapping[str, str]:
         return await self._destination.stopped()
