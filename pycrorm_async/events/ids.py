@@ -30,6 +30,7 @@ __all__ = [
     "episode_text",
     "parse_episode_id",
     "row_id",
+    "row_id_min",
     "row_key",
 ]
 
@@ -76,6 +77,11 @@ def row_id(number: int, sequence: int, slot: int) -> RowId:
     assert 0 <= sequence <= SEQUENCE_MAX, sequence
     assert 0 <= slot <= SLOT_MAX, slot
     return RowId(number << 31 | sequence << 5 | slot)
+
+
+def row_id_min(number: int, sequence: int = 0) -> int:
+    """Return the lowest id of the rows of an episode from an event on; as a bound, also behind the last episode."""
+    return number << 31 | sequence << 5
 
 
 def row_key(row: int) -> RowKey:

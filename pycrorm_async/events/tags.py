@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from typing import Final
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.codec import unwritable
 
-__all__ = ["changed_tags", "checked_tags"]
+__all__ = ["changed_tags", "checked_tags", "retagged"]
 
 _CHARACTERS_MAX: Final = 100
 """Bounds a tag, so that a list of tags fits into a line."""
@@ -42,9 +42,17 @@ def changed_tags(tags: Iterable[str], added: Iterable[str], removed: Iterable[st
     >>> changed_tags(("kitchen", "good"), ("night",), ("good",))
     ('kitchen', 'night')
     """
-    now = dict.fromkeys(tags)
+    now, removed = tuple(tags), tuple(removed)
     for tag in removed:
         if tag not in now:
             raise CallerError(f"the episode has no tag {tag!r}; its tags: {', '.join(now) or 'none'}")
-        del now[tag]
-    return tuple(now | dict.fromkeys(added))
+    return retagged(now, added, removed)
+
+
+def retagged(tags: Iterable[str], added: Iterable[str], removed: Collection[str]) -> tuple[str, ...]:
+    """Return the tags after a recorded change, as `changed_tags` does; ignore a removed tag that is not there.
+
+    >>> retagged(("kitchen", "good"), ("night",), ("good", "late"))
+    ('kitchen', 'night')
+    """
+    return tuple(dict.fromkeys([*(tag for tag in tags if tag not in removed), *added]))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.types import (
@@ -22,7 +22,7 @@ from pycrorm_async.export.selection import CoveredEpisode
 from pycrorm_async.projections.fold.column_values import CannotFold
 from pycrorm_async.projections.fold.fold import happening_of
 from pycrorm_async.query.as_of import unreadable
-from pycrorm_async.query.parameter_text import parameters_text
+from pycrorm_async.query.parameter_text import parameters_text, with_object_names
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.store.stored import StoredEvent
 
@@ -170,11 +170,8 @@ class _EpisodeFold:
 
     def _started(self, when: EventTime, started: NodeStarted) -> None:
         dtype = self._dtypes.get(started.designator or "", "") or started.kind
-        names = [name for each in started.parameters.values() if (name := self._name_of(each)) is not None]
-        named = {
-            name: {**each, "name": self._name_of(each)} if self._name_of(each) is not None else each
-            for name, each in started.parameters.items()
-        }
+        named = with_object_names(started.parameters, self._name_of)
+        names = [each["name"] for key, each in named.items() if each is not started.parameters[key]]
         node = ExportedNode(
             when.sequence,
             started.parent,
@@ -187,11 +184,9 @@ class _EpisodeFold:
         self._nodes[when.sequence] = node
         self.episode.nodes.append(node)
 
-    def _name_of(self, value: Any) -> str | None:
-        """Return the name of the object that a parameter refers to."""
-        if isinstance(value, dict) and (added := self.episode.objects.get(value.get("object", 0))) is not None:
-            return added.name
-        return None
+    def _name_of(self, reference: Mapping[str, int]) -> str | None:
+        added = self.episode.objects.get(reference["object"])
+        return added.name if added is not None else None
 
     def _ended(self, when: EventTime, ended: NodeEnded) -> None:
         if (node := self._nodes.get(ended.node)) is None:

@@ -11,7 +11,7 @@ from typing import Any
 
 from pycrorm_async.events.types import EpisodeEnded, EpisodeStarted, NodeEnded, NodeStarted, ObjectAdded
 from pycrorm_async.projections.fold.fold import happening_of
-from pycrorm_async.query.parameter_text import parameters_text
+from pycrorm_async.query.parameter_text import parameters_text, with_object_names
 from pycrorm_async.store.stored import EpisodeRow, StoredEvent
 
 _READ = frozenset({"EpisodeStarted", "EpisodeEnded", "NodeStarted", "NodeEnded", "ObjectAdded"})
@@ -67,7 +67,7 @@ class Activity:
             case NodeStarted() as started:
                 self._nodes += 1
                 dtype = designators.get(started.designator or "", "")
-                parameters = {name: self._named(each) for name, each in started.parameters.items()}
+                parameters = with_object_names(started.parameters, lambda each: self._names.get(each["object"]))
                 self._parents[event.sequence] = started.parent
                 if started.kind == "action":
                     self._actions.add(event.sequence)
@@ -100,11 +100,6 @@ class Activity:
         self._causes.discard(ended.node)
         if parent is not None:
             self._causes.add(parent)
-
-    def _named(self, value: Any) -> Any:
-        if isinstance(value, dict) and value.get("object") in self._names:
-            return {**value, "name": self._names[value["object"]]}
-        return value
 
     @property
     def now(self) -> list[str]:

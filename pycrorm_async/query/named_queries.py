@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 from typing import Any
@@ -15,6 +15,7 @@ from pycrorm_async.events.ids import SLOT_NODE, row_id, row_key
 from pycrorm_async.orm import Designator, EpisodeTag, Object, Observation, ProcessMetaData, TaskTreeNode
 from pycrorm_async.orm.base import same_row
 from pycrorm_async.query.asking.episode_list import EpisodeChoice
+from pycrorm_async.query.parameter_text import with_object_names
 from pycrorm_async.query.running_episodes import RobotSummary, robots_of
 from pycrorm_async.store.episode_lookup import number_named
 from pycrorm_async.task_status import TaskStatus
@@ -244,6 +245,9 @@ async def task_tree(connection: AsyncConnection, number: int) -> list[NodeSummar
     observations = dict(iter(await connection.execute(counted.group_by(Observation.node_id))))
     children: dict[int | None, list[NodeSummary]] = {}
     for row in await connection.execute(nodes_of(number)):
+        parameters = with_object_names(
+            row.parameters or {}, lambda each: names.get(row_id(number, each["row"], SLOT_NODE))
+        )
         children.setdefault(row.parent_id, []).append(
             NodeSummary(
                 id=row.id,
@@ -251,7 +255,7 @@ async def task_tree(connection: AsyncConnection, number: int) -> list[NodeSummar
                 depth=0,
                 dtype=row.dtype,
                 kind=row.kind,
-                parameters={name: _with_name(value, number, names) for name, value in (row.parameters or {}).items()},
+                parameters=parameters,
                 status=row.status.name if isinstance(row.status, TaskStatus) else row.status,
                 started_at=row.start_time,
                 duration_ns=None if row.end_ns is None else row.end_ns - row.start_ns,
@@ -288,13 +292,6 @@ def _depth_first(children: dict[int | None, list[NodeSummary]]) -> Iterator[Node
         node, depth = stack.pop()
         yield replace(node, depth=depth)
         stack.extend((child, depth + 1) for child in reversed(children.get(node.id, [])))
-
-
-def _with_name(value: Any, number: int, names: Mapping[int, str]) -> Any:
-    """Add the object's name to a reference to an object; return other values unchanged."""
-    if isinstance(value, dict) and value.keys() == {"object", "row"}:
-        return {**value, "name": names.get(row_id(number, value["row"], SLOT_NODE))}
-    return value
 
 
 def _nanoseconds(start: datetime, end: datetime | None) -> int | None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import msgspec
@@ -49,6 +49,24 @@ def _pose_text(pose: Mapping[str, Any]) -> str:
     position, orientation = (f"({', '.join(map(str, pose.get(part) or ()))})" for part in ("position", "orientation"))
     frame = f" in {pose['frame']}" if pose.get("frame", "map") != "map" else ""
     return f"{position} turned {orientation}{frame}"
+
+
+def with_object_names(
+    parameters: Mapping[str, Any], name_of: Callable[[Mapping[str, int]], str | None]
+) -> dict[str, Any]:
+    """Add to each reference to an object the object's name, where it is known; keep the other parameters.
+
+    `name_of` gets a reference: `object`, the sequence of its ObjectAdded, and `row`, that of its latest state.
+
+    >>> with_object_names({"object_designator": {"object": 3, "row": 9}, "arm": "LEFT"}, lambda _: "milk")
+    {'object_designator': {'object': 3, 'row': 9, 'name': 'milk'}, 'arm': 'LEFT'}
+    """
+    named = dict(parameters)
+    for key, value in parameters.items():
+        match value:
+            case {"object": int(), "row": int()} if len(value) == 2 and (name := name_of(value)) is not None:
+                named[key] = {**value, "name": name}
+    return named
 
 
 def one_line(text: object, characters_max: int | None) -> str:

@@ -13,6 +13,7 @@ from typing import Any
 
 from pycrorm_async.errors import LogDamaged
 from pycrorm_async.events.ids import SLOT_NODE, row_id
+from pycrorm_async.events.tags import retagged
 from pycrorm_async.events.types import (
     DescriptionDeclared,
     EpisodeEnded,
@@ -27,6 +28,7 @@ from pycrorm_async.events.values import FailureValue
 from pycrorm_async.projections.fold.column_values import CannotFold
 from pycrorm_async.projections.fold.fold import happening_of
 from pycrorm_async.projections.fold.world_fold import WorldFold, WorldObject
+from pycrorm_async.query.parameter_text import with_object_names
 from pycrorm_async.query.snapshot import Moment, NodeThen, ObjectThen, ObservationThen, RobotThen, WorldThen
 from pycrorm_async.store.stored import StoredEvent
 from pycrorm_async.world.pose import MalformedPose, Pose
@@ -69,7 +71,7 @@ class MomentFold:
         self._status = "RUNNING"
         self._nodes: dict[int, _Node] = {}
         self._fold = WorldFold()
-        self._tags: dict[str, None] = {}
+        self._tags: tuple[str, ...] = ()
         self._observed: dict[str, tuple[StoredEvent, Observed]] = {}
 
     def read(self, event: StoredEvent) -> None:
@@ -105,10 +107,9 @@ class MomentFold:
                 if self._started is not None:
                     raise CannotFold("the episode starts a second time")
                 self._started = happening
-                self._tags = dict.fromkeys(happening.tags)
+                self._tags = retagged((), happening.tags, ())
             case EpisodeTagged():
-                kept = {tag: None for tag in self._tags if tag not in happening.removed}
-                self._tags = kept | dict.fromkeys(happening.added)
+                self._tags = retagged(self._tags, happening.added, happening.removed)
             case EpisodeEnded():
                 self._ended(happening.status)
             case Observed():
@@ -161,7 +162,7 @@ class MomentFold:
             tree=tuple(self._tree(dtypes, first.monotonic_ns)),
             world=self._world(descriptions, meshes),
             observations={name: self._observation(*each) for name, each in self._observed.items()},
-            tags=tuple(self._tags),
+            tags=self._tags,
         )
 
     def _observation(self, event: StoredEvent, observed: Observed) -> ObservationThen:
@@ -194,7 +195,7 @@ class MomentFold:
             depth=depth,
             dtype=dtypes[node.designator] if node.designator is not None else None,
             kind=node.kind,
-            parameters={name: self._with_name(value) for name, value in node.parameters.items()},
+            parameters=with_object_names(node.parameters, lambda each: self._fold.names.get(each["object"])),
             status=node.status,
             started_at=_moment(node.wall_ns),
             duration_ns=node.ended_ns - node.monotonic_ns if node.ended_ns is not None else None,
@@ -206,12 +207,6 @@ class MomentFold:
             start_s=(node.monotonic_ns - start_ns) / 1e9,
             end_s=(node.ended_ns - start_ns) / 1e9 if node.ended_ns is not None else None,
         )
-
-    def _with_name(self, value: Any) -> Any:
-        """Add the object's name to a reference to an object; return other values unchanged."""
-        if isinstance(value, dict) and value.keys() == {"object", "row"}:
-            return {**value, "name": self._fold.names.get(value["object"])}
-        return value
 
     def _world(self, descriptions: Mapping[str, DescriptionDeclared], meshes: Mapping[str, bytes]) -> WorldThen:
         objects = tuple(self._object(identity, each) for identity, each in self._fold.objects.items())

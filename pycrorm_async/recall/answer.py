@@ -241,7 +241,8 @@ class Answer(Sequence[RecalledCase]):
         """
         chosen = [each for each in self.cases if status in (None, each.case.status)]
         whole = math.fsum(each.score for each in chosen)
-        numbers = [(number, each.score) for each in chosen if isinstance(number := _value_of(each.case, feature), float)]
+        values = ((_value_of(each.case, feature), each.score) for each in chosen)
+        numbers = [(value, score) for value, score in values if isinstance(value, float)]
         if numbers:
             return _blended(numbers, whole, angle=is_angle(feature))
         words: dict[str, float] = {}

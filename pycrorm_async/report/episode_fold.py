@@ -17,6 +17,7 @@ from typing import Any
 
 import msgspec
 
+from pycrorm_async.events.tags import retagged
 from pycrorm_async.events.types import (
     EpisodeEnded,
     EpisodeStarted,
@@ -31,7 +32,7 @@ from pycrorm_async.events.types import (
 )
 from pycrorm_async.projections.fold.column_values import CannotFold
 from pycrorm_async.projections.fold.fold import happening_of
-from pycrorm_async.query.parameter_text import parameters_text
+from pycrorm_async.query.parameter_text import parameters_text, with_object_names
 from pycrorm_async.report.recorded_objects import ObjectTracks
 from pycrorm_async.report.tracks import Texts, Track, differences, rounded
 from pycrorm_async.store.stored import EpisodeRow, StoredEvent
@@ -65,7 +66,7 @@ class EpisodeFold:
         self.last = 0
         """The sequence of the last event that was read."""
         self._status = "RUNNING"
-        self._tags: dict[str, None] = {}
+        self._tags: tuple[str, ...] = ()
         self._failure: dict[str, str] | None = None
         self._times: list[int] = []
         self._nodes: dict[int, list[Any]] = {}
@@ -91,7 +92,7 @@ class EpisodeFold:
             case NodeStarted():
                 dtype = designators.get(happening.designator or "", "")
                 number = self._texts.number
-                parameters = parameters_text({name: self._named(each) for name, each in happening.parameters.items()})
+                parameters = parameters_text(with_object_names(happening.parameters, self._name_of))
                 self._nodes[sequence] = [
                     *(sequence, 0, happening.parent or 0),
                     *(number(happening.kind), number(dtype), number(parameters), number("RUNNING"), 0, 0),
@@ -100,10 +101,9 @@ class EpisodeFold:
                 self._node_ended(sequence, happening)
             case EpisodeStarted():
                 self._started = happening
-                self._tags = dict.fromkeys(happening.tags)
+                self._tags = retagged((), happening.tags, ())
             case EpisodeTagged():
-                kept = {tag: None for tag in self._tags if tag not in happening.removed}
-                self._tags = kept | dict.fromkeys(happening.added)
+                self._tags = retagged(self._tags, happening.added, happening.removed)
             case EpisodeEnded():
                 self._ended(sequence, happening)
             case ObjectDetected() if sequence >= self._first:
@@ -125,12 +125,9 @@ class EpisodeFold:
         if len(entries) < _LISTED_MAX:
             entries.append(entry)
 
-    def _named(self, value: Any) -> Any:
-        """Return a parameter with the name of the object that it refers to."""
-        if isinstance(value, dict) and "object" in value and "row" in value:
-            referred = self.world.objects.get(value["object"])
-            return {**value, "name": referred.added.name} if referred is not None else value
-        return value
+    def _name_of(self, reference: Mapping[str, int]) -> str | None:
+        referred = self.world.objects.get(reference["object"])
+        return referred.added.name if referred is not None else None
 
     def _node_ended(self, sequence: int, ended: NodeEnded) -> None:
         if (node := self._nodes.get(ended.node)) is None:

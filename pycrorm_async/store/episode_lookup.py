@@ -11,6 +11,7 @@ import msgspec
 from sqlalchemy import bindparam, text
 
 from pycrorm_async.errors import UnknownEpisode
+from pycrorm_async.events.tags import retagged
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import EpisodeRow
 
@@ -71,8 +72,7 @@ async def tags_of(log: EventLog, number: int) -> tuple[str, ...]:
     async with log.reading() as connection:
         for _, payload in await connection.execute(query, {"number": number}):
             change = msgspec.json.decode(payload, type=_Tagging)
-            left = [each for each in tags if each not in change.removed]
-            tags = tuple(dict.fromkeys([*left, *change.tags, *change.added]))
+            tags = retagged(tags, (*change.tags, *change.added), change.removed)
     return tags
 
 

@@ -44,6 +44,7 @@ from pycrorm_async.store.stored import (
     Stored,
     StoredEvent,
     beyond,
+    consecutive,
     share_out,
 )
 
@@ -230,12 +231,11 @@ class EventLog:
         async with self.reading() as connection:
             return await self._dialect.events(connection, number, after=after, limit=limit)
 
-    async def pages(self, episode: EpisodeRow, *, after: int = 0) -> AsyncIterator[list[StoredEvent]]:
+    async def pages(self, episode: EpisodeRow, *, after: int = 0) -> AsyncIterator[Sequence[StoredEvent]]:
         """Yield the events up to the episode's head in pages. Raises `LogDamaged` at the first missing event."""
         while after < episode.head:
             limit = min(_PAGE_EVENTS, episode.head - after)
-            page = await self.events(episode.number, after=after, limit=limit)
-            whole = [event for sequence, event in enumerate(page, after + 1) if event.sequence == sequence]
+            whole = consecutive(await self.events(episode.number, after=after, limit=limit), after)
             if whole:
                 yield whole
             after += len(whole)

@@ -20,6 +20,13 @@ class StoredEvent(NamedTuple):
     payload: bytes
 
 
+def consecutive(events: Sequence[StoredEvent], after: int) -> Sequence[StoredEvent]:
+    """Return the events of an episode behind sequence `after`, up to the first that is missing."""
+    if not events or events[-1].sequence == after + len(events):
+        return events
+    return [each for sequence, each in enumerate(events, after + 1) if each.sequence == sequence]
+
+
 class EpisodeRow(NamedTuple):
     """The state of an episode.
 

@@ -25,7 +25,7 @@ from pycrorm_async.events.types import EpisodeEnded
 from pycrorm_async.projections.custom.projection import EpisodeFold, EpisodeProjection
 from pycrorm_async.projections.fold.column_values import CannotFold
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.stored import Span, StoredEvent
+from pycrorm_async.store.stored import Span, StoredEvent, consecutive
 
 _EPISODES_MAX: Final = 1_000
 """Bounds the folds of open episodes that are kept, and with it the memory. It is above the episodes of one batch (400).
@@ -134,7 +134,7 @@ class BatchOfFolds:
 
     def _read_again(self, fold: _OpenFold, events: Sequence[StoredEvent], last: int) -> str | None:
         """Fold events up to `last` whose rows are written already; return the reason if that is not possible."""
-        whole = [each for sequence, each in enumerate(events, fold.reached + 1) if each.sequence == sequence]
+        whole = consecutive(events, fold.reached)
         if whole and (refused := self._read(fold.fold, whole, kept=False)) is not None:
             sequence, fault = refused
             raised = "" if isinstance(fault, CannotFold) else f"{type(fault).__name__}: "

@@ -13,6 +13,7 @@ from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.bulk_records import make
 from pycrorm_async.events.codec import unwritable
+from pycrorm_async.events.ids import row_key
 from pycrorm_async.events.types import DesignatorTypeDeclared, NodeStarted
 from pycrorm_async.projections.custom.episode_folds import EpisodeFolds, Refused
 from pycrorm_async.projections.custom.projected_batch import ProjectedBatch
@@ -141,7 +142,7 @@ class CustomRows(ProjectedBatch):
         columns = self._columns.get(table)
         if columns is None:
             raise CannotFold(f"{self._projection.name} has no table {table!r}")
-        if not isinstance(id_, int) or id_ >> 31 != number:  # the upper bits of a row id, as `row_id` packs them
+        if not isinstance(id_, int) or row_key(id_).number != number:
             raise CannotFold(f"{table}: {id_!r} is not a row of this episode: use event.id or event.row(sequence)")
         for name in values:
             if name not in columns or name in OF_EVERY_TABLE:

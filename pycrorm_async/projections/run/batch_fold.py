@@ -36,7 +36,7 @@ from pycrorm_async.projections.schema.union import unite
 from pycrorm_async.store.dialect import Progress, RowRefused
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.stored import Span, StoredEvent, pages_of, size_of
+from pycrorm_async.store.stored import Span, StoredEvent, consecutive, pages_of, size_of
 
 _REASON_LENGTH_MAX = 2_000
 """Bounds the characters of the reason for parking an episode: `status` shows it, and a value may have megabytes."""
@@ -346,6 +346,4 @@ def _by_span(spans: Sequence[Span], events: Sequence[StoredEvent]) -> Iterator[t
         if part and part[-1].number != span.number:  # some are missing, so it has events of the next span
             part = [each for each in part if each.number == span.number]
         first += len(part)
-        if part and part[-1].sequence != span.after + len(part):
-            part = [each for sequence, each in enumerate(part, span.after + 1) if each.sequence == sequence]
-        yield span, part
+        yield span, consecutive(part, span.after)

@@ -7,7 +7,7 @@ from typing import NamedTuple, Protocol
 from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.errors import DatabaseForeign
-from pycrorm_async.events.ids import EPISODE_NUMBER_MAX
+from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, row_id_min
 from pycrorm_async.projections.verify.findings import VerifyResult
 from pycrorm_async.projections.verify.row_comparison import Comparison
 from pycrorm_async.store.dialects import dialect_of
@@ -37,7 +37,7 @@ class Place(NamedTuple):
     @property
     def row(self) -> int:
         """The smallest id of a row made by an event behind this place."""
-        return self.number << 31 | (self.after + 1 if self.after else 0) << 5
+        return row_id_min(self.number, self.after + 1 if self.after else 0)
 
 
 class PartCheck(Protocol):

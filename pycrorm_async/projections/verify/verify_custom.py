@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from sqlalchemy import text
 from sqlalchemy.ext.asyncio import AsyncConnection
 
+from pycrorm_async.events.ids import row_id_min
 from pycrorm_async.projections.custom.packed_projection import PackedProjection
 from pycrorm_async.projections.custom.projection import Projection
 from pycrorm_async.projections.custom.projection_rows import CustomRows
@@ -20,7 +21,7 @@ from pycrorm_async.projections.verify.parts import EpisodeRange, PartCheck, Plac
 from pycrorm_async.projections.verify.row_comparison import Comparison, Difference, Range
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.stored import Span
+from pycrorm_async.store.stored import Span, consecutive
 
 
 def check_of(projection: Projection, result: VerifyResult) -> PartCheck:
@@ -98,8 +99,8 @@ class ProjectionCheck:
     ) -> Sequence[Difference]:
         """Compare the tables with the rows that the events of these episodes make; count the stored rows."""
         assert isinstance(rows, CustomRows)
-        last = None if episodes.end is None else episodes.end << 31
-        within = Range(episodes.first << 31 or None, last, None, None)
+        last = None if episodes.end is None else row_id_min(episodes.end)
+        within = Range(row_id_min(episodes.first) or None, last, None, None)
         differences = await comparison.differences(connection, rows, within, carried=(), settled=())
         self.result.rows += comparison.count
         return differences
@@ -121,8 +122,7 @@ async def _fold_again(connection: AsyncConnection, rows: Batch, span: Span, limi
     """Fold an episode again; return the first event that cannot be folded, with the reason."""
     for after in range(0, span.last, limit):
         page = Span(span.number, after, min(after + limit, span.last))
-        events = await dialect_of(connection).spans(connection, [page])
-        whole = [each for sequence, each in enumerate(events, after + 1) if each.sequence == sequence]
+        whole = consecutive(await dialect_of(connection).spans(connection, [page]), after)
         if whole and (refused := rows.fold(whole)) is not None:
             return refused
         if after + len(whole) < page.last:
