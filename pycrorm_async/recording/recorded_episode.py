@@ -158,8 +158,8 @@ class RecordedEpisode(RecordedNodes):
         event = struct_of(ObjectDetected(source, object_type), ObjectDetected)
 
         def write() -> int:
-            found = self._find(node, "ObjectDetected")
-            number = self.node_or_root(found) if found is not None else None
+            acting = self._find(node, "ObjectDetected")
+            number = self.node_or_root(acting) if acting is not None else None
             held = (each if self._objects.holds(each.object) else replace(each, object=None) for each in percepts)
             return self._put_detection(replace(event, seen=tuple(held), node=number))
 

@@ -36,7 +36,7 @@ class Recording:
     ...     episode.end(id(task), "FAILED", NavigationGoalNotReached())
 
     Args:
-        known: the types that this memory has declared so far, shared with the recorder of our own plans.
+        known_types: the types that this memory has declared so far, shared with the recorder of our own plans.
         stored: the declarations that the database holds already, also from other processes.
         software, provenance: recorded with each episode.
     """
@@ -45,7 +45,7 @@ class Recording:
         self,
         emitter: Emitter,
         episodes: OpenEpisodes,
-        known: KnownTypes,
+        known_types: KnownTypes,
         stored: Iterable[DesignatorTypeDeclared],
         *,
         software: str,
@@ -53,13 +53,13 @@ class Recording:
     ) -> None:
         self._emitter = emitter
         self._episodes = episodes
-        self._known = known
+        self._known_types = known_types
         self._software = software
         self._provenance = provenance
         self._types: dict[Hashable, DeclaredType] = {}
         self._lock = threading.RLock()
         for each in stored:
-            known.note_stored(each)
+            known_types.note_stored(each)
 
     def type(
         self,
@@ -113,7 +113,9 @@ class Recording:
     ) -> DeclaredType:
         if not all(isinstance(each, str) for each in (kind, dtype, *bases, *aliases, concept or "")):
             raise CallerError("the kind, the dtype, the concept, the bases and the aliases of a type must be texts")
-        recorded = declare_type(kind, dtype, dict(fields), self._known, bases=bases, concept=concept, aliases=aliases)
+        recorded = declare_type(
+            kind, dtype, dict(fields), self._known_types, bases=bases, concept=concept, aliases=aliases
+        )
         declared, missing = recorded.type, self._emitter.missing
         for name, renamed in recorded.fields.items():
             missing.note_renamed(declared.dtype, name, *renamed)

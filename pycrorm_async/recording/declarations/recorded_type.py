@@ -65,7 +65,7 @@ def declare_type(
     kind: str,
     dtype: str,
     fields: Mapping[str, FieldSpec],
-    known: KnownTypes,
+    known_types: KnownTypes,
     *,
     bases: Sequence[str] = (),
     concept: str | None = None,
@@ -77,17 +77,17 @@ def declare_type(
     and concept are those of the built-in type.
     """
     own = cut(clean(str(dtype)), _REASON_MAX)
-    dtype, fault = _dtype(own, kind, known)
+    dtype, fault = _dtype(own, kind, known_types)
     renamed = Renamed(dtype, fault) if fault is not None and dtype != own else None
-    built_in = known.built_in(dtype)
+    built_in = known_types.built_in(dtype)
     table = built_in.table if built_in is not None else table_name(dtype)
     if built_in is not None:
-        known.note_stored(built_in)
+        known_types.note_stored(built_in)
     accepted: list[Field] = []
     undeclared: list[Undeclared] = []
     renamed_fields: dict[str, Renamed] = {}
     for name, spec in fields.items():
-        named = _named(str(name), spec, known, table, [each.declared for each in accepted])
+        named = _named(str(name), spec, known_types, table, [each.declared for each in accepted])
         if isinstance(named, str):
             undeclared.append(Undeclared(clean(str(name)), (name,), cut(clean(named), _REASON_MAX)))
             continue
@@ -106,7 +106,7 @@ def declare_type(
     fault = (
         fault_in_declaration(declaration)
         or _fault_in_kind(declaration, built_in)
-        or _fault_in_aliases(declaration, known)
+        or _fault_in_aliases(declaration, known_types)
     )
     if fault is not None:
         placeholder = DesignatorTypeDeclared(kind="action", dtype=own, table="")
@@ -114,21 +114,21 @@ def declare_type(
         undeclared_type = DeclaredType(own, b"", "", tuple(accepted), placeholder, tuple(undeclared), reason)
         return Declared(undeclared_type, renamed_fields, None)
     payload = encode(declaration)
-    known.note(declaration)
+    known_types.note(declaration)
     declared = DeclaredType(dtype, payload, fingerprint(payload), tuple(accepted), declaration, tuple(undeclared))
     return Declared(declared, renamed_fields, renamed)
 
 
-def _dtype(own: str, kind: str, known: KnownTypes) -> tuple[str, str | None]:
+def _dtype(own: str, kind: str, known_types: KnownTypes) -> tuple[str, str | None]:
     """Return the first name that the type may have, and the reason why it is not its own; its own if none may be."""
     plain = re.sub(r"[\W_]+", "_", own).strip("_") or "Unnamed"
     if not plain.isidentifier():
         plain = f"{kind}_{plain}"
     first_fault: str | None = None
     for candidate in (own, plain, f"{plain}{kind.title()}"):
-        built_in = known.built_in(candidate)
+        built_in = known_types.built_in(candidate)
         table = built_in.table if built_in is not None else table_name(candidate)
-        fault = fault_in_dtype(candidate) or fault_in_table(table) or known.fault_in_table(table, candidate)
+        fault = fault_in_dtype(candidate) or fault_in_table(table) or known_types.fault_in_table(table, candidate)
         if fault is None:
             return candidate, first_fault
         first_fault = first_fault or cut(clean(fault), _REASON_MAX)
@@ -141,18 +141,18 @@ def _fault_in_kind(declaration: DesignatorTypeDeclared, built_in: DesignatorType
     return f"the built-in type {built_in.dtype} is a {built_in.kind}, not a {declaration.kind}"
 
 
-def _fault_in_aliases(declaration: DesignatorTypeDeclared, known: KnownTypes) -> str | None:
+def _fault_in_aliases(declaration: DesignatorTypeDeclared, known_types: KnownTypes) -> str | None:
     """Return the reason why the table of a former dtype cannot be this one's; None if it can."""
     for alias in declaration.aliases:
         for field in declaration.fields:
-            reason = known.fault_in_field(field, table_name(alias))
+            reason = known_types.fault_in_field(field, table_name(alias))
             if reason is not None:
                 return f"its alias {alias!r} does not fit: field {field.name!r}: {reason}"
     return None
 
 
 def _named(
-    name: str, spec: FieldSpec, known: KnownTypes, table: str, accepted: Sequence[FieldDeclared]
+    name: str, spec: FieldSpec, known_types: KnownTypes, table: str, accepted: Sequence[FieldDeclared]
 ) -> _Named | str:
     """Return the field under the first name that it may have; the reason if it may have none."""
     shape = _shape(spec)
@@ -169,7 +169,7 @@ def _named(
             enum=f"{shape.enum.__module__}.{shape.enum.__qualname__}" if shape.enum is not None else None,
             item=shape.item,
         )
-        reason = _fault_in_field(declared, accepted) or known.fault_in_field(declared, table)
+        reason = _fault_in_field(declared, accepted) or known_types.fault_in_field(declared, table)
         if reason is None:
             return _Named(Field(declared, (name,), shape.enum), first_reason)
         first_reason = first_reason or reason
