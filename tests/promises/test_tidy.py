@@ -43,6 +43,8 @@ SPOKEN = re.compile(r"\b(says?|said|saying|people)\b|(?<!to )\bstands?\b(?! (at|
 
 A robot may have a place to stand, and stand at or on something: there the word is meant literally.
 """
+ADVERBS_AND_PARTICIPLES = frozenset({"found", "known", "made", "given", "there", "said", "told"})
+"""Names of locals and parameters that do not describe what these hold."""
 RECORDED = frozenset({"why things failed, frame"})
 """Names in the recorded figures of `bench/`, under which later runs are compared with them."""
 
@@ -136,6 +138,20 @@ def test_every_module_has_a_docstring() -> None:
 
 def test_every_docstring_of_the_package_opens_with_a_sentence() -> None:
     assert openings_in(MODULES, PACKAGE_OPENINGS) == []
+
+
+def test_locals_and_parameters_are_nouns() -> None:
+    violations = {
+        f"{path.relative_to(ROOT)}:{node.lineno}: {name}"
+        for path in MODULES
+        for function in ast.walk(ast.parse(path.read_text()))
+        if isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
+        for node in ast.walk(function)
+        if isinstance(node, ast.arg | ast.Name)
+        for name in [node.arg if isinstance(node, ast.arg) else node.id]
+        if name in ADVERBS_AND_PARTICIPLES
+    }
+    assert sorted(violations) == []
 
 
 @pytest.mark.parametrize("folder", sorted({each.relative_to(PACKAGE).parts[0] for each in MODULES}))

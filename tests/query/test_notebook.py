@@ -190,7 +190,7 @@ def test_a_chart_has_events_or_time_as_its_axis() -> None:
     assert [each.get("stroke-dasharray") for each in bars] == [None, None, "4 2"]
     assert len({each["y"] for each in bars}) == 2
     assert events.text.count("▶") == 2  # in its name and in its hint
-    with pytest.raises(CallerError, match="the axis 'events' or 'time', not 'days'"):
+    with pytest.raises(CallerError, match="axis must be 'events' or 'time', got 'days'"):
         tree.gantt("days")  # type: ignore[arg-type]
 
 
