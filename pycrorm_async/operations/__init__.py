@@ -1,4 +1,4 @@
 """Run the daemon, recovery, rebuild and copy, one module for each operation that an operator starts.
 
-Together with `memory.py` this is the only package that sees both a queue and a database.
+Like `memory.py`, it joins a queue to a database; the packages of both ends do not know each other.
 """

@@ -9,6 +9,7 @@ import ast
 import io
 import re
 import tokenize
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -192,3 +193,15 @@ def test_names_docstrings_and_comments_of_the_tests_use_the_words_of_the_glossar
         for match in REPLACED.finditer(without_code(text))
     ]
     assert replaced == []
+
+
+def test_the_table_of_the_package_has_every_module_in_the_order_of_the_layers() -> None:
+    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
+    [layers] = [each["layers"] for each in contracts if each["type"] == "layers"]
+    rows = re.findall(r"^\| (`[^|]*) \|.*\|.*\|$", (PACKAGE / "README.md").read_text(), re.MULTILINE)
+    modules = [name for row in rows for name in re.findall(r"`([a-z_]+)(?:/|\.py)`", row)]
+    for layer in reversed(layers):
+        expected = sorted(set(re.findall(r"\w+", layer)) - {"__main__"})
+        assert sorted(modules[: len(expected)]) == expected
+        del modules[: len(expected)]
+    assert modules == []
