@@ -65,14 +65,20 @@ def test_recorded_rollouts_are_not_repeated(document: Any, folder: Path) -> None
     assert "400 rollouts of this experiment are recorded already" in line
     assert "--resume" in line
     assert refused.returncode == 2
-    done = pycrorm(*BY_ONE, "--resume", "--figure", "two.svg", "--study", "2", cwd=folder)
+    done = pycrorm(*BY_ONE, "--resume", "--figure", "two.svg", cwd=folder)
     assert done.returncode == 0, done.stderr
-    assert "The same policies in other scenes" in done.stdout
     assert done.stdout.count("from the log") > 2
     assert f"{document['phases'][1]['success_rate']:.1%}" in done.stdout
     assert "picked up" in done.stdout
     assert "two.svg" in done.stderr
     assert (folder / "two.svg").read_text().startswith("<?xml")
+
+
+@pytest.mark.soak
+def test_a_study_is_printed_as_a_table(folder: Path) -> None:
+    done = pycrorm(*BY_ONE, "--resume", "--study", "2", cwd=folder)
+    assert done.returncode == 0, done.stderr
+    assert "The same policies in other scenes" in done.stdout
 
 
 def test_a_study_evaluates_the_policy_under_other_conditions(document: Any) -> None:

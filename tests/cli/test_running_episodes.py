@@ -19,6 +19,7 @@ pytestmark = pytest.mark.slow
 MEMORY_OF_0_1_0 = Path(__file__).parents[1] / "golden" / "memory_v1.tar.gz"
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_a_running_episode_is_named_with_its_robots_until_it_ends(database_url: str, tmp_path: Path) -> None:
     asked = "--url", database_url
     async with Memory.open(database_url, spool=tmp_path / "spool") as memory:

@@ -205,6 +205,7 @@ async def test_rows_missing_from_the_tables_are_printed_one_a_line_and_exit_with
     assert answer("verify", cwd=folder, code=1)["outdated"].endswith("run `pycrorm rebuild`")
 
 
+@pytest.mark.soak
 async def test_on_postgresql_every_role_that_may_read_may_verify(server: Server, tmp_path: Path) -> None:
     url = server.new_database()
     database = urlsplit(url).path.removeprefix("/")

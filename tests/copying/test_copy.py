@@ -405,6 +405,7 @@ async def test_an_impossible_copy_makes_no_target(new_file: New) -> None:
     assert not path_of(target).exists()
 
 
+@pytest.mark.soak
 async def test_large_events_are_copied_in_small_batches(new_file: New) -> None:
     source, target = new_file(), new_file()
     big = b'{"kind":"action","parameters":{"text":"%s"}}' % (b"x" * 100_000)

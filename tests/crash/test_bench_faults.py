@@ -231,6 +231,7 @@ def only_flushes_fold(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(restores, "_SETTINGS", replace(restores._SETTINGS, idle_ms=60_000))
 
 
+@pytest.mark.soak
 @pytest.mark.usefixtures("only_flushes_fold")
 def test_the_bench_verifies_a_round_only_after_every_event_of_it_is_stored(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -244,6 +245,7 @@ def test_the_bench_verifies_a_round_only_after_every_event_of_it_is_stored(
     assert (outcome.rounds, outcome.corrupted, outcome.rounds_failed) == (1, 0, [])
 
 
+@pytest.mark.soak
 @pytest.mark.usefixtures("only_flushes_fold")
 def test_the_bench_detects_a_flush_that_folds_nothing_after_a_restore(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

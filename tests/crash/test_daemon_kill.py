@@ -62,6 +62,7 @@ def own_server() -> Iterator[Server]:
         yield running
 
 
+@pytest.mark.soak  # store/test_postgresql_faults kills a server under load
 def test_a_server_that_restarts_under_load_costs_no_event(own_server: Server, tmp_path: Path) -> None:
     lab = Lab(tmp_path, own_server.new_database(), random.randrange(2**31))
     try:

@@ -64,6 +64,7 @@ async def test_a_rebuild_killed_anywhere_changes_nothing_readers_see_and_the_nex
     await kill_again_and_again(database_url, 3, workers=1)
 
 
+@pytest.mark.soak  # projections/test_rebuild kills workers
 async def test_a_rebuild_with_workers_killed_anywhere_changes_nothing_readers_see(tmp_path: Path) -> None:
     await kill_again_and_again(f"sqlite:///{tmp_path}/memory.db", 1, workers=2)
 

@@ -34,6 +34,7 @@ def resume(lab: Lab) -> None:
     lab.daemon.send_signal(signal.SIGCONT)
 
 
+@pytest.mark.soak
 def test_a_suspended_daemon_that_resumes_has_doubled_nothing_and_no_other_took_its_place(
     database_url: str, tmp_path: Path
 ) -> None:
@@ -80,6 +81,7 @@ def test_a_suspended_daemon_that_is_killed_is_succeeded_by_another(database_url:
         lab.clear()
 
 
+@pytest.mark.soak
 async def test_a_daemon_that_stops_while_its_server_is_silent_loses_no_event(server: Server, tmp_path: Path) -> None:
     url = server.new_database()
     async with proxy_before(server.folder) as proxy:

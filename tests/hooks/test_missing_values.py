@@ -179,7 +179,7 @@ def started(events: list[tuple[int, Happening]]) -> NodeStarted:
 @pytest.mark.slow
 @pytest.mark.parametrize("bytes_max", [pytest.param(2**20, marks=pytest.mark.soak), 3_000])
 @given(described=VALUES, fails=st.none() | FAILURES)
-@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=30, deadline=None, suppress_health_check=list(HealthCheck))
 def test_a_memory_does_not_change_the_behaviour_of_a_plan(
     bytes_max: int, described: Any, fails: tuple[type, Any] | None
 ) -> None:

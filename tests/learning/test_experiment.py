@@ -218,6 +218,7 @@ async def test_workers_that_are_not_free_take_no_job() -> None:
             await workers.roll_out(job, [(0, 5)])
 
 
+@pytest.mark.soak
 async def test_held_out_rollouts_without_a_success_leave_the_coverage_unknown(tmp_path: Path) -> None:
     place = MemoryLocation(f"sqlite:///{tmp_path}/memory.db")
     tiny = replace(SMALL, rollouts=150, evaluate=20, held_out=1, workers=1, min_samples_leaf=5)
@@ -267,6 +268,7 @@ async def test_a_second_round_learns_from_the_first_ones_policy_too(tmp_path: Pa
     assert learned.evaluation.tally.success_rate > 0.5
 
 
+@pytest.mark.soak  # the first test resumes too
 async def test_rollouts_are_not_repeated_when_learning_from_them_had_failed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -159,6 +159,7 @@ def test_learning_again_gives_the_same_policy(learned: Policy, successes: list[P
     assert learn(frame_of(successes)) == learned
 
 
+@pytest.mark.soak  # test_policy_file reads one there
 def test_a_learned_policy_is_the_same_in_another_process_without_pyjpt(learned: Policy, tmp_path: Path) -> None:
     from tests.learning.test_policy_file import ELSEWHERE
 
@@ -187,6 +188,7 @@ assert not changed, changed
 """
 
 
+@pytest.mark.soak
 def test_the_first_learning_of_a_process_changes_no_other_state_of_it() -> None:
     done = subprocess.run([sys.executable, "-c", FIRST_OF_ALL], check=False, capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")

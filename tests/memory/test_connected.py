@@ -116,6 +116,7 @@ asyncio.run(main())
 """
 
 
+@pytest.mark.soak  # recording/test_sync_memory
 async def test_a_memory_that_is_never_closed_loses_nothing_and_ends_without_a_traceback(tmp_path: Path) -> None:
     ran = await run_python("-c", FORGETS, cwd=tmp_path)
     assert (ran.returncode, ran.stderr) == (0, "")

@@ -78,6 +78,7 @@ def assert_no_faults(memory: Memory) -> None:
     assert memory.status.faults.total == 0, memory.status.faults.last
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_values_of_every_kind_are_rows_under_the_node_and_the_same_after_copy_and_rebuild(
     database_url: str, tmp_path: Path, server: Server
 ) -> None:

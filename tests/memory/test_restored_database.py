@@ -180,6 +180,7 @@ async def test_lost_episodes_get_their_own_numbers_and_new_ones_get_others(
     assert "events were appended again; 0 of 2 episodes stay incomplete" in reason
 
 
+@pytest.mark.soak_on("sqlite")
 async def test_a_lost_episode_of_a_dead_recorder_ends_lost_again(
     database_url: str, spool: Path, take_backup: TakeBackup, tmp_path: Path
 ) -> None:
@@ -242,6 +243,7 @@ async def test_an_idle_daemon_stores_again_what_dead_recorders_had_stored(
     assert await is_clean(database_url)
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_records_that_are_no_longer_kept_are_refused_with_their_gap_and_not_searched_again(
     database_url: str,
     spool: Path,

@@ -149,6 +149,7 @@ async def test_a_memory_that_is_closed_during_a_motion_ends_its_thread(tmp_path:
         assert require_robot().body.pose == Pose([1, 0, 0])
 
 
+@pytest.mark.soak
 def test_a_forked_child_continues_without_sampling_and_its_parent_keeps_sampling(tmp_path: Path) -> None:
     script = (
         "import asyncio, os, sys, threading, warnings\n"

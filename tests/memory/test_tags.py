@@ -93,6 +93,7 @@ async def test_tags_change_during_and_after_an_episode_and_survive_copy_and_rebu
         server.drop(other)
 
 
+@pytest.mark.soak_on("sqlite")
 async def test_several_processes_tag_an_episode_at_once_and_every_tag_is_there(
     database_url: str, tmp_path: Path
 ) -> None:

@@ -69,6 +69,7 @@ LONGEST = with_fields("Reach" + "Far" * 60 + "Action", "object", "container_id",
 TRUTH = with_fields("TruthAction", "boolean", "true", "False", "true_", "select", "user")
 
 
+@pytest.mark.soak_on("sqlite")
 async def test_names_that_a_database_reserves_are_columns_of_the_view_and_are_rebuilt(log: EventLog) -> None:
     box = {name: float(place) for place, name in enumerate(SYSTEM)}
     records = [*performing(1, BOX, **box), *performing(2, TRUTH, true=True, False_=None, true_=False, user=True)]
@@ -181,6 +182,7 @@ def payload_of(bad: DesignatorTypeDeclared | bytes) -> bytes:
     return bad if isinstance(bad, bytes) else msgspec.json.encode(bad)  # past the checks of this package
 
 
+@pytest.mark.soak_on("sqlite")
 async def test_crafted_declarations_park_their_own_episodes_and_the_others_are_folded(log: EventLog) -> None:
     records: list[Record] = []
     for number, (bad, _) in enumerate(HOSTILE, 2):

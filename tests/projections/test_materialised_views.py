@@ -43,6 +43,7 @@ async def kept_tables_of(log: EventLog) -> list[str]:
     return [name for name in await names(log, "table") if name.startswith("zz_pycrorm_view_")]
 
 
+@pytest.mark.soak_on(3)
 @pytest.mark.parametrize("step", [1, 3, 1000])
 async def test_a_materialised_view_shows_at_every_flush_the_rows_of_the_plain_view(log: EventLog, step: int) -> None:
     projector = Projector(log, views=[KEPT, PLAIN])
@@ -78,6 +79,7 @@ async def test_one_that_is_registered_later_shows_earlier_rows(log: EventLog) ->
     assert len(await visible_rows(log, "said")) == 1000
 
 
+@pytest.mark.soak_on("sqlite")
 async def test_a_changed_query_under_the_same_name_is_shown_and_the_next_rebuild_drops_the_old_rows(
     log: EventLog,
 ) -> None:
@@ -106,6 +108,7 @@ async def test_a_materialised_view_can_become_a_plain_view_and_back(log: EventLo
         assert len(await visible_rows(log, "said")) == 4
 
 
+@pytest.mark.soak_on("sqlite")
 async def test_a_rebuild_makes_it_again_and_it_is_kept_up_to_date(log: EventLog) -> None:
     projector = Projector(log, views=[KEPT, PLAIN])
     await projector.open()

@@ -267,6 +267,7 @@ def volume(number: int) -> FieldDeclared:
     return field(f"volume{number}", "real", 2 + number)
 
 
+@pytest.mark.soak_on("sqlite")
 async def test_several_pipelines_fold_every_event_once(log: EventLog, other_log: EventLog) -> None:
     pairs = [await workers_of([log, other_log], WorkerInLoop, 3) for _ in range(2)]
     talks = [talk(number, words=10) for number in range(1, 6)]

@@ -103,6 +103,7 @@ LIFT = msgspec.structs.replace(declared("LiftAction", "lift_action", *CAREFUL.fi
     ],
 )
 @pytest.mark.parametrize("declared_together", [True, False])
+@pytest.mark.soak_on("postgresql")
 async def test_the_pick_up_view_includes_descendants_and_former_names_in_any_order(
     log: EventLog, types: tuple[DesignatorTypeDeclared, ...], declared_together: bool
 ) -> None:

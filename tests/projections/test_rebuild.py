@@ -242,6 +242,7 @@ async def fold_beside(database_url: str, tmp_path: Path, *, rebuilds: int) -> No
     assert traces(database_url) == []
 
 
+@pytest.mark.soak_on("sqlite")
 async def test_events_folded_while_the_new_tables_are_published_are_in_them(
     database_url: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -365,6 +366,7 @@ async def test_a_rebuild_cancelled_at_any_moment_is_continued(
 # --- bad input ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.soak_on("sqlite")
 async def test_only_one_process_rebuilds_at_a_time(database_url: str) -> None:
     await append_and_fold(database_url, [*TYPES, *picking(1).records])
     log = await EventLog.open(DatabaseAddress.parse(database_url), create=True)
@@ -384,6 +386,7 @@ async def test_tables_of_a_newer_version_are_refused_unchanged(database_url: str
     assert ask(database_url, "SELECT count(*) FROM pick_up_action") == [(5,)]
 
 
+@pytest.mark.soak_on("sqlite")
 async def test_tables_of_an_older_version_are_replaced(database_url: str) -> None:
     await append_and_fold(database_url, [*TYPES, *picking(1).records])
     before = tables_of(database_url)
@@ -446,6 +449,7 @@ async def test_a_reader_in_a_transaction_continues_and_the_next_rebuild_drops_it
     assert traces(url) == []
 
 
+@pytest.mark.soak
 @pytest.mark.usefixtures("few_attempts")
 async def test_a_foreign_view_on_the_tables_keeps_them_and_is_reported(server: Server) -> None:
     url = server.new_database()

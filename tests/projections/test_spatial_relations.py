@@ -283,6 +283,7 @@ async def boxes_by_model(log: EventLog, generation: int = 1001) -> dict[str, int
     return dict(await ask(log, f"SELECT model, count(*) FROM zz_pycrorm_link_box__{generation} GROUP BY model"))
 
 
+@pytest.mark.soak_on("sqlite")
 @pytest.mark.slow
 async def test_the_boxes_of_a_description_are_stored_once_rebuilt_and_verified(log: EventLog) -> None:
     declared_, tidying = Declared(), Tidying()

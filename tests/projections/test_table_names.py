@@ -42,6 +42,7 @@ async def test_the_tables_of_a_generation_come_last_in_a_list_of_names(tmp_path:
         await rebuild_memory(url, views=[UserView("zoom_all", select(TaskTreeNode.id))])
 
 
+@pytest.mark.soak_on("postgresql")
 @pytest.mark.empty_database
 @pytest.mark.slow
 async def test_tables_with_former_names_are_used_until_a_rebuild_replaces_them(

@@ -130,6 +130,7 @@ CHANGED = "or their digest, was changed after it was stored: the digest does not
         ),
     ],
 )
+@pytest.mark.soak_on("postgresql")
 async def test_each_change_of_the_log_is_found_and_named_in_one_line(
     log: EventLog, filled_url: str, changes: list[str], lines: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -139,6 +140,7 @@ async def test_each_change_of_the_log_is_found_and_named_in_one_line(
     assert await findings(log, (), monkeypatch) == [each.format(last=head) for each in lines]
 
 
+@pytest.mark.soak_on("postgresql")
 @pytest.mark.parametrize(
     ("changes", "line"),
     [
@@ -206,6 +208,7 @@ async def test_an_episode_that_is_being_recorded_is_covered_up_to_its_last_block
     await log.close()
 
 
+@pytest.mark.soak_on("postgresql")
 @pytest.mark.parametrize(
     ("change", "finding"),
     [

@@ -135,6 +135,7 @@ async def every_event(request: pytest.FixtureRequest, golden: str) -> str:
     return url
 
 
+@pytest.mark.soak_on("sqlite")
 async def test_a_memory_of_the_first_version_has_all_its_rows_and_its_spool_is_adopted(every_event: str) -> None:
     t0 = 1_700_000_000_000_000
     assert ask(every_event, "SELECT number, head, folded, parked, refused FROM episode ORDER BY 1") == [

@@ -403,6 +403,7 @@ async def test_an_invalid_moment_is_refused(reading: Reading, when: dict[str, An
         await reading.as_of(1, **when)
 
 
+@pytest.mark.soak_on("postgresql")
 @pytest.mark.parametrize(
     ("type_", "payload", "version", "kind", "message"),
     [

@@ -95,6 +95,7 @@ async def test_its_sql_reads_the_rows_that_it_compares(reading: Reading, filled_
     assert [sorted(row[0] for row in each) for each in rows[-2:]] == [["cup 0", "milk"], ["cup 0", "cup 1", "milk"]]
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_two_runs_of_one_plan_do_not_differ_although_their_times_do(reading: Reading) -> None:
     compared = await reading.diff(3, 4)
     assert [(each.of, each.where) for each in compared.differences] == [("episode", "description")]

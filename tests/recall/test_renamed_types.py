@@ -35,6 +35,7 @@ def record(url: str, folder: Path, *, renamed: bool) -> None:
         memory.flush()
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_each_name_finds_the_cases_of_both(database_url: str, tmp_path: Path) -> None:
     record(database_url, tmp_path, renamed=True)
     async with Reading.open(database_url) as reading:
@@ -77,6 +78,7 @@ async def test_a_type_that_is_renamed_while_the_memory_is_open_is_found_at_once(
         assert len(await recall("GrabAction")) == 3
 
 
+@pytest.mark.soak
 @pytest.mark.slow
 def test_the_command_names_what_it_joined_and_does_not_call_an_old_name_unknown(tmp_path: Path) -> None:
     url = f"sqlite:///{tmp_path / 'pycrorm.db'}"

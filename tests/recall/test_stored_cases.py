@@ -73,6 +73,7 @@ def small_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stored_blocks, "_MERGED", 2)
 
 
+@pytest.mark.soak_on("postgresql")
 @pytest.mark.slow
 async def test_cases_do_not_depend_on_batches_restarts_processes_or_merges(
     log: EventLog, monkeypatch: pytest.MonkeyPatch
@@ -248,6 +249,7 @@ CHANGES = {
 }  # fmt: skip
 
 
+@pytest.mark.soak_on("postgresql")
 @pytest.mark.slow
 async def test_verify_finds_what_was_changed_and_a_rebuild_repairs_it(log: EventLog) -> None:
     expected = await filled(log)

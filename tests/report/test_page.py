@@ -210,6 +210,7 @@ def test_a_table_of_episodes_counts_failures_by_reason_and_leads_to_the_pages(
         tab.wait_for("globalThis.pycrormPage?.episode.number === 1")
 
 
+@pytest.mark.soak_on("courier")
 @pytest.mark.parametrize(
     ("page", "number", "name"), [("plan", 1, "pr2"), ("drives", 3, "courier"), ("drives", 3, "other")]
 )

@@ -44,6 +44,7 @@ async def parts_of(recorded: Path, number: int, step: int) -> list[dict[str, Any
         return parts
 
 
+@pytest.mark.soak_on("dies")
 @pytest.mark.parametrize(("page", "number", "step"), [("plan", 1, 7), ("dies", 2, 1)])
 async def test_parts_make_the_same_episode_as_the_whole(
     chrome: Browser, pages: dict[str, Path], recorded: Path, page: str, number: int, step: int

@@ -49,6 +49,7 @@ async def test_a_digest_is_kept_at_the_end_of_each_block_and_of_the_episode(log:
     assert {number: each.sequence for number, each in (await log.last_digests()).items()} == {1: 600, 2: 512, 3: 256}
 
 
+@pytest.mark.soak_on("postgresql")
 @pytest.mark.parametrize("size", [1, 299, 300, 301, 400])
 @pytest.mark.slow
 async def test_each_tag_behind_the_end_has_a_digest(log: EventLog, database_url: str, size: int) -> None:

@@ -148,6 +148,9 @@ async def _perform_every_operation(url: str, spool: Path) -> None:
         ask(url, statement)
 
 
+@pytest.mark.soak_on(
+    "a view in the place of a table", "a default value", "a view in the place of the note of the generations"
+)
 @pytest.mark.parametrize("attack", ATTACKS)
 async def test_a_folder_cannot_rewrite_the_log_by_code_that_the_owner_executes(
     attack: str, owner: str, server: Server, tmp_path: Path
@@ -164,6 +167,7 @@ async def test_a_folder_cannot_rewrite_the_log_by_code_that_the_owner_executes(
     assert ask(owner, enabled) == [(b"O",)]
 
 
+@pytest.mark.soak_on("superuser")
 @pytest.mark.parametrize("owner", ["superuser", "ordinary"], indirect=True)
 async def test_the_owner_is_refused_at_the_tables_and_another_login_folds_what_the_owner_appended(
     owner: str, server: Server, tmp_path: Path

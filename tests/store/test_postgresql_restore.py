@@ -141,6 +141,7 @@ GONE: dict[str, Callable[[Backup], None]] = {
 }
 
 
+@pytest.mark.soak_on("nothing is there")
 @pytest.mark.parametrize("state", GONE)
 async def test_no_log_is_made_in_place_of_the_one_to_which_a_spool_belongs(
     state: str, server: Server, database_url: str, tmp_path: Path

@@ -24,6 +24,7 @@ async def stored_on(url: str) -> StoredOn:
         await log.close()
 
 
+@pytest.mark.soak
 async def test_a_synchronous_standby_counts_as_a_machine_even_for_a_role_that_may_not_see_its_state() -> None:
     with (
         tempfile.TemporaryDirectory(prefix="pg") as folder,
