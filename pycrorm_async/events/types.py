@@ -16,6 +16,7 @@ import msgspec
 from pycrorm_async.events.values import (
     BoxValue,
     CandidateValue,
+    CellsValue,
     EpisodeStatus,
     FailureValue,
     FieldDeclared,
@@ -298,6 +299,7 @@ class LocationResolved(Happening, frozen=True):
         node: the node that resolved it.
         refused: the first examined places that it did not offer, in order; empty in events of older versions.
         offered_beyond: number of further candidates it offered.
+        cells: the places in its costmaps; None if it has none, and in events of older versions.
     """
 
     location: str
@@ -307,6 +309,7 @@ class LocationResolved(Happening, frozen=True):
     node: int | None = None
     refused: tuple[RefusalValue, ...] = ()
     offered_beyond: int = 0
+    cells: CellsValue | None = None
 
 
 class ObjectDetected(Happening, frozen=True):

@@ -22,6 +22,7 @@ __all__ = [
     "LinkBoxValue",
     "CandidateValue",
     "RefusalValue",
+    "CellsValue",
     "SeenValue",
     "NodeReference",
     "FieldType",
@@ -181,6 +182,20 @@ class RefusalValue(_Value, frozen=True):
 
     pose: PoseValue
     reason: str
+
+
+class CellsValue(_Value, frozen=True):
+    """The numbers of places in the costmaps of a search.
+
+    Attributes:
+        occupied: places with an obstacle too near for any heading.
+        hidden: further places from which the target is not visible.
+        free: all others, the best of which the search examined.
+    """
+
+    occupied: int
+    hidden: int
+    free: int
 
 
 class SeenValue(_Value, frozen=True):

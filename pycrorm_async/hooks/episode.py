@@ -23,7 +23,7 @@ from pycrorm_async.events.values import NodeReference, NodeStatus, ObjectReferen
 from pycrorm_async.hooks.episode_events import location_resolved, object_detected
 from pycrorm_async.hooks.world_recorder import WorldRecorder
 from pycrorm_async.plan.designator import Designator
-from pycrorm_async.plan.execution.observer import Candidate, Refusal, Seen
+from pycrorm_async.plan.execution.observer import Candidate, Cells, Refusal, Seen
 from pycrorm_async.plan.execution.unawaited_performs import CalledPerforms
 from pycrorm_async.plan.task_tree import TaskTreeNode
 from pycrorm_async.recording.declarations.declared_type import DeclaredType
@@ -161,13 +161,13 @@ class Episode(EpisodeWriter[TaskTreeNode]):
 
     def record_location(
         self, *, location: str, offered: tuple[Candidate, ...], taken: int | None, considered: int,
-        refused: tuple[Refusal, ...], offered_beyond: int, node: TaskTreeNode | None,
+        refused: tuple[Refusal, ...], offered_beyond: int, cells: Cells | None, node: TaskTreeNode | None,
     ) -> int:  # fmt: skip
         """Write which places a location designator offered, took and refused; return the sequence."""
         number = self._sequence_of(node)
         resolved = location_resolved(
             location, offered, taken=taken, considered=considered, refused=refused, offered_beyond=offered_beyond,
-            node=number,
+            cells=cells, node=number,
         )  # fmt: skip
         try:
             return self.emitter.put(self.id, resolved)

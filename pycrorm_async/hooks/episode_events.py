@@ -8,10 +8,11 @@ from typing import Literal
 from pycrorm_async.events.types import LocationResolved, ObjectDetected
 from pycrorm_async.events.values import (
     CandidateValue,
+    CellsValue,
     RefusalValue,
     SeenValue,
 )
-from pycrorm_async.plan.execution.observer import Candidate, Refusal, Seen
+from pycrorm_async.plan.execution.observer import Candidate, Cells, Refusal, Seen
 from pycrorm_async.plan.object_designators import ObjectDesignator
 from pycrorm_async.recording.values.texts import clean
 from pycrorm_async.recording.values.value_snapshot import References, pose_value
@@ -20,7 +21,7 @@ from pycrorm_async.world.enums import ObjectType
 
 def location_resolved(
     location: str, offered: Sequence[Candidate], *, taken: int | None, considered: int, refused: Sequence[Refusal],
-    offered_beyond: int, node: int | None,
+    offered_beyond: int, cells: Cells | None, node: int | None,
 ) -> LocationResolved:  # fmt: skip
     """Build the event of a resolved location designator; `node` is the sequence of the node that resolved it."""
     return LocationResolved(
@@ -39,6 +40,7 @@ def location_resolved(
         node=node,
         refused=tuple(RefusalValue(pose_value(each.pose), clean(each.reason)) for each in refused),
         offered_beyond=offered_beyond,
+        cells=CellsValue(cells.occupied, cells.hidden, cells.free) if cells is not None else None,
     )
 
 

@@ -29,7 +29,7 @@ from pycrorm_async.events.values import NodeReference
 from pycrorm_async.hooks.declaration import Declarations
 from pycrorm_async.hooks.episode import Episode, NodeRecord
 from pycrorm_async.hooks.sampler import Sampler
-from pycrorm_async.plan.execution.observer import Candidate, Refusal, Seen, Simulation, current_simulation
+from pycrorm_async.plan.execution.observer import Candidate, Cells, Refusal, Seen, Simulation, current_simulation
 from pycrorm_async.plan.execution.unawaited_performs import CalledPerforms
 from pycrorm_async.plan.task_tree import TaskTreeNode
 from pycrorm_async.recording.declarations.declared_type import DeclaredType
@@ -219,7 +219,7 @@ class Recorder:
 
     def location_resolved(
         self, *, location: str, offered: tuple[Candidate, ...], taken: int | None, considered: int,
-        refused: tuple[Refusal, ...], offered_beyond: int, node: TaskTreeNode | None,
+        refused: tuple[Refusal, ...], offered_beyond: int, cells: Cells | None, node: TaskTreeNode | None,
     ) -> None:  # fmt: skip
         episode = self.episode_here()
         if episode is None or self._emitter.is_closed:
@@ -227,7 +227,7 @@ class Recorder:
         try:
             sequence = episode.record_location(
                 location=location, offered=offered, taken=taken, considered=considered, refused=refused,
-                offered_beyond=offered_beyond, node=node,
+                offered_beyond=offered_beyond, cells=cells, node=node,
             )  # fmt: skip
         except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
             self._emitter.note_fault("LocationResolved", error)

@@ -150,12 +150,14 @@ class LocationResolution(RowOfEvent, Base):
 
     Attributes:
         location: the designator's class.
-        considered, offered: the number of places it checked, and of those it offered.
+        considered, offered, refused: the number of places it checked, of those it offered, and of all others.
         candidates: the first 999 places that it offered, and the last one.
         taken: the rank among `candidates` of the place that the plan used, whose pose is `pose`; None if it used none.
         node: the node that made the request.
         refusals: the first 1,000 places that it refused. Not loaded by default: use
             `await resolution.awaitable_attrs.refusals`.
+        occupied_cells, hidden_cells, free_cells: the places in its costmaps that are too near an obstacle, those from
+            which the target is not visible, and those it chose from. None without costmaps and in older episodes.
     """
 
     __tablename__ = "location_resolution"
@@ -169,6 +171,10 @@ class LocationResolution(RowOfEvent, Base):
     taken: Mapped[int | None]
     pose_id: Mapped[int | None] = mapped_column(ForeignKey("pose.id"))
     time: Mapped[datetime]
+    refused: Mapped[int]
+    occupied_cells: Mapped[int | None]
+    hidden_cells: Mapped[int | None]
+    free_cells: Mapped[int | None]
 
     node: Mapped[TaskTreeNode | None] = one_of(lambda: LocationResolution.node_id, "task_tree_node")
     pose: Mapped[Pose | None] = one_of(lambda: LocationResolution.pose_id, "pose")

@@ -20,11 +20,11 @@ from pycrorm_async.events.types import (
     ObjectMoved,
     ObjectRemoved,
 )
-from pycrorm_async.events.values import ObjectReference, PoseValue
+from pycrorm_async.events.values import CellsValue, ObjectReference, PoseValue
 from pycrorm_async.hooks.plan_recorder import current_episode
 from pycrorm_async.plan.actions.basic import MoveTorsoActionPerformable, NavigateActionPerformable
 from pycrorm_async.plan.designator import ActionAbstract
-from pycrorm_async.plan.execution.observer import Candidate, Refusal
+from pycrorm_async.plan.execution.observer import Candidate, Cells, Refusal
 from pycrorm_async.plan.motions.process_modules import simulated_robot
 from pycrorm_async.plan.object_designators import ObjectDesignator, ObjectPart
 from pycrorm_async.settings import Settings
@@ -231,6 +231,7 @@ async def test_a_resolved_location_is_recorded_with_its_node() -> None:
             considered=7,
             refused=(Refusal(pose, "LEFT: too far"), Refusal(pose, "hidden\0")),
             offered_beyond=0,
+            cells=Cells(occupied=3, hidden=2, free=9),
             node=None,
         )
     event = next(e for _, e in case.sink.of(episode) if isinstance(e, LocationResolved))
@@ -238,6 +239,7 @@ async def test_a_resolved_location_is_recorded_with_its_node() -> None:
     assert (event.offered[0].arms, event.taken, event.considered, event.node) == (("LEFT",), 0, 7, None)
     assert [each.reason for each in event.refused] == ["LEFT: too far", "hidden\\x00"]
     assert {each.pose for each in event.refused} == {event.offered[0].pose}
+    assert event.cells == CellsValue(3, 2, 9)
 
 
 async def test_three_plans_in_three_tasks_never_share_a_parent() -> None:

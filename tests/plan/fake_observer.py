@@ -7,7 +7,15 @@ from collections.abc import Awaitable, Iterator
 from contextlib import contextmanager
 from typing import Literal
 
-from pycrorm_async.plan.execution.observer import Candidate, Refusal, Seen, Simulation, current_simulation, recorder
+from pycrorm_async.plan.execution.observer import (
+    Candidate,
+    Cells,
+    Refusal,
+    Seen,
+    Simulation,
+    current_simulation,
+    recorder,
+)
 from pycrorm_async.plan.task_tree import TaskTreeNode, current_node
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world import ObjectType
@@ -24,6 +32,7 @@ class Recording:
         self.notes: list[str] = []
         self.refused: list[tuple[Refusal, ...]] = []
         self.offered_beyond: list[int] = []
+        self.cells: list[Cells | None] = []
         self.places: list[tuple[str, tuple[Candidate, ...], int | None, int, TaskTreeNode | None]] = []
         self.open: list[TaskTreeNode] = []
         self.ended: list[TaskTreeNode] = []
@@ -69,10 +78,12 @@ class Recording:
         considered: int,
         refused: tuple[Refusal, ...],
         offered_beyond: int,
+        cells: Cells | None,
         node: TaskTreeNode | None,
     ) -> None:
         self.refused.append(refused)
         self.offered_beyond.append(offered_beyond)
+        self.cells.append(cells)
         self.places.append((location, offered, taken, considered, node))
         self.notes.append(f"place {location}")
 

@@ -20,6 +20,7 @@ from pycrorm_async.plan import (
     MoveTorsoActionPerformable,
     NavigateActionPerformable,
     NoRobotHere,
+    ObjectPart,
     ObjectRelativeLocation,
     ParkArmsActionPerformable,
     PickUpActionPerformable,
@@ -27,7 +28,8 @@ from pycrorm_async.plan import (
     ResolutionError,
     SemanticCostmapLocation,
 )
-from pycrorm_async.plan.execution.observer import Candidate
+from pycrorm_async.plan.current_robot import CurrentRobot
+from pycrorm_async.plan.execution.observer import Candidate, Cells
 from pycrorm_async.plan.failures import (
     LookingHighLevelFailure,
     ObjectUnavailable,
@@ -41,6 +43,8 @@ from pycrorm_async.world import Arms, Grasp, Object, ObjectType, Pose
 from pycrorm_async.world.errors import UnknownLink
 from pycrorm_async.world.models.primitives import box_urdf
 from pycrorm_async.world.pose import yaw_quaternion
+from pycrorm_async.world.queries.costmaps import OccupancyCostmap, VisibilityCostmap
+from pycrorm_async.world.robots.robot_description import PR2
 from tests.plan.conftest import Scene
 from tests.plan.fake_observer import Recording
 
@@ -217,6 +221,26 @@ def test_a_resolution_is_recorded_with_the_chosen_candidate(scene: Scene) -> Non
     first = next(iter(CostmapLocation(scene.milk, reachable_for=scene.robot, reachable_arm=Arms.RIGHT)))
     assert first == stand
     assert 1 <= considered <= 600
+
+
+def test_a_search_counts_the_places_that_its_costmaps_exclude_each_once(scene: Scene) -> None:
+    handle = ObjectPart("sink_area_drawer_handle", scene.kitchen)
+    with Recording().listening() as recording:
+        CostmapLocation(scene.milk, visible_for=scene.robot).resolve()
+        CostmapLocation(scene.milk, reachable_for=scene.robot).resolve()
+        AccessingLocation(handle, scene.robot).resolve()
+        SemanticCostmapLocation("kitchen_island_surface", scene.kitchen, scene.milk).resolve()
+    ground = Pose([*scene.milk.pose.position[:2], 0])
+    low, high = CurrentRobot(scene.robot, PR2).camera_heights_m()
+    free = OccupancyCostmap(scene.world, ground).map > 0
+    seen = VisibilityCostmap(scene.world, scene.milk, min_height_m=low, max_height_m=high, origin=ground).map > 0
+    visible, reachable, opening, surface = recording.cells
+    assert visible == Cells(occupied=(~free).sum(), hidden=(free & ~seen).sum(), free=(free & seen).sum())
+    assert min(visible.occupied, visible.hidden, visible.free) > 1_000
+    assert reachable == Cells(occupied=visible.occupied, hidden=0, free=free.sum())
+    assert opening is not None
+    assert (opening.occupied + opening.free, opening.hidden) == (80 * 80, 0)
+    assert surface is None
 
 
 def test_a_loop_over_candidates_is_recorded_at_its_end_with_the_last_one_as_chosen(scene: Scene) -> None:

@@ -26,6 +26,7 @@ from pycrorm_async.events.types import (
 )
 from pycrorm_async.events.values import (
     CandidateValue,
+    CellsValue,
     FailureValue,
     MissingValue,
     NodeReference,
@@ -344,12 +345,22 @@ def test_a_resolved_location_keeps_the_offered_and_the_chosen_candidates() -> No
     root = script.put(NodeStarted("root"))
     offered = (CandidateValue(pose(1, 1), ("LEFT", "RIGHT")), CandidateValue(pose(2, 2), ("LEFT",), "TOP", 0.25))
     refused = (RefusalValue(pose(3, 3), "LEFT: too far"), RefusalValue(pose(4, 4), "not visible"))
-    script.put(LocationResolved("CostmapLocation", offered, taken=1, considered=600, node=root, refused=refused))
+    script.put(
+        LocationResolved(
+            "CostmapLocation",
+            offered,
+            taken=1,
+            considered=600,
+            node=root,
+            refused=refused,
+            cells=CellsValue(17, 5, 700),
+        )
+    )
     script.put(LocationResolved("AccessingLocation", considered=3))
     rows_by_table = rows_of(script)
     assert rows_by_table["location_resolution"] == [
-        (row(2), 1, row(1), "CostmapLocation", 600, 2, 1, row(2), time_us(2)),
-        (row(3), 1, None, "AccessingLocation", 3, 0, None, None, time_us(3)),
+        (row(2), 1, row(1), "CostmapLocation", 600, 2, 1, row(2), time_us(2), 598, 17, 5, 700),
+        (row(3), 1, None, "AccessingLocation", 3, 0, None, None, time_us(3), 3, None, None, None),
     ]
     assert rows_by_table["location_candidate"] == [
         (row(2), 0, 1, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, "map", "LEFT,RIGHT", False, None, None),

@@ -375,7 +375,11 @@ async def test_joint_targets_places_detections_and_attachments_are_recorded(tmp_
     resolved, failed = await results_of(tmp_path, select(LocationResolution).order_by(LocationResolution.id))
     assert (resolved.location, resolved.offered, resolved.taken) == ("CostmapLocation", 1, 0)
     assert resolved.considered >= 1
-    assert (failed.offered, failed.taken, failed.considered) == (0, None, 600)
+    assert (failed.offered, failed.taken, failed.considered, failed.refused) == (0, None, 600, 600)
+    assert resolved.refused == resolved.considered - 1
+    for each in (resolved, failed):
+        assert (each.occupied_cells or 0) + (each.free_cells or 0) == 200 * 200
+        assert (each.hidden_cells, (each.occupied_cells or 0) > 1_000) == (0, True)
     refused = await results_of(tmp_path, select(LocationRefusal).order_by(LocationRefusal.position))
     refused = [each for each in refused if each.resolution_id == failed.id]
     assert [each.position for each in refused] == list(range(600))

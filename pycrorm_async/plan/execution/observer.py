@@ -43,6 +43,21 @@ class Refusal:
 
 
 @dataclass(frozen=True, slots=True)
+class Cells:
+    """The numbers of places in the costmaps of a search.
+
+    Attributes:
+        occupied: places with an obstacle too near for any heading.
+        hidden: further places from which the target is not visible.
+        free: all others, the best of which the search tries.
+    """
+
+    occupied: int
+    hidden: int
+    free: int
+
+
+@dataclass(frozen=True, slots=True)
 class Seen:
     """A percept: an object that perception reports, whether or not the world has it.
 
@@ -108,6 +123,7 @@ class PlanObserver(Protocol):
         considered: int,
         refused: tuple[Refusal, ...],
         offered_beyond: int,
+        cells: Cells | None,
         node: TaskTreeNode | None,
     ) -> None:
         """Called after a location designator was resolved or iterated.
@@ -119,6 +135,7 @@ class PlanObserver(Protocol):
             considered: number of places it tried.
             refused: the first places that it tried in vain, in the order of the search.
             offered_beyond: number of further places that it offered.
+            cells: the places in its costmaps; None if it has none, or ended before they were made.
 
         Called once per resolution, in another context if a loop over places was dropped.
         """

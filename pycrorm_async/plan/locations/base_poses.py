@@ -16,6 +16,7 @@ import numpy as np
 
 from pycrorm_async.plan.current_robot import CurrentRobot, check_in_map, require_world
 from pycrorm_async.plan.errors import NoRobotHere
+from pycrorm_async.plan.execution.observer import Cells
 from pycrorm_async.plan.geometry.grasp_poses import pick_up_poses, place_pose, retract
 from pycrorm_async.plan.geometry.gripper_checks import lifting_arms
 from pycrorm_async.plan.locations.base_clearance import BaseClearance, base_clearance
@@ -48,8 +49,11 @@ def base_poses(
     reachable_for: ObjectLike | None,
     visible_for: ObjectLike | None,
     reachable_arm: Arms | None,
-) -> Iterator[tuple[Pose, Reach]]:
-    """Yield base poses that face the target, best first, suitable or not; for a fixed base only its own pose."""
+) -> Iterator[tuple[Pose, Reach] | Cells]:
+    """Yield the cells of the costmaps, then base poses that face the target, best first, suitable or not.
+
+    For a fixed base yield only its own pose.
+    """
     reacher = resolve_robot(reachable_for) if reachable_for is not None else None
     viewer = resolve_robot(visible_for) if visible_for is not None else None
     goal = target if isinstance(target, Pose) else pose_of(target)
@@ -60,7 +64,8 @@ def base_poses(
         return
     robots = [each for each in (reacher, viewer) if each is not None]
     clearance = base_clearance(robots)
-    costmap = _costmap(target, goal, robots, viewer, clearance)
+    costmap, cells = _costmap(target, goal, robots, viewer, clearance)
+    yield cells
     clear, height_m = 0, base_height_m(reacher or viewer)
     for cell in _cells(costmap, robots, every=clearance is not None):
         base_pose = face(cell, goal, height_m=height_m)
@@ -172,19 +177,26 @@ def _costmap(
     robots: list[CurrentRobot],
     viewer: CurrentRobot | None,
     clearance: BaseClearance | None,
-) -> Costmap:
+) -> tuple[Costmap, Cells]:
+    """Return the costmap of the search, and how many cells the maps in it exclude."""
     world = require_world()
     origin = Pose((goal.position.x, goal.position.y, 0.0))
     ignored = {part for robot in robots for part in robot.with_load()}
     free = OccupancyCostmap(world, origin, ignore=ignored) if clearance is None else clearance.costmap(origin)
     costmap = free * GaussianCostmap(origin)
     if viewer is None:
-        return costmap
+        return costmap, cells_of(free)
     low, high = viewer.camera_heights_m()
     viewed = goal if isinstance(target, Pose) else in_world(target)
-    return costmap * VisibilityCostmap(
-        world, viewed, min_height_m=low, max_height_m=high, origin=origin, ignore=ignored
-    )
+    visible = VisibilityCostmap(world, viewed, min_height_m=low, max_height_m=high, origin=origin, ignore=ignored)
+    return costmap * visible, cells_of(free, free * visible)
+
+
+def cells_of(free: Costmap, seeing: Costmap | None = None) -> Cells:
+    """Count the cells of a map of free places; `seeing` leaves those from which the target is visible."""
+    clear = int(np.count_nonzero(free.map))
+    left = clear if seeing is None else int(np.count_nonzero(seeing.map))
+    return Cells(free.map.size - clear, clear - left, left)
 
 
 def _goals(robot: CurrentRobot, base_pose: Pose, target: Pose | ObjectLike, goal: Pose, arm: Arms) -> tuple[Pose, ...]:

@@ -2,7 +2,7 @@
 
 `resolve()` returns the best place; iterating yields one after another. Both search in the current state of the world.
 Each resolution or iteration is reported once: the first places offered and the number of further ones, the one taken,
-the number considered, and the first refused ones with the reason for each.
+the number considered, the first refused ones with the reason for each, and how many a costmap excludes.
 
 >>> stand = CostmapLocation(target=cereal, reachable_for=robot).resolve()
 >>> stand.reachable_arms
@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, NoReturn
 
 from pycrorm_async.plan.errors import NotResolved
-from pycrorm_async.plan.execution.observer import Candidate, Refusal, recorder
+from pycrorm_async.plan.execution.observer import Candidate, Cells, Refusal, recorder
 from pycrorm_async.plan.failures import (
     EnvironmentUnreachable,
     LookingHighLevelFailure,
@@ -60,8 +60,8 @@ class LocationDesignator(ABC):
             raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
 
     @abstractmethod
-    def _candidates(self) -> Iterator[Location | Refusal | None]:
-        """Yield every candidate in order; a refusal, or None, for one that is unsuitable."""
+    def _candidates(self) -> Iterator[Location | Refusal | Cells | None]:
+        """Yield every candidate in order; a refusal, or None, for one that is unsuitable; once `Cells` of costmaps."""
 
     @abstractmethod
     def _no_place_failure(self) -> PlanFailure:
@@ -88,10 +88,14 @@ class LocationDesignator(ABC):
         offered: list[Candidate] = []
         offered_beyond = 0
         refused: list[Refusal] = []
+        cells: Cells | None = None
         taken: int | None = None
         considered = 0
         try:
             for place in self._candidates():
+                if isinstance(place, Cells):
+                    cells = place
+                    continue
                 considered += 1
                 if isinstance(place, Refusal):
                     if len(refused) < REFUSALS_MAX:
@@ -113,6 +117,7 @@ class LocationDesignator(ABC):
                     considered=considered,
                     refused=tuple(refused),
                     offered_beyond=offered_beyond,
+                    cells=cells,
                     node=node,
                 )
 
@@ -174,14 +179,16 @@ class CostmapLocation(LocationDesignator):
     visible_for: ObjectLike | None = None
     reachable_arm: Arms | None = None
 
-    def _candidates(self) -> Iterator[Location | Refusal]:
-        for pose, reach in base_poses(
-            self.target,
-            reachable_for=self.reachable_for,
-            visible_for=self.visible_for,
-            reachable_arm=self.reachable_arm,
-        ):
-            yield _location_or_refusal(pose, reach)
+    def _candidates(self) -> Iterator[Location | Refusal | Cells]:
+        return map(
+            _candidate,
+            base_poses(
+                self.target,
+                reachable_for=self.reachable_for,
+                visible_for=self.visible_for,
+                reachable_arm=self.reachable_arm,
+            ),
+        )
 
     def _no_place_failure(self) -> PlanFailure:
         if self.reachable_for is None:
@@ -217,9 +224,8 @@ class AccessingLocation(LocationDesignator):
     robot: ObjectLike
     arm: Arms | None = None
 
-    def _candidates(self) -> Iterator[Location | Refusal]:
-        for pose, reach in opening_poses(self.handle, self.robot, self.arm):
-            yield _location_or_refusal(pose, reach)
+    def _candidates(self) -> Iterator[Location | Refusal | Cells]:
+        return map(_candidate, opening_poses(self.handle, self.robot, self.arm))
 
     def _no_place_failure(self) -> PlanFailure:
         name = self.handle.name
@@ -253,5 +259,8 @@ class SemanticCostmapLocation(LocationDesignator):
         return ObjectUnavailable(f"there is no room for {name} on {self.urdf_link_name}", self.urdf_link_name, name)
 
 
-def _location_or_refusal(pose: Pose, reach: Reach) -> Location | Refusal:
+def _candidate(searched: tuple[Pose, Reach] | Cells) -> Location | Refusal | Cells:
+    if isinstance(searched, Cells):
+        return searched
+    pose, reach = searched
     return Location(pose, reach.arms) if reach.refusal is None else Refusal(pose, reach.refusal)

@@ -11,10 +11,18 @@ import math
 from collections.abc import Iterator
 
 from pycrorm_async.plan.current_robot import CurrentRobot
+from pycrorm_async.plan.execution.observer import Cells
 from pycrorm_async.plan.geometry.articulation import Handle, closed_position, hand_poses, handle_of, opened_position
 from pycrorm_async.plan.geometry.grasp_poses import approach
 from pycrorm_async.plan.locations.base_clearance import base_clearance
-from pycrorm_async.plan.locations.base_poses import Reach, base_height_m, face, reaching_arms, resolve_robot
+from pycrorm_async.plan.locations.base_poses import (
+    Reach,
+    base_height_m,
+    cells_of,
+    face,
+    reaching_arms,
+    resolve_robot,
+)
 from pycrorm_async.plan.object_designators import ObjectLike
 from pycrorm_async.world.enums import Arms
 from pycrorm_async.world.pose import Pose
@@ -36,8 +44,8 @@ _SWEEP_STEPS = 10
 """The steps of the joint at which the space that the drawer or door sweeps is computed."""
 
 
-def opening_poses(part: ObjectLike, robot: ObjectLike, arm: Arms | None) -> Iterator[tuple[Pose, Reach]]:
-    """Yield base poses, best first, suitable or not, each with the arms that reach every goal.
+def opening_poses(part: ObjectLike, robot: ObjectLike, arm: Arms | None) -> Iterator[tuple[Pose, Reach] | Cells]:
+    """Yield the cells of the costmaps, then base poses, best first, each with the arms that reach every goal or none.
 
     Places that the opening part does not sweep come first, facing the handle and then rotated by each multiple of 45
     degrees; the places that it sweeps follow in the same order.
@@ -46,7 +54,9 @@ def opening_poses(part: ObjectLike, robot: ObjectLike, arm: Arms | None) -> Iter
     handle_pose = handle.whole.link_pose_at(handle.link, {handle.joint: closed_position(handle)})
     goals = _goals(handle)
     clearance, height_m = base_clearance([reacher]), base_height_m(reacher)
-    for costmap in _costmaps(handle, handle_pose, reacher):
+    free, *costmaps = _costmaps(handle, handle_pose, reacher)
+    yield cells_of(free)
+    for costmap in costmaps:
         cells = costmap.best(CELLS_MAX)
         for number in range(HEADINGS):
             for cell in cells:
@@ -71,8 +81,8 @@ def _goals(handle: Handle) -> list[Pose]:
     return [*ends, *(approach(each) for each in ends), *between]
 
 
-def _costmaps(handle: Handle, handle_pose: Pose, robot: CurrentRobot) -> Iterator[Costmap]:
-    """Yield two costmaps of free places near the handle: those the moving part does not sweep, and those it does."""
+def _costmaps(handle: Handle, handle_pose: Pose, robot: CurrentRobot) -> tuple[Costmap, ...]:
+    """Return a map of free places, and two of those near the handle: the moving part does not sweep them, or does."""
     world, origin = handle.whole.world, Pose((handle_pose.position.x, handle_pose.position.y, 0.0))
     near = GaussianCostmap(origin, sigma_cells=_SIGMA_CELLS, size_cells=_CELLS, resolution_m=CELL_M)
     free, unswept = (
@@ -87,8 +97,7 @@ def _costmaps(handle: Handle, handle_pose: Pose, robot: CurrentRobot) -> Iterato
         )
         for boxes in ((), list(_swept(handle)))
     )
-    yield unswept * near
-    yield Costmap(free.map - unswept.map, origin, resolution_m=CELL_M) * near
+    return free, unswept * near, Costmap(free.map - unswept.map, origin, resolution_m=CELL_M) * near
 
 
 def _swept(handle: Handle) -> Iterator[BoundingBox]:

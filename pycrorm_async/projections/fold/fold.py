@@ -291,8 +291,11 @@ def _location_resolved(event: StoredEvent, resolved: LocationResolved, _designat
     pose_id = own if taken is not None else None
     if taken is not None:
         rows.inserts["pose"].append(pose_row(own, number, offered[taken].pose))
+    cells = resolved.cells
+    numbers = (cells.occupied, cells.hidden, cells.free) if cells is not None else (None, None, None)
+    refused = max(resolved.considered - count, 0)
     rows.inserts["location_resolution"].append(
-        (own, number, node, resolved.location, resolved.considered, count, taken, pose_id, time)
+        (own, number, node, resolved.location, resolved.considered, count, taken, pose_id, time, refused, *numbers)
     )
     rows.inserts["location_candidate"].extend(
         (own, rank, number, *pose_columns(each.pose), ",".join(each.arms), rank == taken, each.grasp, each.torso_height)

@@ -161,6 +161,10 @@ CORE: dict[str, dict[str, Storage]] = {
         "taken": "integer",
         "pose_id": "pose",
         "time": "time",
+        "refused": "integer",
+        "occupied_cells": "integer",
+        "hidden_cells": "integer",
+        "free_cells": "integer",
     },
     "location_candidate": {
         "resolution_id": "key",
