@@ -51,7 +51,10 @@ __all__ = ["ReadableMemory"]
 
 
 class ReadableMemory(PartsHolder):
-    """The queries of a memory. Each raises `CallerError` while the memory is not open."""
+    """The queries of a memory. Each raises `CallerError` while the memory is not open.
+
+    "Up to the last flush" means that events recorded since the last `flush` may be missing from the result.
+    """
 
     _recall: Recall | None = None
 
@@ -157,9 +160,10 @@ class ReadableMemory(PartsHolder):
         return await self._open_parts.reading.query(sql, limits)
 
     def mapped(self, designator: str | type) -> Any:
-        """Return the mapped class of a designator type, by its dtype or its class, after one of it was flushed.
+        """Return the mapped class of a designator type, by its dtype or its class.
 
-        With a daemon it needs an earlier query, because until then this memory has no connection.
+        The type is known after a flush of its first use. A memory with a daemon has no connection before its first
+        query, so query it first.
         """
         reading = self._open_parts.reading
         if not reading.is_open:
@@ -275,9 +279,9 @@ class ReadableMemory(PartsHolder):
             x, y: names of columns: numbers, times, texts, enums or bools.
             of: the view: a mapped class, the name of one or of a view or designator type, or a select with a column
                 `status`.
-            kind: `heatmap` of the share of successes, with the number of rows and the 95 % interval where they find
-                room; `scatter` of the rows; by default a scatter of up to 500 rows with two numbers.
-            bins: ranges of a numeric column at most; by default the finer the more rows there are.
+            kind: `heatmap` of the share of successes, with the number of rows and the 95 % interval in cells that are
+                large enough; `scatter` of the rows; by default a scatter of up to 500 rows with two numbers.
+            bins: the largest number of ranges of a numeric column; by default it grows with the number of rows.
             axes: draw into these instead of a new figure.
 
         It needs the extra `pictures`. Raises `CallerError` for an unknown view or column, and if no row is left.

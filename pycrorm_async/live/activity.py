@@ -1,4 +1,4 @@
-"""Fold the events of an episode into what its robot does now, and into its row in the list of episodes.
+"""Fold the events of an episode into the present activity of its robot, and into its row in the list of episodes.
 
 Events of motion are skipped undecoded, so that an episode of a million events is read in seconds.
 """
@@ -27,8 +27,8 @@ class Activity:
 
     Attributes:
         last: sequence of the last event that was read.
-        simulated: whether it is a simulation, performed in a copy of the world.
-        fault: why its events cannot be read any further, or None.
+        simulated: True for a simulation, performed in a copy of the world.
+        fault: the reason for which its events cannot be read any further, or None.
     """
 
     def __init__(self, row: EpisodeRow) -> None:

@@ -90,7 +90,7 @@ class LogFollower:
         turn: counts the turns in which something changed.
         epoch: counts how often the database was replaced.
         began: number of the newest episode, except simulations, that began while the log was followed; 0 without one.
-        overview: what each episode does now.
+        overview: the present activity of each episode.
     """
 
     def __init__(self, address: DatabaseAddress) -> None:
@@ -179,7 +179,7 @@ class LogFollower:
 
     @asynccontextmanager
     async def listening(self, followed: EpisodeFeed | LiveOverview) -> AsyncIterator[None]:
-        """Keep what is followed up to date inside the context."""
+        """Keep the feed or the overview up to date inside the context."""
         followed.listeners += 1
         self._listeners += 1
         self._wanted.set()
@@ -206,7 +206,7 @@ class LogFollower:
             self._changed.notify_all()
 
     async def _take_turn(self) -> bool:
-        """Fold what was stored since the last turn; return whether there was anything."""
+        """Fold the events stored since the last turn; return whether there were any."""
         epoch, log = self.epoch, await self.log()
         if self._newest is None:
             self._newest = max([each.number for each in await log.episodes()], default=0)

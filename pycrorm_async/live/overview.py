@@ -94,7 +94,7 @@ class LiveOverview:
         return [self._activities[each].entry() for each in numbers if not self._activities[each].simulated]
 
     async def document(self, log: EventLog) -> dict[str, Any]:
-        """Return the document of the list: the newest episodes of the tables, and those that run or are not folded."""
+        """Return the document of the list: the newest episodes of the tables, running ones, and those not folded."""
         unended = [number for number, each in self._activities.items() if not each.has_ended]
         running = await grown_episodes(log, above=EPISODE_NUMBER_MAX, numbers=unended)
         await self.catch_up(log, {each.number: each for each in [*await log.behind(), *running]}.values())

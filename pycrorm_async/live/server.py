@@ -5,8 +5,8 @@
     /TOKEN/episode/NAME[?from=N]       an episode by number, id or `last`, from its event N on
     /TOKEN/episode/NAME/events         its stream, behind the event in `Last-Event-ID` or `?after=`
 
-A page has what was recorded up to its loading, and its stream brings the rest in parts (`text/event-stream`). The id of
-a part is its last event, so a browser that lost the connection continues behind it, also with a server started again.
+A page has the events up to its loading, and its stream brings the rest in parts (`text/event-stream`). The id of a part
+is its last event, so a browser that lost the connection continues behind it, also with a server started again.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ _WAITING = """<!doctype html>
 
 
 def listen(port: int | None) -> socket.socket:
-    """Open the port on the loopback address; by default a usual one, or any free one if another process uses that.
+    """Open the port on the loopback address; by default `PORT`, or any free one if another process uses that.
 
     Raises `CallerError` if the requested port cannot be used.
     """

@@ -1,4 +1,4 @@
-"""The base-level activation of ACT-R: how recently and how often a way of acting was used.
+"""Compute the base-level activation of ACT-R, which grows with how recently and how often a way of acting was used.
 
 A way is a type with all its texts but the outcome: the same object, arm and grasp. Its activation at time t is
 
@@ -38,8 +38,8 @@ class Forgotten(NamedTuple):
     """The cases whose ways have an activation below a threshold.
 
     Attributes:
-        cases, ways: how many.
-        nodes: their nodes, ascending.
+        cases, ways: their numbers.
+        nodes: the ids of the cases' nodes, ascending.
     """
 
     cases: int
@@ -128,7 +128,7 @@ def _numbers_of_ways(groups: Sequence[Group], library: CaseLibrary) -> NDArray[n
 
 
 def _renumbered(ways: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
-    """Return the ways with the numbers from 0 on, and how many there are."""
+    """Return the ways numbered from 0 on, and the number of different ones."""
     different, numbers = np.unique(ways, return_inverse=True)
     return numbers.astype(np.int64), int(different.size)
 
@@ -140,7 +140,7 @@ def _spread_evenly(count: int, third_s: float, oldest_s: float) -> float:
 def _spread_evenly_all(
     counts: NDArray[np.int64], third_s: NDArray[np.float64], oldest_s: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Return the sum of the older uses; where all are of one age, each counts alike."""
+    """Return the sum over the older uses of each way; if all have the same age, that of one times their number."""
     spread = oldest_s - third_s
     power = 1 - _DECAY
     with np.errstate(divide="ignore", invalid="ignore"):

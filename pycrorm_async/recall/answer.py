@@ -27,7 +27,7 @@ from pycrorm_async.recall.library import CaseLibrary
 from pycrorm_async.recall.search import Match, Weights, search, weights_of
 
 _TRIED = ("SUCCEEDED", "FAILED", "ERROR")
-"""The statuses of an action that ran to its end. Of one that was cancelled, interrupted or lost nothing is known."""
+"""The statuses of an action that ran to its end; a cancelled, interrupted or lost one is no evidence of success."""
 
 
 class Rate(NamedTuple):
@@ -94,12 +94,12 @@ class Surroundings(Protocol):
 
 @dataclass(frozen=True)
 class RecalledCase:
-    """One case of an answer. It is read from the columns when it is asked for.
+    """One case of an answer. Its values are read from the columns at the first access.
 
     Attributes:
         match: its place in the columns, with its score.
-        cue, weights: what it is compared with.
-        memory: finds what happened around it; None for an answer of columns only.
+        cue, weights: the cue with which it is compared, and the weights of its features.
+        memory: finds its neighbours and its moment; None for an answer without a memory.
     """
 
     match: Match
@@ -194,7 +194,7 @@ class Answer(Sequence[RecalledCase]):
 
     Attributes:
         cue: what was asked.
-        cases: each with its score; fewer than `cue.k` where the memory has no more that share anything with the cue.
+        cases: each with its score; fewer than `cue.k` if the memory has fewer that share a feature with the cue.
         considered: the number of cases of the type, among which words were counted.
         never_seen: pairs of feature and word in `has` or `only` that none of them has.
         joined: the names under which the cases of the type were recorded, if it was renamed.
@@ -231,7 +231,7 @@ class Answer(Sequence[RecalledCase]):
         return sorted(counts.items(), key=lambda item: (-item[1], item[0]))
 
     def typical(self, feature: str, *, status: str | None = None) -> Typical | None:
-        """Return what a feature was like, each case counted by its score (blending, in the terms of ACT-R).
+        """Summarise one feature over the cases, each weighted by its score (blending, in the terms of ACT-R).
 
         Args:
             feature: a name, as `height`, or `duration`.
@@ -329,12 +329,12 @@ def compare(cue: Cue, case: Case, weights: Weights) -> tuple[Compared, ...]:
 
 
 def success_of(cases: Iterable[Case]) -> Rate | None:
-    """Return how many of these cases succeeded, among those that ran to their end; None if none did."""
+    """Return the success rate among the cases that ran to their end; None if none did."""
     return rate_of(Counter(case.status for case in cases))
 
 
 def rate_of(statuses: Mapping[str, int]) -> Rate | None:
-    """Return how many succeeded, from the number of cases with each status; None if none ran to its end."""
+    """Return the success rate from the number of cases with each status; None if none ran to its end."""
     tries, successes = sum(statuses.get(each, 0) for each in _TRIED), statuses.get("SUCCEEDED", 0)
     if not tries:
         return None

@@ -74,9 +74,9 @@ class Case(NamedTuple):
 
 
 def bounded_case(case: Case) -> Case:
-    """Return the case as blocks keep it: without what is not finite, too long or too much, numbers as stored.
+    """Return the case as blocks store it: without infinite numbers, long texts and excess features, numbers rounded.
 
-    It depends on the case alone, so the same action is the same case wherever blocks begin and end.
+    The result depends on the case alone, so an action gives the same case in any block.
     """
     symbols = {name: kept for name, value in case.symbols.items() if (kept := _bounded(value))}
     numbers = {name: _stored(value) for name, value in case.numbers.items() if math.isfinite(value)}

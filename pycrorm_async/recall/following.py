@@ -1,4 +1,4 @@
-"""Find the actions beside and around an action, and those in a temporal relation with it; count what follows what.
+"""Find the neighbours of an action and the actions in a temporal relation with it; count which types follow which.
 
 The next action of a case is the one that started after it under the same parent. The relations are those of Allen
 between the intervals from start to end; moments that differ by less than a millisecond count as one.
@@ -61,10 +61,10 @@ class Follower(NamedTuple):
     """One type of action that came next.
 
     Attributes:
-        type: None where nothing came next under the same parent.
-        cases: how often.
-        share: of all cases that were asked about.
-        success: how it ended; None if none of these ran to its end.
+        type: None for the cases after which no action started under the same parent.
+        cases: the number of times that this type came next.
+        share: that number divided by the number of all cases in question.
+        success: the success rate of these actions; None if none of them ran to its end.
     """
 
     type: str | None
@@ -134,7 +134,7 @@ class Sequences:
         return following
 
     def case(self, node: int) -> Case | None:
-        """Return the case of a node; None if it has none, because it is no action or still runs."""
+        """Return the case of a node; None if it has none, because it is not an action or still runs."""
         index = self._index(node)
         return None if index is None else self._case(index)
 
@@ -158,11 +158,11 @@ class Sequences:
         return sorted(related, key=lambda each: (each.started_us, each.node))
 
     def follows(self, dtype: str, *, status: str | None = None, reason: str | None = None) -> Following:
-        """Return what came next after the actions of a type, how often, and how that ended, without simulations.
+        """Count the actions that came next after the actions of a type, with their success rates, without simulations.
 
         Args:
-            dtype: of the cases to ask about.
-            status, reason: likewise; by default any.
+            dtype: type of the actions before.
+            status, reason: their outcome; by default any.
         """
         dtype = self._library.present_name(dtype)
         outcomes = np.concatenate(

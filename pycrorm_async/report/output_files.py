@@ -40,10 +40,10 @@ def write_file(content: bytes, path: Path, *, force: bool = False) -> None:
 
 @contextmanager
 def new_file(path: Path, *, force: bool) -> Iterator[Path]:
-    """Yield the name of an empty file beside `path`, which takes the name `path` at the end, and not on an error.
+    """Yield the name of an empty file beside `path`, and rename it to `path` at the end unless an error occurred.
 
     Raises `CallerError` as `refuse_existing`, also if another process made the file meanwhile, and for a folder;
-    `OSError` where the disk is full.
+    `OSError` if the disk is full.
     """
     refuse_existing(path, force=force)
     _delete_parts(path)
@@ -68,7 +68,7 @@ def new_file(path: Path, *, force: bool) -> Iterator[Path]:
 
 @contextmanager
 def new_folder(path: Path, *, force: bool, marker: str) -> Iterator[Path]:
-    """Yield a folder beside `path`, which takes the name `path` at the end, and not on an error.
+    """Yield a folder beside `path`, and rename it to `path` at the end unless an error occurred.
 
     With `force` it replaces a folder that has the file `marker`, and no other one.
     """

@@ -40,7 +40,7 @@ class ObjectTracks:
         attachments: `[parent, child, link, from, to]`, the objects by identity, `to` 0 while attached.
         samples: by object and channel.
         full_until: the last event before the world was emptied; None while it has objects.
-        numbers: how many numbers the tracks of poses and joints hold, which bounds the size of the page.
+        numbers: the number of values in the tracks of poses and joints, which bounds the size of the page.
     """
 
     def __init__(self, first: int) -> None:

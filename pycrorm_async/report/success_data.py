@@ -17,7 +17,7 @@ _PAIRS = (("relative_x", "relative_y"), ("arm", "grasp"))
 
 
 async def success_documents(reading: Reading, numbers: Collection[int]) -> list[dict[str, Any]]:
-    """Return a table of successes for each pair of columns; none if no pick-up of these episodes has ended."""
+    """Return a table of successes for each pair of columns; an empty list if no pick-up of these episodes has ended."""
     of = select(PickUpWithContextView).where(PickUpWithContextView.process_metadata_id.in_(numbers))
     try:
         return [_document(success_table(await success_samples(reading, x, y, of))) for x, y in _PAIRS]

@@ -1,4 +1,4 @@
-"""Keep how a value changed over the events of an episode, in columns that JSON holds compactly."""
+"""Keep the changes of a value over the events of an episode, in columns that are compact as JSON."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Track:
         self.values: list[Any] = []
 
     def set(self, sequence: int, value: Any) -> None:
-        """Append a value; one of an equal value or of the same event has no entry of its own."""
+        """Append a value; leave out one that equals the last, and replace the last if it is of the same event."""
         if self.values and self.values[-1] == value:
             return
         if self.at and (self.at[-1] == sequence or sequence <= self._first):

@@ -38,9 +38,9 @@ class Report(NamedTuple):
 
 
 class Overview(NamedTuple):
-    """A written overview: its file, and how many episodes it counts, has pages for, and leaves out.
+    """A written overview: its file, and the numbers of episodes that it counts, has pages for, and leaves out.
 
-    `unreadable` are the reasons why episodes have no page, by number: damaged ones, and those of a newer version.
+    `unreadable` has the reason, by number, for each episode without a page: it is damaged, or of a newer version.
     """
 
     path: Path

@@ -60,7 +60,7 @@ class CaseCheck(ProjectionCheck):
         return differences
 
     async def _block(self, connection: AsyncConnection, generation: int, heading: BlockHeading) -> Block | None:
-        """Read a block, once for all parts that it has cases of. A damaged one is reported, and taken as empty."""
+        """Read a block, once for all parts whose cases it contains. A damaged one is reported, and counts as empty."""
         kept = self._blocks
         if heading.number not in kept:
             block: Block | None = None

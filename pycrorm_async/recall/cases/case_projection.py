@@ -1,4 +1,4 @@
-"""Fold the events of episodes into cases, stored as blocks; a projection of every memory, named `recall`."""
+"""Fold the events of episodes into cases, which are stored as blocks. Every memory has this projection, `recall`."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ _NEAR_M = 0.5
 _UPRIGHT_MIN: Final = 0.99
 """The cosine of 8 degrees: the x-y plane of an object that leans more does not lie on the floor."""
 _OBJECTS_MAX: Final = 1_000
-"""Bounds the objects that are looked at for each action. In a world with more of them nothing is near."""
+"""Bounds the objects that are compared for each action. In a world with more objects `near` is empty."""
 _NUMBER_MAX: Final = 1e300
 """Bounds the magnitude of a number. An integer may have any number of digits, and then has no float."""
 _NEVER_NEAR = frozenset({"ROBOT", "ENVIRONMENT"})

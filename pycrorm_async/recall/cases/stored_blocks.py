@@ -138,7 +138,7 @@ async def read_blocks(connection: AsyncConnection, generation: int, numbers: Col
 
 
 async def read_left_out(connection: AsyncConnection, generation: int) -> list[str]:
-    """Read the features that a block has left out, because they have too many words to liken cases."""
+    """Read the names of the features that a block has left out, because they have more than `WORDS_MAX` words."""
     columns = _columns(generation)
     query = select(columns.c.feature).where(columns.c.kind == "left_out").distinct().order_by(columns.c.feature)
     return list(await connection.scalars(query))

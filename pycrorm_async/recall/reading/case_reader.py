@@ -1,9 +1,9 @@
-"""Keep the cases of a memory at hand: the stored blocks, and the cases of this process that are not stored yet.
+"""Keep the cases of a memory in this process: the stored blocks, and its own cases that are not stored yet.
 
 Theory of operation. Before each recall the reader asks the source for the numbers of the blocks, and reads those that
 it does not have. A merge replaces blocks by one with a new number; the source returns both in one snapshot, so that no
 case is missing or doubled. In another generation, which a rebuild has made, all blocks are new. A case of this process
-is at hand as soon as its action has ended; when a stored block has it, the block's is taken.
+is included as soon as its action has ended; once a stored block has it too, that of the block is used.
 """
 
 from __future__ import annotations
@@ -88,10 +88,10 @@ class CaseReader:
         self._reading = asyncio.Lock()
 
     async def library(self, type: str | None = None, aliases: Collection[str] = ()) -> CaseLibrary:  # noqa: A002
-        """Return all cases that have ended, those that are hidden left out, under the present names of their types.
+        """Return all cases that are not hidden, under the present names of their types.
 
         Args:
-            type: the type that will be asked for, because the memory may know it by another name.
+            type: the type of the next cue, because the memory may know it by another name.
             aliases: former names of this type, also if the memory does not know them yet.
         """
         async with self._reading:

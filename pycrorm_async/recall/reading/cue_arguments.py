@@ -1,4 +1,4 @@
-"""Make a cue of what a caller asks for: designator classes, enums, datetimes, cases, names of episodes and tags."""
+"""Make a cue from a caller's arguments: designator classes, enums, datetimes, cases, names of episodes and tags."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ async def make_cue(
 def cue_like(case: Case, library: CaseLibrary) -> Cue:
     """Return the situation of a case as a cue, without its outcome and without the name of its object.
 
-    Of more features than a cue can have, those that weigh least are left out, and counted.
+    If there are more features than a cue can have, those with the lowest weights are left out, and counted.
     """
     unused = RESERVED | _OF_EACH_CASE | library.left_out
     has = symbols_of({name: value for name, value in case.symbols.items() if name not in unused})

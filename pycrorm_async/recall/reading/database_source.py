@@ -1,4 +1,4 @@
-"""Read the stored blocks of a memory, and with one statement see that none has changed."""
+"""Read the stored blocks of a memory; one statement finds out whether any has changed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Recall past actions: `memory.recall` is called with a cue, and answers with the cases most like it.
+"""Recall past actions: `memory.recall(...)` takes a cue and returns the cases most like it.
 
 >>> answer = await memory.recall(type=PickUpAction, has={"object_type": ObjectType.MILK}, near={"height": 0.93})
 >>> answer.success, answer.reasons, answer.never_seen
@@ -95,8 +95,8 @@ class Recall:
     ) -> Answer:
         """Return the past actions most like a cue, the best first and among equals the newest.
 
-        `has` and `near` make actions similar. The others are conditions, which every action of the answer fulfils. What
-        has ended in this process is included at once; of other processes what is visible in the tables.
+        `has` and `near` make actions similar. The others are conditions, which every action of the answer fulfils. An
+        action of this process is included as soon as it has ended, one of another process once it is in the tables.
 
         Args:
             type: a designator class or its dtype; subclasses are types of their own. One that was renamed is found by
@@ -238,7 +238,7 @@ class Recall:
         status: object = None,
         reason: str | type | None = None,
     ) -> Following:
-        """Return what came next after the actions of a type, how often, and how that ended.
+        """Count the actions that came next after the actions of a type, with their success rates.
 
         Args:
             type: a designator class or its dtype.
