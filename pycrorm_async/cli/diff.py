@@ -23,7 +23,7 @@ def diff(
     as_json: JsonOption = False,
     sql: Annotated[bool, typer.Option("--sql", help="Print the SQL of the rows that are compared.")] = False,
 ) -> None:
-    """Compare two episodes: what surrounded them, their task trees, and the last places of their objects.
+    """Compare two episodes: their circumstances, their task trees, and the last places of their objects.
 
     Nodes correspond by the types from the root down. A node that only one episode has is listed without its children.
     SQL reads the rows (`--sql`); the comparison is made in Python.

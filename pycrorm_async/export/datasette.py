@@ -1,4 +1,4 @@
-"""Describe a memory for Datasette: which tables to hide, what views mean, how they are sorted, and the named questions.
+"""Describe a memory for Datasette: hidden tables, meanings and sort orders of views, and the named questions.
 
     pycrorm datasette-metadata > metadata.json
     datasette -i pycrorm.db --metadata metadata.json
@@ -85,7 +85,7 @@ def _table(name: str, columns: list[str], view: ViewDescription | None) -> dict[
 
 
 def _query(reading: Reading, name: str) -> dict[str, str]:
-    """Return a question as a canned query; values that it needs are parameters of the query."""
+    """Return a question as a canned query of Datasette; its required arguments are parameters of the query."""
     parameters = [*inspect.signature(getattr(Ask, name)).parameters.values()][1:]
     needed = {each.name: str(each.annotation) for each in parameters if each.default is each.empty}
     numbers = {each: _NUMBER * (index + 1) for index, each in enumerate(needed) if needed[each] == "float"}

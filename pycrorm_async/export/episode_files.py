@@ -1,4 +1,4 @@
-"""Write episodes in the formats that hold the course of a world, from their events and not from the tables.
+"""Write episodes as LeRobot, rerun or MCAP, formats of a world that changes, from their events and not from the tables.
 
 A thread does each long step, and a cancelled task waits for its end: a writer that is closed, or a file that is
 deleted, while a thread still writes would crash the process or leave a file.
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 class EpisodeOptions(NamedTuple):
-    """The axis of an episode, events or time, how many frames or events make a second of it, and the size of images."""
+    """The axis of an episode (events or time), the number of frames or events per second, and the size of images."""
 
     clock: Clock
     fps: int = DEFAULT_FPS

@@ -53,7 +53,7 @@ class Exported(NamedTuple):
         path: of the file.
         rows: number of rows.
         episodes: number of episodes that it covers.
-        left_out: number of episodes that run, or are not in the tables yet, and of which it therefore has no rows.
+        left_out: number of episodes without rows in the export, because they run or are not in the tables yet.
         manifest: the description, which is in the file `PATH.manifest.json`.
     """
 
@@ -99,7 +99,7 @@ async def export(
     images: ImageSize | None = None,
     report_progress: ProgressCallback | None = None,
 ) -> Exported:
-    """Write rows or episodes to a file that has its name only when it is complete, and its manifest beside it.
+    """Write rows or episodes to a file that gets its name when it is complete, and its manifest beside it.
 
     Args:
         what: an episode or several (a row for each node), by number, id or `last`; a view or table by name, or a mapped
@@ -163,7 +163,7 @@ async def export_again(
     Args:
         manifest: the file `PATH.manifest.json`.
         path: of the new file; by default the export is only compared.
-        statement: the select or question, for an export of one that was not named.
+        statement: the select or question, if the export was made from one without a name.
 
     If episodes are missing, nothing is made and `differences` lists them. Raises what `export` raises.
     """
@@ -209,7 +209,7 @@ async def export_again(
 def _named_by(
     manifest: Manifest, statement: Question | Select[*tuple[Any, ...]] | None
 ) -> tuple[Exportable, tuple[str, ...]]:
-    """Return what the manifest names, and the episodes to limit it to."""
+    """Return the exportable that the manifest names, and the episodes to limit it to."""
     ids = tuple(each.id for each in manifest.episodes)
     match manifest.kind:
         case "episodes":
@@ -267,14 +267,14 @@ async def _write_rows(
 
 
 def _complete(manifest: Manifest, files: dict[str, str], path: Path) -> Manifest:
-    """Write the manifest with the files, before they get their names: a full disk then leaves none of both."""
+    """Write the manifest with the files, before they get their names, so that a full disk leaves neither."""
     whole = msgspec.structs.replace(manifest, files=files)
     path.write_bytes(msgspec.json.format(msgspec.json.encode(whole), indent=1) + b"\n")
     return whole
 
 
 def _options(file_format: FileFormat, clock: Clock | None, fps: int | None, images: ImageSize | None) -> EpisodeOptions:
-    """Return the options of formats with a clock. Raises `CallerError` for one that the format does not take."""
+    """Return the options of formats with a clock. Raises `CallerError` for an option that the format does not have."""
     if file_format not in ("lerobot", "mcap") and (clock, fps) != (None, None):
         raise CallerError("clock and fps are options of the formats lerobot and mcap")
     if file_format != "lerobot" and images is not None:

@@ -1,4 +1,4 @@
-"""Read an episode's events into what the formats of robots have: objects and how they moved, and nodes of the plan."""
+"""Read an episode's events into objects, their changes, and nodes of the plan, which all formats of robots share."""
 
 from __future__ import annotations
 

@@ -61,7 +61,7 @@ def write_rerun(episode: RecordedEpisode, objects: dict[int, SceneObject], path:
 
 
 def _part(frame: str) -> str:
-    """Return the last part of an entity path, without the characters that rerun gives a meaning."""
+    """Return the last part of an entity path, without the characters that have a meaning in rerun."""
     return "".join(each if each.isalnum() or each in "_-." else "_" for each in frame.rpartition("/")[2])
 
 

@@ -1,4 +1,4 @@
-"""Resolve what to export: episodes, a view or table, a named question, or a select; and which episodes it covers.
+"""Resolve the rows to export (episodes, a view or table, a named question, a select) and the episodes that they cover.
 
 Rows come from episodes that have ended and are visible in the tables to their last event, so that the same export can
 be made again. Those of a view are ordered by its key.
@@ -48,11 +48,12 @@ class Selection:
     """The rows to export.
 
     Attributes:
-        kind, name: `episodes`, `view`, `question` or `select`; of a view and a question its name.
+        kind: `episodes`, `view`, `question` or `select`.
+        name: of the view or the question.
         arguments: of the question.
         statement: the select.
-        episodes: those that it covers, by number; of an own select all that the memory has.
-        simulated: whether simulations are among them.
+        episodes: those that it covers, by number; for a select of the caller all that the memory has.
+        simulated: True if simulations are among them.
         left_out: the number of episodes without all their rows yet.
     """
 
@@ -82,8 +83,8 @@ async def select_rows(
 
     `episodes` limits a view to these, `arguments` are those of a question, and `running` admits episodes that run.
 
-    Raises `CallerError` for a name that nothing has, with the nearest ones, for `episodes` beside something that is not
-    a view, for wrong arguments, and for an episode that has not ended; `UnknownEpisode`.
+    Raises `CallerError` for an unknown name, with the nearest ones; if `episodes` is given and `what` is not a view;
+    for wrong arguments; and for an episode that has not ended. Raises `UnknownEpisode`.
     """
     await reading.refresh()
     chosen = [str(each) for each in episodes]

@@ -172,7 +172,7 @@ class _Tools:
         return _cut(str(moment).splitlines())
 
     async def compare(self, first: int | str, second: int | str, limit: int = 100) -> dict[str, Any]:
-        """Compare two episodes: what surrounded them, their task trees, and where their objects were at the end.
+        """Compare two episodes: their circumstances, their task trees, and the last places of their objects.
 
         `limit` bounds the differences that are listed, 1 to 300.
         """

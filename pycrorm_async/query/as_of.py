@@ -32,7 +32,7 @@ _NUMBERS_END = 1e15
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 _Within: TypeAlias = Callable[[StoredEvent, StoredEvent], bool]
-"""Given the episode's first event and another one, returns whether the other is not after the moment."""
+"""Takes the episode's first event and another event; returns whether the other is not later than the moment."""
 
 
 async def as_of(

@@ -5,7 +5,7 @@
 >>> with world_of(await memory.as_of("last", time=0)), simulated_robot:
 ...     await performable_of(rows[0]).perform()
 
-The row's attributes have all values but the objects themselves, which are looked up by name in the current world. A
+The row's attributes have all values except the objects themselves, which are searched by name in the current world. A
 list that could not be recorded has no entries, like an empty one. A query with `undefer(Action.parameters)`
 distinguishes them, and errors then name the reason why a value is missing.
 """
@@ -43,7 +43,7 @@ _WITHOUT_POSE = "object {!r} was recorded as one outside the world, and without 
 
 
 class NotPerformable(CallerError):
-    """A row does not have what its designator is made from; the message names it."""
+    """A row lacks a value that its designator needs; the message names it."""
 
 
 def performable_of(row: orm.Designator, /, **replacements: Any) -> Designator:

@@ -1,4 +1,4 @@
-"""Suggest the nearest of the valid names where a name is wrong."""
+"""Suggest the nearest valid name in place of a wrong one."""
 
 from __future__ import annotations
 

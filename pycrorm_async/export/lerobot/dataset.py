@@ -68,7 +68,7 @@ class LeRobotFolder:
         return self._frames
 
     def add(self, episode: RecordedEpisode, frames: Frames, pictures: NDArray[np.uint8] | None = None) -> None:
-        """Write the frames of an episode, with a picture of each or for no episode.
+        """Write the frames of an episode, with their pictures; either all episodes have pictures or none has.
 
         Raises `CallerError` if its robot has other joints than that of the first.
         """
@@ -104,7 +104,7 @@ class LeRobotFolder:
         self._frames += count
 
     def finish(self) -> None:
-        """Write what describes the episodes."""
+        """Write the files in `meta/`, which describe the episodes."""
         if self._writer is not None:
             self._writer.close()
         assert self._first is not None, "an episode was added"

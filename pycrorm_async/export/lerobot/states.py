@@ -1,7 +1,7 @@
 """Make the frames of an episode: the robot's base and joints, by event or at a fixed rate, and the running action.
 
 By event there is a frame for each event that changed the robot's state, because a plan whose motions are jumps takes a
-third of a second for 70 nodes. By time the state in force is taken at a fixed rate, samples included.
+third of a second for 70 nodes. By time there is a frame at a fixed rate, with the latest state, samples included.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ BASE = ("base.x", "base.y", "base.z", "base.qx", "base.qy", "base.qz", "base.qw"
 IDLE = "idle"
 """The subtask while no action runs."""
 _FRAMES_MAX = 10_000_000
-"""Bounds the frames of an episode by time, which a mistake in the rate would make many."""
+"""Bounds the frames of an episode by time, because a wrong rate could fill the disk."""
 _SECOND_NS = 10**9
 
 

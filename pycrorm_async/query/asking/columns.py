@@ -1,4 +1,4 @@
-"""Expressions that several questions select or filter by."""
+"""Define the SQL expressions that several questions select or filter by."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ FAILED = (TaskStatus.FAILED, TaskStatus.ERROR, TaskStatus.LOST)
 
 
 def json_text(document: Any, name: str) -> ColumnElement[str]:
-    """Return the member of this name of a column of JSON, as text; of a number SQLite alone would return the number."""
+    """Return the member of this name of a column of JSON as text; SQLite alone would return a number as a number."""
     return cast(member(document, name), Text)
 
 
 def times_with(condition: Any) -> ColumnElement[int]:
-    """Return the number of rows of a group that meet the condition."""
+    """Return the number of rows of a group that fulfil the condition."""
     return cast(func.coalesce(func.sum(case((condition, 1), else_=0)), 0), Integer)
 
 
@@ -40,7 +40,7 @@ def share_succeeded(status: Any) -> ColumnElement[float]:
 
 
 def containing(text: str, *columns: Any) -> ColumnElement[bool]:
-    """Return the condition that one of the columns has the text, whatever its case."""
+    """Return the condition that one of the columns contains the text, in upper or lower case."""
     return or_(*(func.lower(cast(each, Text)).contains(text.lower(), autoescape=True) for each in columns))
 
 

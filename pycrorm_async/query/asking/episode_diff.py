@@ -1,4 +1,4 @@
-"""Compare two episodes: what surrounded them, their task trees, and where their objects were at the end.
+"""Compare two episodes: their circumstances, their task trees, and the last places of their objects.
 
 Nodes correspond by their path: the types from the root down, with numbers among siblings of one type, as in
 `root > PickUpAction > MoveTCPMotion 2`, and objects by their name, with numbers among those of one name in the order

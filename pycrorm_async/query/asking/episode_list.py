@@ -16,7 +16,7 @@ from pycrorm_async.task_status import TaskStatus
 
 @dataclass(frozen=True)
 class EpisodeChoice:
-    """Conditions on episodes; those that are None do not count.
+    """Conditions on episodes; None means no condition.
 
     Attributes:
         status: the name of a `TaskStatus`.
@@ -24,7 +24,7 @@ class EpisodeChoice:
         tags: an episode has all of them.
         robot: name or model of a robot that took part.
         text: a part of the description, the plan's name or a tag.
-        limit: of the episodes that meet all conditions, only the newest, this many.
+        limit: the largest number of episodes; the newest that fulfil all conditions are taken.
     """
 
     status: str | None = None

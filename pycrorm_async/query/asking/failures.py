@@ -1,4 +1,4 @@
-"""Selects about failures: where they began, their causes, and what was done before."""
+"""Selects about failures: their nodes, their causes, and the actions before them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Selects about one object: all that happened to it, and the actions that moved it."""
+"""Selects about one object: the events of its history, and the actions that moved it."""
 
 from __future__ import annotations
 
@@ -102,10 +102,10 @@ def object_history(episode: EpisodeNumber | None, *, name: str, limit: int | Non
 
 
 def _failures(episode: EpisodeNumber | None) -> CTE:
-    """Return the failures, made before one of their objects is looked for.
+    """Return the failures as a subquery that is evaluated before they are filtered by object.
 
-    PostgreSQL, where it has no statistics, expects one failure of an object, and would read all nodes of the episode to
-    know whether a node below it failed.
+    Without statistics PostgreSQL expects one failure of an object, and would read all nodes of the episode to find out
+    whether a node below it failed.
     """
     failed = RootFailure.__table__
     columns = failed.c.id, failed.c.process_metadata_id, failed.c.start_time, failed.c.reason, failed.c.object

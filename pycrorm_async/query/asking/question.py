@@ -58,7 +58,7 @@ class Question:
 
     @property
     def statement(self) -> Select[*tuple[Any, ...]]:
-        """The select, to change or to join: it finds the episodes that the question names by itself."""
+        """The select, to change or to join. It contains the subqueries that find the named episodes."""
         return self._plan.select_of(*(_number_by_query(each) for each in self._plan.episodes))
 
     @property
@@ -84,7 +84,7 @@ class Question:
         return self.frame().__await__()
 
     async def _resolved(self) -> Select[*tuple[Any, ...]]:
-        """Return the select for the numbers of the episodes, with which both databases plan better."""
+        """Return the select with the numbers of the episodes in place of subqueries, so that databases plan better."""
         numbers = [(await self._reading.episode(episode_name(each))).number for each in self._plan.episodes]
         return self._plan.select_of(*numbers)
 

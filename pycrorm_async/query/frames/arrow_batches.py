@@ -1,4 +1,4 @@
-"""Stream the rows of a select as Arrow record batches of one schema, which the declared types of its columns give."""
+"""Stream the rows of a select as Arrow record batches of one schema, derived from the declared types of its columns."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """List the columns of a select with their declared types.
 
-A mapped class contributes its columns under its attributes' names, without deferred ones unless they are asked for. Two
+A mapped class contributes its columns under its attributes' names; deferred ones only if `deferred` is True. Two
 columns of one name become `x` and `x_1`.
 """
 
@@ -54,7 +54,7 @@ _KINDS: tuple[tuple[type[TypeEngine[Any]], ColumnKind, TypeEngine[Any] | None], 
     (DateTime, "local time", None),
     (Date, "date", None),
 )
-"""The kind of each SQLAlchemy type, and the type as which it is read, where its Python values are not wanted."""
+"""The kind of each SQLAlchemy type, and the type as which it is read in place of its own Python values."""
 
 
 class FrameColumn(NamedTuple):

@@ -1,4 +1,4 @@
-"""Make one data frame of the rows of a select."""
+"""Read the rows of a select into one data frame."""
 
 from __future__ import annotations
 

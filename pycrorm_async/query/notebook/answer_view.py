@@ -1,4 +1,4 @@
-"""Draw the answers of queries: rows of SQL, a question before it is asked, the differences between two episodes."""
+"""Draw the results of queries: rows of SQL, a question that is not awaited yet, the differences of two episodes."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def sql_result_html(result: SqlResult) -> str:
 
 
 def question_html(name: str, sql: str, request: str) -> str:
-    """Return the name of a question, the request that asks it, and its SQL."""
+    """Return the name of a question, the code that awaits it, and its SQL."""
     shown = html.escape(sql if len(sql) <= _SQL_MAX else f"{sql[:_SQL_MAX]}…")
     text = f'<div style="font-family:monospace;white-space:pre-wrap;margin:4px 0">{shown}</div>'
     return view(f"<b>Question {html.escape(name)}</b> {quiet(html.escape(request))}", text)

@@ -16,7 +16,7 @@ _COLUMNS = ("episode", "started, UTC", "took", "status", "nodes", "failed", "des
 
 
 def episodes_html(episodes: Sequence[EpisodeSummary], total: int | None = None) -> str:
-    """Return a table of the newest episodes, the oldest of them first; `total` counts those that are not given too."""
+    """Return a table of the newest episodes, the oldest of them first; `total` is the number of all in the memory."""
     if not episodes:
         return view("No episodes")
     count, shown = len(episodes) if total is None else total, episodes[-EPISODES_MAX:]

@@ -1,4 +1,4 @@
-"""Draw the state of an episode at a moment: what runs, the world from above, objects, observations and the tree."""
+"""Draw the state of an episode at a moment: running nodes, the world from above, objects, observations and the tree."""
 
 from __future__ import annotations
 

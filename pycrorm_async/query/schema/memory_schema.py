@@ -1,4 +1,4 @@
-"""Read which views a memory has, with their columns, and add what is known of them in words.
+"""Read the views of a memory with their columns, and add the descriptions from the mapped classes' docstrings.
 
 schema = await read_schema(reading)
 print(as_text(schema))
@@ -38,7 +38,7 @@ CORE_VIEWS = (
     "observation",
     "observation_value",
 )
-"""The views of the diagram, if none are named: which most queries read; those of all types would fill pages."""
+"""The default views of the diagram, which most queries read; the views of all types would fill pages."""
 
 
 @dataclass(frozen=True)

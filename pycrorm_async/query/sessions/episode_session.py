@@ -1,4 +1,4 @@
-"""Load related rows from the part of the tables that has their episode, and attributes when they are read.
+"""Load related rows from the part of the tables that has their episode, and unloaded attributes at the first access.
 
 SQLAlchemy loads subclasses' columns and related rows by their ids. An id contains the number of its episode, but no
 database can know that: where the tables are divided by episode, it would look for these ids in every part. So a load
@@ -34,7 +34,7 @@ class _MapReference(ref[IdentityMap]):
 
 
 class EpisodeSession(Session):
-    """An ordinary session whose objects load what is read of them, also without `await` and after it is closed.
+    """A session whose objects load attributes at the first access, also without `await` or after it is closed.
 
     Its loads of related rows name their episode.
 

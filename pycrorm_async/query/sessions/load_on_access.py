@@ -1,11 +1,11 @@
 """Load attributes that are read without `await`, on a connection of their own.
 
-Theory of operation. Reading `action.arm` is no coroutine, so the loop of the session cannot wait for the database
+Theory of operation. Reading `action.arm` is not a coroutine, so the loop of the session cannot await the database
 meanwhile, and the session's connection belongs to that loop. So the load runs in a loop of its own, in a thread, on
-another connection, and the reader waits for it as for any function: the loop of the reader is blocked until then, for
-the time of a query or two. The session is used by that thread alone, because its own loop waits. Each load has the
-database's state of now, as each statement has in a session of PostgreSQL. The engine keeps no connection between two
-loads, because a connection belongs to the loop that opened it; a lock makes the loads of several threads take turns.
+another connection, and blocks the loop of the reader until it has ended, for the time of a query or two. Only that
+thread uses the session meanwhile, because the session's loop is blocked. Each load sees the present state of the
+database, as each statement of a PostgreSQL session does. The engine keeps no connection between two loads, because a
+connection belongs to the loop that opened it; a lock makes the loads of several threads take turns.
 """
 
 from __future__ import annotations

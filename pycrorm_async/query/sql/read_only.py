@@ -5,7 +5,7 @@ result = await sql.query("SELECT dtype, count(*) AS nodes FROM task_tree_node GR
 async with sql.stream("SELECT * FROM event", SqlLimits(rows=None)) as rows:
     async for row in rows: ...
 
-**Theory of operation.** The text of a query is not trusted: a person typed it, or a language model wrote it. Each query
+**Theory of operation.** The text of a query is untrusted: a user or a language model wrote it. Each query
 has a connection of its own, which is closed after it, so that no setting, lock or temporary table outlives a query.
 The database refuses everything but reading: SQLite through an authorizer, in a process with limits (`sqlite_reader`),
 PostgreSQL through a login without other rights, a read-only transaction and a cursor (`postgresql_reader`). Parsing the
@@ -40,9 +40,9 @@ class SqlLimits:
     """Bounds of one query.
 
     Attributes:
-        rows: returned at most; None for any number.
-        bytes: of the returned values at most, as text.
-        seconds: that the database may spend on it. Waiting for the reader of the rows does not count.
+        rows: the largest number of returned rows; None for any number.
+        bytes: the largest size of the returned values, as text.
+        seconds: the longest time that the database may spend on it, without waits for the reader of the rows.
     """
 
     rows: int | None = 1_000
@@ -66,7 +66,7 @@ class SqlResult:
 
     Attributes:
         columns: their names, in order; two may be the same.
-        more: whether the query has more rows than these, which reached a bound.
+        more: True if the query has more rows than these, because a bound was reached.
     """
 
     columns: tuple[str, ...]

@@ -31,7 +31,7 @@ _BUSY_TIMEOUT_S = 5.0
 
 
 class _Authorizer:
-    """Allows reading and nothing else; `denied` is what a statement tried first."""
+    """Allows reading and nothing else; `denied` is the first denied action of a statement."""
 
     def __init__(self) -> None:
         self.denied: tuple[int, str | None] | None = None
@@ -83,7 +83,7 @@ def _limit(what: int, most: int) -> None:
 
 
 def _answer(rows: sqlite3.Cursor, bytes_left: int) -> None:
-    """Write the rows that are asked for in pieces: the rows, and whether the query ends or its bytes are used up."""
+    """Write the requested rows in pieces, each with whether the query has ended or reached its bound on bytes."""
     while True:
         wanted = _read()
         piece: list[tuple[Any, ...]] = []

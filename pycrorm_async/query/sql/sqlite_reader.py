@@ -111,7 +111,7 @@ class _Cursor:
         return answer
 
     async def _run(self, work: Callable[[], _T], seconds: float) -> _T:
-        """Run it in a thread, to its end also if the time is over or this task is cancelled: then kill the process."""
+        """Run a call in a thread; kill the process if the time is over or this task is cancelled, and await the end."""
         thread = asyncio.ensure_future(asyncio.to_thread(work))
         try:
             done, _ = await asyncio.wait([thread], timeout=max(seconds, 0.001))
@@ -139,7 +139,7 @@ class _Cursor:
 def _refusal(
     kind: str, code: int | None, text: str, denied: tuple[int, str | None] | None, names: list[str]
 ) -> Exception:
-    """Return the error that the process met, as the query's own or as one of the database."""
+    """Return the error of the process, as one of the query or as one of the database."""
     if kind == "memory":
         return QueryRefused(_TOO_MUCH.format("memory"))
     if denied is not None:

@@ -60,7 +60,7 @@ def success_figure(
 
 @cache
 def _figure_type() -> type[Figure]:
-    """Return a figure that a notebook draws also where pyplot, which would do so, is not used."""
+    """Return the class of a figure that a notebook draws without pyplot."""
     try:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
         from matplotlib.figure import Figure

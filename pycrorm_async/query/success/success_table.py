@@ -98,7 +98,7 @@ class SuccessTable(NamedTuple):
 def success_table(samples: Samples, *, bins: int | None = None) -> SuccessTable:
     """Count the samples in at most about `bins` ranges of each numeric column, with round edges.
 
-    By default the ranges are the finer the more rows there are. Raises `CallerError`.
+    By default the number of ranges grows with the number of rows. Raises `CallerError`.
     """
     if bins is None:
         usual = round(math.sqrt(len(samples.succeeded) / _ROWS_A_CELL))
