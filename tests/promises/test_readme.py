@@ -43,9 +43,11 @@ def blocks_of(page: str) -> list[str]:
 
 PLAN, QUESTIONS, EXECUTIVE = python_of("README.md")
 TIDY, LIFTER, STEREO, CELLS = python_of("pycrorm_async/plan/README.md")
-COURSE, PLOTTED, AROUND, ROBOTS, BEGAN, FRAMES, ASKED, TAGGED, SEEN, THEN, AGAIN, RATE, TRIES, FOLLOWED = python_of(
+COURSE, PLOTTED, AROUND, ROBOTS, BEGAN, FRAMES, ASKED, TAGGED, SEEN, THEN, AGAIN = python_of(
     "pycrorm_async/query/README.md"
 )
+RATE, TRIES = python_of("pycrorm_async/projections/README.md")
+(FOLLOWED,) = python_of("pycrorm_async/events/README.md")
 (CHECKED,) = python_of("pycrorm_async/recording/README.md")
 (EXPORTED,) = python_of("pycrorm_async/export/README.md")
 (RECALLED,) = python_of("pycrorm_async/recall/README.md")
