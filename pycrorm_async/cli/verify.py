@@ -132,13 +132,20 @@ def _print(result: VerifyResult) -> None:
         stdout.print(f"{result.behind} events are not in the tables yet")
     if result.without_digest:
         stdout.print(
-            f"{result.without_digest} episodes are without a digest, because an earlier version stored them;"
-            " in a copy made with `pycrorm copy` they have one",
+            f"{result.without_digest} episodes are without a digest: an earlier version stored them, or a login that"
+            " may not insert digests, or the digests were deleted; in a copy made with `pycrorm copy` they have one",
             soft_wrap=True,
         )
     folded = f"{counted(result.events, 'event')} of {counted(result.episodes, 'episode')}"
     checked = f"{folded} and {counted(result.rows, 'row')}: "
-    if result.damage:
+    if result.rows_without_event:
+        stdout.print(
+            f"{checked}events were deleted from the log, and the tables have"
+            f" {counted(result.rows_without_event, 'row')} of them, which `pycrorm rebuild` would delete; restore a"
+            " backup, or compare digests kept elsewhere (`--digests`)",
+            soft_wrap=True,
+        )
+    elif result.damage:
         stdout.print(f"{checked}the log is damaged; copy its intact events to another memory with `pycrorm copy`")
     elif result.drift:
         stdout.print(f"{checked}the log is intact, but the tables differ from it; run `pycrorm rebuild`")
@@ -162,6 +169,7 @@ def _document(result: VerifyResult, ids: dict[int, str]) -> dict[str, Any]:
     return {
         **vars(result),
         "blobs": len(result.blobs),
+        "deleted": sorted(result.deleted),
         "damages": [{"episode": id_of(each.number), **each._asdict()} for each in result.damages],
         "stopped": [{"episode": id_of(each.number), **each._asdict()} for each in result.stopped],
         "differences": [{"episode": id_of(each.number), **each._asdict()} for each in result.differences],

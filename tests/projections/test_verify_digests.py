@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from pycrorm_async.events.codec import encode
-from pycrorm_async.events.types import EpisodeTagged
+from pycrorm_async.events.codec import encode, fingerprint
+from pycrorm_async.events.types import DescriptionDeclared, EpisodeTagged, ObjectAdded
 from pycrorm_async.operations.copy import copy_episodes
 from pycrorm_async.projections.verify.digest_check import OutsideDigest
 from pycrorm_async.projections.verify.findings import VerifyResult
@@ -21,8 +21,10 @@ from pycrorm_async.store.log import EventLog
 from tests.backups import Backup
 from tests.commands import COMMAND, answer, one_line_of, pycrorm
 from tests.databases import ask, ask_to_change, run_in_own_loop
+from tests.projections.event_script import pose
 from tests.projections.test_verify_damage import unlock
-from tests.projections.verify_cases import fold_in_batches, full, in_parts, opened
+from tests.projections.verify_cases import fold_in_batches, full, in_parts, opened, rebuilt
+from tests.store.factories import declaration
 
 pytestmark = pytest.mark.slow
 
@@ -78,6 +80,11 @@ async def digests_of(log: EventLog) -> tuple[OutsideDigest, ...]:
 
 
 CHANGED = "or their digest, was changed after it was stored: the digest does not match"
+CUT = [
+    "DELETE FROM event WHERE episode = 2 AND sequence > 580",
+    "UPDATE episode SET head = 580, folded = 580 WHERE number = 2",
+]
+KEYS = {"event": "episode", "episode": "number", "pycrorm_digest": "episode"}
 
 
 @pytest.mark.soak_on("postgresql")
@@ -115,6 +122,22 @@ CHANGED = "or their digest, was changed after it was stored: the digest does not
         (
             ["DELETE FROM event WHERE episode = 3", "DELETE FROM episode WHERE number = 3"],
             ["episode 3 was deleted: the log has its digests and not its events"],
+        ),
+        (
+            [*CUT, "DELETE FROM pycrorm_digest WHERE episode = 2 AND sequence > 580"],
+            ["episode 2, event 581: it and all behind it were deleted: the episode has an end, and no EpisodeEnded"],
+        ),
+        (
+            [
+                *CUT,
+                "DELETE FROM pycrorm_digest WHERE episode = 2 AND sequence > 580",
+                "UPDATE episode SET ended_wall_ns = NULL WHERE number = 2",
+            ],
+            ["episode 2, event 581: the events 581 to 603 were deleted: the tables have rows of event 603"],
+        ),
+        (
+            [f"DELETE FROM {table} WHERE {key} = 3" for table, key in KEYS.items()],
+            ["episode 3 was deleted: the tables have rows of its events up to 18, and the log has none of them"],
         ),
         (
             ["DELETE FROM pycrorm_digest WHERE episode = 2 AND sequence = 512"],
@@ -233,6 +256,49 @@ async def test_a_tag_behind_the_end_is_covered(database_url: str, change: str, f
 
 
 @pytest.mark.soak_on("postgresql")
+async def test_no_rebuild_is_advised_where_it_would_delete_the_rows_of_deleted_events(
+    log: EventLog, filled_url: str, tmp_path: Path
+) -> None:
+    for change in (*CUT, *(f"DELETE FROM {table} WHERE {key} = 3" for table, key in KEYS.items())):
+        ask_to_change(filled_url, change)
+    done = pycrorm("verify", "--url", filled_url, cwd=tmp_path)
+    result = await verify(log)
+    assert done.returncode == 4
+    assert done.stdout.splitlines()[-1].endswith(
+        f": events were deleted from the log, and the tables have {result.rows_without_event} rows of them, which"
+        " `pycrorm rebuild` would delete; restore a backup, or compare digests kept elsewhere (`--digests`)"
+    )
+    assert result.deleted == {2, 3}
+    writing = await opened(filled_url)
+    await rebuilt(writing)
+    await writing.close()
+    after = await verify(log)
+    assert (after.rows_without_event, after.drift, after.deleted) == (0, 0, {2})
+
+
+async def test_a_missing_digest_is_damage_where_the_version_that_stored_the_episode_keeps_digests(
+    tmp_path: Path,
+) -> None:
+    url = f"sqlite:///{tmp_path}/memory.db"
+    log = await opened(url)
+    description = encode(DescriptionDeclared("e30="))
+    described, undescribed = full(1), full(2)
+    name = fingerprint(description, "DescriptionDeclared")
+    payload = encode(ObjectAdded("pr2", "ROBOT", pose(), {"torso": 0.1}, description=name))
+    described.records[2] = described.records[2]._replace(payload=payload)
+    await log.append([declaration(description)._replace(type="DescriptionDeclared")])
+    await fold_in_batches(log, [described, undescribed], 10_000)
+    assert ((await verify(log)).damages, (await verify(log)).without_digest) == ([], 0)
+    unlock(url)
+    ask_to_change(url, "DELETE FROM pycrorm_digest")
+    result = await verify(log)
+    reason = "its digest is missing, although the version that stored the episode keeps digests"
+    assert [str(each) for each in result.damages] == [f"episode 1, event 20: {reason}"]
+    assert result.without_digest == 1
+    await log.close()
+
+
+@pytest.mark.soak_on("postgresql")
 async def test_the_command_compares_with_a_document_of_digests(log: EventLog, filled_url: str, tmp_path: Path) -> None:
     url = ("--url", filled_url)
     document = answer("episodes", "--simulated", *url, cwd=tmp_path)
@@ -242,7 +308,7 @@ async def test_the_command_compares_with_a_document_of_digests(log: EventLog, fi
     file = tmp_path / "digests.json"
     file.write_text(json.dumps(document))
     assert pycrorm("verify", "--digests", str(file), *url, cwd=tmp_path).returncode == 0
-    for table, column in (("event", "episode"), ("episode", "number"), ("pycrorm_digest", "episode")):
+    for table, column in KEYS.items():
         ask_to_change(filled_url, f"DELETE FROM {table} WHERE {column} = 3")
     line = f"damage: episode {ID.format(3)} is missing: a digest at event 20 is given"
     done = pycrorm("verify", "--digests", str(file), *url, cwd=tmp_path)

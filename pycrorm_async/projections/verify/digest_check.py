@@ -6,7 +6,7 @@ block alone. The blocks are those of `store.digests.episode_digest`.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import groupby
 from typing import NamedTuple
 
@@ -14,6 +14,7 @@ from sqlalchemy import text
 from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.events.ids import parse_episode_id
+from pycrorm_async.projections.verify.episode_check import EpisodeCheck
 from pycrorm_async.projections.verify.findings import VerifyResult
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.digests.digest_table import has_digests
@@ -43,11 +44,15 @@ class OutsideDigest(NamedTuple):
 
 
 class DigestCheck:
-    """The check of one episode's digests, up to the last part read. Adds its findings to `result`."""
+    """The check of one episode's digests, up to the last part read. Adds its findings to `result`.
 
-    def __init__(self, episode: EpisodeRow, result: VerifyResult) -> None:
+    With `certain`, every writer of a version with digests stores them. On PostgreSQL a login may lack the right to.
+    """
+
+    def __init__(self, episode: EpisodeRow, result: VerifyResult, *, certain: bool) -> None:
         self._number = episode.number
         self._result = result
+        self._certain = certain
         self._running: RunningDigest | None = RunningDigest.at_start(parse_episode_id(episode.id))
         tags = () if episode.ended_wall_ns is None else ("EpisodeTagged",)  # behind the end each has a digest
         self._last_types = ("EpisodeEnded", *tags)
@@ -60,7 +65,7 @@ class DigestCheck:
         head: int,
         events: Mapping[int, StoredEvent],
         kept: Mapping[int, str],
-        damaged_blocks: Collection[int],
+        checked: EpisodeCheck,
     ) -> None:
         """Check the events of the next span, given by sequence, with the digests kept inside it.
 
@@ -76,7 +81,7 @@ class DigestCheck:
             last = events.get(end)
             if end in kept:
                 self._has_digest = True
-                if digest not in (None, kept[end]) and block not in damaged_blocks:
+                if digest not in (None, kept[end]) and block not in checked.damaged_blocks:
                     self._report(block * BLOCK_EVENTS + 1, end)
             elif end % BLOCK_EVENTS == 0 or (end == head and last is not None and last.type in self._last_types):
                 self._missing = self._missing or end
@@ -84,7 +89,7 @@ class DigestCheck:
                 self._running = _behind(kept[end], end)
             done = end
         if span.last == head and self._missing is not None:
-            self._report_missing(self._missing)
+            self._report_missing(self._missing, described=checked.described)
 
     def _digest_behind(self, events: Sequence[StoredEvent], count: int) -> str | None:
         """Add the next `count` events and return the digest; None if one of them is missing, or one before them."""
@@ -99,9 +104,12 @@ class DigestCheck:
         reason = f"{which}, or their digest, was changed after it was stored: the digest does not match"
         self._result.add_damage(self._number, first, reason)
 
-    def _report_missing(self, sequence: int) -> None:
+    def _report_missing(self, sequence: int, *, described: bool) -> None:
         if self._has_digest:
             reason = "its digest is missing, although other digests of the episode exist"
+            self._result.add_damage(self._number, sequence, reason)
+        elif described and self._certain:  # version 0.1.0, which has no digests, cannot store descriptions
+            reason = "its digest is missing, although the version that stored the episode keeps digests"
             self._result.add_damage(self._number, sequence, reason)
         else:
             self._result.without_digest += 1
@@ -130,10 +138,10 @@ async def check_places(connection: AsyncConnection, limits: Mapping[str, int], r
     if not await has_digests(dialect_of(connection), connection):
         return
     for (number,) in await connection.execute(_WITHOUT_EPISODE, limits):
-        result.add_damage(None, None, f"episode {number} was deleted: the log has its digests and not its events")
+        result.add_deleted(number, None, f"episode {number} was deleted: the log has its digests and not its events")
     for number, head, sequence in await connection.execute(_BEYOND, limits):
         reason = f"the events {head + 1} to {sequence} were deleted: a digest at event {sequence} exists"
-        result.add_damage(number, head + 1, reason)
+        result.add_deleted(number, head + 1, reason)
 
 
 async def check_outside(

@@ -12,7 +12,7 @@ from typing import Any
 from pycrorm_async.events.blobs import references_in
 from pycrorm_async.events.ids import row_id, row_key
 from pycrorm_async.events.order import OrderCheck
-from pycrorm_async.events.types import ObjectAdded
+from pycrorm_async.events.types import EpisodeEnded, ObjectAdded
 from pycrorm_async.projections.fold.column_values import CannotFold
 from pycrorm_async.projections.fold.fold import UndecodablePayload, fold_happening, happening_of
 from pycrorm_async.projections.fold.node_row import STATUS
@@ -21,7 +21,7 @@ from pycrorm_async.projections.fold.row_batch import Rows
 from pycrorm_async.projections.verify.findings import VerifyResult
 from pycrorm_async.projections.verify.row_comparison import Difference
 from pycrorm_async.store.digests.episode_digest import BLOCK_EVENTS
-from pycrorm_async.store.stored import Span, StoredEvent
+from pycrorm_async.store.stored import EpisodeRow, Span, StoredEvent
 
 
 class EpisodeCheck:
@@ -32,6 +32,8 @@ class EpisodeCheck:
         carried: ids of the running nodes, which a later part compares.
         descriptions: fingerprints of the stored descriptions.
         damaged_blocks: indexes of the blocks (`store.digests`) with an event for which damage was reported.
+        described: whether an object added in the first block names its description.
+        head: the episode's last event in the snapshot of the last part read.
     """
 
     def __init__(self, number: int, result: VerifyResult) -> None:
@@ -41,6 +43,9 @@ class EpisodeCheck:
         self.carried: frozenset[int] = frozenset()
         self.descriptions: frozenset[str] = frozenset()
         self.damaged_blocks: set[int] = set()
+        self.described = False
+        self.head = 0
+        self._has_end = False
         self._nodes: dict[int, list[Any]] = {}
         self._row: dict[str, Any] | None = None
         self._order: OrderCheck | None = OrderCheck()
@@ -60,11 +65,16 @@ class EpisodeCheck:
                 rows.inserts["simulated_episode"].append((self.number,))
 
     def read(
-        self, span: Span, events: Mapping[int, StoredEvent], folded: int, designators: Designators, rows: Rows
+        self,
+        span: Span,
+        events: Mapping[int, StoredEvent],
+        episode: EpisodeRow,
+        designators: Designators,
+        rows: Rows,
     ) -> None:
-        """Check the events of a span, given by sequence, and fold those up to `folded` into `rows`."""
-        if self.compared:
-            folded = 0
+        """Check the events of a span, given by sequence, and fold those that are visible into `rows`."""
+        self.head = episode.head
+        folded = 0 if self.compared else episode.folded
         for sequence in range(span.after + 1, span.last + 1):
             event = events.get(sequence)
             if event is not None:
@@ -74,6 +84,10 @@ class EpisodeCheck:
                 self._in_gap = True
                 self._damaged(sequence, "is missing")
                 self._lose(sequence, folded, rows)
+        ended = span.last == episode.head and episode.ended_wall_ns is not None
+        if ended and not self._has_end and self._order is not None:
+            evidence = "the episode has an end, and no EpisodeEnded"
+            self._result.add_deleted(self.number, span.last + 1, f"it and all behind it were deleted: {evidence}")
 
     def leave(self, rows: Rows, after: int, folded: int) -> None:
         """End a part after event `after` of an episode that continues: take the rows to carry out of `rows`."""
@@ -103,11 +117,13 @@ class EpisodeCheck:
         shown = event.sequence <= folded
         self._result.events += 1
         self._result.behind += not shown
+        self._has_end = self._has_end or event.type == EpisodeEnded.__name__
         for reference in references_in(event.type, event.payload):
             self._result.blobs.setdefault(reference.hash, (self.number, event.sequence))
         try:
             happening = happening_of(event)
             described = happening.description if isinstance(happening, ObjectAdded) else None
+            self.described = self.described or (described is not None and event.sequence <= BLOCK_EVENTS)
             if described is not None and described not in self.descriptions:
                 self._damaged(event.sequence, f"the description {described} was never declared")
             if self._order is not None:

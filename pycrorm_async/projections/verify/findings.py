@@ -48,7 +48,9 @@ class VerifyResult:
         unmade: by dtype, the reason why a designator type has no tables.
         failed_views: by name, the reason why a user's view is left out.
         blobs: by hash, the first event that refers to this blob; the content of each is compared with its hash.
-        without_digest: the number of episodes without a digest, which an earlier version stored.
+        without_digest: the number of episodes without a digest; for them it is not known whether one was deleted.
+        deleted: the episodes of which events were deleted.
+        rows_without_event: the number of rows, among the differences, of events that the log does not have.
         outdated: the reason why no table was compared: an older fold made them. None for tables of this version.
     """
 
@@ -67,6 +69,8 @@ class VerifyResult:
     failed_views: Mapping[str, str] = field(default_factory=dict)
     blobs: dict[str, tuple[int | None, int | None]] = field(default_factory=dict)
     without_digest: int = 0
+    deleted: set[int] = field(default_factory=set)
+    rows_without_event: int = 0
     outdated: str | None = None
 
     def add_damage(self, number: int | None, sequence: int | None, reason: str) -> None:
@@ -74,6 +78,12 @@ class VerifyResult:
         self.damage += 1
         if len(self.damages) < _FINDINGS_MAX:
             self.damages.append(Damage(number, sequence, " ".join(reason.split())))
+
+    def add_deleted(self, number: int, first: int | None, reason: str) -> None:
+        """Add the damage that an episode's events from `first` on, or all of them, were deleted; once for each."""
+        if number not in self.deleted:
+            self.deleted.add(number)
+            self.add_damage(None if first is None else number, first, reason)
 
     def add_difference(self, difference: Difference) -> None:
         """Count a difference and keep it, unless there are many."""

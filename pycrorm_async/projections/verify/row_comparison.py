@@ -41,10 +41,15 @@ class Difference(NamedTuple):
     stored: Any
     expected: Any
 
+    @property
+    def is_superfluous(self) -> bool:
+        """True if no event makes the row."""
+        return self.column is None and self.expected is None
+
     def __str__(self) -> str:
         if self.column is None:
-            fault = "has a row that no event makes" if self.expected is None else "lacks a row"
-            return f"{self.table} {fault}: {self.stored if self.expected is None else self.expected}"
+            fault = "has a row that no event makes" if self.is_superfluous else "lacks a row"
+            return f"{self.table} {fault}: {self.stored if self.is_superfluous else self.expected}"
         return f"{self.table}.{self.column} is {self.stored!r}, and should be {self.expected!r}"
 
 

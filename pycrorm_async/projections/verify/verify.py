@@ -34,7 +34,7 @@ from pycrorm_async.projections.verify.digest_check import (
 from pycrorm_async.projections.verify.episode_check import EpisodeCheck
 from pycrorm_async.projections.verify.findings import StoppedEpisode, VerifyResult
 from pycrorm_async.projections.verify.parts import EpisodeRange, Place, Unreadable
-from pycrorm_async.projections.verify.row_comparison import Comparison, Range
+from pycrorm_async.projections.verify.row_comparison import Comparison, Difference, Range
 from pycrorm_async.projections.verify.verify_custom import check_of, uncompared_projections
 from pycrorm_async.store.address import no_tables
 from pycrorm_async.store.dialects import dialect_of
@@ -231,18 +231,18 @@ class _TablesCheck:
         for span in spans:
             if span.after == 0:
                 self._unfinished = EpisodeCheck(span.number, self.result)
-                self._digests = DigestCheck(by_number[span.number], self.result)
+                self._digests = DigestCheck(by_number[span.number], self.result, certain=self._log.address.is_sqlite)
                 self.result.episodes += 1
             read[span.number] = self._unfinished
             self._unfinished.descriptions = descriptions
-            self._unfinished.read(span, events.get(span.number, {}), folded[span.number], designators, rows)
+            self._unfinished.read(span, events.get(span.number, {}), by_number[span.number], designators, rows)
             if self._digests is not None:
                 self._digests.read(
                     span,
                     by_number[span.number].head,
                     events.get(span.number, {}),
                     kept.get(span.number, {}),
-                    self._unfinished.damaged_blocks,
+                    self._unfinished,
                 )
         carried: frozenset[int] = frozenset()
         if place is not None and place.after:
@@ -293,6 +293,23 @@ class _TablesCheck:
         for each in sorted(differences, key=attrgetter("number", "sequence")):
             if each.number not in read or not read[each.number].hides(each):
                 self.result.add_difference(each)
+        self._check_superfluous([each for each in differences if each.is_superfluous and each.number], read)
+
+    def _check_superfluous(self, rows: Iterable[Difference], read: Mapping[int, EpisodeCheck]) -> None:
+        """Report the events and episodes that the log does not have, although the tables have their rows."""
+        last: dict[int, int] = {}
+        for each in rows:
+            if each.number not in read or each.sequence > read[each.number].head:
+                last[each.number] = max(each.sequence, last.get(each.number, 0))
+                self.result.rows_without_event += 1
+        for number, sequence in last.items():
+            if number not in read:
+                reason = f"episode {number} was deleted: the tables have rows of its events up to {sequence}"
+                self.result.add_deleted(number, None, f"{reason}, and the log has none of them")
+            else:
+                first = read[number].head + 1
+                reason = f"the events {first} to {sequence} were deleted: the tables have rows of event {sequence}"
+                self.result.add_deleted(number, first, reason)
 
 
 def _cut(episodes: Sequence[EpisodeRow], at: Place, limit: int) -> tuple[list[Span], Place | None]:
