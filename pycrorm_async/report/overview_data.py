@@ -66,9 +66,10 @@ async def overview_document(
 async def _reasons(reading: Reading) -> dict[int, dict[str, int]]:
     """Count the root failures of each episode by reason: failed nodes below which no node failed."""
     below = aliased(TaskTreeNode)
-    caused = select(below.id).where(below.parent_id == TaskTreeNode.id, below.status.in_(_FAILED)).exists()
-    counts: dict[int, dict[str, int]] = {}
     episode, reason = TaskTreeNode.process_metadata_id, TaskTreeNode.reason
+    of_node = below.parent_id == TaskTreeNode.id, below.process_metadata_id == episode
+    caused = select(below.id).where(*of_node, below.status.in_(_FAILED)).exists()
+    counts: dict[int, dict[str, int]] = {}
     query = select(episode, reason, func.count()).where(TaskTreeNode.status.in_(_FAILED), ~caused)
     async with reading.session() as session:
         for number, name, count in await session.execute(query.group_by(episode, reason)):

@@ -126,7 +126,7 @@ async def test_values_of_every_kind_are_rows_under_the_node_and_the_same_after_c
         assert np.array_equal(np.load(io.BytesIO(stored.content)), cloud)
         frame = await memory.dataframe(
             select(Observation.name, Observation.sequence, ObservationValue.key, ObservationValue.number)
-            .join(ObservationValue, ObservationValue.id == Observation.id)
+            .join(Observation.items)
             .where(ObservationValue.key == "x")
         )
         assert frame[["name", "key", "number"]].to_numpy().tolist() == [["force", "x", 1.5]]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import re
 from collections.abc import Callable, Coroutine, Iterator
@@ -22,8 +23,10 @@ from pycrorm_async.events.types import (
     NodeStarted,
     ObjectAdded,
     ObjectMoved,
+    Observed,
 )
 from pycrorm_async.events.values import (
+    BlobReference,
     CandidateValue,
     FailureValue,
     ObjectReference,
@@ -31,12 +34,15 @@ from pycrorm_async.events.values import (
     RefusalValue,
     RobotValue,
 )
+from pycrorm_async.learning.policies.recorded_policy import policy_contents
+from pycrorm_async.learning.rollouts.recorded_rollouts import episodes_question, rollouts_question
 from pycrorm_async.orm import (
     Action,
     EpisodeRobot,
     LocationResolution,
     NavigateAction,
     Object,
+    Observation,
     PickUpAction,
     PickUpWithContextView,
     ProcessMetaData,
@@ -45,6 +51,7 @@ from pycrorm_async.orm import (
     TaskTreeNode,
 )
 from pycrorm_async.projections.schema.generations import current_generation
+from pycrorm_async.query.asking.ask import Ask
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.databases import Server, ask, run_in_own_loop
@@ -71,6 +78,14 @@ OF_THE_LOG = """SELECT DISTINCT of_log.relname FROM pg_rewrite
 JOIN pg_depend ON pg_depend.objid = pg_rewrite.oid JOIN pg_class of_log ON of_log.oid = pg_depend.refobjid
 JOIN pg_class view ON view.oid = pg_rewrite.ev_class
 WHERE of_log.relnamespace = 'pycrorm'::regnamespace AND view.relnamespace = 'memory'::regnamespace"""
+BATCH = declared(
+    "BatchRolloutAction",
+    "batch_rollout_action",
+    *(field(name, "text", slot) for slot, name in enumerate(("policy", "scene"), 2)),
+    *(field(name, "integer", slot) for slot, name in enumerate(("seed", "first", "count"), 4)),
+)
+TRY = declared("MoveAndPickUpAction", "move_and_pick_up_action", field("policy", "text", 2, optional=True))
+LEARN = declared("LearnPolicyAction", "learn_policy_action", field("policy", "text", 2))
 SETS = declared("SetAction", "set_action", field("things", "list", 2, item="object"))
 
 
@@ -91,11 +106,20 @@ def episode(number: int) -> Script:
     put(NodeEnded(drive, "SUCCEEDED"))
     seen = ObjectReference(milk, milk)
     put(NodeStarted("action", root, name_of(SETS), {"things": [seen, ObjectValue("BelieveObject", "cup")]}, state))
+    rollout = {"policy": "seen", "scene": "kitchen", "seed": 69, "first": 0, "count": 1}
+    batch = put(NodeStarted("action", root, name_of(BATCH), rollout, state))
+    tried = put(NodeStarted("action", batch, name_of(TRY), {}, state))
     pick = put(
-        NodeStarted("action", root, name_of(PICK_UP), {"object_designator": seen, "arm": "LEFT", "grasp": "TOP"}, state)
+        NodeStarted(
+            "action", tried, name_of(PICK_UP), {"object_designator": seen, "arm": "LEFT", "grasp": "TOP"}, state
+        )
     )
     put(ObjectMoved(milk, "milk", "MILK", pose(9, 9, 9), pick))
-    put(NodeEnded(pick, "FAILED", FailureValue("plan.failures.IKError", "too far", ["LEFT"])))
+    too_far = FailureValue("plan.failures.IKError", "too far", ["LEFT"])
+    put(NodeEnded(pick, "FAILED", too_far))
+    put(NodeEnded(tried, "FAILED", too_far))
+    learned = put(NodeStarted("action", root, name_of(LEARN), {"policy": "learned"}, state))
+    put(Observed("policy", BlobReference("aa", "application/json", 2), learned))
     put(EpisodeEnded("FAILED"))
     return script
 
@@ -112,7 +136,7 @@ def divided(server: Server) -> Iterator[str]:
 async def fill_and_divide(url: str) -> None:
     log = await EventLog.open(DatabaseAddress.parse(url), create=True)
     records = [record for number in range(1, EPISODES + 1) for record in episode(number).records]
-    await stored_and_folded(log, [*declarations(NAVIGATE, MOVE, PICK_UP, SETS), *records])
+    await stored_and_folded(log, [*declarations(NAVIGATE, MOVE, PICK_UP, SETS, BATCH, TRY, LEARN), *records])
     async with log.engine.begin() as connection:
         for (table,) in (await connection.exec_driver_sql(OF_DIVIDED)).all():
             await divide(connection, "memory_tables", table, EPISODE)
@@ -215,16 +239,55 @@ async def an_episode_with_robots(reading: Reading) -> None:
 
 
 async def the_tree(reading: Reading) -> None:
-    assert len(await reading.tree(ASKED)) == 5
+    assert len(await reading.tree(ASKED)) == 8
 
 
 async def a_snapshot(reading: Reading) -> None:
     assert (await reading.as_of(ASKED, sequence=8)).world.objects
 
 
+def asked(name: str, *arguments: Any) -> Callable[[Reading], Coroutine[Any, Any, None]]:
+    async def ask_it(reading: Reading) -> None:
+        assert await getattr(reading.ask, name)(*arguments, episode=ASKED).rows() or name == "successful_pick_ups"
+
+    return ask_it
+
+
+def selected(statement: Any, episode: Any) -> Callable[[Reading], Coroutine[Any, Any, None]]:
+    async def read(reading: Reading) -> None:
+        async with reading.session() as session:
+            assert (await session.execute(statement.where(episode == ASKED))).all()
+
+    return read
+
+
+ROLLOUTS = rollouts_question(scene="kitchen", seed=69)
+ROUNDS = episodes_question(scene="kitchen", seeds=[69], policies=["seen"])
+QUESTIONS = [
+    *((name, ()) for name in ("root_failures", "failures_by_cause", "steps_before_failures", "longest_actions")),
+    *((name, ()) for name in ("durations", "arms_used", "successful_pick_ups")),
+    *((name, ("milk",)) for name in ("object_history", "moves_of")),
+]
+
+
+def test_all_questions_about_an_episode_are_asked() -> None:
+    about = {
+        name
+        for name, method in inspect.getmembers(Ask, inspect.isfunction)
+        if not name.startswith("_") and "episode" in inspect.signature(method).parameters
+    }
+    assert {name for name, _ in QUESTIONS} == about
+
+
 @pytest.mark.parametrize(
     "question",
     [
+        *(pytest.param(asked(name, *arguments), id=name) for name, arguments in QUESTIONS),
+        pytest.param(selected(ROLLOUTS, PickUpWithContextView.process_metadata_id), id="rollouts"),
+        pytest.param(selected(ROUNDS, ProcessMetaData.id), id="episodes of rollouts"),
+        pytest.param(
+            selected(policy_contents("learned"), Observation.process_metadata_id), id="the content of a policy"
+        ),
         pytest.param(of_episode(Action), id="actions"),
         pytest.param(of_episode(Action, undefer(Action.parameters)), id="actions with parameters"),
         pytest.param(of_episode(NavigateAction), id="actions of a type"),

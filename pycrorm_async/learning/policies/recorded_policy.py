@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
-from sqlalchemy import Select, or_, select
+from sqlalchemy import Select, and_, or_, select
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.blobs import Blob
@@ -87,13 +87,17 @@ def keep_policy(name: str, policy: Policy) -> None:
 
 def policy_contents(name: str) -> Select[str | None]:
     """Select the hash of the blob that holds the content of the policy with this name, the latest first."""
+    node, observation, value = LearnPolicyAction, Observation, ObservationValue
+    of_node = node.id == observation.node_id, node.process_metadata_id == observation.process_metadata_id
     return (
-        select(ObservationValue.blob)
-        .join(Observation, Observation.id == ObservationValue.id)
-        .outerjoin(LearnPolicyAction, LearnPolicyAction.id == Observation.node_id)
-        .where(Observation.name == _OBSERVATION, ObservationValue.blob.is_not(None))
-        .where(or_(ObservationValue.key == name, LearnPolicyAction.policy == name))
-        .order_by(Observation.id.desc())
+        select(value.blob)
+        .join(
+            observation, and_(observation.id == value.id, observation.process_metadata_id == value.process_metadata_id)
+        )
+        .outerjoin(node, and_(*of_node))
+        .where(observation.name == _OBSERVATION, value.blob.is_not(None))
+        .where(or_(value.key == name, node.policy == name))
+        .order_by(observation.id.desc())
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 from sqlalchemy import Select, and_, func, or_, select
@@ -27,18 +28,21 @@ def rollouts_question(*, scene: str, seed: int, policy: str | None = None) -> Se
     in `MoveAndPickUp.query_for_database`) and goals: the number of goals the hand was given.
     """
     batch, node, view = BatchRolloutAction, TaskTreeNode, PickUpWithContextView
+    episode = attrgetter("process_metadata_id")
     tried, picked, moved = aliased(TaskTreeNode), aliased(TaskTreeNode), aliased(TaskTreeNode)
+    number = func.row_number().over(partition_by=(episode(tried), node.id), order_by=tried.id)
     # Two steps: the subquery selects and numbers the rollouts within their batch, the outer query joins the details.
     ended = (
         select(
             tried.id,
+            tried.process_metadata_id,
             tried.status,
             tried.reason,
             batch.policy,
-            (batch.first + func.row_number().over(partition_by=node.id, order_by=tried.id) - 1).label("index"),
+            (batch.first + number - 1).label("index"),
         )
-        .join(node, node.id == batch.id)
-        .join(tried, tried.parent_id == node.id)
+        .join(node, and_(node.id == batch.id, episode(node) == episode(batch)))
+        .join(tried, and_(tried.parent_id == node.id, episode(tried) == episode(node)))
         .where(tried.dtype == "MoveAndPickUpAction", batch.scene == scene, batch.seed == seed)
         .where(tried.status.in_([TaskStatus.SUCCEEDED, TaskStatus.FAILED]))
     )
@@ -46,7 +50,9 @@ def rollouts_question(*, scene: str, seed: int, policy: str | None = None) -> Se
         ended = ended.where(batch.policy == policy)
     rollout = ended.subquery("rollout")
     goals = (
-        select(func.count(moved.id)).where(moved.parent_id == view.id, moved.dtype == "MoveTCPMotion").scalar_subquery()
+        select(func.count(moved.id))
+        .where(moved.parent_id == view.id, episode(moved) == episode(view), moved.dtype == "MoveTCPMotion")
+        .scalar_subquery()
     )
     return (
         select(
@@ -62,20 +68,19 @@ def rollouts_question(*, scene: str, seed: int, policy: str | None = None) -> Se
             goals.label("goals"),
         )
         .select_from(rollout)
-        .join(picked, picked.parent_id == rollout.c.id)
-        .join(view, view.id == picked.id)
+        .join(picked, and_(picked.parent_id == rollout.c.id, episode(picked) == rollout.c.process_metadata_id))
+        .join(view, and_(view.id == picked.id, episode(view) == episode(picked)))
         .order_by(rollout.c.index, rollout.c.id)
     )
 
 
 def episodes_question(*, scene: str, seeds: Sequence[int], policies: Sequence[str]) -> Select[str]:
     """Select the ids of the episodes that hold the rollouts in this scene under these policies, each with its seed."""
-    batch, node, episode = BatchRolloutAction, TaskTreeNode, ProcessMetaData
+    batch, episode = BatchRolloutAction, ProcessMetaData
     rounds = [and_(batch.seed == seed, batch.policy == policy) for seed, policy in zip(seeds, policies, strict=True)]
     return (
         select(episode.uuid)
-        .join(node, node.process_metadata_id == episode.id)
-        .join(batch, batch.id == node.id)
+        .join(batch, batch.process_metadata_id == episode.id)
         .where(batch.scene == scene, or_(*rounds))
         .group_by(episode.id, episode.uuid)
         .order_by(episode.id)

@@ -8,11 +8,14 @@ from sqlalchemy import BigInteger, ColumnElement, Select, and_, cast, func, lite
 from sqlalchemy.orm import aliased
 
 from pycrorm_async.errors import CallerError
+from pycrorm_async.events.ids import SEQUENCE_MAX, SLOT_MAX
 from pycrorm_async.orm import RootFailure, TaskTreeNode
 from pycrorm_async.query.asking.columns import checked_count, containing, limited, times_with
 from pycrorm_async.query.asking.failure_words import classes_meant_by
 from pycrorm_async.query.asking.question import EpisodeNumber
 
+_NUMBER_BITS = SEQUENCE_MAX.bit_length() + SLOT_MAX.bit_length()
+"""The bits of an id below the episode's number."""
 _WORDS_MAX = 30
 """Bounds the words of a search: each is a condition on four columns, and SQLite takes a thousand."""
 
@@ -112,6 +115,7 @@ def steps_before_failures(
         .where(*matching(episode, **search))
         .cte("latest", recursive=True)
     )
+    of_episode = () if episode is None else (step.process_metadata_id == episode,)
     # One step after the other is looked up by its id, as a plan by any other way depends on statistics.
     same = "episode", "failure_sequence", "failed", "reason"
     latest = latest.union_all(
@@ -133,7 +137,7 @@ def steps_before_failures(
             step.duration.label("duration_s"),
             step.id.label("node_id"),
         )
-        .join(step, and_(step.id == latest.c.node_id, step.process_metadata_id == latest.c.episode))
+        .join(step, and_(step.id == latest.c.node_id, step.process_metadata_id == latest.c.episode, *of_episode))
         .order_by(latest.c.failure_id, latest.c.steps_before)
     )
     return limited(statement, limit)
@@ -142,15 +146,16 @@ def steps_before_failures(
 def _ended_before(node_id: Any, episode: Any, sequence: Any) -> Any:
     """Return the last action or motion before this node that had ended when the event of this sequence happened.
 
-    It reads nodes backwards by their ids, and ends at a node of another episode, which the caller leaves out. A
-    condition on the episode would be slow: without statistics PostgreSQL estimates that few nodes fulfil it, and reads
-    and sorts all nodes of the episode for each failure.
+    It reads the episode's nodes backwards by their ids. All of them are above the episode's first id. This condition is
+    for PostgreSQL, which without statistics estimates one row with it, and otherwise reads and sorts all nodes of the
+    episode for each failure.
     """
     earlier = aliased(TaskTreeNode)
-    is_step = and_(earlier.kind.in_(("action", "motion")), earlier.end_sequence < sequence)
+    first_id = cast(episode, BigInteger).bitwise_lshift(literal_column(str(_NUMBER_BITS)))
     return (
         select(earlier.id)
-        .where(earlier.id < node_id, or_(earlier.process_metadata_id != episode, is_step))
+        .where(earlier.process_metadata_id == episode, earlier.id > first_id, earlier.id < node_id)
+        .where(earlier.kind.in_(("action", "motion")), earlier.end_sequence < sequence)
         .order_by(earlier.id.desc())
         .limit(literal_column("1"))
         .scalar_subquery()

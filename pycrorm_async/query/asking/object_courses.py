@@ -2,9 +2,25 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
-from sqlalchemy import CTE, ColumnElement, Float, Select, Text, and_, case, cast, func, literal, null, select, union_all
+from sqlalchemy import (
+    CTE,
+    ColumnElement,
+    Float,
+    Select,
+    Text,
+    and_,
+    case,
+    cast,
+    func,
+    literal,
+    null,
+    select,
+    tuple_,
+    union_all,
+)
 
 from pycrorm_async.orm import Attachment, Detection, JointChange, Object, ObjectRemoval, Pose, RootFailure, TaskTreeNode
 from pycrorm_async.query.asking.columns import limited
@@ -42,8 +58,13 @@ def _course(
     )
 
 
-def _same(table: Any, id_: Any, other: Any) -> ColumnElement[bool]:
-    return and_(other.c.id == id_, other.c.process_metadata_id == table.c.process_metadata_id)
+def _joined(episode: EpisodeNumber | None, id_: Any, row: Any, other: Any) -> ColumnElement[bool]:
+    """Return the condition that `row` has this id, which a row of `other` names.
+
+    With `episode` it names the episode itself, so that one part of a divided table is read wherever the row is joined.
+    """
+    same = and_(row.c.id == id_, row.c.process_metadata_id == other.c.process_metadata_id)
+    return same if episode is None else and_(same, row.c.process_metadata_id == episode)
 
 
 def object_history(episode: EpisodeNumber | None, *, name: str, limit: int | None) -> Select[*tuple[Any, ...]]:
@@ -52,19 +73,25 @@ def object_history(episode: EpisodeNumber | None, *, name: str, limit: int | Non
     seen, other = Detection.__table__, _OBJECT.alias("other")
     is_added = _OBJECT.c.id == _OBJECT.c.identity_id
     begins = Attachment.kind == "attached"
-    named = select(_OBJECT.c.id).where(_is_named(_OBJECT.c.name, name))
+    named = select(_OBJECT.c.id, _OBJECT.c.process_metadata_id).where(_is_named(_OBJECT.c.name, name))
     if episode is not None:
         named = named.where(_OBJECT.c.process_metadata_id == episode)
+
+    joined = partial(_joined, episode)
+
+    def is_one(table: Any, id_: Any) -> ColumnElement[bool]:
+        return tuple_(id_, table.c.process_metadata_id).in_(named)
+
     failed = _failures(episode)
-    # The ids alone choose the rows, and what is joined to them is joined outside: of inner joins that share the episode
+    # IN chooses the rows, and what is joined to them is joined outside: of inner joins that share the episode
     # PostgreSQL, where it has no statistics, begins with one that joins all objects of an episode with each other.
     courses = [
         _course(_OBJECT, Object.sequence, case((is_added, "added"), else_="moved"), place=_POSE)
-        .outerjoin(_POSE, _same(_OBJECT, _OBJECT.c.pose_id, _POSE))
+        .outerjoin(_POSE, joined(_OBJECT.c.pose_id, _POSE, _OBJECT))
         .where(_is_named(_OBJECT.c.name, name), _OBJECT.c.identity_id.is_not(None), _OBJECT.c.dtype == "Object"),
         _course(attached, Attachment.sequence, attached.c.kind, other=other.c.name, detail=attached.c.link)
-        .outerjoin(other, _same(attached, attached.c.parent_id, other))
-        .where(attached.c.child_id.in_(named)),
+        .outerjoin(other, joined(attached.c.parent_id, other, attached))
+        .where(is_one(attached, attached.c.child_id)),
         _course(
             attached,
             Attachment.sequence,
@@ -72,11 +99,11 @@ def object_history(episode: EpisodeNumber | None, *, name: str, limit: int | Non
             other=other.c.name,
             detail=attached.c.link,
         )
-        .outerjoin(other, _same(attached, attached.c.child_id, other))
-        .where(attached.c.parent_id.in_(named)),
-        _course(removed, ObjectRemoval.sequence, "removed").where(removed.c.object_id.in_(named)),
+        .outerjoin(other, joined(attached.c.child_id, other, attached))
+        .where(is_one(attached, attached.c.parent_id)),
+        _course(removed, ObjectRemoval.sequence, "removed").where(is_one(removed, removed.c.object_id)),
         _course(joints, JointChange.sequence, "joint moved", detail=joints.c.joint, value=joints.c.position).where(
-            joints.c.object_id.in_(named)
+            is_one(joints, joints.c.object_id)
         ),
         _course(seen, Detection.sequence, "detected", detail=seen.c.source, value=seen.c.confidence, place=seen).where(
             _is_named(seen.c.name, name)
@@ -93,9 +120,12 @@ def object_history(episode: EpisodeNumber | None, *, name: str, limit: int | Non
     if episode is not None:
         courses = [each.where(each.selected_columns.episode == episode) for each in courses]
     course = union_all(*courses).subquery("course")
+    of_course = _NODE.c.process_metadata_id == course.c.episode
+    if episode is not None:
+        of_course = and_(of_course, _NODE.c.process_metadata_id == episode)
     statement = (
         select(*course.c[:-1], _NODE.c.dtype.label("by"), _NODE.c.status.label("status"), course.c.node_id)
-        .outerjoin(_NODE, and_(_NODE.c.id == course.c.node_id, _NODE.c.process_metadata_id == course.c.episode))
+        .outerjoin(_NODE, and_(_NODE.c.id == course.c.node_id, of_course))
         .order_by(course.c.episode, course.c.sequence, course.c.what, course.c.detail)
     )
     return limited(statement, limit)
@@ -117,7 +147,7 @@ def _failures(episode: EpisodeNumber | None) -> CTE:
 
 def moves_of(episode: EpisodeNumber | None, *, name: str, limit: int | None) -> Select[*tuple[Any, ...]]:
     """Return each move of the objects of this name, the node that moved it, and the nearest action around that."""
-    by = _NODE.alias("by")
+    by, joined = _NODE.alias("by"), partial(_joined, episode)
     moved = select(
         _OBJECT.c.id,
         _OBJECT.c.process_metadata_id,
@@ -137,15 +167,14 @@ def moves_of(episode: EpisodeNumber | None, *, name: str, limit: int | None) -> 
     columns = ("id", "parent_id", "process_metadata_id", "kind", "dtype", "status")
     up = (
         select(moves.c.id.label("move"), *(by.c[each] for each in columns))
-        .join(by, and_(by.c.id == moves.c.node_id, by.c.process_metadata_id == moves.c.process_metadata_id))
+        .join(by, joined(moves.c.node_id, by, moves))
         .cte("up", recursive=True)
     )
     above = _NODE.alias("above")
     up = up.union_all(
         select(up.c.move, *(above.c[each] for each in columns)).where(
             up.c.kind != "action",
-            above.c.id == up.c.parent_id,
-            above.c.process_metadata_id == up.c.process_metadata_id,
+            joined(up.c.parent_id, above, up),
         )
     )
     mover = _NODE.alias("mover")
@@ -162,8 +191,8 @@ def moves_of(episode: EpisodeNumber | None, *, name: str, limit: int | None) -> 
             up.c.id.label("action_id"),
         )
         .outerjoin(up, and_(up.c.move == moves.c.id, up.c.kind == "action"))
-        .outerjoin(mover, _same(moves, moves.c.node_id, mover))
-        .outerjoin(_POSE, _same(moves, moves.c.pose_id, _POSE))
+        .outerjoin(mover, joined(moves.c.node_id, mover, moves))
+        .outerjoin(_POSE, joined(moves.c.pose_id, _POSE, moves))
         .order_by(moves.c.id)
     )
     return limited(statement, limit)
