@@ -192,21 +192,22 @@ class Base(MappedAsDataclass, AsyncAttrs, DeclarativeBase, init=False, repr=Fals
 
 
 class RowOfEvent:
-    """A row whose `id` contains the sequence of its event."""
+    """A row with an id, `_row` is its attribute, that contains the sequence of the row's event."""
 
-    id: Any
+    _row: ClassVar[str] = "id"
 
     @hybrid_property
     def sequence(self) -> int:
         """The event that made the row: 1, 2, 3 … inside the episode."""
-        return row_key(self.id).sequence
+        return row_key(getattr(self, self._row)).sequence
 
     @sequence.inplace.expression
     @classmethod
     def _sequence_of_class(cls) -> ColumnElement[int]:
         # Literals, because PostgreSQL shifts by a 4-byte integer only and a parameter would be of 8 bytes.
-        shifted = cls.id.bitwise_rshift(literal_column(str(SLOT_MAX.bit_length())))
-        return shifted.bitwise_and(literal_column(str(SEQUENCE_MAX)))  # type: ignore[no-any-return]
+        row: ColumnElement[int] = getattr(cls, cls._row)
+        shifted = row.bitwise_rshift(literal_column(str(SLOT_MAX.bit_length())))
+        return shifted.bitwise_and(literal_column(str(SEQUENCE_MAX)))
 
 
 @event.listens_for(Base, "mapper_configured", propagate=True)

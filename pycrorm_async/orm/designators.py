@@ -83,7 +83,7 @@ class DesignatorType(Base):
     fields: Mapped[list[Any]] = mapped_column(JsonText())
 
 
-class ParameterItem(Base):
+class ParameterItem(RowOfEvent, Base):
     """One entry of a list or dict field. Its value is in the column of its type; a pose is in x to frame.
 
     Attributes:
@@ -94,6 +94,7 @@ class ParameterItem(Base):
     """
 
     __tablename__ = "parameter_item"
+    _row = "node_id"
 
     node_id: Mapped[int] = mapped_column(ForeignKey("designator.id"), primary_key=True)
     field: Mapped[str] = mapped_column(primary_key=True)

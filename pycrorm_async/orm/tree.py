@@ -97,10 +97,11 @@ class TaskTreeNode(RowOfEvent, Base):
         return self.duration
 
 
-class LocationCandidate(Base):
+class LocationCandidate(RowOfEvent, Base):
     """A place that a location designator offered; `position` is its rank, 0 first."""
 
     __tablename__ = "location_candidate"
+    _row = "resolution_id"
 
     resolution_id: Mapped[int] = mapped_column(ForeignKey("location_resolution.id"), primary_key=True)
     position: Mapped[int] = mapped_column(primary_key=True)
@@ -126,10 +127,11 @@ class LocationCandidate(Base):
         return [Arms.named(name) for name in self.arms.split(",") if name]
 
 
-class LocationRefusal(Base):
+class LocationRefusal(RowOfEvent, Base):
     """A place that a location designator tried and did not offer, and the reason; `position` is its rank, 0 first."""
 
     __tablename__ = "location_refusal"
+    _row = "resolution_id"
 
     resolution_id: Mapped[int] = mapped_column(ForeignKey("location_resolution.id"), primary_key=True)
     position: Mapped[int] = mapped_column(primary_key=True)

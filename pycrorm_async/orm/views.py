@@ -15,7 +15,7 @@ from pycrorm_async.world.enums import Arms, Grasp, ObjectType
 __all__ = ["EpisodeRobot", "EpisodeTag", "PickUpWithContextView", "RootFailure", "SpatialRelation"]
 
 
-class PickUpWithContextView(Base):
+class PickUpWithContextView(RowOfEvent, Base):
     """Every pick-up with the poses of robot and object: the sample that the thesis learns from (section 5.2).
 
     The robot's position is given twice: along the axes of the map, as in the thesis, and in the object's frame, which
@@ -115,13 +115,13 @@ class RootFailure(RowOfEvent, Base):
         return self.process_metadata
 
 
-class SpatialRelation(Base):
+class SpatialRelation(RowOfEvent, Base):
     """A spatial relation of an object when it was picked up, or after it was placed.
 
     `projections.schema.views.spatial_relation_view` defines the relations.
 
     Attributes:
-        node_id: of the pick-up or the placing.
+        node_id: of the pick-up or the placing; `sequence` is the event of its start.
         object, object_id: the picked up or placed object: its name, and its row at that moment.
         relation: `on`, `in` or `next to`.
         other, other_id: the other object: its name, and its row at that moment.
@@ -130,6 +130,7 @@ class SpatialRelation(Base):
     """
 
     __tablename__ = "spatial_relation"
+    _row = "node_id"
 
     node_id: Mapped[int] = mapped_column(ForeignKey("task_tree_node.id"), primary_key=True)
     process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"))
@@ -145,11 +146,12 @@ class SpatialRelation(Base):
     process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True)
 
 
-class EpisodeTag(Base):
+class EpisodeTag(RowOfEvent, Base):
     """A tag that an episode has now, and when it got it. The view `episode_tagging` has all changes."""
 
     __tablename__ = "episode_tag"
 
+    id: Mapped[int]
     process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"), primary_key=True)
     tag: Mapped[str] = mapped_column(primary_key=True)
     time: Mapped[datetime]

@@ -58,7 +58,7 @@ async def test_a_memory_describes_all_of_its_views(reading: Reading) -> None:
     schema = {each.name: each for each in await read_schema(reading)}
     assert {*CORE_VIEWS, "saying_action", "PickUpWithContextView"} <= schema.keys()
     assert schema["saying_action"].text.startswith("Parameters of SayingAction; `id` is that of its row in action")
-    assert {each.name for each in schema["saying_action"].columns} == {"id", "process_metadata_id", "text"}
+    assert {each.name for each in schema["saying_action"].columns} == {"id", "process_metadata_id", "sequence", "text"}
     pick_up = {each.name: each.refers_to for each in schema["pick_up_action"].columns}
     assert (pick_up["id"], pick_up["object_designator_id"]) == ("action.id", "object.id")
     assert not [name for name in schema if name.startswith(("zz_", "pycrorm_"))]

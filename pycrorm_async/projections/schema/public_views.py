@@ -36,13 +36,12 @@ from sqlalchemy.sql.selectable import CompoundSelect
 
 from pycrorm_async.events.codec import DESCRIPTION_PREFIX
 from pycrorm_async.events.fields import table_name
-from pycrorm_async.events.ids import SEQUENCE_MAX, SLOT_MAX
 from pycrorm_async.projections.schema.core_columns import CORE, EPISODE, LINK_BOX, OF_NO_EPISODE, OWN, Storage
 from pycrorm_async.projections.schema.layout import Layout
 from pycrorm_async.projections.schema.tables import column_type, columns_in_order, leaf_columns, make_table
 from pycrorm_async.projections.schema.views.concept_views import CONCEPT_VIEWS
 from pycrorm_async.projections.schema.views.pick_up_view import pick_ups_with_context
-from pycrorm_async.projections.schema.views.portable_expressions import absent, member
+from pycrorm_async.projections.schema.views.portable_expressions import absent, event_of, member
 from pycrorm_async.projections.schema.views.root_failure_view import root_failures
 from pycrorm_async.projections.schema.views.spatial_relation_view import SpatialTables, spatial_relations
 from pycrorm_async.projections.schema.views.world_line import world_line
@@ -202,7 +201,9 @@ def _episode_tag(tables: Tables) -> Select[Any]:
         or_(later.c.id > changes.c.id, and_(later.c.id == changes.c.id, later.c.position > changes.c.position)),
     )
     columns = changes.c.id, changes.c.process_metadata_id, changes.c.tag, changes.c.time
-    return select(*columns).where(changes.c.added, not_(select(later.c.id).where(is_later).exists()))
+    return select(*columns, *_sequence(changes)).where(
+        changes.c.added, not_(select(later.c.id).where(is_later).exists())
+    )
 
 
 def _episode_robot(tables: Tables) -> Select[Any]:
@@ -210,7 +211,7 @@ def _episode_robot(tables: Tables) -> Select[Any]:
     rows = tables["object"]
     robot = rows.c.process_metadata_id, rows.c.name, rows.c.model, rows.c.serial, rows.c.description_fingerprint
     first = func.min(rows.c.id)
-    robots = select(first.label("id"), *robot, _event_of(first).label("sequence")).group_by(*robot)
+    robots = select(first.label("id"), *robot, event_of(first).label("sequence")).group_by(*robot)
     return robots.where(rows.c.obj_type == ObjectType.ROBOT.name, rows.c.id == rows.c.identity_id)
 
 
@@ -244,12 +245,9 @@ def _task_tree_node(tables: Tables) -> Select[Any]:
 
 
 def _sequence(rows: Table) -> tuple[ColumnElement[Any], ...]:
-    """Return the column `sequence` of rows that have an id: the sequence of their event."""
-    return (_event_of(rows.c.id).label("sequence"),) if "id" in rows.c else ()
-
-
-def _event_of(row: ColumnElement[int]) -> ColumnElement[int]:
-    return row.bitwise_rshift(SLOT_MAX.bit_length()).bitwise_and(SEQUENCE_MAX)
+    """Return the column `sequence` of rows: the sequence of the event in the id that their key begins with."""
+    first, *_ = rows.primary_key.columns
+    return (event_of(first).label("sequence"),)
 
 
 def _duration(nodes: Table) -> ColumnElement[Any]:
@@ -360,7 +358,10 @@ def _united_rows(tables: Tables, leaf: _Leaf) -> View:
         for each, storage in leaf.columns:
             same = own.get(each) == storage
             columns.append(_labelled(rows.c[each]) if same else cast(null(), column_type(storage)).label(each))
-        parts.append(tables.shown(select(*columns, rows.c[EPISODE]), rows))
+        columns += [rows.c[EPISODE]]
+        if all(name != "sequence" for name, _ in leaf.columns):
+            columns += _sequence(rows)
+        parts.append(tables.shown(select(*columns), rows))
     return _united(parts)
 
 

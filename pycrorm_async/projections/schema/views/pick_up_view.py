@@ -15,7 +15,7 @@ from typing import Any
 from sqlalchemy import Boolean, ColumnElement, FromClause, ScalarSelect, Select, Table, func, literal_column, select
 
 from pycrorm_async.projections.schema.views.joins import numbers, present, same_episode
-from pycrorm_async.projections.schema.views.portable_expressions import PerDatabase
+from pycrorm_async.projections.schema.views.portable_expressions import PerDatabase, event_of
 from pycrorm_async.projections.schema.views.world_line import world_line
 
 _POSE = "x y z qx qy qz qw"
@@ -74,6 +74,7 @@ def pick_ups_with_context(
             node.c.robot,
             of_episode(episode.c.description).label("description"),
             of_episode(world).label("scene"),
+            event_of(node.c.id).label("sequence"),
         )
         .select_from(picked)
         .join(node, same_episode(node, picked, node.c.id == picked.c.id))

@@ -8,6 +8,8 @@ from sqlalchemy import ColumnElement, Text, literal_column, select
 from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.sql.functions import FunctionElement
 
+from pycrorm_async.events.ids import SEQUENCE_MAX, SLOT_MAX
+
 T = TypeVar("T")
 
 
@@ -64,6 +66,11 @@ def member(document: ColumnElement[Any], name: str) -> ColumnElement[str]:
     """Return the member of this name of a document of JSON, as text; NULL if the document has none."""
     assert name.isidentifier(), name
     return _Member(document, literal_column(f"'$.{name}'"))
+
+
+def event_of(row: ColumnElement[int]) -> ColumnElement[int]:
+    """Return the sequence of the event in the id of a row."""
+    return row.bitwise_rshift(SLOT_MAX.bit_length()).bitwise_and(SEQUENCE_MAX)
 
 
 def absent(number: ColumnElement[int], key: ColumnElement[int]) -> ColumnElement[bool]:

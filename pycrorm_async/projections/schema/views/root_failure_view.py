@@ -15,7 +15,7 @@ from sqlalchemy import Boolean, Select, Table, Text, exists, literal_column, sel
 
 from pycrorm_async.events.ids import SEQUENCE_MAX, SLOT_MAX
 from pycrorm_async.projections.schema.core_columns import EPISODE
-from pycrorm_async.projections.schema.views.portable_expressions import sql_of
+from pycrorm_async.projections.schema.views.portable_expressions import event_of, sql_of
 from pycrorm_async.task_status import TaskStatus
 
 _FAILED = (TaskStatus.FAILED.name, TaskStatus.ERROR.name)
@@ -104,4 +104,5 @@ def root_failures(nodes: Table, objects: Table) -> Select[*tuple[Any, ...]]:
         sql_of(Boolean(), *climbing(_RECOVERED)).label("recovered"),
         nodes.c.start_time,
         nodes.c.end_time,
+        event_of(nodes.c.id).label("sequence"),
     ).where(nodes.c.status.in_(_FAILED), ~failed_child)

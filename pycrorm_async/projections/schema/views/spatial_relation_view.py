@@ -41,6 +41,7 @@ from sqlalchemy.types import TypeEngine
 from pycrorm_async.events.ids import SEQUENCE_MAX, SLOT_MAX
 from pycrorm_async.projections.schema.views.constants import constants
 from pycrorm_async.projections.schema.views.joins import present, same_episode
+from pycrorm_async.projections.schema.views.portable_expressions import event_of
 from pycrorm_async.world.enums import ObjectType
 from pycrorm_async.world.models.catalog import built_in_urdf
 from pycrorm_async.world.models.kitchen import kitchen_urdf
@@ -102,6 +103,7 @@ def spatial_relations(
         both.other_id,
         both.other_name.label("other"),
         both.other_link.label("link"),
+        event_of(both.node_id).label("sequence"),
     ).subquery("related")
     return select(*related.c).where(related.c.relation.is_not(None))
 
