@@ -36,6 +36,8 @@ class PickUpWithContextView(RowOfEvent, Base):
             `torso_height`. The reach of an arm depends on it. Loaded on request.
         robot: the name of the robot; None if a memory of version 0.1.0 recorded it. Loaded on request.
         description, scene: of the episode: its description, and its world in one line. Loaded on request.
+        policy: the name of the policy that chose the pick-up: that of the `MoveAndPickUpAction` around it, or of the
+            `BatchRolloutAction` around that. None if none is named. Loaded on request.
     """
 
     __tablename__ = "PickUpWithContextView"
@@ -65,6 +67,7 @@ class PickUpWithContextView(RowOfEvent, Base):
     _robot: Mapped[str | None] = mapped_column("robot", deferred=True)
     _description: Mapped[str] = mapped_column("description", deferred=True)
     _scene: Mapped[str | None] = mapped_column("scene", deferred=True)
+    _policy: Mapped[str | None] = mapped_column("policy", deferred=True)
 
     object_z: Mapped[float] = synonym("_object_z", descriptor=on_request("object_z"))
     object_qx: Mapped[float] = synonym("_object_qx", descriptor=on_request("object_qx"))
@@ -75,6 +78,7 @@ class PickUpWithContextView(RowOfEvent, Base):
     robot: Mapped[str | None] = synonym("_robot", descriptor=on_request("robot"))
     description: Mapped[str] = synonym("_description", descriptor=on_request("description"))
     scene: Mapped[str | None] = synonym("_scene", descriptor=on_request("scene"))
+    policy: Mapped[str | None] = synonym("_policy", descriptor=on_request("policy"))
 
 
 class RootFailure(RowOfEvent, Base):

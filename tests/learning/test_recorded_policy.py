@@ -30,6 +30,7 @@ from pycrorm_async.orm import (
     LearnPolicyAction,
     MoveAndPickUpAction,
     Observation,
+    PickUpWithContextView,
     ProcessMetaData,
     TaskTreeNode,
 )
@@ -77,9 +78,11 @@ async def test_the_policy_of_rollouts_is_read_back_after_its_file_was_overwritte
             batches = (await session.scalars(select(BatchRolloutAction))).all()
             chosen = set(await session.scalars(select(MoveAndPickUpAction.policy)))
             contents = await session.scalar(select(func.count(Observation.id)))
+            picked = (await session.scalars(select(PickUpWithContextView.policy))).all()
         read = await read_policy(memory.reading, batches[0].policy)
     assert [each.policy for each in batches] == [name_of(OTHER)] * 2
     assert (chosen, read, contents) == ({name_of(OTHER)}, OTHER, 1)
+    assert picked == [name_of(OTHER)] * 4
 
 
 async def test_rollouts_with_one_arm_keep_the_name_of_the_policy_as_it_was_passed(tmp_path: Path) -> None:

@@ -73,7 +73,7 @@ async def test_the_pick_up_view_has_the_columns_of_the_thesis_and_the_pose_at_ex
             "id", "arm", "grasp", "torso_height", "relative_x", "relative_y", "quaternion_x", "quaternion_y",
             "quaternion_z", "quaternion_w", "obj_type", "status", "process_metadata_id", "node_id",
             "object_x", "object_y", "object_z", "object_qx", "object_qy", "object_qz", "object_qw",
-            "height_over_torso", "robot", "description", "scene", "sequence",
+            "height_over_torso", "robot", "description", "scene", "policy", "sequence",
         ]  # fmt: skip
         assert [tuple(each)[:14] for each in answer] == [
             (row(2), "LEFT", "TOP", 0.3, -0.75, 0.5, 0.0, 0.0, 0.6, 0.8, "MILK", "FAILED", 1, row(2)),

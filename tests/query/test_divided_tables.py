@@ -223,6 +223,12 @@ async def the_scenes_of_pick_ups(reading: Reading) -> None:
     )
 
 
+async def the_policies_of_pick_ups(reading: Reading) -> None:
+    view = PickUpWithContextView
+    frame = await reading.dataframe(select(view.policy).where(view.process_metadata_id == ASKED))
+    assert list(frame.policy) == ["seen"]
+
+
 async def a_joined_question(reading: Reading) -> None:
     question = select(PickUpAction).join(PickUpAction.object).join(Object.pose).join(PickUpAction.node)
     await rows_of(reading, question.where(PickUpAction.process_metadata_id == ASKED, Object.name == "milk"))
@@ -300,6 +306,7 @@ def test_all_questions_about_an_episode_are_asked() -> None:
         pytest.param(a_frame_of_pick_ups, id="a data frame of pick-ups"),
         pytest.param(of_episode(RootFailure), id="where failures began"),
         pytest.param(the_scenes_of_pick_ups, id="scenes of pick-ups"),
+        pytest.param(the_policies_of_pick_ups, id="policies of pick-ups"),
         pytest.param(a_joined_question, id="a join"),
         pytest.param(spatial_relations, id="spatial relations"),
         pytest.param(the_tree, id="the task tree"),

@@ -107,7 +107,7 @@ async def test_columns_on_request_are_in_a_frame_that_asks_for_them(reading: Rea
     columns = [*(await reading.dataframe(select(view))).columns]
     whole = await reading.dataframe(select(view).order_by(view.id), deferred=True)
     more = ["object_z", "object_qx", "object_qy", "object_qz", "object_qw", "height_over_torso", "robot"]
-    assert sorted(whole.columns) == sorted([*columns, *more, "description", "scene"])
+    assert sorted(whole.columns) == sorted([*columns, *more, "description", "scene", "policy"])
     assert whole.description.tolist() == ["episode 1", "episode 2"]
     action = await reading.dataframe(select(NavigateAction), deferred=True)
     assert "parameters" in action.columns

@@ -15,7 +15,7 @@ from typing import Any
 from sqlalchemy import Boolean, ColumnElement, FromClause, ScalarSelect, Select, Table, func, literal_column, select
 
 from pycrorm_async.projections.schema.views.joins import numbers, present, same_episode
-from pycrorm_async.projections.schema.views.portable_expressions import PerDatabase, event_of
+from pycrorm_async.projections.schema.views.portable_expressions import PerDatabase, event_of, member
 from pycrorm_async.projections.schema.views.world_line import world_line
 
 _POSE = "x y z qx qy qz qw"
@@ -74,6 +74,7 @@ def pick_ups_with_context(
             node.c.robot,
             of_episode(episode.c.description).label("description"),
             of_episode(world).label("scene"),
+            _policy(node).label("policy"),
             event_of(node.c.id).label("sequence"),
         )
         .select_from(picked)
@@ -82,6 +83,22 @@ def pick_ups_with_context(
         .outerjoin(object_, same_episode(object_, picked, object_.c.id == picked.c.object_designator_id))
         .outerjoin(place, same_episode(place, object_, place.c.id == object_.c.pose_id))
         .where(_planner_hint(node.c.dtype.in_(dtypes)), present(robot), present(place))
+    )
+
+
+def _policy(node: Table) -> ScalarSelect[Any]:
+    """Return the policy that the node around the pick-up names, or else the node around that.
+
+    These are a `MoveAndPickUpAction`, and a `BatchRolloutAction`, which alone names it in episodes of version 0.1.0.
+    """
+    tried, batch = node.alias("tried"), node.alias("batch")
+    named = [member(each.c.parameters, "policy") for each in (tried, batch)]
+    return (
+        select(func.coalesce(*named))
+        .select_from(tried)
+        .outerjoin(batch, same_episode(batch, tried, batch.c.id == tried.c.parent_id))
+        .where(same_episode(tried, node, tried.c.id == node.c.parent_id))
+        .scalar_subquery()
     )
 
 
