@@ -23,7 +23,9 @@ import msgspec
 
 from pycrorm_async.report.output_files import write_file
 
-_EPISODE = "dom episode bodies scene_camera scene_view map_view tree_view gantt_view similar panels main".split()
+_EPISODE = (
+    "dom episode bodies extent path_lines scene_camera scene_view map_view tree_view gantt_view similar panels main"
+).split()
 _OVERVIEW = "dom episode success overview".split()
 """The modules of each page's program, every one behind those that it imports."""
 _STREAM = ("stream",)

@@ -6,7 +6,8 @@ import pytest
 
 from pycrorm_async.memory import Memory
 from pycrorm_async.world import Pose
-from tests.report.browser import Browser
+from tests.report.browser import Browser, Tab
+from tests.report.test_long_page import record_pick_ups
 from tests.report.test_page import NO_WEBGL, assert_quiet, position
 
 pytestmark = pytest.mark.slow
@@ -50,34 +51,104 @@ def test_the_camera_follows_the_robot_and_shows_the_whole_scene_again(chrome: Br
         assert abs(u - robot[0]) < abs(x - robot[0]) + 0.5
         assert [round(u - x, 2), round(v - y, 2)] == [robot[0], robot[1]]  # it stood at the origin
         tab.press("w")
-        assert tab.ask(aim) == whole
         assert tab.ask("document.querySelector('#views [aria-pressed=true]')") is None
+        moment = tab.ask(aim)
+        assert moment not in (whole, [u, v, 0])  # less than all places of the episode
+        tab.ask("pycrormPage.seek(pycrormPage.episode.opens)")
+        tab.press("w")
+        assert tab.ask(aim) != moment
 
 
-def test_everything_is_in_sight_and_as_large_as_that_allows(chrome: Browser, pages: dict[str, Path]) -> None:
-    extent = """(() => {
-      const ends = [];
-      for (const { group } of pycrormPage.view.present) group.traverse((each) => {
-        if (!each.isMesh) return;
-        const { position } = each.geometry.attributes;
-        for (let at = 0; at < position.count; at++)
-          ends.push(new THREE.Vector3().fromBufferAttribute(position, at).applyMatrix4(each.matrixWorld));
-      });
-      for (const each of ends) each.project(pycrormPage.view.camera.camera);
-      return [Math.max(...ends.map(({ x }) => Math.abs(x))), Math.max(...ends.map(({ y }) => Math.abs(y)))];
-    })()"""
-    for width in (420, 1400):
-        with chrome.open(pages["plan"], width=width) as tab:
+EXTENT = """(() => {
+  const ends = [];
+  for (const { group, object } of pycrormPage.view.present) group.traverse((each) => {
+    if (!each.isMesh || object.type === SKIPPED) return;
+    const { position } = each.geometry.attributes;
+    for (let at = 0; at < position.count; at++)
+      ends.push(new THREE.Vector3().fromBufferAttribute(position, at).applyMatrix4(each.matrixWorld));
+  });
+  for (const each of ends) each.project(pycrormPage.view.camera.camera);
+  return ends.reduce((most, { x, y }) => Math.max(most, Math.abs(x), Math.abs(y)), 0);
+})()"""
+"""The largest distance of anything drawn from the middle of the picture; 1 is at an edge."""
+
+
+def farthest_over(tab: Tab, moments: int) -> list[float]:
+    """Return how far from the middle anything but an environment is drawn, at moments all over the episode."""
+    script = f"""(() => {{
+      const {{ first, opens }} = pycrormPage.episode;
+      return Array.from({{ length: {moments} }}, (_, index) => {{
+        pycrormPage.seek(first + ((opens - first) * index) / {moments - 1});
+        return {EXTENT.replace("SKIPPED", "'ENVIRONMENT'")};
+      }});
+    }})()"""
+    return list(tab.ask(script))
+
+
+@pytest.mark.parametrize("width", [420, 1400])
+def test_everything_is_in_sight_and_as_large_as_that_allows(
+    chrome: Browser, pages: dict[str, Path], width: int
+) -> None:
+    with chrome.open(pages["plan"], width=width) as tab:
+        tab.settle()
+        assert 0.7 < tab.ask(EXTENT.replace("SKIPPED", "''")) < 1
+        assert 0.7 < max(farthest_over(tab, 20)) < 1
+        tab.ask("pycrormPage.seek(60)")
+        tab.press("w")
+        assert 0.7 < tab.ask(EXTENT.replace("SKIPPED", "''")) < 1
+
+
+async def test_bodies_are_in_sight_at_every_moment_also_of_a_long_way(
+    chrome: Browser, pages: dict[str, Path], tmp_path: Path
+) -> None:
+    url = f"sqlite:///{tmp_path / 'memory.db'}"
+    record_pick_ups(url, 60)
+    async with Memory.open(url) as read:
+        await read.report(1, tmp_path / "page.html")
+    for page in (pages["drives"], tmp_path / "page.html"):
+        with chrome.open(page) as tab:
             tab.settle()
-            across, up = tab.ask(extent)
-            assert max(across, up) < 1
-            assert max(across, up) > 0.7
+            assert max(farthest_over(tab, 30)) < 1
+
+
+async def test_an_object_far_from_all_else_makes_the_scene_no_smaller(chrome: Browser, tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path / 'memory.db'}"
+    with Memory.sync(url) as memory:
+        with memory.recording.episode(description="far") as episode:
+            episode.object_added("base", "pr2", "ROBOT", Pose([0, 0, 0]))
+            for name, place in (("milk", 1.0), ("lost", 1e4)):
+                episode.object_added(name, name, "MILK", Pose([place, 0, 0.5]))
+            for place in (1.0, 2.0, 300.0, 2.5):
+                episode.object_moved("base", Pose([place, 0, 0]))
+        memory.flush()
+    async with Memory.open(url) as read:
+        await read.report(1, tmp_path / "page.html")
+    robot = EXTENT.replace("SKIPPED", "'MILK'")
+    reach = "pycrormPage.view.reach"
+    with chrome.open(tmp_path / "page.html") as tab:
+        tab.settle()
+        assert tab.ask(reach) < 3
+        tab.ask("pycrormPage.seek(pycrormPage.episode.objects[0].poses.at[3])")
+        assert tab.ask(robot) < 1  # it left, so that the camera went there
+        tab.ask("pycrormPage.seek(pycrormPage.episode.objects[0].poses.at[4])")
+        assert tab.ask(robot) < 1
+        assert tab.ask(reach) < 3
+        tab.ask("pycrormPage.view.camera.touched = true")
+        tab.ask("pycrormPage.seek(pycrormPage.episode.objects[0].poses.at[3])")
+        assert tab.ask(robot) > 1  # the camera is the user's
 
 
 def test_the_paths_in_the_scene_are_named(chrome: Browser, pages: dict[str, Path]) -> None:
     with chrome.open(pages["plan"]) as tab:
         named = "[...document.querySelectorAll('#legend > span')].map((each) => each.textContent)"
         assert tab.ask(named) == [" path of pr2", " path of milk", "during TransportAction", "grid 1 m"]
+        dashes = "[...document.querySelectorAll('#legend line')].map((each) => each.getAttribute('stroke-dasharray'))"
+        assert tab.ask(dashes) == ["none", "7.5 5"]
+        points = "pycrormPage.view.pathList.map((each) => each.points.length)"
+        rods = "pycrormPage.view.paths.children.map((each) => each.geometry.index.count / 24)"
+        (solid, dashed), (drawn, dashes) = tab.ask(points), tab.ask(rods)
+        assert drawn == solid - 1
+        assert dashes > dashed
 
 
 @pytest.mark.parametrize("script", ["", NO_WEBGL])

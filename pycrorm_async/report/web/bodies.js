@@ -134,8 +134,9 @@ export function namedOf(present, chosen) {
 }
 
 const COLORS = ["--path-1", "--path-2", "--path-3", "--path-4"];
+const DASHES = [null, [3, 2], [1, 1.5], [7, 2]];
 
-/** The ways of the objects that moved during a node: name, variable of the colour, dash, and positions. */
+/** The ways of the objects that moved during a node: name, variable of the colour, dash in widths, and positions. */
 export function pathsOf(episode, node) {
   if (node === null) return [];
   const paths = [];
@@ -143,7 +144,8 @@ export function pathsOf(episode, node) {
     const { at, values } = object.poses;
     const points = values.slice(Math.max(0, lastUpTo(at, node.start)), lastUpTo(at, node.lastEvent) + 1);
     const moved = points.filter((each, index) => index === 0 || distance(each, points[index - 1]) > 1e-3);
-    if (moved.length > 1) paths.push({ object, color: COLORS[paths.length % COLORS.length], points: moved.slice(-400) });
+    const style = paths.length % COLORS.length;
+    if (moved.length > 1) paths.push({ object, color: COLORS[style], dash: DASHES[style], points: moved.slice(-400) });
   }
   return paths;
 }

@@ -32,6 +32,9 @@ export function svg(tag, attributes = {}, ...children) {
   return made;
 }
 
+/** The dashes of a line of SVG, from their lengths in widths of the line. */
+export const strokeOf = (dash, width) => (dash === null ? "none" : dash.map((each) => each * width).join(" "));
+
 export function duration(seconds) {
   if (seconds >= 100) return `${seconds.toFixed(0)} s`;
   if (seconds >= 1) return `${seconds.toFixed(2)} s`;

@@ -1,7 +1,7 @@
 // Puts the page together: one moment, `event`, that the tree, the scene, the chart and the panels show.
 
 import { Bodies, pathsOf } from "./bodies.js";
-import { duration, element, recorded, svg } from "./dom.js";
+import { duration, element, recorded, strokeOf, svg } from "./dom.js";
 import { Episode, signOf } from "./episode.js";
 import { GanttView } from "./gantt_view.js";
 import { MapView } from "./map_view.js";
@@ -14,7 +14,7 @@ const NOTES_MAX = 3;
 const NAMED_MAX = 2;
 const HELP = [
   "Space plays. ← → go by one event, with Shift by ten; Home and End to the ends. F goes to the next failure, A changes the axis of the chart.",
-  "Scene: drag turns, drag with the right button or two fingers moves, the wheel zooms; a click chooses an object, a double click goes to it. W shows the whole scene, R follows the robot.",
+  "Scene: drag turns, drag with the right button or two fingers moves, the wheel zooms; a click chooses an object, a double click goes to it. W shows all of the moment and its paths, R follows the robot.",
   "Chart: the wheel zooms, a double click shows all.",
 ];
 const part = (name) => document.getElementById(name);
@@ -110,7 +110,7 @@ class Page {
     this.axis = element("button", { type: "button", title: "axis of the chart: events, which are equally far apart, or time (A)", onclick: () => this.#changeAxis() }, "by event");
     const help = element("button", { type: "button", class: "help", title: "keys and mouse (?)", "aria-label": "keys and mouse", onclick: () => this.#help() }, "?");
     part("controls").append(this.play, this.slider, this.clock, this.axis, help);
-    const whole = element("button", { type: "button", title: "show the whole scene (W)", onclick: () => this.#showWhole() }, "whole scene");
+    const whole = element("button", { type: "button", title: "show all that is there at this moment, and its paths (W)", onclick: () => this.#showWhole() }, "whole scene");
     this.tracking = element("button", { type: "button", title: "keep the robot, or the chosen object, in sight (R)", onclick: () => this.#track() });
     part("views").append(whole, this.tracking);
     this.#nameTracked();
@@ -122,7 +122,7 @@ class Page {
 
   #showWhole() {
     if (this.tracked) this.#track();
-    this.view.frame();
+    this.view.frameMoment();
     this.show();
   }
 
@@ -292,9 +292,9 @@ class Page {
 
   /** Name the paths in the scene, and the distance of its lines. */
   #legend(paths) {
-    const ways = paths.slice(0, 4).map(({ object, color }, index) => {
-      const line = svg("line", { x1: 0, x2: 18, y1: 5, y2: 5, class: color.slice(2), "stroke-dasharray": index % 2 ? "4 3" : "none" });
-      return element("span", {}, svg("svg", { width: 18, height: 10, "aria-hidden": "true" }, line), " path of ", recorded(object.name));
+    const ways = paths.slice(0, 4).map(({ object, color, dash }) => {
+      const line = svg("line", { x1: 0, x2: 26, y1: 5, y2: 5, class: color.slice(2), "stroke-dasharray": strokeOf(dash, 2.5) });
+      return element("span", {}, svg("svg", { width: 26, height: 10, "aria-hidden": "true" }, line), " path of ", recorded(object.name));
     });
     const during = ways.length > 0 ? element("span", {}, "during ", recorded(this.action.name)) : null;
     part("legend").replaceChildren(...ways, ...(during ? [during] : []), element("span", {}, "grid 1 m"));

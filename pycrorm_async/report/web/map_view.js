@@ -1,7 +1,7 @@
 // Draws the world after an event from above, as SVG: without WebGL, and in print.
 
 import { namedOf } from "./bodies.js";
-import { svg } from "./dom.js";
+import { strokeOf, svg } from "./dom.js";
 
 const SIZE_MIN_M = 2;
 const DIRECTIONS = 160;
@@ -22,7 +22,7 @@ export class MapView {
   /** The map always shows everything. */
   follow() {}
 
-  frame() {}
+  frameMoment() {}
 
   paint() {
     if (this.event !== undefined) this.show(this.event, null, this.paths);
@@ -52,12 +52,11 @@ export class MapView {
       shape.append(title);
       picture.append(shape);
     }
-    paths.forEach(({ points: path, color }, index) => {
+    for (const { points: path, color, dash } of paths) {
       const corners = path.map(([x, y]) => `${x},${-y}`).join(" ");
-      const dash = index % 2 ? `${scale} ${scale}` : "none";
       const attributes = { points: corners, class: `path ${color.slice(2)}`, "stroke-width": scale * 0.5 };
-      picture.append(svg("polyline", { ...attributes, "stroke-dasharray": dash }));
-    });
+      picture.append(svg("polyline", { ...attributes, "stroke-dasharray": strokeOf(dash, scale * 0.5) }));
+    }
     const named = namedOf(present.map(({ body }) => body), this.chosen);
     const outlined = present.filter(({ body }) => named.includes(body));
     for (const { x, y, size, name } of labelsOf(outlined, scale * 2.2, left, right)) {

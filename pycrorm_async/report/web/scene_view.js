@@ -1,12 +1,16 @@
 // Draws the world after an event with WebGL: bodies, the paths of the current action, names; and shows what is pointed at.
 
-import { namedOf, pathsOf } from "./bodies.js";
+import { namedOf } from "./bodies.js";
 import { colorOf, element } from "./dom.js";
+import { pointsOfEpisode, pointsOfMoment } from "./extent.js";
+import { rodAlong } from "./path_lines.js";
 import { SceneCamera } from "./scene_camera.js";
 
 const CLICK_PX = 4;
 const GRID_MAX = 200;
 const SUN = [-5, 3.5, 8];
+const PATH_WIDTH = 0.0055; // of the reach of what is framed
+const CUT_MAX = 1.15; // an arm may leave the picture so far, before the picture changes
 
 export class SceneView {
   /** Throws if the browser has no WebGL. `onPick` gets the object that is clicked, or null. */
@@ -125,7 +129,7 @@ export class SceneView {
   grow() {
     this.drawnNode = undefined;
     const { length } = this.episode.objects;
-    if (length !== this.framedObjects && this.framed && !this.camera.touched) this.frame();
+    if (length !== this.framedObjects && this.framed && !this.camera.touched) this.#frameEpisode();
   }
 
   show(event, node, paths) {
@@ -134,9 +138,10 @@ export class SceneView {
     const groups = this.present.map((each) => each.group);
     for (const each of [...this.world.children]) if (!groups.includes(each)) this.world.remove(each);
     for (const each of groups) if (each.parent !== this.world) this.world.add(each);
+    this.camera.update(this.present);
+    if (this.framed) this.#keepInSight();
     if (node !== this.drawnNode) this.#drawPaths(paths);
     this.drawnNode = node;
-    this.camera.update(this.present);
     this.renderer.shadowMap.needsUpdate = true;
     this.#render();
   }
@@ -163,25 +168,45 @@ export class SceneView {
       this.paths.remove(each);
       each.geometry.dispose();
     }
-    for (const { points, color } of paths) {
-      const flat = points.flatMap(([x, y, z]) => [x, y, z + 0.02]);
-      const geometry = new THREE.BufferGeometry();
-      geometry.setAttribute("position", new THREE.Float32BufferAttribute(flat, 3));
-      this.paths.add(new THREE.Line(geometry, new THREE.LineBasicMaterial({ color: colorOf(color) })));
+    for (const { points, color, dash } of paths) {
+      const material = new THREE.MeshStandardMaterial({ color: 0, emissive: new THREE.Color(colorOf(color)), roughness: 1 });
+      this.paths.add(new THREE.Mesh(rodAlong(points, PATH_WIDTH * this.reach, dash), material));
     }
   }
 
-  /** Look at everything that is there when the page opens, from the side of the robot. */
-  frame() {
+  /** Look at every place to which a body comes in the episode. */
+  #frameEpisode() {
     const { episode } = this;
     this.framedObjects = episode.objects.length;
-    this.camera.touched = false;
-    const paths = pathsOf(episode, episode.actionAt(episode.opens)).flatMap(({ points }) => points);
-    const { middle, reach } = this.camera.frame(this.bodies.at(episode.opens), paths);
+    if (this.extentLast !== episode.last) this.extent = pointsOfEpisode(episode, this.bodies);
+    this.extentLast = episode.last;
     if (this.event !== undefined) this.bodies.at(this.event);
+    this.#frame(this.extent);
+    this.framing = "episode";
+  }
+
+  /** Look at what is there at the moment, and at the paths that are drawn. */
+  frameMoment() {
+    this.#frame(pointsOfMoment(this.present, this.pathList));
+    this.framing = "moment";
+  }
+
+  #frame(points) {
+    const { middle, reach } = this.camera.frame(points);
     this.#light(middle.clone().setZ(0), reach);
     this.#drawGrid();
+    this.drawnNode = undefined;
     this.#render();
+  }
+
+  /** Look at the episode again if a body has left the picture, or at the moment as long as one is beyond that too. */
+  #keepInSight() {
+    const { camera, present } = this;
+    if (camera.touched || camera.followed !== null || (this.framing !== "away" && camera.sees(present, 1))) return;
+    if (this.framing !== "episode" || this.extentLast !== this.episode.last) this.#frameEpisode();
+    if (camera.sees(present, CUT_MAX)) return;
+    this.frameMoment();
+    this.framing = "away";
   }
 
   #resize() {
@@ -189,8 +214,9 @@ export class SceneView {
     if (width === 0 || height === 0) return;
     this.renderer.setSize(width, height);
     this.camera.resize(width, height);
-    if (!this.framed || !this.camera.touched) this.frame();
+    if (!this.framed || !this.camera.touched) this.#frameEpisode();
     this.framed = true;
+    if (this.event !== undefined) this.show(this.event, this.node, this.pathList);
     this.#render();
   }
 
