@@ -1,10 +1,10 @@
-// Draws every node as a bar over events or over time on a canvas; bars narrower than a pixel are drawn together.
+// Shows every node as a bar over events or over time: which moment and which part of the episode is drawn, and the axis.
 
-import { FAILED } from "./episode.js";
-import { colorOf, duration } from "./dom.js";
+import { colorOf, duration, element } from "./dom.js";
+import { drawLane, LANE_PX, roundTicks } from "./gantt_bars.js";
 
-const LANE_PX = 19;
 const AXIS_PX = 20;
+const TICK_PX = 90;
 const PAD_PX = 8;
 
 export class GanttView {
@@ -14,7 +14,8 @@ export class GanttView {
     this.canvas = document.createElement("canvas");
     this.canvas.setAttribute("role", "img");
     this.canvas.setAttribute("aria-label", "Gantt chart of the nodes");
-    holder.append(this.canvas);
+    this.axis = element("canvas", { class: "axis", "aria-hidden": "true" });
+    holder.append(this.canvas, this.axis);
     this.byTime = false;
     this.lanes = new Lanes();
     this.lanes.extend(episode.nodes);
@@ -107,111 +108,54 @@ export class GanttView {
     const width = this.holder.clientWidth;
     if (width === 0) return;
     this.width = width - 2 * PAD_PX;
-    const height = this.lanes.nodes.length * LANE_PX + AXIS_PX;
-    const ratio = window.devicePixelRatio || 1;
-    Object.assign(this.canvas, { width: width * ratio, height: height * ratio });
-    Object.assign(this.canvas.style, { width: `${width}px`, height: `${height}px` });
-    const pen = this.canvas.getContext("2d");
-    pen.scale(ratio, ratio);
-    pen.font = "11px system-ui, sans-serif";
-    pen.textBaseline = "middle";
-    const colors = Object.fromEntries(["good", "bad", "odd", "run", "ink", "quiet", "on-bar"].map((each) => [each, colorOf(`--${each}`)]));
-    this.lanes.nodes.forEach((nodes, lane) => this.#drawLane(pen, nodes, lane * LANE_PX, colors));
-    this.#drawAxis(pen, height, colors);
-    if (this.event !== undefined) {
-      pen.fillStyle = colors.ink;
-      pen.fillRect(this.#xOf(this.event) - 1, 0, 2, height - AXIS_PX + 4);
-    }
+    const names = ["good", "bad", "odd", "run", "ink", "quiet", "paper", "on-bar"];
+    const colors = Object.fromEntries(names.map((each) => [each, colorOf(`--${each}`)]));
+    const height = this.lanes.nodes.length * LANE_PX;
+    const pen = penOf(this.canvas, width, height);
+    const span = (node) => [this.#xOf(node.start), this.#xOf(node.lastEvent)];
+    const ends = { left: PAD_PX, right: PAD_PX + this.width };
+    const moment = { event: this.event ?? Infinity, selected: this.selected };
+    this.lanes.nodes.forEach((nodes, lane) => drawLane(pen, nodes, lane * LANE_PX, { ...ends, ...moment, span, colors }));
+    this.#drawCursor(pen, height, colors);
+    const axis = penOf(this.axis, width, AXIS_PX);
+    this.#drawAxis(axis, colors);
+    this.#drawCursor(axis, 4, colors);
   }
 
-  #drawLane(pen, nodes, y, colors) {
-    const narrow = new Map();
-    for (const node of nodes) {
-      const left = Math.max(this.#xOf(node.start), PAD_PX);
-      const right = Math.min(this.#xOf(node.lastEvent), PAD_PX + this.width);
-      if (right < PAD_PX) continue;
-      if (left > PAD_PX + this.width) break;
-      if (right - left < 1) {
-        const column = Math.floor(left);
-        const [all, bad, start] = narrow.get(column) ?? [0, 0, node.start];
-        narrow.set(column, [all + 1, bad + FAILED.has(node.status), start]);
-      } else this.#drawBar(pen, node, left, right, y, colors);
-    }
-    this.#drawNarrow(pen, narrow, y, colors);
+  #drawCursor(pen, height, colors) {
+    if (this.event === undefined) return;
+    pen.fillStyle = colors.ink;
+    pen.fillRect(this.#xOf(this.event) - 1, 0, 2, height);
   }
 
-  /** One column of a pixel for many nodes: the red part is the share of them that failed. */
-  #drawNarrow(pen, columns, y, colors) {
-    const height = LANE_PX - 3;
-    for (const [x, [all, bad, start]] of columns) {
-      pen.globalAlpha = start > (this.event ?? Infinity) ? 0.35 : 1;
-      pen.fillStyle = colors.good;
-      pen.fillRect(x, y + 1, 1, height);
-      if (bad === 0) continue;
-      const share = Math.max(3, (bad / all) * height);
-      pen.fillStyle = colors.bad;
-      pen.fillRect(x, y + 1 + height - share, 1, share);
-    }
-    pen.globalAlpha = 1;
-  }
-
-  #drawBar(pen, node, left, right, y, colors) {
-    const bad = FAILED.has(node.status);
-    const later = node.start > (this.event ?? Infinity);
-    const wide = Math.max(right - left - 1, 1);
-    pen.globalAlpha = later ? 0.35 : 1;
-    pen.fillStyle = colors[{ SUCCEEDED: "good", RUNNING: "run" }[node.status] ?? (bad ? "bad" : "odd")];
-    pen.fillRect(left, y + 1, wide, LANE_PX - 3);
-    if (bad && wide > 3) this.#hatch(pen, left, y + 1, wide, LANE_PX - 3, colors["on-bar"]);
-    pen.globalAlpha = 1;
-    if (node === this.selected) {
-      pen.strokeStyle = colors.ink;
-      pen.lineWidth = 2;
-      pen.strokeRect(left, y + 1, wide, LANE_PX - 3);
-    }
-    const ink = later ? colors.ink : colors["on-bar"];
-    if (wide > 24) this.#write(pen, `${bad ? "✗ " : ""}${node.name}`, left + 4, y + LANE_PX / 2, wide - 6, ink);
-  }
-
-  #hatch(pen, x, y, width, height, color) {
-    pen.save();
-    pen.beginPath();
-    pen.rect(x, y, width, height);
-    pen.clip();
-    pen.strokeStyle = color;
-    pen.globalAlpha *= 0.45;
-    pen.lineWidth = 1;
-    pen.beginPath();
-    for (let at = x - height; at < x + width; at += 6) {
-      pen.moveTo(at, y + height);
-      pen.lineTo(at + height, y);
-    }
-    pen.stroke();
-    pen.restore();
-  }
-
-  #write(pen, text, x, y, width, color) {
-    pen.save();
-    pen.beginPath();
-    pen.rect(x - 2, y - LANE_PX / 2, width + 2, LANE_PX);
-    pen.clip();
-    pen.fillStyle = color;
-    pen.fillText(text, x, y);
-    pen.restore();
-  }
-
-  #drawAxis(pen, height, colors) {
+  /** The labels of the axis and their places, all different. */
+  ticks() {
     const [from, to] = this.window;
-    const count = Math.max(2, Math.floor(this.width / 110));
-    pen.fillStyle = colors.quiet;
-    for (let index = 0; index <= count; index++) {
-      const here = from + ((to - from) * index) / count;
-      pen.textAlign = index === 0 ? "left" : index === count ? "right" : "center";
-      const text = this.byTime ? duration(here) : `e${Math.round(here)}`;
-      pen.fillText(text, PAD_PX + (this.width * index) / count, height - AXIS_PX / 2 + 2);
-    }
-    pen.textAlign = "left";
+    const textOf = (here) => (this.byTime ? duration(here) : `e${Math.round(here)}`);
+    const ticks = roundTicks(from, to, Math.max(2, Math.floor(this.width / TICK_PX)), !this.byTime);
+    return ticks.map((here) => [textOf(here), here]).filter(([text], index, all) => index === 0 || text !== all[index - 1][0]);
   }
+
+  #drawAxis(pen, colors) {
+    const [from, to] = this.window;
+    pen.fillStyle = colors.quiet;
+    for (const [text, here] of this.ticks()) {
+      pen.textAlign = here === from ? "left" : here === to ? "right" : "center";
+      pen.fillText(text, PAD_PX + ((here - from) / (to - from)) * this.width, AXIS_PX / 2 + 2);
+    }
+  }
+}
+
+/** A pen for a canvas of a size in pixels of the page. */
+function penOf(canvas, width, height) {
+  const ratio = window.devicePixelRatio || 1;
+  Object.assign(canvas, { width: width * ratio, height: height * ratio });
+  Object.assign(canvas.style, { width: `${width}px`, height: `${height}px` });
+  const pen = canvas.getContext("2d");
+  pen.scale(ratio, ratio);
+  pen.font = "11px system-ui, sans-serif";
+  pen.textBaseline = "middle";
+  return pen;
 }
 
 /** Gives each node the first free lane below its parent's, so that concurrent branches do not cover each other. */
