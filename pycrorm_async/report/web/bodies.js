@@ -97,7 +97,16 @@ function trianglesOf(model, reference) {
 function geometryOf(kind, sizes) {
   if (kind === "box") return new THREE.BoxGeometry(...sizes);
   if (kind === "sphere") return new THREE.SphereGeometry(sizes[0], 20, 14);
+  if (kind === "capsule") return capsuleOf(...sizes);
   return new THREE.CylinderGeometry(sizes[0], sizes[0], sizes[1], 24).rotateX(Math.PI / 2);
+}
+
+/** A sphere whose halves are drawn apart by the length; an odd number of rings leaves none at the equator. */
+function capsuleOf(radius, length) {
+  const geometry = new THREE.SphereGeometry(radius, 24, 15).rotateX(Math.PI / 2);
+  const { position } = geometry.attributes;
+  for (let at = 0; at < position.count; at++) position.setZ(at, position.getZ(at) + (Math.sign(position.getZ(at)) * length) / 2);
+  return geometry;
 }
 
 /** The bodies of an episode, made when they are first needed. */
