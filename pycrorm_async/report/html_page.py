@@ -40,6 +40,7 @@ _ESCAPES = {
     b"\xe2\x80\xa8": rb"\u2028",
     b"\xe2\x80\xa9": rb"\u2029",
 }
+_CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]")
 _IMPORT = re.compile(r"^import \{[^}]*\} from \"\./\w+\.js\";\n", re.MULTILINE)
 _EXPORT = re.compile(r"^export (?=(const|class|function) )", re.MULTILINE)
 
@@ -70,13 +71,19 @@ def _page(document: Mapping[str, Any], heading: str, suffix: str, body: str, scr
     )
     parts = {
         "policy": policy,
-        "title": html.escape(heading + suffix),
+        "title": html.escape(_CONTROL.sub(_visible, heading) + suffix),
         "style": style,
         "body": body.replace("{heading}", html.escape(heading)),
         "document": _safe_json(document),
         "scripts": "\n".join(f"<script>{each}</script>" for each in scripts),
     }
     return re.sub(r"\{(\w+)\}", lambda match: parts[match[1]], _asset("web/page.html"))
+
+
+def _visible(control: re.Match[str]) -> str:
+    """Return a sign for a control character, which would reorder or break the title of a window."""
+    code = ord(control[0])
+    return chr(0x2400 + code) if code < 0x20 else f"<U+{code:04X}>"
 
 
 def write_page(page: str, path: Path, *, force: bool = False) -> None:

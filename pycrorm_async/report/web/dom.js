@@ -1,10 +1,19 @@
 // Makes elements. Text is only ever set as text, never as markup, because everything shown was recorded by programs.
 
+const READ = new Set(["title", "aria-label"]);
+
+/** Text for a place that has no direction of its own, as a hint or a canvas: control characters are visible signs there, line ends apart. */
+export const plain = (text) =>
+  String(text).replace(/[\0-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]/gu, (each) => {
+    const code = each.codePointAt(0);
+    return code < 0x20 ? String.fromCodePoint(0x2400 + code) : `<U+${code.toString(16).toUpperCase().padStart(4, "0")}>`;
+  });
+
 export function element(tag, attributes = {}, ...children) {
   const made = document.createElement(tag);
   for (const [name, value] of Object.entries(attributes)) {
     if (name.startsWith("on")) made.addEventListener(name.slice(2), value);
-    else if (value !== null && value !== undefined && value !== false) made.setAttribute(name, value);
+    else if (value !== null && value !== undefined && value !== false) made.setAttribute(name, READ.has(name) ? plain(value) : value);
   }
   made.append(...children.filter((each) => each !== null && each !== undefined));
   return made;

@@ -1,6 +1,7 @@
 // Draws the bars of the chart so that each status is readable without colour: by its sign, by hatching, and by marks where
 // a bar is too narrow for both. Bars that are too narrow and too close to be told apart are drawn together.
 
+import { plain } from "./dom.js";
 import { signOf } from "./episode.js";
 
 export const LANE_PX = 19;
@@ -59,7 +60,7 @@ function drawBar(pen, { node, y, left, right, later }, selected, colors) {
   if (text === "") return;
   const width = pen.measureText(text).width;
   const from = text.length === 1 ? left + (wide - width) / 2 : left + 4;
-  if (text !== node.name) {
+  if (node.status !== "SUCCEEDED") {
     pen.globalAlpha = later ? PALE : 1;
     pen.fillStyle = later ? colors.paper : color; // no hatching behind the letters
     pen.fillRect(from - 1, y + 2, width + 2, BAR_PX - 4);
@@ -72,7 +73,7 @@ function drawBar(pen, { node, y, left, right, later }, selected, colors) {
 /** The sign and as much of the name as there is room for; the sign alone, or nothing. */
 function textOf(pen, node, wide) {
   const sign = node.status === "SUCCEEDED" ? "" : signOf(node.status);
-  const name = wide < NAME_PX ? "" : shortened(pen, node.name, wide - 8 - (sign && pen.measureText(`${sign} `).width));
+  const name = wide < NAME_PX ? "" : shortened(pen, plain(node.name), wide - 8 - (sign && pen.measureText(`${sign} `).width));
   return name ? [sign, name].filter(Boolean).join(" ") : wide < SIGN_PX ? "" : sign;
 }
 

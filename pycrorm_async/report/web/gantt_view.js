@@ -1,6 +1,6 @@
 // Shows every node as a bar over events or over time: which moment and which part of the episode is drawn, and the axis.
 
-import { colorOf, duration, element } from "./dom.js";
+import { colorOf, duration, element, plain } from "./dom.js";
 import { drawLane, LANE_PX, roundTicks } from "./gantt_bars.js";
 
 const AXIS_PX = 20;
@@ -32,7 +32,7 @@ export class GanttView {
     this.canvas.addEventListener("pointermove", (pointed) => {
       if (dragging) seek(pointed);
       const node = this.#nodeAt(pointed.offsetX, pointed.offsetY);
-      this.canvas.title = node === null ? "" : `${node.name} ${node.status} ${node.parameters}`.slice(0, 200);
+      this.canvas.title = node === null ? "" : plain(`${node.name} ${node.status} ${node.parameters}`.slice(0, 200));
     });
     for (const kind of ["pointerup", "pointercancel"]) this.canvas.addEventListener(kind, () => (dragging = false));
     this.canvas.addEventListener("wheel", (turned) => this.#zoom(turned), { passive: false });

@@ -1,7 +1,7 @@
 // Draws the world after an event from above, as SVG: without WebGL, and in print.
 
 import { namedOf } from "./bodies.js";
-import { strokeOf, svg } from "./dom.js";
+import { plain, strokeOf, svg } from "./dom.js";
 
 const SIZE_MIN_M = 2;
 const DIRECTIONS = 160;
@@ -48,7 +48,7 @@ export class MapView {
       const thick = object === this.chosen ? 0.7 : 0.15;
       const shape = svg("polygon", { points: corners, fill: color, class: "outline", "stroke-width": scale * thick });
       const title = svg("title");
-      title.textContent = object.name;
+      title.textContent = plain(object.name);
       shape.append(title);
       picture.append(shape);
     }
@@ -61,7 +61,7 @@ export class MapView {
     const outlined = present.filter(({ body }) => named.includes(body));
     for (const { x, y, size, name } of labelsOf(outlined, scale * 2.2, left, right)) {
       const label = svg("text", { x, y: -y, "font-size": size, "text-anchor": "middle" });
-      label.textContent = name;
+      label.textContent = plain(name);
       picture.append(label);
     }
     this.holder.replaceChildren(picture);

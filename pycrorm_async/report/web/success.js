@@ -1,6 +1,6 @@
 // Draws the share of successes over two columns as a heat map, with the number of rows in each cell.
 
-import { svg } from "./dom.js";
+import { plain, svg } from "./dom.js";
 
 const SIZE = 384;
 const TEXT_MIN = 30;
@@ -21,7 +21,7 @@ export function successMap({ x, y, cells, succeeded, rows }) {
     const cell = svg("g", { class: rate > 0.75 ? "cell lit" : "cell" });
     const hint = `${placeOf(x, column)}, ${placeOf(y, row)}: ${text} of ${count}`;
     const shape = { x: from, y: top, width: wide, height: high, "fill-opacity": 0.06 + 0.9 * rate };
-    cell.append(svg("title", {}, hint), svg("rect", shape));
+    cell.append(svg("title", {}, plain(hint)), svg("rect", shape));
     const middle = { x: from + wide / 2, "text-anchor": "middle" };
     if (wide >= TEXT_MIN && high >= TEXT_MIN) {
       cell.append(svg("text", { ...middle, y: top + high / 2 - 2 }, text));
