@@ -25,7 +25,7 @@ from pycrorm_async.report.output_files import write_file
 
 _EPISODE = (
     "dom episode bodies extent path_lines scene_camera scene_view map_view tree_view gantt_bars gantt_view"
-    " similar panels main"
+    " similar panels playback main"
 ).split()
 _OVERVIEW = "dom episode success overview".split()
 """The modules of each page's program, every one behind those that it imports."""

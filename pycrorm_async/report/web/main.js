@@ -6,14 +6,14 @@ import { Episode, signOf } from "./episode.js";
 import { GanttView } from "./gantt_view.js";
 import { MapView } from "./map_view.js";
 import { Panels } from "./panels.js";
+import { Playback } from "./playback.js";
 import { SceneView } from "./scene_view.js";
 import { TreeView } from "./tree_view.js";
 
-const PLAYED_S = 20;
 const NOTES_MAX = 3;
 const NAMED_MAX = 2;
 const HELP = [
-  "Space plays. ← → go by one event, with Shift by ten; Home and End to the ends. F goes to the next failure, A changes the axis of the chart.",
+  "Space plays, in proportion to time if the axis of the chart is time. ← → go by one event, with Shift by ten; Home and End to the ends. F goes to the next failure, A changes the axis of the chart.",
   "Scene: drag turns, drag with the right button or two fingers moves, the wheel zooms; a click chooses an object, a double click goes to it. W shows all of the moment and its paths, R follows the robot.",
   "Chart: the wheel zooms, a double click shows all.",
 ];
@@ -25,7 +25,7 @@ class Page {
     this.event = this.#eventInAddress() ?? episode.opens;
     this.selected = null;
     this.object = null;
-    this.playing = null;
+    this.playback = new Playback({ onEvent: (event) => this.#moveTo(event), onEnd: () => this.#namePlay() });
     this.following = false;
     const seek = (event) => this.seek(event);
     const select = (node, options) => this.select(node, options);
@@ -107,7 +107,7 @@ class Page {
     this.slider = element("input", { type: "range", min: episode.first, max: episode.last, step: 1, "aria-label": "event" });
     this.slider.addEventListener("input", () => this.seek(Number(this.slider.value)));
     this.clock = element("output", { class: "clock" });
-    this.axis = element("button", { type: "button", title: "axis of the chart: events, which are equally far apart, or time (A)", onclick: () => this.#changeAxis() }, "by event");
+    this.axis = element("button", { type: "button", class: "axis", title: "axis of the chart: events, which are equally far apart, or time (A)", onclick: () => this.#changeAxis() }, "by event");
     const help = element("button", { type: "button", class: "help", title: "keys and mouse (?)", "aria-label": "keys and mouse", onclick: () => this.#help() }, "?");
     part("controls").append(this.play, this.slider, this.clock, this.axis, help);
     const whole = element("button", { type: "button", title: "show all that is there at this moment, and its paths (W)", onclick: () => this.#showWhole() }, "whole scene");
@@ -158,6 +158,7 @@ class Page {
   #changeAxis() {
     this.gantt.setAxis(!this.gantt.byTime);
     this.axis.textContent = this.gantt.byTime ? "by time" : "by event";
+    if (this.playback.running) this.#play();
   }
 
   #listen() {
@@ -221,7 +222,15 @@ class Page {
     this.onFollow?.(following);
   }
 
+  /** Show another moment; what plays goes on from there. */
   seek(event) {
+    this.#moveTo(event);
+    if (!this.playback.running) return;
+    if (this.event < this.episode.opens) this.#play();
+    else this.togglePlay();
+  }
+
+  #moveTo(event) {
     if (this.following) this.follow(false);
     const { first, last } = this.episode;
     this.event = Math.min(Math.max(Math.round(event), first), last);
@@ -242,25 +251,23 @@ class Page {
   }
 
   togglePlay() {
-    if (this.playing !== null) {
-      cancelAnimationFrame(this.playing);
-      this.playing = null;
-    } else {
-      const { first, last, opens } = this.episode;
-      if (this.event >= Math.min(last, opens)) this.event = first;
-      this.#step(performance.now(), this.event, Math.max(last - first, 1) / PLAYED_S);
-    }
-    this.play.textContent = this.playing === null ? "▶" : "❚❚";
-    this.play.setAttribute("aria-label", this.playing === null ? "play" : "pause");
+    if (this.playback.running) this.playback.stop();
+    else this.#play();
+    this.#namePlay();
+    this.show();
   }
 
-  #step(began, from, rate) {
-    this.playing = requestAnimationFrame(() => {
-      const event = Math.floor(from + ((performance.now() - began) / 1000) * Math.max(rate, 4));
-      if (event !== this.event) this.seek(Math.min(event, this.episode.opens));
-      if (event < this.episode.opens) this.#step(began, from, rate);
-      else this.togglePlay();
-    });
+  #play() {
+    const { first, last, opens, times } = this.episode;
+    const end = Math.min(last, opens);
+    if (this.event >= end) this.event = first;
+    if (end > first) this.playback.start(first, this.event, end, times, this.gantt.byTime);
+  }
+
+  #namePlay() {
+    const { running } = this.playback;
+    this.play.textContent = running ? "❚❚" : "▶";
+    this.play.setAttribute("aria-label", running ? "pause" : "play");
   }
 
   #paint() {
@@ -282,7 +289,7 @@ class Page {
     this.gantt.show(event, this.selected);
     this.panels.show(event, this.selected, running);
     this.slider.value = event;
-    this.clock.textContent = `${duration(episode.secondsAt(event))} · event ${event} of ${episode.last}`;
+    this.clock.textContent = `${duration(episode.secondsAt(event))} · event ${event} of ${episode.last}${this.playback.shortened ? " · long pauses shortened" : ""}`;
     this.slider.setAttribute("aria-valuetext", this.clock.textContent);
     if (matchMedia("print").matches) this.#print();
     clearTimeout(this.writing);
@@ -293,8 +300,8 @@ class Page {
   /** Name the paths in the scene, and the distance of its lines. */
   #legend(paths) {
     const ways = paths.slice(0, 4).map(({ object, color, dash }) => {
-      const line = svg("line", { x1: 0, x2: 26, y1: 5, y2: 5, class: color.slice(2), "stroke-dasharray": strokeOf(dash, 2.5) });
-      return element("span", {}, svg("svg", { width: 26, height: 10, "aria-hidden": "true" }, line), " path of ", recorded(object.name));
+      const line = svg("line", { x1: 0, x2: 32, y1: 5, y2: 5, class: color.slice(2), "stroke-dasharray": strokeOf(dash, 2.5) });
+      return element("span", {}, svg("svg", { width: 32, height: 10, "aria-hidden": "true" }, line), " path of ", recorded(object.name));
     });
     const during = ways.length > 0 ? element("span", {}, "during ", recorded(this.action.name)) : null;
     part("legend").replaceChildren(...ways, ...(during ? [during] : []), element("span", {}, "grid 1 m"));
