@@ -10,6 +10,7 @@ const CLICK_PX = 4;
 const GRID_MAX = 200;
 const SUN = [-5, 3.5, 8];
 const PATH_WIDTH = 0.0055; // of the reach of what is framed
+const LABELS_PX = 400; // labels are moved down by so much at most
 const CUT_MAX = 1.15; // an arm may leave the picture so far, before the picture changes
 
 export class SceneView {
@@ -237,12 +238,17 @@ export class SceneView {
       const box = new THREE.Box3().setFromObject(group);
       const top = new THREE.Vector3((box.min.x + box.max.x) / 2, (box.min.y + box.max.y) / 2, box.max.z);
       top.project(this.camera.camera);
-      if (Math.abs(top.z) > 1) continue;
+      const middle = box.getCenter(new THREE.Vector3()).project(this.camera.camera);
+      if (Math.max(Math.abs(middle.x), Math.abs(middle.y), Math.abs(middle.z)) > 1) continue;
       const label = element("span", { class: object === this.chosen ? "chosen" : null }, element("bdi", {}, object.name));
       labels.push({ label, x: ((top.x + 1) / 2) * width, y: ((1 - top.y) / 2) * height - 4 });
     }
     this.names.replaceChildren(...labels.map((each) => each.label));
-    stack(labels);
+    const around = this.holder.getBoundingClientRect();
+    const taken = [...this.holder.parentElement.querySelectorAll("#views button, #legend > *")].map((each) => each.getBoundingClientRect());
+    stack(labels, width, taken.map((each) => ({
+      x: (each.left + each.right) / 2 - around.left, y: each.bottom - around.top, width: each.width + 8, height: each.height + 4,
+    })));
   }
 }
 
@@ -256,15 +262,19 @@ function isSoftware(context) {
   return /swiftshader|llvmpipe|softpipe|software|basic render/i.test(name);
 }
 
-/** Place labels, each above those that it would cover. */
-function stack(labels) {
-  const placed = [];
+/** Place labels inside the picture, each above those that it would cover, or below them where there is no room above. */
+function stack(labels, across, taken) {
+  const placed = [...taken];
   for (const each of labels.sort((one, other) => other.y - one.y)) {
     const { offsetWidth: width, offsetHeight: height } = each.label;
-    const covers = (other) => Math.abs(each.x - other.x) < (width + other.width) / 2 && Math.abs(each.y - other.y) < height;
-    while (placed.some(covers)) each.y -= height / 2;
+    each.x = Math.min(Math.max(each.x, width / 2 + 2), across - width / 2 - 2);
+    const free = (y) => !placed.some((other) => Math.abs(each.x - other.x) < (width + other.width) / 2 && y > other.y - other.height && other.y > y - height);
+    const from = Math.max(each.y, height + 2);
+    let y = from;
+    while (y >= height + 2 && !free(y)) y -= height / 2;
+    if (y < height + 2) for (y = from; !free(y) && y < from + LABELS_PX; y += height / 2);
     each.label.style.left = `${each.x}px`;
-    each.label.style.top = `${each.y}px`;
-    placed.push({ ...each, width });
+    each.label.style.top = `${y}px`;
+    placed.push({ x: each.x, y, width, height });
   }
 }

@@ -181,7 +181,8 @@ export class TreeView {
   }
 
   #messageOf(node) {
-    const made = element("div", { class: "row message", "aria-hidden": "true", title: node.message.slice(0, HINT_MAX) });
+    const classes = node.start > this.event ? "row message later" : "row message";
+    const made = element("div", { class: classes, "aria-hidden": "true", title: node.message.slice(0, HINT_MAX) });
     made.append(recorded(node.message.slice(0, 300)));
     return made;
   }
@@ -223,7 +224,7 @@ export class TreeView {
       hidden,
       inside,
       node.reason ? recorded(node.reason, { class: "reason" }) : null,
-      recorded(node.parameters.slice(0, 200), { class: "parameters" }),
+      element("span", { class: "parameters" }, recorded(node.parameters.slice(0, 200))),
       element("span", { class: "took" }, took),
     );
   }
