@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from pycrorm_async.events.values import NodeStatus
 from pycrorm_async.memory import Memory
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.report.write import report
@@ -27,14 +28,15 @@ MARKS = """(() => {
     const rows = Array.from({ length: 19 }, (_, y) => {
       const { data } = pen.getImageData(left, gantt.lanes.of.get(node) * 19 + y, wide, 1);
       const pixels = Array.from({ length: wide }, (_, x) => data.slice(4 * x, 4 * x + 4));
-      return pixels.map((each) => (each[3] < 128 ? "." : grey(each) > 120 ? "o" : grey(each) < 50 ? "x" : "#")).join("");
+      const signOf = (each) => (each[3] < 128 ? "." : grey(each) > 120 ? "o" : grey(each) < 50 ? "x" : "#");
+      return pixels.map(signOf).join("");
     });
     return [node.status, rows.join(" ")];
   }));
 })()"""
-"""What is seen of a node's bar without colour, by status; each bar is WIDTH pixels wide."""
+"""The pixels of a node's bar without colour, by status; each bar is WIDTH pixels wide."""
 
-STATUSES = ("SUCCEEDED", "FAILED", "CANCELLED")
+STATUSES: tuple[NodeStatus, ...] = ("SUCCEEDED", "FAILED", "CANCELLED")
 
 
 @pytest.mark.parametrize("width", [12, 2.9])

@@ -91,6 +91,30 @@ def test_the_table_of_episodes_is_in_sight_without_scrolling(chrome: Browser, ov
         assert tab.ask(robots) == ["courier, other", "pr2", "pr2"]
         texts = tab.ask("[...document.querySelectorAll('#success text')].map((each) => each.textContent)")
         assert [each for each in texts if "_" in each] == ["relative_x (m)", "relative_y (m)"]
+        edges = """[...document.querySelectorAll('#episodes td, #episodes th')].map((each) => {
+          const { left, right } = each.getBoundingClientRect();
+          return [left, right];
+        })"""
+        assert all(0 <= left <= right <= width for left, right in tab.ask(edges))
+        assert tab.ask("document.querySelector('#episodes').scrollHeight") == tab.ask(
+            "document.querySelector('#episodes').clientHeight"
+        )
         if width == 1400:
             assert tab.ask("document.querySelector('#episodes tbody').getBoundingClientRect().bottom") < 900
         assert tab.problems() == []
+
+
+def test_episodes_without_a_page_say_why_and_what_still_runs_has_no_chart(chrome: Browser, overview: Path) -> None:
+    with chrome.open(overview) as tab:
+        assert tab.ask("document.getElementById('trend').textContent").startswith("Success")
+        assert "no page" not in tab.ask("document.getElementById('episodes').textContent")
+        tab.ask(
+            "new pycrormOverview.constructor({ title: '', total: 3, episodes: pycrormOverview.episodes"
+            ".map((each) => ({ ...each, status: 'RUNNING', page: null })) })"
+        )
+        assert tab.ask("document.getElementById('trend').textContent") == ""
+        text = tab.ask("document.getElementById('episodes').textContent")
+        assert text.count(" no page") == 4
+        assert text.endswith(
+            "3 older episodes have no page here. One of them gets a page of its own by pycrorm report 3"
+        )

@@ -1,4 +1,4 @@
-"""What makes a page easy to read: contrast, room, whole words, signs for control characters, shapes as recorded."""
+"""Pages are easy to read: contrast, room, whole words, signs for control characters, shapes as recorded."""
 
 from pathlib import Path
 from typing import Any

@@ -105,8 +105,9 @@ class Overview {
   }
 
   #trend() {
-    if (this.bins.length < 2) return part("trend").replaceChildren();
-    const picture = bars(this.bins.map(rateOf), 1, "share of successful episodes, the oldest first", percent);
+    const rates = this.bins.map(rateOf);
+    if (rates.length < 2 || rates.every((each) => each === null)) return part("trend").replaceChildren();
+    const picture = bars(rates, 1, "share of successful episodes, the oldest first", percent);
     return part("trend").replaceChildren(element("h2", {}, "Success, the oldest episodes first"), picture);
   }
 
@@ -119,7 +120,7 @@ class Overview {
     const rows = sorted.slice(0, REASONS_MAX).map(([reason, count]) => {
       const trend = this.bins.map((bin) => bin.reduce((sum, each) => sum + (each.reasons[reason] ?? 0), 0));
       const picture = this.bins.length > 1 ? bars(trend, Math.max(...trend), `${reason} over time`, String) : "";
-      const cells = [element("td", { class: "number" }, String(count)), element("td", {}, recorded(reason, { class: "reason" }))];
+      const cells = [element("td", { class: "number" }, String(count)), element("td", { class: "named" }, recorded(reason, { class: "reason" }))];
       return element("tr", {}, ...cells, element("td", {}, picture));
     });
     const left = sorted.length - rows.length;
@@ -147,7 +148,10 @@ class Overview {
     const table = element("table", {}, element("thead", {}, element("tr", {}, ...heads)), element("tbody", {}, ...rows));
     const left = sorted.length - rows.length;
     const note = left > 0 ? element("p", { class: "quiet" }, `${left} more episodes are counted above and not listed.`) : "";
-    replaceIn(part("episodes"), element("h2", {}, "Episodes"), table, note);
+    const missing = this.episodes.filter((each) => !each.page && !each.unreadable).map((each) => each.number);
+    const command = element("code", {}, `pycrorm report ${missing.length > 0 ? Math.max(...missing) : ""}`);
+    const text = `${missing.length} older episodes have no page here. One of them gets a page of its own by `;
+    replaceIn(part("episodes"), element("h2", {}, "Episodes"), table, note, missing.length > 0 ? element("p", { class: "quiet" }, text, command) : "");
   }
 
   #row(each) {
@@ -155,15 +159,19 @@ class Overview {
     return element(
       "tr",
       {},
-      element("td", { class: "number" }, each.page ? element("a", { href: each.page }, name) : name),
+      element("td", { class: "number" }, each.page ? element("a", { href: each.page }, name) : name, this.#missing(each)),
       element("td", { class: "fixed" }, each.started),
       element("td", { class: `fixed is-${each.status.toLowerCase()}` }, element("span", { class: "sign" }, signOf(each.status)), ` ${each.status}`),
       element("td", { class: "number" }, each.seconds === null ? "" : duration(each.seconds)),
-      element("td", { class: "number" }, String(each.nodes)),
-      element("td", { class: "number" }, String(each.failed)),
+      element("td", { class: "number", "data-name": "nodes" }, String(each.nodes)),
+      element("td", { class: "number", "data-name": "failed" }, String(each.failed)),
       this.named ? element("td", {}, recorded((each.robots ?? []).join(", "))) : null,
-      element("td", {}, recorded(each.description), each.unreadable ? unreadable(each.unreadable) : null),
+      element("td", { class: "wide" }, recorded(each.description), each.unreadable ? unreadable(each.unreadable) : null),
     );
+  }
+
+  #missing({ page, unreadable: fault }) {
+    return page || fault ? null : element("span", { class: "quiet" }, " no page");
   }
 
   #sortBy(key) {
