@@ -113,7 +113,7 @@ class Successes:
 @pytest.mark.slow
 @pytest.mark.soak_on(*range(1, 8))
 @pytest.mark.parametrize("part", range(8))
-async def test_no_offered_place_is_in_collision_in_two_hundred_table_scenes(part: int) -> None:
+async def test_at_no_offered_place_is_the_base_in_collision_in_two_hundred_table_scenes(part: int) -> None:
     offering = dict.fromkeys(("costmap", "seeing", "experience", "policy", "surface"), 0)
     for seed in range(SEED + part * SCENES // 8, SEED + (part + 1) * SCENES // 8):
         with table_scene(seed) as (robot, support, milk):
