@@ -47,6 +47,7 @@ RUNS = (
     Run("hook"),
     Run("recording"),
     Run("stages"),
+    Run("observations"),
     Run("busy"),
     Run("busy postgresql", ("--postgresql",)),
     Run("plan"),
