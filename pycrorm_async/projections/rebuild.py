@@ -15,9 +15,9 @@ at a time. A killed one leaves rows in `pycrorm_generation`: the next resumes `â
 The switch races with processes that fold into the visible tables. `show` therefore folds until little is missing and
 then, in one transaction that excludes other writers, locks the visible generation's row, folds the events that the
 visible tables have and the new ones lack, and replaces the views. If more than `_LATE_EVENTS_MAX` events are missing it
-rolls back and folds outside the transaction again, so that others wait for a short time only. So readers never see
-fewer events after the switch than before. The new revision is above both old ones: a batch folded for the old tables
-fails its check and is folded again (`generations`).
+rolls back and folds outside the transaction again, so that others wait for a short time only. Therefore readers never
+see fewer events after the switch than before. The new revision is above both old ones: a batch folded for the old
+tables fails its check and is folded again (`generations`).
 
 Queries that began before the switch may still read the replaced tables. The switch never drops them: `clear` in
 `replaced_tables` waits some seconds for such queries, and reports tables that are still in use.
@@ -219,7 +219,7 @@ class Rebuild:
         )
 
     async def _gather_statistics(self) -> None:
-        """Let the planner know the new tables: without statistics, queries of them may take minutes."""
+        """Gather statistics of the new tables for the planner: without them, queries may take minutes."""
         async with self._log.engine.begin() as connection:
             making = await self._making.generation(connection, "share")
             names = [*(CORE | OF_NO_EPISODE if self._projection is None else ()), *making.layout.leaves]

@@ -39,7 +39,7 @@ Refused: TypeAlias = tuple[int, Exception]
 
 
 class _Read(Protocol):
-    """Gives events of one episode to a fold; with `kept` False discards what it makes of them."""
+    """Gives events of one episode to a fold; discards the results if `kept` is False."""
 
     def __call__(self, fold: EpisodeFold, events: Sequence[StoredEvent], *, kept: bool = True) -> Refused | None: ...
 

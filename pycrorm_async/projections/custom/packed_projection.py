@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 class PackedProjection(EpisodeProjection):
     """The base class of projections of this package that pack rows into other rows, as cases into blocks.
 
-    Its tables may have columns of every storage, and names that are reserved for it. Its batch reads the events as they
-    are stored, collects what a fold makes of them, and packs it.
+    Its tables may have columns of every storage, and names that are reserved for it. Its batch reads the stored events,
+    collects the results of the fold, and packs them.
     """
 
     is_packed: ClassVar[bool] = True

@@ -1,4 +1,4 @@
-"""Fold a batch of events with a custom projection; subclasses keep what the fold makes, and store it."""
+"""Fold a batch of events with a custom projection; subclasses collect the results of the fold, and store them."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class ProjectedBatch(ABC):
             await self._folds.restore(log, spans)
 
     def fold(self, events: Sequence[StoredEvent]) -> tuple[int, str] | None:
-        """Add what the projection makes of consecutive events of an episode, as `Batch.fold` does."""
+        """Fold consecutive events of an episode, and add the results to the batch; implements `Batch.fold`."""
         refused = self._read(self._projection.fold, events) if self._folds is None else self._folds.fold(events)
         if refused is None:
             return None
@@ -59,9 +59,9 @@ class ProjectedBatch(ABC):
 
     @abstractmethod
     def add(self, fold: Any, events: Sequence[StoredEvent], *, kept: bool) -> Refused | None:
-        """Add what a fold of the projection makes of events of an episode, or with `kept` False discard it.
+        """Fold events of an episode, and add the results to the batch, or discard them if `kept` is False.
 
-        Returns the first event that cannot be folded, with the exception, and then has added nothing of it.
+        Returns the sequence of the first event that cannot be folded, with the exception; its results are not added.
         """
 
     async def ready(self, engine: AsyncEngine, generation: int) -> None:  # noqa: ARG002 - for subclasses

@@ -56,9 +56,10 @@ AND number % :many = :part {begun} ORDER BY number LIMIT :limit"""),  # noqa: S6
 
 
 async def late(connection: AsyncConnection, place: str, *, seen: str, limit: int) -> list[EpisodeRow]:
-    """Return the episodes of which the visible tables have more events than this generation, with theirs as `head`.
+    """Return the episodes of which the visible tables have more events than this generation.
 
-    `seen`: SQL for the checkpoints of the visible tables, `SEEN` or `folded` of another generation.
+    Their `head` is the last sequence in the visible tables. `seen` is the SQL for the checkpoints of those tables:
+    `SEEN`, or `folded` of another generation.
     """
     rows = await connection.execute(
         text(f"""

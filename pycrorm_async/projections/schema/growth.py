@@ -37,7 +37,7 @@ _log = logging.getLogger("pycrorm_async.projections")
 
 
 class GrowthTarget(Protocol):
-    """The owner of a generation's row in `pycrorm_generation`."""
+    """Protocol of the owner of a generation's row in `pycrorm_generation`, which can extend the tables."""
 
     async def grow(self, connection: AsyncConnection, generation: Generation, layout: Layout) -> Generation:
         """Create the tables and columns that only this layout has, and store the layout."""

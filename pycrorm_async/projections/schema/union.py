@@ -44,7 +44,7 @@ class Union(NamedTuple):
     Attributes:
         accepted: those declarations by fingerprint, with the names that types and fields have in the tables.
         refused: the reasons of refusals, by fingerprint.
-        adjustments: by fingerprint, how accepted declarations that contradict others are kept.
+        adjustments: by fingerprint, the names of the accepted declarations that contradict others.
     """
 
     layout: Layout

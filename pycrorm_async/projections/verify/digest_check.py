@@ -69,8 +69,8 @@ class DigestCheck:
     ) -> None:
         """Check the events of the next span, given by sequence, with the digests kept inside it.
 
-        `head` is the episode's last event in this snapshot; an episode that is being recorded grows meanwhile. Of a
-        block in which damage was reported for an event, a digest that does not match is not reported as well.
+        `head` is the episode's last event in this snapshot; an episode that is being recorded grows meanwhile. If
+        damage was reported for an event of a block, the digest of that block is not reported too.
         """
         done = span.after
         block_ends = range(done - done % BLOCK_EVENTS + BLOCK_EVENTS, span.last + 1, BLOCK_EVENTS)

@@ -39,7 +39,7 @@ class VerifyResult:
 
     Attributes:
         episodes, events, rows: the number of each that was checked.
-        behind: the number of events that are not folded yet, which is no fault.
+        behind: the number of events that are not folded yet, which is normal while robots record.
         damage, drift: the number of findings of damage and of differences.
         damages, differences: the first hundred of each.
         remarks: the number of unusual event orders that correct plans produce too.

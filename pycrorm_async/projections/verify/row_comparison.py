@@ -209,7 +209,7 @@ def _compared(
 
 
 def _event_of(key: Any) -> tuple[int, int]:
-    """Return number and sequence of the row's event; (0, 0) for a key that is no integer, which SQLite can store."""
+    """Return number and sequence of the row's event; (0, 0) if the key is not an integer, as SQLite allows."""
     return row_key(key)[:2] if isinstance(key, int) else (0, 0)
 
 

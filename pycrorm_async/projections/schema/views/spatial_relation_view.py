@@ -1,4 +1,4 @@
-"""Define `spatial_relation`: what each picked up or placed object was on, in or next to.
+"""Define `spatial_relation`: the objects on, in or next to which each picked up or placed object was.
 
 The moment is the start of a pick-up, and the end of a placing. A relation is computed from the poses at that moment and
 from the boxes of the recorded descriptions, link by link. An object of version 0.1.0 has no description; it has the
