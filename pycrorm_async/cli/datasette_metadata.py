@@ -1,4 +1,4 @@
-"""`pycrorm datasette-metadata` prints the metadata with which Datasette shows a memory well."""
+"""`pycrorm datasette-metadata` prints Datasette's metadata of a memory: hidden tables, descriptions, questions."""
 
 from __future__ import annotations
 

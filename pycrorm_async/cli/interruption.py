@@ -1,4 +1,4 @@
-"""This module handles Ctrl-C and SIGTERM while a plan runs and while its events are being stored.
+"""Handle Ctrl-C and SIGTERM while a plan runs and while its events are being stored.
 
 Theory of operation. The first signal cancels the plan's task, as asyncio does; the plan ends and its events are stored.
 If the plan does not end, the second signal raises `KeyboardInterrupt` in it. The next signal, and any signal once the

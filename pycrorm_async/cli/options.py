@@ -1,4 +1,4 @@
-"""This module defines the command-line options that several verbs share."""
+"""Define the command-line options that several verbs share."""
 
 from __future__ import annotations
 

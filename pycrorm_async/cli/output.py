@@ -1,4 +1,4 @@
-"""This module prints tables, facts or one JSON document on stdout, and problems as single lines on stderr."""
+"""Print tables, facts or one JSON document on stdout, and problems as single lines on stderr."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""This module warns when a spool holds events that its database does not; reading verbs never store them themselves."""
+"""Warn when a spool holds events that its database does not; reading verbs never store them themselves."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""This module loads the plan function that `PLAN.py[:function]` names."""
+"""Load the plan function that `PLAN.py[:function]` names."""
 
 from __future__ import annotations
 

@@ -82,7 +82,7 @@ def rebuild(
 
 
 async def _choose(url: str, names: list[str], projections: Mapping[str, Projection]) -> list[str]:
-    """Return the names of what to rebuild, the tables first. Raises `CallerError` for an unknown name."""
+    """Return the names of the projections to rebuild, the tables first. Raises `CallerError` for an unknown name."""
     stored_names = await projections_of(url)
     for name in names:
         if name in stored_names and name not in projections:

@@ -1,4 +1,4 @@
-"""`pycrorm recall` lists the past actions most like a cue, and how they ended."""
+"""`pycrorm recall` lists the past actions most like a cue, with their outcomes."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def recall(
     spool: SpoolOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """List the past actions most like a cue, and how they ended."""
+    """List the past actions most like a cue, with their outcomes."""
     parsed = _parse(cue or [])
     conditions: dict[str, Any] = {
         "before": before, "after": after, "episode": episode, "tag": tag, "robot": robot,

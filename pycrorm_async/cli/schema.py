@@ -26,7 +26,7 @@ def schema(
     spool: SpoolOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Describe the views of a memory: what a row is, and each column with its type, its unit and what it refers to."""
+    """Describe the views of a memory: the meaning of a row, and each column with its type, unit and reference."""
     if as_json and form == "mermaid":
         raise CallerError("--json and --format mermaid exclude each other")
     names = tuple(views or (CORE_VIEWS if form == "mermaid" else ()))

@@ -1,4 +1,4 @@
-"""This module prints the snapshot of an episode at one moment: the running nodes, the robot and the objects."""
+"""Print the snapshot of an episode at one moment: the running nodes, the robot and the objects."""
 
 from __future__ import annotations
 

@@ -183,7 +183,7 @@ def status(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None, as_json: Jso
 def _problems(
     state: DatabaseState, recorders: Sequence[RecorderState], refused: Sequence[RefusedState]
 ) -> Iterator[str]:
-    """Yield a line for all that is stopped, left out or refused."""
+    """Yield a line for each stopped episode or recorder, for each type or view left out, and for each refusal."""
     for episode in state.episodes:
         if stop := episode.refused or episode.parked:
             yield f"episode {episode.number} ({episode.id}) is stopped: {stop}"

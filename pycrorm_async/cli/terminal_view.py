@@ -1,4 +1,4 @@
-"""This module draws running episodes in the terminal: one with its task tree, or what each of them does now."""
+"""Draw running episodes in the terminal: one with its task tree, or all of them with their present actions."""
 
 from __future__ import annotations
 

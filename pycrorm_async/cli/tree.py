@@ -1,4 +1,4 @@
-"""This module draws a recorded task tree with types, statuses, durations and failures."""
+"""Draw a recorded task tree with types, statuses, durations and failures."""
 
 from __future__ import annotations
 

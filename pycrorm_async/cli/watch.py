@@ -39,8 +39,9 @@ def watch(
     """Follow running episodes live: the page of the report, served on this machine and read-only, until Ctrl-C.
 
     Prints the address, which has a token: only a browser on this machine that knows it gets the page. From another
-    machine, open a tunnel: `ssh -L 8137:localhost:8137 ROBOT`. Without EPISODE the page lists what each robot does now
-    and leads to each episode. It waits for a memory that has no episode yet. --json prints the address as one document.
+    machine, open a tunnel: `ssh -L 8137:localhost:8137 ROBOT`. Without EPISODE the page lists the present activity of
+    each robot and leads to each episode. It waits for a memory that has no episode yet. --json prints the address as
+    one document.
     """
     if terminal and (port is not None or open_it or as_json):
         raise CallerError("--terminal serves no page: leave out --port, --open and --json")
@@ -99,7 +100,7 @@ async def _serve(follower: LogFollower, episode: str | None, port: int | None, *
 
 
 async def _check(follower: LogFollower, episode: str | None) -> None:
-    """Raise `UnknownEpisode` for a wrong name, and errors of the database that waiting does not solve."""
+    """Raise `UnknownEpisode` for a wrong name, and database errors that do not pass by waiting."""
     try:
         log = await follower.log()
         if not await log.episodes():

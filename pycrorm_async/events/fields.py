@@ -1,4 +1,4 @@
-"""This module maps designator names to tables and field names to columns, and rejects names that cannot be mapped.
+"""Map designator names to tables and field names to columns, and reject names that cannot be mapped.
 
 | field | column |
 |---|---|

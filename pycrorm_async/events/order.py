@@ -1,4 +1,4 @@
-"""This module defines the legal order of an episode's events as one table, and checks episodes against it.
+"""Define the legal order of an episode's events as one table, and check episodes against it.
 
 | event | legal when | afterwards |
 |---|---|---|

@@ -1,4 +1,4 @@
-"""This module derives the declaration of a designator class: its fields with their types, slots and columns.
+"""Derive the declaration of a designator class: its fields with their types, slots and columns.
 
 Each parameter of the class (see `parameter_types`) becomes a field. A parameter that cannot be a column is omitted from
 the declaration, and its values are recorded as missing. If the whole class cannot be declared, its nodes are recorded

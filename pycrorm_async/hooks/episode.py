@@ -1,11 +1,11 @@
-"""An `Episode` records one open episode of our own plan layer: its nodes, its world and what it perceived.
+"""An `Episode` records one open episode of our own plan layer: its nodes, its world and its percepts.
 
 Theory of operation. Starts of nodes, observations and changes of the world reach an episode in the thread of the plan,
 through `Recorder` and `WorldRecorder`. Ends of nodes do so too, except when a plan is dropped unfinished: then the
-garbage collector closes its coroutines and thereby ends its nodes, in any thread and in the middle of whatever that
-thread is doing. The sampler's thread reads `id`, `world` and `continue_at`. How an episode is continued in a follow-up
-is described in `recording.writing.episode_writer`; meanwhile the sampler takes only the first and the last sample of
-each motion.
+garbage collector closes its coroutines and thereby ends its nodes, in any thread and between any two of that thread's
+bytecodes. The sampler's thread reads `id`, `world` and `continue_at`. How an episode is continued in a follow-up is
+described in `recording.writing.episode_writer`; meanwhile the sampler takes only the first and the last sample of each
+motion.
 
 `NodeRecord.episode_id` is the id under which the node's sequence counts; a node whose `episode_id` is not the episode's
 current id is never referred to in the follow-up.
@@ -146,7 +146,7 @@ class Episode(EpisodeWriter[TaskTreeNode]):
         return self._put_start(node, event, declared.dtype, missing, may_refuse=continues is None)
 
     def end_node(self, node: TaskTreeNode) -> None:
-        """Write how a node ended."""
+        """Write the end of a node."""
         record: NodeRecord = node.record
         self._ending.add(node)  # before the removal, so that no thread that misses the node ends the episode
         try:
@@ -163,7 +163,7 @@ class Episode(EpisodeWriter[TaskTreeNode]):
         self, *, location: str, offered: tuple[Candidate, ...], taken: int | None, considered: int,
         refused: tuple[Refusal, ...], offered_beyond: int, cells: Cells | None, node: TaskTreeNode | None,
     ) -> int:  # fmt: skip
-        """Write which places a location designator offered, took and refused; return the sequence."""
+        """Write the places that a location designator offered, took and refused; return the sequence."""
         number = self._sequence_of(node)
         resolved = location_resolved(
             location, offered, taken=taken, considered=considered, refused=refused, offered_beyond=offered_beyond,

@@ -1,4 +1,4 @@
-"""This module builds the events of resolved locations and of perception from values of the plan."""
+"""Build the events of resolved locations and of perception from values of the plan."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def object_detected(
     *,
     node: int | None,
 ) -> ObjectDetected:
-    """Build the event of a result of perception; `node` is the sequence of the node that asked for it."""
+    """Build the event of a result of perception; `node` is the sequence of the node that requested it."""
     values = tuple(_seen_value(each, references) for each in seen)
     return ObjectDetected(source, object_type.name if object_type is not None else None, values, node)
 

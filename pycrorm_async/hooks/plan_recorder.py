@@ -1,4 +1,4 @@
-"""The `Recorder` receives what the plan and the world report and passes it to the episode it belongs to.
+"""The `Recorder` receives the reports of the plan and the world, and passes each to its episode.
 
 Theory of operation. The plan layer and the world call the recorder synchronously, in the thread and context of the
 plan. `current_episode` holds the episode of a context. It is used only if it is open in this memory and if it is a

@@ -43,7 +43,7 @@ class EpisodeCopy:
 
     Attributes:
         id, number: its UUID, its number in the source.
-        were_there: the number of the source's events that the target had before.
+        were_there: the number of the source's events that the target had before the copy.
         copied: the number of events appended.
         head: the last event that the target has now.
         damage: the reason of an incomplete copy: damage in the source, or other events in the target.

@@ -56,7 +56,7 @@ async def serve(
     fold_workers: int = 0,
     forked: Sequence[ChildProcess] = (),
 ) -> DaemonSummary:
-    """Drain every recorder of the spool and fold, until `stop` is set. Calls `report` with one line for each report.
+    """Drain every recorder of the spool and fold, until `stop` is set. Calls `report` with each line for the operator.
 
     Folds custom `projections` and the installed ones too. `fold_workers` is the number of processes that fold, of which
     the first may be `forked` already; while none is ready, this process folds.

@@ -141,7 +141,7 @@ class HealedLog:
                 _log.warning("%s: the healing cannot be recorded in the log: %s", self._store.address, error)
 
     async def _lost(self) -> dict[EpisodeId, int]:
-        """Return the episodes of which the log has less than was acknowledged, with their heads in the log."""
+        """Return the episodes whose head in the log is below the acknowledged one, with their heads in the log."""
         acknowledged = dict(self._heads.all)
         rows: dict[EpisodeId, EpisodeRow] = {}
         for part in _parts(list(acknowledged), _EPISODES_MAX):

@@ -53,7 +53,7 @@ def learn(successes: pd.DataFrame, *, min_samples_leaf: int = 25) -> Policy:
             position of the robot's base in the object's own frame, m, as in `PickUpWithContextView`; optionally
             `height`, the object's height minus the torso's, m. Other columns are ignored. If all heights are equal,
             the height is not learned but kept as the policy's `constant_height`. Condition a policy that has learned
-            heights on the height at hand, plus or minus 1 to 5 cm; unconditioned, it mixes what works at any height.
+            heights on the present height, plus or minus 1 to 5 cm; unconditioned, it mixes the samples of all heights.
         min_samples_leaf: minimum number of rows in a leaf, two or more. A smaller number makes the policy repeat its
             samples more exactly: its success rate rises and its coverage falls (see `Policy.coverage`).
 

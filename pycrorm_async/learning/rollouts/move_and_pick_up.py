@@ -28,7 +28,7 @@ from pycrorm_async.world.enums import Arms, Grasp
 from pycrorm_async.world.pose import Pose, rotated
 
 HEIGHT_TOLERANCE_M = 0.05
-"""Experience with objects up to this much higher or lower, measured from the torso, applies to the object at hand."""
+"""Experience with objects up to this much higher or lower, measured from the torso, applies to the present object."""
 _DRAWS_MAX = 10
 """Bounds how often samples are drawn again because the base would collide, so that a search without a place ends."""
 _UPRIGHT_MIN = 0.1

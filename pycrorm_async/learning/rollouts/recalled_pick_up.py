@@ -1,4 +1,4 @@
-"""Describe a pick-up whose alternatives are the ways that worked before, at about this height."""
+"""Describe a pick-up whose alternatives are the ways that succeeded before, at about this height."""
 
 from __future__ import annotations
 

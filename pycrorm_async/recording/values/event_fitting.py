@@ -1,4 +1,4 @@
-"""These functions shorten events that cannot be encoded: too long, or with values that JSON cannot hold."""
+"""Shorten events that cannot be encoded: too long, or with values that JSON cannot hold."""
 
 from __future__ import annotations
 

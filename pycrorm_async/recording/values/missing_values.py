@@ -1,4 +1,4 @@
-"""This module counts the values that could not be recorded, and logs one warning for each type and field.
+"""Count the values that could not be recorded, and log one warning for each type and field.
 
 A plan may perform the same action a million times, so one warning per perform would bury the log. The warning states
 the reason, the counter the number of values.

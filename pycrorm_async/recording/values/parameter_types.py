@@ -1,4 +1,4 @@
-"""This module lists the parameters of a designator class with their types.
+"""List the parameters of a designator class with their types.
 
 The parameters of a dataclass are the fields that its constructor accepts, except those with a leading underscore. The
 parameters of any other user class are its annotated attributes and the arguments of its `__init__`

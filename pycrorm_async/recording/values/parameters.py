@@ -1,4 +1,4 @@
-"""This module reads a designator's parameters when it is performed, and shortens a node's start that is too long.
+"""Read a designator's parameters when it is performed, and shorten a node's start that is too long.
 
 Each parameter is read on its own, so a fault in one leaves the values of the others intact.
 """

@@ -1,4 +1,4 @@
-"""This module copies live values of a plan into frozen event values at the moment a hook observes them.
+"""Copy live values of a plan into frozen event values at the moment a hook observes them.
 
 A parameter that cannot be recorded without changing its meaning raises `UnrecordableValue` with the reason. Results,
 arguments of failures and texts of the world never raise: a value that cannot be recorded becomes a `MissingValue`.

@@ -1,4 +1,4 @@
-"""This module builds the first event of an episode, and the statuses that an episode and its root end with."""
+"""Build the first event of an episode, and the statuses that an episode and its root end with."""
 
 from __future__ import annotations
 
