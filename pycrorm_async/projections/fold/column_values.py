@@ -17,8 +17,9 @@ from pycrorm_async.projections.fold.row_batch import Row
 from pycrorm_async.projections.schema.core_columns import COLUMNS
 
 _ROWS_OF_EPISODE, _ROWS_OF_EVENT = row_id(1, 0, 0), row_id(0, 1, 0)
-UNCHANGED: Row = (None,) * (len(COLUMNS["object"]) - COLUMNS["object"].index("joints"))
-"""The columns of an object that only its first row has, from its joints on."""
+POSE_COLUMNS = "x y z qx qy qz qw frame"
+"""The columns of a pose, in the order of `pose_columns`."""
+assert " ".join(COLUMNS["pose"]) == f"id process_metadata_id {POSE_COLUMNS} time", "`pose_row` has another order"
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 _MICROSECOND = timedelta(microseconds=1)
 _SCALARS: dict[str, tuple[type, ...]] = {

@@ -34,7 +34,7 @@ from pycrorm_async.events.types import (
 )
 from pycrorm_async.events.upcasters import UPCASTERS
 from pycrorm_async.projections.fold.column_values import (
-    UNCHANGED,
+    POSE_COLUMNS,
     CannotFold,
     json_text,
     microseconds,
@@ -59,9 +59,11 @@ from pycrorm_async.projections.fold.node_row import (
     START_TIME,
     TORSO_HEIGHT,
 )
+from pycrorm_async.projections.fold.object_row import object_row
 from pycrorm_async.projections.fold.observed_values import value_rows
 from pycrorm_async.projections.fold.parameters import Designators, ParameterRows
 from pycrorm_async.projections.fold.row_batch import EpisodeEnd, Row, Rows
+from pycrorm_async.projections.schema.core_columns import COLUMNS
 from pycrorm_async.store.stored import StoredEvent
 
 _NO_OUTCOME: Row = (None, None, None, None)
@@ -229,34 +231,34 @@ def _outcome(ended: NodeEnded) -> Row:
 
 def _object_added(event: StoredEvent, added: ObjectAdded, _designators: Designators, rows: Rows) -> None:
     own, number = _own(event)
-    node = _node(event, added.node)
+    node, time = _node(event, added.node), microseconds(event.wall_ns)
     joints = json_text(added.joints) if added.joints else None
     color = json_text(added.color) if added.color is not None else None
     if added.description is not None:
         rows.descriptions.add(added.description)
     rows.inserts["pose"].append(pose_row(own, number, added.pose))
-    details = joints, added.description, color, added.model, added.serial, added.mass_kg, added.base_link
-    rows.inserts["object"].append((*_object_row(event, added, own, own, node), *details))
+    columns = object_row(
+        own, number, "Object", added.name, added.object_type, own, None, own, time, node,
+        joints, added.description, color, added.model, added.serial, added.mass_kg, added.base_link,
+    )  # fmt: skip
+    rows.inserts["object"].append(columns)
 
 
 def _object_moved(event: StoredEvent, moved: ObjectMoved, _designators: Designators, rows: Rows) -> None:
     identity, node = row(event.number, moved.object), _node(event, moved.node)
     own, number = _own(event)
-    rows.inserts["pose"].append(pose_row(own, number, moved.pose))
-    rows.inserts["object"].append((*_object_row(event, moved, own, identity, node), *UNCHANGED))
-
-
-def _object_row(event: StoredEvent, value: ObjectAdded | ObjectMoved, own: int, identity: int, node: int | None) -> Row:
-    """Return the columns of an object that change when it moves."""
     time = microseconds(event.wall_ns)
-    return own, event.number, "Object", value.name, value.object_type, own, None, identity, time, node
+    rows.inserts["pose"].append(pose_row(own, number, moved.pose))
+    rows.inserts["object"].append(
+        object_row(own, number, "Object", moved.name, moved.object_type, own, None, identity, time, node)
+    )
 
 
 def _object_removed(event: StoredEvent, removed: ObjectRemoved, _designators: Designators, rows: Rows) -> None:
     reference = removed.object
-    seen, identity = row(event.number, reference.row), row(event.number, reference.object)
+    object_id, identity_id = row(event.number, reference.row), row(event.number, reference.object)
     rows.inserts["object_removal"].append(
-        (*_own(event), seen, identity, microseconds(event.wall_ns), _node(event, removed.node))
+        (*_own(event), object_id, identity_id, microseconds(event.wall_ns), _node(event, removed.node))
     )
 
 
@@ -264,17 +266,17 @@ def _attachment(
     event: StoredEvent, change: ObjectAttached | ObjectDetached, _designators: Designators, rows: Rows
 ) -> None:
     kind = "attached" if isinstance(change, ObjectAttached) else "detached"
-    parent, child = row(event.number, change.parent.row), row(event.number, change.child.row)
+    parent_id, child_id = row(event.number, change.parent.row), row(event.number, change.child.row)
     rows.inserts["attachment"].append(
-        (*_own(event), kind, parent, child, change.link, microseconds(event.wall_ns), _node(event, change.node))
+        (*_own(event), kind, parent_id, child_id, change.link, microseconds(event.wall_ns), _node(event, change.node))
     )
 
 
 def _joints_moved(event: StoredEvent, moved: JointsMoved, _designators: Designators, rows: Rows) -> None:
     own, number = _own(event)
-    seen, node, time = row(number, moved.object.row), _node(event, moved.node), microseconds(event.wall_ns)
+    object_id, node, time = row(number, moved.object.row), _node(event, moved.node), microseconds(event.wall_ns)
     rows.inserts["joint_change"].extend(
-        [(own, joint, number, seen, position, time, node) for joint, position in moved.joints.items()]
+        [(own, joint, number, object_id, position, time, node) for joint, position in moved.joints.items()]
     )
 
 
@@ -314,31 +316,21 @@ def _object_detected(event: StoredEvent, detected: ObjectDetected, _designators:
     node, time = _node(event, detected.node), microseconds(event.wall_ns)
     detections = [  # complete before any row is added, because `row` may raise
         (
-            own,
-            rank,
-            number,
-            node,
-            each.source if each.source is not None else detected.source,
-            detected.object_type,
-            row(number, each.object.row) if each.object is not None else None,
-            each.name,
-            each.object_type,
-            *pose_columns(each.pose),
-            each.visible,
-            each.confidence,
-            time,
+            own, rank, number, node, each.source if each.source is not None else detected.source, detected.object_type,
+            row(number, each.object.row) if each.object is not None else None, each.name, each.object_type,
+            *pose_columns(each.pose), each.visible, each.confidence, time,
         )
         for rank, each in enumerate(detected.seen)
-    ]
+    ]  # fmt: skip
     rows.inserts["detection"].extend(detections)
 
 
 def _state_sampled(event: StoredEvent, sampled: StateSampled, _designators: Designators, rows: Rows) -> None:
     own, number = _own(event)
-    seen, node = row(number, sampled.object.row), _node(event, sampled.node)
+    object_id, node = row(number, sampled.object.row), _node(event, sampled.node)
     time, ns = microseconds(event.wall_ns), event.monotonic_ns
     rows.inserts["state_sample"].extend(
-        [(own, channel, number, seen, node, value, time, ns) for channel, value in sampled.channels.items()]
+        [(own, channel, number, object_id, node, value, time, ns) for channel, value in sampled.channels.items()]
     )
 
 
@@ -381,3 +373,19 @@ _FOLDS: dict[str, Callable[[StoredEvent, Any, Designators, Rows], None]] = {
 _decode = Decoder(
     {name: EVENT_TYPES[name] for name in _FOLDS}, {key: each for key, each in UPCASTERS.items() if key[0] in _FOLDS}
 ).decode
+
+for _table, _columns in {
+    "episode_tagging": "id position process_metadata_id tag added time",
+    "object_removal": "id process_metadata_id object_id identity_id time node_id",
+    "attachment": "id process_metadata_id kind parent_id child_id link time node_id",
+    "joint_change": "id joint process_metadata_id object_id position time node_id",
+    "location_resolution": "id process_metadata_id node_id location considered offered taken pose_id time refused"
+    " occupied_cells hidden_cells free_cells",
+    "location_candidate": f"resolution_id position process_metadata_id {POSE_COLUMNS} arms taken grasp torso_height",
+    "location_refusal": f"resolution_id position process_metadata_id {POSE_COLUMNS} reason",
+    "detection": "id position process_metadata_id node_id source looked_for object_id name obj_type"
+    f" {POSE_COLUMNS} visible confidence time",
+    "state_sample": "id channel process_metadata_id object_id node_id value time ns",
+    "observation": "id process_metadata_id node_id name time ns",
+}.items():
+    assert " ".join(COLUMNS[_table]) == _columns, f"the fold writes the columns of {_table} in another order"

@@ -10,7 +10,6 @@ from pycrorm_async.events.types import DesignatorTypeDeclared, NodeStarted
 from pycrorm_async.events.values import FieldDeclared, ObjectReference, ObjectValue
 from pycrorm_async.projections.fold.column_values import (
     AS_IT_IS,
-    UNCHANGED,
     CannotFold,
     in_slot,
     is_missing,
@@ -22,6 +21,7 @@ from pycrorm_async.projections.fold.column_values import (
     row,
     scalar,
 )
+from pycrorm_async.projections.fold.object_row import object_row
 from pycrorm_async.projections.fold.row_batch import Row
 from pycrorm_async.projections.schema.core_columns import EPISODE
 from pycrorm_async.projections.schema.union import Union
@@ -125,8 +125,8 @@ def _object(event: StoredEvent, node: int, field: FieldDeclared, recorded: Any, 
     pose_id = own if value.pose is not None else None
     part_of = row(event.number, value.part_of.row) if value.part_of is not None else None
     number, time = event.number, microseconds(event.wall_ns)
-    columns = own, number, value.dtype, value.name, value.object_type, pose_id, part_of, None, time, node
-    others.append(("object", (*columns, *UNCHANGED)))
+    columns = object_row(own, number, value.dtype, value.name, value.object_type, pose_id, part_of, None, time, node)
+    others.append(("object", columns))
     return own
 
 

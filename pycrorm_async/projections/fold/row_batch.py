@@ -118,4 +118,7 @@ class Rows:
         self.inserts["task_tree_node"] = list(map(tuple, self.nodes.values()))
         self.inserts["process_metadata"] = list(map(_EPISODE_COLUMNS, self.episodes.values()))
         core = {(table, COLUMNS[table]): rows for table, rows in self.inserts.items()}
-        return {key: rows for key, rows in (core | self.leaves).items() if rows}
+        to_insert = {key: rows for key, rows in (core | self.leaves).items() if rows}
+        for (table, columns), rows in to_insert.items():
+            assert len(rows[0]) == len(columns), f"a row of {table} has {len(rows[0])} values, not {len(columns)}"
+        return to_insert
