@@ -50,7 +50,7 @@ def record_and_drain(url: str, spool: Path, report: Callable[..., None]) -> None
     queue.release()
 
 
-def recover(url: str, spool: Path, _say: object) -> None:
+def recover(url: str, spool: Path, _report: object) -> None:
     """Recover the spool as the next process does."""
     for folder in Spool(spool).recorders():
         recovered = open_dead(folder.path)
