@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 
 from pycrorm_async.events.ids import EpisodeId
 
-__all__ = ["Heading", "Record", "LOST", "is_computed_end"]
+__all__ = ["Heading", "Receipt", "Record", "LOST", "is_computed_end"]
 
 LOST: Final = b'{"status":"LOST"}'
 """Payload of the `EpisodeEnded` that recovery computes for an episode left open.
@@ -28,6 +28,19 @@ class Heading(NamedTuple):
     episode: EpisodeId | None
     type: str
     version: int
+
+
+class Receipt:
+    """The sequence of one event, 0 until the event is written.
+
+    The queue sets it in the same step as it writes the event. So the caller of a put that raised, as Ctrl-C makes it do
+    at any call, can determine whether the event was written before.
+    """
+
+    __slots__ = ("sequence",)
+
+    def __init__(self) -> None:
+        self.sequence = 0
 
 
 class Record(NamedTuple):

@@ -85,7 +85,6 @@ class Episode(EpisodeWriter[TaskTreeNode]):
         self.calls: Final = CalledPerforms(self._note_unawaited)
         self._declared = declared
         self._entered_world: str | None = None
-        self.open()
 
     # --- world ------------------------------------------------------------------------------------------------
 
@@ -148,8 +147,8 @@ class Episode(EpisodeWriter[TaskTreeNode]):
     def end_node(self, node: TaskTreeNode) -> None:
         """Write the end of a node."""
         record: NodeRecord = node.record
-        self._ending.add(node)  # before the removal, so that no thread that misses the node ends the episode
         try:
+            self._ending.add(node)  # before the removal, so that no thread that misses the node ends the episode
             if self._open_nodes.get(record.sequence) is node:
                 failure = failure_value(node.failure, self) if node.failure is not None else None
                 result = encode_or_missing(node.result, self) if node.result is not None else None

@@ -115,7 +115,12 @@ class Recorder:
             labels=labels,
         )
         episode = Episode(self._emitter, self.episodes.new_id(), opening, self._declared)
-        self.episodes.add(episode)
+        self.episodes.add(episode)  # first, so that the memory ends an episode whose start Ctrl-C interrupted
+        try:
+            episode.open()
+        except Exception:
+            self.episodes.by_id.pop(episode.id, None)
+            raise
         if world is not None:
             self._enter(episode, world)
         return episode
@@ -183,14 +188,12 @@ class Recorder:
                 dtype = declared.dtype
                 episode = implicit = self.open_episode(description=dtype, plan=dtype)
             sequence = episode.start_node(node, declared)
-        except (Unrecordable, DeclarationRefused) as refused:
-            if implicit is not None:
-                self.close_episode(implicit, refused)
-            raise
-        except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
-            self._emitter.note_fault("NodeStarted", error)
+        except BaseException as error:
             if implicit is not None:
                 self.close_episode(implicit, error)
+            if isinstance(error, Unrecordable | DeclarationRefused) or not isinstance(error, Exception):
+                raise
+            self._emitter.note_fault("NodeStarted", error)  # a fault of the memory must not reach a plan
         else:
             node.record = NodeRecord(episode, sequence, implicit is not None, outer_episode, episode.id)
             if implicit is not None:

@@ -60,8 +60,10 @@ class Sampler:
         self._emitter = emitter
         self._interval_s = interval_ms / 1000
         self._change_min = change_min
-        # The garbage collector may call `end` in a thread that holds the lock; a plain lock would deadlock there.
-        self._changed = threading.Condition(threading.RLock())
+        # The garbage collector may call `end` in a thread that holds the lock; a plain lock would deadlock there. A
+        # plan takes the lock itself, because Ctrl-C in the condition's `__enter__`, which is Python, would leave it taken.
+        self._lock = threading.RLock()
+        self._changed = threading.Condition(self._lock)
         self._running: dict[tuple[Episode, int], _Motion] = {}
         self._thread: threading.Thread | None = None
         self._asleep = False
@@ -73,7 +75,7 @@ class Sampler:
         robot = acting_robot(episode.world.world) if episode.world is not None else None
         if robot is None:
             return
-        with self._changed:
+        with self._lock:
             if self._closed:
                 return
             motion = self._running[episode, node] = _Motion(episode, node, robot)
@@ -87,7 +89,7 @@ class Sampler:
 
     def end(self, episode: Episode, node: int) -> None:
         """Take the last sample of the motion. The caller writes the node's end afterwards."""
-        with self._changed:
+        with self._lock:
             motion = self._running.pop((episode, node), None)
             if motion is not None:
                 self._sample(motion, margin=0.0)
@@ -95,7 +97,7 @@ class Sampler:
 
     def stop_episode(self, episode: EpisodeWriter[Any]) -> None:
         """Stop sampling all motions of an episode, before the episode ends."""
-        with self._changed:
+        with self._lock:
             for key in [key for key in self._running if key[0] is episode]:
                 self._running.pop(key).is_over = True
 
@@ -105,7 +107,7 @@ class Sampler:
 
         The next sample of each motion holds all channels, because the follow-up must not depend on the former episode.
         """
-        with self._changed:
+        with self._lock:
             yield lambda renumbered: self._renumber(episode, renumbered)
 
     def _renumber(self, episode: Episode, renumbered: Mapping[int, int]) -> None:
@@ -120,7 +122,7 @@ class Sampler:
 
     def close(self) -> None:
         """Stop sampling, and wait until the thread has ended."""
-        with self._changed:
+        with self._lock:
             self._closed = True
             self._running.clear()
             self._changed.notify_all()

@@ -1,10 +1,15 @@
 """`OrderedCalls` runs the calls of one episode one after the other, whichever threads make them.
 
-Theory of operation. Calls queue in `_waiting`, and the holder of the lock runs all of them. A thread that comes while
-another holds the lock waits for it, so its call has run when it returns. It must not wait if it holds the lock of any
-episode already, because the garbage collector, or a method of a key, may have made the call in the middle of another
-one, and two episodes could wait for each other; nor if it is a thread of the memory, because the holder of the lock may
-wait for the room in the spool that this thread makes. Such a call is left to the holder of the lock.
+Theory of operation. A thread runs its call under the lock of the episode, so its call has run when it returns. It must
+not wait for a lock if it runs a call of any episode already, because the garbage collector, or a method of a key, may
+have made the call in the middle of another one, and two episodes could wait for each other: such a call is left in
+`_this_thread.left`, and the thread runs it after that other one. A thread of the memory must not wait either, because
+the holder of the lock may wait for the room in the spool that this thread makes: it takes the lock only if it is free,
+and otherwise leaves the call in `_left` to the holder.
+
+A signal handler may raise KeyboardInterrupt in the main thread when any call returns. `with` on the lock itself cannot
+be interrupted between taking the lock and entering the block, nor before the lock is released; `acquire` and `release`
+in a `try` can. Only threads of the memory, which run no signal handlers, use these.
 """
 
 from __future__ import annotations
@@ -22,10 +27,11 @@ R = TypeVar("R")
 
 
 class _ThreadState(threading.local):
-    """The number of locks that this thread holds or waits for, and whether it is a thread of the memory."""
+    """The state of one thread: busy with a call, the calls left to run after it, and if it is one of the memory."""
 
     def __init__(self) -> None:
-        self.depth = 0
+        self.is_busy = False
+        self.left: deque[tuple[OrderedCalls, Callable[[], object]]] = deque()
         self.is_of_memory = threading.current_thread().name.startswith(THREAD_NAME_PREFIX)
 
 
@@ -36,24 +42,45 @@ class OrderedCalls:
     """The calls of one episode."""
 
     def __init__(self) -> None:
-        self._waiting: deque[Callable[[], object]] = deque()
+        self._left: deque[Callable[[], object]] = deque()
         self._lock = threading.Lock()
 
     def run(self, call: Callable[[], object]) -> None:
         """Run a call, which must not raise, after all earlier ones."""
-        self._waiting.append(call)
-        waits = not _this_thread.depth and not _this_thread.is_of_memory
-        _this_thread.depth += 1  # before the lock, so that a call made while it is taken does not wait for it
+        thread = _this_thread
+        if thread.is_of_memory:
+            self._left.append(call)
+            self._run_if_free()
+            return
+        if thread.is_busy:
+            thread.left.append((self, call))
+            return
+        thread.is_busy = True  # followed by `try` without a call, so that Ctrl-C cannot separate the two
         try:
-            while (waits or self._waiting) and self._lock.acquire(blocking=waits):
-                waits = False
-                try:
-                    while self._waiting:
-                        self._waiting.popleft()()
-                finally:
-                    self._lock.release()
+            self._run(call)
+            while thread.left:
+                calls, each = thread.left.popleft()
+                calls._run(each)  # noqa: SLF001  of the same class
         finally:
-            _this_thread.depth -= 1
+            thread.is_busy = False
+
+    def _run(self, call: Callable[[], object]) -> None:
+        with self._lock:
+            while self._left:
+                self._left.popleft()()
+            call()
+        while self._left:  # a thread of the memory came before the lock was released
+            with self._lock:
+                while self._left:
+                    self._left.popleft()()
+
+    def _run_if_free(self) -> None:
+        while self._left and self._lock.acquire(blocking=False):
+            try:
+                while self._left:
+                    self._left.popleft()()
+            finally:
+                self._lock.release()
 
 
 class CountingEpisode(Protocol):
@@ -79,9 +106,7 @@ def counted(what: str) -> Callable[[Callable[Concatenate[E, P], R]], Callable[Co
                 return None
             try:
                 return method(self, *args, **kwargs)
-            except KeyboardInterrupt:
-                raise
-            except BaseException as error:  # noqa: BLE001  a fault of the memory must not reach a plan
+            except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
                 emitter.note_fault(what, error)
                 return None
 
@@ -94,8 +119,6 @@ def noted(emitter: Any, what: str, read: Callable[P, R], /, *args: P.args, **kwa
     """Return what `read` returns for these arguments; count what it raises and return None."""
     try:
         return read(*args, **kwargs)
-    except KeyboardInterrupt:
-        raise
-    except BaseException as error:  # noqa: BLE001  the code of an executive's values may raise anything
+    except Exception as error:  # noqa: BLE001  the code of an executive's values may raise anything
         emitter.note_fault(what, error)
         return None

@@ -87,12 +87,6 @@ class RecordedNodes(EpisodeWriter[_Node]):
 
         `status` is for a failure whose class only the executive knows: FAILED, ERROR or INTERRUPTED.
         """
-        if not self.emitter.is_closed:
-            self._calls.run(partial(self._close, failure, status))
-
-    def _close(self, failure: BaseException | None, status: EpisodeStatus | None) -> None:
-        if self._nodes and failure is None and not self.closed:
-            self._note("EpisodeEnded", f"nodes open at the end of episode {self}, which end LOST: {len(self._nodes)}")
         if status in get_args(EpisodeStatus):
             self._end_status = status
         self._episodes.close(self, failure)
@@ -253,6 +247,8 @@ class RecordedNodes(EpisodeWriter[_Node]):
         self._calls.run(lambda: noted(self.emitter, "EpisodeEnded", self._end_now, failure))
 
     def _end_now(self, failure: BaseException | None) -> None:
+        if (left := len(self._open_nodes)) and failure is None and not self.closed:
+            self._note("EpisodeEnded", f"nodes open at the end of episode {self}, which end LOST: {left}")
         super().end_episode(failure)
         self._nodes.clear()
         self._ended.clear()

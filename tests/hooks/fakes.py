@@ -11,7 +11,7 @@ from typing import Any
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import SpoolFull
 from pycrorm_async.events.codec import decode
-from pycrorm_async.events.envelope import Heading
+from pycrorm_async.events.envelope import Heading, Receipt
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.events.order import OrderCheck
 from pycrorm_async.events.types import Happening
@@ -44,14 +44,19 @@ class ListSink:
         self.before_end: Callable[[], None] = lambda: None
         """Called before the end of each node is put."""
 
-    def put_nowait(self, heading: Heading, payload: bytes, *, reserved: bool = False) -> int:
+    def put_nowait(
+        self, heading: Heading, payload: bytes, *, reserved: bool = False, receipt: Receipt | None = None
+    ) -> int:
         if heading.type == "NodeEnded":
             self.before_end()
         with self.lock:
             if heading.episode is not None and self.sequences.get(heading.episode, 0) + 1 == self.fails_at:
                 self.fails_at = None
                 raise RuntimeError("the disk is on fire")
-            return self._put(heading, payload, reserved)
+            sequence = self._put(heading, payload, reserved)
+            if receipt is not None:
+                receipt.sequence = sequence
+            return sequence
 
     def _put(self, heading: Heading, payload: bytes, reserved: bool) -> int:
         if heading.type == "NodeStarted" and self.broken_starts and b'"action"' in payload:

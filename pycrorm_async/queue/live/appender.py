@@ -42,7 +42,7 @@ from zlib import crc32
 
 from pycrorm_async.clock import Clock
 from pycrorm_async.errors import EpisodeRefused, InternalError, PycrormError, SpoolFull, SpoolStuck, SpoolUnavailable
-from pycrorm_async.events.envelope import Heading
+from pycrorm_async.events.envelope import Heading, Receipt
 from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.queue.files.frame import (
     CHECKSUM_START,
@@ -136,7 +136,7 @@ class Appender:
 
     # --- putting -----------------------------------------------------------------------------------------------
 
-    def put(self, heading: Heading, payload: bytes, reserved: bool) -> int:  # noqa: FBT001  # the hot path
+    def put(self, heading: Heading, payload: bytes, reserved: bool, receipt: Receipt | None = None) -> int:  # noqa: FBT001  # the hot path
         """Append one event as `RecorderQueue.put_nowait` does."""
         episode, type_name, version = heading
         name = self._type_names.get(type_name) or self._encode_type(type_name)
@@ -197,6 +197,8 @@ class Appender:
                     self.open[episode] = (sequence, wall_ns, monotonic_ns)
                     if type_name == EPISODE_ENDED:
                         del self.open[episode]
+                if receipt is not None:
+                    receipt.sequence = sequence
 
                 if self._quiet:
                     self._wake()

@@ -20,7 +20,7 @@ from pathlib import Path
 
 from pycrorm_async.clock import Clock
 from pycrorm_async.errors import FilesError, SpoolClosed, SpoolUnavailable
-from pycrorm_async.events.envelope import Heading, Record
+from pycrorm_async.events.envelope import Heading, Receipt, Record
 from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.queue.files.locks import FileLock, call_in_forked_child, is_locked
 from pycrorm_async.queue.files.names import DRAIN
@@ -78,7 +78,9 @@ class RecorderQueue(QueueFiles):
 
     # --- producers ---------------------------------------------------------------------------------------------
 
-    def put_nowait(self, heading: Heading, payload: bytes, *, reserved: bool = False) -> int:
+    def put_nowait(
+        self, heading: Heading, payload: bytes, *, reserved: bool = False, receipt: Receipt | None = None
+    ) -> int:
         """Append one event and return its sequence in its episode (0 for a recorder-level record).
 
         May be called from any thread, but not from a signal handler, which could interrupt the holder of the lock. A
@@ -86,6 +88,7 @@ class RecorderQueue(QueueFiles):
 
         Args:
             reserved: the event may use the reserve (`spool_reserve_bytes`), which other events leave free.
+            receipt: gets the sequence in the same step as the event is written.
 
         Raises:
             SpoolFull: the event does not fit; `SpoolStuck` instead after `fail`.
@@ -96,9 +99,9 @@ class RecorderQueue(QueueFiles):
                 `record_bytes_max` that no segment can hold. The hooks put neither.
         """
         try:
-            return self._appender.put(heading, payload, reserved)
+            return self._appender.put(heading, payload, reserved, receipt)
         except AppenderRelocated:  # the queue moved while this thread waited for the lock
-            return self.put_nowait(heading, payload, reserved=reserved)
+            return self.put_nowait(heading, payload, reserved=reserved, receipt=receipt)
 
     def put_blob(self, content: bytes) -> str:
         """Write a blob and return its name, the SHA-256 of the content, for events put afterwards to refer to.

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 from pycrorm_async.errors import FilesError, SpoolFull
 from pycrorm_async.events.codec import encode
-from pycrorm_async.events.envelope import Heading
+from pycrorm_async.events.envelope import Heading, Receipt
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.events.types import Happening
 from pycrorm_async.events.values import BlobReference
@@ -75,23 +75,26 @@ class Emitter:
     def faults(self) -> Faults:
         return Faults(self._fault_count, self._last_fault)
 
-    def put(self, episode: EpisodeId, event: Happening) -> int:
-        """Append an event and return its sequence. Raises `NotEncodable` before anything is written."""
+    def put(self, episode: EpisodeId, event: Happening, receipt: Receipt | None = None) -> int:
+        """Append an event and return its sequence. Raises `NotEncodable` before anything is written.
+
+        The sequence of the receipt shows after any exception whether the event was written.
+        """
         payload = encode(event, bytes_max=self.settings.record_bytes_max)
         heading = self._heading(episode, type(event))
         try:
-            sequence = self.sink.put_nowait(heading, payload, reserved=True)
+            sequence = self.sink.put_nowait(heading, payload, reserved=True, receipt=receipt)
         except SpoolFull:
-            sequence = self.put_payload(heading, payload)
+            sequence = self.put_payload(heading, payload, receipt)
         if self.feed.observers:
             self.feed.publish(episode, sequence, event)
         return sequence
 
-    def put_payload(self, heading: Heading, payload: bytes) -> int:
+    def put_payload(self, heading: Heading, payload: bytes, receipt: Receipt | None = None) -> int:
         """Append an encoded event and return its sequence."""
         while True:
             try:
-                return self.sink.put_nowait(heading, payload, reserved=True)
+                return self.sink.put_nowait(heading, payload, reserved=True, receipt=receipt)
             except SpoolFull:
                 # The garbage collector may close a dropped plan in a thread of the memory. Such a thread must not
                 # block here, because these threads are the ones that free space.

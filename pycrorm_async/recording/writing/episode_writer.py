@@ -2,9 +2,11 @@
 
 Theory of operation. What starts nodes is not known here: `N` is an executive's own record of a node. `_open_nodes`
 holds every node that started and whose end is not written. The call that removes a node writes its end, so no node has
-two; if writing raises, it restores the node, which then ends LOST with the episode. `_ending` holds a node while a
-thread writes its end. The ends of episodes wait, for a limited time, until it is empty, because the end of a node must
-precede the end of its episode. The end of a node never waits, because the garbage collector may cause it.
+two; if it raises before the end is written, it restores the node, which then ends LOST with the episode. Ctrl-C can
+come at any call, also after the event is written: a `Receipt` shows that, and the lines that update the state by it
+make no call. `_ending` holds a node while a thread writes its end. The ends of episodes wait, for a limited time, until
+it is empty, because the end of a node must precede the end of its episode. The end of a node never waits, because the
+garbage collector may cause it.
 
 A sequence has 26 bits, so an episode can run out of sequences. When one reaches `continue_at`, `continue_as` ends it,
 and the same `EpisodeWriter` continues under a new id, so that whatever refers to it stays valid. Every open node ends
@@ -29,6 +31,7 @@ from typing import Any, Final, Generic, TypeVar
 
 from pycrorm_async.errors import Unrecordable
 from pycrorm_async.events.codec import NotEncodable
+from pycrorm_async.events.envelope import Receipt
 from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.events.tags import changed_tags
 from pycrorm_async.events.types import EpisodeEnded, EpisodeTagged, NodeEnded, NodeStarted, ObjectDetected
@@ -80,8 +83,10 @@ class EpisodeWriter(ABC, Generic[N]):
         events_max = emitter.settings.episode_events_max
         self._continue_at: Final = events_max - min(events_max // 8, _RESERVE_EVENTS_MAX)
         self.continue_at = self._continue_at
+        self._is_begun = False
         self._root = 0
         self._root_ended = False
+        self._end_interrupted = False
 
     def __str__(self) -> str:
         return episode_text(self.id)
@@ -123,16 +128,23 @@ class EpisodeWriter(ABC, Generic[N]):
 
     def open(self) -> None:
         """Write the start of the episode."""
-        self._root = self._start(None, None)
+        self._start(None, None)
 
-    def _start(self, continues: EpisodeId | None, root: int | None) -> int:
-        """Write the start of the episode and of its root node; return the root's sequence."""
+    def _start(self, continues: EpisodeId | None, root: int | None) -> None:
+        """Write the start of the episode and of its root node; after an interrupted call, what is missing."""
         started = episode_started(self._opening, continues)
         started, shortened = fit_episode_start(started, self.emitter.settings.record_bytes_max)
         for name in shortened:
             self.emitter.missing.note("Episode", name, "its text is too long for an episode and was cut")
-        self.emitter.put(self.id, started)
-        return self.emitter.put(self.id, NodeStarted("root", simulated=self._opening.simulated, continues=root))
+        begun, root_started = Receipt(), Receipt()
+        try:
+            if not self._is_begun:
+                self.emitter.put(self.id, started, begun)
+            if not self._root:
+                self.emitter.put(self.id, NodeStarted("root", simulated=self.simulated, continues=root), root_started)
+        finally:
+            self._is_begun = self._is_begun or begun.sequence > 0
+            self._root = self._root or root_started.sequence
 
     def change_tags(self, added: Sequence[str], removed: Sequence[str]) -> None:
         """Write a change of the episode's tags. Raises `CallerError` for a removed tag that it does not have."""
@@ -141,23 +153,45 @@ class EpisodeWriter(ABC, Generic[N]):
         self._opening = self._opening.with_tags(tags)
 
     def end_episode(self, failure: BaseException | None) -> None:
-        """Write the end of the episode. Nodes that are still open end LOST, because no later end can be recorded."""
-        if self.closed:
+        """Write the end of the episode. Nodes that are still open end LOST, because no later end can be recorded.
+
+        After a call that raised before the last event was written, the next call writes what is missing.
+        """
+        if self.closed and not self._end_interrupted:
             return
-        self.closed = True
+        receipt = Receipt()
+        self.closed, self._end_interrupted = True, False
+        try:
+            self._put_last_events(failure, receipt)
+        except BaseException:
+            self._end_interrupted = not receipt.sequence
+            raise
+
+    def _put_last_events(self, failure: BaseException | None, receipt: Receipt) -> None:
+        if not self._is_begun:
+            return
         self._leave_world()
         for sequence in sorted(self._open_nodes, reverse=True):
             self._close_node(NodeEnded(sequence, "LOST"), "Episode")
         self._wait_for_ends()
         status, root_status = self._end_statuses(failure)
         value = failure_value(failure, self) if failure is not None else None
-        if not self._root_ended:
-            self._put_end(NodeEnded(self._root, root_status, value), "Episode")
+        self._end_root(root_status, value)
         ended = EpisodeEnded(status, value, world=self._described_world())
         try:
-            self.emitter.put(self.id, ended)
+            self.emitter.put(self.id, ended, receipt)
         except NotEncodable:
-            self.emitter.put(self.id, fit_episode_end(ended, self.emitter.settings.record_bytes_max))
+            self.emitter.put(self.id, fit_episode_end(ended, self.emitter.settings.record_bytes_max), receipt)
+
+    def _end_root(self, status: NodeStatus, failure: FailureValue | None) -> None:
+        """Write the end of the root; no effect if it is written, or if Ctrl-C came before the root started."""
+        if self._root_ended or not self._root:
+            return
+        receipt = Receipt()
+        try:
+            self._put_end(NodeEnded(self._root, status, failure), "Episode", receipt)
+        finally:
+            self._root_ended = receipt.sequence > 0
 
     def _end_statuses(self, failure: BaseException | None) -> tuple[EpisodeStatus, NodeStatus]:
         """Return the statuses of the episode and of its root node."""
@@ -173,13 +207,19 @@ class EpisodeWriter(ABC, Generic[N]):
             interrupted = NodeEnded(sequence, "INTERRUPTED", reason)
             self._close_node(NodeEnded(sequence, "LOST") if self._has_ended(node) else interrupted, "Episode")
         self._wait_for_ends()
-        if not self._root_ended:  # it ended in an attempt before this one
-            self._put_end(NodeEnded(root, "INTERRUPTED", reason), "Episode")
-            self._root_ended = True
-        self.emitter.put(former, EpisodeEnded("INTERRUPTED", reason, episode_text(follow_up), self._described_world()))
-        self.id = follow_up
-        self._root = self._start(former, root)
-        self._root_ended = False
+        self._end_root("INTERRUPTED", reason)
+        ended = EpisodeEnded("INTERRUPTED", reason, episode_text(follow_up), self._described_world())
+        receipt = Receipt()
+        try:
+            self.emitter.put(former, ended, receipt)
+        finally:
+            if receipt.sequence:
+                self.id, self._is_begun, self._root, self._root_ended = follow_up, False, 0, False
+        try:
+            self._start(former, root)
+        except (KeyboardInterrupt, SystemExit):
+            self._start(former, root)  # otherwise no further event would have an episode
+            raise
         self._interrupted.clear()
         last = max(self._root, self._restart_world())
         renumbered: dict[int, int] = {}
@@ -205,15 +245,19 @@ class EpisodeWriter(ABC, Generic[N]):
         """
         if missing:
             self._note_parameters(owner, missing, may_refuse=may_refuse)
+        receipt = Receipt()
         try:
-            sequence = self.emitter.put(self.id, event)
-        except NotEncodable:
-            unfitting: dict[str, str] = {}
-            event = fit_node_start(event, self.emitter.settings.record_bytes_max, unfitting)
-            self._note_parameters(owner, unfitting, may_refuse=may_refuse)
-            sequence = self.emitter.put(self.id, event)
-        self._open_nodes[sequence] = node
-        return sequence
+            try:
+                self.emitter.put(self.id, event, receipt)
+            except NotEncodable:
+                unfitting: dict[str, str] = {}
+                event = fit_node_start(event, self.emitter.settings.record_bytes_max, unfitting)
+                self._note_parameters(owner, unfitting, may_refuse=may_refuse)
+                self.emitter.put(self.id, event, receipt)
+        finally:
+            if receipt.sequence:
+                self._open_nodes[receipt.sequence] = node
+        return receipt.sequence
 
     def _note_parameters(self, owner: str, missing: Mapping[str, str], *, may_refuse: bool) -> None:
         parameters = [name for name in missing if name != ROBOT]
@@ -224,13 +268,17 @@ class EpisodeWriter(ABC, Generic[N]):
 
     def _close_node(self, event: NodeEnded, owner: str) -> None:
         """Remove the node and write its end; no effect if it was removed, as the garbage collector may do meanwhile."""
-        node = self._open_nodes.pop(event.node, None)
-        if node is None:
+        receipt = Receipt()
+        try:
+            node = self._open_nodes[event.node]
+            del self._open_nodes[event.node]  # no call since the line before, so Ctrl-C cannot separate the two
+        except KeyError:
             return
         try:
-            self._put_end(event, owner)
+            self._put_end(event, owner, receipt)
         except BaseException:
-            self._open_nodes[event.node] = node  # so that it ends LOST with the episode
+            if not receipt.sequence:
+                self._open_nodes[event.node] = node  # so that it ends LOST with the episode
             raise
 
     def _wait_for_ends(self) -> None:
@@ -239,16 +287,16 @@ class EpisodeWriter(ABC, Generic[N]):
         while self._ending and time.monotonic() < deadline:
             time.sleep(0.001)
 
-    def _put_end(self, event: NodeEnded, owner: str) -> None:
+    def _put_end(self, event: NodeEnded, owner: str, receipt: Receipt) -> None:
         if event.failure is not None or event.result is not None:
             for field, value in (("failure", event.failure and event.failure.arguments), ("result", event.result)):
                 for each in missing_in(value):
                     self.emitter.missing.note(owner, field, each.missing)
         try:
-            self.emitter.put(self.id, event)
+            self.emitter.put(self.id, event, receipt)
         except NotEncodable as error:
             self.emitter.missing.note(owner, "failure" if event.failure is not None else "result", error.reason)
-            self.emitter.put(self.id, fit_node_end(event, self.emitter.settings.record_bytes_max))
+            self.emitter.put(self.id, fit_node_end(event, self.emitter.settings.record_bytes_max), receipt)
 
     def _put_detection(self, detected: ObjectDetected) -> int:
         try:

@@ -5,14 +5,18 @@ from __future__ import annotations
 from collections.abc import Awaitable
 from typing import Protocol
 
-from pycrorm_async.events.envelope import Heading
+from pycrorm_async.events.envelope import Heading, Receipt
 
 
 class EventSink(Protocol):
     """The producing end of a queue."""
 
-    def put_nowait(self, heading: Heading, payload: bytes, *, reserved: bool = False) -> int:
+    def put_nowait(
+        self, heading: Heading, payload: bytes, *, reserved: bool = False, receipt: Receipt | None = None
+    ) -> int:
         """Append one event and return its sequence in its episode (0 for a recorder-level record).
+
+        Writing the event sets the sequence of the receipt as well, even if Ctrl-C interrupts the call afterwards.
 
         Any thread may call it. Once it returns, the event survives the death of the process. Raises `SpoolFull` if
         there is no room; with `reserved`, only if the reserve for ends and world observations is used up as well.

@@ -83,7 +83,7 @@ class OpenEpisodes:
 
     def last_opened(self) -> AnyWriter | None:
         """Return the open episode that was opened last in any context, without simulations; None without one."""
-        return next((each for each in reversed(self.all) if not each.simulated), None)
+        return next((each for each in reversed(self.all) if not each.simulated and not each.closed), None)
 
     def continue_episode(
         self,
@@ -118,8 +118,8 @@ class OpenEpisodes:
         """Write the end of an episode; `failure` is the exception that ended it, or None. Exceptions are counted."""
         if self._emitter.is_closed:
             return
-        self.by_id.pop(episode.id, None)
         try:
             episode.end_episode(failure)
         except Exception as error:  # noqa: BLE001  a fault of the memory must not replace the plan's outcome
             self._emitter.note_fault("EpisodeEnded", error)
+        self.by_id.pop(episode.id, None)  # last, so that the memory ends an episode whose end Ctrl-C interrupted

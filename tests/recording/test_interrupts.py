@@ -1,0 +1,238 @@
+"""Ctrl-C in the middle of recording: nothing hangs afterwards, and the log is in order.
+
+Python runs the handler of a signal when a function begins and when a call returns. Each test interrupts its scenario at
+every such point inside the package, one after the other: a profiler is called there, and raises at the n-th one. All
+of that goes into a queue in files; each episode that the interrupt left open is then ended as closing a memory does it.
+Where an interrupt leaves a lock taken or the garbage collector off, what follows hangs or shows it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import os
+import sys
+import threading
+from collections import defaultdict
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+
+import pytest
+
+import pycrorm_async
+from pycrorm_async import Settings
+from pycrorm_async.clock import SYSTEM_CLOCK
+from pycrorm_async.events.codec import decode
+from pycrorm_async.events.ids import episode_id
+from pycrorm_async.events.order import OrderCheck
+from pycrorm_async.events.types import EpisodeEnded, Happening, NodeEnded, NodeStarted
+from pycrorm_async.hooks.plan_recorder import Recorder, current_episode
+from pycrorm_async.plan.designator import ActionAbstract
+from pycrorm_async.plan.execution.observer import recorder as observing
+from pycrorm_async.plan.failures import PlanFailure
+from pycrorm_async.queue.live.recorder_queue import RecorderQueue
+from pycrorm_async.recording.declarations.known_types import KnownTypes
+from pycrorm_async.recording.recording import Recording
+from pycrorm_async.recording.writing.emitter import Emitter
+from pycrorm_async.recording.writing.open_episodes import OpenEpisodes
+from pycrorm_async.world.pose import Pose
+from tests.hooks.fakes import NoteActionPerformable
+
+PACKAGE = str(Path(pycrorm_async.__file__).parent)
+HANGS_S = 20.0
+"""Bounds the wait for a run of a scenario; each takes less than 10 ms."""
+WITHOUT_LIMIT = 2**26 - 1
+
+
+class Interrupt:
+    """Raises KeyboardInterrupt at the n-th point of the package at which Python runs the handlers of signals."""
+
+    def __init__(self, at: int) -> None:
+        self.left = at
+
+    def __call__(self, frame: FrameType, what: str, _argument: object) -> None:
+        if what in ("call", "c_return") and frame.f_code.co_filename.startswith(PACKAGE):
+            self.left -= 1
+            if not self.left:
+                raise KeyboardInterrupt
+
+    def during(self, scenario: Callable[[], object]) -> bool:
+        """Run the scenario; return whether it was interrupted."""
+        try:
+            sys.setprofile(self)
+            scenario()
+        except KeyboardInterrupt:
+            return True
+        finally:
+            sys.setprofile(None)
+        return False
+
+
+class Recorded:
+    """A recording without a database, and what is in its queue."""
+
+    def __init__(self, folder: Path, settings: Settings) -> None:
+        name = episode_id(SYSTEM_CLOCK.wall_ns(), os.urandom(10))
+        self.queue = RecorderQueue.create(folder, settings=settings, clock=SYSTEM_CLOCK, recorder=name)
+        self.emitter = Emitter(self.queue, settings)
+        self.episodes = OpenEpisodes(self.emitter, SYSTEM_CLOCK)
+        self.hangs = False
+        self.recording = Recording(self.emitter, self.episodes, KnownTypes(lambda _dtype: None), (), software="test")
+
+    def end_open_episodes(self) -> None:
+        """End the episodes as closing a memory does, in another thread, which a lock that was left taken stops."""
+
+        def end() -> None:
+            for each in self.episodes.all:
+                self.episodes.close(each, asyncio.CancelledError("the memory was closed"))
+
+        if self.episodes.all:
+            thread = threading.Thread(target=end, daemon=True)
+            thread.start()
+            thread.join()
+
+    def logs(self) -> list[list[tuple[int, Happening]]]:
+        """Return the events of each episode, with their sequences."""
+        events: defaultdict[bytes, list[tuple[int, Happening]]] = defaultdict(list)
+
+        async def read() -> None:
+            await self.queue.synced_to()
+            left = self.queue.written
+            while left:
+                batch = await self.queue.get_batch(events_max=10_000, bytes_max=2**26, age_s_max=0)
+                left -= len(batch)
+                for each in batch:
+                    if each.episode is not None:
+                        events[each.episode].append((each.sequence, decode(each.type, each.payload)))
+
+        asyncio.run(read())
+        return list(events.values())
+
+
+@pytest.fixture
+def recorded(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Recorded]:
+    settings = Settings(episode_events_max=getattr(request, "param", WITHOUT_LIMIT))
+    made = Recorded(tmp_path, settings)
+    yield made
+    if not made.hangs:
+        made.queue.release()
+
+
+def interrupt_everywhere(recorded: Recorded, scenario: Callable[[], object]) -> int:
+    """Run the scenario, interrupted at each of its points, until it ends uninterrupted; return their number."""
+    points = 0
+    raised: list[BaseException] = []
+
+    def run() -> None:
+        nonlocal points
+        try:
+            while Interrupt(points + 1).during(scenario):
+                recorded.end_open_episodes()
+                points += 1
+        except BaseException as error:  # noqa: BLE001  raised below, in the thread of the test
+            raised.append(error)
+
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    while thread.is_alive():
+        before = points
+        thread.join(HANGS_S)
+        recorded.hangs = thread.is_alive() and points == before
+        assert not recorded.hangs, f"what follows an interrupt at point {points + 1} hangs"
+    for each in raised:
+        raise each
+    assert gc.isenabled()
+    return points
+
+
+def assert_in_order(log: list[tuple[int, Happening]]) -> None:
+    """Check that the log is legal, that each node has one end, and that the episode has one."""
+    check = OrderCheck()
+    findings = [finding for sequence, event in log for finding in check.read(sequence, event)]
+    assert [each for each in findings if each.kind == "damage"] == []
+    started = [sequence for sequence, event in log if isinstance(event, NodeStarted)]
+    assert sorted(event.node for _, event in log if isinstance(event, NodeEnded)) == started
+    assert isinstance(log[-1][1], EpisodeEnded)
+
+
+@pytest.mark.parametrize("recorded", [WITHOUT_LIMIT, 100], ids=["one episode", "follow-ups"], indirect=True)
+def test_an_interrupt_at_any_call_of_an_executive_neither_hangs_nor_damages_the_log(recorded: Recorded) -> None:
+    step = recorded.recording.type("action", "Step", {"number": int})
+
+    def scenario() -> None:
+        with recorded.recording.episode(description="d") as episode:
+            episode.object_added("cup", "cup", "CUP", Pose())
+            if recorded.emitter.settings.episode_events_max < WITHOUT_LIMIT:
+                episode.continue_at = 8
+            episode.start("outer", step, {"number": 1})
+            episode.start("inner", step, {"number": 2}, parent="outer")
+            episode.object_moved("cup", Pose([1, 0, 0]), node="inner")
+            episode.observe("force", 1.5, node="inner")
+            episode.end("inner", "FAILED", ValueError("slipped"), {"tries": 2})
+            episode.start("again", step, {"number": 3}, parent="outer")
+            episode.start("again", step, {"number": 4}, parent="outer")
+            episode.end("again")
+            episode.end("outer")
+
+    points = interrupt_everywhere(recorded, scenario)
+    logs = recorded.logs()
+    assert points > 300
+    for log in logs:
+        assert_in_order(log)
+    # The last run was not interrupted, so no state of the thread was left behind by those before it.
+    ends = [event.status for _, event in logs[-1] if isinstance(event, NodeEnded)]
+    assert ends[-2:] == ["SUCCEEDED", "SUCCEEDED"]
+    assert recorded.episodes.all == ()
+
+
+@dataclass
+class OuterActionPerformable(ActionAbstract):
+    async def perform(self) -> str:
+        await NoteActionPerformable("inner").perform()
+        with suppress(PlanFailure):
+            await FailingActionPerformable().perform()
+        return "done"
+
+
+@dataclass
+class FailingActionPerformable(ActionAbstract):
+    async def perform(self) -> None:
+        raise PlanFailure("slipped")
+
+
+@pytest.mark.parametrize("recorded", [WITHOUT_LIMIT, 100], ids=["one episode", "follow-ups"], indirect=True)
+def test_an_interrupt_at_any_call_of_our_own_plan_neither_hangs_nor_damages_the_log(recorded: Recorded) -> None:
+    hooks = Recorder(recorded.emitter, episodes=recorded.episodes, software="test")
+
+    async def plan() -> None:
+        episode = hooks.open_episode(description="d")
+        if recorded.emitter.settings.episode_events_max < WITHOUT_LIMIT:
+            episode.continue_at = 4
+        raised: BaseException | None = None
+        token = current_episode.set(episode)
+        try:
+            await OuterActionPerformable().perform()
+        except BaseException as error:
+            raised = error
+            raise
+        finally:
+            current_episode.reset(token)
+            hooks.close_episode(episode, raised)
+
+    def scenario() -> None:
+        token = observing.set(hooks)
+        try:
+            running = plan()
+            with suppress(StopIteration):
+                while True:
+                    running.send(None)
+        finally:
+            observing.reset(token)
+
+    assert interrupt_everywhere(recorded, scenario) > 150
+    for log in recorded.logs():
+        assert_in_order(log)
+    assert recorded.episodes.all == ()
