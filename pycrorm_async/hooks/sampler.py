@@ -60,8 +60,8 @@ class Sampler:
         self._emitter = emitter
         self._interval_s = interval_ms / 1000
         self._change_min = change_min
-        # The garbage collector may call `end` in a thread that holds the lock; a plain lock would deadlock there. A
-        # plan takes the lock itself, because Ctrl-C in the condition's `__enter__`, which is Python, would leave it taken.
+        # The garbage collector may call `end` in a thread that holds the lock; a plain lock would deadlock there. Plans
+        # use the lock itself, because Ctrl-C inside the condition's `__enter__`, a Python function, leaves it taken.
         self._lock = threading.RLock()
         self._changed = threading.Condition(self._lock)
         self._running: dict[tuple[Episode, int], _Motion] = {}

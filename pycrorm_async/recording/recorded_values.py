@@ -54,9 +54,7 @@ class RecordedValues:
             except UnrecordableValue as refusal:
                 missing[field.name] = str(refusal)
                 parameters[field.name] = missing_value(str(refusal), value)
-            except KeyboardInterrupt:
-                raise
-            except BaseException as error:  # noqa: BLE001  a __float__ of the user's may raise anything
+            except Exception as error:  # noqa: BLE001  a __float__ of the user's may raise anything
                 missing[field.name] = fault = reading_fault(error)
                 parameters[field.name] = missing_value(fault, value)
         for name, value in undeclared.items():
@@ -81,9 +79,7 @@ class RecordedValues:
         if self._convert is not None:
             try:
                 value = self._convert(value)
-            except KeyboardInterrupt:
-                raise
-            except BaseException as error:  # noqa: BLE001  an executive's conversion may raise anything
+            except Exception as error:  # noqa: BLE001  an executive's conversion may raise anything
                 return RefusedValue(message_of(error) if isinstance(error, ValueError) else reading_fault(error))
             if as_object and (reference := self._known_object(value)) is not None:
                 return reference

@@ -95,9 +95,7 @@ class Recording:
                         self._types.clear()
                     declared = self._types.get(cached) or self._declare(*cached)
                     self._types[cached] = declared
-        except KeyboardInterrupt:
-            raise
-        except BaseException as error:  # noqa: BLE001  a fault of the memory must not reach a plan
+        except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
             declared = None
             self._emitter.note_fault("DesignatorTypeDeclared", error)
         return declared or _undeclared(kind, dtype)

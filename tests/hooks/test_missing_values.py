@@ -69,7 +69,7 @@ class Raising(str):
 
     def __raise(self, *_: object) -> Any:
         if nasty.get():
-            raise SystemExit("read me not")
+            raise RuntimeError("read me not")
         return "raising"
 
     __repr__ = __str__ = __float__ = __len__ = __iter__ = encode = replace = __raise  # type: ignore[assignment]
@@ -83,7 +83,7 @@ class RaisingAny:
 
     def __repr__(self) -> str:
         if nasty.get():
-            raise GeneratorExit
+            raise RuntimeError("no repr")
         return "raising"
 
 

@@ -49,7 +49,7 @@ class Faulty:
     """Its methods raise."""
 
     def __float__(self) -> float:
-        raise SystemExit(3)
+        raise OverflowError("no number")
 
     def __str__(self) -> str:
         raise RuntimeError("no text")

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import asyncio
 import gc
+import inspect
 import os
 import sys
 import threading
@@ -48,26 +49,34 @@ WITHOUT_LIMIT = 2**26 - 1
 
 
 class Interrupt:
-    """Raises KeyboardInterrupt at the n-th point of the package at which Python runs the handlers of signals."""
+    """Raises at the n-th point of the package at which Python runs the handlers of signals.
 
-    def __init__(self, at: int) -> None:
+    A generator is left out, because the profiler is also called when Python closes one, where it runs no handler.
+    """
+
+    def __init__(self, at: int, raised: type[BaseException]) -> None:
         self.left = at
+        self.raised = raised
+        self.place = ""
 
     def __call__(self, frame: FrameType, what: str, _argument: object) -> None:
-        if what in ("call", "c_return") and frame.f_code.co_filename.startswith(PACKAGE):
+        is_point = what == "c_return" or (what == "call" and not frame.f_code.co_flags & inspect.CO_GENERATOR)
+        if is_point and frame.f_code.co_filename.startswith(PACKAGE):
             self.left -= 1
             if not self.left:
-                raise KeyboardInterrupt
+                self.place = f"{frame.f_code.co_qualname}:{frame.f_lineno} {what}"
+                raise self.raised
 
     def during(self, scenario: Callable[[], object]) -> bool:
-        """Run the scenario; return whether it was interrupted."""
+        """Run the scenario; return whether there was such a point. Raises if the interrupt did not reach the caller."""
         try:
             sys.setprofile(self)
             scenario()
-        except KeyboardInterrupt:
+        except self.raised:
             return True
         finally:
             sys.setprofile(None)
+        assert self.left > 0, f"the interrupt in {self.place} was swallowed"
         return False
 
 
@@ -121,7 +130,11 @@ def recorded(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Recorde
         made.queue.release()
 
 
-def interrupt_everywhere(recorded: Recorded, scenario: Callable[[], object]) -> int:
+def interrupt_everywhere(
+    recorded: Recorded,
+    scenario: Callable[[], object],
+    interrupt: type[BaseException] = KeyboardInterrupt,
+) -> int:
     """Run the scenario, interrupted at each of its points, until it ends uninterrupted; return their number."""
     points = 0
     raised: list[BaseException] = []
@@ -129,7 +142,7 @@ def interrupt_everywhere(recorded: Recorded, scenario: Callable[[], object]) -> 
     def run() -> None:
         nonlocal points
         try:
-            while Interrupt(points + 1).during(scenario):
+            while Interrupt(points + 1, interrupt).during(scenario):
                 recorded.end_open_episodes()
                 points += 1
         except BaseException as error:  # noqa: BLE001  raised below, in the thread of the test
@@ -236,3 +249,22 @@ def test_an_interrupt_at_any_call_of_our_own_plan_neither_hangs_nor_damages_the_
     for log in recorded.logs():
         assert_in_order(log)
     assert recorded.episodes.all == ()
+
+
+def test_an_exit_at_any_call_leaves_the_plan(recorded: Recorded) -> None:
+    """A signal handler that calls `sys.exit`, as that of PyCRAM's world does at Ctrl-C, ends the program."""
+
+    class Reading:
+        def __float__(self) -> float:
+            return 1.5
+
+    def scenario() -> None:
+        step = recorded.recording.type("action", "Step", {"number": "real", "all": ("list", "real")})
+        with recorded.recording.episode(description="d", convert=lambda value: value) as episode:
+            episode.start("a", step, {"number": Reading(), "all": [Reading(), 2.0]})
+            episode.observe("force", {"x": Reading(), "y": [1, {"z": "text"}]}, node="a")
+            episode.end("a", "FAILED", ValueError("slipped"), {"reading": Reading()})
+
+    assert interrupt_everywhere(recorded, scenario, SystemExit) > 150
+    for log in recorded.logs():
+        assert_in_order(log)

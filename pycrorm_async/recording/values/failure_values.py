@@ -23,7 +23,7 @@ _GROUP_MAX = 100
 
 
 def failure_value(failure: BaseException, references: References) -> FailureValue:
-    """Copy class, message and arguments of an exception. Never raises anything but `KeyboardInterrupt`."""
+    """Copy class, message and arguments of an exception. Raises no `Exception`."""
     return FailureValue(
         type=cut(_path_of(type(failure)), _NAME_MAX),
         message=cut(clean(message_of(failure)), _TEXT_MAX),
@@ -41,9 +41,7 @@ def _path_of(kind: type) -> str:
 def _arguments_or_missing(failure: BaseException, references: References) -> list[Any]:
     try:
         return _arguments(failure, references, 0)
-    except KeyboardInterrupt:
-        raise
-    except BaseException as error:  # noqa: BLE001  `args` may be a property that raises anything
+    except Exception as error:  # noqa: BLE001  `args` may be a property that raises anything
         return [MissingValue(reading_fault(error))]
 
 

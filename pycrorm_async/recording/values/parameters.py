@@ -42,9 +42,7 @@ def read_parameters(
         except UnrecordableValue as reason:
             parameters[field.name] = missing_value(str(reason), value)
             missing[field.name] = str(reason)
-        except KeyboardInterrupt:
-            raise
-        except BaseException as error:  # noqa: BLE001  a property or a __float__ of the user's may raise anything
+        except Exception as error:  # noqa: BLE001  a property or a __float__ of the user's may raise anything
             missing[field.name] = fault = reading_fault(error)
             parameters[field.name] = missing_value(fault, value)
     if declared.undeclared:
@@ -61,9 +59,7 @@ def _read_undeclared(
         try:
             for name in path:
                 value = getattr(value, name, None)
-        except KeyboardInterrupt:
-            raise
-        except BaseException as error:  # noqa: BLE001  a property of the user's may raise anything
+        except Exception as error:  # noqa: BLE001  a property of the user's may raise anything
             reason = reading_fault(error)
         if value is not None:
             parameters[field] = missing_value(reason, value)

@@ -21,12 +21,10 @@ def reading_fault(error: BaseException) -> str:
 
 
 def message_of(failure: BaseException) -> str:
-    """Return the message of an exception. Raises nothing except `KeyboardInterrupt`."""
+    """Return the message of an exception, also of one whose `__str__` raises an `Exception`."""
     try:
         return str(failure)
-    except KeyboardInterrupt:
-        raise
-    except BaseException as error:  # noqa: BLE001  a user's __str__ may raise anything
+    except Exception as error:  # noqa: BLE001  a user's __str__ may raise anything
         return f"<its __str__ raised {type(error).__name__}>"
 
 
@@ -47,7 +45,7 @@ def _cut_mark(length: int, unit: str, length_max: int = _TEXT_MAX) -> str:
 def clean_repr(value: Any) -> str:
     """Return a shortened repr; a large list, tuple, set or dict is not represented as a whole first.
 
-    Raises nothing except `KeyboardInterrupt`.
+    Returns also for a value whose `__repr__` raises an `Exception`.
     """
     text = clean(_Brief().repr(value))
     return text if len(text) <= _REPR_MAX else f"{text[:_REPR_MAX]}…"
@@ -73,9 +71,7 @@ class _Brief(Repr):
                 kind = bytes if isinstance(x, bytes) else bytearray
                 return repr(kind(x[:_TEXT_MAX])) + _cut_mark(len(x), "bytes")
             return super().repr1(x, level)
-        except KeyboardInterrupt:
-            raise
-        except BaseException as error:  # noqa: BLE001  a user's __repr__ may raise anything
+        except Exception as error:  # noqa: BLE001  a user's __repr__ may raise anything
             return f"<a {type(x).__name__} whose repr raised {type(error).__name__}>"
 
     def repr_instance(self, x: Any, level: int) -> str:  # noqa: ARG002  `Repr` gives the signature

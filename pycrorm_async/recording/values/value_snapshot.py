@@ -3,8 +3,9 @@
 A parameter that cannot be recorded without changing its meaning raises `UnrecordableValue` with the reason. Results,
 arguments of failures and texts of the world never raise: a value that cannot be recorded becomes a `MissingValue`.
 Reading a value runs the code of its class (`__float__`, `__repr__`, properties), which may raise anything, so every
-exception but `KeyboardInterrupt` becomes the reason why that value is missing. Reading is bounded in depth and in
-items, so it also ends for a structure that contains itself.
+`Exception` becomes the reason why that value is missing. Ctrl-C, and the SystemExit of a signal handler, which may come
+in the middle of that code, reach the caller. Reading is bounded in depth and in items, so it also ends for a structure
+that contains itself.
 """
 
 from __future__ import annotations
@@ -95,14 +96,12 @@ def encode_parameter(field: FieldDeclared, enum: type[Enum] | None, value: Any, 
 
 
 def encode_or_missing(value: Any, references: References) -> Any:
-    """Convert any value to a JSON value, or to a `MissingValue`. Never raises anything but `KeyboardInterrupt`."""
+    """Convert any value to a JSON value, or to a `MissingValue`. Raises no `Exception`."""
     try:
         return _ValueReader(references).read(value, 0)
     except UnrecordableValue as reason:
         return missing_value(str(reason), value)
-    except KeyboardInterrupt:
-        raise
-    except BaseException as error:  # noqa: BLE001  a user's __iter__ or property may raise anything
+    except Exception as error:  # noqa: BLE001  a user's __iter__ or property may raise anything
         return missing_value(reading_fault(error), value)
 
 
