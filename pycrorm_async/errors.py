@@ -8,6 +8,7 @@ A plan that fails raises none of these, but `pycrorm_async.plan.PlanFailure`.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 __all__ = [
     "PycrormError",
@@ -48,6 +49,16 @@ __all__ = [
 
 class PycrormError(Exception):
     """The root of the tree: `except PycrormError` catches every error that the memory itself can raise."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle with message and data, for another process; by default the message would become the first argument."""
+        return _restored, (type(self), self.args, self.__dict__)
+
+
+def _restored(kind: type[PycrormError], args: tuple[Any, ...], data: dict[str, Any]) -> PycrormError:
+    error = kind.__new__(kind, *args)
+    error.__dict__.update(data)
+    return error
 
 
 # --- the caller -----------------------------------------------------------------------------------------------
