@@ -4,7 +4,8 @@ import { cornersOf, surroundings } from "./extent.js";
 
 const AWAY = [-1.3, -1.1, 0.95];
 const ANGLE_OF_VIEW = 28; // narrow, so that what stands upright leans little
-const MARGIN = 1.1;
+const MARGIN = 1.07;
+const LEGEND_PX = 30; // at the lower edge, kept free
 const NEAREST_M = 3;
 const CLOSE_M = 6;
 
@@ -16,10 +17,12 @@ export class SceneCamera {
     this.controls.addEventListener("change", onChange);
     this.controls.addEventListener("start", () => (this.touched = true));
     this.followed = null;
+    this.covered = 0;
   }
 
   resize(width, height) {
     this.camera.aspect = width / height;
+    this.covered = Math.min(LEGEND_PX / height, 0.25);
     this.camera.updateProjectionMatrix();
   }
 
@@ -38,7 +41,10 @@ export class SceneCamera {
       const ends = [Infinity, -Infinity, Infinity, -Infinity];
       const seen = corners.map((each) => each.clone().sub(target)).map((each) => [each.dot(across), each.dot(upright), each.dot(away)]);
       distance = NEAREST_M;
-      for (const [x, y, z] of seen) distance = Math.max(distance, Math.max(Math.abs(x) / this.camera.aspect, Math.abs(y)) / tall + z);
+      for (const [x, y, z] of seen) {
+        const widest = Math.max(Math.abs(x) / this.camera.aspect, Math.abs(y) / (1 - this.covered));
+        distance = Math.max(distance, widest / tall + z);
+      }
       for (const [x, y, z] of seen) {
         const near = distance / (distance - z);
         for (const [end, place] of [[0, x * near], [2, y * near]]) {
@@ -48,6 +54,7 @@ export class SceneCamera {
       }
       target.addScaledVector(across, (ends[0] + ends[1]) / 2).addScaledVector(upright, (ends[2] + ends[3]) / 2);
     }
+    target.addScaledVector(upright, -this.covered * tall * distance);
     this.touched = false;
     this.#look(target, away.multiplyScalar(distance * MARGIN));
     return { middle: target, reach: size.length() / 2 };
