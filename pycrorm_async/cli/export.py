@@ -46,7 +46,7 @@ def export(
     out: Annotated[Path | None, typer.Option("--out", metavar="PATH", help="The file or folder to write.")] = None,
     episode: Annotated[
         list[str] | None,
-        typer.Option("--episode", metavar="EPISODE", help="Of a view: only the rows of this episode; repeatable."),
+        typer.Option("--episode", metavar="EPISODE", help="Of a view or a question: only this episode; repeatable."),
     ] = None,
     arguments: Annotated[
         list[str] | None,

@@ -107,7 +107,7 @@ async def export(
         path: of the file.
         file_format: `parquet`, `csv` or `jsonl` for rows; `lerobot` for episodes, into a folder; `rrd` or `mcap` for
             one episode, which may be running; by default that of the suffix.
-        episodes: limit a view to these.
+        episodes: limit a view, or a question about all, to these.
         arguments: of a question that is named.
         force: replace the file if it exists; a folder only if it is such a data set.
         clock, fps: of LeRobot: a frame for each event that changed the robot's state (`event`, the default), or `fps`
@@ -217,12 +217,13 @@ def _named_by(
         case "view":
             return manifest.names[0], ids
         case "question":
-            return manifest.names[0], ()
+            asked = manifest.options.get("arguments", {})
+            return manifest.names[0], ids if asked.get("episode") is None else ()
     if statement is None:
         raise CallerError(
             "this is the export of a program's own select: call `await memory.export_again(manifest, statement=...)`"
         )
-    return statement, ()
+    return statement, ids if isinstance(statement, Question) and statement.episode is None else ()
 
 
 def _changes(what: str, before: dict[str, str], now: dict[str, str]) -> list[str]:

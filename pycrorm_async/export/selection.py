@@ -1,7 +1,7 @@
 """Resolve the rows to export (episodes, a view or table, a named question, a select) and the episodes that they cover.
 
-Rows come from episodes that have ended and are visible in the tables to their last event, so that the same export can
-be made again. Those of a view are ordered by its key.
+Rows, also those that a question sums up, come from episodes that have ended and are visible in the tables to their last
+event, so that the same export can be made again. Those of a view are ordered by its key.
 """
 
 from __future__ import annotations
@@ -15,13 +15,14 @@ from types import MappingProxyType
 from typing import Any, NamedTuple, TypeAlias
 
 import msgspec
-from sqlalchemy import ColumnElement, Select, column, inspect, or_, select, table
+from sqlalchemy import Select, column, inspect, select, table
 from sqlalchemy.orm import Mapper
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.orm import Base, Designator, ProcessMetaData, TaskTreeNode
 from pycrorm_async.orm.base import EPISODE, same_row
 from pycrorm_async.query.asking.ask import QUESTIONS
+from pycrorm_async.query.asking.columns import of_episode
 from pycrorm_async.query.asking.question import Question, episode_name
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.suggestions import nearest
@@ -81,10 +82,11 @@ async def select_rows(
 ) -> Selection:
     """Return the selection that `what` names.
 
-    `episodes` limits a view to these, `arguments` are those of a question, and `running` admits episodes that run.
+    `episodes` limits a view or a question to these, `arguments` are those of a question, and `running` admits episodes
+    that run.
 
-    Raises `CallerError` for an unknown name, with the nearest ones; if `episodes` is given and `what` is not a view;
-    for wrong arguments; and for an episode that has not ended. Raises `UnknownEpisode`.
+    Raises `CallerError` for an unknown name, with the nearest ones; if `episodes` is given and `what` chooses them
+    itself; for wrong arguments; and for an episode that has not ended. Raises `UnknownEpisode`.
     """
     await reading.refresh()
     chosen = [str(each) for each in episodes]
@@ -116,7 +118,7 @@ async def select_rows(
     statement = (
         select(node, designator.c.parameters)
         .outerjoin(designator, same_row(designator, node.__table__))
-        .where(_among(node.process_metadata_id, of_names.episodes))
+        .where(of_episode(node.process_metadata_id, _numbers(of_names.episodes)))
         .order_by(node.id)
     )
     return Selection("episodes", "", statement, of_names.episodes, of_names.simulated)
@@ -151,15 +153,22 @@ def _recorded(value: Any) -> Any:
 async def _asked(
     reading: Reading, kind: str, question: Question, arguments: Mapping[str, Any], chosen: Sequence[str]
 ) -> Selection:
+    recorded = {name: _recorded(value) for name, value in arguments.items()}
+    if question.episode is not None:
+        if chosen:
+            raise CallerError(
+                "the question has the argument `episode`, which chooses it already: leave one of both out"
+            )
+        chosen = [episode_name(question.episode)]
     if chosen:
-        raise CallerError("a question chooses its episode itself: give it the argument `episode` (--with episode=...)")
-    if question.episodes:
-        of_names = await _named(reading, [episode_name(each) for each in question.episodes])
-        covered, simulated, left_out = *of_names, 0
+        covered, simulated, left_out = *await _named(reading, chosen), 0
     else:
         (covered, left_out), simulated = await _complete(reading), False
-    recorded = {name: _recorded(value) for name, value in arguments.items()}
-    return Selection(kind, question.name, question.statement, covered, simulated, left_out, recorded)
+    if recorded.get("episode") is not None:
+        recorded["episode"] = covered[0].id  # later, `last` and a number may be of another episode
+    return Selection(
+        kind, question.name, question.select_among(_numbers(covered)), covered, simulated, left_out, recorded
+    )
 
 
 async def _view(reading: Reading, name: str, mapper: Mapper[Any] | None, chosen: Sequence[str]) -> Selection:
@@ -182,10 +191,11 @@ async def _view(reading: Reading, name: str, mapper: Mapper[Any] | None, chosen:
         return Selection("view", name, statement, ())
     if chosen:
         of_names = await _named(reading, chosen)
-        condition = _among(episode, of_names.episodes)
+        condition = of_episode(episode, _numbers(of_names.episodes))
         return Selection("view", name, statement.where(condition), of_names.episodes, of_names.simulated)
     covered, left_out = await _complete(reading)
-    return Selection("view", name, statement.where(_among(episode, covered)), covered, left_out=left_out)
+    condition = of_episode(episode, _numbers(covered))
+    return Selection("view", name, statement.where(condition), covered, left_out=left_out)
 
 
 async def _views(reading: Reading) -> dict[str, Mapper[Any] | None]:
@@ -244,15 +254,8 @@ async def _covered(reading: Reading, statuses: dict[int, str]) -> tuple[CoveredE
     )
 
 
-def _among(episode: Any, covered: Sequence[CoveredEpisode]) -> ColumnElement[bool]:
-    """Return the condition that a row is of one of these episodes, as ranges, because most numbers have no gaps."""
-    ranges: list[list[int]] = []
-    for each in covered:
-        if ranges and ranges[-1][1] == each.number - 1:
-            ranges[-1][1] = each.number
-        else:
-            ranges.append([each.number, each.number])
-    return or_(*(episode.between(*each) for each in ranges)) if ranges else episode < 0
+def _numbers(covered: Sequence[CoveredEpisode]) -> list[int]:
+    return [each.number for each in covered]
 
 
 def _may_be_episode(name: str) -> bool:

@@ -24,6 +24,7 @@ from sqlalchemy.orm import aliased
 
 from pycrorm_async import Memory, Reading
 from pycrorm_async.errors import CallerError, MissingExtra, UnknownEpisode
+from pycrorm_async.events.types import EpisodeEnded, EpisodeStarted, NodeEnded, NodeStarted
 from pycrorm_async.export import row_files
 from pycrorm_async.export.export import export, export_again
 from pycrorm_async.export.manifest import read_manifest
@@ -33,7 +34,7 @@ from pycrorm_async.world.enums import Arms
 from tests.commands import one_line_of, pycrorm
 from tests.databases import run_in_own_loop
 from tests.full_disk import files_of_at_most
-from tests.projections.event_script import NAVIGATE, PICK_UP, SAYING, declarations
+from tests.projections.event_script import NAVIGATE, PICK_UP, SAYING, Script, declarations, name_of
 from tests.projections.factories import append_and_fold
 from tests.query.test_reading import episode
 
@@ -171,7 +172,8 @@ async def test_a_question_is_exported_and_made_again_by_name_and_arguments(readi
     arguments = {"episode": 1, "object": "milk", "arm": Arms.LEFT, "limit": 1}
     exported = await export(reading, "root_failures", tmp_path / "failures.csv", arguments=arguments)
     assert (exported.rows, exported.episodes) == (1, 1)
-    assert exported.manifest.options == {"arguments": {"episode": 1, "object": "milk", "arm": "LEFT", "limit": 1}}
+    first = exported.manifest.episodes[0].id
+    assert exported.manifest.options == {"arguments": {"episode": first, "object": "milk", "arm": "LEFT", "limit": 1}}
     frame = await reading.ask.root_failures(episode=1, object="milk", arm="LEFT", limit=1)
     assert pd.read_csv(tmp_path / "failures.csv").message.tolist() == frame.message.tolist()
     assert (await export_again(reading, tmp_path / "failures.csv.manifest.json")).same
@@ -192,24 +194,66 @@ async def test_a_question_is_exported_and_made_again_by_name_and_arguments(readi
         ("root_failures", {"objct": "milk"}, r"root_failures has no argument 'objct'; did you mean object\?; it has"),
         ("object_history", {}, "object_history needs name: give it as an argument"),
         ("durations", {"episode": 99}, "there is no episode '99'"),
+        (
+            "durations",
+            {"episode": 1, "episodes": [2]},
+            "the argument `episode`, which chooses it already",
+        ),
     ],
 )
 async def test_a_question_with_a_wrong_argument_is_refused(
     reading: Reading, tmp_path: Path, name: str, arguments: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(CallerError, match=message):
-        await export(reading, name, tmp_path / "a.csv", arguments=arguments)
+        await export(reading, name, tmp_path / "a.csv", episodes=arguments.pop("episodes", ()), arguments=arguments)
     assert list(tmp_path.iterdir()) == []
 
 
-async def test_every_question_is_exported_with_declared_types(either: Reading, tmp_path: Path) -> None:
+async def test_every_question_is_exported_with_declared_types_of_episodes_that_have_ended(
+    either: Reading, tmp_path: Path
+) -> None:
     arguments: dict[str, dict[str, Any]] = {
-        "object_history": {"name": "milk"}, "moves_of": {"name": "milk"}, "experience_at": {"x": 1, "y": 1},
+        "object_history": {"name": "milk"}, "moves_of": {"name": "milk"}, "experience_at": {"x": 0.5, "y": 0},
     }  # fmt: skip
+    changed = set()
     for name in QUESTIONS:
-        file = tmp_path / f"{name}.parquet"
-        await export(either, name, file, arguments=arguments.get(name, {}))
-        assert pa.null() not in parquet.read_schema(file).types, name
+        all_, ended = tmp_path / f"{name}.parquet", tmp_path / f"{name}-ended.parquet"
+        exported = await export(either, name, all_, arguments=arguments.get(name, {}))
+        assert pa.null() not in parquet.read_schema(all_).types, name
+        assert ([each.number for each in exported.manifest.episodes], exported.left_out) == ([2], 1)
+        await export(either, name, ended, arguments=arguments.get(name, {}), episodes=["2"])
+        assert parquet.read_table(all_).to_pylist() == parquet.read_table(ended).to_pylist(), name
+        whole = await getattr(either.ask, name)(**arguments.get(name, {})).frame(to="arrow")
+        if whole.to_pylist() != parquet.read_table(all_).to_pylist():
+            changed.add(name)
+    assert changed == {*QUESTIONS} - {"successful_pick_ups", "moves_of", "steps_before_failures"}
+
+
+async def test_a_question_is_made_again_about_the_same_episodes_when_more_are_recorded(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path}/memory.db"
+    await append_and_fold(url, [*declarations(NAVIGATE, PICK_UP, SAYING), *episode(2).records])
+    cases: Any = ("last", {"episode": "last"}), ("digits", {"episode": "0000"}), ("all", {})
+    async with Reading.open(url) as reading:
+        for name, arguments in cases:
+            exported = await export(reading, "durations", tmp_path / f"{name}.csv", arguments=arguments)
+            assert exported.manifest.options == ({"arguments": {"episode": ID}} if arguments else {})
+        of_digits = reading.ask.durations(episode="0000")
+        assert await reading.rows(of_digits.statement) == await of_digits.rows() != []
+        every = reading.ask.durations()
+        await export(reading, every, tmp_path / "every.csv")
+    script = Script(3)
+    script.put(EpisodeStarted("another", "me", "host", "1.0", "3.11"))
+    say = script.put(NodeStarted("action", None, name_of(SAYING), {"text": "hi"}))
+    script.put(NodeEnded(say, "SUCCEEDED"))
+    script.put(EpisodeEnded("SUCCEEDED"))
+    await append_and_fold(url, script.records)
+    async with Reading.open(url) as reading:
+        assert (await reading.episode("last")).number == 2
+        for name, _ in cases:
+            again = await export_again(reading, tmp_path / f"{name}.csv.manifest.json")
+            assert (again.same, again.differences) == (True, ()), name
+        every = reading.ask.durations()
+        assert (await export_again(reading, tmp_path / "every.csv.manifest.json", statement=every)).same
 
 
 async def test_a_full_disk_leaves_no_file(reading: Reading, tmp_path: Path) -> None:

@@ -16,6 +16,7 @@ from pycrorm_async.query.asking.columns import (
     json_text,
     limited,
     member_of,
+    of_episode,
     share_succeeded,
     times_with,
 )
@@ -41,7 +42,7 @@ def longest_actions(
         node.id.label("node_id"),
     ).where(node.kind == "action", node.end_ns.is_not(None))
     if episode is not None:
-        statement = statement.where(node.process_metadata_id == episode)
+        statement = statement.where(of_episode(node.process_metadata_id, episode))
     if dtype is not None:
         statement = statement.where(node.dtype == dtype)
     if status is not None:
@@ -66,7 +67,7 @@ def durations(
         func.max(node.duration).label("longest_s"),
     ).where(node.kind == kind)
     if episode is not None:
-        statement = statement.where(node.process_metadata_id == episode)
+        statement = statement.where(of_episode(node.process_metadata_id, episode))
     if dtype is not None:
         statement = statement.where(node.dtype == dtype)
     return limited(statement.group_by(node.dtype).order_by(func.sum(node.duration).desc(), node.dtype), limit)
@@ -87,7 +88,7 @@ def arms_used(episode: EpisodeNumber | None, dtype: str | None, limit: int | Non
         .where(node.kind == "action", arm.is_not(None))
     )
     if episode is not None:
-        statement = statement.where(node.process_metadata_id == episode)
+        statement = statement.where(of_episode(node.process_metadata_id, episode))
     if dtype is not None:
         statement = statement.where(node.dtype == dtype)
     return limited(statement.group_by(arm, node.dtype).order_by(arm, func.count().desc(), node.dtype), limit)
@@ -131,7 +132,7 @@ def successful_pick_ups(
         .order_by(node.id)
     )
     if episode is not None:
-        statement = statement.where(node.process_metadata_id == episode)
+        statement = statement.where(of_episode(node.process_metadata_id, episode))
     if object_ is not None:
         statement = statement.where(containing(object_, taken.c.name))
     if object_type is not None:
@@ -146,7 +147,7 @@ def successful_pick_ups(
 
 
 def experience_at(
-    x: float, y: float, radius_m: float, dtype: str | None, limit: int | None
+    episode: EpisodeNumber | None, x: float, y: float, radius_m: float, dtype: str | None, limit: int | None
 ) -> Select[*tuple[Any, ...]]:
     x, y, radius_m = (checked_metres(*each) for each in (("x", x), ("y", y), ("radius_m", radius_m)))
     if radius_m <= 0:
@@ -176,6 +177,8 @@ def experience_at(
         .group_by(node.dtype, arm)
         .order_by(func.count().desc(), node.dtype, arm)
     )
+    if episode is not None:
+        statement = statement.where(of_episode(node.process_metadata_id, episode))
     if dtype is not None:
         statement = statement.where(node.dtype == dtype)
     return limited(statement, limit)

@@ -164,10 +164,8 @@ class Ask(Generic[Q]):
         self, x: float, y: float, *, radius_m: float = 0.5, dtype: str | None = None, limit: int | None = None
     ) -> Q:
         """Sum up the actions that a robot started within `radius_m` of a place: by type and arm, with successes."""
-        check_texts({"dtype": dtype})
-        select_of = partial(actions.experience_at, x, y, radius_m, dtype, limit)
-        select_of()  # so that a wrong argument is refused at once
-        return self._make(QuestionPlan("experience_at", (), select_of))
+        make = partial(actions.experience_at, x=x, y=y, radius_m=radius_m, dtype=dtype, limit=limit)
+        return self._ask("experience_at", None, make)
 
     # --- objects ----------------------------------------------------------------------------------------------
 
@@ -203,7 +201,7 @@ class Ask(Generic[Q]):
         """
         state = status.name if isinstance(status, TaskStatus) else status
         choice = episode_list.EpisodeChoice(state, since, () if tag is None else (tag,), robot, text, limit)
-        return self._make(QuestionPlan("episodes", (), partial(episode_list.episode_list, choice)))
+        return self._make(QuestionPlan("episodes", None, partial(episode_list.episode_list, choice=choice)))
 
     def _ask(self, name: str, episode: AskedEpisode | None, select_of: partial[Select[*tuple[Any, ...]]]) -> Q:
         check_texts({key: value for key, value in select_of.keywords.items() if key in _TEXTS})
@@ -211,9 +209,7 @@ class Ask(Generic[Q]):
         if recovered is not None and not isinstance(recovered, bool):
             raise CallerError(f"recovered must be True or False, got {recovered!r}")
         select_of(episode=None)  # so that a wrong argument is refused at once
-        if episode is None:
-            return self._make(QuestionPlan(name, (), partial(select_of, episode=None)))
-        return self._make(QuestionPlan(name, (episode,), lambda number: select_of(episode=number)))
+        return self._make(QuestionPlan(name, episode, select_of))
 
     if not TYPE_CHECKING:
 

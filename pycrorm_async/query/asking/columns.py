@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from enum import Enum
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from sqlalchemy import ColumnElement, Double, Integer, Select, Text, case, cast, func, or_
+from sqlalchemy import ColumnElement, Double, Integer, Select, Text, case, cast, false, func, or_
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.projections.schema.views.portable_expressions import member
 from pycrorm_async.query.suggestions import nearest
 from pycrorm_async.task_status import TaskStatus
+
+if TYPE_CHECKING:
+    from pycrorm_async.query.asking.question import EpisodeNumber
 
 E = TypeVar("E", bound=Enum)
 _STATEMENT = TypeVar("_STATEMENT", bound=Select[Any])
@@ -22,6 +25,23 @@ _STATEMENT = TypeVar("_STATEMENT", bound=Select[Any])
 _CHARACTERS = re.compile("[^\0\ud800-\udfff]*")
 
 FAILED = (TaskStatus.FAILED, TaskStatus.ERROR, TaskStatus.LOST)
+
+
+def of_episode(column: Any, episode: EpisodeNumber) -> ColumnElement[bool]:
+    """Return the condition that a row is of this episode, or of one of these, by the column of their numbers.
+
+    Several are ranges, because most numbers have no gaps.
+    """
+    if not isinstance(episode, Sequence):
+        same: ColumnElement[bool] = column == episode
+        return same
+    ranges: list[list[int]] = []
+    for number in sorted(episode):
+        if ranges and ranges[-1][1] == number - 1:
+            ranges[-1][1] = number
+        else:
+            ranges.append([number, number])
+    return or_(false(), *(column == first if first == last else column.between(first, last) for first, last in ranges))
 
 
 def json_text(document: Any, name: str) -> ColumnElement[str]:

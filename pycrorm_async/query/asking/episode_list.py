@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from sqlalchemy import ColumnElement, Select, exists, or_, select
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.orm import EpisodeRobot, EpisodeTag, ProcessMetaData
-from pycrorm_async.query.asking.columns import check_texts, containing, limited, member_of
+from pycrorm_async.query.asking.columns import check_texts, containing, limited, member_of, of_episode
 from pycrorm_async.task_status import TaskStatus
+
+if TYPE_CHECKING:
+    from pycrorm_async.query.asking.question import EpisodeNumber
 
 
 @dataclass(frozen=True)
@@ -72,21 +75,23 @@ class EpisodeChoice:
         )
 
 
-def episode_list(choice: EpisodeChoice) -> Select[*tuple[Any, ...]]:
+def episode_list(episode: EpisodeNumber | None, choice: EpisodeChoice) -> Select[*tuple[Any, ...]]:
     """Select the chosen episodes with their outcomes, the newest first."""
-    episode = ProcessMetaData
+    listed = ProcessMetaData
     statement = select(
-        episode.id.label("episode"),
-        episode.uuid.label("id"),
-        episode.created_at.label("started_at"),
-        episode.ended_at,
-        episode.status,
-        episode.description,
-        episode.plan,
-        episode.created_by,
-        episode.world,
-        episode.failure_type,
-        episode.failure_message,
-        episode.continues,
+        listed.id.label("episode"),
+        listed.uuid.label("id"),
+        listed.created_at.label("started_at"),
+        listed.ended_at,
+        listed.status,
+        listed.description,
+        listed.plan,
+        listed.created_by,
+        listed.world,
+        listed.failure_type,
+        listed.failure_message,
+        listed.continues,
     )
-    return limited(statement.where(*choice.conditions()).order_by(episode.id.desc()), choice.limit)
+    if episode is not None:
+        statement = statement.where(of_episode(listed.id, episode))
+    return limited(statement.where(*choice.conditions()).order_by(listed.id.desc()), choice.limit)

@@ -10,7 +10,7 @@ from sqlalchemy.orm import aliased
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.ids import SEQUENCE_MAX, SLOT_MAX
 from pycrorm_async.orm import RootFailure, TaskTreeNode
-from pycrorm_async.query.asking.columns import checked_count, containing, limited, times_with
+from pycrorm_async.query.asking.columns import checked_count, containing, limited, of_episode, times_with
 from pycrorm_async.query.asking.failure_words import classes_meant_by
 from pycrorm_async.query.asking.question import EpisodeNumber
 
@@ -34,7 +34,7 @@ def matching(
     failure = RootFailure
     conditions: list[ColumnElement[bool]] = []
     if episode is not None:
-        conditions.append(failure.process_metadata_id == episode)
+        conditions.append(of_episode(failure.process_metadata_id, episode))
     if object is not None:
         conditions.append(containing(object, failure.object))
     if arm is not None:
@@ -115,7 +115,7 @@ def steps_before_failures(
         .where(*matching(episode, **search))
         .cte("latest", recursive=True)
     )
-    of_episode = () if episode is None else (step.process_metadata_id == episode,)
+    named = () if episode is None else (of_episode(step.process_metadata_id, episode),)
     # One step after the other is looked up by its id, as a plan by any other way depends on statistics.
     same = "episode", "failure_sequence", "failed", "reason"
     latest = latest.union_all(
@@ -137,7 +137,7 @@ def steps_before_failures(
             step.duration.label("duration_s"),
             step.id.label("node_id"),
         )
-        .join(step, and_(step.id == latest.c.node_id, step.process_metadata_id == latest.c.episode, *of_episode))
+        .join(step, and_(step.id == latest.c.node_id, step.process_metadata_id == latest.c.episode, *named))
         .order_by(latest.c.failure_id, latest.c.steps_before)
     )
     return limited(statement, limit)

@@ -23,7 +23,7 @@ from sqlalchemy import (
 )
 
 from pycrorm_async.orm import Attachment, Detection, JointChange, Object, ObjectRemoval, Pose, RootFailure, TaskTreeNode
-from pycrorm_async.query.asking.columns import limited
+from pycrorm_async.query.asking.columns import limited, of_episode
 from pycrorm_async.query.asking.question import EpisodeNumber
 
 _OBJECT, _POSE, _NODE = Object.__table__, Pose.__table__, TaskTreeNode.__table__
@@ -64,7 +64,7 @@ def _joined(episode: EpisodeNumber | None, id_: Any, row: Any, other: Any) -> Co
     With `episode` it names the episode itself, so that one part of a divided table is read wherever the row is joined.
     """
     same = and_(row.c.id == id_, row.c.process_metadata_id == other.c.process_metadata_id)
-    return same if episode is None else and_(same, row.c.process_metadata_id == episode)
+    return same if episode is None else and_(same, of_episode(row.c.process_metadata_id, episode))
 
 
 def object_history(episode: EpisodeNumber | None, *, name: str, limit: int | None) -> Select[*tuple[Any, ...]]:
@@ -75,7 +75,7 @@ def object_history(episode: EpisodeNumber | None, *, name: str, limit: int | Non
     begins = Attachment.kind == "attached"
     named = select(_OBJECT.c.id, _OBJECT.c.process_metadata_id).where(_is_named(_OBJECT.c.name, name))
     if episode is not None:
-        named = named.where(_OBJECT.c.process_metadata_id == episode)
+        named = named.where(of_episode(_OBJECT.c.process_metadata_id, episode))
 
     joined = partial(_joined, episode)
 
@@ -118,11 +118,11 @@ def object_history(episode: EpisodeNumber | None, *, name: str, limit: int | Non
         ).where(_is_named(failed.c.object, name)),
     ]
     if episode is not None:
-        courses = [each.where(each.selected_columns.episode == episode) for each in courses]
+        courses = [each.where(of_episode(each.selected_columns.episode, episode)) for each in courses]
     course = union_all(*courses).subquery("course")
     of_course = _NODE.c.process_metadata_id == course.c.episode
     if episode is not None:
-        of_course = and_(of_course, _NODE.c.process_metadata_id == episode)
+        of_course = and_(of_course, of_episode(_NODE.c.process_metadata_id, episode))
     statement = (
         select(*course.c[:-1], _NODE.c.dtype.label("by"), _NODE.c.status.label("status"), course.c.node_id)
         .outerjoin(_NODE, and_(_NODE.c.id == course.c.node_id, of_course))
@@ -141,7 +141,7 @@ def _failures(episode: EpisodeNumber | None) -> CTE:
     columns = failed.c.id, failed.c.process_metadata_id, failed.c.start_time, failed.c.reason, failed.c.object
     statement = select(*columns, RootFailure.sequence.label("sequence"))
     if episode is not None:
-        statement = statement.where(failed.c.process_metadata_id == episode)
+        statement = statement.where(of_episode(failed.c.process_metadata_id, episode))
     return statement.cte("failed").prefix_with("MATERIALIZED", dialect="postgresql")
 
 
@@ -162,7 +162,7 @@ def moves_of(episode: EpisodeNumber | None, *, name: str, limit: int | None) -> 
         _OBJECT.c.dtype == "Object",
     )
     if episode is not None:
-        moved = moved.where(_OBJECT.c.process_metadata_id == episode)
+        moved = moved.where(of_episode(_OBJECT.c.process_metadata_id, episode))
     moves = moved.cte("moves")
     columns = ("id", "parent_id", "process_metadata_id", "kind", "dtype", "status")
     up = (

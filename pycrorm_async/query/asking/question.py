@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Coroutine, Generator
+from collections.abc import Callable, Coroutine, Generator, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
@@ -21,19 +21,23 @@ T = TypeVar("T")
 
 AskedEpisode: TypeAlias = "int | str | Episode | EpisodeSummary"
 """An episode by its number, its id or the first digits of it, `last`, or as an `Episode` or `EpisodeSummary`."""
-EpisodeNumber: TypeAlias = "int | ColumnElement[int]"
-"""The number of an episode, or an expression that finds it."""
+EpisodeNumber: TypeAlias = "int | ColumnElement[int] | Sequence[int]"
+"""The number of an episode, an expression that finds it, or the numbers of several."""
+_DIGITS_MAX = 7
+"""The largest number of an episode has seven digits."""
+_DIGITS_OF_ID = 4
+"""Fewer digits are a number and not the first ones of an id, as in `store.episode_lookup`."""
 
 
 @dataclass(frozen=True)
 class QuestionPlan:
-    """The parts of a question: its name, the episodes it is about, and the function that makes its select.
+    """The parts of a question: its name, the episode it is about, and the function that makes its select.
 
-    `select_of` takes the numbers of the episodes, in their order.
+    `select_of` takes an `EpisodeNumber` as `episode`; None makes the select about all episodes.
     """
 
     name: str
-    episodes: tuple[AskedEpisode, ...]
+    episode: AskedEpisode | None
     select_of: Callable[..., Select[*tuple[Any, ...]]]
 
 
@@ -58,13 +62,18 @@ class Question:
 
     @property
     def statement(self) -> Select[*tuple[Any, ...]]:
-        """The select, to change or to join. It contains the subqueries that find the named episodes."""
-        return self._plan.select_of(*(_number_by_query(each) for each in self._plan.episodes))
+        """The select, to change or to join. It contains the subquery that finds the named episode."""
+        episode = self._plan.episode
+        return self._plan.select_of(episode=None if episode is None else _number_by_query(episode))
 
     @property
-    def episodes(self) -> tuple[AskedEpisode, ...]:
-        """The episodes that it names; empty for one to all episodes."""
-        return self._plan.episodes
+    def episode(self) -> AskedEpisode | None:
+        """The episode that it names; None for a question about all episodes."""
+        return self._plan.episode
+
+    def select_among(self, numbers: Sequence[int]) -> Select[*tuple[Any, ...]]:
+        """Return the select about the episodes of these numbers, instead of about those that the question names."""
+        return self._plan.select_of(episode=numbers)
 
     @property
     def sql(self) -> str:
@@ -84,9 +93,10 @@ class Question:
         return self.frame().__await__()
 
     async def _resolved(self) -> Select[*tuple[Any, ...]]:
-        """Return the select with the numbers of the episodes in place of subqueries, so that databases plan better."""
-        numbers = [(await self._reading.episode(episode_name(each))).number for each in self._plan.episodes]
-        return self._plan.select_of(*numbers)
+        """Return the select with the number of the episode in place of a subquery, so that databases plan better."""
+        if self.episode is None:
+            return self._plan.select_of(episode=None)
+        return self._plan.select_of(episode=(await self._reading.episode(episode_name(self.episode))).number)
 
     def __str__(self) -> str:
         return self.sql
@@ -159,6 +169,10 @@ def _number_by_query(episode: AskedEpisode) -> EpisodeNumber:
     name, numbered = episode_name(episode), ProcessMetaData
     if name == "last":
         return select(func.max(numbered.id)).where(~numbered.simulated).scalar_subquery()
-    if name.isdecimal() and name.isascii():
+    is_number = name.isdecimal() and name.isascii() and len(name) <= _DIGITS_MAX
+    if is_number and (isinstance(episode, int) or len(name) < _DIGITS_OF_ID):
         return int(name)
-    return select(numbered.id).where(numbered.uuid.startswith(name.lower(), autoescape=True)).scalar_subquery()
+    begins = select(numbered.id).where(numbered.uuid.startswith(name.lower(), autoescape=True)).scalar_subquery()
+    if not is_number or name.startswith("0"):
+        return begins
+    return func.coalesce(select(numbered.id).where(numbered.id == int(name)).scalar_subquery(), begins)
