@@ -16,7 +16,7 @@ stderr = Console(stderr=True, highlight=False, soft_wrap=True)
 
 
 class ProgressCallback(Protocol):
-    """Gets the amount done, the total, and what is being done if it changes: a phase, or a result so far."""
+    """Gets the amount done, the total, and the present step if it changes: a phase, or a result so far."""
 
     def __call__(self, done: int, total: int, what: str | None = None, /) -> None: ...
 

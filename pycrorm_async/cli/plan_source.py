@@ -24,7 +24,7 @@ def plan_source(path: Path, sha256: str) -> PlanSource:
 
 
 def _git(path: Path, *arguments: str) -> str | None:
-    """Return what git prints in the folder of the file; None if it fails."""
+    """Return the output of git in the folder of the file; None if it fails."""
     environment = os.environ | {"GIT_OPTIONAL_LOCKS": "0"}  # `git status` must not write into the repository
     try:
         result = subprocess.run(  # noqa: S603  fixed arguments; the path is that of the plan, which runs anyway

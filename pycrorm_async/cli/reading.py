@@ -14,7 +14,7 @@ T = TypeVar("T")
 
 
 def read_memory(url: str, spool: Path | None, read: Callable[[Reading], Awaitable[T]]) -> T:
-    """Return what `read` returns for the memory at the URL, which is open meanwhile; then note pending events."""
+    """Open the memory at the URL, call `read` with it, and return the result; then note pending events."""
 
     async def run() -> T:
         async with Reading.open(url) as reading:

@@ -1,4 +1,4 @@
-"""`pycrorm status` reports recorders, running episodes, the lag of database and tables, and what is stopped."""
+"""`pycrorm status` reports recorders, running and stopped episodes, and the lag of database and tables."""
 
 from __future__ import annotations
 

@@ -131,7 +131,7 @@ def in_sight(nodes: Sequence[NodeThen], lines_max: int) -> list[NodeThen]:
 
 
 async def draw_overview(follower: LogFollower, stop: asyncio.Event) -> None:
-    """Draw what each running episode does, and the newest that have ended, until stopped."""
+    """Draw the present action of each running episode, and the newest ended episodes, until stopped."""
     overview = follower.overview
     with _live() as live:
         async with follower.listening(overview):

@@ -193,8 +193,7 @@ class ObjectAdded(Happening, frozen=True):
         node: added the object; None if none did, or if it was in the world before the episode.
         description: fingerprint of the `DescriptionDeclared`; None in events of older versions.
         color: red, green, blue, opacity, 0 to 1; None if only the description has it.
-        model, serial: of a robot with a `RobotDescription`: the model's name, and what distinguishes robots of one
-            model, if it is known.
+        model, serial: of a robot with a `RobotDescription`: the model's name, and the serial number if it is known.
         mass_kg: as given, or the sum of the masses in the description; None if it is not known.
         base_link: of a robot: the link whose frame has the pose, in every event; None: the root link.
     """

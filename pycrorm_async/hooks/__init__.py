@@ -1,1 +1,1 @@
-"""The hooks turn what a plan and its world report into events, with copies of the values, and put them in the queue."""
+"""The hooks turn reports of a plan and its world into events, with copies of the values, and put them in the queue."""

@@ -165,7 +165,7 @@ class WorldRecorder(ObjectRows[Object]):
 
 
 def _model(added: Object) -> tuple[str | None, str | None]:
-    """Return model and serial of a robot; None for other objects, and for what its description does not have."""
+    """Return model and serial of a robot; None for other objects, and for each that its description lacks."""
     described = added.robot_description
     if described is None:
         return None, None

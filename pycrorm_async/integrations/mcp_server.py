@@ -163,7 +163,7 @@ class _Tools:
         return {"causes": [*map(_row, causes)], "failures": [*map(_row, failures)]}
 
     async def at(self, when: str, episode: int | str = "last") -> str:
-        """Show what ran and where every object was at a moment of an episode.
+        """Show the running nodes and the place of every object at a moment of an episode.
 
         `when` is an event, such as "e115", or seconds since the episode's start, such as "12.5".
         """

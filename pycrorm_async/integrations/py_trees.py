@@ -62,7 +62,7 @@ class _Activation:
 
 
 class RememberedTree(VisitorBase):
-    """Records the ticks of a tree in a `with` block as one episode; what is RUNNING at its end is INTERRUPTED.
+    """Records the ticks of a tree in a `with` block as one episode; nodes that are RUNNING at its end are INTERRUPTED.
 
     The block gets the `RecordedEpisode`. A node's `result` has its number of `ticks`; an observation `repeated` of it
     has the number of further ticks with the same outcome, and follows when they are over.
@@ -211,7 +211,7 @@ class RememberedTree(VisitorBase):
                 self._end(each, "INTERRUPTED")
 
     def _end_all(self, error: BaseException | None) -> None:
-        """End what is open; with the error, the behaviour that raised it and those above that one."""
+        """End the open nodes; with the error, the behaviour that raised it and those above that one."""
         raised_in = None
         for frame, _line in traceback.walk_tb(error.__traceback__ if error is not None else None):
             if isinstance(behaviour := frame.f_locals.get("self"), Behaviour):

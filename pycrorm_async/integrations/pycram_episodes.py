@@ -16,7 +16,7 @@ from pycrorm_async.recording.recording import Recording
 class RunningNode:
     """A node that runs: PyCRAM's node, or the action that another one performs; `key` names it in its episode.
 
-    A description of an action has no key: what it resolves to is recorded, or the description once it has failed.
+    A description of an action has no key: the action to which it resolves is recorded, or the description if it failed.
     """
 
     def __init__(self, of: Any, episode: RecordedEpisode, kind: RecordedKind, *, is_description: bool = False) -> None:
@@ -34,7 +34,7 @@ class Change:
 
 
 class _Thread(threading.local):
-    """The nodes that run in this thread, innermost last, and what its motion has changed, by `id` of the object."""
+    """The nodes that run in this thread, innermost last, and the changes of its motion, by `id` of the object."""
 
     def __init__(self) -> None:
         self.nodes: list[RunningNode] = []
@@ -45,7 +45,7 @@ class PyCRAMEpisodes:
     """The episodes of one `remember`.
 
     Attributes:
-        thread: what runs in the calling thread.
+        thread: the running nodes of the calling thread.
         real: the episode of the real world.
     """
 
@@ -78,7 +78,7 @@ class PyCRAMEpisodes:
                     episode.object_attached(self._values.key(each), self._values.key(child), link)
 
     def present(self) -> RecordedEpisode:
-        """Return the episode of what happens now; open one for the first node in the prospection world."""
+        """Return the episode of the present world; open one for the first node in the prospection world."""
         world = self._values.pycram.World.current_world
         if world is None or not world.is_prospection_world:
             return self.real

@@ -1,4 +1,4 @@
-"""Convert what PyCRAM holds into what events hold: parameters and their types, poses, objects, the acting robot."""
+"""Convert PyCRAM's values into those of events: parameters and their types, poses, objects, the acting robot."""
 
 from __future__ import annotations
 
@@ -206,7 +206,7 @@ class PyCRAMValues:
         return _OBJECT_TYPES.get(name, table_name(name).upper())
 
     def description(self, world_object: Any) -> dict[str, Any]:
-        """Return what is recorded once about an object, as arguments of `RecordedEpisode.object_added`."""
+        """Return the facts of an object that are recorded once, as arguments of `RecordedEpisode.object_added`."""
         robot = (
             self.pycram.RobotDescription.current_robot_description if self._original(world_object).is_a_robot else None
         )

@@ -1,7 +1,7 @@
 """`PyCRAMWorld` records the objects of PyCRAM's Bullet worlds: poses, joints, attachments, also of worlds made later.
 
-PyCRAM sets joints one by one and moves what the robot holds each time, so what a motion changes is collected in its
-thread and recorded once, when the motion ends.
+PyCRAM sets joints one by one and each time moves the objects that the robot holds, so the changes of a motion are
+collected in its thread and recorded once, when the motion ends.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ class PyCRAMWorld:
             episode.object_detached(*keys, node=self._episodes.cause(episode))
 
     def detected(self, node: RunningNode, result: Any) -> None:
-        """Record what a detecting motion returned."""
+        """Record the result of a detecting motion."""
         values, episode = self._values, node.episode
         seen = []
         for each in result:
@@ -111,7 +111,7 @@ class PyCRAMWorld:
             self.flush()
 
     def flush(self) -> None:
-        """Record what this thread has changed in the world."""
+        """Record the changes of the world by this thread."""
         thread = self._episodes.thread
         if not thread.changes:
             return

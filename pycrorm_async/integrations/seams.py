@@ -76,7 +76,7 @@ def _without_fault(remove: Callable[[Any], None], callback: Callable[..., Any]) 
 
 
 def guarded(method: Callable[..., Any]) -> Callable[..., Any]:
-    """Count what a method of an observer raises, so that it does not reach the plan; do nothing without the seams."""
+    """Count the exceptions of an observer's method, so that none reaches the plan; do nothing without the seams."""
 
     @wraps(method)
     def call(self: _Observer, *args: Any, **kwargs: Any) -> Any:

@@ -17,7 +17,7 @@ from pycrorm_async.store.stored import EpisodeRow, StoredEvent
 _READ = frozenset({"EpisodeStarted", "EpisodeEnded", "NodeStarted", "NodeEnded", "ObjectAdded"})
 _FAILED = frozenset({"FAILED", "ERROR"})
 _TEXT_MAX = 200
-"""Bounds the characters of a description, and of the text of what runs now."""
+"""Bounds the characters of a description, and of the text of the running nodes."""
 _NODES_IN_FULL = 2
 """Bounds the innermost nodes that are shown with parameters."""
 

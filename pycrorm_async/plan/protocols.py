@@ -1,4 +1,4 @@
-"""Define what the execution of plans needs of designators, arbiters and monitors, without importing them.
+"""Define protocols for the designators, arbiters and monitors that the execution of plans uses without importing them.
 
 Designators import the execution, which creates their nodes; with these protocols the execution need not import them.
 """

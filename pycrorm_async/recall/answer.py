@@ -153,7 +153,7 @@ class RecalledCase:
         return tuple(each for each in self.compared if each.similarity == 0)
 
     def difference(self) -> str:
-        """Return the features that are not quite alike, with what the case has, as text."""
+        """Return the features that are not quite alike, with the values of the case, as text."""
         return "; ".join(_missed(each) for each in self.compared if each.similarity < 1)
 
     async def next(self) -> Case | None:
@@ -179,7 +179,7 @@ class RecalledCase:
         return self.memory
 
     def why(self) -> str:
-        """Return why the case was found, as lines of text."""
+        """Return the score and the compared features, as lines of text."""
         case = self.case
         reason = f" ({case.reason})" if case.reason else ""
         lines = [f"{case.type} in episode {case.episode}, event {case.sequence}: {case.status}{reason}"]
@@ -193,7 +193,7 @@ class Answer(Sequence[RecalledCase]):
     """The cases most like a cue, the best first.
 
     Attributes:
-        cue: what was asked.
+        cue: the searched cue.
         cases: each with its score; fewer than `cue.k` if the memory has fewer that share a feature with the cue.
         considered: the number of cases of the type, among which words were counted.
         never_seen: pairs of feature and word in `has` or `only` that none of them has.

@@ -183,7 +183,7 @@ class Numbers:
 
     @classmethod
     def of(cls, values: Sequence[float | None]) -> Numbers:
-        """Make the column of these numbers, None where a case does not have the feature, without what is not finite."""
+        """Make the column of these numbers, None where a case does not have the feature; infinite ones are left out."""
         wide = np.array(values, np.float64)  # with NaN for None
         wide[np.isinf(wide)] = np.nan
         large = np.abs(wide) > SINGLE_MAX

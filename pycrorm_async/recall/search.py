@@ -3,8 +3,8 @@
 The score of a case is the sum of weight times similarity over the features of the cue, divided by the sum of weights.
 
 - A word is there or not: similarity 1 or 0. Its weight is ln((N + 1) / (n + 1)) + 0.1, where n of N cases of the type
-  have it, so what is rare weighs more, but at most `WEIGHT_MAX`, so that a word which no case has cannot hide a case
-  that matches all else.
+  have it, so rare words weigh more, but at most `WEIGHT_MAX`, so that a word which no case has cannot hide a case that
+  matches all else.
 - A number has similarity 1 at the wanted value and 0 at its tolerance and beyond, linear between, and weight 1.
 
 Cases of equal score are ordered by their start, the newest first, then by their node. Scores are compared in steps of

@@ -1,6 +1,7 @@
-"""Copy what an executive hands over, because a value of a wrong type in the log would stop the fold of its episode.
+"""Copy the arguments of an executive, because a value of a wrong type in the log would stop the fold of its episode.
 
-What is needed (a pose) raises `CallerError`; what can be left out (a colour, one joint) is counted as missing.
+A wrong value raises `CallerError` if it is required (a pose); an optional one (a colour, one joint) is counted as
+missing.
 """
 
 from __future__ import annotations
@@ -57,7 +58,7 @@ def _are_plain(joints: dict[Any, Any]) -> bool:
 
 
 class ArgumentReader:
-    """Copies the arguments that describe an object; counts in `missing` what it has to leave out."""
+    """Copies the arguments that describe an object; counts the ones that it has to leave out in `missing`."""
 
     def __init__(self, missing: MissingValues) -> None:
         self._missing = missing

@@ -96,7 +96,7 @@ E = TypeVar("E", bound=CountingEpisode)
 
 
 def counted(what: str) -> Callable[[Callable[Concatenate[E, P], R]], Callable[Concatenate[E, P], R | None]]:
-    """Count what a method raises; do nothing if the memory is closed or belongs to a parent process."""
+    """Count the exceptions of a method; do nothing if the memory is closed or belongs to a parent process."""
 
     def wrap(method: Callable[Concatenate[E, P], R]) -> Callable[Concatenate[E, P], R | None]:
         @functools.wraps(method)
@@ -116,7 +116,7 @@ def counted(what: str) -> Callable[[Callable[Concatenate[E, P], R]], Callable[Co
 
 
 def noted(emitter: Any, what: str, read: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> R | None:
-    """Return what `read` returns for these arguments; count what it raises and return None."""
+    """Call `read` with these arguments and return its result; if it raises, count the exception and return None."""
     try:
         return read(*args, **kwargs)
     except Exception as error:  # noqa: BLE001  the code of an executive's values may raise anything

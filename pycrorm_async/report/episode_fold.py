@@ -3,8 +3,8 @@
 The document holds columns and numbers of texts instead of one object per node, so that 100,000 nodes stay below 20 MB.
 `web/episode.js` reads it. Sequences of events are the axis of everything; `times` maps them to seconds.
 
-A part holds what the events behind `after` added and changed; a whole document is the part behind event 0. Each entry
-is found by the sequence of its event, so one fold serves any number of pages, wherever each of them has stopped.
+A part holds the additions and changes of the events behind `after`; a whole document is the part behind event 0. Each
+entry is found by the sequence of its event, so one fold serves any number of pages, wherever each of them has stopped.
 """
 
 from __future__ import annotations

@@ -105,7 +105,7 @@ def _prefix(path: Path) -> str:
 
 
 def _delete_parts(path: Path) -> None:
-    """Delete what killed processes left of files of this name. A process locks its own part while it writes."""
+    """Delete the parts that killed processes left of files of this name. A process locks its part while it writes."""
     for each in path.absolute().parent.glob(f"{glob.escape(_prefix(path))}????????{_SUFFIX}"):
         with suppress(OSError):  # another process, or another user's
             descriptor = os.open(each, os.O_RDONLY)

@@ -1,4 +1,4 @@
-"""Find the past actions most like those of an episode, each with what is alike and what differs, for its page."""
+"""Find the past actions most like those of an episode, each with its equal and its different features, for the page."""
 
 from __future__ import annotations
 

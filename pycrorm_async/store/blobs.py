@@ -119,7 +119,7 @@ class Blobs:
         return blob.content
 
     async def fault(self, name: str) -> str | None:
-        """Return what is wrong with a stored blob; None if its content has this SHA-256."""
+        """Return the fault of a stored blob; None if its content has this SHA-256."""
         digest, count, parts = sha256(), 0, 1
         async for each in self._parts(name):
             count, parts = count + 1, each.parts

@@ -319,7 +319,7 @@ class Dialect(Protocol):
     """The exceptions of the driver, and those SQLAlchemy raises for it."""
 
     def refusal(self, error: Exception) -> str | None:
-        """Return why the database can never create a table or view of this definition; None for a temporary error."""
+        """Return the reason why the database can never create such a table or view; None for a temporary error."""
         ...
 
     def translate_error(self, error: Exception, name: str) -> PycrormError:

@@ -90,7 +90,7 @@ stored: as many as a hundred robots begin in an hour. Shrinks as numbers run out
 
 
 def numbers_reserved(above: int) -> int:
-    """Return how many numbers to leave free behind this one.
+    """Return the number of episode numbers to leave free behind this one.
 
     >>> numbers_reserved(1_000), numbers_reserved(EPISODE_NUMBER_MAX - 640)
     (4096, 10)

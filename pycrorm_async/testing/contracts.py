@@ -69,7 +69,7 @@ async def check_projection(projection: Projection, plan: Callable[[], Awaitable[
 
 
 async def check_designator(designator: ActionAbstract, folder: Path) -> Any:
-    """Perform an action with a memory that refuses what it cannot record, and check that its fields can be queried.
+    """Perform an action with a memory that refuses unrecordable values, and check that its fields can be queried.
 
     Returns the row, an instance of the mapped class. Scalars, enums and datetimes are compared with the designator's
     fields; other fields have columns of their own that depend on their type. What `perform` raises is not caught.

@@ -167,7 +167,7 @@ class Proxy:
         return chunk
 
     def from_server(self, chunk: bytes) -> bytes:
-        """Return what the client receives of the server's bytes."""
+        """Return the bytes that the client receives in place of the server's."""
         original, replacement = self._replacement
         return chunk.replace(original, replacement) if original else chunk
 

@@ -47,7 +47,7 @@ def engine() -> Any:
 
 @contextmanager
 def captured() -> Iterator[list[str]]:
-    """Capture what C code prints inside the context; afterwards the list holds it as one string.
+    """Capture the output of C code inside the context; afterwards the list holds it as one string.
 
     One thread at a time can capture, others block; not reentrant. Without glibc nothing is captured.
     """

@@ -135,7 +135,7 @@ class ClaimedSource(Source, Protocol):
         ...
 
     def mark_unavailable(self, reason: str | None) -> None:
-        """Publish why the database is unavailable; None when it is available again."""
+        """Publish the reason why the database is unavailable; None when it is available again."""
         ...
 
     def release(self) -> str | None:

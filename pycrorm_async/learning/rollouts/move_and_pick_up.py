@@ -30,7 +30,7 @@ from pycrorm_async.world.pose import Pose, rotated
 HEIGHT_TOLERANCE_M = 0.05
 """Experience with objects up to this much higher or lower, measured from the torso, applies to the present object."""
 _DRAWS_MAX = 10
-"""Bounds how often samples are drawn again because the base would collide, so that a search without a place ends."""
+"""Bounds the draws as a multiple of the samples, because in a scene without free places all samples collide."""
 _UPRIGHT_MIN = 0.1
 """Minimum vertical component of the object's own z axis (a cosine); below it the object lies on its side and its x-y
 plane no longer maps to the floor."""

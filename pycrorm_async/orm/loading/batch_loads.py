@@ -1,4 +1,4 @@
-"""Load attributes of many objects at once, when one of them is read that is not loaded.
+"""Load an attribute of many objects at once, at the first access to one that is not loaded.
 
 A query for a base class, such as `select(Action)`, loads the columns of the base only, and no relationship. The first
 time that `arm` of one action is read, the columns of its class are loaded for up to `BATCH` objects of this class in

@@ -1,1 +1,1 @@
-"""Compute poses for grasping, opening and holding, and check what a gripper can take."""
+"""Compute poses for grasping, opening and holding, and check whether a gripper can take an object."""

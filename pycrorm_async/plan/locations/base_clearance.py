@@ -1,4 +1,4 @@
-"""Check where a robot's base, with its heading, is clear of obstacles."""
+"""Check whether a robot's base, with its heading, is clear of obstacles at a pose."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class BaseClearance:
         self._obstacles = Obstacles(require_world(), ignore={part for each in robots for part in each.with_load()})
 
     def refusal(self, base: Pose) -> str | None:
-        """Return why a base cannot be at this pose; None if it is clear of obstacles there."""
+        """Return the reason why a base cannot be at this pose; None if it is clear of obstacles there."""
         for footprint in self._footprints:
             if (obstacle := self._obstacles.overlapping(footprint, base)) is not None:
                 return "base in collision with {} ({})".format(*obstacle)

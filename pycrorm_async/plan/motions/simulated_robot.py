@@ -57,8 +57,8 @@ class SimulatedModules:
     """The process modules of `with simulated_robot:`; inverse kinematics keeps the arms within `limits`.
 
     With `collisions` a goal is refused at which the arm or the held object, or the base, collides with another object;
-    the gripper itself may collide if the motion allows it. Driving moves the whole robot, but arms and what they hold
-    are checked only by their own motions.
+    the gripper itself may collide if the motion allows it. Driving moves the whole robot, but arms and held objects are
+    checked only by their own motions.
     """
 
     def __init__(self, limits: Limits, *, collisions: bool = False) -> None:

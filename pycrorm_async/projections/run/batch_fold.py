@@ -78,7 +78,7 @@ class Batch(Protocol):
     """The rows of a batch of events."""
 
     async def restore(self, log: EventLog, spans: Sequence[Span]) -> None:
-        """Prepare for folding these spans, by reading what the fold needs of the events before them."""
+        """Prepare for folding these spans, by reading the facts that the fold needs of the events before them."""
         ...
 
     def fold(self, events: Sequence[StoredEvent]) -> tuple[int, str] | None:

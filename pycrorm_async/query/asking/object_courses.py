@@ -68,7 +68,7 @@ def _joined(episode: EpisodeNumber | None, id_: Any, row: Any, other: Any) -> Co
 
 
 def object_history(episode: EpisodeNumber | None, *, name: str, limit: int | None) -> Select[*tuple[Any, ...]]:
-    """Return what happened to the objects of this name, in the order of the events."""
+    """Select the history of the objects of this name, in the order of the events."""
     attached, removed, joints = Attachment.__table__, ObjectRemoval.__table__, JointChange.__table__
     seen, other = Detection.__table__, _OBJECT.alias("other")
     is_added = _OBJECT.c.id == _OBJECT.c.identity_id

@@ -155,7 +155,7 @@ def _camera(
 
 
 def _visible(world: RecordedWorld, camera: Camera, radius: float, actors: Sequence[Object]) -> float:
-    """Return how well the actors are visible: the sum of the logarithms, so that small ones count as much as robots.
+    """Rate the visibility of the actors by the sum of the logarithms, so that small ones count as much as robots.
 
     An object between the camera and the framed objects, such as a wall, costs as much as it covers.
     """

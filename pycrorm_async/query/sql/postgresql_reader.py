@@ -139,7 +139,7 @@ class _Cursor:
 
     @asynccontextmanager
     async def _bounded(self, seconds: float) -> AsyncIterator[None]:
-        """Stop what runs inside after this time, and raise its own errors as `QueryRefused`."""
+        """Stop the statement inside after this time, and raise its own errors as `QueryRefused`."""
         try:
             async with asyncio.timeout(seconds):  # cancels it on the server, too
                 yield

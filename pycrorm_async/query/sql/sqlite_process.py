@@ -19,7 +19,7 @@ _FORBIDDEN_FUNCTIONS = frozenset({"load_extension", "fts3_tokenizer"})
 _VALUE_BYTES = 16 << 20
 """Bounds a value while it is computed. Stored values are smaller: a part of a blob has 4 MiB."""
 _HEAP_BYTES = 128 << 20
-"""Bounds what SQLite allocates, beside two values: enough to sort and to group a million rows before it uses files."""
+"""Bounds SQLite's allocations, beside two values: enough to sort and to group a million rows before it uses files."""
 _PROCESS_BYTES = 256 << 20
 """Bounds the address space beside SQLite's and the rows: Python's own has a tenth of it."""
 _TEMPORARY_BYTES = 1 << 30

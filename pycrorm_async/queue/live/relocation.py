@@ -13,8 +13,8 @@ mapped. So the sync thread creates the folder of a new recorder, carries all rea
    deletes its `alive`: only one of the two folders may be recovered, because recovery ends the open episodes.
 4. The rest of the old folder is deleted. The next sync appends the commit frame and acknowledges.
 
-A process killed before step 3 leaves what the other program left of the old folder. The process holds the lock on the
-old `alive` until it ends, so that a folder moved elsewhere still counts as alive.
+A process killed before step 3 leaves the old folder as the other program left it. The process holds the lock on the old
+`alive` until it ends, so that a folder moved elsewhere still counts as alive.
 
 Records in segments that are neither mapped nor readable are lost. `Remains.lost` names them. The log gets a gap there,
 so the database refuses the rest of their episodes, which become dead letters (`sources/dead_letters.py`).

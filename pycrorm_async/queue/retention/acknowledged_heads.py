@@ -1,4 +1,4 @@
-"""Remember how far each episode is stored, in a file below the spool, to detect a log that went back.
+"""Remember the stored head of each episode in a file below the spool, to detect a log that went back.
 
     spool/stored/<log id>/heads        one line for each episode of each stored batch
     0192f3c0-…-9ab0 17 4002 1763845200 + 9f3c2a1b      id, number, head, UTC in seconds, mark, crc32 of the rest

@@ -134,7 +134,7 @@ class LiveSource:
         return True
 
     def fail(self, reason: str) -> None:
-        """Publish why no more records will be acknowledged, so that waiting producers fail. The first reason stays."""
+        """Publish the reason why no more records will be acknowledged: waiting producers then fail. The first stays."""
         if self._status.note.failure is None:
             self._update_note(failure=reason)
 
@@ -154,7 +154,7 @@ class LiveSource:
             self._write_status(status)
 
     def mark_unavailable(self, reason: str | None) -> None:
-        """Publish why the database is unavailable; None when it is available again. Raises `SpoolUnavailable`."""
+        """Publish the reason why the database is unavailable; None when it is available. Raises `SpoolUnavailable`."""
         self._update_note(unavailable=reason)
 
     @property

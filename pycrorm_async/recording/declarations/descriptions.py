@@ -182,7 +182,7 @@ class Descriptions:
 
 
 def _stat(file: str) -> tuple[int, int, int, int] | None:
-    """Return what differs after any change of a file; a program can set the time of its content, but not the other."""
+    """Return inode, size and times of a file, of which any change alters one: programs cannot set the last of them."""
     try:
         status = os.stat(file)  # noqa: PTH116  a fifth of the time of Path.stat
     except OSError:

@@ -1,6 +1,6 @@
 """An `EpisodeWriter` writes the events of one open episode and continues it in a follow-up when it gets too long.
 
-Theory of operation. What starts nodes is not known here: `N` is an executive's own record of a node. `_open_nodes`
+Theory of operation. The writer does not know the executive: `N` is an executive's own record of a node. `_open_nodes`
 holds every node that started and whose end is not written. The call that removes a node writes its end, so no node has
 two; if it raises before the end is written, it restores the node, which then ends LOST with the episode. Ctrl-C can
 come at any call, also after the event is written: a `Receipt` shows that, and the lines that update the state by it

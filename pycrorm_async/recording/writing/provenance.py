@@ -1,4 +1,4 @@
-"""Describe what an episode was recorded with: the plan's source, the libraries, the settings and the clock's quality.
+"""Describe the origin of an episode: the plan's source, the libraries, the settings and the clock's quality.
 
 Reading the plan's source is left to the program that starts the plan (`pycrorm run`); a plan's process never does it on
 its own.

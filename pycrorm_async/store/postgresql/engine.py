@@ -40,7 +40,7 @@ _SSL_MODES = ("disable", "allow", "prefer", "require", "verify-ca", "verify-full
 
 
 def refusal(url: URL) -> str | None:
-    """Return what is wrong with a PostgreSQL URL, or None. Quotes no part of it, which may belong to a password."""
+    """Return the fault of a PostgreSQL URL, or None. Quotes no part of it, which may belong to a password."""
     if "@" in (url.host or ""):
         return "an @ in a password is written %40"
     if not url.database:

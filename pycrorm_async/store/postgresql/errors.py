@@ -102,7 +102,7 @@ def _is_missing(code: str, text: str) -> bool:
 
 
 def refusal(error: Exception) -> str | None:
-    """Return why the server can never create a table or view of this definition; None for any other error."""
+    """Return the reason why the server can never create a table or view of this definition; None for other errors."""
     fault = error.orig if isinstance(error, DBAPIError) and error.orig is not None else error
     code = _code(fault)
     text = _text(fault)

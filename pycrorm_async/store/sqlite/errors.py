@@ -63,7 +63,7 @@ def translate_error(fault: BaseException | None, database: str) -> PycrormError:
 
 
 def refusal(fault: BaseException | None) -> str | None:
-    """Return why SQLite can never create a table or view of this definition; None for any other error."""
+    """Return the reason why SQLite can never create a table or view of this definition; None for other errors."""
     code = getattr(fault, "sqlite_errorcode", None)
     if code is None or code & 0xFF not in (sqlite3.SQLITE_ERROR, sqlite3.SQLITE_TOOBIG):
         return None

@@ -1,8 +1,8 @@
 """Describe robots for plans: arms, grippers, torso, head, camera, limits and named postures.
 
 A `RobotDescription` is a constant; the robot's current pose and joint positions are in the world. Lengths are in
-metres, angles in rad, poses of links those of the loaded model (URDF). What a robot lacks is None or empty in its
-description, and an action that needs it fails with `CapabilityAbsenceFailure`.
+metres, angles in rad, poses of links those of the loaded model (URDF). A part that a robot lacks is None or empty in
+its description, and an action that needs it fails with `CapabilityAbsenceFailure`.
 
 >>> PR2.arms[Arms.LEFT].tool_frame
 'l_gripper_tool_frame'
@@ -122,7 +122,7 @@ _VIEW = FieldOfView(1.0, 0.75)  # about that of an ordinary colour camera
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class RobotDescription:
-    """A robot: its base and what is mounted on it.
+    """A robot: its base and the parts mounted on it.
 
     >>> PANDA = RobotDescription(name="panda", drive=Drive.FIXED, arms={Arms.RIGHT: arm}, urdf=Path("panda.urdf"))
     >>> robot = Object("panda", ObjectType.ROBOT, robot=PANDA)
