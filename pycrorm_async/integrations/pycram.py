@@ -114,14 +114,18 @@ class _PyCRAMPlans:
         world = self._pycram.World.current_world
         self._episodes.real = episode = self._episodes.open(world, **labels)
         self.seams.is_on = True
+        failure: BaseException | None = None  # not `sys.exception()`, which has one also if the block is in an `except`
         try:
             self._connect()
             self._add_world(world)
             yield episode
+        except BaseException as error:
+            failure = error
+            raise
         finally:
-            self._end_simulation(sys.exception())
+            self._end_simulation(failure)
             self.seams.remove()
-            self._episodes.close(episode, sys.exception())
+            self._episodes.close(episode, failure)
 
     def _connect(self) -> None:
         plan, used, seams = self._pycram.Plan, self._pycram, self.seams
@@ -211,12 +215,15 @@ class _PyCRAMPlans:
 
     def _whole_plan(self, call: Callable[[], Any], _plan: Any) -> Any:
         """Perform a plan, and end the nodes that a callback of another library kept PyCRAM from ending."""
-        running = len(self._thread.nodes)
+        running, failure = len(self._thread.nodes), None
         try:
             return call()
+        except BaseException as error:
+            failure = error
+            raise
         finally:
             if len(self._thread.nodes) > running:
-                self._end_unreported(self._thread.nodes[running], sys.exception())
+                self._end_unreported(self._thread.nodes[running], failure)
 
     @guarded
     def _end_unreported(self, node: RunningNode, failure: BaseException | None) -> None:
@@ -233,6 +240,7 @@ class _PyCRAMPlans:
         if node is None:
             return call()
         self._parallel[id(designator)] = node
+        before = getattr(designator, "reason", None)  # PyCRAM keeps the outcome of an earlier call
         try:
             result = call()
         except BaseException as failure:
@@ -240,7 +248,7 @@ class _PyCRAMPlans:
             raise
         finally:
             self._parallel.pop(id(designator), None)
-        self._finish(node, None, result)
+        self._finish(node, None, result, before)
         return result
 
     @guarded
@@ -248,10 +256,11 @@ class _PyCRAMPlans:
         return self._start(designator, kind, designator)
 
     @guarded
-    def _finish(self, node: RunningNode, failure: BaseException | None, result: Any = None) -> None:
-        status = getattr(node.of, "status", None)
-        if failure is not None or status is self._pycram.TaskStatus.FAILED:
-            failure = failure if failure is not None else node.of.reason
+    def _finish(self, node: RunningNode, failure: BaseException | None, result: Any = None, before: Any = None) -> None:
+        status, reason = getattr(node.of, "status", None), getattr(node.of, "reason", None)
+        has_failed = status is self._pycram.TaskStatus.FAILED and (before is None or reason is not before)
+        if failure is not None or has_failed:
+            failure = failure if failure is not None else reason
             self._end(node, self._values.status(failure), failure)
         elif status is self._pycram.TaskStatus.INTERRUPTED:
             self._end(node, "INTERRUPTED")

@@ -34,11 +34,15 @@ class Change:
 
 
 class _Thread(threading.local):
-    """The nodes that run in this thread, innermost last, and the changes of its motion, by `id` of the object."""
+    """The nodes that run in this thread, innermost last, and the changes of its motion, by `id` of the object.
+
+    `is_collecting` while one call sets several joints: what it changes is recorded when it returns.
+    """
 
     def __init__(self) -> None:
         self.nodes: list[RunningNode] = []
         self.changes: dict[int, Change] = {}
+        self.is_collecting = False
 
 
 class PyCRAMEpisodes:

@@ -19,6 +19,7 @@ from pycrorm_async.events.fields import table_name
 from pycrorm_async.events.values import ItemType, NodeStatus, ObjectValue, PoseValue, RobotValue
 from pycrorm_async.recording.declarations.recorded_type import FieldSpec
 from pycrorm_async.recording.recorded_episode import RecordedEpisode
+from pycrorm_async.recording.values.texts import clean_repr
 
 PyCRAM = Any
 """A namespace of PyCRAM's classes; PyCRAM has no types."""
@@ -88,7 +89,7 @@ class PyCRAMValues:
         if isinstance(designator, used.CodeNode):
             return {
                 "function": _function_name(designator.function),
-                "arguments": {key: repr(each) for key, each in designator.kwargs.items()},
+                "arguments": {key: clean_repr(each) for key, each in designator.kwargs.items()},
             }
         return {}
 

@@ -6,7 +6,7 @@ collected in its thread and recorded once, when the motion ends.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from typing import Any
 
 from pycrorm_async.events.values import SeenValue
@@ -35,6 +35,7 @@ class PyCRAMWorld:
         self.seams.around(used.World, "remove_object", self._remove_object)
         self.seams.after(used.BulletWorld, "reset_object_base_pose", self._object_moved)
         self.seams.after(used.BulletWorld, "_reset_joint_position", self._joint_moved)
+        self.seams.around(used.Object, "set_multiple_joint_positions", self._joints_moved)
         for unseen in ("step", "set_realtime", "restore_physics_simulator_state"):
             self.seams.after(used.BulletWorld, unseen, self._moved_unseen)
         self.seams.after(used.Object, "attach", self._attached)
@@ -46,11 +47,15 @@ class PyCRAMWorld:
             cause = self._episodes.cause(episode)
             episode.object_added(self._values.key(added), **self._values.description(added), node=cause)
 
-    def _remove_object(self, call: Callable[[], Any], world: Any, removed: Any) -> Any:
-        key = self._values.key(removed)  # the prospection world forgets what it is a copy of
+    def _remove_object(self, call: Callable[[], Any], world: Any, *removed: Any, **_: Any) -> Any:
+        key = self._key(*removed)  # the prospection world forgets what it is a copy of
         result = call()
         self._object_removed(world, key)
         return result
+
+    @guarded
+    def _key(self, removed: Any) -> Hashable:
+        return self._values.key(removed)
 
     @guarded
     def _object_removed(self, world: Any, key: Any) -> None:
@@ -69,6 +74,17 @@ class PyCRAMWorld:
         if self._episodes.of(world) is not None:
             self._change(joint.object).joints[joint.name] = float(position)
             self._flush_unless_moving()
+
+    def _joints_moved(self, call: Callable[[], Any], *_: Any, **__: Any) -> Any:
+        """Record the joints that one call sets as one change, also outside a motion."""
+        thread = self._episodes.thread
+        is_outermost, thread.is_collecting = not thread.is_collecting, True
+        try:
+            return call()
+        finally:
+            if is_outermost:
+                thread.is_collecting = False
+                self._flush_unless_moving()
 
     def _change(self, changed: Any) -> Change:
         changes = self._episodes.thread.changes
@@ -89,7 +105,7 @@ class PyCRAMWorld:
             episode.object_attached(*keys, link, node=self._episodes.cause(episode))
 
     @guarded
-    def _detached(self, parent: Any, child: Any) -> None:
+    def _detached(self, parent: Any, child: Any, *_: Any, **__: Any) -> None:
         self.flush()
         if (episode := self._episodes.of(parent.world)) is not None:
             keys = self._values.key(parent), self._values.key(child)
@@ -105,9 +121,10 @@ class PyCRAMWorld:
                 seen.append(SeenValue(each.name, values.object_type(each), values.pose(each.pose), row))
         episode.detected(seen, node=node.key)
 
+    @guarded
     def _flush_unless_moving(self) -> None:
-        nodes = self._episodes.thread.nodes
-        if not nodes or nodes[-1].kind != "motion":
+        thread = self._episodes.thread
+        if not thread.is_collecting and not (thread.nodes and thread.nodes[-1].kind == "motion"):
             self.flush()
 
     def flush(self) -> None:

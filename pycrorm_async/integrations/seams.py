@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from functools import partial, wraps
+from inspect import Signature, signature
 from typing import Any, Protocol
 
 from pycrorm_async.recording.recording import Recording
@@ -31,22 +32,30 @@ class Seams:
         self._undo.close()
 
     def around(self, owner: type, name: str, perform: Callable[..., Any]) -> None:
-        """Call `perform(call, subject, *args)` in place of a method, where `call()` performs the method itself."""
+        """Call `perform(call, subject, *args)` in place of a method, where `call()` performs the method itself.
+
+        Arguments that the caller names reach `perform` by their position, as far as they have one.
+        """
         original = vars(owner)[name]
+        parameters = signature(original)
 
         def seam(subject: Any, *args: Any, **kwargs: Any) -> Any:
-            if not self.is_on:
-                return original(subject, *args, **kwargs)
-            return perform(partial(original, subject, *args, **kwargs), subject, *args, **kwargs)
+            call = partial(original, subject, *args, **kwargs)
+            if kwargs:
+                args, kwargs = _by_position(parameters, subject, args, kwargs)
+            return perform(call, subject, *args, **kwargs) if self.is_on else call()
 
         self._replace(owner, name, seam)
 
     def after(self, owner: type, name: str, report: Callable[..., Any]) -> None:
-        """Call `report(subject, *args)` after a method."""
+        """Call `report(subject, *args)` after a method; arguments that the caller names have their position there."""
         original = vars(owner)[name]
+        parameters = signature(original)
 
         def seam(subject: Any, *args: Any, **kwargs: Any) -> Any:
             result = original(subject, *args, **kwargs)
+            if kwargs:
+                args, kwargs = _by_position(parameters, subject, args, kwargs)
             if self.is_on:
                 report(subject, *args, **kwargs)
             return result
@@ -68,6 +77,17 @@ class Seams:
         """Add a callback; remove it with the seams, unless another library has removed it."""
         add(callback)
         self._undo.callback(_without_fault, remove, callback)
+
+
+def _by_position(
+    parameters: Signature, subject: Any, args: tuple[Any, ...], kwargs: dict[str, Any]
+) -> tuple[tuple[Any, ...], dict[str, Any]]:
+    """Return the arguments with those by name at their position; unchanged if the method does not take them."""
+    try:
+        bound = parameters.bind(subject, *args, **kwargs)
+    except TypeError:
+        return args, kwargs
+    return bound.args[1:], bound.kwargs
 
 
 def _without_fault(remove: Callable[[Any], None], callback: Callable[..., Any]) -> None:

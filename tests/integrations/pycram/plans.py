@@ -365,6 +365,46 @@ def held_and_seen() -> Facts:
     return {}
 
 
+def raised(failure: BaseException) -> None:
+    raise failure
+
+
+class Unspeakable:
+    """A parameter whose repr raises."""
+
+    def __repr__(self) -> str:
+        raise OSError("no repr")
+
+
+def unusual_calls() -> Facts:
+    """Name the arguments of methods, in an `except`; perform an expression again that had failed before."""
+    joints = [each.name for each in World.robot.joints.values() if each.name.startswith("l_")]
+    movable = [name for name in joints if World.robot.joints[name].type.name != "FIXED"][:4]
+    tries: list[int] = []
+
+    def fails_at_first() -> None:
+        tries.append(1)
+        if len(tries) == 1:
+            raise PlanFailure("at first")
+
+    again = RepeatPlan(1, CodePlan(fails_at_first))
+    carton = Object("spare", Milk, "milk.urdf", pose=pose(0.5, 1, 0.9))
+    try:
+        CodePlan(raised, {"failure": PlanFailure("of an earlier plan")}).perform()
+    except PlanFailure:
+        with remember(url("unusual_calls"), description="Unusual calls") as episode:
+            World.robot.attach(child_object=carton, parent_link="l_gripper_tool_frame")
+            World.robot.detach(child_object=carton)
+            World.current_world.remove_object(obj=carton)
+            World.robot.set_multiple_joint_positions(dict.fromkeys(movable, 0.1))
+            World.robot.set_multiple_joint_positions(dict.fromkeys(movable, 0.05))
+            CodePlan(lambda given: given, {"given": Unspeakable()}).perform()
+            with contextlib.suppress(PlanFailure):
+                again.perform()
+            again.perform()
+    return {"faults": episode.emitter.faults.total}
+
+
 def kinds_of_objects() -> Facts:
     """Convert what stands for an object; its concept has another name in this package."""
     carton = Object("cereal", Cereal, "cereal.urdf", pose=pose(0, 2, 0.5))
@@ -425,6 +465,7 @@ PLANS: tuple[Callable[[], Facts], ...] = (
     others,
     refusals,
     restored_state,
+    unusual_calls,
     held_and_seen,
     kinds_of_objects,
     world_inside,

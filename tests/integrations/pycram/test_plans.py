@@ -418,6 +418,24 @@ def test_what_the_robot_holds_at_the_beginning_and_what_it_detects_are_recorded(
     ) == [("DetectingMotion", "milk", "MILK", 1)]
 
 
+def test_named_arguments_an_outer_except_and_a_second_call_are_recorded_as_they_are(run: Run) -> None:
+    assert run.tree("unusual_calls") == text("""
+        root SUCCEEDED
+          Code SUCCEEDED
+          Repeat FAILED
+            Code FAILED
+          Repeat SUCCEEDED
+            Code SUCCEEDED
+    """)
+    assert run.rows("unusual_calls", "SELECT status FROM process_metadata") == [("SUCCEEDED",)]
+    assert run.rows("unusual_calls", "SELECT kind FROM attachment ORDER BY id") == [("attached",), ("detached",)]
+    assert run.rows("unusual_calls", "SELECT count(*) FROM object_removal") == [(1,)]
+    assert run.rows("unusual_calls", "SELECT count(*) FROM event WHERE type = 'JointsMoved'") == [(2,)]
+    assert run.facts["unusual_calls"]["faults"] == 0
+    (argument,) = run.rows("unusual_calls", "SELECT text FROM parameter_item WHERE field = 'arguments' AND text > ''")
+    assert argument == ("<a Unspeakable whose repr raised OSError>",)
+
+
 def test_what_stands_for_an_object_is_recorded_as_its_row_a_part_or_a_belief(run: Run) -> None:
     assert run.facts["kinds_of_objects"]["values"] == [
         ["ObjectReference", None, None, None],
