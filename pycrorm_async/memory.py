@@ -126,8 +126,10 @@ class Memory(RecordingMemory):
         if settings.writer == "daemon" and address.is_private:
             raise CallerError("sqlite:// is private to this process, so no daemon can write it: use writer='thread'")
         if settings.writer == "daemon" and (views or projections):
-            what = "views" if views else "projections"
-            raise CallerError(f"the daemon creates the tables, without the {what} of this process: use writer='thread'")
+            unused = "views" if views else "projections"
+            raise CallerError(
+                f"the daemon creates the tables, without the {unused} of this process: use writer='thread'"
+            )
         return cls(
             address,
             spool=Path(spool) if spool is not None else None,

@@ -18,11 +18,11 @@ stderr = Console(stderr=True, highlight=False, soft_wrap=True)
 class ProgressCallback(Protocol):
     """Gets the amount done, the total, and the present step if it changes: a phase, or a result so far."""
 
-    def __call__(self, done: int, total: int, what: str | None = None, /) -> None: ...
+    def __call__(self, done: int, total: int, step: str | None = None, /) -> None: ...
 
 
 @contextmanager
-def progress_bar(what: str, *, unit: str = "events") -> Iterator[ProgressCallback]:
+def progress_bar(task_name: str, *, unit: str = "events") -> Iterator[ProgressCallback]:
     """Show a bar inside the context; yields the callback that updates it."""
     bar = Progress(
         TextColumn("{task.description}"),
@@ -35,11 +35,11 @@ def progress_bar(what: str, *, unit: str = "events") -> Iterator[ProgressCallbac
         transient=True,
     )
     with bar:
-        task = bar.add_task(what, total=None, rate="")
+        task = bar.add_task(task_name, total=None, rate="")
 
-        def report_progress(done: int, total: int, what: str | None = None) -> None:
+        def report_progress(done: int, total: int, step: str | None = None) -> None:
             speed = bar.tasks[0].speed
             rate = f"{speed:,.0f}/s" if speed else ""
-            bar.update(task, description=what, completed=done, total=total, rate=rate)
+            bar.update(task, description=step, completed=done, total=total, rate=rate)
 
         yield report_progress

@@ -226,9 +226,9 @@ def _named_by(
     return statement, ids if isinstance(statement, Question) and statement.episode is None else ()
 
 
-def _changes(what: str, before: dict[str, str], now: dict[str, str]) -> list[str]:
+def _changes(subject: str, before: dict[str, str], now: dict[str, str]) -> list[str]:
     names = [name for name in before | now if before.get(name) != now.get(name)]
-    return [f"{what} {name}: {now.get(name, 'none')} instead of {before.get(name, 'none')}" for name in names]
+    return [f"{subject} {name}: {now.get(name, 'none')} instead of {before.get(name, 'none')}" for name in names]
 
 
 async def _write_rows(

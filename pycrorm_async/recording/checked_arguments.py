@@ -83,7 +83,7 @@ class ArgumentReader:
             **texts,
         )
 
-    def text_of(self, what: str, text: object) -> str | None:
+    def text_of(self, argument: str, text: object) -> str | None:
         """Copy a text; of an enum its member's name, of another value its shortened repr."""
         if text is None:
             return None
@@ -91,7 +91,7 @@ class ArgumentReader:
             return clean(str(text.name))
         if isinstance(text, str):
             return clean(str.__str__(text))
-        self._missing.note("ObjectAdded", what, f"it must be a text, not {clean_repr(text)}")
+        self._missing.note("ObjectAdded", argument, f"it must be a text, not {clean_repr(text)}")
         return clean_repr(text)
 
     def joints_of(self, joints: Mapping[str, float]) -> dict[str, float]:
@@ -110,7 +110,7 @@ class ArgumentReader:
                 positions[text] = number
         return positions
 
-    def _number_of(self, what: str, number: Any) -> float | None:
+    def _number_of(self, argument: str, number: Any) -> float | None:
         if number is None:
             return None
         try:
@@ -118,7 +118,7 @@ class ArgumentReader:
                 raise ValueError("it must be a finite number")  # noqa: TRY301  counted below
             return float(number)
         except Exception as error:  # noqa: BLE001  a __float__ of the user's may raise anything
-            self._missing.note("ObjectAdded", what, f"{clean_repr(number)}: {message_of(error)}")
+            self._missing.note("ObjectAdded", argument, f"{clean_repr(number)}: {message_of(error)}")
             return None
 
     def _color_of(self, color: Any) -> tuple[float, float, float, float] | None:

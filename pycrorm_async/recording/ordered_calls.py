@@ -95,7 +95,7 @@ class CountingEpisode(Protocol):
 E = TypeVar("E", bound=CountingEpisode)
 
 
-def counted(what: str) -> Callable[[Callable[Concatenate[E, P], R]], Callable[Concatenate[E, P], R | None]]:
+def counted(event_type: str) -> Callable[[Callable[Concatenate[E, P], R]], Callable[Concatenate[E, P], R | None]]:
     """Count the exceptions of a method; do nothing if the memory is closed or belongs to a parent process."""
 
     def wrap(method: Callable[Concatenate[E, P], R]) -> Callable[Concatenate[E, P], R | None]:
@@ -107,7 +107,7 @@ def counted(what: str) -> Callable[[Callable[Concatenate[E, P], R]], Callable[Co
             try:
                 return method(self, *args, **kwargs)
             except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
-                emitter.note_fault(what, error)
+                emitter.note_fault(event_type, error)
                 return None
 
         return run
@@ -115,10 +115,10 @@ def counted(what: str) -> Callable[[Callable[Concatenate[E, P], R]], Callable[Co
     return wrap
 
 
-def noted(emitter: Any, what: str, read: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> R | None:
+def noted(emitter: Any, event_type: str, read: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> R | None:
     """Call `read` with these arguments and return its result; if it raises, count the exception and return None."""
     try:
         return read(*args, **kwargs)
     except Exception as error:  # noqa: BLE001  the code of an executive's values may raise anything
-        emitter.note_fault(what, error)
+        emitter.note_fault(event_type, error)
         return None

@@ -91,14 +91,14 @@ class RecordedNodes(EpisodeWriter[_Node]):
             self._end_status = status
         self._episodes.close(self, failure)
 
-    def _write(self, what: str, write: Callable[P, int], *args: P.args, **kwargs: P.kwargs) -> None:
+    def _write(self, event_type: str, write: Callable[P, int], *args: P.args, **kwargs: P.kwargs) -> None:
         """Call `write` after all earlier calls; it returns the sequence of the event that it wrote, 0 for none."""
-        self._calls.run(partial(self._written, what, write, *args, **kwargs))
+        self._calls.run(partial(self._written, event_type, write, *args, **kwargs))
 
-    def _written(self, what: str, write: Callable[P, int], *args: P.args, **kwargs: P.kwargs) -> None:
+    def _written(self, event_type: str, write: Callable[P, int], *args: P.args, **kwargs: P.kwargs) -> None:
         if self.closed:
-            self._note(what, f"episode {self} has ended")
-        elif (noted(self.emitter, what, write, *args, **kwargs) or 0) >= self.continue_at:
+            self._note(event_type, f"episode {self} has ended")
+        elif (noted(self.emitter, event_type, write, *args, **kwargs) or 0) >= self.continue_at:
             self._episodes.continue_episode(self)
 
     def _now(self, value: Any, prepared: EpisodeId) -> Any:
@@ -293,13 +293,13 @@ class RecordedNodes(EpisodeWriter[_Node]):
     def _described_world(self) -> str | None:
         return None
 
-    def _find(self, key: Hashable | None, what: str) -> _Node | None:
+    def _find(self, key: Hashable | None, event_type: str) -> _Node | None:
         """Return the node of a key, or of a value that `start` returned; count a key that no node has."""
         if key is None or isinstance(key, _Node):
             return key
-        node = noted(self.emitter, what, lambda: self._nodes.get(key) or self._ended.get(key))
+        node = noted(self.emitter, event_type, lambda: self._nodes.get(key) or self._ended.get(key))
         if node is None:
-            self._note(what, f"no node has the key {clean_repr(key)}; the root of the episode takes its place")
+            self._note(event_type, f"no node has the key {clean_repr(key)}; the root of the episode takes its place")
         return node
 
     def _known(self, key: Hashable) -> Hashable:
@@ -312,5 +312,5 @@ class RecordedNodes(EpisodeWriter[_Node]):
         node = self._find(key, "a change of the world")
         return node.sequence if node is not None and node.episode_id == self.id else None
 
-    def _note(self, what: str, reason: str) -> None:
-        self.emitter.note_fault(what, CallerError(reason))
+    def _note(self, event_type: str, reason: str) -> None:
+        self.emitter.note_fault(event_type, CallerError(reason))

@@ -155,9 +155,9 @@ class EventLog:
                 stored = await appending.write(connection)
             if self.digests is not None and appending.extension is not None:
                 self.digests.keep(appending.extension)
-        for what, warning in appending.warnings.items():
-            if what not in self._warned:
-                self._warned.add(what)
+        for subject, warning in appending.warnings.items():
+            if subject not in self._warned:
+                self._warned.add(subject)
                 _log.warning("%s: %s", self.address, warning)
         return stored
 

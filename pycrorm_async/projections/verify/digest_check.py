@@ -166,6 +166,6 @@ async def check_outside(
                 at = {"number": row.number, "sequence": each.sequence}
                 kept = (await connection.execute(_AT, at)).scalar() if readable else None
                 if kept != each.digest:
-                    what = "is missing" if kept is None else "differs from the given one"
-                    reason = f"the digest at this event {what}: one of the events 1 to {each.sequence} was changed"
+                    fault = "is missing" if kept is None else "differs from the given one"
+                    reason = f"the digest at this event {fault}: one of the events 1 to {each.sequence} was changed"
                     result.add_damage(row.number, each.sequence, reason)

@@ -93,12 +93,12 @@ def check_texts(arguments: Mapping[str, Any]) -> None:
             raise CallerError(f"{name.removesuffix('_')} has U+0000 or half of a surrogate pair, which no memory holds")
 
 
-def member_of(enum: type[E], value: E | str, what: str) -> str:
+def member_of(enum: type[E], value: E | str, argument: str) -> str:
     """Return the name of an enum's member. Raises `CallerError` with the nearest name for another text."""
     name = value.name if isinstance(value, Enum) else value
     if not isinstance(name, str):
-        raise CallerError(f"{what} must be a name or a member of {enum.__name__}, got {value!r}")
+        raise CallerError(f"{argument} must be a name or a member of {enum.__name__}, got {value!r}")
     if name.upper() not in enum.__members__:
         valid = ", ".join(enum.__members__)
-        raise CallerError(f"there is no {what} {name!r}{nearest(name, enum.__members__)} ({valid})")
+        raise CallerError(f"there is no {argument} {name!r}{nearest(name, enum.__members__)} ({valid})")
     return name.upper()

@@ -82,9 +82,9 @@ class EpisodeDiff:
         """
         parts = {"facts": _facts, "nodes": nodes_of, "last places of objects": _last_places}
         return "\n\n".join(
-            f"-- {what} of episode {each.number}\n"
+            f"-- {part} of episode {each.number}\n"
             f"{statement(each.number).compile(compile_kwargs={'literal_binds': True})};"
-            for what, statement in parts.items()
+            for part, statement in parts.items()
             for each in (self.first, self.second)
         )
 
@@ -265,8 +265,8 @@ def _place_differences(first: Mapping[_Nth, _Place], second: Mapping[_Nth, _Plac
     for key in dict.fromkeys([*first, *second]):
         one, other = first.get(key), second.get(key)
         if _comparable(list(one or ())) != _comparable(list(other or ())):
-            what = _presence(one, other) or "place"
-            yield Difference("object", _nth_text(*key), what, _place_text(one), _place_text(other))
+            difference = _presence(one, other) or "place"
+            yield Difference("object", _nth_text(*key), difference, _place_text(one), _place_text(other))
 
 
 def _place_text(place: _Place | None) -> str | None:

@@ -36,7 +36,7 @@ def _is_named(column: Any, name: str) -> ColumnElement[bool]:
 def _course(
     table: Any,
     sequence: Any,
-    what: Any,
+    happening: Any,
     *,
     other: Any = None,
     detail: Any = None,
@@ -49,7 +49,7 @@ def _course(
         table.c.process_metadata_id.label("episode"),
         sequence.label("sequence"),
         (table.c.time if time is None else time).label("time"),
-        (literal(what, Text) if isinstance(what, str) else what).label("what"),
+        (literal(happening, Text) if isinstance(happening, str) else happening).label("what"),
         cast(null() if other is None else other, Text).label("other"),
         cast(null() if detail is None else detail, Text).label("detail"),
         cast(null() if value is None else value, Float).label("value"),

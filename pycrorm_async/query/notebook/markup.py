@@ -69,9 +69,9 @@ def moment(when: datetime) -> str:
     return f"{when:%Y-%m-%d %H:%M:%S}"
 
 
-def left_out(count: int, what: str = "") -> str:
+def left_out(count: int, noun: str = "") -> str:
     """Return the line with the number of items that a view leaves out."""
-    return quiet(f"… {count:,} more{' ' if what else ''}{what}")
+    return quiet(f"… {count:,} more{' ' if noun else ''}{noun}")
 
 
 def facts(pairs: Mapping[str, str]) -> str:

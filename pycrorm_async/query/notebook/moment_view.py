@@ -70,5 +70,5 @@ def _json(values: object) -> str:
     return msgspec.json.encode(values).decode()
 
 
-def _more(count: int, what: str) -> str:
-    return f"<div>{left_out(count - _ROWS_MAX, what)}</div>" if count > _ROWS_MAX else ""
+def _more(count: int, noun: str) -> str:
+    return f"<div>{left_out(count - _ROWS_MAX, noun)}</div>" if count > _ROWS_MAX else ""

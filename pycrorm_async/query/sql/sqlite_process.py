@@ -77,9 +77,9 @@ def _bound(connection: sqlite3.Connection, bytes_max: int, seconds: float) -> No
     _limit(resource.RLIMIT_CORE, 0)
 
 
-def _limit(what: int, most: int) -> None:
-    most = min([most, *(each for each in resource.getrlimit(what) if each != resource.RLIM_INFINITY)])
-    resource.setrlimit(what, (most, most))
+def _limit(resource_id: int, most: int) -> None:
+    most = min([most, *(each for each in resource.getrlimit(resource_id) if each != resource.RLIM_INFINITY)])
+    resource.setrlimit(resource_id, (most, most))
 
 
 def _answer(rows: sqlite3.Cursor, bytes_left: int) -> None:
