@@ -63,7 +63,7 @@ class Symbols:
         return cls(words, np.fromiter(map(codes.__getitem__, values), np.min_scalar_type(len(words)), len(values)))
 
     def equal_to(self, word: str, rows: slice) -> Mask:
-        """Return which of these rows have the word."""
+        """Return a mask of these rows: True where the case has the word."""
         code = self.words.code(word)
         return self.codes[rows] == code if code else np.zeros(self.codes[rows].size, np.bool_)
 
@@ -77,7 +77,7 @@ class Symbols:
         return np.bincount(self.codes, minlength=len(self.words) + 1)
 
     def present(self) -> Mask:
-        """Return which cases have the feature."""
+        """Return a mask of all cases: True where the case has the feature."""
         return self.codes > 0
 
     def part(self, first: int, last: int) -> Symbols:
@@ -126,7 +126,7 @@ class Sets:
         return np.repeat(np.arange(self.sizes.size, dtype=np.int32), self.sizes)
 
     def equal_to(self, word: str, rows: slice) -> Mask:
-        """Return which of these rows have the word among their values."""
+        """Return a mask of these rows: True where the case has the word among its values."""
         start, stop, _ = rows.indices(self.sizes.size)
         mask = np.zeros(stop - start, np.bool_)
         code = self.words.code(word)
@@ -147,7 +147,7 @@ class Sets:
         return np.bincount(self.codes, minlength=len(self.words) + 1)
 
     def present(self) -> Mask:
-        """Return which cases have the feature."""
+        """Return a mask of all cases: True where the case has the feature."""
         return self.sizes > 0
 
     def part(self, first: int, last: int) -> Sets:
@@ -196,7 +196,7 @@ class Numbers:
         return value if value == value else None
 
     def present(self) -> Mask:
-        """Return which cases have the number."""
+        """Return a mask of all cases: True where the case has the number."""
         return ~np.isnan(self.values)
 
     def part(self, first: int, last: int) -> Numbers:

@@ -81,7 +81,7 @@ class Following(NamedTuple):
 
 
 def relation(first: Case, second: Case) -> Relation | None:
-    """Return how the interval of the first case lies to that of the second; None if one has no end, as a lost one."""
+    """Return the relation of the first case's interval to the second's; None if one has no end because it was lost."""
     if first.duration_s is None or second.duration_s is None:
         return None
     starts, ends = first.started_us, first.started_us + first.duration_s * 1e6

@@ -201,7 +201,7 @@ def _reachable(group: Group, cue: Cue, weights: Weights) -> float:
 
 
 def _conditions(group: Group, rows: slice, cue: Cue) -> Iterator[Mask]:
-    """Yield which rows fulfil each condition but the times of their starts."""
+    """Yield a mask of the rows that fulfil it for each condition, except the times of their starts."""
     for pair in cue.lacks:
         yield ~_having(group, pair, rows)
     for pair in cue.requires:
@@ -227,7 +227,7 @@ def _having(group: Group, pair: tuple[str, str], rows: slice) -> Mask:
 
 
 def _ended_by(group: Group, moment_us: int, rows: slice = slice(None)) -> Mask:
-    """Return which cases had ended by a moment; of a lost one nothing is known."""
+    """Return a mask of the cases that had ended by a moment; False for a lost one, which has no duration."""
     durations = group.numbers.get("duration")
     if durations is None:
         return np.zeros(group.nodes[rows].size, np.bool_)

@@ -55,7 +55,7 @@ CONTINUED: Final = "EpisodeContinued"
 _RESERVE_EVENTS_MAX = 2**20
 """Bounds the sequences reserved behind `continue_at`: more open nodes than fit into a process' memory."""
 _LAST_ENDS_S = 1.0
-"""Bounds how long the end of an episode waits for ends of nodes in other threads; each takes microseconds."""
+"""Bounds the wait of an episode's end for ends of nodes in other threads; each takes microseconds."""
 
 N = TypeVar("N")
 

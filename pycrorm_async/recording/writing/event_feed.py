@@ -33,7 +33,7 @@ _log = logging.getLogger("pycrorm_async")
 BUFFER_EVENTS: Final = 10_000
 """Bounds the events that wait for one observer: a second of a plan that records 10,000 events a second."""
 _LAST_EVENTS_S: Final = 5.0
-"""Bounds how long closing a memory waits for a callback to process its buffer."""
+"""Bounds the wait of a closing memory for a callback that processes its buffer."""
 
 
 class RecordedEvent(NamedTuple):

@@ -352,7 +352,7 @@ class PostgreSQL:
 
 
 def _confirming(configured: str) -> int:
-    """Return how many standbys confirm each COMMIT, from `synchronous_standby_names`.
+    """Return the number of standbys that confirm each COMMIT, from `synchronous_standby_names`.
 
     >>> _confirming("ANY 2 (a, b, c)"), _confirming("FIRST 1 (a)"), _confirming("2 (a, b)"), _confirming("a, b")
     (2, 1, 2, 1)
