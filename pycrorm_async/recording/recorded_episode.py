@@ -34,9 +34,9 @@ class RecordedEpisode(RecordedNodes):
     ...     episode.start("a", navigate, {"target_location": Pose([1, 0, 0])})
     ...     episode.end("a")
 
-    Keys are any hashable values, `id(node)` for example; a key can be used again after its node has ended. Nothing
-    raises: what cannot be recorded is counted in `Memory.status` and logged. `node` is always the key of the acting
-    node; None means the root of the episode.
+    Keys are any hashable values, `id(node)` for example; a key can be used again after its node has ended. No method
+    raises: values that cannot be recorded are counted in `Memory.status` and logged. `node` is always the key of the
+    acting node; None means the root of the episode.
     """
 
     def __enter__(self) -> Self:
@@ -67,7 +67,7 @@ class RecordedEpisode(RecordedNodes):
         torso_joint: str | None = None,
         node: Hashable | None = None,
     ) -> None:
-        """Record that an object entered the world; of a known key, that pose and joints are these now.
+        """Record that an object entered the world; for a known key, record its new pose and joints.
 
         Args:
             key: names the object from now on.
@@ -85,7 +85,7 @@ class RecordedEpisode(RecordedNodes):
 
     @counted("ObjectMoved")
     def object_moved(self, key: Hashable, pose: Pose | PoseValue, *, node: Hashable | None = None) -> None:
-        """Record the new pose of an object; nothing, if it is the same."""
+        """Record the new pose of an object, unless it is the same."""
         if not self.closed and self._objects.is_at(key, pose):
             return  # before the pose is copied, which takes longer
         copied = pose_of(pose)
@@ -126,7 +126,7 @@ class RecordedEpisode(RecordedNodes):
     def reference(self, key: Hashable) -> ObjectReference | None:
         """Return the current row of an object, for values that name it; None if there is none of this key.
 
-        Ask again for each value: it is the row of now, and another one when the episode has been continued.
+        Call it again for each value: the row changes when the object moves and when the episode is continued.
         """
         return noted(self.emitter, "ObjectAdded", self._objects.reference, key)
 

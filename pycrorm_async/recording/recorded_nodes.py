@@ -3,8 +3,8 @@
 Theory of operation. Each method first copies its arguments, which may run any code of the caller, and then has
 `OrderedCalls` write them; so no other call comes between the events of one, and a node's parent has started before it,
 whichever threads start them. If the episode is continued after the copy, `_now` replaces references to rows of the
-former episode. Nothing raises into the caller: what goes wrong, and what comes after the end of the episode, is counted
-in `Memory.status`. `_nodes` holds the open nodes by key, `_ended` the last ones that ended, because a child may start
+former episode. No method raises into the caller: faults, and calls after the end of the episode, are counted in
+`Memory.status`. `_nodes` holds the open nodes by key, `_ended` the last ones that ended, because a child may start
 after the end of its parent.
 """
 
@@ -288,7 +288,7 @@ class RecordedNodes(EpisodeWriter[_Node]):
         return self._objects.last
 
     def _leave_world(self) -> None:
-        """Objects are reported by the executive, so nothing observes them."""
+        """Do nothing: the executive reports the objects, so no observer has to stop."""
 
     def _described_world(self) -> str | None:
         return None

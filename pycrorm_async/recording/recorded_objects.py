@@ -102,7 +102,7 @@ class RecordedObjects(ObjectRows[Hashable]):
         return state is not None and isinstance(pose, (Pose, PoseValue)) and _are_at_one_place(state.pose, pose)
 
     def add(self, key: Hashable, added: RecordedObject, node: int | None) -> int:
-        """Write that an object entered the world; of a known key, its new pose and joints."""
+        """Write that an object entered the world; for a known key, write its new pose and joints."""
         if key in self._references:
             return max(self.move(key, added.pose, node), self.turn(key, added.joints, node))
         sequence = self._put(

@@ -1,4 +1,4 @@
-"""Copy the values that an executive hands over, through its own conversion, into values of events."""
+"""Copy the values of an executive, through its own conversion, into values of events."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`Recording` is how any executive writes episodes into a memory, from any thread and without asyncio."""
+"""`Recording` writes the episodes of any executive into a memory, from any thread and without asyncio."""
 
 from __future__ import annotations
 
@@ -146,14 +146,14 @@ class Recording:
         Args:
             description, plan, seed, tags, metadata: as for `Memory.episode`.
             world: the description of the world in one line.
-            simulated: whether the robot only imagines it; ordinary queries leave such an episode out.
-            thought_by: the node that imagines it, from `RecordedEpisode.node_reference`.
+            simulated: True for a simulation, which no robot performs; ordinary queries leave it out.
+            thought_by: the node that performs the simulation, from `RecordedEpisode.node_reference`.
             convert: converts each parameter, result and observed value, and each item of one, to a scalar, a text, a
                 list or dict, a `PoseValue`, an `ObjectReference`, or, for a field of the type `object`, the key of an
-                object. What it raises is recorded as the reason why the value is missing.
+                object. An exception that it raises is recorded as the reason why the value is missing.
 
         Raises:
-            CallerError: an argument has the wrong type. What else goes wrong is counted, and the episode stays empty.
+            CallerError: an argument has the wrong type. Any other fault is counted, and the episode stays empty.
         """
         text = description or plan or "an episode"
         check_arguments(description=text, plan=plan, seed=seed, strict=False)

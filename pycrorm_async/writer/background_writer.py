@@ -29,8 +29,9 @@ class WriterState(NamedTuple):
     Attributes:
         queue: the drain of this memory's own queue.
         adopted: the drains of dead recorders.
-        failure: why appending has stopped for good; None while it continues. The queue keeps its events on disk.
-        fold_error: why the last attempt to update the tables failed; None if it succeeded.
+        failure: the reason why appending has stopped for good; None while it continues. The queue keeps its events on
+            disk.
+        fold_error: the reason why the last attempt to update the tables failed; None if it succeeded.
         adoption_errors: the dead recorders' folders that could not be drained, with the reasons.
     """
 

@@ -39,11 +39,11 @@ class DrainState(NamedTuple):
         records: number of appended records, with those stored before, without refused ones.
         batches: number of appended batches.
         retries: number of attempts at which the database was unavailable.
-        unavailable: why the database is unavailable at the moment; None if it is available.
+        unavailable: the reason why the database is unavailable at the moment; None if it is available.
         last_error: the latest of these reasons.
         appended: position of the last appended record.
         acknowledged: position up to which the source may delete records.
-        refused: by episode id, why the log refused records of it.
+        refused: by episode id, the reason why the log refused records of it.
     """
 
     source: str

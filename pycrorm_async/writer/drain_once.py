@@ -20,9 +20,9 @@ class DrainSummary:
 
     Attributes:
         drained: one state per source, in the order of draining.
-        failed: by source name, why it could not be drained to its end, or its refused records not be kept.
+        failed: by source name, the reason why it could not be drained to its end, or its refused records not be kept.
         folded: number of folded events.
-        stopped: by episode id, why it is refused or parked; includes episodes refused whole, which have no row.
+        stopped: by episode id, the reason why it is refused or parked; includes episodes refused whole, without a row.
     """
 
     drained: tuple[DrainState, ...]

@@ -60,7 +60,7 @@ class VisibilityTracker:
         Args:
             appended: this tracker's `appended` before `behind` and `stopped` were read.
             behind: by id, the folded sequence of each episode with events that are not visible yet.
-            stopped: by id, why an episode is refused or parked.
+            stopped: by id, the reason why an episode is refused or parked.
         """
         visible_to, stopped = 0, {**self.drain.state.refused, **stopped}
         while self._invisible and self._invisible[0][0] <= appended:

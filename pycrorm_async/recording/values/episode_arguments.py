@@ -1,4 +1,4 @@
-"""Check the arguments that a program opens an episode with."""
+"""Check the arguments with which a program opens an episode."""
 
 from __future__ import annotations
 

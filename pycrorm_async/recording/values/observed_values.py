@@ -36,7 +36,7 @@ class ObservedReader:
     """Reads the values of one observation. `put_blob` takes content and media type.
 
     Attributes:
-        missing: by path, why a value is missing.
+        missing: by path, the reason why a value is missing.
         blobs: the references in the values, to be released when the event is put.
     """
 
