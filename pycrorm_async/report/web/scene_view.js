@@ -8,6 +8,7 @@ import { SceneCamera } from "./scene_camera.js";
 
 const CLICK_PX = 4;
 const GRID_MAX = 200;
+const GRID_PARTS = 40;
 const SUN = [-5, 3.5, 8];
 const PATH_WIDTH = 0.0055; // of the reach of what is framed
 const LABELS_PX = 400; // labels are moved down by so much at most
@@ -107,6 +108,7 @@ export class SceneView {
     const size = Math.min(GRID_MAX, 2 * Math.ceil(Math.max(10, 2.5 * this.reach)));
     const line = colorOf("--grid");
     this.grid = new THREE.GridHelper(size, size, line, line);
+    divideLines(this.grid.geometry, Math.min(size, GRID_PARTS));
     this.grid.rotation.x = Math.PI / 2;
     this.grid.position.set(Math.round(this.middle.x), Math.round(this.middle.y), -0.002);
     this.scene.add(this.grid);
@@ -260,6 +262,19 @@ function isSoftware(context) {
     if (names !== null) name = context.getParameter(names.UNMASKED_RENDERER_WEBGL);
   }
   return /swiftshader|llvmpipe|softpipe|software|basic render/i.test(name);
+}
+
+/** Divide lines into parts, because some drivers leave out a line that ends behind the camera. */
+function divideLines(geometry, parts) {
+  for (const name of ["position", "color"]) {
+    const { array } = geometry.attributes[name];
+    const divided = [];
+    for (let at = 0; at < array.length; at += 6) {
+      const pointAt = (share) => [0, 1, 2].map((axis) => array[at + axis] * (1 - share) + array[at + 3 + axis] * share);
+      for (let part = 0; part < parts; part++) divided.push(...pointAt(part / parts), ...pointAt((part + 1) / parts));
+    }
+    geometry.setAttribute(name, new THREE.Float32BufferAttribute(divided, 3));
+  }
 }
 
 /** Place labels inside the picture, each above those that it would cover, or below them where there is no room above. */
