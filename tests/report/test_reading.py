@@ -97,9 +97,9 @@ def test_the_page_plays_by_events_or_in_proportion_to_time(chrome: Browser, page
         assert ask([0, 0, 1_000_000], True) == {"at": [0, 0, 2], "shortened": True}
         tab.ask("pycrormPage.gantt.setAxis(true); pycrormPage.togglePlay()")
         assert tab.ask("pycrormPage.playback.running")
-        assert tab.ask("document.querySelector('.clock').textContent").endswith(" · long pauses shortened")
+        assert tab.ask("document.querySelector('.clock').textContent").endswith(" · pauses cut")
         tab.ask("pycrormPage.togglePlay()")
-        assert not tab.ask("document.querySelector('.clock').textContent").endswith("shortened")
+        assert not tab.ask("document.querySelector('.clock').textContent").endswith("cut")
 
 
 async def test_control_characters_are_signs_in_titles_and_hints(chrome: Browser, tmp_path: Path) -> None:

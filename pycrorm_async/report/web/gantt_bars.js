@@ -36,7 +36,7 @@ export function drawLane(pen, nodes, y, { left, right, span, event, selected, co
   }
   for (const [bin, bars] of bins) {
     if (bars.length === 1) drawNarrow(pen, bars[0], colors);
-    else drawBin(pen, bars, left + bin * BIN_PX, colors);
+    else drawBin(pen, bars, left + bin * BIN_PX, Math.min(BIN_PX, right - left - bin * BIN_PX), colors);
   }
 }
 
@@ -124,7 +124,7 @@ function drawNarrow(pen, { node, y, left, right, later }, colors) {
 }
 
 /** Many nodes together: the share of each outcome, failures at the bottom and striped. */
-function drawBin(pen, bars, x, colors) {
+function drawBin(pen, bars, x, wide, colors) {
   const counts = new Map();
   for (const { node } of bars) {
     const group = node.failed ? "bad" : colorOfNode(node);
@@ -138,15 +138,15 @@ function drawBin(pen, bars, x, colors) {
     const last = index === groups.length - 1;
     const high = last ? foot - y : Math.min(Math.max(4, Math.round((counts.get(group) / bars.length) * BAR_PX)), foot - y - 3);
     pen.fillStyle = colors[group];
-    pen.fillRect(x, foot - high, BIN_PX, high - (index > 0 ? 1 : 0));
+    pen.fillRect(x, foot - high, wide, high - (index > 0 ? 1 : 0));
     pen.fillStyle = colors.paper;
-    if (group !== "good") for (let at = foot - high + 1; at < foot; at += 3) pen.fillRect(x, at, BIN_PX, 1);
+    if (group !== "good") for (let at = foot - high + 1; at < foot; at += 3) pen.fillRect(x, at, wide, 1);
     foot -= high;
   });
   pen.globalAlpha = 1;
 }
 
-/** Round positions for ticks: both ends, and between them multiples of 1, 2 or 5 times a power of ten, far enough apart. */
+/** Positions for ticks: both ends, and between them multiples of 1, 2 or 5 times a power of ten. */
 export function roundTicks(from, to, most, whole) {
   const rough = (to - from) / Math.max(1, most);
   const power = 10 ** Math.floor(Math.log10(rough));
@@ -154,7 +154,7 @@ export function roundTicks(from, to, most, whole) {
   const ticks = [from];
   for (let index = Math.ceil(from / step); index * step < to; index++) {
     const here = index * step;
-    if (here - from > rough * 0.55 && to - here > rough * 0.55) ticks.push(here);
+    if (here > from) ticks.push(here);
   }
   return [...ticks, to];
 }

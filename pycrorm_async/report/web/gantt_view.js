@@ -128,21 +128,26 @@ export class GanttView {
     pen.fillRect(this.#xOf(this.event) - 1, 0, 2, height);
   }
 
-  /** The labels of the axis and their places, all different. */
+  /** The labels of the axis and their left ends in pixels: all different, and none over another; the ends come first. */
   ticks() {
     const [from, to] = this.window;
-    const textOf = (here) => (this.byTime ? duration(here) : `e${Math.round(here)}`);
     const ticks = roundTicks(from, to, Math.max(2, Math.floor(this.width / TICK_PX)), !this.byTime);
-    return ticks.map((here) => [textOf(here), here]).filter(([text], index, all) => index === 0 || text !== all[index - 1][0]);
+    const pen = this.axis.getContext("2d");
+    const placed = [];
+    for (const here of [from, to, ...ticks.slice(1, -1)]) {
+      const text = this.byTime ? duration(here) : `e${Math.round(here)}`;
+      const { width } = pen.measureText(text);
+      const middle = PAD_PX + ((here - from) / (to - from)) * this.width;
+      const left = Math.min(Math.max(middle - width / 2, PAD_PX), PAD_PX + this.width - width);
+      const isFree = placed.every((each) => each.text !== text && (left > each.left + each.width + 8 || left + width + 8 < each.left));
+      if (isFree) placed.push({ text, left, width });
+    }
+    return placed;
   }
 
   #drawAxis(pen, colors) {
-    const [from, to] = this.window;
     pen.fillStyle = colors.quiet;
-    for (const [text, here] of this.ticks()) {
-      pen.textAlign = here === from ? "left" : here === to ? "right" : "center";
-      pen.fillText(text, PAD_PX + ((here - from) / (to - from)) * this.width, AXIS_PX / 2 + 2);
-    }
+    for (const { text, left } of this.ticks()) pen.fillText(text, left, AXIS_PX / 2 + 2);
   }
 }
 

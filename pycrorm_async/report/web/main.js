@@ -289,7 +289,7 @@ class Page {
     this.gantt.show(event, this.selected);
     this.panels.show(event, this.selected, running);
     this.slider.value = event;
-    this.clock.textContent = `${duration(episode.secondsAt(event))} · event ${event} of ${episode.last}${this.playback.shortened ? " · long pauses shortened" : ""}`;
+    this.clock.textContent = `${duration(episode.secondsAt(event))} · event ${event} of ${episode.last}${this.playback.shortened ? " · pauses cut" : ""}`;
     this.slider.setAttribute("aria-valuetext", this.clock.textContent);
     if (matchMedia("print").matches) this.#print();
     clearTimeout(this.writing);
