@@ -205,3 +205,11 @@ def test_the_table_of_the_package_has_every_module_in_the_order_of_the_layers() 
         assert sorted(modules[: len(expected)]) == expected
         del modules[: len(expected)]
     assert modules == []
+
+
+def test_the_flow_of_an_event_names_classes_that_exist() -> None:
+    flow = re.findall(r"```text\n(.*?)```", (PACKAGE / "README.md").read_text(), re.DOTALL)[0]
+    names = set(re.findall(r"[A-Z][a-z]+[A-Z]\w+", flow))
+    assert len(names) > 10
+    sources = "\n".join(each.read_text() for each in MODULES)
+    assert {each for each in names if not re.search(rf"^class {each}\b", sources, re.MULTILINE)} == set()
