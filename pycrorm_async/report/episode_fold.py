@@ -293,6 +293,8 @@ def _location(sequence: int, resolved: LocationResolved) -> dict[str, Any]:
     refused: dict[str, int] = {}
     for each in resolved.refused:
         refused[each.reason] = refused.get(each.reason, 0) + 1
+    cells = resolved.cells
+    excluded = {} if cells is None else {"occupied": cells.occupied, "hidden": cells.hidden}
     return {
         "at": sequence,
         "node": resolved.node or 0,
@@ -303,6 +305,7 @@ def _location(sequence: int, resolved: LocationResolved) -> dict[str, Any]:
         "places": [rounded(each.pose.position) for each in resolved.offered[:200]],
         "refused_places": [rounded(each.pose.position) for each in resolved.refused[:200]],
         "refused": refused,
+        "excluded": {name: count for name, count in excluded.items() if count},
     }
 
 

@@ -7,10 +7,13 @@ from typing import Any
 
 import msgspec
 import pytest
+from sqlalchemy import select
 
 from pycrorm_async.errors import CallerError, UnknownEpisode
 from pycrorm_async.events.types import DescriptionDeclared
 from pycrorm_async.memory import Memory
+from pycrorm_async.orm import LocationResolution
+from pycrorm_async.plan import CostmapLocation, simulated_robot
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.scene.object_model import object_model
 from pycrorm_async.recording.recorded_episode import RecordedEpisode
@@ -19,7 +22,7 @@ from pycrorm_async.report.episode_data import episode_document
 from pycrorm_async.report.html_page import page_of
 from pycrorm_async.report.tracks import Texts, Track
 from pycrorm_async.report.write import Report
-from pycrorm_async.world import Pose
+from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
 
 HOSTILE = "</script><script>alert(1)</script> & \u2028\u202e]]> {title} <!--"
 
@@ -45,6 +48,24 @@ def url(tmp_path: Path) -> str:
             record(memory, episode)
         memory.flush()
     return url
+
+
+async def test_a_document_has_the_places_that_a_search_refused_and_those_that_its_costmap_excludes(
+    tmp_path: Path,
+) -> None:
+    url = f"sqlite:///{tmp_path / 'memory.db'}"
+    async with Memory.open(url) as memory:
+        async with memory.episode(description="where to stand"):
+            with BulletWorld(), simulated_robot:
+                robot = Object("pr2", ObjectType.ROBOT)
+                Object("kitchen", ObjectType.ENVIRONMENT)
+                CostmapLocation(Pose([1.3, 1, 0.9]), reachable_for=robot).resolve()
+        await memory.flush()
+        async with memory.session() as session:
+            row = (await session.scalars(select(LocationResolution))).one()
+    (location,) = (await document_of(url))["locations"]
+    assert sum(location["refused"].values()) == row.refused == row.considered - 1
+    assert location["excluded"] == {"occupied": row.occupied_cells}
 
 
 async def document_of(url: str, **window: Any) -> dict[str, Any]:

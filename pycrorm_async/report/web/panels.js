@@ -125,9 +125,13 @@ export class Panels {
     const list = listOf(facts);
     const places = episode.locations.filter((each) => each.node === node.start).slice(0, LISTED_MAX);
     const chosen = places.map((each) => {
-      const refused = Object.entries(each.refused).map(([reason, count]) => `${count} ${reason}`).join(", ");
-      const text = `${each.location}: ${each.offered} of ${each.considered} places offered`;
-      return element("p", {}, this.#moment(each.at), " ", recorded(refused ? `${text}; refused: ${refused}` : text));
+      const counted = (title, counts) => {
+        const listed = Object.entries(counts).map(([reason, count]) => `${count} ${reason}`).join(", ");
+        return listed ? `; ${title}: ${listed}` : "";
+      };
+      const offered = `${each.location}: ${each.offered} of ${each.considered} places offered`;
+      const text = offered + counted("refused", each.refused) + counted("not considered", each.excluded);
+      return element("p", {}, this.#moment(each.at), " ", recorded(text));
     });
     const whole = node.parent === null ? this.#episodeFacts() : [];
     const alike = similarTo(node, this.similar, (start) => this.#node(start));
