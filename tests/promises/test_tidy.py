@@ -134,7 +134,7 @@ def test_no_folder_but_that_of_the_verbs_has_more_than_twelve_modules() -> None:
 
 
 def test_every_module_has_a_docstring() -> None:
-    assert names_of([path for path in MODULES if not ast.get_docstring(ast.parse(path.read_text()))]) == []
+    assert names_of([path for path in MODULES if not re.match(r'"""[^"\s]', path.read_text())]) == []
 
 
 def test_every_docstring_of_the_package_opens_with_a_sentence() -> None:
@@ -142,10 +142,13 @@ def test_every_docstring_of_the_package_opens_with_a_sentence() -> None:
 
 
 def test_locals_and_parameters_are_nouns() -> None:
+    is_possible = re.compile(rf"\b({'|'.join(ADVERBS_AND_PARTICIPLES)})\b")  # most files need not be parsed
     violations = {
         f"{path.relative_to(ROOT)}:{node.lineno}: {name}"
         for path in MODULES
-        for function in ast.walk(ast.parse(path.read_text()))
+        for source in [path.read_text()]
+        if is_possible.search(source)
+        for function in ast.walk(ast.parse(source))
         if isinstance(function, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
         for node in ast.walk(function)
         if isinstance(node, ast.arg | ast.Name)
