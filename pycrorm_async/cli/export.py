@@ -137,9 +137,11 @@ def _again(manifest: Path, out: Path | None, url: str, spool: Path | None, *, fo
     note_pending_events(url, spool)
     if as_json:
         file = comparison.exported and out
-        print_json({"same": comparison.same, "differences": comparison.differences, "file": file})
+        outcome = {"same": comparison.same, "by_bytes": comparison.by_bytes, "differences": comparison.differences}
+        print_json({**outcome, "file": file})
     else:
-        print_line("the same bytes" if comparison.same else "not the same")
+        same = "the same bytes" if comparison.by_bytes else "the same episode and changes; rerun gives random ids"
+        print_line(same if comparison.same else "not the same")
         for each in comparison.differences:
             print_line(f"  {each}")
     return 0 if comparison.same else 1

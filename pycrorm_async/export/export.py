@@ -65,11 +65,20 @@ class Exported(NamedTuple):
 
 
 class ExportComparison(NamedTuple):
-    """An export that was made again: whether its files have the same bytes, and one line for each other difference."""
+    """An export that was made again.
+
+    Attributes:
+        same: whether its files have the same bytes; of a rerun recording, whose chunks have random ids, whether nothing
+            else differs.
+        differences: one line for each other difference.
+        exported: the new file, if one was asked for.
+        by_bytes: False for a rerun recording, whose bytes are not compared.
+    """
 
     same: bool
     differences: tuple[str, ...]
     exported: Exported | None
+    by_bytes: bool = True
 
 
 def format_of(path: Path) -> FileFormat:
@@ -200,10 +209,9 @@ async def export_again(
         differences.append(f"version of the tables: {now.tables} instead of {before.tables}")
     if before.rows != now.rows:
         differences.append(f"rows: {now.rows} instead of {before.rows}")
-    same = [*before.files.values()] == [*now.files.values()]
-    if before.file_format == "rrd":  # whose chunks have random ids
-        same = not differences
-    return ExportComparison(same, tuple(differences), exported if path is not None else None)
+    by_bytes = before.file_format != "rrd"
+    same = [*before.files.values()] == [*now.files.values()] if by_bytes else not differences
+    return ExportComparison(same, tuple(differences), exported if path is not None else None, by_bytes)
 
 
 def _named_by(

@@ -394,6 +394,9 @@ def test_the_command_writes_compares_and_names_mistakes_in_one_line(kitchen: Pat
     assert (answer["format"], answer["episodes"], [*answer["files"]]) == ("parquet", 2, ["both.parquet"])
     done = pycrorm("export", "--again", tmp_path / "both.parquet.manifest.json", cwd=kitchen)
     assert (done.returncode, done.stdout) == (0, "the same bytes\n")
+    pycrorm("export", "3", "--out", tmp_path / "three.rrd", cwd=kitchen)
+    done = pycrorm("export", "--again", tmp_path / "three.rrd.manifest.json", cwd=kitchen)
+    assert (done.returncode, done.stdout) == (0, "the same episode and changes; rerun gives random ids\n")
     done = pycrorm("export", "1", "--out", tmp_path / "both.parquet", cwd=kitchen)
     assert (done.returncode, "exists: add --force" in one_line_of(done)) == (2, True)
     with_milk = "--with", "object=milk", "--with", "limit=1", "--with", "recovered=true"
