@@ -68,7 +68,7 @@ def export(
     images: Annotated[
         str | None, typer.Option(metavar="WIDTHxHEIGHT", help="Of lerobot: a picture of the scene at each frame.")
     ] = None,
-    force: Annotated[bool, typer.Option("--force", help="Replace the file if it exists.")] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace the file and its manifest if they exist.")] = False,
     url: UrlOption = DEFAULT_URL,
     spool: SpoolOption = None,
     as_json: JsonOption = False,

@@ -125,17 +125,18 @@ async def export(
         images: of LeRobot: width and height of a picture of the scene at each frame, which needs the extra `world`.
         report_progress: gets the number of rows, or events, done and of all.
 
-    Raises `CallerError` if the file exists, if nothing has this name, or for a running episode; `UnknownEpisode`;
-    `MissingExtra`; `OSError` if the disk is full, and then leaves no file.
+    Raises `CallerError` if the file or its manifest exists, if nothing has this name, or for a running episode;
+    `UnknownEpisode`; `MissingExtra`; `OSError` if the disk is full, and then leaves no file.
     """
     target = Path(path)
     refuse_existing(target, force=force, folder=True)
+    refuse_existing(manifest_path(target), force=force)
     chosen = file_format or format_of(target)
     if chosen not in get_args(FileFormat):
         raise CallerError(f"there is no format {chosen!r}{nearest(chosen, get_args(FileFormat))}; formats: {_listed()}")
     options = _options(chosen, clock, fps, images)
     left_out = 0
-    with new_file(manifest_path(target), force=True) as described:
+    with new_file(manifest_path(target), force=force) as described:
         match chosen:
             case "parquet" | "csv" | "jsonl":
                 selection = await select_rows(reading, what, episodes, arguments=arguments)

@@ -321,6 +321,11 @@ async def test_a_file_is_replaced_only_when_asked(reading: Reading, tmp_path: Pa
     with files_of_at_most(DISK_BYTES), pytest.raises(OSError, match="File too large"):
         await export(reading, LARGE, file, force=True)
     assert file.read_text() == "mine"
+    manifest = tmp_path / "new.csv.manifest.json"
+    manifest.write_text("mine")
+    with pytest.raises(CallerError, match=r"new.csv.manifest.json exists: add --force"):
+        await export(reading, "1", tmp_path / "new.csv")
+    assert (manifest.read_text(), (tmp_path / "new.csv").exists()) == ("mine", False)
     await export(reading, "1", file, force=True)
     assert file.read_text().startswith('"id"')
 
