@@ -259,7 +259,7 @@ async def test_options_of_lerobot_are_refused_for_rows(reading: Reading, tmp_pat
 
 
 def test_lerobots_own_loader_reads_it(dataset: Path) -> None:
-    pytest.importorskip("lerobot", reason="lerobot brings torch, 6 GB: run this test in an environment that has both")
+    pytest.importorskip("lerobot", reason="LeRobot brings torch, 6 GB: tests/README.md has the commands")
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     loaded = LeRobotDataset("local/kitchen", root=dataset, delta_timestamps={"action": [0.0, 0.1]})
