@@ -21,6 +21,7 @@ from pycrorm_async.query.asking.ask import Ask
 from pycrorm_async.query.asking.episode_diff import EpisodeDiff
 from pycrorm_async.query.asking.question import AskedEpisode, Question
 from pycrorm_async.query.frames.arrow_batches import BATCH_ROWS
+from pycrorm_async.query.frames.columns import FrameQuery
 from pycrorm_async.query.frames.dataframe import Library
 from pycrorm_async.query.notebook.listings import Episodes, TaskTree
 from pycrorm_async.query.reading import Reading
@@ -81,7 +82,7 @@ class ReadableMemory(PartsHolder):
     @overload
     async def dataframe(
         self,
-        statement: Select[*tuple[Any, ...]],
+        statement: FrameQuery,
         *,
         to: Literal["pandas"] = "pandas",
         simulated: bool = False,
@@ -91,7 +92,7 @@ class ReadableMemory(PartsHolder):
     @overload
     async def dataframe(
         self,
-        statement: Select[*tuple[Any, ...]],
+        statement: FrameQuery,
         *,
         to: Library,
         simulated: bool = False,
@@ -100,7 +101,7 @@ class ReadableMemory(PartsHolder):
 
     async def dataframe(
         self,
-        statement: Select[*tuple[Any, ...]],
+        statement: FrameQuery,
         *,
         to: Library = "pandas",
         simulated: bool = False,
@@ -109,6 +110,7 @@ class ReadableMemory(PartsHolder):
         """Return the rows as a frame of pandas, polars or Arrow (extra `frames`), typed as the columns are declared.
 
         Args:
+            statement: a select, a union of selects, a mapped class, or a question of `ask`.
             to: the library: `pandas`, `polars` or `arrow`.
             simulated: include the rows of simulations.
             deferred: include the columns of mapped classes that their objects load on request.
@@ -117,7 +119,7 @@ class ReadableMemory(PartsHolder):
 
     def batches(
         self,
-        statement: Select[*tuple[Any, ...]],
+        statement: FrameQuery,
         *,
         rows: int = BATCH_ROWS,
         simulated: bool = False,

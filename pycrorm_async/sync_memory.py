@@ -20,8 +20,6 @@ from os import PathLike
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar, overload
 
-from sqlalchemy import Select
-
 from pycrorm_async.errors import CallerError, FlushTimeout
 from pycrorm_async.memory_parts import MemoryStatus
 from pycrorm_async.memory_recording import RecordingMemory
@@ -29,6 +27,7 @@ from pycrorm_async.query.as_of import AnyEpisode
 from pycrorm_async.query.asking.ask import Ask
 from pycrorm_async.query.asking.episode_diff import EpisodeDiff
 from pycrorm_async.query.asking.question import AskedEpisode, Question, SyncQuestion
+from pycrorm_async.query.frames.columns import FrameQuery
 from pycrorm_async.query.frames.dataframe import Library
 from pycrorm_async.query.notebook.listings import Episodes, TaskTree
 from pycrorm_async.query.snapshot import Moment
@@ -192,7 +191,7 @@ class SyncMemory:
     @overload
     def dataframe(
         self,
-        statement: Select[*tuple[Any, ...]],
+        statement: FrameQuery | SyncQuestion,
         *,
         to: Literal["pandas"] = "pandas",
         simulated: bool = False,
@@ -202,7 +201,7 @@ class SyncMemory:
     @overload
     def dataframe(
         self,
-        statement: Select[*tuple[Any, ...]],
+        statement: FrameQuery | SyncQuestion,
         *,
         to: Library,
         simulated: bool = False,
@@ -211,15 +210,17 @@ class SyncMemory:
 
     def dataframe(
         self,
-        statement: Select[*tuple[Any, ...]],
+        statement: FrameQuery | SyncQuestion,
         *,
         to: Library = "pandas",
         simulated: bool = False,
         deferred: bool = False,
     ) -> Any:
         """Return the rows as a frame of pandas, polars or Arrow; see `Memory.dataframe`."""
-        return self._await(self._memory.reading.dataframe(statement, to=to, simulated=simulated, deferred=deferred))
+        query = statement.question if isinstance(statement, SyncQuestion) else statement
+        return self._await(self._memory.reading.dataframe(query, to=to, simulated=simulated, deferred=deferred))
 
-    def export(self, what: Exportable, path: str | PathLike[str], **options: Any) -> Exported:
+    def export(self, what: Exportable | SyncQuestion, path: str | PathLike[str], **options: Any) -> Exported:
         """Write episodes or rows to a file; see `Memory.export`, which has the same options."""
-        return self._await(self._memory.export(what, path, **options))
+        exported = what.question if isinstance(what, SyncQuestion) else what
+        return self._await(self._memory.export(exported, path, **options))

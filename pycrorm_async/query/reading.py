@@ -35,6 +35,7 @@ from pycrorm_async.query.asking.episode_diff import EpisodeDiff, diff_episodes
 from pycrorm_async.query.asking.episode_list import EpisodeChoice
 from pycrorm_async.query.asking.question import AskedEpisode, Question
 from pycrorm_async.query.frames.arrow_batches import BATCH_ROWS, arrow_batches
+from pycrorm_async.query.frames.columns import FrameQuery, select_of
 from pycrorm_async.query.frames.dataframe import Library, dataframe
 from pycrorm_async.query.named_queries import EpisodeSummary
 from pycrorm_async.query.notebook.listings import Episodes, TaskTree
@@ -140,7 +141,7 @@ class Reading:
     @overload
     async def dataframe(
         self,
-        statement: Select[*tuple[Any, ...]],
+        statement: FrameQuery,
         *,
         to: Literal["pandas"] = "pandas",
         simulated: bool = False,
@@ -150,7 +151,7 @@ class Reading:
     @overload
     async def dataframe(
         self,
-        statement: Select[*tuple[Any, ...]],
+        statement: FrameQuery,
         *,
         to: Library,
         simulated: bool = False,
@@ -159,7 +160,7 @@ class Reading:
 
     async def dataframe(
         self,
-        statement: Select[*tuple[Any, ...]],
+        statement: FrameQuery,
         *,
         to: Library = "pandas",
         simulated: bool = False,
@@ -167,17 +168,20 @@ class Reading:
     ) -> Any:
         """Return the rows as a frame of pandas, polars or Arrow, typed as the columns are declared.
 
-        `pycrorm_async.query.frames` lists the types. With `deferred` a mapped class contributes the columns too that
-        its objects load on request. Raises `MissingExtra` where the library is not installed.
+        `pycrorm_async.query.frames` lists the types. `statement` is a select, a union of selects, a mapped class, or a
+        question of `ask`. With `deferred` a mapped class contributes the columns too that its objects load on request.
+
+        Raises `MissingExtra` where the library is not installed, and `CallerError` for SQL as text, which `query` runs.
         """
         await self._ready()
+        statement = await self._select_of(statement)
         with self._log.translated():
             async with self._connection(simulated=simulated) as connection:
                 return await dataframe(connection, statement, to=to, deferred=deferred)
 
     async def batches(
         self,
-        statement: Select[*tuple[Any, ...]],
+        statement: FrameQuery,
         *,
         rows: int = BATCH_ROWS,
         simulated: bool = False,
@@ -193,6 +197,7 @@ class Reading:
         errors are those of `dataframe`.
         """
         await self._ready()
+        statement = await self._select_of(statement)
         with self._log.translated():
             async with (
                 self._connection(simulated=simulated) as connection,
@@ -202,6 +207,9 @@ class Reading:
             ):
                 async for batch in batches:
                     yield batch
+
+    async def _select_of(self, query: FrameQuery) -> Select[*tuple[Any, ...]]:
+        return await query.resolved() if isinstance(query, Question) else select_of(query)
 
     async def query(self, sql: str, limits: SqlLimits = DEFAULT_LIMITS) -> SqlResult:
         """Return the rows of one query in SQL that can only read; see `pycrorm_async.query.sql.read_only`.

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import sys
 from collections.abc import AsyncIterator
+from typing import Any
 
 import pandas as pd
 import polars as pl
 import pyarrow as pa
 import pytest
-from sqlalchemy import Text, func, null, select, type_coerce
+from sqlalchemy import Text, func, null, select, text, type_coerce, union_all
 
-from pycrorm_async.errors import CallerError, MissingExtra
+from pycrorm_async.errors import CallerError, MissingExtra, UnknownEpisode
 from pycrorm_async.orm import Action, NavigateAction, PickUpAction, PickUpWithContextView, Pose, TaskTreeNode
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.store.address import DatabaseAddress
@@ -58,12 +59,21 @@ async def test_columns_have_their_declared_types_with_all_some_and_no_values(rea
 
 
 async def test_a_frame_of_pandas_has_these_types_also_without_a_value(reading: Reading) -> None:
-    text = pd.Series(["text"]).dtype
+    texts = pd.Series(["text"]).dtype
     frame = await reading.dataframe(OF_EACH_KIND.where(NODE.kind == "root", NODE.process_metadata_id == 1))
     times = ["datetime64[us, UTC]"] * 2
-    assert [*map(str, frame.dtypes)] == ["int64", str(text), *times, str(text), "float64", "bool", "Int64", "object"]
+    assert [*map(str, frame.dtypes)] == ["int64", str(texts), *times, str(texts), "float64", "bool", "Int64", "object"]
     empty = await reading.dataframe(OF_EACH_KIND.where(NODE.id < 0))
-    assert [*map(str, empty.dtypes)] == ["Int64", str(text), *times, str(text), "float64", "boolean", "Int64", "object"]
+    assert [*map(str, empty.dtypes)] == [
+        "Int64",
+        str(texts),
+        *times,
+        str(texts),
+        "float64",
+        "boolean",
+        "Int64",
+        "object",
+    ]
 
 
 async def test_a_frame_of_polars_has_these_types_and_values(reading: Reading) -> None:
@@ -80,6 +90,38 @@ async def test_json_is_a_value_in_pandas_and_text_elsewhere(reading: Reading) ->
     question = select(Action.parameters).where(Action.dtype == "SayingAction").limit(1)
     assert (await reading.dataframe(question)).parameters.tolist() == [{"text": "hi"}]
     assert (await reading.dataframe(question, to="arrow")).to_pylist() == [{"parameters": '{"text":"hi"}'}]
+
+
+async def test_json_that_a_class_loads_on_request_is_a_value_in_pandas(reading: Reading) -> None:
+    await reading.refresh()
+    frame = await reading.dataframe(select(reading.mapped("SayingAction")).limit(1), deferred=True)
+    assert frame.parameters.tolist() == [{"text": "hi"}]
+
+
+async def test_a_class_a_question_and_a_union_have_frames(reading: Reading) -> None:
+    whole = await reading.dataframe(PickUpAction)
+    pd.testing.assert_frame_equal(whole, await reading.dataframe(select(PickUpAction)))
+    asked = reading.ask.durations(episode=2)
+    pd.testing.assert_frame_equal(await reading.dataframe(asked), await asked)
+    with pytest.raises(UnknownEpisode):
+        await reading.dataframe(reading.ask.durations(episode=99))
+    parts = [select(NODE.id, NODE.start_time, NODE.status).where(NODE.process_metadata_id == each) for each in (1, 2)]
+    union = await reading.dataframe(union_all(*parts), to="arrow")
+    assert (union.schema.types, union.num_rows) == ([pa.int64(), TIME, ENUM], 8)
+    (batch,) = [each async for each in reading.batches(PickUpAction)]
+    assert batch.num_rows == 2
+
+
+@pytest.mark.parametrize("query", ["SELECT 1", text("SELECT 1"), text("SELECT 1 AS x").columns()])
+async def test_sql_as_text_is_refused_with_the_call_that_runs_it(reading: Reading, query: Any) -> None:
+    with pytest.raises(CallerError, match=r"SQL as text declares none: `\(await memory.query\(sql\)\).frame\(\)`"):
+        await reading.dataframe(query)
+
+
+@pytest.mark.parametrize("query", [7, int, Pose.x])
+async def test_what_has_no_rows_is_refused(reading: Reading, query: Any) -> None:
+    with pytest.raises(CallerError, match="a frame can be of a select, a mapped class or a question, not of "):
+        await reading.dataframe(query)
 
 
 async def test_batches_have_one_schema_and_the_rows_of_the_frame_in_order(reading: Reading) -> None:

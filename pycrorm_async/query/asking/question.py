@@ -83,16 +83,16 @@ class Question:
 
     async def frame(self, *, to: Library = "pandas", simulated: bool = False) -> Any:
         """Return the answer as a frame; see `Reading.dataframe`. Raises `UnknownEpisode`, `MissingExtra`."""
-        return await self._reading.dataframe(await self._resolved(), to=to, simulated=simulated)
+        return await self._reading.dataframe(await self.resolved(), to=to, simulated=simulated)
 
     async def rows(self, *, simulated: bool = False) -> list[Row[*tuple[Any, ...]]]:
         """Return the answer as named tuples, which needs no extra. Raises `UnknownEpisode`."""
-        return await self._reading.rows(await self._resolved(), simulated=simulated)
+        return await self._reading.rows(await self.resolved(), simulated=simulated)
 
     def __await__(self) -> Generator[Any, Any, Any]:
         return self.frame().__await__()
 
-    async def _resolved(self) -> Select[*tuple[Any, ...]]:
+    async def resolved(self) -> Select[*tuple[Any, ...]]:
         """Return the select with the number of the episode in place of a subquery, so that databases plan better."""
         if self.episode is None:
             return self._plan.select_of(episode=None)
@@ -118,26 +118,26 @@ class SyncQuestion:
 
     def __init__(self, question: Question, run: Callable[[Coroutine[Any, Any, Any]], Any]) -> None:
         self.name = question.name
-        self._question = question
+        self.question = question
         self._run = run
 
     @property
     def statement(self) -> Select[*tuple[Any, ...]]:
         """The select; see `Question.statement`."""
-        return self._question.statement
+        return self.question.statement
 
     @property
     def sql(self) -> str:
         """The statement in the SQL of this memory's database, with all values written out."""
-        return self._question.sql
+        return self.question.sql
 
     def frame(self, *, to: Library = "pandas", simulated: bool = False) -> Any:
         """Return the answer as a frame; see `Question.frame`."""
-        return self._run(self._question.frame(to=to, simulated=simulated))
+        return self._run(self.question.frame(to=to, simulated=simulated))
 
     def rows(self, *, simulated: bool = False) -> list[Row[*tuple[Any, ...]]]:
         """Return the answer as named tuples, which needs no extra."""
-        rows: list[Row[*tuple[Any, ...]]] = self._run(self._question.rows(simulated=simulated))
+        rows: list[Row[*tuple[Any, ...]]] = self._run(self.question.rows(simulated=simulated))
         return rows
 
     def __str__(self) -> str:

@@ -12,4 +12,5 @@
 
 The type of a column is that of its SQLAlchemy expression and never derived from the values, so that a column without
 any value has it too. Only an expression without a type, such as `func.round(...)`, gets that of its first values.
+SQLAlchemy gives `func.sum` the type of what it sums, so a sum of a bool column is a bool: sum `cast(column, Integer)`.
 """

@@ -7,11 +7,12 @@ columns of one name become `x` and `x_1`.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
 
 from sqlalchemy import (
     BigInteger,
     Boolean,
+    CompoundSelect,
     Date,
     DateTime,
     Double,
@@ -23,7 +24,10 @@ from sqlalchemy import (
     Select,
     String,
     Text,
+    TextClause,
+    TextualSelect,
     inspect,
+    select,
     type_coerce,
 )
 from sqlalchemy.ext.hybrid import HybridExtensionType
@@ -31,8 +35,15 @@ from sqlalchemy.orm import Mapper
 from sqlalchemy.sql.functions import FunctionElement
 from sqlalchemy.types import TypeEngine
 
+from pycrorm_async.errors import CallerError
 from pycrorm_async.orm.designators import ClassOfRow
 from pycrorm_async.orm.types import EnumName, JsonText, Moment
+
+if TYPE_CHECKING:
+    from pycrorm_async.query.asking.question import Question
+
+FrameQuery: TypeAlias = "Select[*tuple[Any, ...]] | CompoundSelect[*tuple[Any, ...]] | type[Any] | Question"
+"""A query that has a frame: a select, a union of selects, a mapped class, whose rows are all meant, or a question."""
 
 ColumnKind: TypeAlias = Literal[
     "integer", "number", "bool", "text", "enum", "time", "json", "bytes", "date", "local time", "untyped"
@@ -63,6 +74,22 @@ class FrameColumn(NamedTuple):
     name: str
     expression: Any
     kind: ColumnKind
+
+
+def select_of(query: object) -> Select[*tuple[Any, ...]]:
+    """Return the select of a `FrameQuery` except a question. Raises `CallerError` for anything else."""
+    if isinstance(query, Select):
+        return query
+    if isinstance(query, CompoundSelect):
+        return select(query.subquery())
+    if isinstance(query, type) and getattr(inspect(query, raiseerr=False), "is_mapper", False):
+        return select(query)
+    if isinstance(query, str | TextClause | TextualSelect):
+        raise CallerError(
+            "a frame has the types that a select declares, and SQL as text declares none:"
+            " `(await memory.query(sql)).frame()` has those of its values"
+        )
+    raise CallerError(f"a frame can be of a select, a mapped class or a question, not of {query!r:.100}")
 
 
 def columns_of(statement: Select[*tuple[Any, ...]], *, deferred: bool = False) -> list[FrameColumn]:

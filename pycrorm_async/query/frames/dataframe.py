@@ -37,7 +37,8 @@ async def dataframe(
     table = needed_pyarrow().Table.from_batches([each async for each in batches])
     match to:
         case "pandas":
-            return _pandas(library, table, [each.name for each in columns_of(statement) if each.kind == "json"])
+            columns = columns_of(statement, deferred=deferred)
+            return _pandas(library, table, [each.name for each in columns if each.kind == "json"])
         case "polars":
             return library.from_arrow(table)
         case "arrow":

@@ -23,10 +23,13 @@ import time
 from collections.abc import AsyncIterator
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 from pycrorm_async.errors import QueryRefused
 from pycrorm_async.store.log import EventLog
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 _ROWS_AT_ONCE = 500
 """Bounds the rows that are fetched in one visit to the database."""
@@ -72,6 +75,23 @@ class SqlResult:
     columns: tuple[str, ...]
     rows: list[tuple[Any, ...]]
     more: bool
+
+    @property
+    def names(self) -> list[str]:
+        """The columns' names, the second `x` as `x_1`, as frames have them."""
+        times: dict[str, int] = {}
+        names = []
+        for name in self.columns:
+            times[name] = times.get(name, -1) + 1
+            names.append(f"{name}_{times[name]}" if times[name] else name)
+        return names
+
+    def frame(self) -> pd.DataFrame:
+        """Return the rows as a frame of pandas, which derives the types from the values. Raises `MissingExtra`."""
+        from pycrorm_async.query.frames.dataframe import imported
+
+        frame: pd.DataFrame = imported("pandas").DataFrame(self.rows, columns=self.names)
+        return frame
 
     def _repr_html_(self) -> str:
         from pycrorm_async.query.notebook.answer_view import sql_result_html
