@@ -61,7 +61,7 @@ class LogLines(logging.Handler):
 
 def print_json(document: Any) -> None:
     """Print the JSON document of a `--json` call on stdout."""
-    encoded = msgspec.json.encode(document, enc_hook=str)
+    encoded = msgspec.json.Encoder(enc_hook=str, decimal_format="number").encode(document)
     sys.stdout.write(msgspec.json.format(encoded, indent=2).decode() + "\n")
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import math
 import sys
-from collections.abc import Iterable
 from typing import Annotated, Any, Literal
 
 import typer
@@ -15,6 +14,7 @@ from pycrorm_async.cli.output import counted, note, print_json, print_table
 from pycrorm_async.cli.reading import read_memory
 from pycrorm_async.errors import CallerError
 from pycrorm_async.query.reading import Reading
+from pycrorm_async.query.sql.json_values import json_rows
 from pycrorm_async.query.sql.read_only import SqlLimits, SqlResult
 
 _ROWS = 1_000
@@ -39,7 +39,8 @@ def query(
     """Run one read-only query in SQL: no statement can change the memory or the machine.
 
     On PostgreSQL the login in the URL must have no more rights than the role pycrorm_reader. Times are integers, µs
-    since 1970-01-01 UTC; columns that end in _ns are ns of the robot's monotonic clock.
+    since 1970-01-01 UTC; columns that end in _ns are ns of the robot's monotonic clock. Bytes are hexadecimal
+    digits; JSON has "NaN", "Infinity" and "-Infinity" as texts.
     """
     text = sys.stdin.read() if sql == "-" else sql
     if not 0 < megabytes < math.inf:
@@ -74,23 +75,18 @@ async def _write_csv(reading: Reading, sql: str, limits: SqlLimits) -> bool:
 
 
 def _document(result: SqlResult) -> dict[str, Any]:
-    names = list(_distinct(result.columns))
-    rows = [dict(zip(names, map(_value, row), strict=True)) for row in result.rows]
-    return {"columns": names, "rows": rows, "more": result.more}
-
-
-def _distinct(columns: Iterable[str]) -> Iterable[str]:
-    """Yield the names, the second `x` as `x_1`, as frames have them."""
-    times: dict[str, int] = {}
-    for name in columns:
-        times[name] = times.get(name, -1) + 1
-        yield f"{name}_{times[name]}" if times[name] else name
-
-
-def _value(value: Any) -> Any:
-    return value.hex() if isinstance(value, bytes | memoryview) else value
+    rows = [dict(zip(result.names, row, strict=True)) for row in json_rows(result.rows)]
+    return {"columns": result.names, "rows": rows, "more": result.more}
 
 
 def _cell(value: Any) -> Any:
     """Return a value of the table: numbers with all their digits, bytes in hexadecimal digits."""
-    return repr(value) if isinstance(value, float) else "" if value is None else _value(value)
+    return (
+        repr(value)
+        if isinstance(value, float)
+        else ""
+        if value is None
+        else value.hex()
+        if isinstance(value, bytes | memoryview)
+        else value
+    )

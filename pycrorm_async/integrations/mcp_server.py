@@ -25,6 +25,7 @@ from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary
 from pycrorm_async.query.parameter_text import duration, one_line, parameters_text
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.schema.memory_schema import as_text, read_schema
+from pycrorm_async.query.sql.json_values import json_rows
 from pycrorm_async.query.sql.read_only import SqlLimits
 from pycrorm_async.store.address import DatabaseAddress
 
@@ -196,10 +197,11 @@ class _Tools:
     async def query(self, sql: str) -> str:
         """Run one SELECT on the views that `schema` lists; at most 200 rows, 200 kB and 10 s. It can only read.
 
-        Times are integers, µs since 1970-01-01 UTC; columns that end in _ns are ns of the robot's clock.
+        Times are integers, µs since 1970-01-01 UTC; columns that end in _ns are ns of the robot's clock. Bytes are
+        hexadecimal digits.
         """
         result = await (await self._open()).query(sql, _LIMITS)
-        rows, more = result.rows, result.more
+        rows, more = json_rows(result.rows), result.more
         while True:
             text = _json({"columns": result.columns, "rows": rows, "more_rows_exist": more})
             if len(rows) < 2 or len(text.encode()) <= _ANSWER_BYTES:
@@ -281,7 +283,7 @@ def _short(value: Any) -> Any:
 
 
 def _json(document: Any) -> str:
-    return msgspec.json.encode(document, enc_hook=str).decode()
+    return msgspec.json.Encoder(enc_hook=str, decimal_format="number").encode(document).decode()
 
 
 def _cut(lines: Sequence[str]) -> str:

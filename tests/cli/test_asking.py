@@ -114,6 +114,7 @@ def test_a_closed_pipe_and_closed_streams_are_no_fault(folder: Path) -> None:
 
 def test_a_query_is_printed_as_a_table_as_csv_and_as_json(folder: Path) -> None:
     sql = "SELECT id AS n, status, NULL AS empty, 0.1 + 0.2 AS sum, x'ff00' AS bytes, 1 AS n FROM process_metadata"
+    infinite = "SELECT 1e999 AS x, x'ff00' AS y"
     lines = list(csv.reader(io.StringIO(pycrorm("query", sql, "--format", "csv", cwd=folder).stdout)))
     assert lines[0] == ["n", "status", "empty", "sum", "bytes", "n"]
     assert lines[1] == ["1", lines[1][1], "", "0.30000000000000004", "ff00", "1"]
@@ -122,6 +123,7 @@ def test_a_query_is_printed_as_a_table_as_csv_and_as_json(folder: Path) -> None:
     assert document["columns"] == ["n", "status", "empty", "sum", "bytes", "n_1"]
     assert document["rows"][0]["sum"] == 0.1 + 0.2
     assert not document["more"]
+    assert answer("query", infinite, cwd=folder)["rows"] == [{"x": "Infinity", "y": "ff00"}]
     assert json.loads(pycrorm("query", sql, "--format", "json", cwd=folder).stdout) == document
     shown = pycrorm("query", sql, "--limit", "2", cwd=folder)
     assert "0.30000000000000004" in shown.stdout

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import math
 import time
 from collections.abc import AsyncIterator
@@ -11,11 +12,13 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
+import msgspec
 import psutil
 import pytest
 
 from pycrorm_async.errors import DatabaseUnavailable, QueryRefused
 from pycrorm_async.query.reading import Reading
+from pycrorm_async.query.sql.json_values import json_rows
 from pycrorm_async.query.sql.read_only import DEFAULT_LIMITS, ReadOnlySql, SqlLimits
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
@@ -104,6 +107,22 @@ async def test_a_query_returns_its_columns_and_rows(sql: _Sql) -> None:
     if not sql.is_sqlite:
         text = "SELECT count(*) FROM event, jsonb_each(payload::jsonb) AS member"
     assert (await sql.query(text))[1][0] > (20,)
+
+
+async def test_rows_are_the_same_json_on_both_databases(sql: _Sql) -> None:
+    written = (
+        "x'00ff', 1e999, -1e999" if sql.is_sqlite else r"'\x00ff'::bytea, 'Infinity'::float8, '-Infinity'::numeric"
+    )
+    rows = (await sql.query(f"SELECT sum(id), avg(id), NULL, {written} FROM process_metadata"))[1]
+    encoded = msgspec.json.Encoder(decimal_format="number").encode(json_rows(rows))
+    assert json.loads(encoded) == [[3, 1.5, None, "00ff", "Infinity", "-Infinity"]]
+
+
+async def test_an_answer_is_a_frame_of_pandas(reader_url: str) -> None:
+    async with Reading.open(reader_url) as reading:
+        frame = (await reading.query("SELECT id AS n, status, id AS n FROM process_metadata ORDER BY id")).frame()
+    assert [*frame.columns] == ["n", "status", "n_1"]
+    assert frame.n.tolist() == [1, 2]
 
 
 async def test_more_rows_than_the_limit_are_reported(sql: _Sql) -> None:

@@ -108,6 +108,9 @@ async def test_an_agent_asks_with_every_tool(url: str) -> None:
         assert "µs since 1970-01-01 00:00 UTC" in await agent.ask("schema", view="pose")
         counted = await agent.ask("query", sql="SELECT count(*) AS n FROM process_metadata")
         assert counted == {"columns": ["n"], "rows": [[2]], "more_rows_exist": False}
+        written = "x'00ff'" if url.startswith("sqlite") else r"'\x00ff'::bytea"
+        of_bytes = await agent.ask("query", sql=f"SELECT avg(id), {written} FROM process_metadata")
+        assert of_bytes["rows"] == [[1.5, "00ff"]]
 
 
 async def test_a_wrong_call_is_an_error_of_the_tool_in_one_line(url: str) -> None:
