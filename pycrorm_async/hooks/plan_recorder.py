@@ -24,7 +24,7 @@ from contextlib import nullcontext
 from contextvars import ContextVar
 from typing import Any, Literal
 
-from pycrorm_async.errors import DeclarationRefused, EpisodeRefused, SpoolFull, Unrecordable
+from pycrorm_async.errors import DeclarationRefused, EpisodeRefused, Unrecordable
 from pycrorm_async.events.values import NodeReference
 from pycrorm_async.hooks.declaration import Declarations
 from pycrorm_async.hooks.episode import Episode, NodeRecord
@@ -169,10 +169,8 @@ class Recorder:
     # --- the port of the plan layer ----------------------------------------------------------------------------------
 
     def admit(self) -> Awaitable[None] | None:
-        if self._emitter.is_closed or not self._emitter.sink.full:
+        if self._emitter.is_closed or not self._emitter.must_wait():
             return None
-        if self._emitter.settings.on_full == "fail":
-            raise SpoolFull("the spool is full (spool_bytes_max) and on_full is 'fail': start a writer to drain it")
         return self._emitter.sink.room()
 
     def node_started(self, node: TaskTreeNode) -> None:

@@ -38,6 +38,11 @@ class _ThreadState(threading.local):
 _this_thread = _ThreadState()
 
 
+def may_wait() -> bool:
+    """Return if this thread may wait for room in the spool: it holds no lock, and is none of those that make room."""
+    return not _this_thread.is_busy and not _this_thread.is_of_memory
+
+
 class OrderedCalls:
     """The calls of one episode."""
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Hashable, Mapping, Sequence
 from enum import Enum
 from types import TracebackType
@@ -19,12 +18,9 @@ from pycrorm_async.events.values import (
 )
 from pycrorm_async.recording.checked_arguments import pose_of, struct_of
 from pycrorm_async.recording.ordered_calls import counted, noted
-from pycrorm_async.recording.recorded_nodes import RecordedNodes
+from pycrorm_async.recording.recorded_nodes import FOREVER_S, RecordedNodes
 from pycrorm_async.recording.writing.observing import put_observation
 from pycrorm_async.world.pose import Pose
-
-_ROOM_POLL_S = 0.005
-"""The pause in s between two looks at a full spool."""
 
 
 class RecordedEpisode(RecordedNodes):
@@ -178,13 +174,10 @@ class RecordedEpisode(RecordedNodes):
 
     @counted("EpisodeStarted")
     def wait_for_room(self, timeout_s: float | None = None) -> bool:
-        """Block while the spool is full, before a node starts; return whether it has room now.
+        """Block while the spool is full, for a limited time; return whether it has room now.
 
-        A start that finds no room uses the reserve of the spool, and blocks when that is used up as well.
+        `start` waits by itself, without a limit; so this is for an executive that has something else to do then.
         """
-        deadline = None if timeout_s is None else time.monotonic() + timeout_s
-        while not self.emitter.is_closed and self.emitter.sink.full:
-            if deadline is not None and time.monotonic() >= deadline:
-                return False
-            time.sleep(_ROOM_POLL_S)
-        return not self.emitter.is_closed
+        sink = self.emitter.sink
+        has_room = not sink.full or sink.block_until_room(FOREVER_S if timeout_s is None else timeout_s, reserved=False)
+        return has_room and not self.emitter.is_closed

@@ -29,7 +29,7 @@ from pycrorm_async.events.values import (
 )
 from pycrorm_async.recording.checked_arguments import END_STATUSES, ArgumentReader, struct_of
 from pycrorm_async.recording.declarations.declared_type import DeclaredType
-from pycrorm_async.recording.ordered_calls import OrderedCalls, counted, noted
+from pycrorm_async.recording.ordered_calls import OrderedCalls, counted, may_wait, noted
 from pycrorm_async.recording.recorded_objects import RecordedObjects
 from pycrorm_async.recording.recorded_values import Convert, RecordedValues
 from pycrorm_async.recording.values.texts import clean_repr
@@ -39,6 +39,8 @@ from pycrorm_async.recording.writing.episode_writer import EpisodeWriter
 from pycrorm_async.recording.writing.open_episodes import OpenEpisodes
 
 P = ParamSpec("P")
+FOREVER_S = 1e8
+"""The seconds that a start waits for room: three years, because a wait takes a number."""
 _ENDED_MAX = 1_000
 """Bounds the keys of ended nodes that a child can still name as its parent."""
 
@@ -119,6 +121,8 @@ class RecordedNodes(EpisodeWriter[_Node]):
     ) -> Hashable:
         """Record that a node started; return it.
 
+        Waits while the spool is full. With `on_full="fail"`, the node is counted as a fault then, and not recorded.
+
         The returned value can be passed as `parent` and `node` in place of the key, also long after the node has ended
         and its key names another one.
 
@@ -130,6 +134,8 @@ class RecordedNodes(EpisodeWriter[_Node]):
             robot: the state of the robot that acts, or the key of its object.
         """
         hash(key)
+        if self.emitter.must_wait() and may_wait():
+            self.emitter.sink.block_until_room(FOREVER_S, reserved=False)
         missing: dict[str, str] = {}
         prepared = self.id
         values = noted(self.emitter, "NodeStarted", self._values.parameters, type, parameters, missing) or {}

@@ -85,7 +85,7 @@ class ListSink:
     async def room(self) -> None:
         await self.space.wait()
 
-    def block_until_room(self, timeout_s: float) -> bool:
+    def block_until_room(self, timeout_s: float, *, reserved: bool = True) -> bool:
         return True
 
     def of(self, episode: Episode | EpisodeId) -> list[tuple[int, Happening]]:

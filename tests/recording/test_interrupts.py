@@ -8,13 +8,10 @@ Where an interrupt leaves a lock taken or the garbage collector off, what follow
 
 from __future__ import annotations
 
-import asyncio
 import gc
 import inspect
-import os
 import sys
 import threading
-from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
@@ -25,22 +22,15 @@ import pytest
 
 import pycrorm_async
 from pycrorm_async import Settings
-from pycrorm_async.clock import SYSTEM_CLOCK
-from pycrorm_async.events.codec import decode
-from pycrorm_async.events.ids import episode_id
 from pycrorm_async.events.order import OrderCheck
 from pycrorm_async.events.types import EpisodeEnded, Happening, NodeEnded, NodeStarted
 from pycrorm_async.hooks.plan_recorder import Recorder, current_episode
 from pycrorm_async.plan.designator import ActionAbstract
 from pycrorm_async.plan.execution.observer import recorder as observing
 from pycrorm_async.plan.failures import PlanFailure
-from pycrorm_async.queue.live.recorder_queue import RecorderQueue
-from pycrorm_async.recording.declarations.known_types import KnownTypes
-from pycrorm_async.recording.recording import Recording
-from pycrorm_async.recording.writing.emitter import Emitter
-from pycrorm_async.recording.writing.open_episodes import OpenEpisodes
 from pycrorm_async.world.pose import Pose
 from tests.hooks.fakes import NoteActionPerformable
+from tests.recording.recorded_queue import Recorded
 
 PACKAGE = str(Path(pycrorm_async.__file__).parent)
 HANGS_S = 20.0
@@ -78,47 +68,6 @@ class Interrupt:
             sys.setprofile(None)
         assert self.left > 0, f"the interrupt in {self.place} was swallowed"
         return False
-
-
-class Recorded:
-    """A recording without a database, and what is in its queue."""
-
-    def __init__(self, folder: Path, settings: Settings) -> None:
-        name = episode_id(SYSTEM_CLOCK.wall_ns(), os.urandom(10))
-        self.queue = RecorderQueue.create(folder, settings=settings, clock=SYSTEM_CLOCK, recorder=name)
-        self.emitter = Emitter(self.queue, settings)
-        self.episodes = OpenEpisodes(self.emitter, SYSTEM_CLOCK)
-        self.hangs = False
-        self.recording = Recording(self.emitter, self.episodes, KnownTypes(lambda _dtype: None), (), software="test")
-
-    def end_open_episodes(self) -> None:
-        """End the episodes as closing a memory does, in another thread, which a lock that was left taken stops."""
-
-        def end() -> None:
-            for each in self.episodes.all:
-                self.episodes.close(each, asyncio.CancelledError("the memory was closed"))
-
-        if self.episodes.all:
-            thread = threading.Thread(target=end, daemon=True)
-            thread.start()
-            thread.join()
-
-    def logs(self) -> list[list[tuple[int, Happening]]]:
-        """Return the events of each episode, with their sequences."""
-        events: defaultdict[bytes, list[tuple[int, Happening]]] = defaultdict(list)
-
-        async def read() -> None:
-            await self.queue.synced_to()
-            left = self.queue.written
-            while left:
-                batch = await self.queue.get_batch(events_max=10_000, bytes_max=2**26, age_s_max=0)
-                left -= len(batch)
-                for each in batch:
-                    if each.episode is not None:
-                        events[each.episode].append((each.sequence, decode(each.type, each.payload)))
-
-        asyncio.run(read())
-        return list(events.values())
 
 
 @pytest.fixture

@@ -37,7 +37,7 @@ _LAST_SYNC_S = 30.0
 """Bounds the time that `release` waits for the last sync; a disk that takes longer has failed."""
 _log = logging.getLogger("pycrorm_async")
 _WAIT_WARNING_S = 2.0
-"""`room` logs one warning if it waits longer than this."""
+"""A wait for room logs one warning if it takes longer than this."""
 
 
 class RecorderQueue(QueueFiles):
@@ -143,21 +143,27 @@ class RecorderQueue(QueueFiles):
             self.folder.parent,
         )
 
-    def block_until_room(self, timeout_s: float) -> bool:
-        """Block this thread until a reserved event fits or the queue refuses all events; False after `timeout_s`.
+    def block_until_room(self, timeout_s: float, *, reserved: bool = True) -> bool:
+        """Block this thread until an event fits or the queue refuses all events; False after `timeout_s`.
 
-        Raises `SpoolStuck` as `room` does. Returns False at once in the sync thread, which frees the space: a finalizer
-        that runs there may end a plan, and with it record an event.
+        Warns, and raises `SpoolStuck`, as `room` does. Returns False at once in the sync thread, which frees the space:
+        a finalizer that runs there may end a plan, and with it record an event.
         """
         if self._sync_thread.is_this_thread:
             return False
+        decided = self._block_until_decided(min(timeout_s, _WAIT_WARNING_S), reserved=reserved)
+        if not decided and timeout_s > _WAIT_WARNING_S:
+            self._warn_waiting()
+            decided = self._block_until_decided(timeout_s - _WAIT_WARNING_S, reserved=reserved)
+        self._refuse_to_wait(reserved=reserved)
+        return decided
+
+    def _block_until_decided(self, timeout_s: float, *, reserved: bool) -> bool:
         end_ns = self._clock.monotonic_ns() + round(timeout_s * 1e9)
-        decided = self._room_notifier.block_until(
-            lambda: self._room_is_decided(reserved=True),
+        return self._room_notifier.block_until(
+            lambda: self._room_is_decided(reserved=reserved),
             remaining_s=lambda: (end_ns - self._clock.monotonic_ns()) / 1e9,
         )
-        self._refuse_to_wait(reserved=True)
-        return decided
 
     def _room_is_decided(self, *, reserved: bool) -> bool:
         if self._over or self._appender.stuck is not None or self._appender.admits_again(reserved=reserved):

@@ -47,7 +47,7 @@ class Faults(NamedTuple):
 class Emitter:
     """Puts the events of one memory into its queue.
 
-    Only the start of a node or an episode waits for room, before it is written (`Recorder.admit`). All other events,
+    Only the start of a node or an episode waits for room, before it is written (`must_wait`). All other events,
     including the start of a simulation, must not wait, so `put` may use the spool's reserve. If the reserve is used up
     as well, `put` blocks the calling thread until a record was stored. It drops no event.
 
@@ -101,6 +101,14 @@ class Emitter:
                 if threading.current_thread().name.startswith(THREAD_NAME_PREFIX):
                     raise
                 self.sink.block_until_room(_BLOCK_S)
+
+    def must_wait(self) -> bool:
+        """Return if a node has to wait for room before it starts. Raises `SpoolFull` with `on_full="fail"`."""
+        if not self.sink.full:
+            return False
+        if self.settings.on_full == "fail":
+            raise SpoolFull("the spool is full (spool_bytes_max) and on_full is 'fail': start a writer to drain it")
+        return True
 
     def put_declaration(self, declared: DeclaredType) -> None:
         """Append the declaration of a designator type."""

@@ -44,6 +44,9 @@ class EventSink(Protocol):
         """Wait until an event without `reserved` fits again."""
         ...
 
-    def block_until_room(self, timeout_s: float) -> bool:
-        """Block the calling thread until a reserved event fits; return False after `timeout_s` seconds."""
+    def block_until_room(self, timeout_s: float, *, reserved: bool = True) -> bool:
+        """Block the calling thread until an event fits; return False after `timeout_s` seconds.
+
+        Logs a warning if it waits for more than two seconds. Raises `SpoolStuck` when waiting cannot help.
+        """
         ...
