@@ -34,7 +34,7 @@ from pycrorm_async.recording.recorded_objects import RecordedObjects
 from pycrorm_async.recording.recorded_values import Convert, RecordedValues
 from pycrorm_async.recording.values.texts import clean_repr
 from pycrorm_async.recording.writing.emitter import Emitter
-from pycrorm_async.recording.writing.episode_opening import EpisodeOpening
+from pycrorm_async.recording.writing.episode_opening import EpisodeOpening, Failures, end_statuses
 from pycrorm_async.recording.writing.episode_writer import EpisodeWriter
 from pycrorm_async.recording.writing.open_episodes import OpenEpisodes
 
@@ -73,9 +73,11 @@ class RecordedNodes(EpisodeWriter[_Node]):
         episodes: OpenEpisodes,
         opening: EpisodeOpening,
         convert: Convert | None,
+        failures: Failures = (),
     ) -> None:
         super().__init__(emitter, episodes.new_id(), opening)
         self._episodes = episodes
+        self._failures = failures
         self._calls = OrderedCalls()
         self._end_status: EpisodeStatus | None = None
         self._nodes: dict[Hashable, _Node] = {}
@@ -87,7 +89,7 @@ class RecordedNodes(EpisodeWriter[_Node]):
     def close(self, failure: BaseException | None = None, status: EpisodeStatus | None = None) -> None:
         """End the episode. Without a failure it SUCCEEDED; nodes that are still open end LOST, and are counted.
 
-        `status` is for a failure whose class only the executive knows: FAILED, ERROR or INTERRUPTED.
+        `status` is FAILED, ERROR or INTERRUPTED, by default as for `end`.
         """
         if status in get_args(EpisodeStatus):
             self._end_status = status
@@ -185,28 +187,44 @@ class RecordedNodes(EpisodeWriter[_Node]):
     def end(
         self,
         key: Hashable,
-        status: NodeStatus = "SUCCEEDED",
+        status: NodeStatus | None = None,
         failure: BaseException | FailureValue | str | None = None,
         result: Any = None,
+        *,
+        below: NodeStatus | None = None,
     ) -> None:
-        """Record that a node ended. A key that no open node has is counted, and so is an unknown status, as ERROR."""
+        """Record that a node ended. A key that no open node has is counted, and so is an unknown status, as ERROR.
+
+        Args:
+            status: by default SUCCEEDED without a failure, FAILED for a plan failure or a text, CANCELLED for a
+                cancellation, Ctrl-C or an exit, and ERROR for any other exception.
+            failure, result: why it failed; what it returned.
+            below: first end the nodes that are open below this one, the innermost first, with this status.
+        """
         key = key.key if isinstance(key, _Node) and self._nodes.get(key.key) is key else key
         hash(key)
-        if status not in END_STATUSES:
-            self._note("NodeEnded", f"{clean_repr(status)} is not a status ({', '.join(END_STATUSES)})")
-            status = "ERROR"
+        if status is None:
+            status = "FAILED" if isinstance(failure, str | FailureValue) else end_statuses(failure, self._failures)[1]
+        status, below = self._checked_status(status), self._checked_status(below) if below is not None else None
         prepared = self.id
         value = noted(self.emitter, "NodeEnded", self._values.failure, failure) if failure is not None else None
         encoded = self._values.any(result) if result is not None else None
-        self._write("NodeEnded", self._end_open, key, status, value, encoded, prepared)
+        self._write("NodeEnded", self._end_open, key, NodeEnded(0, status, value, encoded), below, prepared)
 
-    def _end_open(
-        self, key: Hashable, status: NodeStatus, failure: FailureValue | None, result: Any, prepared: EpisodeId
-    ) -> int:
+    def _checked_status(self, status: NodeStatus) -> NodeStatus:
+        if status in END_STATUSES:
+            return status
+        self._note("NodeEnded", f"{clean_repr(status)} is not a status ({', '.join(END_STATUSES)})")
+        return "ERROR"
+
+    def _end_open(self, key: Hashable, end: NodeEnded, below: NodeStatus | None, prepared: EpisodeId) -> int:
         node = self._nodes.get(key)
         if node is None:
             raise CallerError(f"no open node has the key {clean_repr(key)}")
-        self._end_node(node, NodeEnded(node.sequence, status, failure, self._now(result, prepared)))
+        if below is not None:
+            for each in [each for each in reversed(self._nodes.values()) if _is_below(each, node)]:
+                self._end_node(each, NodeEnded(each.sequence, below))
+        self._end_node(node, replace(end, node=node.sequence, result=self._now(end.result, prepared)))
         return 0  # an end continues no episode
 
     def _end_node(self, node: _Node, event: NodeEnded) -> None:
@@ -276,7 +294,7 @@ class RecordedNodes(EpisodeWriter[_Node]):
     def _end_statuses(self, failure: BaseException | None) -> tuple[EpisodeStatus, NodeStatus]:
         status = self._end_status
         if status is None:
-            return super()._end_statuses(failure)
+            return end_statuses(failure, self._failures)
         return status, ("CANCELLED" if status == "INTERRUPTED" else status)
 
     def _has_ended(self, node: _Node) -> bool:
@@ -320,3 +338,10 @@ class RecordedNodes(EpisodeWriter[_Node]):
 
     def _note(self, event_type: str, reason: str) -> None:
         self.emitter.note_fault(event_type, CallerError(reason))
+
+
+def _is_below(node: _Node, ancestor: _Node) -> bool:
+    above = node.parent
+    while above is not None and above is not ancestor:
+        above = above.parent
+    return above is not None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import builtins
 import threading
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from types import MappingProxyType
@@ -19,7 +20,7 @@ from pycrorm_async.recording.recorded_values import Convert
 from pycrorm_async.recording.values.episode_arguments import check_arguments, read_labels
 from pycrorm_async.recording.values.texts import clean_repr
 from pycrorm_async.recording.writing.emitter import Emitter
-from pycrorm_async.recording.writing.episode_opening import EpisodeOpening
+from pycrorm_async.recording.writing.episode_opening import EpisodeOpening, Failures
 from pycrorm_async.recording.writing.open_episodes import OpenEpisodes
 from pycrorm_async.recording.writing.provenance import Provenance
 
@@ -140,6 +141,7 @@ class Recording:
         simulated: bool = False,
         thought_by: NodeReference | None = None,
         convert: Convert | None = None,
+        failures: Failures = (),
     ) -> RecordedEpisode:
         """Start an episode; use it with `with`, or call its `close`. Any number may be open at a time.
 
@@ -151,6 +153,8 @@ class Recording:
             convert: converts each parameter, result and observed value, and each item of one, to a scalar, a text, a
                 list or dict, a `PoseValue`, an `ObjectReference`, or, for a field of the type `object`, the key of an
                 object. An exception that it raises is recorded as the reason why the value is missing.
+            failures: the classes of the executive's own plan failures: nodes and episodes that one left are FAILED, and
+                those that another exception left are CANCELLED or ERROR.
 
         Raises:
             CallerError: an argument has the wrong type. Any other fault is counted, and the episode stays empty.
@@ -160,14 +164,13 @@ class Recording:
         check_arguments(description=world, plan=None, seed=None, strict=False)
         if thought_by is not None and not _is_whole(thought_by):
             raise CallerError(f"thought_by must be from `node_reference` of an episode, not {thought_by!r:.100}")
-        unchecked: tuple[object, object] = (
-            simulated,
-            seed,
-        )  # as the caller passed them
+        unchecked: tuple[object, object, object] = (simulated, seed, failures)  # as the caller passed them
         if not isinstance(unchecked[0], bool) or isinstance(unchecked[1], bool):
             raise CallerError("simulated must be a bool, and seed an int")
         if convert is not None and not callable(convert):
             raise CallerError(f"convert must be a function, not {convert!r:.100}")
+        if not isinstance(unchecked[2], tuple) or not all(isinstance(each, builtins.type) for each in unchecked[2]):
+            raise CallerError(f"failures must be a tuple of classes of exceptions, not {failures!r:.100}")
         opening = EpisodeOpening(
             text,
             self._software,
@@ -179,7 +182,7 @@ class Recording:
             provenance=self._provenance,
             labels=read_labels(tags, metadata, self._emitter),
         )
-        episode = RecordedEpisode(self._emitter, self._episodes, opening, convert)
+        episode = RecordedEpisode(self._emitter, self._episodes, opening, convert, failures)
         if not self._emitter.is_closed:
             episode.open()
         return episode

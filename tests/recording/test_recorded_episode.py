@@ -534,3 +534,63 @@ def test_an_executive_states_the_outcome_of_a_failure_that_only_it_knows(
     assert [tuple(each) for each in ended] == [(status or "ERROR", "builtins.ValueError", "a failure of its own")]
     roots = ask(tmp_path / "memory.db", "SELECT status FROM task_tree_node WHERE kind = 'root'")
     assert [tuple(each) for each in roots] == [(root,)]
+
+
+class Slip(Exception):
+    """A plan failure of an executive of its own."""
+
+
+def test_without_a_status_a_node_and_its_episode_have_that_of_the_failure(tmp_path: Path) -> None:
+    expected: list[tuple[Any, str, str]] = [
+        (None, "SUCCEEDED", "SUCCEEDED"),
+        (NavigationGoalInCollision("n"), "FAILED", "FAILED"),
+        (Slip("s"), "FAILED", "FAILED"),
+        ("the wheel slipped", "FAILED", "SUCCEEDED"),
+        (FailureValue("Slip", "s"), "FAILED", "SUCCEEDED"),
+        (ValueError("v"), "ERROR", "ERROR"),
+        (KeyboardInterrupt(), "CANCELLED", "INTERRUPTED"),
+        (SystemExit(0), "CANCELLED", "INTERRUPTED"),
+        (asyncio.CancelledError(), "CANCELLED", "INTERRUPTED"),
+    ]
+    with opened(tmp_path) as memory:
+        for failure, *_ in expected:
+            episode = memory.recording.episode(failures=(Slip,))
+            episode.start("a", memory.recording.type("action", "Step"))
+            episode.end("a", failure=failure)
+            episode.close(failure if isinstance(failure, BaseException) else None)
+        assert memory.status.faults == (0, None)
+    assert [row[2] for row in nodes(tmp_path)] == [status for _, status, _ in expected]
+    assert [each["status"] for each in events(tmp_path, "EpisodeEnded")] == [status for *_, status in expected]
+
+
+def test_an_end_can_end_the_nodes_that_are_open_below(tmp_path: Path) -> None:
+    def write(recording: Recording, episode: RecordedEpisode) -> None:
+        step = recording.type("action", "Step")
+        episode.start("job", step)
+        episode.start("other", step)
+        episode.start("ended", step, parent="job")
+        episode.start("below it", step, parent="ended")
+        episode.end("ended", "FAILED")
+        episode.start("inside", step, parent="job")
+        episode.start("innermost", step, parent="inside")
+        episode.end("job", failure=ValueError("dropped"), below="INTERRUPTED")
+        assert not episode.is_open("below it")
+        episode.end("other", below="INTERRUPTED")
+        episode.start("last", step)
+        episode.end("last", below=cast("Any", "GONE"))
+
+    total, last = faults_of(tmp_path, write)
+    assert total == 1
+    assert last is not None
+    assert "'GONE' is not a status" in last
+    # in this order: ended, innermost, inside, below it, job, other, last, the root
+    assert [(each["node"], each["status"]) for each in events(tmp_path, "NodeEnded")] == [
+        (5, "FAILED"), (9, "INTERRUPTED"), (8, "INTERRUPTED"), (6, "INTERRUPTED"), (3, "ERROR"), (4, "SUCCEEDED"),
+        (15, "SUCCEEDED"), (2, "SUCCEEDED"),
+    ]  # fmt: skip
+    assert_verified(tmp_path)
+
+
+def test_failures_that_are_no_classes_are_refused(tmp_path: Path) -> None:
+    with opened(tmp_path) as memory, pytest.raises(CallerError, match="failures must be a tuple of classes"):
+        memory.recording.episode(failures=cast("Any", Slip))

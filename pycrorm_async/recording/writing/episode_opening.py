@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import getpass
 import platform
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.events.types import EpisodeStarted
@@ -14,6 +14,9 @@ from pycrorm_async.plan.exceptions import is_plan_failure
 from pycrorm_async.recording.values.episode_arguments import NO_LABELS, Labels
 from pycrorm_async.recording.values.texts import clean
 from pycrorm_async.recording.writing.provenance import Provenance
+
+Failures: TypeAlias = tuple[type[BaseException], ...]
+"""The classes of an executive's own plan failures."""
 
 
 class EpisodeOpening(NamedTuple):
@@ -54,13 +57,13 @@ def episode_started(opening: EpisodeOpening, continues: EpisodeId | None) -> Epi
     )
 
 
-def end_statuses(failure: BaseException | None) -> tuple[EpisodeStatus, NodeStatus]:
-    """Return the statuses of an episode and of its root node after `failure` left the episode."""
+def end_statuses(failure: BaseException | None, failures: Failures = ()) -> tuple[EpisodeStatus, NodeStatus]:
+    """Return the statuses of an episode, and of a node, that this exception left."""
     if failure is None:
         return "SUCCEEDED", "SUCCEEDED"
-    if is_plan_failure(failure):
+    if is_plan_failure(failure) or isinstance(failure, failures):
         return "FAILED", "FAILED"
-    if isinstance(failure, asyncio.CancelledError | KeyboardInterrupt):
+    if isinstance(failure, asyncio.CancelledError | KeyboardInterrupt | SystemExit):
         return "INTERRUPTED", "CANCELLED"
     return "ERROR", "ERROR"
 
