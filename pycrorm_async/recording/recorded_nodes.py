@@ -91,7 +91,7 @@ class RecordedNodes(EpisodeWriter[_Node]):
 
         `status` is FAILED, ERROR or INTERRUPTED, by default as for `end`.
         """
-        if status in get_args(EpisodeStatus):
+        if isinstance(status, str) and status in get_args(EpisodeStatus):
             self._end_status = status
         self._episodes.close(self, failure)
 

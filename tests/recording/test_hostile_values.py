@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import pytest
 
 from pycrorm_async import Memory, Settings
 from pycrorm_async.errors import CallerError
+from pycrorm_async.events.types import EpisodeEnded
 from pycrorm_async.events.values import (
     FailureValue,
     NodeReference,
@@ -28,6 +30,7 @@ from pycrorm_async.world import ObjectType
 from pycrorm_async.world.pose import Pose
 from tests.databases import ask
 from tests.recording.recorded_memory import assert_verified, events, nodes, url_of
+from tests.recording.recorded_queue import Recorded
 
 HERE = Pose([1, 2, 3])
 AT = PoseValue((1, 2, 3), (0, 0, 0, 1), "map", 0)
@@ -374,3 +377,20 @@ def test_an_episode_opened_while_the_memory_closes_is_counted_and_stays_empty(tm
         thread.join()
     statuses = {status for (status,) in ask(tmp_path / "memory.db", "SELECT status FROM process_metadata")}
     assert statuses <= {"SUCCEEDED", "INTERRUPTED"}
+
+
+def test_no_argument_of_an_end_raises(tmp_path: Path) -> None:
+    class Incomparable:
+        def __eq__(self, other: object) -> bool:
+            raise OSError
+
+        __hash__ = None  # type: ignore[assignment]
+
+    anything: Any = Incomparable()
+    with closing(Recorded(tmp_path, Settings())) as recorded:
+        episode = recorded.recording.episode()
+        episode.end(anything, anything, anything, anything, below=anything)
+        episode.close(anything, anything)
+        ((*_, (_, ended)),) = recorded.logs()
+    assert isinstance(ended, EpisodeEnded)
+    assert ended.status == "ERROR"
