@@ -34,7 +34,7 @@ CLASSES = [
 ]
 ON_REQUEST = {"children", "ancestors", "node", "parameters", "refusals", "description", "robots"}
 ON_REQUEST_OF_PICK_UPS = {"object_z", "object_qx", "object_qy", "object_qz", "object_qw", "height_over_torso"}
-ON_REQUEST_OF_PICK_UPS |= {"robot", "scene"}
+ON_REQUEST_OF_PICK_UPS |= {"policy", "robot", "scene"}
 
 
 def attributes(row: Base) -> set[str]:

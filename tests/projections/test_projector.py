@@ -199,7 +199,7 @@ async def test_an_episode_that_cannot_be_folded_is_parked_there_and_the_others_c
         (row(2, number=2), "RUNNING"),
         (row(3, number=2), "RUNNING"),
     ]
-    assert await ask(log, "SELECT * FROM saying_action") == [(row(3, number=2), "hi", 2)]
+    assert await ask(log, "SELECT * FROM saying_action") == [(row(3, number=2), "hi", 2, 3)]
     assert await projector.catch_up() == 0
 
 
@@ -252,10 +252,10 @@ async def test_a_descendant_is_listed_with_its_base_even_if_the_base_was_declare
     await log.append([*declarations(base), *script.records])
     await projector.catch_up()
     assert await ask(log, "SELECT * FROM grab_action ORDER BY id") == [
-        (row(1), None, "LEFT", 1),
-        (row(2), None, "RIGHT", 1),
+        (row(1), None, "LEFT", 1, 1),
+        (row(2), None, "RIGHT", 1, 2),
     ]
-    assert await ask(log, "SELECT * FROM careful_grab_action") == [(row(1), None, "LEFT", 0.5, 1)]
+    assert await ask(log, "SELECT * FROM careful_grab_action") == [(row(1), None, "LEFT", 0.5, 1, 1)]
 
 
 @pytest.mark.soak_on("sqlite")
