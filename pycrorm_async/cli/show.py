@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, TypeAlias
 
 import typer
 
 from pycrorm_async.cli.options import DEFAULT_URL, EpisodeArgument, JsonOption, SpoolOption, UrlOption
 from pycrorm_async.cli.output import moment, print_facts, print_json
 from pycrorm_async.cli.reading import read_memory
-from pycrorm_async.cli.snapshot_view import print_snapshot
+from pycrorm_async.cli.snapshot_view import print_percepts, print_places, print_snapshot
 from pycrorm_async.cli.tree import print_tree, simulated_by
 from pycrorm_async.query.as_of import parse_moment
 from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary
 from pycrorm_async.query.parameter_text import duration, one_line
+from pycrorm_async.query.percepts_and_places import Percept, PlaceSearch, percepts_of, searches_of
 from pycrorm_async.query.reading import Reading
+
+_Answers: TypeAlias = "tuple[Sequence[Percept], Sequence[PlaceSearch]]"
 
 _DIGITS_MAX = 12
 """Bounds the digits of a hash, which are enough to compare it by eye; `--full` prints all."""
@@ -35,7 +38,11 @@ def show(
         bool, typer.Option("--events", help="Print the events of each node's start and end, as in e6-e11.")
     ] = False,
     full: Annotated[
-        bool, typer.Option("--full", help="Print texts, lists, hashes and numbers in full; --json always does.")
+        bool,
+        typer.Option(
+            "--full",
+            help="Print texts, lists, hashes and numbers in full, and all percepts and places; --json always does.",
+        ),
     ] = False,
     url: UrlOption = DEFAULT_URL,
     spool: SpoolOption = None,
@@ -49,13 +56,18 @@ def show(
 
 
 def _show(episode: str, url: str, spool: Path | None, *, events: bool, full: bool, as_json: bool) -> None:
-    async def query(reading: Reading) -> tuple[EpisodeSummary, list[NodeSummary]]:
+    async def query(reading: Reading) -> tuple[EpisodeSummary, list[NodeSummary], _Answers]:
         summary = await reading.episode(episode)
-        return summary, await reading.tree(summary)
+        tree = await reading.tree(summary)
+        if not (full or as_json):
+            return summary, tree, ((), ())
+        async with reading.session(simulated=True) as session:
+            number = summary.number
+            return summary, tree, (await percepts_of(session, number), await searches_of(session, number))
 
-    summary, tree = read_memory(url, spool, query)
+    summary, tree, (percepts, places) = read_memory(url, spool, query)
     if as_json:
-        print_json({"episode": summary, "tree": tree})
+        print_json({"episode": summary, "tree": tree, "percepts": percepts, "places": places})
         return
     print_facts(
         f"Episode {summary.number}: {summary.description}",
@@ -76,6 +88,8 @@ def _show(episode: str, url: str, spool: Path | None, *, events: bool, full: boo
         },
     )
     print_tree(tree, events=events, full=full)
+    print_percepts(percepts)
+    print_places(places)
 
 
 def _provenance(summary: EpisodeSummary, *, full: bool) -> dict[str, str | None]:

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 from pycrorm_async.cli.output import moment as wall_clock
 from pycrorm_async.cli.output import print_facts, print_table
 from pycrorm_async.cli.tree import print_tree
 from pycrorm_async.events.blobs import BLOB_KEY
+from pycrorm_async.events.ids import row_key
 from pycrorm_async.query.parameter_text import parameters_text
+from pycrorm_async.query.percepts_and_places import Percept, PlaceSearch
 from pycrorm_async.query.snapshot import Moment, ObjectThen, ObservationThen, RobotThen
 
+_LATEST_MAX = 10
+"""Bounds the printed percepts and searches for places, each, unless all are asked for."""
 _JOINTS_MAX = 3
 """Bounds the joints listed for an object, so that its row stays short."""
 
@@ -47,6 +52,42 @@ def print_snapshot(snapshot: Moment, requested: str, *, events: bool = False, fu
     if snapshot.observations:
         observed = [_observed_row(name, each, full=full) for name, each in snapshot.observations.items()]
         print_table("Observations", ("name", "at", "event", "values"), observed)
+    latest = slice(None) if full else slice(-_LATEST_MAX, None)
+    print_percepts(snapshot.percepts[latest], "Latest percepts")
+    print_places(snapshot.places[latest], "Latest searches for places")
+
+
+def print_percepts(percepts: Sequence[Percept], title: str = "Percepts") -> None:
+    """Print a table of percepts; nothing without any."""
+    if percepts:
+        columns = ("event", "node", "percept", "type", "x", "y", "z", "source", "confidence", "visible", "object")
+        print_table(title, columns, map(_percept_row, percepts))
+
+
+def _percept_row(each: Percept) -> tuple[object, ...]:
+    shares = (f"{share:g}" if share is not None else "" for share in (each.confidence, each.visible))
+    matched = "none" if each.object_id is None else _event_of(each.object_id)
+    at = f"e{each.sequence}", _event_of(each.node)
+    return *at, each.name, each.object_type, *each.position, each.source, *shares, matched
+
+
+def print_places(places: Sequence[PlaceSearch], title: str = "Searches for places") -> None:
+    """Print a table of searches for places; nothing without any."""
+    if places:
+        columns = ("event", "node", "location", "considered", "offered", "taken", "refused")
+        print_table(title, columns, map(_search_row, places))
+
+
+def _search_row(each: PlaceSearch) -> tuple[object, ...]:
+    taken = f"({', '.join(f'{part:.3f}' for part in each.taken)})" if each.taken is not None else ""
+    refused = ", ".join(f"{count} {reason}" for reason, count in each.refused.items())
+    at = f"e{each.sequence}", _event_of(each.node)
+    return *at, each.location, each.considered, each.offered, taken, refused
+
+
+def _event_of(row: int | None) -> str:
+    """Return the event that made a row, as in `e5`."""
+    return "" if row is None else f"e{row_key(row).sequence}"
 
 
 def _observed_row(name: str, observation: ObservationThen, *, full: bool) -> tuple[object, ...]:

@@ -11,6 +11,7 @@ from rich.tree import Tree
 from pycrorm_async.cli.output import stdout
 from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary
 from pycrorm_async.query.parameter_text import duration, one_line, parameters_text
+from pycrorm_async.query.percepts_and_places import counts_text
 
 _MESSAGE_MAX = 100
 """Bounds the characters of a failure's message, so that a failed node takes few lines."""
@@ -60,6 +61,8 @@ def _line(node: NodeSummary, *, events: bool, full: bool) -> Text:
         line.append(f"  e{node.sequence}-{end}", style="dim")
     if node.observations:
         line.append(f"  {node.observations} observation{'s' * (node.observations > 1)}", style="dim")
+    if counts := counts_text(node):
+        line.append(f"  {counts}", style="dim")
     if node.reason:
         message = one_line(node.failure_message or "", None if full else _MESSAGE_MAX)
         line.append(f"  {node.reason}{': ' if message else ''}{message}", style="red")

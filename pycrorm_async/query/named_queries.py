@@ -12,7 +12,16 @@ from sqlalchemy.ext.asyncio import AsyncConnection
 from sqlalchemy.orm import aliased
 
 from pycrorm_async.events.ids import SLOT_NODE, row_id, row_key
-from pycrorm_async.orm import Designator, EpisodeTag, Object, Observation, ProcessMetaData, TaskTreeNode
+from pycrorm_async.orm import (
+    Designator,
+    Detection,
+    EpisodeTag,
+    LocationResolution,
+    Object,
+    Observation,
+    ProcessMetaData,
+    TaskTreeNode,
+)
 from pycrorm_async.orm.base import same_row
 from pycrorm_async.query.asking.episode_list import EpisodeChoice
 from pycrorm_async.query.parameter_text import with_object_names
@@ -113,6 +122,8 @@ class NodeSummary:
         reason, failure_message: the class and the text of the failure it ended with.
         thoughts: numbers of the simulations that it performed.
         observations: number of observations that a program made at it.
+        considered, offered: number of places that location designators checked for it, and of those they offered.
+        detected: number of percepts that it had.
     """
 
     id: int
@@ -131,6 +142,9 @@ class NodeSummary:
     end_sequence: int | None
     thoughts: tuple[int, ...] = ()
     observations: int = 0
+    considered: int = 0
+    offered: int = 0
+    detected: int = 0
 
 
 async def episodes(connection: AsyncConnection, chosen: int | EpisodeChoice | None = None) -> list[EpisodeSummary]:
@@ -243,11 +257,17 @@ async def task_tree(connection: AsyncConnection, number: int) -> list[NodeSummar
     simulations = await _simulations_by_node(connection, number)
     counted = select(Observation.node_id, func.count()).where(Observation.process_metadata_id == number)
     observations = dict(iter(await connection.execute(counted.group_by(Observation.node_id))))
+    seen = select(Detection.node_id, func.count()).where(Detection.process_metadata_id == number)
+    detected = dict(iter(await connection.execute(seen.group_by(Detection.node_id))))
+    sums = func.sum(LocationResolution.considered), func.sum(LocationResolution.offered)
+    searched = select(LocationResolution.node_id, *sums).where(LocationResolution.process_metadata_id == number)
+    places = {row[0]: row[1:] for row in await connection.execute(searched.group_by(LocationResolution.node_id))}
     children: dict[int | None, list[NodeSummary]] = {}
     for row in await connection.execute(nodes_of(number)):
         parameters = with_object_names(
             row.parameters or {}, lambda each: names.get(row_id(number, each["row"], SLOT_NODE))
         )
+        considered, offered = map(int, places.get(row.id, (0, 0)))
         children.setdefault(row.parent_id, []).append(
             NodeSummary(
                 id=row.id,
@@ -266,6 +286,9 @@ async def task_tree(connection: AsyncConnection, number: int) -> list[NodeSummar
                 sequence=row_key(row.id).sequence,
                 end_sequence=row.end_sequence,
                 observations=observations.get(row.id, 0),
+                considered=considered,
+                offered=offered,
+                detected=detected.get(row.id, 0),
             )
         )
     return list(_depth_first(children))

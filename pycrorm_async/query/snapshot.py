@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.types import DescriptionDeclared
 from pycrorm_async.query.named_queries import NodeSummary
+from pycrorm_async.query.percepts_and_places import Percept, PlaceSearch
 from pycrorm_async.world.pose import Pose
 from pycrorm_async.world.state import ObjectState, WorldState
 
@@ -175,6 +176,7 @@ class Moment:
         status: of the episode at that moment.
         tree: the nodes that had started, each before its children, children in the order they started.
         observations: by name, the latest observation of a program.
+        percepts, places: the latest 100 percepts and searches for a place up to that moment, in the order of events.
         tags: of the episode at that moment.
     """
 
@@ -192,6 +194,8 @@ class Moment:
     world: WorldThen
     observations: Mapping[str, ObservationThen] = field(default_factory=dict)
     tags: tuple[str, ...] = ()
+    percepts: tuple[Percept, ...] = ()
+    places: tuple[PlaceSearch, ...] = ()
 
     @property
     def running(self) -> tuple[NodeThen, ...]:

@@ -6,6 +6,7 @@ sample had an exact event of its own, while the sample may be older than the eve
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
@@ -20,8 +21,10 @@ from pycrorm_async.events.types import (
     EpisodeStarted,
     EpisodeTagged,
     Happening,
+    LocationResolved,
     NodeEnded,
     NodeStarted,
+    ObjectDetected,
     Observed,
 )
 from pycrorm_async.events.values import FailureValue
@@ -29,12 +32,14 @@ from pycrorm_async.projections.fold.column_values import CannotFold
 from pycrorm_async.projections.fold.fold import happening_of
 from pycrorm_async.projections.fold.world_fold import WorldFold, WorldObject
 from pycrorm_async.query.parameter_text import with_object_names
+from pycrorm_async.query.percepts_and_places import Percept, PlaceSearch, percepts_in, search_in
 from pycrorm_async.query.snapshot import Moment, NodeThen, ObjectThen, ObservationThen, RobotThen, WorldThen
 from pycrorm_async.store.stored import StoredEvent
 from pycrorm_async.world.pose import MalformedPose, Pose
 from pycrorm_async.world.robots.robot_description import robot_description
 
-_CHANGE_NOTHING = frozenset({"LocationResolved", "ObjectDetected", "StateSampled"})
+_LATEST_MAX = 100
+"""Bounds the percepts and the searches for places of a snapshot, each: an episode may have many thousands."""
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 
@@ -53,6 +58,9 @@ class _Node:
     ended_ns: int | None = None
     end_sequence: int | None = None
     failure: FailureValue | None = None
+    considered: int = 0
+    offered: int = 0
+    detected: int = 0
 
 
 class MomentFold:
@@ -73,12 +81,14 @@ class MomentFold:
         self._fold = WorldFold()
         self._tags: tuple[str, ...] = ()
         self._observed: dict[str, tuple[StoredEvent, Observed]] = {}
+        self._percepts: deque[Percept] = deque(maxlen=_LATEST_MAX)
+        self._places: deque[PlaceSearch] = deque(maxlen=_LATEST_MAX)
 
     def read(self, event: StoredEvent) -> None:
         """Apply the next event. Raises `CannotFold`."""
         if self.first is None and event.type != "EpisodeStarted":
             raise CannotFold(f"the episode begins with {event.type} instead of EpisodeStarted")
-        if event.type not in _CHANGE_NOTHING:
+        if event.type != "StateSampled":
             self._happened(event, happening_of(event))
         self.first = event if self.first is None else self.first
         self._last = event
@@ -114,8 +124,25 @@ class MomentFold:
                 self._ended(happening.status)
             case Observed():
                 self._observed[happening.name] = event, happening
+            case ObjectDetected() | LocationResolved():
+                self._answered(event, happening)
             case _:
                 self._fold.read(event.sequence, happening)
+
+    def _answered(self, event: StoredEvent, answer: ObjectDetected | LocationResolved) -> None:
+        """Keep the answer of perception or of a location designator, and count it at the node that asked."""
+        node = self._nodes.get(answer.node or 0)
+        if isinstance(answer, ObjectDetected):
+            percepts = percepts_in(self.number, event, answer)
+            self._percepts.extend(percepts)
+            if node is not None:
+                node.detected += len(percepts)
+            return
+        search = search_in(self.number, event, answer)
+        self._places.append(search)
+        if node is not None:
+            node.considered += search.considered
+            node.offered += search.offered
 
     def _ended(self, status: str) -> None:
         self._status = status
@@ -163,6 +190,8 @@ class MomentFold:
             world=self._world(descriptions, meshes),
             observations={name: self._observation(*each) for name, each in self._observed.items()},
             tags=self._tags,
+            percepts=tuple(self._percepts),
+            places=tuple(self._places),
         )
 
     def _observation(self, event: StoredEvent, observed: Observed) -> ObservationThen:
@@ -206,6 +235,9 @@ class MomentFold:
             end_sequence=node.end_sequence,
             start_s=(node.monotonic_ns - start_ns) / 1e9,
             end_s=(node.ended_ns - start_ns) / 1e9 if node.ended_ns is not None else None,
+            considered=node.considered,
+            offered=node.offered,
+            detected=node.detected,
         )
 
     def _world(self, descriptions: Mapping[str, DescriptionDeclared], meshes: Mapping[str, bytes]) -> WorldThen:

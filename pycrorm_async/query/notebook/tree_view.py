@@ -8,6 +8,7 @@ from collections.abc import Set as AbstractSet
 from pycrorm_async.query.named_queries import NodeSummary
 from pycrorm_async.query.notebook.markup import FAILED, left_out, quiet, recorded, status
 from pycrorm_async.query.parameter_text import duration, parameters_text
+from pycrorm_async.query.percepts_and_places import counts_text
 
 NODES_MAX = 500
 """Bounds the nodes of a view, so that a notebook with many of them stays small."""
@@ -123,6 +124,8 @@ def _line(node: NodeSummary, from_below: AbstractSet[tuple[int | None, str | Non
         parts.append(f"<b>{recorded(node.reason)}</b>{message}")
     if node.observations:
         parts.append(quiet(f"{node.observations} observation{'s' * (node.observations > 1)}"))
+    if counts := counts_text(node):
+        parts.append(quiet(counts))
     if node.thoughts:
         parts.append(quiet(f"{len(node.thoughts)} simulation{'s' * (len(node.thoughts) > 1)}"))
     return " ".join(parts)
