@@ -7,6 +7,11 @@ pose. Foreign keys are not enforced, because that would cost a third of the writ
 The tables can be divided by episode. No row refers to a row of another episode, views and relationships join by id and
 episode, and on PostgreSQL the episode is part of every primary key, as a table partitioned by it requires. The id comes
 first in the key, so that a lookup by id alone, which is unique in the memory, finds its row as well.
+
+Three kinds of tables are not divided. `pycrorm_link_box` has the boxes of descriptions, each once by its content,
+however many episodes use it: a catalogue of which each part needs a copy, as of the declarations. A row of
+`recall_block` and `recall_column`, the index of the recall of all episodes, has cases of many of them, and 0 as its
+episode. The checkpoints of a projection (`pycrorm_progress`) are keyed by the number of an episode, as `episode` is.
 """
 
 from __future__ import annotations
