@@ -7,12 +7,14 @@ inserts them, in the transaction with the object's row, and later ones find them
 from __future__ import annotations
 
 from collections.abc import Collection
+from xml.etree.ElementTree import ParseError, fromstring
 
 import msgspec
 from sqlalchemy import select, text
 from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.events.codec import UnknownShape, description_of, fingerprint
+from pycrorm_async.events.types import DescriptionDeclared
 from pycrorm_async.projections.fold.row_batch import Row
 from pycrorm_async.projections.schema.core_columns import LINK_BOX, OF_NO_EPISODE
 from pycrorm_async.projections.schema.tables import make_table
@@ -45,15 +47,24 @@ async def boxes_of(connection: AsyncConnection, descriptions: Collection[str]) -
     for payload in payloads:
         model = fingerprint(payload, "DescriptionDeclared")
         try:
-            boxes = description_of(payload).link_boxes
+            description = description_of(payload)
+            boxes = description.link_boxes
         except (UnknownShape, msgspec.DecodeError):
             continue
         if model in descriptions:
             # The only link of a description has no name here, as that of a built-in model.
-            names = [each.link for each in boxes] if len(boxes) > 1 else [None]
+            is_named = len(boxes) > 1 or _has_further_links(description)
             rows[model] = [
-                (model, position, name, each.joint, *each.center, *each.half, *each.axis)
-                for position, (name, each) in enumerate(zip(names, boxes, strict=False))
+                (model, position, each.link if is_named else None, each.joint, *each.center, *each.half, *each.axis)
+                for position, each in enumerate(boxes)
                 if not each.link.endswith("_handle")
             ]
     return rows
+
+
+def _has_further_links(description: DescriptionDeclared) -> bool:
+    """Return whether a description has several links, also such that turn or have no shape, and so no box."""
+    try:
+        return len(fromstring(description.text).findall("link")) > 1  # noqa: S314  it was loaded into a world
+    except (ValueError, ParseError):  # its content is not a URDF, as no recorder writes
+        return False

@@ -45,7 +45,7 @@ from pycrorm_async.projections.schema.views.comments import comments
 from pycrorm_async.projections.table_names import index_name, physical_name
 from pycrorm_async.store.dialects import dialect_of
 
-PROJECTION_VERSION = 7
+PROJECTION_VERSION = 8
 """The version of the fold, raised when its rows change: tables of an older version must be rebuilt."""
 
 SHOWN = "tables"
