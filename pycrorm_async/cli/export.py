@@ -16,8 +16,9 @@ from pycrorm_async.cli.output import counted, note, print_json, print_line
 from pycrorm_async.cli.pending_events import note_pending_events
 from pycrorm_async.cli.since import parse_since
 from pycrorm_async.errors import CallerError
-from pycrorm_async.export.export import ExportComparison, Exported, export_again
+from pycrorm_async.export.export import EPISODE_FORMATS, ExportComparison, Exported, export_again, format_of
 from pycrorm_async.export.export import export as write_export
+from pycrorm_async.export.manifest import read_manifest
 from pycrorm_async.progress_bar import ProgressCallback, progress_bar, stderr
 from pycrorm_async.query.asking.ask import QUESTIONS, Ask
 from pycrorm_async.query.reading import Reading
@@ -93,11 +94,15 @@ def export(
             )
 
     interrupt_on_termination()
-    with progress_bar("exporting", unit="rows") as report_progress:
+    with progress_bar("exporting", unit=_unit(file_format or format_of(target))) as report_progress:
         exported = asyncio.run(write(report_progress if stderr.is_terminal else None))
     note_pending_events(url, spool)
     _print(exported, as_json=as_json)
     return 0
+
+
+def _unit(file_format: str) -> str:
+    return "events" if file_format in EPISODE_FORMATS else "rows"
 
 
 def _size(text: str | None) -> tuple[int, int] | None:
@@ -132,7 +137,7 @@ def _again(manifest: Path, out: Path | None, url: str, spool: Path | None, *, fo
             return await export_again(reading, manifest, out, force=force, report_progress=report_progress)
 
     interrupt_on_termination()
-    with progress_bar("exporting", unit="rows") as report_progress:
+    with progress_bar("exporting", unit=_unit(read_manifest(manifest).file_format)) as report_progress:
         comparison = asyncio.run(write(report_progress if stderr.is_terminal else None))
     note_pending_events(url, spool)
     if as_json:
@@ -154,7 +159,8 @@ def _print(exported: Exported, *, as_json: bool) -> None:
         print_json({"file": exported.path, "format": manifest.file_format, **counts, "files": manifest.files})
         return
     print_line(exported.path)
-    content = f"{counted(exported.rows, 'row')} of {counted(exported.episodes, 'episode')}"
+    noun = {"lerobot": "frame", "rrd": "change", "mcap": "message"}.get(manifest.file_format, "row")
+    content = f"{counted(exported.rows, noun)} of {counted(exported.episodes, 'episode')}"
     note(f"It has {content}; {exported.path}.manifest.json describes it.")
     if exported.left_out:
         note(f"{exported.left_out} episodes are left out, because they run or are not in the tables yet.")

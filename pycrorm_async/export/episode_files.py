@@ -7,7 +7,7 @@ deleted, while a thread still writes would crash the process or leave a file.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, NamedTuple
 
@@ -57,19 +57,17 @@ async def write_lerobot(
 
     Raises `CallerError` for episodes that the format cannot hold; `MissingExtra`.
     """
-    total = sum(each.events for each in episodes)
-    done = 0
+    progress = _Progress(report_progress, sum(each.events for each in episodes))
     dataset = LeRobotFolder(folder, fps=options.fps)
     for each in episodes:
-        episode = await read_episode(reading, each)
+        episode = await read_episode(reading, each, progress.of("reading"))
         frames = await run_to_completion(asyncio.to_thread(frames_of, episode, options.clock, options.fps))
         pictures = None
         if options.images is not None:
-            pictures = np.stack(await draw_frames(reading, episode, frames, options.images))
+            pictures = np.stack(await draw_frames(reading, episode, frames, options.images, progress.of("drawing")))
         await run_to_completion(asyncio.to_thread(dataset.add, episode, frames, pictures))
-        done += each.events
-        if report_progress is not None:
-            report_progress(done, total)
+        progress.of("writing")(each.events)
+        progress.before += each.events
     await run_to_completion(asyncio.to_thread(dataset.finish))
     return dataset.frames
 
@@ -80,14 +78,39 @@ async def write_scene(
     path: Path,
     file_format: Literal["rrd", "mcap"],
     options: EpisodeOptions,
+    report_progress: ProgressCallback | None,
 ) -> int:
     """Write one episode to a file; return the number of changes or messages. Raises as `write_lerobot` does."""
     if len(episodes) != 1:
         raise CallerError(f"a file of the format {file_format} holds one episode, not {len(episodes)}: name one")
-    episode = await read_episode(reading, episodes[0])
+    progress = _Progress(report_progress, episodes[0].events)
+    episode = await read_episode(reading, episodes[0], progress.of("reading"))
     objects = await scene_objects(reading, episode)
+    report = progress.of("writing")
     if file_format == "rrd":
-        return await run_to_completion(asyncio.to_thread(write_rerun, episode, objects, path))
-    return await run_to_completion(
-        asyncio.to_thread(lambda: write_mcap(episode, objects, path, clock=options.clock, fps=options.fps))
-    )
+        written = await run_to_completion(asyncio.to_thread(write_rerun, episode, objects, path, report))
+    else:
+        clock, fps = options.clock, options.fps
+        written = await run_to_completion(
+            asyncio.to_thread(lambda: write_mcap(episode, objects, path, report, clock=clock, fps=fps))
+        )
+    report(episodes[0].events)
+    return written
+
+
+class _Progress:
+    """Reports how many events of all episodes are done in a phase; `before` is the number of those of earlier ones."""
+
+    def __init__(self, report_progress: ProgressCallback | None, total: int) -> None:
+        self.before = 0
+        self._report_progress = report_progress
+        self._total = total
+
+    def of(self, phase: str) -> Callable[[int], None]:
+        """Return the function that reports the number of events of the present episode; any thread may call it."""
+
+        def report_events(done: int) -> None:
+            if self._report_progress is not None:
+                self._report_progress(self.before + done, self._total, phase)
+
+        return report_events

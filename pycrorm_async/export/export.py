@@ -44,6 +44,8 @@ if TYPE_CHECKING:
     from pycrorm_async.progress_bar import ProgressCallback
 
 FileFormat: TypeAlias = Literal["parquet", "csv", "jsonl", "lerobot", "rrd", "mcap"]
+EPISODE_FORMATS = frozenset(("lerobot", "rrd", "mcap"))
+"""The formats that hold episodes, from their events, instead of rows."""
 
 
 class Exported(NamedTuple):
@@ -123,7 +125,8 @@ async def export(
             frames each second (`time`). Of MCAP: the wall time of the events (`time`, the default), or `fps` events in
             each second (`event`).
         images: of LeRobot: width and height of a picture of the scene at each frame, which needs the extra `world`.
-        report_progress: gets the number of rows, or events, done and of all.
+        report_progress: gets the number of rows, done and of all; of the formats of episodes that of events, with the
+            phase, `reading`, `drawing` or `writing`, also from another thread.
 
     Raises `CallerError` if the file or its manifest exists, if nothing has this name, or for a running episode;
     `UnknownEpisode`; `MissingExtra`; `OSError` if the disk is full, and then leaves no file.
@@ -153,7 +156,7 @@ async def export(
             case "rrd" | "mcap":
                 covered = await _episodes(reading, what, episodes, chosen, running=True)
                 with new_file(target, force=force) as written:
-                    changes = await write_scene(reading, covered, written, chosen, options)
+                    changes = await write_scene(reading, covered, written, chosen, options, report_progress)
                     manifest = await _described(reading, covered, chosen, options, changes)
                     manifest = _complete(manifest, {target.name: checksums(written)[written.name]}, described)
     return Exported(target, manifest.rows, len(manifest.episodes), left_out, manifest)

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 from pycrorm_async.errors import MissingExtra
 from pycrorm_async.export.lerobot.states import Clock
 from pycrorm_async.export.recorded_episode import EventTime, RecordedEpisode
-from pycrorm_async.export.scene_frames import FrameChange, SceneObject, Shape, frame_changes
+from pycrorm_async.export.scene_frames import REPORTED_CHANGES, FrameChange, SceneObject, Shape, frame_changes
 
 _SECOND_NS = 10**9
 _TOPICS = {"/tf": "FrameTransforms", "/scene": "SceneUpdate", "/plan": "Log"}
@@ -31,10 +31,19 @@ class _Message(NamedTuple):
     content: Callable[[Any], Any]
 
 
-def write_mcap(episode: RecordedEpisode, objects: dict[int, SceneObject], path: Path, *, clock: Clock, fps: int) -> int:
+def write_mcap(
+    episode: RecordedEpisode,
+    objects: dict[int, SceneObject],
+    path: Path,
+    report_events: Callable[[int], object],
+    *,
+    clock: Clock,
+    fps: int,
+) -> int:
     """Write the file and return the number of messages.
 
     Args:
+        report_events: gets the event up to which the messages are written.
         clock: the axis of the messages: `time`, the wall time of each event, or `event`, `fps` events in a second.
 
     Raises `MissingExtra`.
@@ -57,6 +66,8 @@ def write_mcap(episode: RecordedEpisode, objects: dict[int, SceneObject], path: 
             stamped = each.content(messages.Timestamp(sec=time_ns // _SECOND_NS, nsec=time_ns % _SECOND_NS))
             writer.add_message(channels[each.topic], time_ns, stamped.encode(), time_ns, each.when.sequence)
             count += 1
+            if count % REPORTED_CHANGES == 0:
+                report_events(each.when.sequence)
         writer.finish()
     return count
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -87,8 +87,10 @@ class RecordedEpisode:
     nodes: list[ExportedNode] = field(default_factory=list)
 
 
-async def read_episode(reading: Reading, covered: CoveredEpisode) -> RecordedEpisode:
-    """Read an episode up to the event `covered.events`.
+async def read_episode(
+    reading: Reading, covered: CoveredEpisode, report_events: Callable[[int], object]
+) -> RecordedEpisode:
+    """Read an episode up to the event `covered.events`. `report_events` gets the number of events read so far.
 
     Raises `CallerError` for one without an event; `LogDamaged` or `DatabaseForeign` for an event that cannot be read.
     """
@@ -103,6 +105,7 @@ async def read_episode(reading: Reading, covered: CoveredEpisode) -> RecordedEpi
                 fold.read(event)
             except CannotFold as reason:
                 raise unreadable(row.id, event, str(reason), log) from None
+        report_events(page[-1].sequence)
     return fold.episode
 
 

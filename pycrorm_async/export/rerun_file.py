@@ -7,19 +7,24 @@ are one column (`send_columns`), so that a recording is small and opens at once.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from pycrorm_async.errors import MissingExtra
 from pycrorm_async.export.recorded_episode import EventTime, RecordedEpisode
-from pycrorm_async.export.scene_frames import MAP, FrameChange, SceneObject, Shape, frame_changes
+from pycrorm_async.export.scene_frames import MAP, REPORTED_CHANGES, FrameChange, SceneObject, Shape, frame_changes
 
 _APPLICATION = "pycrorm"
 
 
-def write_rerun(episode: RecordedEpisode, objects: dict[int, SceneObject], path: Path) -> int:
-    """Write the file and return the number of changes in it. Raises `MissingExtra`; `OSError` if the disk is full."""
+def write_rerun(
+    episode: RecordedEpisode, objects: dict[int, SceneObject], path: Path, report_events: Callable[[int], object]
+) -> int:
+    """Write the file and return the number of changes in it. `report_events` gets the event of the latest change.
+
+    Raises `MissingExtra`; `OSError` if the disk is full.
+    """
     os.environ.setdefault("RERUN_ANALYTICS", "0")  # its first start would print a notice and ask a server
     try:
         import rerun as rr
@@ -38,6 +43,8 @@ def write_rerun(episode: RecordedEpisode, objects: dict[int, SceneObject], path:
         entities.setdefault(each.child, f"{entities[each.parent]}/{_part(each.child)}")
         changes.setdefault(each.child, []).append(each)
         count += 1
+        if count % REPORTED_CHANGES == 0:
+            report_events(each.when.sequence)
     for frame, moved in changes.items():
         recording.send_columns(
             entities[frame],

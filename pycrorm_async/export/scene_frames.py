@@ -20,6 +20,8 @@ from pycrorm_async.query.scene.object_model import assumed_model, object_model, 
 from pycrorm_async.world.pose import Pose
 
 MAP = "map"
+REPORTED_CHANGES = 100
+"""A writer reports its progress after so many changes or messages: to draw a bar takes longer than to write one."""
 _GREY = (0.6, 0.6, 0.6, 1.0)
 """The colour of a shape without one."""
 

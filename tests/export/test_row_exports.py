@@ -399,7 +399,8 @@ def test_the_command_writes_compares_and_names_mistakes_in_one_line(kitchen: Pat
     assert (answer["format"], answer["episodes"], [*answer["files"]]) == ("parquet", 2, ["both.parquet"])
     done = pycrorm("export", "--again", tmp_path / "both.parquet.manifest.json", cwd=kitchen)
     assert (done.returncode, done.stdout) == (0, "the same bytes\n")
-    pycrorm("export", "3", "--out", tmp_path / "three.rrd", cwd=kitchen)
+    done = pycrorm("export", "3", "--out", tmp_path / "three.rrd", cwd=kitchen)
+    assert " changes of 1 episode; " in done.stderr
     done = pycrorm("export", "--again", tmp_path / "three.rrd.manifest.json", cwd=kitchen)
     assert (done.returncode, done.stdout) == (0, "the same episode and changes; rerun gives random ids\n")
     done = pycrorm("export", "1", "--out", tmp_path / "both.parquet", cwd=kitchen)

@@ -164,6 +164,24 @@ async def test_without_its_library_the_error_names_the_extra(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("name", ["a.rrd", "a.mcap", "set"])
+async def test_the_progress_of_an_episode_is_reported_in_events(reading: Reading, tmp_path: Path, name: str) -> None:
+    reports: list[tuple[int, int, str | None]] = []
+    exported = await export(
+        reading,
+        1,
+        tmp_path / name,
+        file_format="lerobot" if name == "set" else None,
+        report_progress=lambda done, total, what=None: reports.append((done, total, what)),
+    )
+    events = exported.manifest.episodes[0].events
+    assert {total for _, total, _ in reports} == {events}
+    reading_, writing = ([done for done, _, what in reports if what == phase] for phase in ("reading", "writing"))
+    assert (reading_[-1], writing[-1]) == (events, events)
+    assert writing == sorted(writing)
+    assert len(writing) > 1 or name == "set"
+
+
 @pytest.mark.parametrize(
     ("suffix", "function", "size"),
     [("rrd", "write_rerun", 4_000), ("rrd", "write_rerun", 400_000), ("mcap", "write_mcap", 10_000)],

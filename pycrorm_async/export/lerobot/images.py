@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextvars import Context
 
 import numpy as np
@@ -43,9 +43,15 @@ def check_size(size: ImageSize) -> None:
 
 
 async def draw_frames(
-    reading: Reading, episode: RecordedEpisode, frames: Frames, size: ImageSize
+    reading: Reading,
+    episode: RecordedEpisode,
+    frames: Frames,
+    size: ImageSize,
+    report_events: Callable[[int], object],
 ) -> list[NDArray[np.uint8]]:
     """Return the picture of each frame, of shape (height, width, 3). Frames of one event share theirs.
+
+    `report_events` gets the event up to which the frames are drawn.
 
     Raises `BulletMissing` without the extra `world`.
     """
@@ -58,6 +64,7 @@ async def draw_frames(
         # In a thread with an empty context the world belongs to no open episode and is not recorded.
         pictures = await asyncio.to_thread(Context().run, _drawn, moments, camera, size)
         drawn.update(zip(part, pictures, strict=True))
+        report_events(part[-1])
     return [drawn[each.sequence] for each in frames.at]
 
 
