@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from pycrorm_async.export.export import Exported
     from pycrorm_async.export.selection import Exportable
     from pycrorm_async.query.scene.picture import MomentReference
+    from pycrorm_async.report.write import Report
 
 __all__ = ["SyncMemory"]
 
@@ -171,6 +172,10 @@ class SyncMemory:
     def picture(self, episode: AnyEpisode, *, at: MomentReference = None, **view: Any) -> bytes:
         """Return the scene of an episode at a moment as PNG; see `Memory.picture`."""
         return self._await(self._memory.picture(episode, at=at, **view))
+
+    def report(self, episode: AnyEpisode, path: str | PathLike[str] | None = None, **options: Any) -> Report:
+        """Write an episode as one HTML page that opens offline; see `Memory.report`, which has the same options."""
+        return self._await(self._memory.report(episode, path, **options))
 
     def plot_success(self, x: str, y: str, **options: Any) -> Figure:
         """Draw how often the actions of a view succeeded over two of its columns; see `Memory.plot_success`."""

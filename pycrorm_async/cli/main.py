@@ -68,7 +68,8 @@ def _with_exit_code(verb: Callable[..., int | None]) -> Callable[..., None]:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             code = 0
         except OSError as error:
-            problem(f"the output cannot be written: {error.strerror or error}")
+            what = error.filename if isinstance(error.filename, str) else "the output"
+            problem(f"{what} cannot be written: {error.strerror or error}")
             code = 1
         raise typer.Exit(code)
 

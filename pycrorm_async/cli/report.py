@@ -93,7 +93,7 @@ def _write_episode(
         return
     print_line(written.path)
     note(f"The page has {size / 1e6:.1f} MB and opens in any browser, also offline.")
-    if first is None and last is None and written.last < written.events:
+    if written.last < min(last or written.events, written.events):
         note(
             f"It shows the events {written.first} to {written.last} of {written.events}, because a page holds no more;"
             f" the next page: --from {written.last + 1}"

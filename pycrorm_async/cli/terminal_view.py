@@ -24,7 +24,6 @@ from pycrorm_async.query.as_of import unreadable
 from pycrorm_async.query.snapshot import Moment, NodeThen
 from pycrorm_async.query.snapshot_fold import MomentFold
 from pycrorm_async.store.episode_lookup import episode_named
-from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import EpisodeRow
 
 _INTERVAL_S = 0.1
@@ -39,42 +38,58 @@ _SIGNS = {"RUNNING": "cyan", "SUCCEEDED": "green", "LOST": "yellow", "INTERRUPTE
 
 
 async def draw_episode(follower: LogFollower, name: str, stop: asyncio.Event) -> None:
-    """Draw an episode until it has ended. Raises `UnknownEpisode`, `LogDamaged`, `DatabaseForeign`."""
+    """Draw an episode until it has ended; wait while the database is unavailable.
+
+    Raises `UnknownEpisode`, `LogDamaged`, `DatabaseForeign`.
+    """
     with _live() as live:
-        opened = await _wait_for(follower, name, live, stop)
-        if opened is None:
-            return
-        log, begun = opened
-        number, identity, last = begun.number, parse_episode_id(begun.id), 0
-        fold = MomentFold(number, begun.id)
-        while not stop.is_set():
+        begun = await _wait_for(follower, name, live, stop)
+        drawing = _Drawing(follower, begun, live) if begun is not None else None
+        while drawing is not None and not stop.is_set():
             began = time.monotonic()
-            row = await log.episode(identity)
-            if row is None:
-                raise UnknownEpisode(f"{follower.address} no longer has episode {number}")
-            if row.head > last:
-                dtypes = await log.dtypes()
-                async for page in log.pages(row, after=last):
-                    for event in page:
-                        try:
-                            fold.read(event)
-                        except CannotFold as reason:
-                            raise unreadable(row.id, event, str(reason), log) from None
-                last = row.head
-                live.update(_picture(fold.moment(dtypes, {}, {}), _lines()), refresh=True)
-            if row.ended_wall_ns is not None:
-                return
+            try:
+                if await drawing.draw():
+                    return
+            except DatabaseUnavailable as error:
+                live.update(Text(f"waiting: {error}"), refresh=True)
             await _rest(stop, max(_INTERVAL_S, _SHARE * (time.monotonic() - began)))
 
 
-async def _wait_for(
-    follower: LogFollower, name: str, live: Live, stop: asyncio.Event
-) -> tuple[EventLog, EpisodeRow] | None:
+class _Drawing:
+    """An episode as far as it was read, and the picture of it."""
+
+    def __init__(self, follower: LogFollower, begun: EpisodeRow, live: Live) -> None:
+        self._follower = follower
+        self._live = live
+        self._identity = parse_episode_id(begun.id)
+        self._fold = MomentFold(begun.number, begun.id)
+        self._last = 0
+
+    async def draw(self) -> bool:
+        """Read the new events and draw them; return whether the episode has ended."""
+        log = await self._follower.log()
+        row = await log.episode(self._identity)
+        if row is None:
+            raise UnknownEpisode(f"{self._follower.address} no longer has episode {self._fold.number}")
+        if row.head > self._last:
+            dtypes = await log.dtypes()
+            async for page in log.pages(row, after=self._last):
+                for event in page:
+                    try:
+                        self._fold.read(event)
+                    except CannotFold as reason:
+                        raise unreadable(row.id, event, str(reason), log) from None
+                    self._last = event.sequence
+            self._live.update(_picture(self._fold.moment(dtypes, {}, {}), _lines()), refresh=True)
+        return row.ended_wall_ns is not None
+
+
+async def _wait_for(follower: LogFollower, name: str, live: Live, stop: asyncio.Event) -> EpisodeRow | None:
     while not stop.is_set():
         try:
             log = await follower.log()
             if await log.episodes():
-                return log, await episode_named(log, name)
+                return await episode_named(log, name)
             live.update(Text(f"{follower.address} has no episode yet: waiting for the first."), refresh=True)
         except DatabaseUnavailable as error:
             live.update(Text(f"waiting: {error}"), refresh=True)

@@ -70,10 +70,13 @@ def _stop_at_signals() -> asyncio.Event:
 async def _draw(follower: LogFollower, episode: str | None) -> None:
     await _check(follower, episode)
     stop = _stop_at_signals()
-    async with asyncio.TaskGroup() as tasks:
-        following = tasks.create_task(follower.run(), name="follow the log")
-        await (draw_overview(follower, stop) if episode is None else draw_episode(follower, episode, stop))
-        following.cancel()
+    try:
+        async with asyncio.TaskGroup() as tasks:
+            following = tasks.create_task(follower.run(), name="follow the log")
+            await (draw_overview(follower, stop) if episode is None else draw_episode(follower, episode, stop))
+            following.cancel()
+    except ExceptionGroup as errors:  # the command reports one error in one line
+        raise errors.exceptions[0] from None
 
 
 async def _serve(follower: LogFollower, episode: str | None, port: int | None, *, open_it: bool, as_json: bool) -> None:

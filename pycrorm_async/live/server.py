@@ -52,7 +52,7 @@ _WAITING = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta http-equiv="refresh" content="2">
 <meta name="color-scheme" content="light dark"><meta name="viewport" content="width=device-width, initial-scale=1">
 <meta http-equiv="Content-Security-Policy" content="default-src 'none'"><title>waiting</title></head>
-<body><h1>Waiting for the database</h1><p>{reason}</p><p>This page loads again every two seconds.</p></body></html>
+<body><h1>Waiting for the memory</h1><p>{reason}</p><p>This page loads again every two seconds.</p></body></html>
 """
 """The page of an episode that cannot be read at the moment."""
 
@@ -143,12 +143,22 @@ class LiveServer:
                 return PlainTextResponse(reason, 404)
             document = await feed.document(await self._follower.log())
         except UnknownEpisode as error:
-            return RedirectResponse(f"/{self._token}/") if name == "last" else PlainTextResponse(str(error), 404)
+            if name == "last":
+                return RedirectResponse(f"/{self._token}/")
+            if await self._waits_for_first_episode():
+                return HTMLResponse(_WAITING.format(reason=html.escape(str(error))), 503)
+            return PlainTextResponse(str(error), 404)
         except PycrormError as error:
             return HTMLResponse(_WAITING.format(reason=html.escape(str(error))), 503)
         stream = f"/{self._token}/episode/{feed.number}/events?from={first}&id={feed.id}"
         live = {"stream": stream, "list": f"/{self._token}/", "page": f"/{self._token}/episode/"}
         return await _html(page_of, {**document, "live": live})
+
+    async def _waits_for_first_episode(self) -> bool:
+        try:
+            return not await (await self._follower.log()).episodes()
+        except PycrormError:
+            return True
 
     # --- streams ----------------------------------------------------------------------------------------------
 

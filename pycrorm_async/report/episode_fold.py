@@ -47,8 +47,11 @@ _NUMBERS_MAX = 1_400_000
 """Bounds the numbers of poses and joints of a page, of which each takes about 7 bytes: 200,000 moves of an object."""
 _CURVE_POINTS_MAX = 2_000
 """Bounds the values of a curve, which is a few hundred pixels wide."""
+_LISTS = "detections", "observations", "locations"
 _LISTED_MAX = 20_000
-"""Bounds the percepts, observations and location resolutions of a page, each."""
+"""Bounds the percepts, observations and location resolutions of a page, each; the page counts the others."""
+_ITEMS_MAX = 8
+"""Bounds the numbers of a list that have curves: as many as a wrench, a quaternion or the joints of an arm have."""
 _VALUES_MAX = 2_000
 """Bounds the characters of an observation's values in the page."""
 
@@ -72,9 +75,8 @@ class EpisodeFold:
         self._nodes: dict[int, list[Any]] = {}
         self._ended_nodes: list[tuple[int, int]] = []
         """The event that ended a node, and the node's start; both also of a node that is LOST."""
-        self._detections: list[dict[str, Any]] = []
-        self._observations: list[dict[str, Any]] = []
-        self._locations: list[dict[str, Any]] = []
+        self._listed: dict[str, list[dict[str, Any]]] = {name: [] for name in _LISTS}
+        self._unlisted = dict.fromkeys(_LISTS, 0)
         self._series: dict[str, Track] = {}
 
     def read(self, event: StoredEvent, designators: Mapping[str, str]) -> None:
@@ -107,11 +109,11 @@ class EpisodeFold:
             case EpisodeEnded():
                 self._ended(sequence, happening)
             case ObjectDetected() if sequence >= self._first:
-                self._list(self._detections, _detection(sequence, happening))
+                self._list("detections", _detection(sequence, happening))
             case Observed() if sequence >= self._first:
                 self._observed(sequence, happening)
             case LocationResolved() if sequence >= self._first:
-                self._list(self._locations, _location(sequence, happening))
+                self._list("locations", _location(sequence, happening))
             case _:
                 self.world.read(sequence, happening)
 
@@ -120,10 +122,11 @@ class EpisodeFold:
         """True if a page can hold no further node, or no further move."""
         return len(self._nodes) >= _NODES_MAX or self.world.numbers >= _NUMBERS_MAX
 
-    @staticmethod
-    def _list(entries: list[dict[str, Any]], entry: dict[str, Any]) -> None:
-        if len(entries) < _LISTED_MAX:
-            entries.append(entry)
+    def _list(self, name: str, entry: dict[str, Any]) -> None:
+        if len(self._listed[name]) < _LISTED_MAX:
+            self._listed[name].append(entry)
+        else:
+            self._unlisted[name] += 1
 
     def _name_of(self, reference: Mapping[str, int]) -> str | None:
         referred = self.world.objects.get(reference["object"])
@@ -160,7 +163,7 @@ class EpisodeFold:
         if len(text) > _VALUES_MAX:
             text = f"{text[:_VALUES_MAX]}… ({len(text) - _VALUES_MAX:,} more characters)"
         entry = {"at": sequence, "node": observed.node or 0, "name": observed.name, "values": text}
-        self._list(self._observations, entry)
+        self._list("observations", entry)
         for path, number in _numbers_in(observed.name, observed.values):
             self._series.setdefault(path, Track(self._first)).set(sequence, number)
 
@@ -185,9 +188,7 @@ class EpisodeFold:
                 each for each in (self._object(identity, models, after) for identity in self.world.objects) if each
             ],
             "attachments": [each for each in self.world.attachments if max(each[3:]) > after],
-            "detections": _behind(self._detections, after),
-            "observations": _behind(self._observations, after),
-            "locations": _behind(self._locations, after),
+            **{name: _behind(entries, after) for name, entries in self._listed.items()},
             "series": _tracks(self._series, after),
             "samples": {
                 str(identity): tracks
@@ -219,6 +220,7 @@ class EpisodeFold:
             "last": self.last,
             "head": max(self.row.head, self.last),
             "full": self.is_full,
+            "unlisted": dict(self._unlisted),
             "opens": min(max(opens, self._first), self.last),
         }
 
@@ -317,6 +319,8 @@ def _numbers_in(name: str, values: Any) -> list[tuple[str, float]]:
         return [(name, float(values))]
     if isinstance(values, dict) and name.count(".") < 2:
         return [pair for key, each in values.items() for pair in _numbers_in(f"{name}.{key}", each)]
+    if isinstance(values, list) and len(values) <= _ITEMS_MAX and name.count(".") < 2:
+        return [pair for index, each in enumerate(values) for pair in _numbers_in(f"{name}.{index}", each)]
     return []
 
 

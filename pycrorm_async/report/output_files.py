@@ -57,10 +57,12 @@ def new_file(path: Path, *, force: bool) -> Iterator[Path]:
         if force:
             written.replace(path)
         else:
-            path.hardlink_to(written)  # fails, unlike a renaming, if another process made the file meanwhile
+            _rename_to_new(written, path)
         _sync(path.absolute().parent)
     except FileExistsError:
         raise CallerError(f"{path} exists: add --force to replace it, or give another name") from None
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from error  # the user knows no part
     finally:
         written.unlink(missing_ok=True)
         os.close(descriptor)
@@ -98,6 +100,17 @@ def new_folder(path: Path, *, force: bool, marker: str) -> Iterator[Path]:
         shutil.rmtree(written, ignore_errors=True)
         shutil.rmtree(replaced, ignore_errors=True)
         os.close(descriptor)
+
+
+def _rename_to_new(written: Path, path: Path) -> None:
+    """Give the file its name; unlike a renaming, raise `FileExistsError` if another process made it meanwhile."""
+    try:
+        path.hardlink_to(written)
+    except FileExistsError:
+        raise
+    except OSError:  # a file system without links, such as that of a USB stick
+        path.touch(exist_ok=False)
+        written.replace(path)
 
 
 def _prefix(path: Path) -> str:

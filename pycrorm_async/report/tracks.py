@@ -42,14 +42,25 @@ class Track:
     def columns(self, points_max: int | None = None, *, after: int = 0) -> list[Any]:
         """Return the differences of the sequences, and the values, of the entries behind event `after`.
 
-        If there are more than `points_max` entries, it returns an evenly spaced selection.
+        Of more than `points_max` entries, which must be numbers, it returns the least and the greatest of each group of
+        neighbours, so that the range of a curve stays that of all values.
         """
         begin = bisect_right(self.at, after)
         at, values = self.at[begin:], self.values[begin:]
         if points_max is not None and len(at) > points_max:
-            step = -(-len(at) // points_max)
-            at, values = at[::step], values[::step]
+            kept = _extremes(values, points_max)
+            at, values = [at[each] for each in kept], [values[each] for each in kept]
         return [differences(at), values]
+
+
+def _extremes(values: list[Any], points_max: int) -> list[int]:
+    """Return the indices of the least and the greatest value in each bucket of neighbours, and that of the last."""
+    size = -(-2 * len(values) // points_max)
+    kept = {len(values) - 1}
+    for begin in range(0, len(values), size):
+        bucket = range(begin, min(begin + size, len(values)))
+        kept |= {min(bucket, key=values.__getitem__), max(bucket, key=values.__getitem__)}
+    return sorted(kept)
 
 
 def differences(values: Iterable[int]) -> list[int]:

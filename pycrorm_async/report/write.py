@@ -7,7 +7,9 @@ Report(path=PosixPath('breakfast.html'), first=1, last=188, events=188)
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Collection, Mapping
+import shutil
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
 from os import PathLike
 from pathlib import Path
 from typing import NamedTuple
@@ -113,18 +115,31 @@ async def overview(
     episodes, total = await newest_episodes(reading, tags)
     if not episodes:
         raise CallerError(f"no episode has the tags {', '.join(tags)}" if tags else "this memory has no episode yet")
-    folder.mkdir(exist_ok=True)
-    shown = episodes[-_PAGES_MAX:]
-    unreadable = await _write_pages(reading, shown, folder, force=force)
-    shown = [each for each in shown if each.number not in unreadable]
-    if unreadable:  # again, because some pages may link to those that are missing
-        await _write_pages(reading, shown, folder, force=True)
-    pages = {each.number: f"{quote(folder.name)}/{page_name(each.number)}" for each in shown}
     title = f"Episodes with the tags {', '.join(tags)}" if tags else "Episodes"
-    document = await overview_document(reading, title, episodes, total, pages, unreadable)
-    document["successes"] = await success_documents(reading, [each.number for each in episodes])
-    await asyncio.to_thread(lambda: write_page(overview_page_of(document), file, force=force))
+    with _folder_of_pages(folder):
+        shown = episodes[-_PAGES_MAX:]
+        unreadable = await _write_pages(reading, shown, folder, force=force)
+        shown = [each for each in shown if each.number not in unreadable]
+        if unreadable:  # again, because some pages may link to those that are missing
+            await _write_pages(reading, shown, folder, force=True)
+        pages = {each.number: f"{quote(folder.name)}/{page_name(each.number)}" for each in shown}
+        document = await overview_document(reading, title, episodes, total, pages, unreadable)
+        document["successes"] = await success_documents(reading, [each.number for each in episodes])
+        await asyncio.to_thread(lambda: write_page(overview_page_of(document), file, force=force))
     return Overview(file, len(episodes), len(pages), total - len(episodes), unreadable)
+
+
+@contextmanager
+def _folder_of_pages(folder: Path) -> Iterator[None]:
+    """Make the folder if it does not exist; delete it again, with its pages, if an error leaves the block."""
+    is_new = not folder.exists()
+    folder.mkdir(exist_ok=True)
+    try:
+        yield
+    except BaseException:
+        if is_new:
+            shutil.rmtree(folder, ignore_errors=True)
+        raise
 
 
 async def _write_pages(

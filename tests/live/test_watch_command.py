@@ -1,7 +1,9 @@
 """`pycrorm watch`: which requests it answers, what it prints, and one line for each mistake."""
 
+import asyncio
 import builtins
 import os
+import shutil
 import signal
 import socket
 import sqlite3
@@ -15,9 +17,15 @@ from unittest import mock
 
 import pytest
 
-from pycrorm_async.errors import CallerError, MissingExtra
+from pycrorm_async.cli.terminal_view import draw_episode
+from pycrorm_async.errors import CallerError, DatabaseUnavailable, MissingExtra
+from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.live.access import kept_token, refusal
+from pycrorm_async.live.follower import LogFollower
 from pycrorm_async.live.server import PORT, listen
+from pycrorm_async.operations.destination import shared_address
+from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.stored import EpisodeRow
 from tests.commands import COMMAND, Started, environment, one_line_of, pycrorm
 from tests.live.conftest import Watch, robot_in
 
@@ -122,6 +130,42 @@ def test_mistakes_are_one_line(folder: Path, arguments: tuple[str, ...], code: i
     done = pycrorm("watch", *arguments, cwd=folder, timeout_s=30)
     assert done.returncode == code
     assert message in one_line_of(done)
+
+
+def test_an_event_that_cannot_be_read_is_one_line_in_the_terminal_too(folder: Path, tmp_path: Path) -> None:
+    shutil.copy(folder / "pycrorm.db", tmp_path / "pycrorm.db")
+    with closing(sqlite3.connect(tmp_path / "pycrorm.db")) as database, database:
+        for (trigger,) in database.execute("SELECT name FROM sqlite_master WHERE type = 'trigger'").fetchall():
+            database.execute(f"DROP TRIGGER {trigger}")
+        database.execute("UPDATE event SET payload = '{' WHERE sequence = 3")
+    done = pycrorm("watch", "1", "--terminal", cwd=tmp_path, timeout_s=30)
+    assert done.returncode == 4
+    assert "event 3: " in one_line_of(done)
+
+
+async def test_the_terminal_waits_while_the_database_is_unavailable_and_draws_each_event_once(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    follower = LogFollower(shared_address(f"sqlite:///{folder / 'pycrorm.db'}"))
+    of_log, calls = EventLog.episode, []
+
+    async def episode(log: EventLog, identity: EpisodeId) -> EpisodeRow | None:
+        calls.append(identity)
+        if len(calls) == 1:
+            raise DatabaseUnavailable("the server is away")
+        return await of_log(log, identity)
+
+    monkeypatch.setattr(EventLog, "episode", episode)
+    await draw_episode(follower, "1", asyncio.Event())  # returns at the episode's end
+    await follower.close()
+    assert len(calls) == 2
+
+
+def test_an_episode_of_an_empty_memory_has_a_page_that_waits(watch: Callable[..., Watch], tmp_path: Path) -> None:
+    pycrorm("writer", "--once", cwd=tmp_path)
+    server = watch("--port", "0", "7", folder=tmp_path)
+    status, page = server.get()
+    assert (status, 'http-equiv="refresh"' in page) == (503, True)
 
 
 def test_the_server_answers_its_own_pages_and_no_others(watch: Callable[..., Watch], folder: Path) -> None:

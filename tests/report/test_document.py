@@ -85,7 +85,9 @@ async def test_a_document_has_every_node_object_observation_and_time(url: str) -
     assert [(each["name"], each["type"]) for each in document["objects"]] == [("turtle\u202e", "ROBOT")]
     assert [each[:2] for each in document["objects"][0]["poses"][1]] == [[0.0, 0.0], [1.0, 2.0]]
     assert [each["name"] for each in document["observations"]] == ["battery"]
-    assert document["series"] == {"battery.volts": [[document["observations"][0]["at"]], [24.5]]}
+    at = document["observations"][0]["at"]
+    values = {"battery.volts": 24.5, "battery.cells.0": 1.0, "battery.cells.1": 2.0}
+    assert document["series"] == {name: [[at], [value]] for name, value in values.items()}
     assert len(document["times"]) == document["episode"]["head"]
 
 
@@ -153,11 +155,27 @@ def test_a_track_keeps_each_change_once_and_one_value_before_the_window() -> Non
     assert track.columns() == [[9, 4, 7], [2.0, 4.0, 5.0]]
 
 
-def test_of_a_long_curve_a_part_of_the_values_is_kept() -> None:
+def test_of_a_long_curve_the_extremes_and_the_last_value_are_kept() -> None:
     track = Track(1)
-    for sequence in range(1, 11):
-        track.set(sequence, sequence / 2)
-    assert track.columns(4) == [[1, 3, 3, 3], [0.5, 2.0, 3.5, 5.0]]
+    for sequence, value in enumerate((0.5, 1.0, 100.0, 2.0, 2.5, 3.0, -7.0, 4.0, 4.5, 5.0), 1):
+        track.set(sequence, value)
+    assert track.columns(4) == [[1, 2, 4, 3], [0.5, 100.0, -7.0, 5.0]]
+
+
+async def test_the_entries_that_a_page_does_not_list_are_counted_and_a_list_has_curves(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(episode_fold, "_LISTED_MAX", 2)
+    url = f"sqlite:///{tmp_path / 'memory.db'}"
+    async with Memory.open(url) as memory:
+        async with memory.episode(description="a wrench"):
+            for index in range(5):
+                memory.observe("wrench", [float(index), 0.5])
+        await memory.flush()
+    document = await document_of(url)
+    assert len(document["observations"]) == 2
+    assert document["episode"]["unlisted"] == {"detections": 0, "observations": 3, "locations": 0}
+    assert document["series"]["wrench.0"][1] == [0.0, 1.0, 2.0, 3.0, 4.0]
 
 
 async def test_a_page_ends_where_it_can_hold_no_further_node(url: str, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,10 +1,12 @@
 """A file or folder has its name only when it is complete and on the disk."""
 
+import errno
 import os
 from pathlib import Path
 
 import pytest
 
+from pycrorm_async.errors import CallerError
 from pycrorm_async.report.output_files import new_folder, write_file
 
 
@@ -33,6 +35,27 @@ def test_a_file_is_synced_before_it_gets_its_name_and_its_folder_afterwards(
     write_file(b"all of it", target, force=force)
     assert [(content, named) for _, content, named in syncs.noted] == [(b"all of it", False), (None, True)]
     assert syncs.noted[-1][0] == tmp_path.name
+    assert [each.name for each in tmp_path.iterdir()] == ["rows.csv"]
+
+
+@pytest.mark.parametrize("exists", [False, True])
+def test_a_file_system_without_links_gives_a_new_file_its_name_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, exists: bool
+) -> None:
+    target = tmp_path / "rows.csv"
+
+    def link(*_: object, **__: object) -> None:
+        if exists:
+            target.write_bytes(b"of another process")
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(os, "link", link)
+    if exists:
+        with pytest.raises(CallerError, match="exists: add --force"):
+            write_file(b"all of it", target)
+    else:
+        write_file(b"all of it", target)
+    assert target.read_bytes() == (b"of another process" if exists else b"all of it")
     assert [each.name for each in tmp_path.iterdir()] == ["rows.csv"]
 
 

@@ -1,7 +1,6 @@
 """`pycrorm report`: the file it writes, and one line for each mistake that prevents it."""
 
 import json
-import resource
 import shutil
 import sqlite3
 from contextlib import closing
@@ -10,8 +9,13 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from pycrorm_async import Reading
+from pycrorm_async.cli import report as command
+from pycrorm_async.report import episode_fold
 from pycrorm_async.report.html_page import write_page
+from pycrorm_async.report.write import overview
 from tests.commands import one_line_of, pycrorm
+from tests.full_disk import files_of_at_most
 
 pytestmark = pytest.mark.slow
 
@@ -111,11 +115,34 @@ def test_a_damaged_episode_has_a_row_with_the_reason_and_the_others_their_pages(
 
 
 def test_a_disk_that_fills_leaves_no_partial_file(tmp_path: Path) -> None:
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (10_000, limits[1]))
-    try:
-        with pytest.raises(OSError, match="File too large"):
-            write_page("x" * 100_000, tmp_path / "page.html")
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    with files_of_at_most(10_000), pytest.raises(OSError, match="File too large") as raised:
+        write_page("x" * 100_000, tmp_path / "page.html")
+    assert raised.value.filename == str(tmp_path / "page.html")
     assert list(tmp_path.iterdir()) == []
+
+
+async def test_a_disk_that_fills_leaves_no_page_and_no_folder_of_a_table_of_episodes(
+    recorded: Path, tmp_path: Path
+) -> None:
+    async with Reading.open(f"sqlite:///{recorded / 'pycrorm.db'}") as reading:
+        with files_of_at_most(10_000), pytest.raises(OSError, match="File too large"):
+            await overview(reading, tmp_path / "all.html")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(("first", "last", "continues"), [(None, None, True), (3, None, True), (None, 4, False)])
+def test_a_full_page_names_the_next_window(
+    recorded: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    first: int | None,
+    last: int | None,
+    *,
+    continues: bool,
+) -> None:
+    notes: list[str] = []
+    monkeypatch.setattr(episode_fold, "_NODES_MAX", 2)
+    monkeypatch.setattr(command, "note", notes.append)
+    url = f"sqlite:///{recorded / 'pycrorm.db'}"
+    command.report("1", every=False, out=tmp_path / "page.html", first=first, last=last, url=url)
+    assert any("the next page: --from " in each for each in notes) == continues

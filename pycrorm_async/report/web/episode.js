@@ -41,13 +41,29 @@ export class Track {
     append(this.at, sums(at));
     append(this.values, values);
     if (this.at.length <= 2 * pointsMax) return;
-    this.at = this.at.filter((_, index) => index % 2 === 0);
-    this.values = this.values.filter((_, index) => index % 2 === 0);
+    const kept = extremes(this.values, pointsMax);
+    this.at = kept.map((index) => this.at[index]);
+    this.values = kept.map((index) => this.values[index]);
   }
 
   valueAt(event) {
     return this.values[Math.max(0, lastUpTo(this.at, event))];
   }
+}
+
+/** The indices of the least and the greatest value of each bucket of neighbours, and of the last value, in order. */
+export function extremes(values, pointsMax) {
+  const size = Math.ceil((2 * values.length) / pointsMax);
+  const kept = new Set();
+  for (let begin = 0; begin < values.length; begin += size) {
+    let [least, greatest] = [begin, begin];
+    for (let index = begin; index < Math.min(begin + size, values.length); index += 1) {
+      if (values[index] < values[least]) least = index;
+      if (values[index] > values[greatest]) greatest = index;
+    }
+    kept.add(Math.min(least, greatest)).add(Math.max(least, greatest));
+  }
+  return [...kept.add(values.length - 1)].sort((one, other) => one - other);
 }
 
 const CURVE_POINTS_MAX = 2000;

@@ -1,6 +1,6 @@
 // Shows what belongs to a node or to the moment: details, failures by reason, percepts, observations, states.
 
-import { failureGroups, lastUpTo, signOf } from "./episode.js";
+import { extremes, failureGroups, lastUpTo, signOf } from "./episode.js";
 import { duration, element, recorded, replaceIn, svg } from "./dom.js";
 import { similarTo } from "./similar.js";
 
@@ -183,7 +183,7 @@ export class Panels {
   }
 
   /** The entries around the moment, at most `LISTED_MAX`; those after it are pale. */
-  #around(entries, row) {
+  #around(entries, row, unlisted = 0) {
     const here = lastUpTo(entries.map((each) => each.at), this.event);
     const from = Math.max(0, Math.min(here - LISTED_MAX / 2, entries.length - LISTED_MAX));
     const listed = entries.slice(from, from + LISTED_MAX);
@@ -192,7 +192,7 @@ export class Panels {
       if (each.at > this.event) made.classList.add("later");
       return made;
     });
-    const left = entries.length - listed.length;
+    const left = entries.length - listed.length + unlisted;
     return left > 0 ? [...rows, element("p", { class: "quiet" }, `${left} others are not listed here.`)] : rows;
   }
 
@@ -204,7 +204,7 @@ export class Panels {
       });
       const what = percepts.length > 0 ? percepts.join("; ") : "nothing seen";
       return element("p", {}, this.#moment(at), ` ${source.replace("_", " ")} `, type ? `looked for ${type}: ` : "", recorded(what), " ", this.#node(node));
-    });
+    }, this.episode.unlisted.detections);
   }
 
   /** The objects of the moment: where each is, which way it looks, and what it moves with. */
@@ -239,9 +239,9 @@ export class Panels {
   }
 
   #observations() {
-    return this.#around(this.episode.observations, ({ at, name, values, node }) =>
-      element("p", {}, this.#moment(at), " ", recorded(name, { class: "name" }), " ", recorded(values), " ", this.#node(node)),
-    );
+    const row = ({ at, name, values, node }) =>
+      element("p", {}, this.#moment(at), " ", recorded(name, { class: "name" }), " ", recorded(values), " ", this.#node(node));
+    return this.#around(this.episode.observations, row, this.episode.unlisted.observations);
   }
 
   #curves() {
@@ -265,8 +265,8 @@ export class Panels {
     const x = (event) => ((event - first) / Math.max(last - first, 1)) * width;
     const y = (value) => height - 3 - ((value - low) / (high - low || 1)) * (height - 6);
     let path = "";
-    const step = Math.max(1, Math.floor(track.at.length / 1000));
-    for (let index = 0; index < track.at.length; index += step) {
+    const drawn = track.at.length > 1000 ? extremes(track.values, 1000) : track.at.keys();
+    for (const index of drawn) {
       const here = `${x(track.at[index]).toFixed(1)},${y(track.values[index]).toFixed(1)}`;
       path += index === 0 ? `M${here}` : `H${here.split(",")[0]}V${here.split(",")[1]}`;
     }
