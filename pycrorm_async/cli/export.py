@@ -111,7 +111,7 @@ def _size(text: str | None) -> tuple[int, int] | None:
         return None
     width, separator, height = text.partition("x")
     if not (separator and width.isdecimal() and height.isdecimal()):
-        raise CallerError(f"--images takes WIDTHxHEIGHT, as in 320x240, not {text!r}")
+        raise CallerError(f"--images must be WIDTHxHEIGHT, as in 320x240, got {text!r}")
     return int(width), int(height)
 
 
@@ -122,12 +122,12 @@ def _arguments(question: str, pairs: list[str]) -> dict[str, Any]:
     for each in pairs:
         name, separator, text = each.partition("=")
         if not separator:
-            raise CallerError(f"--with takes NAME=VALUE, as in object=milk, not {each!r}")
+            raise CallerError(f"--with must be NAME=VALUE, as in object=milk, got {each!r}")
         types = str(valid[name].annotation).split(" | ") if name in valid else []
         try:
             arguments[name] = next((read(text) for type_, read in _READ.items() if type_ in types), text)
         except (KeyError, ValueError):
-            raise CallerError(f"{name} of {question} is of the type {types[0]}, not {text!r}") from None
+            raise CallerError(f"{name} of {question} must be of the type {types[0]}, got {text!r}") from None
     return arguments
 
 

@@ -82,7 +82,7 @@ async def write_scene(
 ) -> int:
     """Write one episode to a file; return the number of changes or messages. Raises as `write_lerobot` does."""
     if len(episodes) != 1:
-        raise CallerError(f"a file of the format {file_format} holds one episode, not {len(episodes)}: name one")
+        raise CallerError(f"a file of the format {file_format} holds one episode, got {len(episodes)}: name one")
     progress = _Progress(report_progress, episodes[0].events)
     episode = await read_episode(reading, episodes[0], progress.of("reading"))
     objects = await scene_objects(reading, episode)

@@ -409,7 +409,7 @@ def test_the_command_writes_compares_and_names_mistakes_in_one_line(kitchen: Pat
     done = pycrorm("export", "root_failures", *with_milk, "--out", tmp_path / "f.csv", "--json", cwd=kitchen)
     assert json.loads(done.stdout)["rows"] == 1
     done = pycrorm("export", "root_failures", "--with", "limit=many", "--out", tmp_path / "g.csv", cwd=kitchen)
-    assert one_line_of(done) == "pycrorm: limit of root_failures is of the type int, not 'many'"
+    assert one_line_of(done) == "pycrorm: limit of root_failures must be of the type int, got 'many'"
     done = pycrorm("export", cwd=kitchen)
     assert (done.returncode, one_line_of(done)[:32]) == (2, "pycrorm: name what to export, fo")
 

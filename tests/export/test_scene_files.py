@@ -205,7 +205,7 @@ async def test_a_full_disk_leaves_no_file(
 @pytest.mark.parametrize(
     ("what", "options", "message"),
     [
-        ([1, 2], {}, "a file of the format mcap holds one episode, not 2"),
+        ([1, 2], {}, "a file of the format mcap holds one episode, got 2"),
         ("action", {}, "the format mcap holds whole episodes, and action is a view"),
         ([1], {"clock": "sun"}, "clock must be 'event' or 'time', got 'sun'"),
     ],

@@ -196,9 +196,9 @@ def test_a_region_consists_of_rectangles_that_do_not_overlap(rectangles: list[Re
 
 
 def test_invalid_evidence_is_refused() -> None:
-    with pytest.raises(CallerError, match="evidence on arms takes members of Arms"):
+    with pytest.raises(CallerError, match="evidence on arms must be members of Arms"):
         Evidence(arms=frozenset({Grasp.LEFT}))  # type: ignore[arg-type]
-    with pytest.raises(CallerError, match="evidence on grasps takes members of Grasp"):
+    with pytest.raises(CallerError, match="evidence on grasps must be members of Grasp"):
         Evidence(grasps=frozenset({"LEFT"}))  # type: ignore[arg-type]
     for height in ((0.9, 0.9), (1.0, 0.9), (0.9, math.nan)):
         with pytest.raises(CallerError, match="evidence on height takes an interval"):

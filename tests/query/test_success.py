@@ -153,9 +153,9 @@ async def test_a_figure_has_a_text_in_each_cell_or_a_point_for_each_row(url: str
         own = Figure()
         axes = own.add_subplot()
         points = await memory.plot_success("speed", "tool", of="TryAction", kind="scatter", axes=axes)
-        with pytest.raises(CallerError, match="is a heatmap or a scatter, not 'pie'"):
+        with pytest.raises(CallerError, match="kind must be 'auto', 'heatmap' or 'scatter', got 'pie'"):
             await memory.plot_success("speed", "arm", of="TryAction", kind="pie")  # type: ignore[arg-type]
-        with pytest.raises(CallerError, match="has 1 to 200 bins, not 0"):
+        with pytest.raises(CallerError, match="bins must be 1 to 200, got 0"):
             await memory.plot_success("speed", "arm", of="TryAction", bins=0)
     assert [each.get_text() for each in drawn.axes[0].texts].count("100 %\n21 to 100 %\nn = 1") == 3
     assert "37.5 % of 8 succeeded" in drawn.axes[0].get_title(loc="left")

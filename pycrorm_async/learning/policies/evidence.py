@@ -92,7 +92,7 @@ class Evidence:
         for name, members, kind in (("arms", self.arms, Arms), ("grasps", self.grasps, Grasp)):
             # Arms.LEFT == Grasp.LEFT because both are the integer 1: compare the types.
             if members is not None and not all(isinstance(each, kind) for each in members):
-                raise CallerError(f"evidence on {name} takes members of {kind.__name__}, not {set(members)}")
+                raise CallerError(f"evidence on {name} must be members of {kind.__name__}, got {set(members)}")
         if self.height is not None:
             low, high = self.height
             if not -math.inf < low < high < math.inf:

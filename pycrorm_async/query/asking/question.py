@@ -162,7 +162,7 @@ def episode_name(episode: AskedEpisode) -> str:
 
     if isinstance(episode, Episode):
         return str(episode)
-    raise CallerError(f"an episode is a number, an id, 'last', an Episode or an EpisodeSummary, not {episode!r}")
+    raise CallerError(f"episode must be a number, an id, 'last', an Episode or an EpisodeSummary, got {episode!r}")
 
 
 def _number_by_query(episode: AskedEpisode) -> EpisodeNumber:

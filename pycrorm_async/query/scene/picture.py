@@ -77,7 +77,7 @@ async def picture(
             f" not {width} x {height}"
         )
     if not (math.isfinite(pitch_deg) and -89 <= pitch_deg <= 89):
-        raise CallerError(f"the camera's pitch is between -89 and 89 degrees, not {pitch_deg}")
+        raise CallerError(f"pitch_deg must be -89 to 89, got {pitch_deg}")
     then = await _moment(reading, episode, at)
     if not then.world.objects:
         raise CallerError(await _emptiness(reading, then))

@@ -40,7 +40,7 @@ def success_figure(
     Raises `MissingExtra` without matplotlib; `CallerError` for another kind or number of bins.
     """
     if kind not in get_args(Kind):
-        raise CallerError(f"a picture of successes is a heatmap or a scatter, not {kind!r}")
+        raise CallerError(f"kind must be 'auto', 'heatmap' or 'scatter', got {kind!r}")
     table = success_table(samples, bins=bins)
     figure_type = _figure_type()
     if axes is None:

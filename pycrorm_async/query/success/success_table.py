@@ -104,7 +104,7 @@ def success_table(samples: Samples, *, bins: int | None = None) -> SuccessTable:
         usual = round(math.sqrt(len(samples.succeeded) / _ROWS_A_CELL))
         bins = min(max(usual, _BINS_LEAST), _BINS_USUAL)
     if not 1 <= bins <= _BINS_MAX:
-        raise CallerError(f"an axis has 1 to {_BINS_MAX} bins, not {bins}")
+        raise CallerError(f"bins must be 1 to {_BINS_MAX}, got {bins}")
     x, columns = _axis(samples.x, bins)
     y, rows = _axis(samples.y, bins)
     counts = np.zeros((2, x.cells, y.cells), dtype=int)
