@@ -209,7 +209,7 @@ class RecordedNodes(EpisodeWriter[_Node]):
         prepared = self.id
         value = noted(self.emitter, "NodeEnded", self._values.failure, failure) if failure is not None else None
         encoded = self._values.any(result) if result is not None else None
-        self._write("NodeEnded", self._end_open, key, NodeEnded(0, status, value, encoded), below, prepared)
+        self._write("NodeEnded", self._end_open, key, status, value, encoded, below, prepared)
 
     def _checked_status(self, status: NodeStatus) -> NodeStatus:
         if status in END_STATUSES:
@@ -217,14 +217,17 @@ class RecordedNodes(EpisodeWriter[_Node]):
         self._note("NodeEnded", f"{clean_repr(status)} is not a status ({', '.join(END_STATUSES)})")
         return "ERROR"
 
-    def _end_open(self, key: Hashable, end: NodeEnded, below: NodeStatus | None, prepared: EpisodeId) -> int:
+    def _end_open(
+        self, key: Hashable, status: NodeStatus, failure: FailureValue | None, result: Any, below: NodeStatus | None,
+        prepared: EpisodeId,
+    ) -> int:  # fmt: skip
         node = self._nodes.get(key)
         if node is None:
             raise CallerError(f"no open node has the key {clean_repr(key)}")
         if below is not None:
             for each in [each for each in reversed(self._nodes.values()) if _is_below(each, node)]:
                 self._end_node(each, NodeEnded(each.sequence, below))
-        self._end_node(node, replace(end, node=node.sequence, result=self._now(end.result, prepared)))
+        self._end_node(node, NodeEnded(node.sequence, status, failure, self._now(result, prepared)))
         return 0  # an end continues no episode
 
     def _end_node(self, node: _Node, event: NodeEnded) -> None:
