@@ -18,7 +18,7 @@ from typing import Final, Literal, NamedTuple
 
 from pycrorm_async.events.codec import NotEncodable
 from pycrorm_async.events.ids import EpisodeId
-from pycrorm_async.events.types import NodeEnded, NodeStarted
+from pycrorm_async.events.types import NodeEnded
 from pycrorm_async.events.values import NodeReference, NodeStatus, ObjectReference, RobotValue
 from pycrorm_async.hooks.episode_events import location_resolved, object_detected
 from pycrorm_async.hooks.world_recorder import WorldRecorder
@@ -133,16 +133,12 @@ class Episode(EpisodeWriter[TaskTreeNode]):
         """
         assert node.designator is not None
         missing: dict[str, str] = {}
-        event = NodeStarted(
-            kind=node.kind,
-            parent=self._sequence_of(node.parent) or self._root,
-            designator=declared.fingerprint or None,
-            parameters=read_parameters(node.designator, declared, self, missing),
-            robot=self._robot_state(),
-            simulated=self.simulated,
-            continues=continues,
-        )
-        return self._put_start(node, event, declared.dtype, missing, may_refuse=continues is None)
+        parent = self._sequence_of(node.parent) or self._root
+        parameters = read_parameters(node.designator, declared, self, missing)
+        return self._put_start(
+            node, declared, node.kind, parent, parameters, self._robot_state(),
+            missing=missing, continues=continues, may_refuse=continues is None,
+        )  # fmt: skip
 
     def end_node(self, node: TaskTreeNode) -> None:
         """Write the end of a node."""

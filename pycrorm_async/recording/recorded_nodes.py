@@ -19,7 +19,7 @@ from msgspec.structs import replace
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.ids import EpisodeId
-from pycrorm_async.events.types import NodeEnded, NodeStarted
+from pycrorm_async.events.types import NodeEnded
 from pycrorm_async.events.values import (
     EpisodeStatus,
     FailureValue,
@@ -171,16 +171,11 @@ class RecordedNodes(EpisodeWriter[_Node]):
         return acting
 
     def _write_start(self, node: _Node, missing: Mapping[str, str], continues: int | None) -> None:
-        event = NodeStarted(
-            kind=node.declared.declaration.kind,
-            parent=self.node_or_root(node.parent),
-            designator=node.declared.fingerprint or None,
-            parameters=node.parameters,
-            robot=node.robot,
-            simulated=self.simulated,
-            continues=continues,
-        )
-        node.sequence = self._put_start(node, event, node.declared.dtype, missing, may_refuse=False)
+        declared, parent = node.declared, self.node_or_root(node.parent)
+        node.sequence = self._put_start(
+            node, declared, declared.declaration.kind, parent, node.parameters, node.robot,
+            missing=missing, continues=continues, may_refuse=False,
+        )  # fmt: skip
         node.episode_id = self.id
 
     @counted("NodeEnded")

@@ -35,7 +35,8 @@ from pycrorm_async.events.envelope import Receipt
 from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.events.tags import changed_tags
 from pycrorm_async.events.types import EpisodeEnded, EpisodeTagged, NodeEnded, NodeStarted, ObjectDetected
-from pycrorm_async.events.values import EpisodeStatus, FailureValue, NodeStatus, ObjectReference
+from pycrorm_async.events.values import EpisodeStatus, FailureValue, NodeKind, NodeStatus, ObjectReference, RobotValue
+from pycrorm_async.recording.declarations.declared_type import DeclaredType
 from pycrorm_async.recording.values.event_fitting import (
     fit_detection,
     fit_episode_end,
@@ -237,12 +238,23 @@ class EpisodeWriter(ABC, Generic[N]):
     # --- nodes and perception -----------------------------------------------------------------------------------
 
     def _put_start(
-        self, node: N, event: NodeStarted, owner: str, missing: Mapping[str, str], *, may_refuse: bool
-    ) -> int:
+        self, node: N, declared: DeclaredType, kind: NodeKind, parent: int, parameters: dict[str, Any],
+        robot: RobotValue | None, *, missing: Mapping[str, str], continues: int | None, may_refuse: bool,
+    ) -> int:  # fmt: skip
         """Write the start of a node and return its sequence. `missing` has the reason for each missing value.
 
         Raises `Unrecordable` if `may_refuse` and the settings ask for it.
         """
+        owner = declared.dtype
+        event = NodeStarted(
+            kind=kind,
+            parent=parent,
+            designator=declared.fingerprint or None,
+            parameters=parameters,
+            robot=robot,
+            simulated=self.simulated,
+            continues=continues,
+        )
         if missing:
             self._note_parameters(owner, missing, may_refuse=may_refuse)
         receipt = Receipt()
