@@ -388,7 +388,10 @@ def test_a_memory_without_asyncio_exports_too(tmp_path: Path) -> None:
             pass
         memory.flush()
         exported = memory.export("last", tmp_path / "walk.csv")
+        asked = memory.export(memory.ask.episodes(), tmp_path / "episodes.csv")
+        assert memory.dataframe(memory.ask.episodes()).description.tolist() == ["a walk"]
     assert (exported.rows, exported.episodes) == (1, 1)
+    assert (asked.rows, asked.episodes) == (1, 1)
 
 
 @pytest.mark.slow
