@@ -9,7 +9,7 @@ next call opens the database again.
 from __future__ import annotations
 
 import functools
-from collections.abc import AsyncIterator, Awaitable, Callable, Sequence
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Sequence
 from contextlib import asynccontextmanager
 from enum import Enum
 from typing import Any, TypeAlias
@@ -27,12 +27,15 @@ from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.schema.memory_schema import as_text, read_schema
 from pycrorm_async.query.sql.json_values import json_rows
 from pycrorm_async.query.sql.read_only import SqlLimits
+from pycrorm_async.query.suggestions import nearest
 from pycrorm_async.store.address import DatabaseAddress
 
 try:
     from mcp.server import MCPServer
     from mcp.server.mcpserver.exceptions import ToolError
+    from mcp.server.mcpserver.tools import Tool
     from mcp.types import ToolAnnotations
+    from pydantic import ValidationError  # mcp needs it too
 except ImportError:
     raise MissingExtra("a server for agents needs mcp: pip install 'pycrorm-async[mcp]'") from None
 
@@ -58,22 +61,65 @@ _ERROR_MAX = 1_000
 """Bounds the characters of an error."""
 _READS_ONLY = ToolAnnotations(read_only_hint=True, open_world_hint=False)
 
-Tool: TypeAlias = "Callable[..., Awaitable[Any]]"
+_Function: TypeAlias = "Callable[..., Awaitable[Any]]"
 
 
 def memory_server(address: DatabaseAddress) -> MCPServer:
     """Return the server of the memory at a located address; its `run_stdio_async` serves until stdin is closed."""
     tools = _Tools(address)
-    server = MCPServer(
-        "pycrorm", instructions=INSTRUCTIONS, version=__version__, log_level="WARNING", lifespan=tools.lifespan
+    functions = tools.episodes, tools.show, tools.why_failed, tools.at, tools.compare, tools.schema, tools.query
+    return _Server(
+        "pycrorm",
+        instructions=INSTRUCTIONS,
+        version=__version__,
+        log_level="WARNING",
+        lifespan=tools.lifespan,
+        tools=[_tool_of(_with_tool_errors(each, tools)) for each in functions],
     )
-    for tool in (tools.episodes, tools.show, tools.why_failed, tools.at, tools.compare, tools.schema, tools.query):
-        answer = _with_tool_errors(tool, tools)
-        server.add_tool(answer, annotations=_READS_ONLY, structured_output=False)
-    return server
 
 
-def _with_tool_errors(tool: Tool, tools: _Tools) -> Tool:
+class _Server(MCPServer):
+    """A server that answers wrong arguments with one line, where the SDK gives a paragraph and a URL for each."""
+
+    async def call_tool(self, name: str, arguments: dict[str, Any], context: Any = None) -> Any:
+        """Call a tool by name. Raises `ToolError`."""
+        try:
+            return await super().call_tool(name, arguments, context)
+        except ToolError as error:
+            if not isinstance(error.__cause__, ValidationError):
+                raise
+            schemas = {each.name: each.input_schema for each in await self.list_tools()}
+            faults = _argument_faults(name, error.__cause__, schemas[name]["properties"])
+            raise ToolError(f"Error executing tool {name}: {one_line(faults, _ERROR_MAX)}") from None
+
+
+def _tool_of(function: _Function) -> Tool:
+    """Return the tool of a function. It refuses unknown arguments, which the SDK ignores by default."""
+    tool = Tool.from_function(function, annotations=_READS_ONLY, structured_output=False)
+    arguments = tool.fn_metadata.arg_model
+    arguments.model_config["extra"] = "forbid"
+    arguments.model_rebuild(force=True)
+    tool.parameters = arguments.model_json_schema(by_alias=True)
+    return tool
+
+
+def _argument_faults(tool: str, faults: ValidationError, names: Iterable[str]) -> str:
+    """Return what is wrong with each argument, once for one that fits none of several types."""
+    lines: dict[str, str] = {}
+    for fault in faults.errors(include_url=False, include_input=False):
+        name = str(fault["loc"][0])
+        match fault["type"]:
+            case "extra_forbidden":
+                lines[name] = f"{tool} has no argument {name}{nearest(name, names)} (it has {', '.join(names)})"
+            case "missing":
+                lines[name] = f"{tool} needs the argument {name}"
+            case _:
+                needed = fault["msg"].removeprefix("Input should be ")
+                lines[name] = f"{lines[name]} or {needed}" if name in lines else f"{name} must be {needed}"
+    return "; ".join(lines.values())
+
+
+def _with_tool_errors(tool: _Function, tools: _Tools) -> _Function:
     """Return the tool with its result as text, JSON unless it is a text, and its errors as errors of the tool."""
 
     @functools.wraps(tool)
@@ -163,12 +209,12 @@ class _Tools:
         failures = await ask.root_failures(episode=episode, object=object, text=text, limit=rows).rows()
         return {"causes": [*map(_row, causes)], "failures": [*map(_row, failures)]}
 
-    async def at(self, when: str, episode: int | str = "last") -> str:
+    async def at(self, when: str | float, episode: int | str = "last") -> str:
         """Show the running nodes and the place of every object at a moment of an episode.
 
-        `when` is an event, such as "e115", or seconds since the episode's start, such as "12.5".
+        `when` is an event, such as "e115", or seconds since the episode's start, such as 12.5.
         """
-        time, sequence = parse_moment(when, "when")
+        time, sequence = parse_moment(str(when), "when")
         moment = await (await self._open()).as_of(str(episode), time=time, sequence=sequence)
         return _cut(str(moment).splitlines())
 

@@ -128,6 +128,27 @@ async def test_a_wrong_call_is_an_error_of_the_tool_in_one_line(url: str) -> Non
         assert [each["number"] for each in await agent.ask("episodes")] == [1, 2]
 
 
+@pytest.mark.soak_on("postgresql")  # the arguments are checked before the database is read
+async def test_a_wrong_argument_is_refused_in_one_line_with_the_nearest_one(url: str) -> None:
+    async with agent_in_process(url) as agent:
+        assert await agent.refused("show", episodes=1) == (
+            "show has no argument episodes; did you mean episode or nodes? (it has episode, first, nodes)"
+        )
+        assert await agent.refused("why_failed", arm="LEFT") == (
+            "why_failed has no argument arm (it has episode, object, text, limit)"
+        )
+        assert await agent.refused("at") == "at needs the argument when"
+        assert await agent.refused("show", episode=[1], nodes="many", last=2) == (
+            "episode must be a valid integer or a valid string;"
+            " nodes must be a valid integer, unable to parse string as an integer;"
+            " show has no argument last (it has episode, first, nodes)"
+        )
+        tools = (await agent.client.list_tools()).tools
+        assert all(each.input_schema["additionalProperties"] is False for each in tools)
+        assert await agent.ask("at", when=0.5, episode=1) == await agent.ask("at", when="0.5", episode=1)
+        assert await agent.ask("at", when=1, episode=1) == await agent.ask("at", when="1", episode=1)
+
+
 async def test_every_answer_is_bounded_however_long_the_recorded_texts_are(tmp_path: Path) -> None:
     url = f"sqlite:///{tmp_path / 'memory.db'}"
     long = "b\x01\u20ac" * 8_000
