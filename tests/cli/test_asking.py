@@ -57,7 +57,7 @@ def test_without_a_name_the_questions_are_listed_and_with_sql_the_statement(fold
     assert all(each in listed.stdout for each in QUESTIONS)
     shown = pycrorm("ask", "moves_of", "milk", "--sql", "--limit", "3", cwd=folder)
     assert shown.stdout.startswith("WITH RECURSIVE")
-    assert "lower(object.name) = 'milk'" in shown.stdout
+    assert "lower(object.name) = lower('milk')" in shown.stdout
     assert pycrorm("query", shown.stdout, cwd=folder).returncode == 0
 
 

@@ -53,7 +53,7 @@ async def test_every_question_is_a_query_with_parameters_for_what_it_needs(
 ) -> None:
     queries = described["queries"]
     assert queries.keys() == {*QUESTIONS}
-    given = {"name": "milk", "x": "0.7", "y": "0.55"}
+    given = {"name": "Milk", "x": "0.7", "y": "0.55"}
     with contextlib.closing(sqlite3.connect(f"file:{kitchen}/pycrorm.db?mode=ro", uri=True)) as plain:
         rows = {name: plain.execute(each["sql"], given).fetchall() for name, each in queries.items()}
     assert len(rows["episodes"]) == 4

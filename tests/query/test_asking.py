@@ -19,6 +19,7 @@ from pycrorm_async.memory import Memory
 from pycrorm_async.query.asking.ask import QUESTIONS
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.task_status import TaskStatus
+from pycrorm_async.world import Pose
 from pycrorm_async.world.enums import Arms, Grasp
 from tests.databases import ask_each, run_in_own_loop
 from tests.projections.event_script import PICK_UP, T0_NS, Script, declarations, declared, field, name_of, pose
@@ -462,6 +463,29 @@ def test_a_memory_without_asyncio_answers_with_frames_and_rows(tmp_path: Path) -
     with pytest.raises(CallerError, match="not open"):
         memory.ask.durations()
     assert list(itertools.islice(QUESTIONS, 2)) == ["root_failures", "failures_by_cause"]
+
+
+# --- names that are not ASCII, or not as they are written -----------------------------------------------------
+
+
+def test_an_object_is_found_by_its_name_whatever_its_letters_are(database_url: str) -> None:
+    with Memory.sync(database_url) as memory:
+        take = memory.recording.type("action", "TakeAction", {"thing": str})
+        with memory.recording.episode(description="Fetch the Äpfel") as episode:
+            episode.object_added("apples", "Äpfel", "GENERIC_OBJECT", Pose([0, 0, 0]))
+            episode.object_added("share", "50%_A/b", "GENERIC_OBJECT", Pose([0, 0, 0]))
+            episode.start("take", take, {"thing": "Äpfel"})
+            episode.object_moved("apples", Pose([1, 0, 0]), node="take")
+            episode.end("take", "FAILED", "no Äpfel / 50%_A/b")
+        memory.flush()
+        ask = memory.ask
+        for name, moves in (("Äpfel", 1), ("ÄPFEL", 1), ("Äpfe_", 0), ("50%_a/B", 0), ("50%aA/b", 0)):
+            assert len(ask.moves_of(name).rows()) == moves, name
+        assert [each.what for each in ask.object_history("Äpfel").rows()] == ["added", "moved"]
+        assert [each.what for each in ask.object_history("50%_a/B").rows()] == ["added"]
+        for part, failures in (("NO Äpf", 1), ("%_a/B", 1), ("50__A/b", 0), ("Ä%l", 0)):
+            assert len(ask.root_failures(message=part).rows()) == failures, part
+        assert len(ask.episodes(text="the Äpfel").rows()) == 1
 
 
 # --- arms that are not names ----------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ from contextlib import suppress
 from enum import Enum
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from sqlalchemy import ColumnElement, Double, Integer, Select, Text, case, cast, false, func, or_
+from sqlalchemy import ColumnElement, Double, Integer, Select, Text, case, cast, false, func, literal, or_
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.projections.schema.views.portable_expressions import member
@@ -60,8 +60,20 @@ def share_succeeded(status: Any) -> ColumnElement[float]:
 
 
 def containing(text: str, *columns: Any) -> ColumnElement[bool]:
-    """Return the condition that one of the columns contains the text, in upper or lower case."""
-    return or_(*(func.lower(cast(each, Text)).contains(text.lower(), autoescape=True) for each in columns))
+    """Return the condition that one of the columns contains the text, in upper or lower case; see `is_named`."""
+    escaped = re.sub("[/%_]", r"/\g<0>", text)
+    return or_(
+        *(func.lower(cast(each, Text)).contains(func.lower(literal(escaped, Text)), escape="/") for each in columns)
+    )
+
+
+def is_named(column: Any, name: str) -> ColumnElement[bool]:
+    """Return the condition that the column is this name, in upper or lower case.
+
+    The database lowers both, because its rule for letters differs from Python's: SQLite lowers only A to Z, so that
+    other letters are compared as they are written; PostgreSQL lowers those that the locale of the database has.
+    """
+    return func.lower(column) == func.lower(literal(name, Text))
 
 
 def limited(statement: _STATEMENT, limit: int | None) -> _STATEMENT:

@@ -14,7 +14,6 @@ from sqlalchemy import (
     and_,
     case,
     cast,
-    func,
     literal,
     null,
     select,
@@ -23,14 +22,10 @@ from sqlalchemy import (
 )
 
 from pycrorm_async.orm import Attachment, Detection, JointChange, Object, ObjectRemoval, Pose, RootFailure, TaskTreeNode
-from pycrorm_async.query.asking.columns import limited, of_episode
+from pycrorm_async.query.asking.columns import is_named, limited, of_episode
 from pycrorm_async.query.asking.question import EpisodeNumber
 
 _OBJECT, _POSE, _NODE = Object.__table__, Pose.__table__, TaskTreeNode.__table__
-
-
-def _is_named(column: Any, name: str) -> ColumnElement[bool]:
-    return func.lower(column) == name.lower()
 
 
 def _course(
@@ -73,7 +68,7 @@ def object_history(episode: EpisodeNumber | None, *, name: str, limit: int | Non
     seen, other = Detection.__table__, _OBJECT.alias("other")
     is_added = _OBJECT.c.id == _OBJECT.c.identity_id
     begins = Attachment.kind == "attached"
-    named = select(_OBJECT.c.id, _OBJECT.c.process_metadata_id).where(_is_named(_OBJECT.c.name, name))
+    named = select(_OBJECT.c.id, _OBJECT.c.process_metadata_id).where(is_named(_OBJECT.c.name, name))
     if episode is not None:
         named = named.where(of_episode(_OBJECT.c.process_metadata_id, episode))
 
@@ -88,7 +83,7 @@ def object_history(episode: EpisodeNumber | None, *, name: str, limit: int | Non
     courses = [
         _course(_OBJECT, Object.sequence, case((is_added, "added"), else_="moved"), place=_POSE)
         .outerjoin(_POSE, joined(_OBJECT.c.pose_id, _POSE, _OBJECT))
-        .where(_is_named(_OBJECT.c.name, name), _OBJECT.c.identity_id.is_not(None), _OBJECT.c.dtype == "Object"),
+        .where(is_named(_OBJECT.c.name, name), _OBJECT.c.identity_id.is_not(None), _OBJECT.c.dtype == "Object"),
         _course(attached, Attachment.sequence, attached.c.kind, other=other.c.name, detail=attached.c.link)
         .outerjoin(other, joined(attached.c.parent_id, other, attached))
         .where(is_one(attached, attached.c.child_id)),
@@ -106,7 +101,7 @@ def object_history(episode: EpisodeNumber | None, *, name: str, limit: int | Non
             is_one(joints, joints.c.object_id)
         ),
         _course(seen, Detection.sequence, "detected", detail=seen.c.source, value=seen.c.confidence, place=seen).where(
-            _is_named(seen.c.name, name)
+            is_named(seen.c.name, name)
         ),
         _course(
             failed,
@@ -115,7 +110,7 @@ def object_history(episode: EpisodeNumber | None, *, name: str, limit: int | Non
             detail=failed.c.reason,
             node_id=failed.c.id,
             time=failed.c.start_time,
-        ).where(_is_named(failed.c.object, name)),
+        ).where(is_named(failed.c.object, name)),
     ]
     if episode is not None:
         courses = [each.where(of_episode(each.selected_columns.episode, episode)) for each in courses]
@@ -157,7 +152,7 @@ def moves_of(episode: EpisodeNumber | None, *, name: str, limit: int | None) -> 
         _OBJECT.c.pose_id,
         _OBJECT.c.node_id,
     ).where(
-        _is_named(_OBJECT.c.name, name),
+        is_named(_OBJECT.c.name, name),
         _OBJECT.c.id != _OBJECT.c.identity_id,
         _OBJECT.c.dtype == "Object",
     )
