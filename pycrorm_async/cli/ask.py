@@ -11,18 +11,15 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
-from sqlalchemy import select
 
 from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
 from pycrorm_async.cli.output import moment, note, print_json, print_line, print_table
 from pycrorm_async.cli.reading import read_memory
 from pycrorm_async.cli.since import parse_since
-from pycrorm_async.orm import DesignatorType
 from pycrorm_async.query.asking.ask import QUESTIONS, Ask
 from pycrorm_async.query.asking.question import Question
 from pycrorm_async.query.parameter_text import duration
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.query.suggestions import nearest
 from pycrorm_async.store.address import DatabaseAddress
 
 _SqlOption = Annotated[bool, typer.Option("--sql", help="Print the question's SQL instead of asking it.")]
@@ -127,8 +124,8 @@ def _answer(
     async def ask(reading: Reading) -> tuple[list[str], list[tuple[Any, ...]], str]:
         question: Question = getattr(reading.ask, name)(**arguments)
         columns = list(question.statement.selected_columns.keys())
-        rows = [tuple(row) for row in await question.rows(simulated=simulated)]
-        return columns, rows, "" if rows else await _unknown_type(reading, arguments.get("dtype"))
+        rows, unknown = await question.rows_or_unknown_name(simulated=simulated)
+        return columns, [tuple(row) for row in rows], unknown
 
     columns, rows, unknown = read_memory(url, spool, ask)
     if as_json:
@@ -138,14 +135,6 @@ def _answer(
     print_table(name, headings, ([*map(_cell, columns, row)] for row in rows))
     if not rows:
         note(f"no row answers; {unknown or '`--sql` shows the question.'}")
-
-
-async def _unknown_type(reading: Reading, dtype: str | None) -> str:
-    """Return a line that the memory has no such type, with the nearest one; empty if it has, or for None."""
-    if dtype is None:
-        return ""
-    types = [row.dtype for row in await reading.rows(select(DesignatorType.dtype).distinct())]
-    return "" if dtype in types else f"the memory has no type {dtype}{nearest(dtype, types)}"
 
 
 def _plain(value: Any) -> Any:

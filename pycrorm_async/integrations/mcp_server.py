@@ -205,9 +205,12 @@ class _Tools:
         """
         rows = _bounded("limit", limit, 100)
         ask = (await self._open()).ask
-        causes = await ask.failures_by_cause(episode=episode, object=object, text=text, limit=rows).rows()
-        failures = await ask.root_failures(episode=episode, object=object, text=text, limit=rows).rows()
-        return {"causes": [*map(_row, causes)], "failures": [*map(_row, failures)]}
+        by_cause = ask.failures_by_cause(episode=episode, object=object, text=text, limit=rows)
+        causes, _ = await by_cause.rows_or_unknown_name()
+        question = ask.root_failures(episode=episode, object=object, text=text, limit=rows)
+        failures, unknown = await question.rows_or_unknown_name()
+        note = {"note": unknown} if unknown else {}
+        return {"causes": [*map(_row, causes)], "failures": [*map(_row, failures)], **note}
 
     async def at(self, when: str | float, episode: int | str = "last") -> str:
         """Show the running nodes and the place of every object at a moment of an episode.

@@ -387,10 +387,12 @@ async def test_wrong_names_and_values_are_answered_with_the_right_ones(reading: 
     ask = reading.ask
     with pytest.raises(AttributeError, match=r"no question root_failure; did you mean root_failures"):
         ask.root_failure  # type: ignore[attr-defined]  # noqa: B018
-    with pytest.raises(TypeError, match="objekt"):
+    with pytest.raises(CallerError, match=r"root_failures has no argument objekt; did you mean object\?$"):
         ask.root_failures(objekt="milk")  # type: ignore[call-arg]
     with pytest.raises(CallerError, match="no status 'SUCEEDED'; did you mean SUCCEEDED"):
         ask.episodes(status="SUCEEDED")
+    with pytest.raises(CallerError, match="no arm 'lefft'; did you mean LEFT"):
+        ask.successful_pick_ups(arm="lefft")
     with pytest.raises(CallerError, match="no grasp 'tip'; did you mean TOP"):
         ask.successful_pick_ups(grasp="tip")
     with pytest.raises(CallerError, match="limit must be a whole number from 1"):
@@ -431,6 +433,33 @@ async def test_wrong_names_and_values_are_answered_with_the_right_ones(reading: 
         await ask.durations(episode="0000").rows()
 
 
+@pytest.mark.parametrize(
+    ("question", "arguments", "suggests"),
+    [
+        ("root_failures", {"arm": "lefft"}, "no arm lefft; did you mean LEFT"),
+        ("root_failures", {"object": "mlik"}, "no object mlik; did you mean milk"),
+        ("root_failures", {"reason": "unreachabel"}, "no reason unreachabel; did you mean unreachable"),
+        ("failures_by_cause", {"reason": "ColisionEror"}, "no reason ColisionEror; did you mean CollisionError"),
+        ("moves_of", {"name": "mlik"}, "no object mlik; did you mean milk"),
+        ("object_history", {"name": "mil"}, "no object mil; did you mean milk"),
+        ("durations", {"dtype": "PickUpActoin"}, "no type PickUpActoin; did you mean PickUpAction"),
+        ("successful_pick_ups", {"object": "mlik"}, "no object mlik; did you mean milk"),
+    ],
+)
+async def test_an_empty_answer_about_an_unknown_name_warns_with_the_nearest_one(
+    reading: Reading, question: str, arguments: dict[str, str], suggests: str
+) -> None:
+    with pytest.warns(UserWarning, match=rf"^no row answers: the memory has {suggests}"):
+        assert await getattr(reading.ask, question)(**arguments).rows() == []
+
+
+async def test_an_empty_answer_about_a_name_of_the_memory_or_an_unlike_one_warns_of_nothing(reading: Reading) -> None:
+    assert await reading.ask.root_failures(object="MILK", message="no such text").rows() == []
+    assert await reading.ask.root_failures(object="helicopter").rows() == []
+    with pytest.warns(UserWarning, match="mlik"):
+        assert (await reading.ask.moves_of("mlik")).empty
+
+
 async def test_a_question_to_a_closed_memory_is_refused_and_opens_no_connection(tmp_path: Path) -> None:
     url = f"sqlite:///{tmp_path}/memory.db"
     async with Memory.open(url) as memory:
@@ -468,10 +497,12 @@ def test_a_memory_without_asyncio_answers_with_frames_and_rows(tmp_path: Path) -
 # --- names that are not ASCII, or not as they are written -----------------------------------------------------
 
 
-def test_an_object_is_found_by_its_name_whatever_its_letters_are(database_url: str) -> None:
+@pytest.mark.filterwarnings("ignore:no row answers")
+def test_names_are_found_whatever_their_letters_are(database_url: str) -> None:
     with Memory.sync(database_url) as memory:
         take = memory.recording.type("action", "TakeAction", {"thing": str})
-        with memory.recording.episode(description="Fetch the Äpfel") as episode:
+        with memory.recording.episode(description="Fetch the Äpfel", tags=["harvest"]) as episode:
+            episode.object_added("base", "turtle", "ROBOT", Pose([0, 0, 0]))
             episode.object_added("apples", "Äpfel", "GENERIC_OBJECT", Pose([0, 0, 0]))
             episode.object_added("share", "50%_A/b", "GENERIC_OBJECT", Pose([0, 0, 0]))
             episode.start("take", take, {"thing": "Äpfel"})
@@ -486,6 +517,11 @@ def test_an_object_is_found_by_its_name_whatever_its_letters_are(database_url: s
         for part, failures in (("NO Äpf", 1), ("%_a/B", 1), ("50__A/b", 0), ("Ä%l", 0)):
             assert len(ask.root_failures(message=part).rows()) == failures, part
         assert len(ask.episodes(text="the Äpfel").rows()) == 1
+        for question in (ask.episodes(robot="turtel"), ask.successful_pick_ups(robot="turtel")):
+            with pytest.warns(UserWarning, match=r"no robot turtel; did you mean turtle\?"):
+                assert question.rows() == []
+        with pytest.warns(UserWarning, match=r"no tag harvets; did you mean harvest\?"):
+            assert ask.episodes(tag="harvets").rows() == []
 
 
 # --- arms that are not names ----------------------------------------------------------------------------------

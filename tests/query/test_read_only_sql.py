@@ -166,6 +166,8 @@ async def test_an_open_memory_for_reading_takes_queries(reader_url: str) -> None
 async def test_a_wrong_name_is_answered_with_the_nearest_one(sql: _Sql) -> None:
     with pytest.raises(QueryRefused, match=r"no table or view root_failures; did you mean root_failure\?"):
         await sql.query("SELECT * FROM root_failures")
+    with pytest.raises(QueryRefused, match=r"no table or view task_tree_nodes; did you mean task_tree_node\?$"):
+        await sql.query("SELECT * FROM task_tree_nodes")
     with pytest.raises(QueryRefused, match="no table or view weather; the README of `query` lists them"):
         await sql.query("SELECT * FROM weather")
     with pytest.raises(QueryRefused, match="statu"):

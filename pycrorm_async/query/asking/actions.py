@@ -22,7 +22,7 @@ from pycrorm_async.query.asking.columns import (
 )
 from pycrorm_async.query.asking.question import EpisodeNumber
 from pycrorm_async.task_status import TaskStatus
-from pycrorm_async.world.enums import Grasp, ObjectType
+from pycrorm_async.world.enums import Arms, Grasp, ObjectType
 
 _NODE, _DESIGNATOR = TaskTreeNode.__table__, Designator.__table__
 
@@ -138,7 +138,7 @@ def successful_pick_ups(
     if object_type is not None:
         statement = statement.where(taken.c.obj_type == member_of(ObjectType, object_type, "object_type"))
     if arm is not None:
-        statement = statement.where(pick_up.c.arm == arm.upper())
+        statement = statement.where(pick_up.c.arm == member_of(Arms, arm, "arm"))
     if grasp is not None:
         statement = statement.where(pick_up.c.grasp == member_of(Grasp, grasp, "grasp"))
     if robot is not None:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from datetime import datetime
-from functools import partial
+from functools import partial, wraps
+from inspect import signature
 from typing import TYPE_CHECKING, Any, Generic, Literal, NoReturn, TypeVar
 
 from sqlalchemy import Select
@@ -13,6 +14,7 @@ from pycrorm_async.errors import CallerError
 from pycrorm_async.query.asking import actions, episode_list, failures, object_courses
 from pycrorm_async.query.asking.columns import check_texts
 from pycrorm_async.query.asking.question import AskedEpisode, QuestionPlan
+from pycrorm_async.query.asking.unknown_names import CHECKED
 from pycrorm_async.query.suggestions import nearest
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.enums import Arms, Grasp, ObjectType
@@ -31,6 +33,10 @@ class Ask(Generic[Q]):
     `episode` is a number, an id or its first digits, `last`, an `Episode` or an `EpisodeSummary`; by default all
     episodes except simulations. `limit` bounds the rows. Durations are in s, places in m in the map, `time` is when
     the node started or the change happened, in UTC.
+
+    An empty answer to a question about a name that is nowhere in the memory, such as `object="mlik"`, is a warning with
+    the nearest name that is. Without `episode`, `longest_actions`, `durations`, `arms_used`, `experience_at` and
+    `episodes` read all nodes, or all episodes, of the memory; the others read what they are about by an index.
     """
 
     def __init__(self, make: Callable[[QuestionPlan], Q]) -> None:
@@ -201,7 +207,8 @@ class Ask(Generic[Q]):
         """
         state = status.name if isinstance(status, TaskStatus) else status
         choice = episode_list.EpisodeChoice(state, since, () if tag is None else (tag,), robot, text, limit)
-        return self._make(QuestionPlan("episodes", None, partial(episode_list.episode_list, choice=choice)))
+        select_of = partial(episode_list.episode_list, choice=choice)
+        return self._make(QuestionPlan("episodes", None, select_of, _names({"tag": tag, "robot": robot})))
 
     def _ask(self, name: str, episode: AskedEpisode | None, select_of: partial[Select[*tuple[Any, ...]]]) -> Q:
         check_texts({key: value for key, value in select_of.keywords.items() if key in _TEXTS})
@@ -209,12 +216,17 @@ class Ask(Generic[Q]):
         if recovered is not None and not isinstance(recovered, bool):
             raise CallerError(f"recovered must be True or False, got {recovered!r}")
         select_of(episode=None)  # so that a wrong argument is refused at once
-        return self._make(QuestionPlan(name, episode, select_of))
+        return self._make(QuestionPlan(name, episode, select_of, _names(select_of.keywords)))
 
     if not TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> NoReturn:
             raise AttributeError(f"there is no question {name}{nearest(name, QUESTIONS)}")
+
+
+def _names(arguments: Mapping[str, Any]) -> dict[str, str]:
+    texts = {key.removesuffix("_"): value for key, value in arguments.items() if isinstance(value, str)}
+    return {key: value for key, value in texts.items() if key in CHECKED}
 
 
 def _search(
@@ -231,3 +243,20 @@ def _search(
 
 QUESTIONS: tuple[str, ...] = tuple(name for name in vars(Ask) if not name.startswith("_"))
 """The names of all questions."""
+
+
+def _with_suggestions(question: Callable[..., Any]) -> Callable[..., Any]:
+    """Return the question so that an unknown argument is refused with the nearest one."""
+    arguments = frozenset(signature(question).parameters) - {"self"}
+
+    @wraps(question)
+    def ask(*values: Any, **options: Any) -> Any:
+        for each in options.keys() - arguments:
+            raise CallerError(f"{question.__name__} has no argument {each}{nearest(each, sorted(arguments))}")
+        return question(*values, **options)
+
+    return ask
+
+
+for _name in QUESTIONS:
+    setattr(Ask, _name, _with_suggestions(getattr(Ask, _name)))

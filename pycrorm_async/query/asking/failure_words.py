@@ -61,6 +61,8 @@ _WORDS: dict[str, tuple[str, ...]] = {
     "crash, crashed, bug, exception": ("ValueError", "TypeError", "KeyError", "AttributeError", "RuntimeError"),
 }
 """The failure classes by the words for them."""
+SEARCH_WORDS = tuple(dict.fromkeys(word for synonyms in _WORDS for word in synonyms.split(", ")))
+"""All these words."""
 
 
 def classes_meant_by(words: str) -> list[str]:

@@ -10,7 +10,7 @@ from sqlalchemy.orm import aliased
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.ids import SEQUENCE_MAX, SLOT_MAX
 from pycrorm_async.orm import RootFailure, TaskTreeNode
-from pycrorm_async.query.asking.columns import checked_count, containing, limited, of_episode, times_with
+from pycrorm_async.query.asking.columns import checked_count, containing, is_named, limited, of_episode, times_with
 from pycrorm_async.query.asking.failure_words import classes_meant_by
 from pycrorm_async.query.asking.question import EpisodeNumber
 
@@ -38,7 +38,7 @@ def matching(
     if object is not None:
         conditions.append(containing(object, failure.object))
     if arm is not None:
-        conditions.append(failure.arm == arm.upper())
+        conditions.append(is_named(failure.arm, arm))
     if reason is not None:
         conditions.append(_is_reason(reason))
     if message is not None:

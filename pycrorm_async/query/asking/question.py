@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Coroutine, Generator, Sequence
-from dataclasses import dataclass
+import warnings
+from collections.abc import Callable, Coroutine, Generator, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 from sqlalchemy import ColumnElement, Row, Select, func, select
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.orm import ProcessMetaData
+from pycrorm_async.query.asking.unknown_names import unknown_name
 from pycrorm_async.query.named_queries import EpisodeSummary
 
 if TYPE_CHECKING:
@@ -33,12 +35,14 @@ _DIGITS_OF_ID = 4
 class QuestionPlan:
     """The parts of a question: its name, the episode it is about, and the function that makes its select.
 
-    `select_of` takes an `EpisodeNumber` as `episode`; None makes the select about all episodes.
+    `select_of` takes an `EpisodeNumber` as `episode`; None makes the select about all episodes. `names` are the
+    arguments that name what a memory has or has not, such as an object.
     """
 
     name: str
     episode: AskedEpisode | None
     select_of: Callable[..., Select[*tuple[Any, ...]]]
+    names: Mapping[str, str] = field(default_factory=dict)
 
 
 class Question:
@@ -83,11 +87,25 @@ class Question:
 
     async def frame(self, *, to: Library = "pandas", simulated: bool = False) -> Any:
         """Return the answer as a frame; see `Reading.dataframe`. Raises `UnknownEpisode`, `MissingExtra`."""
-        return await self._reading.dataframe(await self.resolved(), to=to, simulated=simulated)
+        frame = await self._reading.dataframe(await self.resolved(), to=to, simulated=simulated)
+        if not len(frame):
+            _warn(await self.unknown_name())
+        return frame
 
     async def rows(self, *, simulated: bool = False) -> list[Row[*tuple[Any, ...]]]:
         """Return the answer as named tuples, which needs no extra. Raises `UnknownEpisode`."""
-        return await self._reading.rows(await self.resolved(), simulated=simulated)
+        rows, unknown = await self.rows_or_unknown_name(simulated=simulated)
+        _warn(unknown)
+        return rows
+
+    async def rows_or_unknown_name(self, *, simulated: bool = False) -> tuple[list[Row[*tuple[Any, ...]]], str]:
+        """Return the answer as named tuples and, if it is empty, what `unknown_name` returns."""
+        rows = await self._reading.rows(await self.resolved(), simulated=simulated)
+        return rows, "" if rows else await self.unknown_name()
+
+    async def unknown_name(self) -> str:
+        """Return a line about an argument, such as an object, that is nowhere in the memory; empty without one."""
+        return await unknown_name(self._reading, self._plan.names)
 
     def __await__(self) -> Generator[Any, Any, Any]:
         return self.frame().__await__()
@@ -150,6 +168,11 @@ class SyncQuestion:
         from pycrorm_async.query.notebook.answer_view import question_html
 
         return question_html(self.name, self.sql, "call frame() or rows()")
+
+
+def _warn(unknown: str) -> None:
+    if "did you mean" in unknown:
+        warnings.warn(f"no row answers: {unknown}", stacklevel=3)
 
 
 def episode_name(episode: AskedEpisode) -> str:

@@ -10,8 +10,8 @@ from pycrorm_async.query.suggestions import nearest
 
 ONLY_READS = "a query may only read: it is one SELECT, or WITH … SELECT"
 NOT_ONE = "a query is one statement: this text has several"
-_INTERNAL = re.compile(r"__\d+$|^sqlite_|^pycrorm_generation$")
-"""Names of the tables behind the views, one for each generation."""
+_INTERNAL = re.compile(r"^zz_|__\d+$|^sqlite_|^pycrorm_")
+"""Names of the tables behind the views, one for each generation, and of the bookkeeping."""
 
 
 def stopped(seconds: float) -> str:

@@ -51,7 +51,8 @@ def main() -> None:
         connection = sqlite3.connect(uri, uri=True, isolation_level=None, timeout=_BUSY_TIMEOUT_S)
         # Making these tables counts as an UPDATE of the schema, although nothing is stored.
         connection.execute("SELECT 1 FROM json_each('[]'), json_tree('[]')")
-        names = [str(name) for (name,) in connection.execute("SELECT name FROM sqlite_master")]
+        relations = "SELECT name FROM sqlite_master WHERE type IN ('table', 'view')"
+        names = [str(name) for (name,) in connection.execute(relations)]
         _bound(connection, bytes_max, seconds)
         _write("open")
         connection.set_authorizer(authorizer)

@@ -99,6 +99,9 @@ async def test_an_agent_asks_with_every_tool(url: str) -> None:
         assert (await agent.ask("show", episode=1, first=2)).splitlines() == [facts, *nodes]
         failed = await agent.ask("why_failed", episode=1)
         assert sum(each["times"] for each in failed["causes"]) == len(failed["failures"])
+        assert await agent.ask("why_failed", object="zebra") == {
+            "causes": [], "failures": [], "note": "the memory has no object zebra",
+        }  # fmt: skip
         moment, *running = (await agent.ask("at", when="e2", episode=1)).splitlines()
         assert (moment.startswith("episode 1 at "), running) == (True, ["  root RUNNING"])
         compared = await agent.ask("compare", first=1, second="last")
