@@ -4,11 +4,12 @@
 ...     tree.tick_tock(period_ms=20)
 
 Theory of operation. A visitor sees a behaviour after its tick, children before parents, so a composite starts with its
-first child. An activation ends when the behaviour is not RUNNING any more. A behaviour that repeats its outcome at
-once, tick after tick, as a condition does, remains one node; so a tick that changes nothing writes nothing. `_pending`
-holds behaviours that repeat their outcome after the activation of their parent has ended: the visit of the parent shows
-that it repeats its outcome too, or a change shows that they belong to a new activation of it. py_trees does not visit
-a behaviour that it stops, so the visitor searches the open activations for those that are not RUNNING any more, before
+first child. An activation ends when the behaviour is not RUNNING any more. A behaviour that repeats its outcome, status
+and feedback, at once, tick after tick, as a condition does, remains one node; so a tick that changes nothing writes
+nothing, except that numbers of repeats are written now and then, so that a killed process loses few. `_pending` holds
+behaviours that repeat their outcome after the activation of their parent has ended: the visit of the parent shows that
+it repeats its outcome too, or a change shows that they belong to a new activation of it. py_trees does not visit a
+behaviour that it stops, so the visitor searches the open activations for those that are not RUNNING any more, before
 each tick and after a tick with a change.
 """
 
@@ -47,25 +48,33 @@ _RUNNING: Final = Status.RUNNING
 _STATUSES: Final[Mapping[Any, NodeStatus]] = {Status.SUCCESS: "SUCCEEDED", Status.FAILURE: "FAILED"}
 _KNOWN_MAX: Final = 10_000
 """Bounds the activations kept, because a program may replace subtrees; beyond it those that ended are dropped."""
+_UNWRITTEN_TICKS: Final = 50
+_UNWRITTEN_SHARE: Final = 0.1
+"""Bound the repeats that a killed process loses: this many ticks, or this share of them, which keeps the events of a
+tree that idles for a night few."""
 
 
 class _Activation:
-    """An activation of a behaviour; `node` is its node in the episode, `ticks` counts its ticks not recorded yet."""
+    """An activation of a behaviour; `node` is its node in the episode.
 
-    __slots__ = ("behaviour", "is_open", "node", "parent", "status", "ticks")
+    `ticks` counts the ticks of an open activation, then those that repeat its outcome, of which `written` are recorded.
+    """
+
+    __slots__ = ("behaviour", "feedback", "is_open", "node", "parent", "status", "ticks", "written")
 
     def __init__(self, behaviour: Behaviour, parent: _Activation | None, node: Hashable) -> None:
         self.behaviour, self.parent, self.node = behaviour, parent, node
         self.status: Status | None = None
         self.is_open = True
-        self.ticks = 0
+        self.ticks = self.written = 0
+        self.feedback = ""
 
 
 class RememberedTree(VisitorBase):
     """Records the ticks of a tree in a `with` block as one episode; nodes that are RUNNING at its end are INTERRUPTED.
 
-    The block gets the `RecordedEpisode`. A node's `result` has its number of `ticks`; an observation `repeated` of it
-    has the number of further ticks with the same outcome, and follows when they are over.
+    The block gets the `RecordedEpisode`. A node's `result` has its number of `ticks`; the last observation `repeated`
+    of it has the number of further ticks with the same status and feedback.
 
     Args:
         fields: for a class of behaviours, the attributes that are recorded as parameters, and their types.
@@ -100,7 +109,7 @@ class RememberedTree(VisitorBase):
         self._open: dict[int, _Activation] = {}
         self._pending: list[_Activation] = []
         self._values: dict[str, Any] = {}
-        self._visited_s, self._changed = 0.0, False
+        self._visited_s, self._changed, self._ticks = 0.0, False, 0
         self._episode = self._recording.episode(**self._arguments)
         self._tree.add_visitor(self)
         return self._episode
@@ -128,7 +137,7 @@ class RememberedTree(VisitorBase):
                 latest.ticks += 1
                 return
             parent = latest.parent
-            if self._visited_s - before >= self._instant_s:
+            if self._visited_s - before >= self._instant_s or _feedback(behaviour) != latest.feedback:
                 pass
             elif parent is None or parent.is_open:
                 latest.ticks += 1
@@ -148,6 +157,11 @@ class RememberedTree(VisitorBase):
             self._changed = False
             self._guarded(self._end_stopped)
         self._guarded(self._observe_blackboard)
+        self._ticks += 1
+        if self._ticks % _UNWRITTEN_TICKS == 0:
+            for each in self._latest.values():
+                if each.ticks - each.written > each.ticks * _UNWRITTEN_SHARE:
+                    self._put_repeated(each)
 
     def _guarded(self, method: Callable[..., None], *arguments: Any) -> None:
         try:
@@ -193,11 +207,12 @@ class RememberedTree(VisitorBase):
         """End an activation, after those below it, which py_trees stopped without a visit."""
         for child in [each for each in reversed(self._open.values()) if each.parent is activation]:
             self._end(child, "INTERRUPTED")
-        feedback, result = activation.behaviour.feedback_message, dict[str, Any](ticks=activation.ticks)
+        feedback, result = _feedback(activation.behaviour), dict[str, Any](ticks=activation.ticks)
+        activation.feedback = feedback
         if feedback and status == "SUCCEEDED":
             result["feedback"] = feedback
         elif feedback and failure is None:
-            failure = str(feedback)
+            failure = feedback
         self._episode.end(id(activation.behaviour), status, failure, result)
         del self._open[id(activation.behaviour)]
         activation.is_open, activation.ticks = False, 0
@@ -231,7 +246,8 @@ class RememberedTree(VisitorBase):
             self._put_repeated(each)
 
     def _put_repeated(self, activation: _Activation) -> None:
-        if activation.ticks:
+        if activation.ticks > activation.written and not activation.is_open:
+            activation.written = activation.ticks
             self._episode.observe("repeated", {"ticks": activation.ticks}, node=activation.node)
 
     def _observe_blackboard(self) -> None:
@@ -260,6 +276,13 @@ def _read(behaviour: Behaviour, name: str) -> Any:
         return getattr(behaviour, name, None)
     except Exception as error:  # noqa: BLE001  a property may raise anything
         return RefusedValue(reading_fault(error))
+
+
+def _feedback(behaviour: Behaviour) -> str:
+    try:
+        return str(behaviour.feedback_message or "")
+    except Exception as error:  # noqa: BLE001  a property may raise anything
+        return reading_fault(error)
 
 
 def _are_equal(value: object, other: object) -> bool:

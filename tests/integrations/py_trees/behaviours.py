@@ -12,15 +12,15 @@ SUCCESS, FAILURE, RUNNING, INVALID = Status.SUCCESS, Status.FAILURE, Status.RUNN
 
 
 class Scripted(py_trees.behaviour.Behaviour):
-    """Returns the given outcomes, one a tick, and the last one from then on."""
+    """Returns the given outcomes and messages, one a tick, and the last one from then on."""
 
-    def __init__(self, name: str, outcomes: Iterable[Status], feedback: str = "") -> None:
+    def __init__(self, name: str, outcomes: Iterable[Status], *feedback: str) -> None:
         super().__init__(name)
         self._outcomes = list(outcomes)
-        self._feedback = feedback
+        self._feedback = [*feedback] or [""]
 
     def update(self) -> Status:
-        self.feedback_message = self._feedback
+        self.feedback_message = self._feedback.pop(0) if len(self._feedback) > 1 else self._feedback[0]
         return self._outcomes.pop(0) if len(self._outcomes) > 1 else self._outcomes[0]
 
 

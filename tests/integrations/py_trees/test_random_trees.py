@@ -13,6 +13,7 @@ import py_trees
 import pytest
 
 from pycrorm_async import Memory, Settings
+from pycrorm_async.integrations import py_trees as integration
 from pycrorm_async.integrations.py_trees import RememberedTree
 from tests.databases import ask
 from tests.integrations.py_trees.behaviours import FAILURE, RUNNING, SUCCESS, Visits, parallel, selector, sequence, tree
@@ -30,10 +31,12 @@ class Moody(py_trees.behaviour.Behaviour):
         super().__init__(name)
         self._chance = chance
         self._outcome = SUCCESS
+        self.feedback_message = "quiet"
 
     def update(self) -> Any:
         if self._chance.random() < 0.15:
             self._outcome = self._chance.choice([SUCCESS, FAILURE, RUNNING])
+            self.feedback_message = self._chance.choice(["quiet", "loud"])
         return self._outcome
 
 
@@ -66,7 +69,7 @@ def recorded(folder: Path) -> tuple[dict[str, list[str]], dict[str, int]]:
     ticks: dict[str, int] = {}
     rows = ask(
         folder / "memory.db",
-        "SELECT parameters, status, result, (SELECT number FROM observation JOIN observation_value USING (id)"
+        "SELECT parameters, status, result, (SELECT max(number) FROM observation JOIN observation_value USING (id)"
         " WHERE observation.node_id = designator.id) FROM designator ORDER BY id",
     )
     for parameters, status, result, repeats in rows:
@@ -89,7 +92,10 @@ def misplaced(folder: Path) -> list[Any]:
 
 @pytest.mark.parametrize("instant_s", [0.0, 60.0])
 @pytest.mark.parametrize("seed", range(6))
-def test_a_random_tree_is_remembered_as_it_was_visited(seed: int, instant_s: float, tmp_path: Path) -> None:
+def test_a_random_tree_is_remembered_as_it_was_visited(
+    seed: int, instant_s: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(integration, "_UNWRITTEN_TICKS", 5 + seed)
     _compare(random.Random(seed), instant_s, tmp_path)
 
 

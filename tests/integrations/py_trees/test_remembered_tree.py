@@ -222,6 +222,41 @@ def test_feedback_is_the_message_of_a_failure_and_in_the_result_of_a_success(tmp
     assert json.loads(result[0]) == {"ticks": 1, "feedback": "a human came"}
 
 
+@pytest.mark.parametrize("outcome", ["F", "S"])
+def test_the_same_status_with_other_feedback_is_another_outcome(tmp_path: Path, outcome: str) -> None:
+    said = ["no milk", "no milk", "battery flat", "battery flat", "battery flat", "no milk"]
+    remembered(tmp_path, Condition("check", named(outcome), *said), lambda ticked: tick(ticked, 6))
+    assert ask(
+        tmp_path / "memory.db",
+        "SELECT coalesce(failure_message, result ->> 'feedback'), (SELECT number FROM observation"
+        " JOIN observation_value USING (id) WHERE node_id = designator.id) FROM designator ORDER BY id",
+    ) == [("no milk", 1.0), ("battery flat", 2.0), ("no milk", None)]
+
+
+def test_feedback_that_changes_while_a_behaviour_runs_adds_no_node(tmp_path: Path) -> None:
+    remembered(tmp_path, Scripted("drive", named("RRF"), "2 m", "1 m", "slip"), lambda ticked: tick(ticked, 3))
+    assert nodes(tmp_path) == [("drive", None, "FAILED", 3, "slip")]
+
+
+def test_each_try_of_a_retried_behaviour_that_fails_differently_is_a_node(tmp_path: Path) -> None:
+    grasp = Scripted("grasp", named("FFS"), "slip 1", "slip 2", "")
+    remembered(tmp_path, py_trees.decorators.Retry("try", grasp, 3), lambda ticked: tick(ticked, 3))
+    assert [each[:3] + each[4:] for each in nodes(tmp_path)] == [
+        ("try", None, "SUCCEEDED", None),
+        ("grasp", "try", "FAILED", "slip 1"),
+        ("grasp", "try", "FAILED", "slip 2"),
+        ("grasp", "try", "SUCCEEDED", None),
+    ]
+
+
+def test_the_number_of_repeats_is_written_rarely_while_they_go_on(tmp_path: Path) -> None:
+    remembered(tmp_path, Condition("is near", named("S")), lambda ticked: tick(ticked, 10_001))
+    written = [value for *_, value in observations(tmp_path)]
+    assert written[:3] == [49, 99, 149]
+    assert written[-1] == 10_000
+    assert len(written) == 36
+
+
 def test_composites_and_decorators_are_language_and_other_behaviours_are_actions(tmp_path: Path) -> None:
     root = sequence("job", py_trees.decorators.Inverter("not", Condition("is hot", named("F"))))
     remembered(tmp_path, root, lambda ticked: tick(ticked, 1))
@@ -287,6 +322,8 @@ def test_changes_of_the_blackboard_are_observations_of_the_behaviour_that_writes
         ("blackboard/goal", None, "value", "kitchen"),
         ("blackboard/battery/volts", "measure", "value", 24.0),
         ("blackboard/battery/volts", "measure", "value", 23.5),
+        ("repeated", "measure", "ticks", 49),
+        ("repeated", "measure", "ticks", 99),
         ("blackboard/goal", None, "value", None),
         ("repeated", "measure", "ticks", 100),
     ]
@@ -493,6 +530,7 @@ def test_a_killed_tree_keeps_what_its_ticks_announced(tmp_path: Path) -> None:
         ("is near", "job", "SUCCEEDED"),
         ("drive", "job", "LOST"),
     ]
+    assert repeated(tmp_path) == {"is near": 99}
 
 
 def test_the_example_of_the_readme_is_recorded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
