@@ -32,6 +32,7 @@ from pycrorm_async.world.pose import Pose
 from tests.hooks.fakes import NoteActionPerformable
 from tests.recording.recorded_queue import Recorded
 
+pytestmark = [pytest.mark.slow, pytest.mark.every_python]  # each version of Python has an evaluation loop of its own
 PACKAGE = str(Path(pycrorm_async.__file__).parent)
 HANGS_S = 20.0
 """Bounds the wait for a run of a scenario; each takes less than 10 ms."""
