@@ -98,8 +98,11 @@ class Sampler:
     def stop_episode(self, episode: EpisodeWriter[Any]) -> None:
         """Stop sampling all motions of an episode, before the episode ends."""
         with self._lock:
-            for key in [key for key in self._running if key[0] is episode]:
-                self._running.pop(key).is_over = True
+            self._stop_motions(episode)
+
+    def _stop_motions(self, episode: EpisodeWriter[Any]) -> None:  # without a loop in `with`: see `OrderedCalls`
+        for key in [key for key in self._running if key[0] is episode]:
+            self._running.pop(key).is_over = True
 
     @contextmanager
     def renumbering(self, episode: Episode) -> Iterator[Callable[[Mapping[int, int]], None]]:

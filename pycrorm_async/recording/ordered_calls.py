@@ -9,7 +9,9 @@ and otherwise leaves the call in `_left` to the holder.
 
 A signal handler may raise KeyboardInterrupt in the main thread when any call returns. `with` on the lock itself cannot
 be interrupted between taking the lock and entering the block, nor before the lock is released; `acquire` and `release`
-in a `try` can. Only threads of the memory, which run no signal handlers, use these.
+in a `try` can. Only threads of the memory, which run no signal handlers, use these. A handler may also run where a loop
+begins its next round, and there Python 3.12 and 3.13 leave the block without releasing the lock, because they take the
+jump back for one that cannot raise. So no loop, and no comprehension, is directly in such a block.
 """
 
 from __future__ import annotations
@@ -63,29 +65,34 @@ class OrderedCalls:
         thread.is_busy = True  # followed by `try` without a call, so that Ctrl-C cannot separate the two
         try:
             self._run(call)
-            while thread.left:
-                calls, each = thread.left.popleft()
-                calls._run(each)  # noqa: SLF001  of the same class
+            _run_left(thread)
         finally:
             thread.is_busy = False
 
     def _run(self, call: Callable[[], object]) -> None:
         with self._lock:
-            while self._left:
-                self._left.popleft()()
+            self._drain()
             call()
         while self._left:  # a thread of the memory came before the lock was released
             with self._lock:
-                while self._left:
-                    self._left.popleft()()
+                self._drain()
 
     def _run_if_free(self) -> None:
         while self._left and self._lock.acquire(blocking=False):
             try:
-                while self._left:
-                    self._left.popleft()()
+                self._drain()
             finally:
                 self._lock.release()
+
+    def _drain(self) -> None:
+        while self._left:
+            self._left.popleft()()
+
+
+def _run_left(thread: _ThreadState) -> None:
+    while thread.left:
+        calls, each = thread.left.popleft()
+        calls._run(each)  # noqa: SLF001  of this module
 
 
 class CountingEpisode(Protocol):

@@ -8,6 +8,7 @@ Where an interrupt leaves a lock taken or the garbage collector off, what follow
 
 from __future__ import annotations
 
+import ast
 import gc
 import inspect
 import sys
@@ -16,7 +17,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
+from types import FrameType, ModuleType
 
 import pytest
 
@@ -24,10 +25,14 @@ import pycrorm_async
 from pycrorm_async import Settings
 from pycrorm_async.events.order import OrderCheck
 from pycrorm_async.events.types import EpisodeEnded, Happening, NodeEnded, NodeStarted
+from pycrorm_async.hooks import sampler
 from pycrorm_async.hooks.plan_recorder import Recorder, current_episode
 from pycrorm_async.plan.designator import ActionAbstract
 from pycrorm_async.plan.execution.observer import recorder as observing
 from pycrorm_async.plan.failures import PlanFailure
+from pycrorm_async.queue.live import appender, gc_safe_lock
+from pycrorm_async.recording import ordered_calls
+from pycrorm_async.recording.writing import event_feed, open_episodes
 from pycrorm_async.world.pose import Pose
 from tests.hooks.fakes import NoteActionPerformable
 from tests.recording.recorded_queue import Recorded
@@ -218,3 +223,19 @@ def test_an_exit_at_any_call_leaves_the_plan(recorded: Recorded) -> None:
     assert interrupt_everywhere(recorded, scenario, SystemExit) > 150
     for log in recorded.logs():
         assert_in_order(log)
+
+
+@pytest.mark.parametrize("module", [ordered_calls, open_episodes, event_feed, sampler, gc_safe_lock, appender])
+def test_no_loop_is_directly_in_a_block_that_holds_a_lock(module: ModuleType) -> None:
+    """Python 3.12 and 3.13 leave the block with the lock taken if a handler raises where a loop jumps back."""
+    tree = ast.parse(inspect.getsource(module))
+    blocks = [each for each in ast.walk(tree) if isinstance(each, ast.With) and "lock" in ast.unparse(each.items[0])]
+    loops = (ast.For, ast.While, ast.ListComp, ast.DictComp, ast.SetComp)
+    assert [each.lineno for block in blocks for each in ast.walk(block) if isinstance(each, loops)] == []
+
+
+def test_a_loop_is_never_directly_before_the_end_of_being_busy() -> None:
+    tree = ast.parse(inspect.getsource(ordered_calls))
+    busy = [each for each in ast.walk(tree) if isinstance(each, ast.Try) and "is_busy" in ast.unparse(each)]
+    assert len(busy) == 1
+    assert [each for each in ast.walk(busy[0]) if isinstance(each, ast.For | ast.While)] == []
