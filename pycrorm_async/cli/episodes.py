@@ -7,7 +7,18 @@ from typing import Annotated
 
 import typer
 
-from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
+from pycrorm_async.cli.options import (
+    DEFAULT_URL,
+    JsonOption,
+    LimitOption,
+    RobotOption,
+    SinceOption,
+    SpoolOption,
+    StatusOption,
+    TagOption,
+    TextOption,
+    UrlOption,
+)
 from pycrorm_async.cli.output import moment, note, print_json, print_table, stdout
 from pycrorm_async.cli.reading import read_memory
 from pycrorm_async.cli.since import parse_since
@@ -28,43 +39,22 @@ def episodes(
     simulated: Annotated[
         bool, typer.Option("--simulated", help="Also list simulated episodes (SimulatedTaskTree).")
     ] = False,
-    status: Annotated[
-        str | None, typer.Option(metavar="STATUS", help="List only episodes of this status: RUNNING, SUCCEEDED, …")
-    ] = None,
-    since: Annotated[
-        str | None,
-        typer.Option(
-            metavar="WHEN",
-            help="List only episodes that started then or later: 2026-11-23, 2026-11-23T14:30, 90min, 7d.",
-        ),
-    ] = None,
-    tag: Annotated[
-        list[str] | None, typer.Option(metavar="TAG", help="List only episodes with this tag; repeatable: with all.")
-    ] = None,
-    robot: Annotated[
-        str | None, typer.Option(metavar="ROBOT", help="List only episodes with a robot of this name or model.")
-    ] = None,
-    text: Annotated[
-        str | None,
-        typer.Option(metavar="TEXT", help="List only episodes whose description, plan or a tag has this text."),
-    ] = None,
-    limit: Annotated[int | None, typer.Option(metavar="N", min=1, help="List only the newest N of them.")] = None,
+    status: StatusOption = None,
+    since: SinceOption = None,
+    tag: TagOption = None,
+    robot: RobotOption = None,
+    text: TextOption = None,
+    limit: LimitOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """List the recorded episodes, the oldest first."""
-    earliest = None if since is None else parse_since(since)
-    choice = EpisodeChoice(status, earliest, tuple(tag or ()), robot, text, limit)
+    choice = EpisodeChoice(status, parse_since(since), tuple(tag or ()), robot, text, limit)
     summaries = read_memory(url, spool, lambda reading: reading.episodes(choice, simulated=simulated))
     if as_json:
         print_json(summaries)
         return
     if not summaries:
-        chosen = choice != EpisodeChoice()
-        note(
-            "no episode matches these options; `pycrorm episodes` lists all"
-            if chosen
-            else "no episode yet: record one with `pycrorm run` or `pycrorm demo`"
-        )
+        note(choice.absence)
         return
     numbers = {e.id: e.number for e in summaries}
     columns: tuple[str, ...] = ("episode", "started", "took", "status", "nodes", "failed", "description")

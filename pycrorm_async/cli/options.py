@@ -56,4 +56,28 @@ ProjectionOption = Annotated[
 EpisodeArgument = Annotated[
     str, typer.Argument(help="The episode's number, its id or first digits of the id, or `last`.")
 ]
+StatusOption = Annotated[
+    str | None, typer.Option("--status", metavar="STATUS", help="Only episodes of this status: RUNNING, SUCCEEDED, …")
+]
+SinceOption = Annotated[
+    str | None,
+    typer.Option(
+        "--since",
+        metavar="WHEN",
+        help="Only episodes that started then or later: 2026-11-23, 2026-11-23T14:30, 90min, 7d.",
+    ),
+]
+TagOption = Annotated[
+    list[str] | None, typer.Option("--tag", metavar="TAG", help="Only episodes with this tag; repeatable: with all.")
+]
+RobotOption = Annotated[
+    str | None, typer.Option("--robot", metavar="ROBOT", help="Only episodes with a robot of this name or model.")
+]
+TextOption = Annotated[
+    str | None,
+    typer.Option("--text", metavar="TEXT", help="Only episodes whose description, plan or a tag has this text."),
+]
+LimitOption = Annotated[
+    int | None, typer.Option("--limit", metavar="N", min=1, help="Only the newest N of these episodes.")
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document.")]

@@ -7,10 +7,23 @@ from typing import Annotated
 
 import typer
 
-from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
+from pycrorm_async.cli.options import (
+    DEFAULT_URL,
+    JsonOption,
+    LimitOption,
+    RobotOption,
+    SinceOption,
+    SpoolOption,
+    StatusOption,
+    TagOption,
+    TextOption,
+    UrlOption,
+)
 from pycrorm_async.cli.output import counted, note, print_json, print_line, problem
 from pycrorm_async.cli.reading import read_memory
+from pycrorm_async.cli.since import parse_since
 from pycrorm_async.errors import CallerError
+from pycrorm_async.query.asking.episode_list import EpisodeChoice
 from pycrorm_async.report.write import overview
 from pycrorm_async.report.write import report as write_report
 
@@ -22,9 +35,12 @@ def report(
     every: Annotated[
         bool, typer.Option("--all", help="Write a table of the episodes, and pages of the newest 200 behind it.")
     ] = False,
-    tag: Annotated[
-        list[str] | None, typer.Option(metavar="TAG", help="With --all: only episodes with this tag; repeatable.")
-    ] = None,
+    status: StatusOption = None,
+    since: SinceOption = None,
+    tag: TagOption = None,
+    robot: RobotOption = None,
+    text: TextOption = None,
+    limit: LimitOption = None,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -44,22 +60,26 @@ def report(
 ) -> int:
     """Write an episode as one HTML page that opens offline: task tree, Gantt chart, 3D scene, failures.
 
+    --status, --since, --tag, --robot, --text and --limit choose among the episodes of --all, as in `pycrorm episodes`.
     Exit code 1 if --all met an episode whose events cannot be read; its row has the error, and all others have pages.
     """
     if every == (episode is not None):
         raise CallerError("name an episode, for example `pycrorm report last`, or write all of them with --all")
-    if not every and tag:
-        raise CallerError("--tag chooses among all episodes: add --all")
+    choice = EpisodeChoice(status, parse_since(since), tuple(tag or ()), robot, text, limit)
+    if not every and choice != EpisodeChoice():
+        raise CallerError(f"an option chooses among all episodes ({choice}): add --all")
     if every and (first is not None or last is not None):
         raise CallerError("--from and --to choose events of one episode: name it instead of --all")
     if episode is None:
-        return _write_overview(out or Path("episodes.html"), tag or [], url, spool, force=force, as_json=as_json)
+        return _write_overview(out or Path("episodes.html"), choice, url, spool, force=force, as_json=as_json)
     _write_episode(episode, out, (first, last), url, spool, force=force, as_json=as_json)
     return 0
 
 
-def _write_overview(out: Path, tags: list[str], url: str, spool: Path | None, *, force: bool, as_json: bool) -> int:
-    written = read_memory(url, spool, lambda reading: overview(reading, out, tags=tags, force=force))
+def _write_overview(
+    out: Path, choice: EpisodeChoice, url: str, spool: Path | None, *, force: bool, as_json: bool
+) -> int:
+    written = read_memory(url, spool, lambda reading: overview(reading, out, choice=choice, force=force))
     if as_json:
         counts = {"episodes": written.episodes, "pages": written.pages, "left_out": written.left_out}
         print_json({"file": written.path, **counts, "unreadable": written.unreadable})

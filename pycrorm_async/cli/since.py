@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from datetime import UTC, datetime, timedelta
+from typing import overload
 
 from pycrorm_async.errors import CallerError
 
@@ -16,14 +17,22 @@ _UNITS = {
 }
 
 
-def parse_since(text: str, now: datetime | None = None) -> datetime:
-    """Return the time. One without a zone is in UTC, as the verbs print times; an age counts back from `now`.
+@overload
+def parse_since(text: str, now: datetime | None = None) -> datetime: ...
+@overload
+def parse_since(text: str | None, now: datetime | None = None) -> datetime | None: ...
+def parse_since(text: str | None, now: datetime | None = None) -> datetime | None:
+    """Return the time, or None without a text.
+
+    A time without a zone is in UTC, as the verbs print times; an age counts back from `now`.
 
     >>> parse_since("2026-11-23 14:30").isoformat()
     '2026-11-23T14:30:00+00:00'
 
     Raises `CallerError` for another text.
     """
+    if text is None:
+        return None
     try:
         if age := _AGE.fullmatch(text.strip()):
             return (now or datetime.now(UTC)) - int(age[1]) * _UNITS[age[2]]

@@ -9,6 +9,7 @@ from sqlalchemy import func, select
 from sqlalchemy.orm import aliased
 
 from pycrorm_async.orm import TaskTreeNode
+from pycrorm_async.query.asking.episode_list import EpisodeChoice
 from pycrorm_async.query.named_queries import EpisodeSummary
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.task_status import TaskStatus
@@ -22,9 +23,9 @@ _REASON_MAX = 500
 _FAILED = (TaskStatus.FAILED, TaskStatus.ERROR)
 
 
-async def newest_episodes(reading: Reading, tags: Collection[str] = ()) -> tuple[list[EpisodeSummary], int]:
-    """Return the newest episodes that have all these tags, the oldest first, and the number of all that have them."""
-    summaries = [each for each in await reading.episodes() if set(tags) <= set(each.tags)]
+async def newest_episodes(reading: Reading, choice: EpisodeChoice | None = None) -> tuple[list[EpisodeSummary], int]:
+    """Return the newest of all episodes, or of a choice, the oldest first, and the number of all of them."""
+    summaries = await reading.episodes(choice)
     return summaries[-_EPISODES_MAX:], len(summaries)
 
 

@@ -17,6 +17,7 @@ from urllib.parse import quote
 
 from pycrorm_async.errors import CallerError, DatabaseForeign, LogDamaged
 from pycrorm_async.query.as_of import AnyEpisode
+from pycrorm_async.query.asking.episode_list import EpisodeChoice
 from pycrorm_async.query.named_queries import EpisodeSummary
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.report.episode_data import episode_document
@@ -99,9 +100,9 @@ async def _report(
 
 
 async def overview(
-    reading: Reading, path: str | PathLike[str], *, tags: Collection[str] = (), force: bool = False
+    reading: Reading, path: str | PathLike[str], *, choice: EpisodeChoice | None = None, force: bool = False
 ) -> Overview:
-    """Write a table of the episodes that have all these tags, and pages of the newest 200 of them behind it.
+    """Write a table of all episodes, or of a choice, and pages of the newest 200 of them behind it.
 
     The pages are in the folder `NAME.pages` beside the file `NAME.html`. An episode whose events cannot be read has the
     reason in its row and no page. Raises `CallerError` if one of the files exists, without `force`, or if there is no
@@ -112,10 +113,11 @@ async def overview(
     refuse_existing(file, force=force)
     if folder.exists() and not (force and folder.is_dir()):
         raise CallerError(f"{folder} exists: add --force to write pages into it, or give another name")
-    episodes, total = await newest_episodes(reading, tags)
+    choice = choice or EpisodeChoice()
+    episodes, total = await newest_episodes(reading, choice)
     if not episodes:
-        raise CallerError(f"no episode has the tags {', '.join(tags)}" if tags else "this memory has no episode yet")
-    title = f"Episodes with the tags {', '.join(tags)}" if tags else "Episodes"
+        raise CallerError(choice.absence)
+    title = f"Episodes: {choice}" if str(choice) else "Episodes"
     with _folder_of_pages(folder):
         shown = episodes[-_PAGES_MAX:]
         unreadable = await _write_pages(reading, shown, folder, force=force)

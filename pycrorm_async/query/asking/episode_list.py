@@ -1,9 +1,9 @@
-"""Choose episodes by status, start, tags, robot, text: for `memory.ask.episodes` and `pycrorm episodes` alike."""
+"""Choose episodes by status, start, tags, robot, text: for `memory.ask.episodes`, `pycrorm episodes` and reports."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any
 
 from sqlalchemy import ColumnElement, Select, exists, or_, select
@@ -48,6 +48,25 @@ class EpisodeChoice:
         # Both are built again for each query; here they raise where the choice is made.
         self.conditions()
         limited(select(), self.limit)
+
+    def __str__(self) -> str:
+        """Return the conditions as `status FAILED; tags night, kitchen; the newest 10`; empty if there is none."""
+        conditions = {
+            "status": self.status,
+            "since": None if self.since is None else f"{self.since.astimezone(UTC):%Y-%m-%d %H:%M:%S} UTC",
+            "tags" if len(self.tags) > 1 else "tag": ", ".join(self.tags) or None,
+            "robot": self.robot,
+            "text": self.text,
+            "the newest": self.limit,
+        }
+        return "; ".join(f"{name} {value}" for name, value in conditions.items() if value is not None)
+
+    @property
+    def absence(self) -> str:
+        """Return the line that a verb prints if there is no such episode."""
+        if self != EpisodeChoice():
+            return "no episode matches these options; `pycrorm episodes` lists all"
+        return "no episode yet: record one with `pycrorm run` or `pycrorm demo`"
 
     def conditions(self) -> list[ColumnElement[bool]]:
         """Return the conditions on `ProcessMetaData`, without the limit. Raises `CallerError` for a wrong status."""

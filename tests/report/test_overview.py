@@ -1,0 +1,67 @@
+"""The table of episodes has those that `pycrorm episodes` lists with the same options, and names the choice."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+from typer.testing import CliRunner
+
+from pycrorm_async import Memory
+from pycrorm_async.cli.main import app
+
+
+@pytest.fixture(scope="module")
+def url(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Return the URL of a memory with three episodes: the second fails, the third has a tag."""
+    address = f"sqlite:///{tmp_path_factory.mktemp('overview') / 'memory.db'}"
+    with Memory.sync(address) as memory:
+        grasp = memory.recording.type("action", "GraspAction", {"arm": str, "grams": float})
+        for number in range(3):
+            tags = ("night",) if number == 2 else ()
+            with memory.recording.episode(description=f"grasp {'milk' if number else 'bowl'}", tags=tags) as episode:
+                for arm in ("left", "right"):
+                    episode.start(arm, grasp, {"arm": arm, "grams": 100.0 * number})
+                    episode.end(arm, "FAILED" if number == 1 else "SUCCEEDED", "slipped")
+        memory.flush()
+    return address
+
+
+def report(url: str, out: Path, *options: str) -> tuple[int, str]:
+    done = CliRunner().invoke(app("report"), ["report", "--all", "--out", str(out), "--url", url, *options])
+    return done.exit_code, done.output
+
+
+def in_page(page: Path) -> Any:
+    return msgspec.json.decode(page.read_text().partition('id="document">')[2].partition("</script>")[0])
+
+
+@pytest.mark.parametrize(
+    ("options", "numbers", "title"),
+    [
+        ((), [1, 2, 3], "Episodes"),
+        (("--text", "milk"), [2, 3], "Episodes: text milk"),
+        (("--tag", "night", "--status", "succeeded"), [3], "Episodes: status succeeded; tag night"),
+        (
+            ("--since", "2026-01-02 03:04", "--limit", "2"),
+            [2, 3],
+            "Episodes: since 2026-01-02 03:04:00 UTC; the newest 2",
+        ),
+    ],
+)
+def test_a_table_has_the_chosen_episodes_and_their_pages(
+    url: str, tmp_path: Path, options: tuple[str, ...], numbers: list[int], title: str
+) -> None:
+    assert report(url, tmp_path / "all.html", *options)[0] == 0
+    document = in_page(tmp_path / "all.html")
+    assert (document["title"], document["total"]) == (title, len(numbers))
+    assert [each["number"] for each in document["episodes"]] == numbers
+    assert sorted(each.stem for each in (tmp_path / "all.pages").iterdir()) == [f"episode-{each}" for each in numbers]
+
+
+def test_a_choice_of_no_episode_is_refused_as_by_the_list_of_episodes(url: str, tmp_path: Path) -> None:
+    code, text = report(url, tmp_path / "all.html", "--robot", "nobody")
+    assert (code, text) == (2, "pycrorm: no episode matches these options; `pycrorm episodes` lists all\n")
+    assert list(tmp_path.iterdir()) == []
