@@ -15,10 +15,10 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from html import escape
-from typing import Any, NamedTuple, Protocol, overload
+from typing import NamedTuple, Protocol, overload
 
 from pycrorm_async.errors import CallerError
+from pycrorm_async.query.notebook.answer_view import cases_html
 from pycrorm_async.query.snapshot import Moment
 from pycrorm_async.query.success.interval import interval_95
 from pycrorm_async.recall.case import Case, is_angle
@@ -290,10 +290,7 @@ class Answer(Sequence[RecalledCase]):
 
     def _repr_html_(self) -> str:
         header, rows = self.table()
-        head = "".join(f"<th>{name}</th>" for name in header)
-        body = "".join(f"<tr>{''.join(f'<td>{_cell(value)}</td>' for value in row)}</tr>" for row in rows)
-        facts = "<br>".join(map(escape, self.why().splitlines()))
-        return f"<p>{facts}</p><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+        return cases_html(self.why().splitlines(), header, rows)
 
 
 def answer(cue: Cue, library: CaseLibrary, memory: Surroundings | None = None) -> Answer:
@@ -384,7 +381,3 @@ def _text(value: str | tuple[str, ...] | float) -> str:
         case tuple():
             return ", ".join(value)
     return value
-
-
-def _cell(value: Any) -> str:
-    return f"{value:.3f}" if isinstance(value, float) else escape("" if value is None else str(value))

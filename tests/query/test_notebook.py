@@ -11,6 +11,7 @@ from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from html.parser import HTMLParser
 from itertools import pairwise
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -23,6 +24,7 @@ from pycrorm_async.events.values import BlobReference, BoxValue, MeshValue
 from pycrorm_async.plan import NavigateAction, simulated_robot
 from pycrorm_async.query.asking.episode_diff import Difference, EpisodeDiff
 from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary
+from pycrorm_async.query.notebook.answer_view import cases_html
 from pycrorm_async.query.notebook.listings import Episodes, TaskTree
 from pycrorm_async.query.notebook.memory_view import memory_html
 from pycrorm_async.query.running_episodes import RobotSummary
@@ -134,6 +136,7 @@ def test_everything_recorded_is_escaped_and_nothing_runs_or_is_requested() -> No
     difference = Difference("node", HOSTILE, HOSTILE, HOSTILE, None)
     views.append(EpisodeDiff(hostile, hostile, (difference,), 1)._repr_html_())
     views.append(SqlResult((HOSTILE,), [(HOSTILE,), (None,)], more=True)._repr_html_())
+    views.append(cases_html((HOSTILE, HOSTILE), ("type", "status"), [(HOSTILE, "FAILED"), (None, HOSTILE)]))
     views += [then.world._repr_html_(), then.map()._repr_html_(), tree.gantt("time")._repr_html_()]
     for view in views:
         assert "</script><script>" in harmless(view).text
@@ -194,6 +197,27 @@ def test_a_chart_has_events_or_time_as_its_axis() -> None:
         tree.gantt("days")  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize(("failing", "line"), [(100, "all 26 failed nodes and 474 of 4,975"), (5, "of 501 failed")])
+def test_a_chart_of_many_nodes_has_some_from_the_whole_episode_and_counts_them(failing: int, line: str) -> None:
+    steps = [node(1, status="FAILED")]
+    for branch in range(2, 5_002, 2):
+        status = "FAILED" if branch // 2 % failing == 0 else "SUCCEEDED"
+        steps += [node(branch, 1), node(branch + 1, branch, status)]
+    chart = Page(TaskTree(steps).gantt().svg)
+    hints = re.findall(r"Step(\d+)Action (SUCCEEDED|FAILED)", chart.text)
+    assert line in chart.text
+    for part in range(10):  # of the episode
+        within = [status for number, status in hints if part * 500 < int(number) <= (part + 1) * 500]
+        assert within.count("SUCCEEDED") >= 15
+        assert 1 <= within.count("FAILED") <= 35
+    assert "chosen at random" not in TaskTree(steps[:500]).gantt().svg
+
+
+def test_a_chart_of_a_deep_tree_is_drawn() -> None:
+    chart = Page(TaskTree([node(number, number - 1 or None) for number in range(1, 3_001)]).gantt().svg)
+    assert 1 <= chart.count("g") <= 500
+
+
 def test_a_chart_of_few_events_repeats_no_label() -> None:
     labels = re.findall(r">(e\d+)<", TaskTree([node(1, end_sequence=3)]).gantt().svg)
     assert labels == ["e1", "e2", "e3"]
@@ -224,6 +248,16 @@ def test_a_long_list_of_episodes_shows_the_newest_and_counts_the_others() -> Non
     assert "1,150 episodes" in page.text
     assert "… 1,050 more before these" in page.text
     assert page.count("tr") == 101
+
+
+async def test_an_episode_that_is_recorded_is_drawn_without_a_look_into_the_database(tmp_path: Path) -> None:
+    async with Memory.open(f"sqlite:///{tmp_path / 'memory.db'}") as memory:
+        async with memory.episode(description=HOSTILE) as recorded:
+            page = harmless(recorded._repr_html_())
+        ended = harmless(recorded._repr_html_())
+    assert f"Episode · {' '.join(HOSTILE.split())} · ▶ RUNNING" in page.text
+    assert f"id {recorded}; to look at it: await memory.flush(); await memory.tree(episode)" in page.text
+    assert ("RUNNING" in ended.text, "· ended" in ended.text) == (False, True)
 
 
 def test_a_moment_shows_what_runs_where_everything_is_and_what_was_observed() -> None:

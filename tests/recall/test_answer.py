@@ -124,8 +124,16 @@ def test_the_typical_angle_is_that_around_the_circle() -> None:
 def test_a_page_shows_an_answer_without_obeying_its_texts() -> None:
     page = asked(Cue(type="PickUpAction"))._repr_html_()
     assert page.count("<tr>") == 5
-    assert "&lt;IKError&gt;" in page
+    assert "<bdi>&lt;IKError&gt;</bdi>" in page
     assert "<IKError>" not in page
+    assert (page.count("✓</span> SUCCEEDED"), page.count("✗</span> FAILED")) == (2, 2)
+
+
+def test_a_page_of_a_long_answer_has_a_hundred_cases_and_counts_the_others() -> None:
+    cases = [pick_up(number, height=1.0) for number in range(1, 151)]
+    page = answer(Cue(type="PickUpAction", k=150), CaseLibrary([Block.of(cases)]))._repr_html_()
+    assert page.count("<tr>") == 101
+    assert "… 50 more" in page
 
 
 def test_an_answer_without_cases_says_so() -> None:
@@ -134,4 +142,4 @@ def test_an_answer_without_cases_says_so() -> None:
     assert empty.success is None
     assert empty.reasons == []
     assert empty.why() == "0 of 0 cases for FlyAction"
-    assert "<table>" in empty._repr_html_()
+    assert "<bdi>0 of 0 cases for FlyAction</bdi>" in empty._repr_html_()

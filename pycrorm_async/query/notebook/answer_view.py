@@ -1,11 +1,12 @@
-"""Draw the results of queries: rows of SQL, a question that is not awaited yet, the differences of two episodes."""
+"""Draw results: rows of SQL, a question that is not awaited yet, differences of two episodes, recalled cases."""
 
 from __future__ import annotations
 
 import html
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from pycrorm_async.query.notebook.markup import left_out, quiet, recorded, table, view
+from pycrorm_async.query.notebook.markup import left_out, quiet, recorded, status, table, view
 
 if TYPE_CHECKING:
     from pycrorm_async.query.asking.episode_diff import EpisodeDiff
@@ -52,6 +53,20 @@ def diff_html(compared: EpisodeDiff) -> str:
     count = len(compared.differences)
     same = quiet(f"{count:,} difference{'s' * (count != 1)}; {compared.same_nodes:,} nodes are the same")
     return view(title, same, table(("of", "where", "what", "A", "B"), rows) if rows else "", _more(count))
+
+
+def cases_html(summary: Sequence[str], columns: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    """Return the lines of a summary, and the first cases as a table; the column `status` has signs."""
+    title, *lines = (recorded(each) for each in summary)
+    cells = [
+        [
+            status(str(value)) if name == "status" else f"{value:.3f}" if isinstance(value, float) else recorded(value)
+            for name, value in zip(columns, ("" if each is None else each for each in row), strict=True)
+        ]
+        for row in rows[:_ROWS_MAX]
+    ]
+    facts = [f"<div>{each}</div>" for each in lines]
+    return view(f"<b>{title}</b>", *facts, table(columns, cells) if cells else "", _more(len(rows)))
 
 
 def _more(count: int) -> str:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from random import Random
 from typing import Literal, NamedTuple, TypeAlias, get_args
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.query.named_queries import NodeSummary
 from pycrorm_async.query.notebook.markup import FAILED, Drawing, color_of, sign_of
-from pycrorm_async.query.notebook.tree_view import shown_nodes
+from pycrorm_async.query.notebook.tree_view import NODES_MAX, root_failures
 from pycrorm_async.query.parameter_text import duration, one_line, parameters_text
 
 Axis: TypeAlias = Literal["events", "time"]
@@ -19,6 +20,8 @@ _CHARACTER = 6.8
 """Width of a character of a bar's name, so that a name is cut where its bar ends."""
 _TICKS = 6
 """The labels along the axis."""
+_DRAWS_MAX = 4 * NODES_MAX
+"""Bounds the nodes drawn by lot for a chart of a part, because those whose ancestors do not fit are left out."""
 
 
 class _Bar(NamedTuple):
@@ -32,11 +35,13 @@ def gantt(nodes: Sequence[NodeSummary], axis: Axis = "events") -> Drawing:
     """Return a chart of the nodes over their events, or over time in s. Raises `CallerError` for another axis.
 
     Robots of a kinematic world jump, so that many nodes take no time; over events each is as wide as its number of
-    events. A node that has not ended extends to the end of the chart.
+    events. A node that has not ended extends to the end of the chart. Of more nodes than 500 the chart has failures, up
+    to half of it, and others by lot from the whole episode, each with its ancestors; a line below the axis counts them.
     """
     if axis not in get_args(Axis):
         raise CallerError(f"axis must be 'events' or 'time', got {axis!r}")
-    bars = _bars(shown_nodes(nodes), by_time=axis == "time")
+    drawn = _sample(nodes)
+    bars = _bars(drawn, by_time=axis == "time")
     first = min((each.start for each in bars), default=0.0)
     last = max((each.end for each in bars), default=0.0)
     scale = (_WIDTH - 2 * _PAD) / ((last - first) or 1.0)
@@ -52,10 +57,50 @@ def gantt(nodes: Sequence[NodeSummary], axis: Axis = "events") -> Drawing:
         labels.add(label)
         anchor = "start" if index == 0 else "end" if index == _TICKS - 1 else "middle"
         parts.append(f'<text x="{x:.1f}" y="{height - 4:.0f}" text-anchor="{anchor}" opacity=".7">{label}</text>')
+    if note := _note(drawn, nodes):
+        height += _AXIS
+        parts.append(f'<text x="{_PAD:.1f}" y="{height - 4:.0f}" opacity=".7">{note}</text>')
     return Drawing(
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {_WIDTH:.0f} {height:.0f}" role="img"'
         f' aria-label="chart of {len(bars)} nodes over {axis}" font-family="system-ui,sans-serif" font-size="11"'
         f' fill="currentColor" style="width:100%;max-width:{_WIDTH:.0f}px">{"".join(parts)}</svg>'
+    )
+
+
+def _sample(nodes: Sequence[NodeSummary]) -> list[NodeSummary]:
+    """Return all nodes, or of many some that are spread over the whole episode, always the same ones."""
+    if len(nodes) <= NODES_MAX:
+        return list(nodes)
+    lot = Random(0)  # noqa: S311  no secret: a seed draws the same chart again
+    by_id = {each.id: each for each in nodes}
+    kept: set[int] = set()
+    failures = root_failures(nodes)
+    _keep(kept, lot.sample(failures, min(len(failures), _DRAWS_MAX)), by_id, NODES_MAX // 2)
+    _keep(kept, lot.sample(nodes, min(len(nodes), _DRAWS_MAX)), by_id, NODES_MAX)
+    return [each for each in nodes if each.id in kept]
+
+
+def _keep(kept: set[int], chosen: Sequence[NodeSummary], by_id: Mapping[int, NodeSummary], nodes_max: int) -> None:
+    """Add the chosen nodes, each with its ancestors, as far as they fit."""
+    for each in chosen:
+        path: set[int] = set()
+        node: NodeSummary | None = each
+        while node is not None and node.id not in kept and len(kept) + len(path) <= nodes_max:
+            path.add(node.id)
+            node = by_id.get(node.parent_id) if node.parent_id is not None else None
+        if len(kept) + len(path) <= nodes_max:
+            kept |= path
+
+
+def _note(drawn: Sequence[NodeSummary], nodes: Sequence[NodeSummary]) -> str:
+    """Return the line that counts what a chart of a part of the nodes draws; empty for a chart of all."""
+    if len(drawn) == len(nodes):
+        return ""
+    failed, all_failed = (sum(each.status in FAILED for each in some) for some in (drawn, nodes))
+    failures = f"all {failed:,}" if failed == all_failed else f"{failed:,} of {all_failed:,}"
+    others = f"{len(drawn) - failed:,} of {len(nodes) - all_failed:,}"
+    return (
+        f"{failures} failed nodes and {others} others, chosen at random from the whole episode; gaps are not idle time"
     )
 
 

@@ -29,7 +29,7 @@ def shown_nodes(nodes: Sequence[NodeSummary]) -> list[NodeSummary]:
     for each in nodes:
         depths[each.id] = depths.get(each.parent_id, -1) + 1 if each.parent_id is not None else 0
     kept: set[int] = set()
-    for each in _root_failures(nodes):
+    for each in root_failures(nodes):
         path = {each.id}
         while (parent := each.parent_id) in by_id and parent is not None:
             path.add(parent)
@@ -42,7 +42,7 @@ def shown_nodes(nodes: Sequence[NodeSummary]) -> list[NodeSummary]:
     return [each for each in nodes if each.id in kept]
 
 
-def _root_failures(nodes: Sequence[NodeSummary]) -> list[NodeSummary]:
+def root_failures(nodes: Sequence[NodeSummary]) -> list[NodeSummary]:
     """Return the failed nodes without a failed child."""
     caused = {each.parent_id for each in nodes if each.status in FAILED}
     return [each for each in nodes if each.status in FAILED and each.id not in caused]
@@ -92,7 +92,7 @@ def _opened(shown: Sequence[NodeSummary], parents: Mapping[int, int | None]) -> 
     """Return the nodes to open: the first levels, and those with one of the first failed or running nodes below."""
     opened: set[int] = set()
     levels = 2 if len(shown) <= _NODES_OPEN else 1
-    leading = _root_failures(shown)[:_FAILURES_OPEN]
+    leading = root_failures(shown)[:_FAILURES_OPEN]
     ends = {each.id for each in (*leading, *(each for each in shown if each.status == "RUNNING"))}
     depths: dict[int | None, int] = {None: -1}
     for each in shown:

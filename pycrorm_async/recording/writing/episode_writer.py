@@ -24,6 +24,7 @@ end and, if they still run then, are started again in the follow-up.
 
 from __future__ import annotations
 
+import html
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -45,6 +46,7 @@ from pycrorm_async.recording.values.event_fitting import (
 )
 from pycrorm_async.recording.values.failure_values import failure_value
 from pycrorm_async.recording.values.parameters import ROBOT, fit_node_start
+from pycrorm_async.recording.values.texts import clean
 from pycrorm_async.recording.values.value_snapshot import missing_in
 from pycrorm_async.recording.writing.emitter import Emitter
 from pycrorm_async.recording.writing.episode_opening import EpisodeOpening, end_statuses, episode_started
@@ -57,6 +59,8 @@ _RESERVE_EVENTS_MAX = 2**20
 """Bounds the sequences reserved behind `continue_at`: more open nodes than fit into a process' memory."""
 _LAST_ENDS_S = 1.0
 """Bounds the wait of an episode's end for ends of nodes in other threads; each takes microseconds."""
+_DESCRIPTION_MAX = 200
+"""Bounds the characters of the description in a notebook."""
 
 N = TypeVar("N")
 
@@ -94,6 +98,19 @@ class EpisodeWriter(ABC, Generic[N]):
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self}{' closed' if self.closed else ''}>"
+
+    def _repr_html_(self) -> str:
+        """Return the view of a notebook; it has no number, because only the database knows that."""
+        description = html.escape(" ".join(clean(self._opening.description).split())[:_DESCRIPTION_MAX])
+        running = '<span style="color:#2f7fd1;font-weight:bold">▶</span> RUNNING'
+        kind = "Simulated episode" if self.simulated else "Episode"
+        return (
+            f'<div style="font-family:system-ui,sans-serif"><b>{kind} · <bdi>{description}</bdi></b>'
+            f" · {'ended' if self.closed else running}"
+            f'<div style="opacity:.7">id {self}; to look at it: '
+            '<span style="font-family:monospace">await memory.flush(); await memory.tree(episode)</span>, '
+            "where episode is this object</div></div>"
+        )
 
     # --- what an executive adds -------------------------------------------------------------------------------
 
