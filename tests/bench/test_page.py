@@ -60,8 +60,10 @@ def test_mapped_objects_are_judged_on_both_databases() -> None:
             "objects": {**ABOUT, **{name: {"actions": {"ours_is": {"median": is_}}} for name, is_ in ratios.items()}}
         }
 
-    assert verdict("CPU time of `select", of(0.7, 1.0)) == Verdict("sqlite 0.70 times, postgresql 1.00 times", met=True)
-    assert verdict("CPU time of `select", of(0.7, 1.1)).met is False
+    assert verdict("CPU time of `select(Action)`", of(0.7, 1.0)) == Verdict(
+        "sqlite 0.70 times, postgresql 1.00 times", met=True
+    )
+    assert verdict("CPU time of `select(Action)`", of(0.7, 1.1)).met is False
 
 
 def test_a_common_cue_is_judged_beside_soar_where_it_is_installed() -> None:
@@ -97,6 +99,23 @@ def test_cases_are_judged_on_both_databases_and_by_their_growth() -> None:
     assert verdict(load, of(25, 101, 11)).met is False
     assert verdict(growth, of(25, 100, 11)) == Verdict("1.10 times an action (rare), 60 bytes an action", met=True)
     assert verdict(growth, of(25, 100, 11.5)).met is False
+
+
+def test_the_wall_time_of_mapped_objects_is_shown_beside_that_of_the_thesis() -> None:
+    def of(sqlite_ms: int, postgresql_ms: int) -> dict[str, Any]:
+        sides = {
+            name: {"actions": {"ours_ms": {"median": ms}, "thesis_ms": {"median": 1_500}}}
+            for name, ms in (("sqlite", sqlite_ms), ("postgresql", postgresql_ms))
+        }
+        return {"objects": {**ABOUT, **sides}}
+
+    assert verdict("the same, wall time", of(1_000, 250)) == Verdict(
+        "sqlite 1.00 s (system of the thesis: 1.50 s), postgresql 0.25 s (system of the thesis: 1.50 s),"
+        " at a load of 0.1 to 2.0",
+        met=True,
+    )
+    assert verdict("the same, wall time", of(1_001, 250)).met is False
+    assert verdict("the same, wall time", of(1_000, 251)).met is False
 
 
 def test_of_all_rebuilt_logs_the_largest_is_judged() -> None:
