@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable, Coroutine, Iterator
 from pathlib import Path
 from typing import Any
@@ -21,11 +22,12 @@ from pycrorm_async.orm import (
     SpatialRelation,
     TaskTreeNode,
 )
+from pycrorm_async.query.asking.ask import QUESTIONS
 from pycrorm_async.recall.experience import PickUpExperience
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.world import ObjectType
-from tests.databases import Server, ask, ask_to_change, run_in_own_loop
+from tests.databases import Server, ask, ask_each, ask_to_change, run_in_own_loop
 
 pytestmark = pytest.mark.slow
 
@@ -52,6 +54,44 @@ def rollouts(request: pytest.FixtureRequest, server: Server, tmp_path_factory: p
         ask_to_change(url, "ANALYZE")
     yield url
     server.drop(url)
+
+
+WHOLE_MEMORY = "longest_actions durations arms_used successful_pick_ups experience_at episodes".split()
+"""The questions that without an episode read all nodes, pick-ups or episodes, because they are about all of them."""
+
+
+def test_a_question_reads_no_table_of_nodes_or_poses_as_a_whole(server: Server, tmp_path: Path) -> None:
+    """At this size the planner chooses an index by itself."""
+    url = server.new_database()
+    spool_rollouts(1_200, tmp_path, seed=69)
+
+    async def asked() -> list[dict[str, str]]:
+        await recover(url, spool=tmp_path)
+        ask_to_change(url, "ANALYZE")
+        async with Reading.open(url) as reading:
+            questions = {name: getattr(reading.ask, name) for name in QUESTIONS}
+            named = {name: {"name": "milk"} for name in ("object_history", "moves_of")}
+            about_all = {
+                name: question(**named.get(name, {}))
+                for name, question in questions.items()
+                if name not in WHOLE_MEMORY
+            }
+            about_one = {
+                f"{name} of an episode": question(**named.get(name, {}), episode=1)
+                for name, question in questions.items()
+                if name not in ("episodes", "experience_at")
+            }
+            return [{name: each.sql for name, each in {**about_all, **about_one}.items()}]
+
+    [statements] = run_in_own_loop(asked())
+    assert len(statements) == 5 + 9
+    plans = dict(zip(statements, ask_each(url, [f"EXPLAIN {each}" for each in statements.values()]), strict=True))
+    scans = {name: [step for (step,) in plan if _WHOLE_TABLE.search(step)] for name, plan in plans.items()}
+    server.drop(url)
+    assert {name: steps for name, steps in scans.items() if steps} == {}
+
+
+_WHOLE_TABLE = re.compile("Seq Scan on zz_(task_tree_node|pose)")
 
 
 def rows_of(statement: Any) -> Question:

@@ -35,8 +35,9 @@ class Ask(Generic[Q]):
     the node started or the change happened, in UTC.
 
     An empty answer to a question about a name that is nowhere in the memory, such as `object="mlik"`, is a warning with
-    the nearest name that is. Without `episode`, `longest_actions`, `durations`, `arms_used`, `experience_at` and
-    `episodes` read all nodes, or all episodes, of the memory; the others read what they are about by an index.
+    the nearest name that is. Without `episode`, `longest_actions`, `durations`, `arms_used`, `successful_pick_ups`,
+    `experience_at` and `episodes` read all nodes, pick-ups or episodes of the memory, because they are about all of
+    them; the others find what they are about by an index, but that names of objects are compared one by one.
     """
 
     def __init__(self, make: Callable[[QuestionPlan], Q]) -> None:

@@ -138,6 +138,12 @@ def steps_before_failures(
             step.id.label("node_id"),
         )
         .join(step, and_(step.id == latest.c.node_id, step.process_metadata_id == latest.c.episode, *named))
+        # Both hold of every step. PostgreSQL expects ten times as many steps as there are, and would read all nodes to
+        # join them; with each range it expects a two-hundredth of that, and looks the steps up by their ids.
+        .where(
+            latest.c.steps_before.between(literal_column("1"), literal_column(str(count))),
+            latest.c.node_id.between(_first_id(latest.c.episode), _first_id(latest.c.episode + 1)),
+        )
         .order_by(latest.c.failure_id, latest.c.steps_before)
     )
     return limited(statement, limit)
@@ -151,12 +157,16 @@ def _ended_before(node_id: Any, episode: Any, sequence: Any) -> Any:
     episode for each failure.
     """
     earlier = aliased(TaskTreeNode)
-    first_id = cast(episode, BigInteger).bitwise_lshift(literal_column(str(_NUMBER_BITS)))
     return (
         select(earlier.id)
-        .where(earlier.process_metadata_id == episode, earlier.id > first_id, earlier.id < node_id)
+        .where(earlier.process_metadata_id == episode, earlier.id > _first_id(episode), earlier.id < node_id)
         .where(earlier.kind.in_(("action", "motion")), earlier.end_sequence < sequence)
         .order_by(earlier.id.desc())
         .limit(literal_column("1"))
         .scalar_subquery()
     )
+
+
+def _first_id(episode: Any) -> Any:
+    """Return the number below all ids of the episode, which is above all those of the one before."""
+    return cast(episode, BigInteger).bitwise_lshift(literal_column(str(_NUMBER_BITS)))
