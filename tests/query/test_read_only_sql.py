@@ -403,12 +403,40 @@ MORE_RIGHTS = {
     "may create schemas": ("IN ROLE pycrorm_reader", "GRANT CREATE ON DATABASE {database} TO {name}"),
     "may create tables": ("IN ROLE pycrorm_reader", "GRANT CREATE ON SCHEMA memory_tables TO {name}"),
     "may change the memory": ("IN ROLE pycrorm_reader", "GRANT UPDATE (head) ON pycrorm.episode TO {name}"),
+    "may create tables in the schema lab": ("IN ROLE pycrorm_reader", "GRANT CREATE ON SCHEMA lab TO {name}"),
+    "may change the table lab.notes": ("IN ROLE pycrorm_reader", "GRANT DELETE ON lab.notes TO {name}"),
+    "may change the table lab.drafts": ("IN ROLE pycrorm_reader", "GRANT UPDATE (x) ON lab.drafts TO {name}"),
+    "may change the sequence lab.numbers": ("IN ROLE pycrorm_reader", "GRANT USAGE ON SEQUENCE lab.numbers TO {name}"),
+    "may run lab.effect with the rights of its owner": (
+        "IN ROLE pycrorm_reader",
+        "GRANT EXECUTE ON FUNCTION lab.effect TO {name}",
+    ),
 }
 
 
 async def test_a_login_with_more_rights_than_a_reader_is_refused(server: Server) -> None:
     owner_url = await _with_roles(server)
     database = urlsplit(owner_url).path.removeprefix("/")
+    change_each(
+        owner_url,
+        [
+            "CREATE SCHEMA lab",
+            *(f"CREATE TABLE lab.{name} (x text)" for name in ("notes", "drafts")),
+            "CREATE SEQUENCE lab.numbers",
+            "CREATE FUNCTION lab.effect() RETURNS integer LANGUAGE sql SECURITY DEFINER AS 'SELECT 1'",
+            "REVOKE ALL ON FUNCTION lab.effect FROM PUBLIC",
+            "CREATE TABLE public.board (x text)",
+            "GRANT ALL ON public.board TO PUBLIC",
+        ],
+    )
+    reader = login(
+        owner_url,
+        "IN ROLE pycrorm_reader",
+        "GRANT USAGE ON SCHEMA lab TO {name}",
+        "GRANT SELECT ON lab.notes TO {name}",
+    )
+    async with _opened(reader) as sql:  # reading more is no excess, nor is what every login may
+        assert (await sql.query("SELECT count(*) FROM lab.notes"))[1] == [(0,)]
     for right, (attributes, *after) in MORE_RIGHTS.items():
         url = login(owner_url, attributes, *(each.format(database=database, name="{name}") for each in after))
         async with _opened(url) as sql:
@@ -429,6 +457,37 @@ async def test_a_function_with_effects_is_refused_although_every_login_may_call_
         with pytest.raises(QueryRefused, match="the function effect can do more and is not allowed"):
             await sql.query("SELECT public.effect()")
         assert (await sql.query("SELECT 1 AS effect"))[0] == ("effect",)  # a name alone calls nothing
+
+
+async def test_a_volatile_function_is_refused_however_its_name_is_written_and_behind_an_operator(
+    server: Server,
+) -> None:
+    owner_url = await _with_roles(server)
+    names = ('"my func"', '"ÄNDERN"', '"Än"', '"a""b"', "Ünder", '"Lab X".plain')
+    change_each(
+        owner_url,
+        [
+            'CREATE SCHEMA "Lab X"',
+            'GRANT USAGE ON SCHEMA "Lab X" TO PUBLIC',
+            *(
+                f"CREATE FUNCTION {name if '.' in name else f'public.{name}'}() RETURNS integer LANGUAGE sql"
+                " SECURITY DEFINER AS $$ SELECT 1 $$"
+                for name in names
+            ),
+            "CREATE FUNCTION public.two(a integer, b integer) RETURNS integer LANGUAGE sql AS $$ SELECT a + b $$",
+            "CREATE OPERATOR public.@+@ (FUNCTION = public.two, LEFTARG = integer, RIGHTARG = integer)",
+            "CREATE AGGREGATE public.folded (integer) (SFUNC = public.two, STYPE = integer)",
+        ],
+    )
+    calls = [f"{name if '.' in name else f'public.{name}'}()" for name in names]
+    calls += [f"'\"' || {each} || '\"'" for each in calls]
+    async with _opened(login(owner_url, "IN ROLE pycrorm_reader")) as sql:
+        for call in (*calls, "1 OPERATOR(public.@+@) 2", "public.folded(1)"):
+            with pytest.raises(QueryRefused, match=r"the (function|operator) .* can do more and is not allowed"):
+                pytest.fail(f"{call} was answered with {await sql.query(f'SELECT {call}')}")
+        assert (await sql.query("""SELECT 1 AS "my func", '{"a": [1]}'::jsonb @> '{"a": []}' AS held"""))[1] == [
+            (1, True)
+        ]
 
 
 async def test_a_date_that_python_lacks_is_refused_with_the_way_to_read_it(server: Server) -> None:

@@ -8,8 +8,10 @@ and COPY … TO PROGRAM runs programs on it. Four independent checks apply:
    VALUES and TABLE there, no SET, COPY, DO, CALL or SELECT INTO.
 3. The transaction is READ ONLY and always rolled back, and the connection is closed after it.
 4. A function that PostgreSQL declares VOLATILE may have effects that no rollback undoes: it ends other sessions, takes
-   locks, changes settings, runs a text as SQL. A text with the name of one, as a word anywhere, is refused. The words
-   of strings and comments count too, because leaving them out would need PostgreSQL's own lexer.
+   locks, changes settings, runs a text as SQL. A text with the name of one, or of an operator or aggregate over one, is
+   refused. Strings and comments count too, because leaving them out would need PostgreSQL's own lexer. A view, a cast
+   or a type calls functions that the text does not name. One outside the memory, which every login may use, over a
+   volatile function with the rights of its owner, gives these rights to each query.
 
 The cursor returns with each row the sum of the bytes up to it, and empty values from the bound on, because one value
 can have a gigabyte.
@@ -38,6 +40,11 @@ _BEGIN = (
     "SET LOCAL idle_in_transaction_session_timeout = '10min'",  # a pager stops reading for minutes
 )
 _SCHEMAS = f"'{LOG_SCHEMA}', '{TABLES_SCHEMA}', '{VIEWS_SCHEMA}'"
+_MORE = (
+    "(nspname !~ '^pg_' AND has_{privilege}_privilege(session_user, {object}, '{rights}')"
+    f" AND NOT COALESCE(has_{{privilege}}_privilege(to_regrole('{READER}'), {{object}}, '{{rights}}'), false))"
+)
+"""The condition that the login has one of these rights outside the system's schemas, and the reader has none."""
 _RIGHTS = f"""
 SELECT session_user::text AS login, to_regrole('{READER}') IS NOT NULL AS has_roles, CASE
     WHEN login.rolsuper THEN 'is a superuser'
@@ -56,20 +63,48 @@ SELECT session_user::text AS login, to_regrole('{READER}') IS NOT NULL AS has_ro
             OR has_table_privilege(session_user, pg_class.oid, 'DELETE, TRUNCATE, TRIGGER')
         )
     ) THEN 'may change the memory'
+    WHEN elsewhere.excess IS NOT NULL THEN elsewhere.excess
 END AS excess
 FROM pg_roles AS login CROSS JOIN pg_database LEFT JOIN LATERAL (
     SELECT min(rolname::text) AS name FROM pg_roles
     WHERE rolname NOT IN (session_user, '{READER}') AND pg_has_role(session_user, oid, 'MEMBER')
-) AS other ON true
+) AS other ON true LEFT JOIN LATERAL (
+    SELECT min(excess) AS excess FROM (
+        SELECT 'may create tables in the schema ' || nspname FROM pg_namespace
+        WHERE {_MORE.format(privilege="schema", object="oid", rights="CREATE")}
+        UNION ALL
+        SELECT 'may change the table ' || nspname || '.' || relname
+        FROM pg_class JOIN pg_namespace ON pg_namespace.oid = relnamespace
+        WHERE relkind IN ('r', 'v', 'm', 'p', 'f') AND (
+            {_MORE.format(privilege="table", object="pg_class.oid", rights="INSERT, UPDATE, DELETE, TRUNCATE, TRIGGER")}
+            OR {_MORE.format(privilege="any_column", object="pg_class.oid", rights="INSERT, UPDATE")}
+        )
+        UNION ALL
+        SELECT 'may change the sequence ' || nspname || '.' || relname
+        FROM pg_class JOIN pg_namespace ON pg_namespace.oid = relnamespace
+        WHERE relkind = 'S' AND {_MORE.format(privilege="sequence", object="pg_class.oid", rights="USAGE, UPDATE")}
+        UNION ALL
+        SELECT 'may run ' || nspname || '.' || proname || ' with the rights of its owner'
+        FROM pg_proc JOIN pg_namespace ON pg_namespace.oid = pronamespace
+        WHERE prosecdef AND {_MORE.format(privilege="function", object="pg_proc.oid", rights="EXECUTE")}
+    ) AS rights (excess)
+) AS elsewhere ON true
 WHERE login.rolname = session_user AND datname = current_database()"""  # noqa: S608  our own names only
-"""Selects the rights of the login that `pycrorm_reader` has not; null if there are none."""
+"""Selects the rights of the login that `pycrorm_reader` has not; null if there are none. Any table may be read."""
 
 _VOLATILE = """
-SELECT proname FROM pg_proc JOIN pg_namespace ON pg_namespace.oid = pronamespace
-WHERE provolatile = 'v' AND lower(proname) = ANY($1) AND proname <> ALL($2)
-AND (nspname = ANY(current_schemas(true)) OR lower(nspname) = ANY($1))
-ORDER BY proname LIMIT 1"""
-"""Selects a function of these names that may have effects. One of another schema is only called with its schema."""
+SELECT 'function ' || f.proname FROM pg_proc AS f JOIN pg_namespace ON pg_namespace.oid = f.pronamespace
+LEFT JOIN pg_aggregate ON aggfnoid = f.oid LEFT JOIN pg_proc AS transition ON transition.oid = aggtransfn
+WHERE 'v' IN (f.provolatile, transition.provolatile) AND f.proname = ANY($1::text[]) AND f.proname <> ALL($2)
+AND (nspname = ANY(current_schemas(true)) OR nspname = ANY($1::text[]))
+UNION ALL
+SELECT 'operator ' || oprname FROM pg_operator JOIN pg_proc ON pg_proc.oid = oprcode
+JOIN pg_namespace ON pg_namespace.oid = oprnamespace
+WHERE provolatile = 'v' AND strpos($3, oprname) > 0
+AND (nspname = ANY(current_schemas(true)) OR nspname = ANY($1::text[]))
+LIMIT 1"""
+"""Selects a function or an operator of the text that may have effects. One of another schema is called with its schema
+only."""
 _HARMLESS = (
     "random", "random_normal", "gen_random_uuid", "clock_timestamp", "timeofday", "pg_sleep", "pg_relation_size",
     "pg_table_size", "pg_indexes_size", "pg_total_relation_size", "pg_database_size",
@@ -132,10 +167,9 @@ class _Cursor:
         lowered = sql.lower()
         if 'u&"' in lowered:
             raise QueryRefused('a query writes names as they are, not as U&"…"')
-        words = sorted(set(re.findall(r"[\w$]+", lowered)))
-        name = await self._connection.fetchval(_VOLATILE, words, _HARMLESS)
+        name = await self._connection.fetchval(_VOLATILE, sorted(_names(sql)), _HARMLESS, sql)
         if name is not None:
-            raise QueryRefused(f"{ONLY_READS}; the function {name} can do more and is not allowed")
+            raise QueryRefused(f"{ONLY_READS}; the {name} can do more and is not allowed")
 
     @asynccontextmanager
     async def _bounded(self, seconds: float) -> AsyncIterator[None]:
@@ -165,6 +199,18 @@ class _Cursor:
         await self._connection.execute("ROLLBACK")
         names = [row[0] for row in await self._connection.fetch(_RELATIONS)]
         return missing_relation(name.group(1) if name else text, names)
+
+
+def _names(sql: str) -> set[str]:
+    """Return every text that can be a name: each word, in its own letters and folded, and each text in quotes.
+
+    PostgreSQL folds A to Z in a word that is not quoted, and other letters only in some encodings.
+    """
+    words = re.findall(r"[\w$]+", sql)
+    folded = [re.sub("[A-Z]+", lambda letters: letters[0].lower(), each) for each in words]
+    # A quotation mark in a string shifts the pairs, so each text from one mark to the next counts.
+    quoted = re.findall(r'(?=\"((?:[^"]|""){1,63})\")', sql)
+    return {*words, *folded, *(each.lower() for each in words), *(each.replace('""', '"') for each in quoted)}
 
 
 def _declaration(query: str, columns: int, bytes_max: int) -> str:
