@@ -94,9 +94,10 @@ class RememberedRuns(BaseCallbackHandler):
     def _start(
         self, run_id: UUID, run: Mapping[str, Any], kind: RecordedKind, dtype: str, inputs: Mapping[str, Any]
     ) -> None:
+        inputs = {name: value for name, value in inputs.items() if value is not None}  # None has no type
         fields = {name: _NUMBERS.get(type(value), "text") for name, value in inputs.items()}
         parameters = {
-            name: value if isinstance(value, str | int | float | None) else _plain(value, as_text=True)
+            name: value if isinstance(value, str | int | float) else _plain(value, as_text=True)
             for name, value in inputs.items()
         }
         parent = run.get("parent_run_id")

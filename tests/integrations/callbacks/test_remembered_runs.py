@@ -99,6 +99,7 @@ def test_prompts_answers_and_token_counts_are_recorded(tmp_path: Path) -> None:
     assert [json.loads(text) for (text,) in inputs] == [{"messages": [["user", "bring milk"]]}]
 
 
+@pytest.mark.every_python
 def test_the_input_of_a_tool_is_its_parameters(tmp_path: Path) -> None:
     remembered(tmp_path, _invoke)
     file = tmp_path / "memory.db"
@@ -116,6 +117,25 @@ def test_a_number_with_and_without_a_decimal_point_is_in_one_column(tmp_path: Pa
 
     assert remembered(tmp_path, run).missing.total == 0
     assert ask(tmp_path / "memory.db", "SELECT force_n FROM pick_up ORDER BY id") == [(5.0,), (5.5,), (None,)]
+
+
+def test_an_argument_without_a_value_adds_no_column_and_is_not_missing(tmp_path: Path) -> None:
+    @tool
+    def push(force: float | None) -> str:
+        """Push."""
+        return "pushed"
+
+    def run(runs: RememberedRuns) -> None:
+        for force in (3.5, None):
+            push.invoke({"force": force}, {"callbacks": [runs]})
+
+    assert remembered(tmp_path, run).missing.total == 0
+    assert "force_text" not in _columns(tmp_path, "push")
+    assert ask(tmp_path / "memory.db", "SELECT force FROM push ORDER BY id") == [(3.5,), (None,)]
+
+
+def _columns(folder: Path, table: str) -> set[str]:
+    return {name for _, name, *_ in ask(folder / "memory.db", f"PRAGMA table_info({table})")}
 
 
 def test_an_error_that_a_tool_answers_with_is_the_error_of_the_tool_only(tmp_path: Path) -> None:
