@@ -193,7 +193,6 @@ class _PyCRAMPlans:
         # Asking Bullet for pose and torso takes as long as recording the event, so it is done where they may differ.
         is_recorded = episode is self._episodes.real and (self._world.is_followed or node.kind == "motion")
         robot = self._values.robot_key() if is_recorded else self._values.robot(episode)
-        episode.wait_for_room()
         cause = self._episodes.cause(episode)
         node.key = episode.start(next(self._keys), declared, values, parent=cause, robot=robot)
 

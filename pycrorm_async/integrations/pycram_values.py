@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import time
 import typing
-from collections.abc import Hashable
+from collections.abc import Hashable, Iterator
 from datetime import datetime
 from enum import Enum
 from importlib import import_module
@@ -57,6 +57,7 @@ class PyCRAMValues:
         self.pycram: PyCRAM = SimpleNamespace(**{name: getattr(module, name) for name, module in modules.items()})
         used = self.pycram
         self._names: dict[type, tuple[str, ...]] = {}
+        self._hints: dict[type, dict[str, Any]] = {}
         self._poses = (used.PoseStamped, used.Pose)
         self._field_types: tuple[tuple[type, ItemType], ...] = (
             (Enum, "enum"),  # before `int`, which some of PyCRAM's enums are
@@ -70,6 +71,8 @@ class PyCRAMValues:
             (used.Link, "object"),
             (used.ObjectDesignatorDescription, "object"),
         )
+        for designator in (*_descendants(used.ActionDescription), *_descendants(used.BaseMotion)):
+            self._hints_of(designator)  # which takes long, before the plan instead of in it
 
     # --- parameters -------------------------------------------------------------------------------------------
 
@@ -117,12 +120,22 @@ class PyCRAMValues:
 
     def field_types(self, designator: type, values: dict[str, Any]) -> dict[str, FieldSpec]:
         """Return the types of the fields: those of the annotations, or of the values where these leave it open."""
-        try:
-            hints = typing.get_type_hints(designator)
-        except Exception:  # noqa: BLE001  an annotation may name what its module does not import
-            hints = {}
-        hints = {"position": float} | hints | {"grasp": Enum, "approach_direction": Enum, "rotate_gripper": bool}
+        hints = (
+            {"position": float}
+            | self._hints_of(designator)
+            | {"grasp": Enum, "approach_direction": Enum, "rotate_gripper": bool}
+        )
         return {name: self._field_type(hints.get(name, type(each)), each) for name, each in values.items()}
+
+    def _hints_of(self, designator: type) -> dict[str, Any]:
+        hints = self._hints.get(designator)
+        if hints is None:
+            try:
+                hints = typing.get_type_hints(designator)
+            except Exception:  # noqa: BLE001  an annotation may name what its module does not import
+                hints = {}
+            self._hints[designator] = hints
+        return hints
 
     def _field_type(self, hint: Any, value: Any) -> FieldSpec:
         arguments = [each for each in typing.get_args(hint) if each is not NoneType]
@@ -238,6 +251,13 @@ class PyCRAMValues:
         torso = robot.joints.get(description.torso_joint) if description is not None else None
         torso_m = float(torso.position) if torso is not None else None
         return RobotValue(self.pose(robot.pose), "ROBOT", torso_m, episode.reference(self.key(robot)), robot.name)
+
+
+def _descendants(root: type) -> Iterator[type]:
+    each: type
+    for each in root.__subclasses__():
+        yield each
+        yield from _descendants(each)
 
 
 def _function_name(function: Any) -> str:

@@ -71,8 +71,14 @@ class PyCRAMWorld:
 
     @guarded
     def _joint_moved(self, world: Any, joint: Any, position: float) -> None:
-        if self._episodes.of(world) is not None:
-            self._change(joint.object).joints[joint.name] = float(position)
+        thread, owner = self._episodes.thread, joint.object
+        change = thread.changes.get(id(owner))
+        if change is None:  # for the first of up to fourteen joints
+            if self._episodes.of(world) is None:
+                return
+            change = self._change(owner)
+        change.joints[joint.name] = float(position)
+        if not thread.is_collecting:
             self._flush_unless_moving()
 
     def _joints_moved(self, call: Callable[[], Any], *_: Any, **__: Any) -> Any:

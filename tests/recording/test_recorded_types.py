@@ -12,7 +12,8 @@ import pytest
 
 from pycrorm_async import Memory, Settings
 from pycrorm_async.plan import ActionAbstract
-from pycrorm_async.recording.declarations.recorded_type import FieldSpec
+from pycrorm_async.recording.declarations.known_types import KnownTypes
+from pycrorm_async.recording.declarations.recorded_type import FieldSpec, declare_type
 from pycrorm_async.world.pose import Pose
 from tests.commands import pycrorm
 from tests.databases import ask
@@ -53,6 +54,18 @@ def test_a_field_that_contradicts_a_built_in_type_is_kept_under_its_type(tmp_pat
     assert ask(tmp_path / "memory.db", columns) == [("milk", "LEFT", 1.5)]
     (declared,) = events(tmp_path, "NodeStarted")[1:]
     assert declared["parameters"] == {"object_designator_text": "milk", "arm": "LEFT", "grasp_real": 1.5}
+
+
+def test_each_memory_searches_the_classes_for_a_built_in_type_once() -> None:
+    searched: list[str] = []
+
+    def find(dtype: str) -> None:
+        searched.append(dtype)
+
+    known_types = KnownTypes(find)
+    for _ in range(2):
+        declare_type("action", "Wipe", {}, known_types)
+    assert searched == ["Wipe"]
 
 
 def test_a_built_in_type_keeps_its_concept_and_bases(tmp_path: Path) -> None:

@@ -19,10 +19,20 @@ class KnownTypes:
     """
 
     def __init__(self, built_in: Callable[[str], DesignatorTypeDeclared | None]) -> None:
-        self.built_in = built_in
+        self._find_built_in = built_in
+        self._built_in: dict[str, DesignatorTypeDeclared | None] = {}
         self._fields_by_dtype: dict[str, dict[str, str]] = {}
         self._tables: dict[str, str] = {}
         self._columns: dict[str, dict[str, FieldDeclared]] = {}
+
+    def built_in(self, dtype: str) -> DesignatorTypeDeclared | None:
+        """Return the declaration of the plan layer's own type with this dtype; None if it has none.
+
+        Each answer is kept for the life of the memory, because finding that there is none searches all classes.
+        """
+        if dtype not in self._built_in:
+            self._built_in[dtype] = self._find_built_in(dtype)
+        return self._built_in[dtype]
 
     def fields_of(self, dtype: str) -> Mapping[str, str]:
         """Return the types of the fields of a dtype as this memory declared them, as `type_text` describes them."""
