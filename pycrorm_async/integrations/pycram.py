@@ -16,6 +16,7 @@ fails before it is resolved. The first node in the prospection world opens a sim
 from __future__ import annotations
 
 import itertools
+import os
 import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -42,8 +43,9 @@ __all__ = ["KNOWN_VERSIONS", "remember"]
 
 KNOWN_VERSIONS: Final = ("1.0.4",)
 """The versions of the distribution `pycram-robotics` whose methods this module replaces."""
-_ONE_AT_A_TIME: Final = threading.Lock()
-"""Held while a `remember` is active, because the methods that it replaces are those of the whole process."""
+_ONE_AT_A_TIME: Final[dict[int, threading.Lock]] = {}
+"""A lock by the id of the process, because a forked child may have a `remember` of its own. It is held while a
+`remember` is active, because the methods that this replaces are those of the whole process."""
 
 
 @contextmanager
@@ -70,7 +72,8 @@ def remember(
         PycrormError: as of `Memory.open`; nothing of PyCRAM is replaced then.
     """
     _check_version()
-    if not _ONE_AT_A_TIME.acquire(blocking=False):
+    active = _ONE_AT_A_TIME.setdefault(os.getpid(), threading.Lock())
+    if not active.acquire(blocking=False):
         raise CallerError("another `remember` is active in this process: leave its block first, or perform inside it")
     try:
         settings = settings or Settings(fold="at_end")
@@ -81,7 +84,7 @@ def remember(
             ) as episode:
                 yield episode
     finally:
-        _ONE_AT_A_TIME.release()
+        active.release()
 
 
 def _check_version() -> None:

@@ -329,6 +329,23 @@ def refusals() -> Facts:
     return said | {"seams": seams()}
 
 
+def forked_child() -> Facts:
+    """Remember a plan in a forked child, inside the block of its parent."""
+    with remember(url("forked_child"), description="Parent"):
+        child = os.fork()
+        if child == 0:
+            code = 1
+            try:
+                with remember(url("child"), description="Child"):
+                    CodePlan(lambda: None).perform()
+                code = 0
+            finally:
+                os._exit(code)
+        _pid, status = os.waitpid(child, 0)
+        CodePlan(lambda: None).perform()
+    return {"exit": os.waitstatus_to_exitcode(status), "seams": seams()}
+
+
 def world_inside() -> Facts:
     """Make the world inside the block, and leave it there."""
     World.current_world.exit()
@@ -464,6 +481,7 @@ PLANS: tuple[Callable[[], Facts], ...] = (
     top_grasp,
     others,
     refusals,
+    forked_child,
     restored_state,
     unusual_calls,
     held_and_seen,

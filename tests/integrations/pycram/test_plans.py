@@ -372,6 +372,15 @@ def test_callbacks_and_replaced_methods_of_others_work_beside_and_after_the_seam
     """), "what another library's callback refuses has failed, and the next one is not below it"
 
 
+def test_a_forked_child_has_a_remember_of_its_own_and_leaves_that_of_its_parent_alone(run: Run) -> None:
+    assert run.facts["forked_child"] == {"exit": 0, "seams": []}
+    assert run.tree("child") == text("""
+        root SUCCEEDED
+          Code SUCCEEDED
+    """)
+    assert run.tree("forked_child") == run.tree("child")
+
+
 def test_a_second_remember_another_version_and_a_bad_database_are_refused_before_anything_is_replaced(run: Run) -> None:
     facts = run.facts["refusals"]
     assert facts["url"] == "UnknownUrl"
