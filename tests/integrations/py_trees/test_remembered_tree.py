@@ -111,6 +111,7 @@ def test_each_activation_is_one_node_below_that_of_its_parent(tmp_path: Path) ->
     assert status.faults.total == 0
 
 
+@pytest.mark.every_python
 def test_a_condition_with_the_same_outcome_is_one_node_whose_further_ticks_are_counted(tmp_path: Path) -> None:
     root = sequence("job", Condition("is charged", named("S" * 1_000 + "F")), Scripted("drive", named("R")))
     remembered(tmp_path, root, lambda ticked: tick(ticked, 1_001))

@@ -94,7 +94,7 @@ def out_of_reach() -> Any:
 
 
 def pick_and_place() -> Facts:
-    """Park, raise the torso, pick up the milk, drive and place it; give what PyCRAM's own database has of it."""
+    """Park, raise the torso, pick up the milk, drive and place it; return what PyCRAM's own database has of it."""
     from pycram.orm import ormatic_interface  # before the plan, because it changes the classes of its nodes
 
     carton = milk()
@@ -111,7 +111,7 @@ def pick_and_place() -> Facts:
 
 
 def pycrams_database(plan: Any, tables: Any) -> Facts:
-    """Insert a plan into PyCRAM's own database; return its rows, and robot position and torso of each action."""
+    """Insert a plan into PyCRAM's own database; return its rows, and robot pose and torso of each action."""
     from pycram.orm.logging_hooks import insert
     from sqlalchemy import create_engine, func, select
     from sqlalchemy.orm import Session
@@ -121,7 +121,12 @@ def pycrams_database(plan: Any, tables: Any) -> Facts:
         tables.create_all(engine)
         insert(plan, session, use_progress_bar=False)
         actions = [
-            [type(each).__name__, *each.robot_position.position.to_list(), each.robot_torso_height]
+            [
+                type(each).__name__,
+                *each.robot_position.position.to_list(),
+                *each.robot_position.orientation.to_list(),
+                each.robot_torso_height,
+            ]
             for each in session.scalars(select(ActionDescription))
         ]
         counted = {name: session.scalar(select(func.count()).select_from(each)) for name, each in tables.tables.items()}

@@ -130,13 +130,45 @@ def test_a_plan_of_pycram_is_stored_as_the_tree_that_it_is(run: Run) -> None:
 def test_pose_and_torso_of_the_robot_are_those_of_pycrams_own_database_row_by_row(run: Run) -> None:
     ours = run.rows(
         "pick_and_place",
-        "SELECT node.dtype, position.x, position.y, position.z, node.torso_height FROM task_tree_node AS node"
-        " JOIN pose ON pose.id = node.robot_pose_id JOIN position ON position.id = pose.position_id"
+        "SELECT node.dtype, position.x, position.y, position.z, turn.x, turn.y, turn.z, turn.w, node.torso_height"
+        " FROM task_tree_node AS node JOIN pose ON pose.id = node.robot_pose_id"
+        " JOIN position ON position.id = pose.position_id JOIN quaternion AS turn ON turn.id = pose.orientation_id"
         " WHERE node.kind = 'action' AND node.dtype != 'ReachToPickUpAction' ORDER BY node.id",
     )
     assert [list(each) for each in ours] == run.facts["pick_and_place"]["actions"]
     assert len(ours) == 5
-    assert len({each[4] for each in ours}) == 2, "the torso has moved"
+    assert len({each[-1] for each in ours}) == 2, "the torso has moved"
+
+
+def test_the_table_that_compares_the_two_databases_holds_for_this_run(run: Run) -> None:
+    theirs = run.facts["pick_and_place"]
+    assert theirs["rows"]["PlanNode"] == 0
+    assert theirs["columns"]["ORMActionNode"] == theirs["columns"]["ORMMotionNode"] == ["id"]
+    assert {"grasp_description_id", "object_designator_id"}.isdisjoint(theirs["columns"]["PickUpAction"])
+    [tables] = run.rows("pick_and_place", "SELECT json_group_array(name) FROM sqlite_master WHERE type = 'table'")
+    names = [each for each in json.loads(tables[0]) if each.startswith("zz_") and "pycrorm" not in each]
+    stored = {each: _count(run, each) for each in names}
+    kinds = dict(run.rows("pick_and_place", "SELECT kind, count(*) FROM task_tree_node GROUP BY kind"))
+    versions, identities = run.rows("pick_and_place", "SELECT count(*), count(DISTINCT identity_id) FROM object")[0]
+    objects = f"{versions} rows of {identities} objects"
+    assert kinds == {"root": 1, "language": 1, "action": 6, "motion": 11}
+    page = (ROOT / "pycrorm_async" / "integrations" / "README.md").read_text()
+    for row in (
+        f"| rows | {_size(theirs['rows'])}, after the plan | {_size(stored)}, from {_count(run, 'event')} events,",
+        f"| {theirs['rows']['ORMActionNode']} actions twice, {theirs['rows']['ORMMotionNode']} motions: ids without",
+        f"| {sum(kinds.values())}: root, sequence, {kinds['action']} actions, {kinds['motion']} motions |",
+        f"| {_count(run, 'joint_change')} joint positions, {_count(run, 'attachment')} attachments, {objects} |",
+    ):
+        assert row in page
+
+
+def _count(run: Run, table: str) -> int:
+    count: int = run.rows("pick_and_place", f"SELECT count(*) FROM {table}")[0][0]
+    return count
+
+
+def _size(rows_by_table: dict[str, int]) -> str:
+    return f"{sum(rows_by_table.values())} in {sum(each > 0 for each in rows_by_table.values())} tables"
 
 
 def test_no_event_of_any_plan_was_lost_or_refused_and_the_memories_verify(run: Run) -> None:
@@ -228,7 +260,7 @@ def test_all_motions_of_parallel_branches_are_stored_below_their_own_actions(run
         " WHERE branches.dtype = 'Parallel' AND goal.gripper = parameters.gripper AND goal.motion = parameters.motion",
     )
     assert below == [(60, 60, 20)]
-    assert run.facts["parallel_branches"]["motions_in_pycrams_plans"] <= 60
+    assert run.facts["parallel_branches"]["motions_in_pycrams_plans"] < 60, "PyCRAM's own plan loses some"
 
 
 def test_failures_of_both_kinds_differ_and_recoveries_succeed(run: Run) -> None:
