@@ -1,6 +1,8 @@
 """The documentation is correct: its plans run, its queries have answers, and its commands and links exist."""
 
+import ast
 import asyncio
+import configparser
 import contextlib
 import json
 import re
@@ -227,6 +229,23 @@ async def test_a_node_shows_the_nodes_around_it(tidied: Path, capsys: pytest.Cap
     assert capsys.readouterr().out.endswith("['TransportAction', None]\n")
 
 
+async def test_the_blocks_about_queries_run_in_order_in_one_notebook(
+    tidied: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In the memory of the plan with every expression, whose first episode has the milk that the page names."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copyfile(tidied / "pycrorm.db", tmp_path / "pycrorm.db")
+    page = PAGES["pycrorm_async/query/README.md"]
+    (opening,) = re.findall(r"after `(memory = .*?)`", page)
+    names: dict[str, Any] = {}
+    for block in ("from pycrorm_async import Memory", opening, *python_of("pycrorm_async/query/README.md")):
+        code = compile(block, "README", "exec", flags=ast.PyCF_ALLOW_TOP_LEVEL_AWAIT)
+        running = eval(code, names)  # a coroutine, as in a cell of a notebook
+        if running is not None:
+            await running
+    await names["memory"].close()
+
+
 async def test_episodes_have_their_robots(tidied: Path, capsys: pytest.CaptureFixture[str]) -> None:
     await run_block(ROBOTS, tidied)
     assert capsys.readouterr().out.endswith("[('pr2', None)]\n")
@@ -359,6 +378,27 @@ def test_every_block_of_commands_is_run_by_a_test_or_has_a_reason() -> None:
     assert [each.split()[1] for each in commands] == ["demo"]  # the list of the verbs, which has a test of its own
 
 
+def test_every_other_block_is_well_formed() -> None:
+    """Also of the fences that no other test reads, because they are indented or named otherwise."""
+    languages = set()
+    for page, content in PAGES.items():
+        for indentation, language, block in re.findall(
+            r"^( *)```(\w+)\n(.*?)^\1```$", content, re.DOTALL | re.MULTILINE
+        ):
+            languages.add(language)
+            text = textwrap.dedent(indentation + block)
+            match language:
+                case "python" | "py":
+                    compile(text, page, "exec", flags=ast.PyCF_ALLOW_TOP_LEVEL_AWAIT)
+                case "json":
+                    json.loads(text)
+                case "ini":
+                    configparser.ConfigParser(strict=False, interpolation=None).read_string(text)
+                case "sh":
+                    shlex.split(text, comments=True)
+    assert languages <= {"python", "py", "json", "ini", "sh", "sql", "text", "mermaid"}
+
+
 async def test_rows_are_exported_and_made_again(
     tidied: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -433,7 +473,8 @@ with BulletWorld() as world:
         + textwrap.indent(THEN, "            ")
         + "            milk_then = recorded.object('milk').pose\n"
         + textwrap.indent(AGAIN, "            ")
-        + "            return then, milk.pose, milk_then, milk_in_hand, recorded.object('milk').attached_to"
+        + "            restored = world.object('milk').pose\n"
+        + "            return then, restored, milk_then, milk_in_hand, recorded.object('milk').attached_to"
     )
     exec(f"async def asked():\n{body}", names)
     asked = names["asked"]
