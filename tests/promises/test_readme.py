@@ -349,7 +349,8 @@ def test_sql_finds_the_actions_of_a_concept(tidied: Path) -> None:
 
 
 NOT_RUN = {
-    "python3 -m venv": "`.ci/run` runs it, in a fresh clone",
+    "python3 -m venv .venv": "`.ci/run` runs it, in a fresh clone",
+    "python3 -m venv /tmp/lerobot": "installs LeRobot, which takes minutes",
     ".venv/bin/pip install": "`.ci/run` runs it, and these tests with it",
     "pip install 'pycrorm-async[live]'": "installs; `tests/live` watches",
     "ssh -L": "needs a second computer",
