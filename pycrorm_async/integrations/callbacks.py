@@ -18,7 +18,6 @@ from uuid import UUID
 from pycrorm_async.errors import MissingExtra
 from pycrorm_async.recording.declarations.recorded_type import FieldSpec, RecordedKind
 from pycrorm_async.recording.recording import Recording
-from pycrorm_async.recording.writing.episode_opening import end_statuses
 
 try:
     from langchain_core.callbacks import BaseCallbackHandler
@@ -83,7 +82,7 @@ class RememberedRuns(BaseCallbackHandler):
     def on_chain_error(self, error: BaseException, *, run_id: UUID, **_run: Any) -> None:
         if self.episode.is_open(run_id):
             paused = any(each.__name__ == "GraphBubbleUp" for each in type(error).__mro__)  # LangGraph asks a human
-            self.episode.end(run_id, "INTERRUPTED" if paused else end_statuses(error)[1], error)
+            self.episode.end(run_id, "INTERRUPTED" if paused else None, error)
 
     on_llm_end = on_tool_end = on_retriever_end = on_chain_end
     on_llm_error = on_tool_error = on_retriever_error = on_chain_error

@@ -28,7 +28,6 @@ from pycrorm_async.recording.recorded_episode import RecordedEpisode
 from pycrorm_async.recording.recording import Recording
 from pycrorm_async.recording.values.texts import reading_fault
 from pycrorm_async.recording.values.value_snapshot import RefusedValue
-from pycrorm_async.recording.writing.episode_opening import end_statuses
 
 try:
     from py_trees.behaviour import Behaviour
@@ -203,7 +202,9 @@ class RememberedTree(VisitorBase):
         activation = self._latest[id(behaviour)] = self._open[id(behaviour)] = _Activation(behaviour, parent, node)
         return activation
 
-    def _end(self, activation: _Activation, status: NodeStatus, failure: BaseException | str | None = None) -> None:
+    def _end(
+        self, activation: _Activation, status: NodeStatus | None, failure: BaseException | str | None = None
+    ) -> None:
         """End an activation, after those below it, which py_trees stopped without a visit."""
         for child in [each for each in reversed(self._open.values()) if each.parent is activation]:
             self._end(child, "INTERRUPTED")
@@ -238,7 +239,7 @@ class RememberedTree(VisitorBase):
             raising = raising.parent
         for each in reversed(list(self._open.values())):
             if each in above:
-                self._end(each, end_statuses(error)[1], error)
+                self._end(each, None, error)
             elif each.is_open:
                 self._end(each, "INTERRUPTED")
         self._observe_blackboard()

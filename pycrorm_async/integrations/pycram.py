@@ -128,7 +128,7 @@ class _PyCRAMPlans:
         finally:
             self._end_simulation(failure)
             self.seams.remove()
-            self._episodes.close(episode, failure)
+            episode.close(failure)
 
     def _connect(self) -> None:
         plan, used, seams = self._pycram.Plan, self._pycram, self.seams
@@ -175,7 +175,7 @@ class _PyCRAMPlans:
             self._end(started, "SUCCEEDED", None, node.result)
         else:  # PyCRAM knows plan failures only: after any other exception the node is still RUNNING
             failure = node.reason if node.status is statuses.FAILED else sys.exception()
-            self._end(started, self._values.status(failure), failure)
+            self._end(started, "FAILED", failure)
 
     def _start(self, of: Any, kind: RecordedKind, designator: Any) -> RunningNode:
         self._world.flush()
@@ -202,7 +202,7 @@ class _PyCRAMPlans:
     def _end(
         self, node: RunningNode, status: NodeStatus, failure: BaseException | None = None, result: Any = None
     ) -> None:
-        """End a node, and those inside it whose end PyCRAM did not report."""
+        """End a node, and those inside it whose end PyCRAM did not report; a failure's class decides the status."""
         self._world.flush()
         nodes = self._thread.nodes
         while nodes and (inner := nodes.pop()) is not node:
@@ -213,7 +213,7 @@ class _PyCRAMPlans:
         if node.key is not None:
             if type(getattr(node.of, "designator_ref", None)).__name__ == "DetectingMotion" and result:
                 self._world.detected(node, result)
-            node.episode.end(node.key, status, failure, result)
+            node.episode.end(node.key, status if failure is None else None, failure, result)
 
     def _whole_plan(self, call: Callable[[], Any], _plan: Any) -> Any:
         """Perform a plan, and end the nodes that a callback of another library kept PyCRAM from ending."""
@@ -229,7 +229,7 @@ class _PyCRAMPlans:
 
     @guarded
     def _end_unreported(self, node: RunningNode, failure: BaseException | None) -> None:
-        self._end(node, self._values.status(failure) if failure is not None else "ERROR", failure)
+        self._end(node, "ERROR", failure)
 
     def _nested_action(self, call: Callable[[], Any], action: Any) -> Any:
         nodes = self._thread.nodes
@@ -262,8 +262,7 @@ class _PyCRAMPlans:
         status, reason = getattr(node.of, "status", None), getattr(node.of, "reason", None)
         has_failed = status is self._pycram.TaskStatus.FAILED and (before is None or reason is not before)
         if failure is not None or has_failed:
-            failure = failure if failure is not None else reason
-            self._end(node, self._values.status(failure), failure)
+            self._end(node, "FAILED", failure if failure is not None else reason)
         elif status is self._pycram.TaskStatus.INTERRUPTED:
             self._end(node, "INTERRUPTED")
         else:

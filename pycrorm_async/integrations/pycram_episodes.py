@@ -66,7 +66,10 @@ class PyCRAMEpisodes:
         """Open an episode in this world."""
         name = type(world).__name__ if world is not None else None
         episode = self._recording.episode(
-            world=name, convert=lambda value: self._values.value(value, episode), **labels
+            world=name,
+            convert=lambda value: self._values.value(value, episode),
+            failures=(self._values.pycram.PlanFailure,),
+            **labels,
         )
         return episode
 
@@ -110,9 +113,4 @@ class PyCRAMEpisodes:
         with self._lock:
             simulation, self._simulation = self._simulation, None
         if simulation is not None:
-            self.close(simulation, failure)
-
-    def close(self, episode: RecordedEpisode, failure: BaseException | None) -> None:
-        """End an episode that this exception left."""
-        status = self._values.status(failure) if failure is not None else "SUCCEEDED"
-        episode.close(failure, "INTERRUPTED" if status == "CANCELLED" else status)
+            simulation.close(failure)

@@ -16,7 +16,7 @@ from typing import Any, Final
 import numpy as np
 
 from pycrorm_async.events.fields import table_name
-from pycrorm_async.events.values import ItemType, NodeStatus, ObjectValue, PoseValue, RobotValue
+from pycrorm_async.events.values import ItemType, ObjectValue, PoseValue, RobotValue
 from pycrorm_async.recording.declarations.recorded_type import FieldSpec
 from pycrorm_async.recording.recorded_episode import RecordedEpisode
 from pycrorm_async.recording.values.texts import clean_repr
@@ -152,12 +152,6 @@ class PyCRAMValues:
         if not isinstance(kind, type):
             return "text"
         return next((name for each, name in self._field_types if issubclass(kind, each)), "text")
-
-    def status(self, failure: BaseException | None) -> NodeStatus:
-        """Return the status of a node that this exception left; None means a failure that PyCRAM does not name."""
-        if failure is None or isinstance(failure, self.pycram.PlanFailure):
-            return "FAILED"
-        return "ERROR" if isinstance(failure, Exception) else "CANCELLED"  # SystemExit, too: a world exits at Ctrl-C
 
     # --- values -----------------------------------------------------------------------------------------------
 
