@@ -24,6 +24,7 @@ from pycrorm_async.cli.reading import read_memory
 from pycrorm_async.cli.since import parse_since
 from pycrorm_async.errors import CallerError
 from pycrorm_async.query.asking.episode_list import EpisodeChoice
+from pycrorm_async.report.success_data import Plot
 from pycrorm_async.report.write import overview
 from pycrorm_async.report.write import report as write_report
 
@@ -41,6 +42,13 @@ def report(
     robot: RobotOption = None,
     text: TextOption = None,
     limit: LimitOption = None,
+    plot: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="X,Y[,VIEW]",
+            help="With --all: how often actions succeeded over these columns, as `pycrorm plot` draws it; repeatable.",
+        ),
+    ] = None,
     out: Annotated[
         Path | None,
         typer.Option(
@@ -68,18 +76,35 @@ def report(
     choice = EpisodeChoice(status, parse_since(since), tuple(tag or ()), robot, text, limit)
     if not every and choice != EpisodeChoice():
         raise CallerError(f"an option chooses among all episodes ({choice}): add --all")
+    if not every and plot:
+        raise CallerError("--plot draws successes of many episodes: add --all")
     if every and (first is not None or last is not None):
         raise CallerError("--from and --to choose events of one episode: name it instead of --all")
     if episode is None:
-        return _write_overview(out or Path("episodes.html"), choice, url, spool, force=force, as_json=as_json)
+        return _write_overview(
+            out or Path("episodes.html"),
+            choice,
+            [_plot(each) for each in plot or ()],
+            url,
+            spool,
+            force=force,
+            as_json=as_json,
+        )
     _write_episode(episode, out, (first, last), url, spool, force=force, as_json=as_json)
     return 0
 
 
+def _plot(text: str) -> Plot:
+    names = [each.strip() for each in text.split(",")]
+    if len(names) not in (2, 3) or not all(names):
+        raise CallerError(f"--plot {text!r} must be X,Y or X,Y,VIEW, for example arm,grasp,PickUpAction")
+    return Plot(*names)
+
+
 def _write_overview(
-    out: Path, choice: EpisodeChoice, url: str, spool: Path | None, *, force: bool, as_json: bool
+    out: Path, choice: EpisodeChoice, plots: list[Plot], url: str, spool: Path | None, *, force: bool, as_json: bool
 ) -> int:
-    written = read_memory(url, spool, lambda reading: overview(reading, out, choice=choice, force=force))
+    written = read_memory(url, spool, lambda reading: overview(reading, out, choice=choice, plots=plots, force=force))
     if as_json:
         counts = {"episodes": written.episodes, "pages": written.pages, "left_out": written.left_out}
         print_json({"file": written.path, **counts, "unreadable": written.unreadable})

@@ -1,32 +1,46 @@
-"""Count the pick-ups of episodes by place and by arm and grasp, for the heat maps of an overview."""
+"""Count successes of episodes over two columns, pick-ups by default, for the heat maps of an overview."""
 
 from __future__ import annotations
 
 from collections.abc import Collection
-from typing import Any
-
-from sqlalchemy import select
+from typing import Any, NamedTuple
 
 from pycrorm_async.errors import CallerError
-from pycrorm_async.orm import PickUpWithContextView
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.query.success.samples import success_samples
-from pycrorm_async.query.success.success_table import Axis, SuccessTable, success_table
-
-_PAIRS = (("relative_x", "relative_y"), ("arm", "grasp"))
+from pycrorm_async.query.success.samples import PICK_UPS, success_samples
+from pycrorm_async.query.success.success_table import Axis, success_table
 
 
-async def success_documents(reading: Reading, numbers: Collection[int]) -> list[dict[str, Any]]:
-    """Return a table of successes for each pair of columns; an empty list if no pick-up of these episodes has ended."""
-    of = select(PickUpWithContextView).where(PickUpWithContextView.process_metadata_id.in_(numbers))
+class Plot(NamedTuple):
+    """Two columns of a view over which successes are counted; the names are those of `pycrorm plot`."""
+
+    x: str
+    y: str
+    of: str = PICK_UPS
+
+
+_PICK_UPS = (Plot("relative_x", "relative_y"), Plot("arm", "grasp"))
+
+
+async def success_documents(
+    reading: Reading, numbers: Collection[int], plots: Collection[Plot] = ()
+) -> list[dict[str, Any]]:
+    """Return a table of successes of these episodes for each plot.
+
+    Raises `CallerError` as `success_samples` does. Without plots the tables are those of pick-ups, if any has ended.
+    """
+    if plots:
+        return [await _document(reading, numbers, each) for each in plots]
     try:
-        return [_document(success_table(await success_samples(reading, x, y, of))) for x, y in _PAIRS]
+        return [await _document(reading, numbers, each) for each in _PICK_UPS]
     except CallerError:  # no pick-up, or more than are counted
         return []
 
 
-def _document(table: SuccessTable) -> dict[str, Any]:
+async def _document(reading: Reading, numbers: Collection[int], plot: Plot) -> dict[str, Any]:
+    table = success_table(await success_samples(reading, plot.x, plot.y, plot.of, episodes=numbers))
     return {
+        "of": table.source,
         "x": _axis(table.x),
         "y": _axis(table.y),
         "cells": [list(each) for each in table.cells],

@@ -25,7 +25,7 @@ from pycrorm_async.report.html_page import overview_page_of, page_of, write_page
 from pycrorm_async.report.output_files import refuse_existing
 from pycrorm_async.report.overview_data import newest_episodes, overview_document
 from pycrorm_async.report.similar_cases import SimilarCases, page_name
-from pycrorm_async.report.success_data import success_documents
+from pycrorm_async.report.success_data import Plot, success_documents
 
 _PAGES_MAX = 200
 """Bounds the pages behind an overview: one has about 0.7 MB."""
@@ -100,10 +100,16 @@ async def _report(
 
 
 async def overview(
-    reading: Reading, path: str | PathLike[str], *, choice: EpisodeChoice | None = None, force: bool = False
+    reading: Reading,
+    path: str | PathLike[str],
+    *,
+    choice: EpisodeChoice | None = None,
+    plots: Collection[Plot] = (),
+    force: bool = False,
 ) -> Overview:
     """Write a table of all episodes, or of a choice, and pages of the newest 200 of them behind it.
 
+    `plots` replace the heat maps of pick-ups; a wrong column or view raises before anything is written.
     The pages are in the folder `NAME.pages` beside the file `NAME.html`. An episode whose events cannot be read has the
     reason in its row and no page. Raises `CallerError` if one of the files exists, without `force`, or if there is no
     such episode.
@@ -118,6 +124,7 @@ async def overview(
     if not episodes:
         raise CallerError(choice.absence)
     title = f"Episodes: {choice}" if str(choice) else "Episodes"
+    successes = await success_documents(reading, [each.number for each in episodes], plots)
     with _folder_of_pages(folder):
         shown = episodes[-_PAGES_MAX:]
         unreadable = await _write_pages(reading, shown, folder, force=force)
@@ -126,7 +133,7 @@ async def overview(
             await _write_pages(reading, shown, folder, force=True)
         pages = {each.number: f"{quote(folder.name)}/{page_name(each.number)}" for each in shown}
         document = await overview_document(reading, title, episodes, total, pages, unreadable)
-        document["successes"] = await success_documents(reading, [each.number for each in episodes])
+        document["successes"] = successes
         await asyncio.to_thread(lambda: write_page(overview_page_of(document), file, force=force))
     return Overview(file, len(episodes), len(pages), total - len(episodes), unreadable)
 

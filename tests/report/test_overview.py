@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 from typing import Any
+from unittest.mock import ANY
 
 import msgspec
 import pytest
@@ -64,4 +65,32 @@ def test_a_table_has_the_chosen_episodes_and_their_pages(
 def test_a_choice_of_no_episode_is_refused_as_by_the_list_of_episodes(url: str, tmp_path: Path) -> None:
     code, text = report(url, tmp_path / "all.html", "--robot", "nobody")
     assert (code, text) == (2, "pycrorm: no episode matches these options; `pycrorm episodes` lists all\n")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_successes_over_any_columns_of_the_chosen_episodes_are_in_the_page(url: str, tmp_path: Path) -> None:
+    plots = ("--plot", "arm,grams,GraspAction", "--plot", "kind, dtype, action")
+    assert report(url, tmp_path / "all.html", "--text", "milk", *plots) == (0, ANY)
+    grasps, actions = in_page(tmp_path / "all.html")["successes"]
+    assert (grasps["of"], grasps["x"]["name"], grasps["y"]["name"]) == ("GraspAction", "arm", "grams")
+    assert (grasps["succeeded"], grasps["rows"], grasps["x"]["labels"]) == (2, 4, ["left", "right"])
+    assert sorted(rows for *_, rows in grasps["cells"]) == [1, 1, 1, 1]
+    assert (actions["of"], actions["rows"], actions["y"]["labels"]) == ("action", 4, ["GraspAction"])
+
+
+@pytest.mark.parametrize(
+    ("plot", "message"),
+    [
+        ("arm", "--plot 'arm' must be X,Y or X,Y,VIEW, for example arm,grasp,PickUpAction"),
+        ("arm,grasp,GraspActoin", "there is no view 'GraspActoin'; did you mean grasp_action"),
+        ("arm,gram,GraspAction", "GraspAction has no column 'gram'; did you mean grams?"),
+        ("arm,grasp", "no row of PickUpWithContextView has ended"),
+    ],
+)
+def test_a_plot_that_cannot_be_drawn_is_one_line_and_leaves_no_file(
+    url: str, tmp_path: Path, plot: str, message: str
+) -> None:
+    code, text = report(url, tmp_path / "all.html", "--plot", plot)
+    assert (code, text.count("\n")) == (2, 1)
+    assert message in text
     assert list(tmp_path.iterdir()) == []

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -14,6 +14,7 @@ from sqlalchemy.orm import DeclarativeBase
 
 from pycrorm_async import orm
 from pycrorm_async.errors import CallerError
+from pycrorm_async.orm.base import EPISODE
 from pycrorm_async.orm.documentation.descriptions import unit_of
 from pycrorm_async.query.frames.columns import FrameColumn, columns_of
 from pycrorm_async.query.parameter_text import one_line
@@ -23,6 +24,9 @@ from pycrorm_async.task_status import TaskStatus
 
 Source: TypeAlias = "str | type[DeclarativeBase] | Select[Any]"
 """A view, table, mapped class or designator type by name, a mapped class, or a select; with a column `status`."""
+
+PICK_UPS = "PickUpWithContextView"
+"""The view that is plotted by default."""
 
 _ROWS_MAX = 1_000_000
 """Bounds the rows that are counted, which then take about 300 MB."""
@@ -70,8 +74,10 @@ class Samples(NamedTuple):
     running: int
 
 
-async def success_samples(reading: Reading, x: str, y: str, of: Source = "PickUpWithContextView") -> Samples:
-    """Return the samples of two columns, by name.
+async def success_samples(
+    reading: Reading, x: str, y: str, of: Source = PICK_UPS, *, episodes: Collection[int] | None = None
+) -> Samples:
+    """Return the samples of two columns, by name; with `episodes`, those of the episodes with these numbers.
 
     Raises `CallerError` for an unknown view or column, one that has no status or cannot be an axis, and if no row has
     both values and has ended.
@@ -82,6 +88,8 @@ async def success_samples(reading: Reading, x: str, y: str, of: Source = "PickUp
         name, statement = await _statement(reading, connection, of)
         columns = {each.name: each for each in columns_of(statement, deferred=True)}
         wanted = [_column(each, columns, name) for each in (x, y, "status")]
+        if episodes is not None:
+            statement = statement.where(_column(EPISODE, columns, name).expression.in_(episodes))
         plain = statement.with_only_columns(*(each.expression for each in wanted))
         rows: list[Any] = []
         async for part in (await connection.stream(plain)).partitions(_ROWS_AT_ONCE):
@@ -124,6 +132,8 @@ async def _statement(reading: Reading, connection: AsyncConnection, of: Source) 
 
 
 def _column(name: str, columns: dict[str, FrameColumn], source: str) -> FrameColumn:
+    if name == EPISODE and name not in columns:
+        raise CallerError(f"{source} has no column {EPISODE}, so its rows cannot be counted for chosen episodes")
     if name not in columns:
         names = ", ".join(columns)
         reason = " whose success could be counted" if name == "status" else ""

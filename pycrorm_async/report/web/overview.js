@@ -42,6 +42,16 @@ function bars(values, most, label, textOf) {
   return picture;
 }
 
+/** The heading of a view, and the maps over its columns. */
+function mapsOf(of, tables) {
+  const { succeeded, rows } = tables[0];
+  const name = of === "PickUpWithContextView" ? "Pick-ups" : of;
+  const axes = tables.map(({ x, y }) => `${x.name} and ${y.name}`).join(", and by ");
+  const title = element("h2", {}, recorded(name), `: ${percent(succeeded / rows)} of ${rows} succeeded`);
+  const note = element("p", { class: "quiet" }, "The share of successes in per cent, by ", recorded(axes), ".");
+  return [title, note, element("div", { class: "maps" }, ...tables.map(successMap))];
+}
+
 /** Says why an episode has no page. */
 const unreadable = (reason) => element("p", { class: "reason" }, "✗ No page: ", recorded(reason));
 
@@ -49,11 +59,9 @@ class Overview {
   constructor({ title, total, episodes, successes = [] }) {
     Object.assign(this, { title, total, episodes, by: "number", down: true });
     if (successes.length > 0) {
-      const { succeeded, rows } = successes[0];
-      const title = `Pick-ups: ${percent(succeeded / rows)} of ${rows} succeeded`;
-      const note = "The share of successes in per cent, by the robot's position relative to the object (m), and by arm and grasp.";
-      const maps = element("div", { class: "maps" }, ...successes.map(successMap));
-      part("success").replaceChildren(element("h2", {}, title), element("p", { class: "quiet" }, note), maps);
+      const sources = [...new Set(successes.map(({ of }) => of))];
+      const parts = sources.map((of) => mapsOf(of, successes.filter((each) => each.of === of)));
+      part("success").replaceChildren(...parts.flat());
     }
     this.#draw();
   }
