@@ -65,7 +65,9 @@ def about_objects() -> Iterator[Designator]:
         waiting += kind.__subclasses__()
         if kind.__module__.startswith("pycrorm_async.") and "__dataclass_fields__" in vars(kind):
             hints = get_type_hints(kind)
-            fields = [each.name for each in dataclasses.fields(kind) if each.init]
+            fields = [
+                each.name for each in dataclasses.fields(kind) if each.init and each.default is dataclasses.MISSING
+            ]
             about = [name for name in fields if "ObjectDesignator" in str(hints[name])]
             if about:
                 values = {name: VALUES.get(hints[name], 0.5) for name in fields}

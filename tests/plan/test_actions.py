@@ -84,7 +84,7 @@ def targets(tree: CollectedTree) -> list[Pose]:
             MoveAndPickUpPerformable,
             "MoveAndPickUpAction",
             "Fetching",
-            ["standing_position", "object_designator", "arm", "grasp"],
+            ["standing_position", "object_designator", "arm", "grasp", "policy"],  # `policy` is our own
         ),
     ],
 )

@@ -212,8 +212,8 @@ class EpisodeWriter(ABC, Generic[N]):
             self._root_ended = receipt.sequence > 0
 
     def _end_statuses(self, failure: BaseException | None) -> tuple[EpisodeStatus, NodeStatus]:
-        """Return the statuses of the episode and of its root node."""
-        return end_statuses(failure)
+        """Return the statuses of the episode and of its root node; a plan that exits the program has failed."""
+        return ("ERROR", "ERROR") if isinstance(failure, SystemExit) else end_statuses(failure)
 
     def continue_as(self, follow_up: EpisodeId) -> dict[int, int]:
         """End the episode and continue it under the id `follow_up`; map the old sequences of open nodes to the new."""
