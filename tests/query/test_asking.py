@@ -425,7 +425,7 @@ async def test_wrong_names_and_values_are_answered_with_the_right_ones(reading: 
         ask.durations(kind="actions")  # type: ignore[arg-type]
     with pytest.raises(CallerError, match="since has no time zone"):
         ask.episodes(since=datetime(2026, 1, 1))  # noqa: DTZ001
-    with pytest.raises(CallerError, match=r"not 1\.5"):
+    with pytest.raises(CallerError, match=r"got 1\.5"):
         await ask.durations(episode=1.5).rows()  # type: ignore[arg-type]
     with pytest.raises(UnknownEpisode, match="there is no episode '99'"):
         await ask.durations(episode=99)
