@@ -39,7 +39,8 @@ def test_the_cost_of_a_hook_is_measured_with_the_database_up_slow_and_down() -> 
         assert 0 < spread["median"] <= spread["p99"] <= spread["p99.9"] <= spread["max"]
 
 
-@pytest.mark.parametrize("options", [(), pytest.param(("--postgresql",), marks=pytest.mark.soak)])
+@pytest.mark.soak
+@pytest.mark.parametrize("options", [(), ("--postgresql",)])
 def test_the_backlog_beside_a_busy_plan_is_measured(options: tuple[str, ...]) -> None:
     result = measure("busy", *options)
     assert result["events"] > 0

@@ -275,6 +275,7 @@ def without_rights(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[st
     return subprocess.run(command, cwd=cwd, env=environment(), capture_output=True, text=True, timeout=60, check=False)
 
 
+@pytest.mark.soak
 def test_a_file_that_may_only_be_read_is_refused_before_the_plan_runs_and_can_be_read(folder: Path) -> None:
     assert pycrorm("run", "plans.py", cwd=folder).returncode == 0
     (folder / "pycrorm.db").chmod(0o444)

@@ -69,6 +69,7 @@ def test_a_copy_reports_what_it_did_and_the_copy_of_the_copy_is_the_same(folder:
     assert_same(f"sqlite:///{folder}/a.db", f"sqlite:///{folder}/b.db")
 
 
+@pytest.mark.soak
 def test_the_environment_may_name_the_source(folder: Path) -> None:
     done = subprocess.run(
         [*COMMAND, "copy", "--to", "sqlite:///b.db"],

@@ -88,6 +88,7 @@ def _appears(path: Path) -> bool:
     return path.exists()
 
 
+@pytest.mark.soak
 @pytest.mark.slow
 def test_a_plan_whose_database_is_unavailable_at_its_end_is_interrupted_by_ctrl_c_and_stored_later(
     tmp_path: Path,

@@ -40,6 +40,7 @@ def document(folder: Path) -> Any:
     return json.loads((folder / "document.json").read_text())
 
 
+@pytest.mark.soak  # promises/test_readme runs the command too
 def test_learn_prints_the_rollouts_the_rates_and_the_path_of_the_policy(document: Any, folder: Path) -> None:
     default, learned, held_out = document["phases"]
     assert (default["rollouts"], learned["rollouts"], held_out["rollouts"]) == (400, 150, 150)
@@ -59,6 +60,7 @@ def test_learn_prints_the_rollouts_the_rates_and_the_path_of_the_policy(document
     assert ask(folder / "pycrorm.db", tried) == [(700,)]
 
 
+@pytest.mark.soak  # learning/test_experiment resumes one
 def test_recorded_rollouts_are_not_repeated(document: Any, folder: Path) -> None:
     refused = pycrorm(*SMALL, cwd=folder)
     line = one_line_of(refused)
@@ -81,6 +83,7 @@ def test_a_study_is_printed_as_a_table(folder: Path) -> None:
     assert "The same policies in other scenes" in done.stdout
 
 
+@pytest.mark.soak  # learning/test_experiment makes one
 def test_a_study_evaluates_the_policy_under_other_conditions(document: Any) -> None:
     studied = document["study"]
     assert len(studied["elsewhere"]) > 8
@@ -129,6 +132,8 @@ def test_a_second_interrupt_ends_at_once_and_resume_continues(tmp_path: Path) ->
     assert (phase["rollouts"], phase["done_now"] < 400) == (400, True)
 
 
+# the options of the database and of files are those of other verbs
+@pytest.mark.soak_on("cannot be reached", "/proc/none", "--figure folder.png cannot be written", "cannot be written")
 @pytest.mark.parametrize(
     ("arguments", "code", "words"),
     [

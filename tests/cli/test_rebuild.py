@@ -40,6 +40,7 @@ async def plan():
 '''
 
 
+@pytest.mark.soak
 def test_a_rebuild_needs_no_code_of_the_plan_and_reports_what_it_made(tmp_path: Path) -> None:
     (tmp_path / "weighing.py").write_text(PLAN)
     assert pycrorm("run", "weighing.py", cwd=tmp_path).returncode == 0

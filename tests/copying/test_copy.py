@@ -125,6 +125,7 @@ async def test_a_computed_end_is_copied_like_any_event(new_url: New, new_file: N
 # --- two sources ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.soak
 async def test_two_memories_merge_into_the_same_one_in_any_order_and_concurrently(new_url: New, new_file: New) -> None:
     one, other = new_file(), new_file()
     await random_plans(one, range(20, 30))
@@ -163,6 +164,7 @@ async def test_a_running_episode_is_copied_as_far_as_it_is_and_later_completed(n
     assert_same(source, target)
 
 
+@pytest.mark.soak
 async def test_copies_run_beside_a_recorder_of_the_source_and_one_of_the_target(
     new_url: New, new_file: New, tmp_path: Path
 ) -> None:

@@ -82,6 +82,7 @@ def test_a_server_that_restarts_under_load_costs_no_event(own_server: Server, tm
         lab.clear()
 
 
+@pytest.mark.soak
 def test_a_database_file_that_another_program_locks_costs_no_event(tmp_path: Path) -> None:
     lab = Lab(tmp_path, f"sqlite:///{tmp_path / 'memory.db'}", random.randrange(2**31))
     try:

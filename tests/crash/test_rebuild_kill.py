@@ -77,6 +77,7 @@ async def test_a_rebuild_killed_at_fifty_points_changes_nothing_readers_see(
     await kill_again_and_again(database_url, 8 if in_turn else 50, workers=workers)
 
 
+@pytest.mark.soak
 async def test_a_killed_worker_costs_time_and_no_event(database_url: str, monkeypatch: pytest.MonkeyPatch) -> None:
     from multiprocessing.context import SpawnProcess
 

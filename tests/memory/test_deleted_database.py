@@ -68,6 +68,7 @@ async def _logged(caplog: pytest.LogCaptureFixture, text: str) -> None:
             await asyncio.sleep(0.02)
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_events_of_a_replaced_database_are_stored_by_rebind_and_not_before(
     database_url: str, server: Server, tmp_path: Path
 ) -> None:

@@ -195,6 +195,7 @@ async def test_plain_sqlite3_shows_only_what_really_happened(tmp_path: Path) -> 
     connection.close()
 
 
+@pytest.mark.soak
 async def test_the_command_leaves_simulations_out_and_shows_them_on_request(tmp_path: Path) -> None:
     await fetched(url_of(tmp_path))
     url = ("--url", url_of(tmp_path))

@@ -100,6 +100,7 @@ async def test_half_open_furniture_can_be_opened_or_closed_from_every_candidate(
             scene.world.restore_state(before)
 
 
+@pytest.mark.soak
 def test_candidates_are_clear_of_furniture_and_those_in_the_path_of_the_drawer_come_last(scene: Scene) -> None:
     def gap(pose: Pose, low: tuple[float, float], high: tuple[float, float]) -> float:
         x, y, _ = pose.position

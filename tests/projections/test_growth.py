@@ -122,6 +122,7 @@ async def test_a_type_has_any_number_of_descendants(log: EventLog) -> None:
     assert await parked_reasons(log) == []
 
 
+@pytest.mark.soak_on("sqlite")
 async def test_tables_are_altered_in_several_transactions_where_one_would_hold_too_many_locks(
     log: EventLog, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -305,7 +305,7 @@ async def test_an_interrupted_rebuild_is_continued(database_url: str, monkeypatc
     assert traces(database_url) == []
 
 
-@pytest.mark.soak_on("postgresql")
+@pytest.mark.soak
 async def test_the_size_of_batches_does_not_change_the_tables(
     database_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -463,6 +463,7 @@ async def test_a_foreign_view_on_the_tables_keeps_them_and_is_reported(server: S
     assert traces(url) == []
 
 
+@pytest.mark.soak
 async def test_a_foreign_table_in_the_schema_of_the_views_is_reported_in_one_line_and_stays(server: Server) -> None:
     url = server.new_database()
     await append_and_fold(url, [*TYPES, *picking(1).records])

@@ -341,6 +341,7 @@ class RandomChanger:
             self.world.restore_state(self.state)
 
 
+@pytest.mark.soak_on(1, 2)
 @pytest.mark.parametrize("seed", range(3))
 async def test_every_operation_on_a_world_is_recorded(tmp_path: Path, seed: int) -> None:
     async with recorded(tmp_path):

@@ -218,7 +218,7 @@ def test_arguments_of_an_episode_that_would_stop_it_are_refused(tmp_path: Path) 
         (("PickUpAction", {}), ("PickUpAction", {"Arm": "real"})),
     ],
 )
-@pytest.mark.parametrize("runs", [1, 2])
+@pytest.mark.parametrize("runs", [pytest.param(1, marks=pytest.mark.soak), 2])
 def test_contradicting_declarations_are_kept_apart(tmp_path: Path, first: Any, second: Any, runs: int) -> None:
     value = {"real": 1.0, "text": "one", "pose": HERE}
 
@@ -356,6 +356,7 @@ def test_objects_and_the_tree_pass_into_a_follow_up_whole(tmp_path: Path) -> Non
     assert sorted(above) == [("p",), ("q",)]
 
 
+@pytest.mark.soak
 @pytest.mark.slow
 def test_an_episode_opened_while_the_memory_closes_is_counted_and_stays_empty(tmp_path: Path) -> None:
     with Memory.sync(url_of(tmp_path), settings=SMALL) as memory:

@@ -44,6 +44,7 @@ async def record(folder: Path, meshes: RecordMeshes = "files", pose: Pose = UPRI
     return url
 
 
+@pytest.mark.soak
 async def test_mesh_files_are_drawn_with_their_triangles(chrome: Browser, tmp_path: Path) -> None:
     async with Memory.open(await record(tmp_path)) as memory:
         page = (await memory.report(1, tmp_path / "page.html")).path

@@ -31,8 +31,15 @@ def position(tab: Tab, name: str) -> list[float]:
     return [round(each, 2) for each in tab.ask(POSE.format(name))]
 
 
-@pytest.mark.parametrize("width", [420, 800, 1400])
-@pytest.mark.parametrize("dark", [False, True])
+@pytest.mark.parametrize(
+    ("dark", "width"),
+    [
+        (False, 420),
+        (True, 800),
+        (False, 1400),
+        *(pytest.param(*each, marks=pytest.mark.soak) for each in ((True, 420), (False, 800), (True, 1400))),
+    ],
+)
 def test_a_page_opens_by_one_request_and_is_no_wider_than_its_window(
     chrome: Browser, pages: dict[str, Path], width: int, dark: bool
 ) -> None:

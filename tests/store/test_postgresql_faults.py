@@ -129,6 +129,7 @@ FAULTS: dict[str, Callable[[Proxy], None]] = {
 }
 
 
+@pytest.mark.soak_on("reset", "cut before COPY", "reply to COPY lost")
 @pytest.mark.parametrize("fault", FAULTS)
 async def test_a_connection_that_fails_repeatedly_costs_no_event(fault: str, proxy: Proxy, direct_url: str) -> None:
     records = records_of_three_episodes(random.Random(7), 3000)

@@ -69,6 +69,7 @@ async def until_refused_again(drain: Drain, *, times: int) -> None:
         await asyncio.sleep(0.001)
 
 
+@pytest.mark.soak
 async def test_a_writer_waits_while_its_tables_are_dropped_and_restored_step_by_step(
     server: Server, database_url: str, tmp_path: Path
 ) -> None:

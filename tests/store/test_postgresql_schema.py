@@ -244,6 +244,7 @@ async def test_two_concurrent_appends_of_one_episode_store_it_once(database_url:
         await each.close()
 
 
+@pytest.mark.soak
 async def test_sixteen_concurrent_appends_of_different_episodes_lose_nothing_and_share_no_number(
     database_url: str,
 ) -> None:

@@ -184,6 +184,7 @@ async def test_every_answer_is_bounded_however_long_the_recorded_texts_are(tmp_p
         assert len(await agent.refused("query", sql=f"SELECT {'x' * 50_000}")) < 1_100
 
 
+@pytest.mark.soak
 async def test_a_database_that_goes_away_is_an_error_until_it_comes_back(tmp_path: Path) -> None:
     file, away = tmp_path / "memory.db", tmp_path / "away.db"
     url = f"sqlite:///{file}"

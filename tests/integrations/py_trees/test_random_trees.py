@@ -91,6 +91,7 @@ def misplaced(folder: Path) -> list[Any]:
 
 
 @pytest.mark.parametrize("instant_s", [0.0, 60.0])
+@pytest.mark.soak_on(3, 4, 5)
 @pytest.mark.parametrize("seed", range(6))
 def test_a_random_tree_is_remembered_as_it_was_visited(
     seed: int, instant_s: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
