@@ -46,7 +46,6 @@ for path in sys.argv[1:]:
 """
 
 
-@pytest.mark.soak
 @pytest.mark.slow
 def test_a_policy_is_the_same_in_another_process_without_the_libraries_for_learning(tmp_path: Path) -> None:
     policies = {tmp_path / "default.json": default_policy(), tmp_path / "learned.json": LEARNED}

@@ -300,7 +300,6 @@ async def test_an_administrator_who_ends_sessions_or_statements_costs_no_event(w
     verify_stored_once(direct_url, records, drain, source)
 
 
-@pytest.mark.soak  # crash/test_cancelled
 async def test_an_append_cancelled_at_any_await_leaves_a_whole_batch_or_nothing_and_no_lock(
     direct_url: str,
 ) -> None:
