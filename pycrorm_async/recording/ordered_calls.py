@@ -41,7 +41,7 @@ _this_thread = _ThreadState()
 
 
 def may_wait() -> bool:
-    """Return if this thread may wait for room in the spool: it holds no lock, and is none of those that make room."""
+    """Return whether this thread may wait for room in the spool: it runs no call, and does not make room itself."""
     return not _this_thread.is_busy and not _this_thread.is_of_memory
 
 

@@ -470,7 +470,7 @@ async def test_a_foreign_table_in_the_schema_of_the_views_is_reported_in_one_lin
     ask_to_change(url, "CREATE TABLE memory.mine (a int)")
     for _ in range(2):
         with pytest.raises(DatabaseError, match=r"memory\.mine does not belong to the memory.*: move it to"):
-            await rebuild_memory(url, report_progress=lambda done, *_: pytest.fail(f"told after {done} events"))
+            await rebuild_memory(url, report_progress=lambda done, *_: pytest.fail(f"reported after {done} events"))
         assert ask(url, "SELECT count(*) FROM memory.mine") == [(0,)]
         assert traces(url) == []
     ask_to_change(url, "DROP TABLE memory.mine")
