@@ -118,13 +118,16 @@ async def test_an_attribute_is_read_between_the_rows_of_an_open_session(reading:
     assert places == [(number, True) for number in range(_COUNT)]
 
 
-async def test_a_database_that_is_away_is_named_when_an_attribute_is_read(reading: Reading) -> None:
+async def test_a_database_that_is_away_is_named_when_an_attribute_is_read(
+    reading: Reading, database_url: str, request: pytest.FixtureRequest
+) -> None:
     rows = await actions_of(reading)
     address = reading._address
     await reading.close()
-    if not address.is_sqlite:
-        pytest.skip("the server serves other tests too")
-    address.path.unlink()
+    if address.is_sqlite:
+        address.path.unlink()
+    else:
+        request.getfixturevalue("server").drop(database_url)
     with pytest.raises(DatabaseUnavailable):
         _ = rows[0].robot_state
     assert (
