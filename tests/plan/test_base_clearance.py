@@ -142,7 +142,7 @@ async def test_at_no_offered_place_is_the_base_in_collision_in_two_hundred_table
             for pose in (each.pose for each in surfaces):
                 bowl.set_pose(pose)
                 assert not collisions(bowl), (seed, pose)
-    assert all(count > SCENES / 8 * 0.8 for count in offering.values()), offering
+    assert all(count > SCENES / 8 * 0.6 for count in offering.values()), offering
 
 
 @pytest.mark.slow
