@@ -171,7 +171,7 @@ class Body:
         return placed.position, placed.orientation
 
     def _placed_at_load(self, link: str) -> Frame | None:
-        """Return Bullet's frame of a link after loading, when the root link is at the origin; None if Bullet does."""
+        """Compute the frame of a link after loading, with the root link at the origin; None if Bullet returns it."""
         if not self._chains:
             return None
         frame = along(self._chains[link], {})
@@ -210,9 +210,9 @@ class Body:
 
 
 def visual_boxes(urdfs: Mapping[str, str], client: int) -> dict[str, BoundingBox]:
-    """Return the box around the only link of each of these, by name; without those that Bullet does not load.
+    """Return the box around the shapes of each link, by its name; each URDF describes one link.
 
-    Each is loaded and removed again.
+    Each is loaded into Bullet and removed again. Links that Bullet cannot load or that have no shape are left out.
     """
     boxes: dict[str, BoundingBox] = {}
     for link, urdf in urdfs.items():

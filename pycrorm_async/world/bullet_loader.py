@@ -1,8 +1,8 @@
 """Load Bullet when the first world is entered, and keep its output away from stdout and stderr.
 
 Two packages ship the same Bullet: pybullet has wheels up to Python 3.11, and pycram-bullet, the fork of the institute
-behind PyCRAM, has wheels for 3.11 and 3.12 and calls its module `pycram_bullet`. Either serves; no other module of this
-package imports one of them.
+behind PyCRAM, has wheels for 3.11 and 3.12 and calls its module `pycram_bullet`. Either one works; no other module of
+this package imports one of them.
 
 Bullet prints with C's `printf`, which cannot be switched off: a greeting at import, warnings when it loads a body.
 Meanwhile this module points C's own `stdout` and `stderr` to a buffer in memory. Python and child processes write to

@@ -19,7 +19,7 @@ class Arms(IntEnum):
 
     @classmethod
     def named(cls, name: str) -> Arms:
-        """Return the arm of that name, the same object at each call; it may be one that no member of the class has.
+        """Return the arm of that name, the same object at each call. The class need not have a member of that name.
 
         >>> Arms.named("CENTRE").name, Arms.named("LEFT") is Arms.LEFT
         ('CENTRE', True)
@@ -33,7 +33,7 @@ class Arms(IntEnum):
         number = int.from_bytes(name.encode(), "big")  # the same in every process, and of no other name
         arm = int.__new__(cls, number)
         arm._name_, arm._value_ = name, number
-        # The enum's own table of values gives each name one object, whichever thread makes it first.
+        # `setdefault` on the enum's own table keeps one object for each name, whichever thread makes it first.
         members: Any = cls._value2member_map_
         return cast("Arms", members.setdefault(number, arm))
 

@@ -38,7 +38,7 @@ class NoWorld(WorldError):
 
 
 class ObjectRefused(WorldError):
-    """An object's name is not a str, or its type is not an `ObjectType`."""
+    """An object cannot have this name, type, mass or base link."""
 
 
 class ObjectNotInWorld(WorldError):
@@ -99,7 +99,7 @@ class JointLimitExceeded(WorldError):
 
 
 class PoseRefused(WorldError):
-    """An object's new pose is in another frame than "map", or has a number that is not finite."""
+    """An object's new pose is not a `Pose`, is not in the frame "map", or has a number that is NaN or too large."""
 
     def __init__(self, object_name: str, pose: Pose, reason: str) -> None:
         super().__init__(f"{object_name!r} cannot be moved to {pose!r}: {reason}")

@@ -53,7 +53,7 @@ class Object:
         pose: pose of the base link's frame, in "map"; None means the root link's at the origin. `reset` restores it.
         world: the world to add it to; None means the current world of this context.
         color: red, green, blue, opacity, 0 to 1.
-        mass_kg: None means the sum of the masses in the description, which may be unknown.
+        mass_kg: None means the sum of the masses in the description, if it has any; unknown for a robot or environment.
         robot: the description of a robot; None means the built-in or registered one with the object's name. Without
             `description` the model is that of the robot's description, or the built-in one of its name.
         base_link: the link whose pose is the robot's pose, empty for the root link; None means that of the robot's

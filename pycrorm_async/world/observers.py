@@ -66,7 +66,7 @@ class WorldWatcher(Protocol):
     """Receives the worlds that are entered and left in its context."""
 
     def world_entered(self, world: BulletWorld) -> None:
-        """Called when `with BulletWorld()` begins; an exception closes the world and reaches the caller."""
+        """Called when a world is entered, by `with` or `connect`; an exception closes it and reaches the caller."""
         ...
 
     def world_left(self, world: BulletWorld) -> None:

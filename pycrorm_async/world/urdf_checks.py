@@ -22,7 +22,8 @@ def urdf_text(name: str, description: str | Path) -> str:
     Args:
         name: the object's name, used in the error message only.
         description: URDF text (it begins with "<"), or the path of a .urdf file. `package://x/y` is searched as `x/y`
-            in the folders above the file; other relative names start at the file's folder.
+            in the file's folder and those above it; other relative names start at the file's folder. For URDF text,
+            which has no file, the current folder takes that place.
 
     Raises:
         DescriptionNotLoadable: the URDF has a fault, which the message names.

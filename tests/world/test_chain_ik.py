@@ -123,7 +123,7 @@ def test_a_description_that_does_not_fit_the_model_is_refused_by_name() -> None:
     for base, tool, named in (
         ("", "hand", "'hand'"),
         ("no_link", "tool_frame", "'no_link'"),
-        ("tool_frame", "camera_link", "does not hang on"),
+        ("tool_frame", "camera_link", "is not below"),
         ("column_link", "elbow_link", "but its description has arm_yaw_joint: correct it"),
     ):
         wrong = ArmDescription(joints=("arm_yaw_joint",), base_link=base, tool_frame=tool)

@@ -1,8 +1,8 @@
 """Return built-in descriptions as URDF text, so that no file has to be read, downloaded or licensed.
 
 A small object is one link, a box or an upright cylinder, with the extent of the objects in the thesis' plans (metres,
-around the object's origin). Its mass is assumed: it was not compared with a source. The masses are meant to be those of
-the like objects of the YCB set (chips can, cracker box, bowl, mug, spoon), and that of a litre of milk in its carton;
+around the object's origin). The masses are assumptions that were not checked against a source: they are meant to match
+similar objects of the YCB set (chips can, cracker box, bowl, mug, spoon), and a litre of milk in its carton;
 `Object(..., mass_kg=)` replaces one. The robots and the environment are built in by name.
 """
 

@@ -1,8 +1,9 @@
 """Compute the box around the collision shapes of each link of a URDF, without Bullet.
 
-The boxes are along the axes of the root link's frame, with every joint at position 0. Boxes are exact; cylinders have
-the box around them. A caller that knows the boxes of the links gives them, and then the shapes may be any. A link that
-a prismatic joint slides also has that joint and its direction. Links without a shape and links that turn are left out.
+The result is aligned with the axes of the root link's frame, with every joint at position 0. The shapes must be boxes
+and cylinders, unless the caller passes the boxes around the links; then the shapes are not read. The result for a link
+that a prismatic joint slides names that joint and its direction. Links without a shape and links that turn are left
+out.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ _ZERO: _Vector = (0.0, 0.0, 0.0)
 class LinkBox(NamedTuple):
     """The box around a link: its center and half of its edges in the root link's frame, m.
 
-    `joint` slides it along `axis`, a unit vector in the same frame; None for a link that is fixed.
+    `joint` slides the link along `axis`, a unit vector in the same frame; None for a link that is fixed.
     """
 
     link: str

@@ -1,6 +1,6 @@
 """Replace the mesh files of a URDF: by other names, or by the boxes around the collision shapes of their links.
 
-With the boxes an object keeps its links, joints and poses without any file.
+A URDF with boxes needs no mesh file, and the object keeps its links, joints and poses.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def with_mesh_files(urdf: str, names: Mapping[str, str]) -> str:
 
 
 def with_boxes(urdf: str, boxes: Mapping[str, BoundingBox], *, kept: frozenset[str] = frozenset()) -> str:
-    """Return the URDF with the box of its link instead of each mesh, without one for a link that has no box.
+    """Replace the meshes of each link by the box of that link; remove them if the link has no box.
 
     Meshes with a file name in `kept` stay.
     """
@@ -96,4 +96,4 @@ def _add_box(shape: Element, box: BoundingBox, material: Element | None) -> None
 
 
 def _parsed(urdf: str) -> Element:
-    return fromstring(urdf)  # noqa: S314  `urdf_text` has checked it, or a memory has recorded it then
+    return fromstring(urdf)  # noqa: S314  `urdf_text` has checked it, now or before a memory recorded it

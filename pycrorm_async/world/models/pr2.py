@@ -4,8 +4,9 @@ Both have the same root, links, joints and dimensions as far as plans use them. 
 loads in milliseconds; the mesh model is in the optional package example-robot-data and has narrower limits of two
 joints (wrist flex -2.094 rad, torso 0.31 m).
 
-The root link `base_footprint` is on the floor. The mass of every link is in its origin, so that Bullet's frames are the
-model's. The shapes are about as large as the robot's: precise enough for bounding boxes, rays and pictures.
+The root link `base_footprint` is on the floor. The centre of mass of every link is its origin, so that Bullet, which
+places links by their centres of mass, uses the frames of the model. The shapes are about as large as the robot's:
+precise enough for bounding boxes, rays and pictures.
 """
 
 from __future__ import annotations

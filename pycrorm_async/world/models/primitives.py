@@ -17,7 +17,7 @@ WHITE = (1.0, 1.0, 1.0, 1.0)
 def box_urdf(
     name: str, *, x: Range, y: Range, z: Range, color: Sequence[float] = WHITE, mass_kg: float | None = None
 ) -> str:
-    """Return an object of one link: the box between these bounds, m. A mass of None is not known."""
+    """Return an object of one link: the box between these bounds, m. A mass of None is left out of the URDF."""
     size, middle = zip(*((high - low, (low + high) / 2) for low, high in (x, y, z)), strict=True)
     return _one_link(name, f'<box size="{numbers(size)}"/>', middle, color, mass_kg)
 
@@ -27,7 +27,7 @@ def cylinder_urdf(
 ) -> str:
     """Return an object of one link: the upright cylinder around its z axis between these heights, m.
 
-    A mass of None is not known.
+    A mass of None is left out of the URDF.
     """
     geometry = f'<cylinder radius="{radius:g}" length="{numbers([z[1] - z[0]])}"/>'
     return _one_link(name, geometry, (0.0, 0.0, (z[0] + z[1]) / 2), color, mass_kg)

@@ -1,6 +1,7 @@
 """Add links and joints to the URDF of a built-in robot.
 
-The mass of every link is in its origin, so that Bullet's frames are the model's.
+The centre of mass of every link is its origin, so that Bullet, which places links by their centres of mass, uses the
+frames of the model.
 """
 
 from __future__ import annotations

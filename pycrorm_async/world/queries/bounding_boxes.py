@@ -89,8 +89,8 @@ def solids_of(
 ) -> tuple[Solid, ...]:
     """Return the collision shapes of one link in the link's frame; `inertial` is Bullet's frame relative to it.
 
-    `placed` is Bullet's frame in "map", for a body of which Bullet does not return it. Call it before the body is moved
-    from the pose at which it was loaded.
+    `placed` is that frame in "map", for a body whose links have no frames in Bullet's answers. Call this function
+    before the body is moved from the pose at which it was loaded.
     """
     shapes = bullet.getCollisionShapeData(body, link, physicsClientId=client)
     rotation, position = rotation_matrix(inertial[1]), np.array(inertial[0])

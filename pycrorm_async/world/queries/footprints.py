@@ -1,8 +1,8 @@
 """Compare the outline of a robot's base, with its heading, with the outlines of obstacles, viewed from above.
 
 An outline is the smallest rectangle around a shape with the heading of its link, so upright furniture keeps its exact
-outline however it is turned. A base may overlap an outline below or above which it would fit, but a base that overlaps
-none collides with nothing.
+outline whatever its heading. Heights are not compared: a base counts as overlapping an outline even if it would fit
+below or above the shape. A base that overlaps no outline collides with nothing.
 
 >>> obstacles = Obstacles(world, ignore=[robot])
 >>> obstacles.overlapping(footprint_of(robot, links), Pose([1.0, 0.7, 0.0]))

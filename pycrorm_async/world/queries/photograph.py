@@ -20,7 +20,8 @@ _NEAR_M, _FAR_M = 0.05, 60.0
 """The distances in m between which the camera sees."""
 _SKY = (238.0, 241.0, 245.0)
 _FLOOR_LIGHT, _FLOOR_CONTRAST = 225.0, 0.35
-"""The floor is a blue and white chessboard; as a pale grey one it does not outshine the objects."""
+"""Bullet's floor is a blue and white chessboard; it is repainted in pale greys, so that it does not outshine the
+objects."""
 
 Floats: TypeAlias = NDArray[np.float64]
 
@@ -66,7 +67,7 @@ class Photograph(NamedTuple):
 
 
 def photograph(world: BulletWorld, camera: Camera, width: int, height: int, *, smooth: bool = True) -> Photograph:
-    """Return a picture of the world. With `smooth`, 4 points make a pixel, and objects throw shadows.
+    """Return a picture of the world. With `smooth`, each pixel is the mean of 4 points, and objects cast shadows.
 
     A smooth picture of 640 x 480 takes about 1 s of CPU time, one of 80 x 60 without it 10 ms.
     """

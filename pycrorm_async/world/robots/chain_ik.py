@@ -1,15 +1,15 @@
 """Solve the inverse kinematics of any chain of revolute, continuous and prismatic joints, numerically.
 
 `Chain` reads the joints between a robot's root link and an arm's tool from the URDF. The library optik minimises the
-distance between the tool and the target from up to `STARTS_MAX` starts; here only the chain is prepared for it, and its
-answer is checked by its caller. One thread and a fixed order of starts make the answer the same for the same arguments.
+distance between the tool and the target from up to `STARTS_MAX` starts; this module prepares the chain for it, and
+`kinematics` checks the answer. One thread and a fixed order of starts make the answer the same for the same arguments.
 The library ends the process when a joint of the chain is prismatic, so such chains are solved here, by damped least
 squares, which is slower and refuses more: of 100 reachable poses of a TIAGo whose torso counts as a joint of its arm it
 refused 8, in 0.15 s each. A torso that is the description's `torso_joint` belongs to no arm.
 
-Of 2,000 random reachable poses it refused none, for the arm of a Panda and for that of a TIAGo (with 20 starts 1 and
-2), in 0.3 ms each; a refusal takes some 10 ms. Bullet's solver, with 10 starts, reached two thirds of the Panda's poses
-to 1 mm, in 5 ms.
+The library refused none of 2,000 random reachable poses, neither for the arm of a Panda nor for that of a TIAGo (with
+20 starts 1 and 2), in 0.3 ms each; a refusal takes some 10 ms. Bullet's solver, with 10 starts, reached two thirds of
+the Panda's poses to 1 mm, in 5 ms.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ TIME_MAX_S = 1.0
 """Bounds a search, because the library never ends one whose first step is not a number. That happens at postures where
 joints are in line with each other and with the target, which `_start` avoids; a search takes some milliseconds."""
 _ERROR_MAX = 1e-14
-"""Square of the distance, m² and rad², at which a search ends; the answer is checked by its caller."""
+"""Square of the distance, m² and rad², at which a search ends; `kinematics` checks the answer."""
 DESCENTS_MAX, STEPS_MAX = 20, 60
 """Bound the damped least squares: 20 starts of 60 steps take half a second when the target is out of reach."""
 _EXACT, _DAMPING_MAX = 1e-9, 1e6
@@ -55,7 +55,7 @@ class Chain:
         tool_link: the link that carries the tool.
         tool_in_link: the tool's frame in that link; None: the link's own.
 
-    Raises `CallerError` if the model has no such links, or the tool does not hang on the base link.
+    Raises `CallerError` if the model has no such links, or the tool link is not below the base link.
     """
 
     def __init__(self, urdf: str, *, base_link: str, tool_link: str, tool_in_link: Pose | None) -> None:
@@ -76,7 +76,7 @@ class Chain:
         lengths = [_norm(each.origin) for each in self._arm[first + 1 :]]
         slides = [max(map(abs, each.bounds)) for each in self._arm if each.kind is JointType.PRISMATIC]
         self.reach_m = sum(lengths) + sum(slides) + (_norm(tool_in_link) if tool_in_link else 0.0)
-        """No posture brings the tool farther from the first joint than this."""
+        """The greatest distance of the tool from the first joint, in any posture."""
 
     def forward(self, positions: Mapping[str, float]) -> Pose:
         """Return the tool's frame in the root link at these joint positions; joints that are left out are at 0."""
@@ -200,7 +200,8 @@ def _matrix(pose: Pose) -> list[list[float]]:
 def _solver(joints: Sequence[Joint], ranges: Sequence[Bounds]) -> optik.Robot:
     """Load a model of this chain alone, whose last joint is movable, with these ranges.
 
-    The library knows no continuous joint, and leaves out fixed ones, so they are made part of the next joint.
+    The library supports no continuous joint: each becomes a revolute one with its range. The library leaves out fixed
+    joints: each is made part of the next movable joint.
     """
     robot = Element("robot", name="chain")
     SubElement(robot, "link", name="link 0")

@@ -42,7 +42,7 @@ def joints_between(urdf: str, base_link: str, tool_link: str) -> tuple[str, ...]
 def divided(urdf: str, base_link: str, tool_link: str) -> tuple[tuple[Joint, ...], tuple[Joint, ...]]:
     """Return the joints from the root to the base link (empty: the root), and those from there to the tool.
 
-    Raises `CallerError` if the model has no such links, or the tool does not hang on the base link.
+    Raises `CallerError` if the model has no such links, or the tool link is not below the base link.
     """
     robot = fromstring(urdf)  # noqa: S314  loaded by the caller's own process, and checked before
     links = {each.get("name", "") for each in robot.findall("link")}
@@ -57,7 +57,7 @@ def divided(urdf: str, base_link: str, tool_link: str) -> tuple[tuple[Joint, ...
         link = joined_link(above[link], "parent")
     passed = [link, *(each.child for each in path)]  # from the root to the tool
     if base_link and base_link not in passed:
-        raise CallerError(f"{tool_link!r} does not hang on {base_link!r}: correct the robot's description")
+        raise CallerError(f"{tool_link!r} is not below {base_link!r}: correct the robot's description")
     begin = passed.index(base_link) if base_link else 0
     return tuple(path[:begin]), tuple(path[begin:])
 
@@ -111,7 +111,7 @@ def _numbers(text: str | None, default: tuple[float, float, float]) -> tuple[flo
 
 
 def along(joints: Sequence[Joint], positions: Mapping[str, float]) -> Pose:
-    """Return the frame of the last joint's child in the parent of the first, without drift: only products."""
+    """Return the frame of the last joint's child link in the first joint's parent link, at these positions."""
     x = y = z = 0.0
     turn = Quaternion(0.0, 0.0, 0.0, 1.0)
     for each in joints:

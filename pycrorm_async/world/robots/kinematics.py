@@ -6,8 +6,8 @@ result is the posture that stays farthest from every limit. Continuous joints ha
 reach, except for rare ones at the rim of the workspace (about 1 in 10,000 of the reachable ones there) whose only
 postures lie in a narrow range between limits. Any other arm is solved numerically (`chain_ik`).
 
-The result is deterministic: on one machine the same arguments give the same result, to the bit. Forward kinematics has
-verified it to 1e-6 m and 1e-6 rad. Collisions, with the robot itself or with objects, are not checked.
+The result is deterministic: on one machine the same arguments yield the same result, to the bit. `solve` verifies it by
+forward kinematics to 1e-6 m and 1e-6 rad. Collisions, with the robot itself or with objects, are not checked.
 """
 
 from __future__ import annotations
@@ -91,8 +91,9 @@ def solve(
 
     Raises:
         Unreachable: no posture within the limits reaches the target.
-        CallerError: the robot has no description, `arm` is not a single arm, or the target is in another frame or
-            not finite.
+        CallerError: the robot has no description or one that does not fit its model, `arm` is not a single arm, or the
+            target is in another frame or not finite.
+        MissingExtra: the arm has no closed form, and the library for other arms is not installed.
     """
     description = robot.robot_description
     if description is None:

@@ -66,7 +66,7 @@ class ArmDescription:
     Its origin is between the finger tips; x points along the fingers, which close along y.
     """
     soft_limits: Mapping[str, Bounds] = field(default_factory=dict)
-    """The range of each joint inside its hard limits; of a joint that is not in it, the hard limits."""
+    """The range of each joint inside its hard limits; a joint that is left out has its hard limits only."""
     hard_limits: Mapping[str, Bounds] = field(default_factory=dict)
     """Hard limits that are narrower than those of the loaded model."""
     gripper_joints: Mapping[GripperState, Mapping[str, float]] = field(default_factory=dict)
@@ -150,7 +150,7 @@ class RobotDescription:
     """The camera's optical frame in `camera_link`: z points ahead, x to the right, y down. None: the link's own."""
     camera_view_rad: FieldOfView = _VIEW
     camera_height_m: Bounds | None = None
-    """Camera height above the floor with the torso at its lowest and highest; None: as high as it is when it looks."""
+    """Camera height above the floor with the torso at its lowest and highest; None: the camera's current height."""
     postures: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     """Joint positions by the name of the posture, for `MoveJointsMotion`, such as "carry"."""
 

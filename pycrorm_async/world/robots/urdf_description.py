@@ -43,8 +43,8 @@ def describe_robot(
         facts: further attributes of `RobotDescription`, such as `drive`, `torso_joint`, `camera_link`.
 
     Raises:
-        CallerError: URDF and SRDF do not fit together, neither describes an arm that `arms` names, or the model has no
-            such base link.
+        CallerError: the SRDF cannot be parsed or does not fit the URDF, `payload_kg` names an arm that the robot lacks,
+            or the model has no such base link.
         DescriptionNotLoadable: the URDF has a fault.
     """
     if base_link:
@@ -74,7 +74,7 @@ def describe_arm(
     """Return the arm between two links of the model, with its gripper, if that has fingers that slide.
 
     The gripper's joints are those that the arm carries and that are none of its own: open at their upper limits, closed
-    at the lower ones. For a hand of another kind set `gripper_joints` and `opening_m`: `dataclasses.replace`.
+    at the lower ones. For a hand of another kind set `gripper_joints` and `opening_m` with `dataclasses.replace`.
 
     Raises:
         CallerError: the model has no such links, or no movable joint between them.
@@ -139,7 +139,7 @@ def _first_link(name: str, urdf: str, group: Element | None) -> str:
 
 
 def _sliding(robot: Element, last: str) -> Iterator[tuple[str, tuple[float, float]]]:
-    """Yield the joints that the joint `last` carries, with their limits, unless one of them is not prismatic."""
+    """Yield the joints that the joint `last` carries, with their limits; none at all if one of them turns."""
     carried = {joined_link(each, "child") for each in robot.findall("joint") if each.get("name") == last}
     joints: list[tuple[str, tuple[float, float]]] = []
     added = True
