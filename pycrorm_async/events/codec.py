@@ -74,16 +74,16 @@ class Decoder:
         """Decode a payload of `version` (None: the current version) into the current shape of its type.
 
         Raises `UnknownShape` for an unknown type or version, and `msgspec.DecodeError` for bytes of another shape.
-        Both are a `ValueError`.
+        Both are subclasses of `ValueError`.
         """
         current_shape = self._current.get(type_name)
         if current_shape is None:
-            raise UnknownShape(f"{type_name} is not an event this version knows")
+            raise UnknownShape(f"{type_name} is not an event type of this version")
         current, decode_current = current_shape
         try:
             if version != current and version is not None:
                 if not 1 <= version < current:
-                    raise UnknownShape(f"{type_name} has version {version}, this version knows {current}")
+                    raise UnknownShape(f"{type_name} has version {version}, this version reads {current}")
                 payload = self._upcast(type_name, payload, version, current)
             return decode_current(payload)
         except (UnicodeDecodeError, RecursionError) as error:  # invalid UTF-8, or nesting too deep
@@ -130,7 +130,7 @@ description_of = _decoder.description_of
 
 
 def encode(event: Happening, *, bytes_max: int = 2**20) -> bytes:
-    """Encode an event as its payload; the same event gives the same bytes in every process.
+    """Encode an event as its payload; the same event has the same bytes in every process.
 
     Raises `NotEncodable`, also for a payload of more than `bytes_max` bytes.
     """

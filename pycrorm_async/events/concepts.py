@@ -1,10 +1,10 @@
 """List the ontology's classes that recorded tasks and objects are instances of, with their superclasses.
 
-Facts of SOMA 2.1.0 and of DOLCE+DnS Ultralite (DUL) as published with it: owl/2.1.0/SOMA-HOME.owl, which contains the
-classes of SOMA-ACT and SOMA-OBJ, and owl/2.1.0/DUL.owl of https://github.com/ease-crc/soma. They are limited to what
-the built-in designators and object types use. The superclasses are the named ones; an intersection counts as each of
-its named classes. Classes without a superclass here have one in DUL. Two concepts of PyCRAM's designators are not in
-SOMA 2.1.0; their superclasses here are ours.
+The classes are those of SOMA 2.1.0 and of DOLCE+DnS Ultralite (DUL) as published with it: owl/2.1.0/SOMA-HOME.owl,
+which contains the classes of SOMA-ACT and SOMA-OBJ, and owl/2.1.0/DUL.owl of https://github.com/ease-crc/soma. The list
+is limited to what the built-in designators and object types use. The superclasses are the named ones; an intersection
+counts as each of its named classes. Classes without a superclass here have one in DUL. Two concepts of PyCRAM's
+designators are not in SOMA 2.1.0; this project chose their superclasses.
 """
 
 from __future__ import annotations

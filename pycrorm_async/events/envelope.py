@@ -15,7 +15,7 @@ __all__ = ["Heading", "Receipt", "Record", "LOST", "is_computed_end"]
 LOST: Final = b'{"status":"LOST"}'
 """Payload of the `EpisodeEnded` that recovery computes for an episode left open.
 
-It stays at version 1 of `EpisodeEnded`, so that recovering a folder twice gives the same bytes.
+It stays at version 1 of `EpisodeEnded`, so that recovering a folder twice yields the same bytes.
 """
 
 

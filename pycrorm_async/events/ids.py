@@ -80,7 +80,7 @@ def row_id(number: int, sequence: int, slot: int) -> RowId:
 
 
 def row_id_min(number: int, sequence: int = 0) -> int:
-    """Return the lowest id of the rows of an episode from an event on; as a bound, also behind the last episode."""
+    """Return the lowest row id of an episode from an event on; `number` may exceed its maximum by 1, for a bound."""
     return number << 31 | sequence << 5
 
 

@@ -109,7 +109,7 @@ class EpisodeEnded(Happening, frozen=True):
     """The last event of an episode. Only recovery writes the status LOST.
 
     `continued_in` is the UUID of the episode that continues this one, if this one ran out of sequences. `world` is the
-    description, in one line, of the world that was entered inside the episode, as it was at last.
+    description, in one line, of the world that was entered inside the episode, as it was when it was left.
     """
 
     status: EpisodeStatus
@@ -190,12 +190,12 @@ class ObjectAdded(Happening, frozen=True):
 
     Attributes:
         joints: in rad or m.
-        node: added the object; None if none did, or if it was in the world before the episode.
+        node: the node that added the object; None if no node did, or if it was in the world before the episode.
         description: fingerprint of the `DescriptionDeclared`; None in events of older versions.
         color: red, green, blue, opacity, 0 to 1; None if only the description has it.
         model, serial: of a robot with a `RobotDescription`: the model's name, and the serial number if it is known.
         mass_kg: as given, or the sum of the masses in the description; None if it is not known.
-        base_link: of a robot: the link whose frame has the pose, in every event; None: the root link.
+        base_link: of a robot: the link whose frame has the pose, in all events of this object; None: the root link.
     """
 
     name: str
@@ -318,7 +318,7 @@ class ObjectDetected(Happening, frozen=True):
         source: the head camera, or the state of the world itself.
         object_type: type of the objects searched for; None: any type.
         seen: the perceived objects, most visible first.
-        node: the node that asked perception.
+        node: the node that made the request.
     """
 
     source: Literal["camera", "world_state"]

@@ -199,7 +199,7 @@ class CellsValue(_Value, frozen=True):
 
 
 class SeenValue(_Value, frozen=True):
-    """A percept; `object` is None if it matches no object, `source` if it has that of its `ObjectDetected`."""
+    """A percept. `object` is None if no object matches; `source` is None if it is that of its `ObjectDetected`."""
 
     name: str
     object_type: str

@@ -215,10 +215,10 @@ class LearnPolicyAction(Action):
     """A policy was learned (`pycrorm_async.learning.record_policy`); `read_policy` returns it by its name.
 
     Attributes:
-        policy: its name, the hash of its content, which rollouts under it repeat.
+        policy: its name, which is the hash of its content and the `policy` of the rollouts under it.
         successes: number of samples from which it was learned.
         min_samples_leaf: the setting of `learn`.
-        rollouts, scene: of the rollouts that gave the samples; None if others did.
+        rollouts, scene: of the rollouts that the samples come from; None if they come from other episodes.
         episode_count: number of the episodes that hold the samples.
     """
 
@@ -233,7 +233,7 @@ class LearnPolicyAction(Action):
 
     @property
     def seeds(self) -> list[int]:
-        """The seeds of the rollouts that gave the samples, one for each round."""
+        """The seeds of the rollouts that the samples come from, one for each round."""
         return self.entries("seeds")
 
     @property

@@ -192,7 +192,7 @@ class Base(MappedAsDataclass, AsyncAttrs, DeclarativeBase, init=False, repr=Fals
 
 
 class RowOfEvent:
-    """A row with an id, `_row` is its attribute, that contains the sequence of the row's event."""
+    """A row whose id, the attribute named by `_row`, contains the sequence of the row's event."""
 
     _row: ClassVar[str] = "id"
 
@@ -212,7 +212,7 @@ class RowOfEvent:
 
 @event.listens_for(Base, "mapper_configured", propagate=True)
 def _complete_mapping(mapper: Mapper[Any], class_: type[Base]) -> None:  # noqa: ARG001  SQLAlchemy's
-    """Load columns of subclasses in batches, and know the enum columns."""
+    """Let columns of subclasses be loaded in batches, and note the enum columns for `_read_members`."""
     if mapper.inherits is not None:
         mapper.class_manager.expired_attribute_loader = load_columns
     kinds = {each.key: each.columns[0].type for each in mapper.column_attrs}
@@ -222,7 +222,7 @@ def _complete_mapping(mapper: Mapper[Any], class_: type[Base]) -> None:  # noqa:
 def require_loaded(row: Base, name: str, requested_by: Base | None = None, request: str | None = None) -> None:
     """Raise `CallerError` with the remedy if this attribute is not loaded and can only be loaded by awaiting it.
 
-    `requested_by` and `request` are the object and the attribute to name, where these are others.
+    The message names the object `requested_by` and the attribute `request`, if they differ from `row` and `name`.
     """
     if name in vars(row):
         return
@@ -255,7 +255,7 @@ def _reader(name: str) -> Callable[[Any], Any]:
 
 
 class HybridOnRequest(hybrid_property[_Value]):
-    """The same for a class with joined inheritance, of which a query may select any subclass.
+    """A descriptor like that of `on_request`, for a class with joined inheritance, whose subclasses a query may select.
 
     A synonym in a query of a subclass would be that of the base, without a join to it.
     """

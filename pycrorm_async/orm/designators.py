@@ -155,7 +155,7 @@ class Designator(RowOfEvent, Base):
         parameters: its fields as recorded. Deferred: load them with `undefer(Action.parameters)` or
             `await action.awaitable_attrs.parameters`.
         status, start_time, end_time, reason: of its node. A type with a field of such a name has the field instead.
-        robot: the name of the robot that acted; None without one. Likewise.
+        robot: the name of the robot that acted; None without one. A type with a field `robot` has the field instead.
         duration: of its node, in s; None while it runs, and if it is LOST.
         sequence, end_sequence: the events of its start and its end, 1, 2, 3 … inside the episode.
         episode: the same as `process_metadata`.

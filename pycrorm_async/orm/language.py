@@ -48,7 +48,7 @@ class Repeat(Language):
 
 
 class Monitor(Language):
-    """Performs its operand until that ends or a condition holds; then the status of its node is INTERRUPTED.
+    """Performs its operand until that ends or a condition holds; in the latter case its node becomes INTERRUPTED.
 
     Attributes:
         condition: the qualified name of the condition.

@@ -1,4 +1,4 @@
-"""Map the built-in views for learning and failures, and of episodes; `user_views` has those of users."""
+"""Map the built-in views of pick-ups, failures, spatial relations, and the tags and robots of episodes."""
 
 from __future__ import annotations
 
@@ -151,7 +151,7 @@ class SpatialRelation(RowOfEvent, Base):
 
 
 class EpisodeTag(RowOfEvent, Base):
-    """A tag that an episode has now, and when it got it. The view `episode_tagging` has all changes."""
+    """A tag that an episode has now, and the time when it was added. The view `episode_tagging` has all changes."""
 
     __tablename__ = "episode_tag"
 

@@ -129,7 +129,7 @@ async def test_an_episode_that_cannot_be_folded_is_copied_and_reported(folder: P
     done = pycrorm("copy", "--from", "sqlite:///c.db", "--to", "sqlite:///b.db", cwd=folder)
     assert done.returncode == 1
     name = "00000000-0000-0000-0000-000000000009"
-    reason = "event 1: HandShaken is not an event this version knows"
+    reason = "event 1: HandShaken is not an event type of this version"
     assert one_line_of(done) == f"pycrorm: episode {name} is stopped: {reason}"
     assert len(logs_of(f"sqlite:///{folder}/b.db")[name]) == 1
 

@@ -357,7 +357,7 @@ async def test_events_of_a_newer_version_are_copied_unchanged(new_url: New, new_
     await append_and_fold(source, script.records)
     (done,) = (await copy_episodes(source, target)).episodes
     assert done.damage is None
-    assert done.stopped == "event 1: HandShaken is not an event this version knows"
+    assert done.stopped == "event 1: HandShaken is not an event type of this version"
     assert logs_of(target) == logs_of(source)
 
 

@@ -73,7 +73,7 @@ def test_every_event_type_is_known_by_its_own_name() -> None:
 def test_other_bytes_are_a_decode_error() -> None:
     with pytest.raises(msgspec.DecodeError):
         decode("NodeEnded", b'{"node":"one"}')
-    with pytest.raises(UnknownShape, match="NodeDreamt is not an event this version knows"):
+    with pytest.raises(UnknownShape, match="NodeDreamt is not an event type of this version"):
         decode("NodeDreamt", b"{}")
 
 

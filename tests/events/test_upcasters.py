@@ -67,7 +67,7 @@ def test_an_event_of_the_current_version_takes_no_step(version: int | None) -> N
 
 @pytest.mark.parametrize("version", [4, 0, -1])
 def test_an_unknown_version_is_refused_with_the_known_one(version: int) -> None:
-    with pytest.raises(UnknownShape, match=rf"^ObjectAdded has version {version}, this version knows 3$"):
+    with pytest.raises(UnknownShape, match=rf"^ObjectAdded has version {version}, this version reads 3$"):
         LATER.decode("ObjectAdded", MILK, version)
 
 
@@ -125,7 +125,7 @@ def test_a_declaration_of_a_newer_version_is_refused_by_its_name_and_no_other_is
     assert list(united.accepted) == [fingerprint(SAYING)]
     assert united.refused == {
         fingerprint(newer): "this version cannot read the declaration of its type:"
-        " DesignatorTypeDeclared has version 2, this version knows 1"
+        " DesignatorTypeDeclared has version 2, this version reads 1"
     }
 
 

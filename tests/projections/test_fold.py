@@ -458,8 +458,8 @@ def test_an_event_that_cannot_be_folded_gives_the_reason_and_leaves_no_row(event
 @pytest.mark.parametrize(
     ("type_", "payload", "version", "reason"),
     [
-        ("RobotDanced", b"{}", 1, "RobotDanced is not an event this version knows"),
-        ("NodeEnded", b'{"node":1,"status":"SUCCEEDED"}', 2, "NodeEnded has version 2, this version knows 1"),
+        ("RobotDanced", b"{}", 1, "RobotDanced is not an event type of this version"),
+        ("NodeEnded", b'{"node":1,"status":"SUCCEEDED"}', 2, "NodeEnded has version 2, this version reads 1"),
         ("NodeEnded", b"{", 1, "NodeEnded cannot be decoded: Input data was truncated"),
     ],
 )

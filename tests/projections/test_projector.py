@@ -153,8 +153,8 @@ async def test_without_unfolded_events_nothing_is_done(log: EventLog) -> None:
     [
         ("undeclared", "event 3: the designator type 00000000000000000000000000000000 was never declared"),
         ("undecodable", "event 3: NodeEnded cannot be decoded: JSON is malformed: invalid character (byte 0)"),
-        ("unknown", "event 3: RobotDanced is not an event this version knows"),
-        ("newer", "event 3: NodeEnded has version 2, this version knows 1"),
+        ("unknown", "event 3: RobotDanced is not an event type of this version"),
+        ("newer", "event 3: NodeEnded has version 2, this version reads 1"),
         (
             "taken",
             "event 3: SayingAction: its table would be 'pose', which the memory itself uses (set another dtype)",

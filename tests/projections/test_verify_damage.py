@@ -106,11 +106,11 @@ CANNOT = "is in the tables, and cannot be folded:"
         ),
         (
             f"UPDATE event SET type = 'RobotDanced' {OF_2} 4",
-            [f"event 4: {CANNOT} RobotDanced is not an event this version knows"],
+            [f"event 4: {CANNOT} RobotDanced is not an event type of this version"],
         ),
         (
             f"UPDATE event SET version = 2 {OF_2} 20",
-            [f"event 20: {CANNOT} EpisodeEnded has version 2, this version knows 1"],
+            [f"event 20: {CANNOT} EpisodeEnded has version 2, this version reads 1"],
         ),
         (f"UPDATE event SET type = 'ObjectAdded' {OF_2} 11", ["event 11: "]),
         (

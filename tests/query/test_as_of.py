@@ -418,9 +418,9 @@ async def test_an_invalid_moment_is_refused(reading: Reading, when: dict[str, An
             b"{}",
             2,
             DatabaseForeign,
-            "event 16: NodeEnded has version 2, this version knows 1: use a newer",
+            "event 16: NodeEnded has version 2, this version reads 1: use a newer",
         ),
-        ("ObjectPainted", b"{}", 1, DatabaseForeign, "ObjectPainted is not an event this version knows: use a newer"),
+        ("ObjectPainted", b"{}", 1, DatabaseForeign, "ObjectPainted is not an event type of this version: use a newer"),
     ],
 )
 async def test_a_snapshot_before_an_unreadable_event_is_given(

@@ -2,8 +2,8 @@
 
 A query for a base class, such as `select(Action)`, loads the columns of the base only, and no relationship. The first
 time that `arm` of one action is read, the columns of its class are loaded for up to `BATCH` objects of this class in
-the session, beginning with that one; the first time that `robot_state` is read, likewise. So 25,000 actions cost what
-is read of them, and reading an attribute of each of them takes a few queries, not 25,000.
+the session, beginning with that one. A relationship such as `robot_state` is loaded in the same way. So a query for
+25,000 actions loads only the attributes that are read, and reading one of each takes 50 queries, not 25,000.
 """
 
 from __future__ import annotations
