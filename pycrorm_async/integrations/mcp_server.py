@@ -1,9 +1,9 @@
 """Answer agents' questions about a memory: a server of the Model Context Protocol, for `pycrorm mcp`.
 
-An agent starts `pycrorm mcp --url URL` and speaks with it over stdin and stdout (extra `[mcp]`). Its tools read; none
-writes, and none moves a robot. A fault is an error of the tool, with the one line that a person would read, so that the
-model can correct its call. One `Reading` serves the server's life; after a fault of the database it is closed, and the
-next call opens the database again.
+An agent starts `pycrorm mcp --url URL` and communicates with it over stdin and stdout (extra `[mcp]`). Its tools read;
+none writes, and none moves a robot. A fault is returned as an error of the tool, with the same one-line message as on
+the command line, so that the model can correct its call. The server keeps one `Reading`; after a fault of the database
+it is closed, and the next call opens the database again.
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ def memory_server(address: DatabaseAddress) -> MCPServer:
 
 
 class _Server(MCPServer):
-    """A server that answers wrong arguments with one line, where the SDK gives a paragraph and a URL for each."""
+    """A server that answers wrong arguments with one line, where the SDK returns a paragraph and a URL for each."""
 
     async def call_tool(self, name: str, arguments: dict[str, Any], context: Any = None) -> Any:
         """Call a tool by name. Raises `ToolError`."""
@@ -132,7 +132,7 @@ def _with_tool_errors(tool: _Function, tools: _Tools) -> _Function:
             raise ToolError(one_line(error, _ERROR_MAX)) from error
         text = result if isinstance(result, str) else _json(_short(msgspec.to_builtins(result, enc_hook=str)))
         if (size := len(text.encode())) > _ANSWER_BYTES:
-            raise ToolError(f"the answer has {size} bytes, and at most {_ANSWER_BYTES} are given: ask for less")
+            raise ToolError(f"the answer has {size} bytes, but at most {_ANSWER_BYTES} are returned: ask for less")
         return text
 
     return answer

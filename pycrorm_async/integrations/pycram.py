@@ -5,7 +5,7 @@ what has no callback: actions that another action performs, expressions of the l
 the prospection world, and changes of a Bullet world. Leaving the block removes all of them.
 
 Theory of operation. Each thread has a stack of the nodes that run in it, because PyCRAM has one current node for all
-threads and so loses nodes of parallel branches or gives them wrong parents. The stack of a branch begins with the
+threads and so loses nodes of parallel branches or assigns wrong parents. The stack of a branch begins with the
 parallel node; that of a thread that the plan starts itself is empty, so its first node is a child of the root. PyCRAM
 has two nodes for an action, a description and what it resolves to; only the latter is recorded, unless the description
 fails before it is resolved. The first node in the prospection world opens a simulated episode, which ends with PyCRAM's
@@ -69,7 +69,7 @@ def remember(
     Raises:
         MissingExtra: PyCRAM is not installed.
         CallerError: this version of PyCRAM is unknown, or another `remember` is active in this process.
-        PycrormError: as of `Memory.open`; nothing of PyCRAM is replaced then.
+        PycrormError: `Memory.open` raised it; no method of PyCRAM is replaced then.
     """
     _check_version()
     active = _ONE_AT_A_TIME.setdefault(os.getpid(), threading.Lock())
@@ -173,7 +173,7 @@ class _PyCRAMPlans:
         statuses = self._pycram.TaskStatus
         if node.status is statuses.SUCCEEDED:
             self._end(started, "SUCCEEDED", None, node.result)
-        else:  # PyCRAM knows plan failures only: after any other exception the node is still RUNNING
+        else:  # PyCRAM handles plan failures only: after any other exception the node is still RUNNING
             failure = node.reason if node.status is statuses.FAILED else sys.exception()
             self._end(started, "FAILED", failure)
 

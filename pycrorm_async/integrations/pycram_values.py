@@ -72,7 +72,7 @@ class PyCRAMValues:
             (used.ObjectDesignatorDescription, "object"),
         )
         for designator in (*_descendants(used.ActionDescription), *_descendants(used.BaseMotion)):
-            self._hints_of(designator)  # which takes long, before the plan instead of in it
+            self._hints_of(designator)  # slow, therefore done before the plan and not during it
 
     # --- parameters -------------------------------------------------------------------------------------------
 
@@ -156,7 +156,7 @@ class PyCRAMValues:
     # --- values -----------------------------------------------------------------------------------------------
 
     def value(self, value: Any, episode: RecordedEpisode) -> Any:
-        """Convert a parameter or a result for this episode. Raises `ValueError` with the reason if it cannot."""
+        """Convert a parameter or a result for this episode; return values of other types unchanged."""
         if type(value) in _AS_THEY_ARE or isinstance(value, Enum):
             return value
         used = self.pycram

@@ -18,7 +18,7 @@ class _Observer(Protocol):
 class Seams:
     """The methods replaced and the callbacks added since `is_on` was set; `remove` removes all of them.
 
-    A method that another library has replaced in turn stays: its seam of ours then performs the method alone.
+    A method that another library has replaced in turn is not restored; the seam inside it then only calls the original.
     """
 
     def __init__(self, recording: Recording) -> None:
@@ -34,7 +34,7 @@ class Seams:
     def around(self, owner: type, name: str, perform: Callable[..., Any]) -> None:
         """Call `perform(call, subject, *args)` in place of a method, where `call()` performs the method itself.
 
-        Arguments that the caller names reach `perform` by their position, as far as they have one.
+        Arguments that the caller passes by name reach `perform` by position, as far as they have one.
         """
         original = vars(owner)[name]
         parameters = signature(original)
@@ -48,7 +48,7 @@ class Seams:
         self._replace(owner, name, seam)
 
     def after(self, owner: type, name: str, report: Callable[..., Any]) -> None:
-        """Call `report(subject, *args)` after a method; arguments that the caller names have their position there."""
+        """Call `report(subject, *args)` after a method; named arguments are passed by position where they have one."""
         original = vars(owner)[name]
         parameters = signature(original)
 
@@ -82,7 +82,7 @@ class Seams:
 def _by_position(
     parameters: Signature, subject: Any, args: tuple[Any, ...], kwargs: dict[str, Any]
 ) -> tuple[tuple[Any, ...], dict[str, Any]]:
-    """Return the arguments with those by name at their position; unchanged if the method does not take them."""
+    """Move named arguments to their positions; return them unchanged if they do not fit the method."""
     try:
         bound = parameters.bind(subject, *args, **kwargs)
     except TypeError:

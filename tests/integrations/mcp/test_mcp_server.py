@@ -118,9 +118,7 @@ async def test_an_agent_asks_with_every_tool(url: str) -> None:
 
 async def test_a_wrong_call_is_an_error_of_the_tool_in_one_line(url: str) -> None:
     async with agent_in_process(url) as agent:
-        assert await agent.refused("show", episode=99) == (
-            "there is no episode '99' (`pycrorm episodes` lists the 2 there are)"
-        )
+        assert await agent.refused("show", episode=99) == ("there is no episode '99' (`pycrorm episodes` lists all 2)")
         assert (await agent.refused("show", episode="00000000")).startswith("2 episodes have an id that begins with")
         assert (await agent.refused("at", when="noon")).startswith("when takes seconds since the episode's start")
         assert await agent.refused("show", nodes=0) == "nodes must be 1 to 300, got 0"
@@ -180,7 +178,7 @@ async def test_every_answer_is_bounded_however_long_the_recorded_texts_are(tmp_p
         halved = await agent.ask(*calls[-1][:1], **calls[-1][1])
         assert (0 < len(halved["rows"]) < 20, halved["more_rows_exist"]) == (True, True)
         names = ", ".join(f"1 AS {'c' * 3000}{number}" for number in range(200))
-        assert (await agent.refused("query", sql=f"SELECT {names}")).endswith("at most 500000 are given: ask for less")
+        assert (await agent.refused("query", sql=f"SELECT {names}")).endswith("at most 500000 are returned: ask for less")
         assert len(await agent.refused("query", sql=f"SELECT {'x' * 50_000}")) < 1_100
 
 
