@@ -56,7 +56,7 @@ async def tag_episode(
     try:
         row = await episode_named(log, name)
         for _ in range(_ATTEMPTS):
-            before = await tags_of(log, row.number)
+            before = await tags_of(log, row)
             tags = changed_tags(before, added, removed)
             if sorted(tags) == sorted(before):
                 return TaggedEpisode(row.number, row.id, tuple(sorted(tags)), visible=True)

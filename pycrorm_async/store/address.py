@@ -53,7 +53,7 @@ _VALID_URLS = (
 
 @dataclass(frozen=True, repr=False)
 class DatabaseAddress:
-    """A database's address; `str` gives the URL without its password.
+    """A database's address; `str` returns the URL without its password.
 
     >>> str(DatabaseAddress.parse("postgresql://robot:secret@lab/memory"))
     'postgresql://robot:***@lab/memory'

@@ -177,7 +177,7 @@ def _rows(steps: Iterable[EpisodeStep], digests: Extension | None) -> Iterator[t
 
 
 def _parts(change: EpisodeStep) -> Iterator[tuple[Sequence[Record], bool]]:
-    """Split an episode's new events; yield of each part whether it is the episode's end, or a tag behind the end."""
+    """Split an episode's new events; yield each part, and whether it is the episode's end or a tag behind the end."""
     events = change.fresh
     last = len(events)
     if change.after.ended_wall_ns is not None:

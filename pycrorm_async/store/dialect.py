@@ -18,7 +18,7 @@ RowsByTable: TypeAlias = Mapping[tuple[str, tuple[str, ...]], Sequence[tuple[Any
 """Rows to insert, by table and its columns."""
 
 Insertion: TypeAlias = Any
-"""Rows to insert, prepared for the driver; only the dialect knows the type."""
+"""Rows to insert, prepared for the driver, in a form that only their dialect reads."""
 
 Progress: TypeAlias = tuple[int, int, int]
 """An episode's number, its folded sequence before, and its folded sequence now."""
@@ -85,7 +85,7 @@ class Dialect(Protocol):
     """Statements that create the table of the blobs unless it exists."""
 
     async def prepare(self, engine: AsyncEngine, name: str) -> None:
-        """Prepare a database, outside a transaction, for creating or migrating a log. Refuses foreign databases."""
+        """Prepare a database, outside a transaction, for creating or migrating a log. Raises `DatabaseForeign`."""
         ...
 
     async def lock_log_changes(self, connection: AsyncConnection) -> None:
@@ -120,8 +120,8 @@ class Dialect(Protocol):
         ...
 
     async def new_numbers(self, connection: AsyncConnection, count: int, *, above: int = 0) -> list[int]:
-        """Return numbers that no episode has or had. Skips the numbers up to `above` and a reserve behind it
-        (`numbers_reserved`), unless they are above already."""
+        """Return numbers that no episode has or had. If the next free number is not above `above`, skip those up to
+        `above` and a reserve behind it (`numbers_reserved`)."""
         ...
 
     async def skip_numbers(self, connection: AsyncConnection, above: int) -> None:
@@ -218,7 +218,10 @@ class Dialect(Protocol):
         ...
 
     async def keep(self, connection: AsyncConnection, tables: Sequence[str]) -> bool:
-        """Protect these tables from being dropped until the transaction ends; False, ending it, if one is missing."""
+        """Protect these tables from being dropped until the transaction ends.
+
+        Returns False if one is missing; the caller must not use the transaction any more then.
+        """
         ...
 
     async def faults_of_file(self, connection: AsyncConnection) -> list[str]:
@@ -270,7 +273,7 @@ class Dialect(Protocol):
         ...
 
     async def comment_views(self, connection: AsyncConnection, comments: Mapping[str, Mapping[str, str]]) -> None:
-        """Describe views and columns in the database, if it keeps comments: texts by column, the view's own by ``.
+        """Describe views and columns in the database, if it keeps comments: texts by column, the view's own by "".
 
         Views and columns that do not exist are skipped.
         """

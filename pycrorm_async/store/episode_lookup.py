@@ -10,7 +10,7 @@ from collections.abc import Collection, Mapping
 import msgspec
 from sqlalchemy import bindparam, text
 
-from pycrorm_async.errors import UnknownEpisode
+from pycrorm_async.errors import LogDamaged, UnknownEpisode
 from pycrorm_async.events.tags import retagged
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import EpisodeRow
@@ -27,7 +27,7 @@ def number_named(name: str, ids: Mapping[int, str], *, listed: int) -> int:
         number for number, identity in ids.items() if len(name) >= 4 and identity.startswith(name.lower())
     ]
     if len(numbers) > 1:
-        raise UnknownEpisode(f"{len(numbers)} episodes have an id that begins with {name!r}: give more of it")
+        raise UnknownEpisode(f"{len(numbers)} episodes have an id that begins with {name!r}: use more of its digits")
     if not numbers:
         raise UnknownEpisode(f"there is no episode {name!r} ({_present(listed)})")
     return numbers[0]
@@ -36,7 +36,7 @@ def number_named(name: str, ids: Mapping[int, str], *, listed: int) -> int:
 def _present(listed: int) -> str:
     if listed == 0:
         return "this memory has none yet: record one with `pycrorm run` or `pycrorm demo`"
-    return f"`pycrorm episodes` lists {'the one there is' if listed == 1 else f'the {listed} there are'}"
+    return f"`pycrorm episodes` lists {'the only one' if listed == 1 else f'all {listed}'}"
 
 
 async def episode_named(log: EventLog, name: str) -> EpisodeRow:
@@ -62,16 +62,19 @@ async def grown_episodes(log: EventLog, *, above: int, numbers: Collection[int])
         return [EpisodeRow(*row) for row in rows]
 
 
-async def tags_of(log: EventLog, number: int) -> tuple[str, ...]:
-    """Return the tags of an episode according to its events. Raises `LogDamaged` for one that cannot be read."""
+async def tags_of(log: EventLog, row: EpisodeRow) -> tuple[str, ...]:
+    """Return the tags of an episode according to its events. Raises `LogDamaged` if one of these cannot be read."""
     tags: tuple[str, ...] = ()
     query = text(
         "SELECT sequence, payload FROM event WHERE episode = :number AND type IN ('EpisodeStarted', 'EpisodeTagged')"
         " ORDER BY sequence"
     )
     async with log.reading() as connection:
-        for _, payload in await connection.execute(query, {"number": number}):
-            change = msgspec.json.decode(payload, type=_Tagging)
+        for sequence, payload in await connection.execute(query, {"number": row.number}):
+            try:
+                change = msgspec.json.decode(payload, type=_Tagging)
+            except msgspec.DecodeError as error:
+                raise LogDamaged(row.id, sequence, f"its payload cannot be read: {error}") from error
             tags = retagged(tags, (*change.tags, *change.added), change.removed)
     return tags
 

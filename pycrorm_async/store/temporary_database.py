@@ -1,6 +1,6 @@
 """Create the folder behind `sqlite://`: private to one process, in shared memory if possible, removed at the end.
 
-A file instead of SQLite's `:memory:`, because the writer thread, readers and the spool need a database that several
+The database is a file and not SQLite's `:memory:`, because the writer thread and the readers need one that several
 connections share. Only the owner can enter the folder. It contains a file `mark`, locked by `flock` while the process
 lives. The next process of the same user removes folders whose mark it can lock, which killed processes left.
 

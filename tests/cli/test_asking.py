@@ -70,12 +70,12 @@ def test_without_a_name_the_questions_are_listed_and_with_sql_the_statement(fold
         (["longest_actions", "--status", "SUCEEDED"], "did you mean SUCCEEDED?"),
         pytest.param(
             ["durations", "--episode", "77"],
-            "there is no episode '77' (`pycrorm episodes` lists the 7 there are)",
+            "there is no episode '77' (`pycrorm episodes` lists all 7)",
             marks=pytest.mark.soak,
         ),
         pytest.param(
             ["durations", "--episode", "00000000"],
-            "7 episodes have an id that begins with '00000000': give more of it",
+            "7 episodes have an id that begins with '00000000': use more of its digits",
             marks=pytest.mark.soak,
         ),
         pytest.param(

@@ -187,7 +187,7 @@ def test_the_running_nodes_of_a_killed_robot_are_shown(tmp_path: Path) -> None:
         (["1", "--at", "#3.5"], "--at takes seconds since the episode's start, or an event such as e300, got '#3.5'"),
         (["1", "--at=-1"], "-1 s is before episode 1 began"),
         (["1", "--at", "#0"], "event 0 is before episode 1 began"),
-        (["7", "--at", "1"], "there is no episode '7' (`pycrorm episodes` lists the one there is)"),
+        (["7", "--at", "1"], "there is no episode '7' (`pycrorm episodes` lists the only one)"),
     ],
 )
 def test_an_invalid_moment_of_an_episode_is_one_line(ridden: Path, arguments: list[str], message: str) -> None:

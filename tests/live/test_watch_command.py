@@ -117,8 +117,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize(
     ("arguments", "code", "message"),
     [
-        (("77",), 2, "there is no episode '77' (`pycrorm episodes` lists the one there is)"),
-        (("77", "--terminal"), 2, "there is no episode '77' (`pycrorm episodes` lists the one there is)"),
+        (("77",), 2, "there is no episode '77' (`pycrorm episodes` lists the only one)"),
+        (("77", "--terminal"), 2, "there is no episode '77' (`pycrorm episodes` lists the only one)"),
         (("1", "--terminal", "--json"), 2, "--terminal serves no page: leave out --port, --open and --json"),
         (("--url", "mysql://host/name"), 2, "mysql:// is not a supported database"),
         (("--url", "sqlite://"), 2, "sqlite:// exists only in its own process"),
@@ -176,7 +176,7 @@ def test_the_server_answers_its_own_pages_and_no_others(watch: Callable[..., Wat
     root = "/".join(server.address.split("/")[3:4])
     assert server.get(f"/{root}/episode/77") == (
         404,
-        "there is no episode '77' (`pycrorm episodes` lists the one there is)",
+        "there is no episode '77' (`pycrorm episodes` lists the only one)",
     )
     assert server.get(f"/{root}/episode/1?from=99") == (404, "episode 1 has 7 events, and none from event 99")
     assert server.get(f"/{root}/episode/1", origin="http://127.0.0.1:1")[0] == 403

@@ -14,7 +14,7 @@ import pytest
 from sqlalchemy import select
 
 from pycrorm_async import Memory, Reading, Settings, recover
-from pycrorm_async.errors import CallerError, DatabaseUnavailable, UnknownEpisode
+from pycrorm_async.errors import CallerError, DatabaseUnavailable, LogDamaged, UnknownEpisode
 from pycrorm_async.operations import tag as operation
 from pycrorm_async.operations.copy import copy_episodes
 from pycrorm_async.operations.rebuild import rebuild_memory
@@ -26,7 +26,7 @@ from pycrorm_async.store.episode_lookup import tags_of as log_tags
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.postgresql.roles import GRANTS
 from tests.commands import answer, one_line_of, pycrorm
-from tests.databases import Server, ask
+from tests.databases import Server, ask, ask_to_change
 from tests.memory.note_actions import NoteActionPerformable
 from tests.projections.verify_cases import TYPES, full
 from tests.table_comparison import differences, tables_of
@@ -128,6 +128,18 @@ async def test_a_tagger_that_loses_a_race_decides_again_from_the_new_tags(
     async with Reading.open(database_url) as reading:
         assert await tags_of(reading) == {"one": ["first"]}
     await assert_intact(database_url)
+
+
+async def test_tagging_an_episode_with_a_damaged_tag_names_the_event(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path}/memory.db"
+    async with Memory.open(url, spool=tmp_path / "spool") as memory, memory.episode(description="one"):
+        pass
+    tagged = await tag_episode(DatabaseAddress.parse(url), "1", ("kitchen",), ())
+    ask_to_change(url, "DROP TRIGGER event_is_not_updated")
+    ask_to_change(url, "UPDATE event SET payload = '{\"added' WHERE type = 'EpisodeTagged'")
+    with pytest.raises(LogDamaged, match="its payload cannot be read") as refused:
+        await tag_episode(DatabaseAddress.parse(url), "1", ("night",), ())
+    assert (refused.value.episode, refused.value.sequence) == (tagged.id, 5)
 
 
 @pytest.mark.soak_on("postgresql")
@@ -286,6 +298,7 @@ async def test_a_recorders_role_tags_and_a_readers_role_does_not(server: Server,
 async def assert_log_has(url: str, *tags: str) -> None:
     log = await EventLog.open(DatabaseAddress.parse(url), create=False)
     try:
-        assert await log_tags(log, 1) == tags
+        [row] = await log.episodes()
+        assert await log_tags(log, row) == tags
     finally:
         await log.close()

@@ -429,7 +429,7 @@ async def test_wrong_names_and_values_are_answered_with_the_right_ones(reading: 
         await ask.durations(episode=1.5).rows()  # type: ignore[arg-type]
     with pytest.raises(UnknownEpisode, match="there is no episode '99'"):
         await ask.durations(episode=99)
-    with pytest.raises(UnknownEpisode, match="25 episodes have an id that begins with '0000': give more of it"):
+    with pytest.raises(UnknownEpisode, match="25 episodes have an id that begins with '0000': use more of its digits"):
         await ask.durations(episode="0000").rows()
 
 

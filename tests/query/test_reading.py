@@ -101,9 +101,9 @@ async def test_an_episode_is_found_by_number_by_id_or_as_the_last(reading: Readi
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("3", "there is no episode '3' (`pycrorm episodes` lists the 2 there are)"),
-        ("first", "there is no episode 'first' (`pycrorm episodes` lists the 2 there are)"),
-        ("00000000-0000", "2 episodes have an id that begins with '00000000-0000': give more of it"),
+        ("3", "there is no episode '3' (`pycrorm episodes` lists all 2)"),
+        ("first", "there is no episode 'first' (`pycrorm episodes` lists all 2)"),
+        ("00000000-0000", "2 episodes have an id that begins with '00000000-0000': use more of its digits"),
     ],
 )
 async def test_an_unknown_or_ambiguous_episode_is_refused(reading: Reading, name: str, message: str) -> None:

@@ -260,7 +260,7 @@ async def test_a_simulated_episode_is_found_by_name_and_the_last_episode_is_a_re
         assert (await reading.episode("2")).simulated
         assert (await reading.episode(episode_text(Script(2).episode))).number == 2
         assert (await reading.episode("last")).number == 1
-        with pytest.raises(UnknownEpisode, match="lists the one there is"):
+        with pytest.raises(UnknownEpisode, match="lists the only one"):
             await reading.episode("3")
 
 

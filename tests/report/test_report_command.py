@@ -47,7 +47,7 @@ def test_a_file_that_exists_is_replaced_only_when_asked(recorded: Path, tmp_path
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("77",), "pycrorm: there is no episode '77' (`pycrorm episodes` lists the 3 there are)"),
+        (("77",), "pycrorm: there is no episode '77' (`pycrorm episodes` lists all 3)"),
         ((), "pycrorm: name an episode, for example `pycrorm report last`, or write all of them with --all"),
         (
             ("1", "--all"),

@@ -7,7 +7,7 @@ the head that the transaction sees under its lock; otherwise, as after a restart
 it is computed again from the kept digest before the current block and the block's events in the log. So a process that
 restarts takes over the events of an incomplete block as the log holds them.
 
-The table only grows: a digest is inserted once and never changed, like an event. It is no part of the log's format:
+The table only grows: a digest is inserted once and never changed, like an event. It is not part of the log's format:
 older programs still use the log, and the episodes that they append get no digests. If the digest before the current
 block is missing, the episode gets no further ones. On PostgreSQL a login that may not insert digests, because the
 owner has not run `GRANTS` again, appends without them.

@@ -10,7 +10,7 @@ digest depends on the id and on every event from the first one on, and on nothin
 sizes of batches and the database make no difference.
 
 An event is encoded as a MessagePack array of sequence, type, version, both times and payload, in the shortest forms.
-The encoding of an event gives its own length, so no two lists of events have the same encoding.
+The encoding of an event contains its own length, so no two lists of events have the same encoding.
 
 The log keeps the digest at the end of each block, at the end of the episode, and at each tag behind its end. The events
 behind the last kept digest, at most 255 of an episode that has not ended, are not covered yet. A kept digest is 64

@@ -61,7 +61,7 @@ BEGIN
     BEGIN
         EXECUTE format('ALTER SCHEMA {TABLES} OWNER TO pycrorm_folder');
     EXCEPTION WHEN insufficient_privilege THEN
-        BEGIN  -- one who created the role may become a member of it, and is not by itself
+        BEGIN  -- the creator of a role is not a member of it, but may become one
             EXECUTE format('GRANT pycrorm_folder TO %I', current_user);
         EXCEPTION WHEN insufficient_privilege THEN
             RAISE EXCEPTION '% cannot hand the tables over; a role with CREATEROLE runs: GRANT pycrorm_folder TO %',

@@ -81,7 +81,7 @@ CREATE TABLE {LOG}.pycrorm_declaration (
     payload text NOT NULL
 )"""
 
-# A sequence, so that no robot waits for another one's transaction; a rollback leaves a hole.
+# Numbers come from a sequence, so that no robot waits for another one's transaction; a rollback leaves a hole.
 _NUMBERS = f"CREATE SEQUENCE {LOG}.episode_number"
 
 _EPISODE = f"""
@@ -102,8 +102,8 @@ _BEHIND = f"CREATE INDEX episode_behind ON {LOG}.episode (number) WHERE folded <
 _STOPPED = f"CREATE INDEX episode_stopped ON {LOG}.episode (number) WHERE refused IS NOT NULL OR parked IS NOT NULL"
 
 # integer holds both parts of the key (`events.ids`) in half the bytes. Logs of 0.1.0 have bigint, which reads alike.
-# No room in the pages of the key, because events are only appended.
-# text, because jsonb refuses U+0000, reorders keys and rounds numbers; text keeps the bytes of the queue.
+# The fill factor leaves no room in the pages of the key, because events are only appended.
+# The payload is text, which keeps the bytes of the queue: jsonb refuses U+0000, reorders keys and rounds numbers.
 _EVENT = f"""
 CREATE TABLE {LOG}.event (
     episode integer NOT NULL,

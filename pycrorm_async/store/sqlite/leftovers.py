@@ -20,7 +20,8 @@ _WITH_CONTENT: Final = ("-wal", "-journal")
 _ORPHANED: Final = ".orphaned"
 """Suffix of a kept file; the next one replaces it, so that at most one is kept."""
 _LOCK_WAIT_S: Final = 10.0
-"""Bounds the wait for another process that does the same, which takes a moment; another user could hold the lock."""
+"""Bounds the wait for another process that does the same, which takes milliseconds. Another user, who can read the
+folder, can hold its lock for ever: after this time the leftovers are moved without it."""
 _RETRY_S: Final = 0.001
 """The pause in s between two attempts."""
 

@@ -39,11 +39,11 @@ CREATE TABLE episode (
     parked TEXT
 ) STRICT"""
 
-# Read at every poll: contains few rows, whatever the number of episodes.
+# Each poll reads this index; it contains few rows, whatever the number of episodes.
 _BEHIND = "CREATE INDEX episode_behind ON episode (number) WHERE folded < head AND parked IS NULL"
 _STOPPED = "CREATE INDEX episode_stopped ON episode (number) WHERE refused IS NOT NULL OR parked IS NOT NULL"
 
-# With a rowid, because the rows are too long for WITHOUT ROWID, which appended a third slower.
+# The table has a rowid, because the rows are too long for WITHOUT ROWID, which appended a third slower.
 _EVENT = """
 CREATE TABLE event (
     episode INTEGER NOT NULL,
