@@ -3,6 +3,7 @@
     spool/                     one folder, bound to one database
       log                      id of that database's log, one line; fixed while the spool holds a recorder's folder
       writer                   locked by the daemon that drains the spool
+      stored/<log id>/         segments whose records are all stored, and the stored heads (`retention/`)
       <recorder>/              one recorder, one life of a process; the name is its UUID, so names sort by time
         alive                  locked (flock) by the recorder as long as it lives
         drain                  locked by the process that drains the folder
@@ -20,7 +21,7 @@ All numbers in segments are little endian, and every structure begins at a multi
 
     offset  type  header of a segment
     0       8 s   magic, "PYCRQSEG"
-    8       u32   format, 1; a program refuses a format it does not know
+    8       u32   format, 1; a program refuses a newer format than its own
     12      u32   salt: crc32 of the recorder's id and the number as u64
     16      16 s  the recorder's id
     32      u64   number of the segment, 1 …

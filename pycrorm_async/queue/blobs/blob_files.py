@@ -61,7 +61,7 @@ def is_whole(folder: Path, name: str) -> bool:
 
 
 def carry_blobs(source: Path, target: Path) -> None:
-    """Give the blobs of a recorder's folder to another one too. Durable on return. Raises `OSError`."""
+    """Link the blobs of a recorder's folder into another one, or copy them. Durable on return. Raises `OSError`."""
     blobs = blob_files(source)
     if not blobs:
         return

@@ -216,7 +216,7 @@ class DrainStatusReader:
         return True
 
     def read(self, *, synced: int) -> DrainStatus:
-        """Read the drainer's status; one that claims records beyond `synced`, which never left, counts as empty."""
+        """Read the drainer's status; one with positions beyond `synced`, which no drainer can have, counts as empty."""
         status = self._progress.drained()
         if max(status.stored, status.folded) > synced:
             return DrainStatus()

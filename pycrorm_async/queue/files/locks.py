@@ -22,7 +22,7 @@ from zlib import crc32
 from pycrorm_async.queue.files.file_access import open_file
 
 _ATTEMPTS = 5
-"""Attempts at a lock that a concurrent `is_locked` may hold, and at a note that is being written: milliseconds."""
+"""Attempts at a lock that a concurrent `is_locked` may hold, and at a note that is being written: 5 ms in total."""
 _FOLDER_ATTEMPTS = 10_000
 """Attempts at a folder's lock: ten seconds in total."""
 _RETRY_S = 0.001

@@ -87,7 +87,7 @@ def begin_folder(spool: Path, name: str, access: FileAccess = "owner") -> tuple[
 
 
 def finish_folder(unfinished: Path, *, replaced: Path | None = None) -> Path:
-    """Give the folder its final name and take `alive` from the folder it replaces. Raises `SpoolUnavailable`."""
+    """Give the folder its final name, and delete `alive` in the folder it replaces. Raises `SpoolUnavailable`."""
     folder = unfinished.with_name(unfinished.name.removesuffix(MAKING))
     with wrap_os_errors(folder):
         unfinished.rename(folder)

@@ -33,7 +33,7 @@ SEGMENT_BYTES_MAX: Final = 2**30
 _HEADER: Final = Struct("<8sII16sQQI")
 _CHECKSUM: Final = Struct("<I")
 _MADV_POPULATE_WRITE: Final = 23
-"""The number of Linux, which Python has no name for."""
+"""Linux's number for this advice to `madvise`; Python's `mmap` has no name for it."""
 _POSITION_MAX: Final = 2**62
 """Bounds the position in a header: no recorder reaches it, so a header above it was changed."""
 _FIXED: Final = _HEADER.size + _CHECKSUM.size

@@ -127,7 +127,7 @@ class SpoolReport:
         log_id: id of the log that the spool is bound to; None before the first drain.
         recorders: the recorders' folders, oldest first.
         set_aside: damaged folders that `repair` replaced.
-        unfinished: empty folders left by a process that was killed while it created or removed them.
+        unfinished: folders left by a process that was killed while it created, repaired or removed them.
         strangers: entries that are not ours.
     """
 

@@ -4,7 +4,7 @@ The damaged folder is renamed unchanged to `<recorder>.damaged`, and a new folde
 the segments before the damage and new segments with the whole records behind it, as far as `salvage.py` can keep them.
 
 The new folder is built beside the old one, scanned and synced before either is renamed. After a kill at any point the
-next repair continues: it builds an unfinished folder again, and gives a finished one its name.
+next repair continues: it builds an unfinished folder again, and renames a finished one.
 """
 
 from __future__ import annotations

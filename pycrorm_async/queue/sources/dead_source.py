@@ -1,7 +1,7 @@
 """Drain a dead recorder's folder: supply its whole records and the computed ends, then delete the folder.
 
 **Theory of operation.** `open_dead` takes `alive`, which proves that the recorder is dead, and `drain`, which excludes
-other drainers; `release` gives both back. No process writes the segments any more, so the only races are with other
+other drainers; `release` releases both. No process writes the segments any more, so the only races are with other
 recoverers, which the locks exclude, and with a kill of this process.
 
 The source scans one segment at a time (`files/scan.py`) and syncs it before it supplies any of its records: a killed

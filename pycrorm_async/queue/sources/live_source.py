@@ -188,7 +188,7 @@ class LiveSource:
             self._drain.release()
         if is_alive and self.stored != self.supplied:
             return None
-        return "has ended" if closed else "is left at work" if is_alive else "died"
+        return "has ended" if closed else "is still recording" if is_alive else "died"
 
     # --- inside -----------------------------------------------------------------------------------------------
 
