@@ -40,7 +40,7 @@ __all__ = [
 _ROOM_BYTES: Final = 4 << 30
 """A server takes at most half a gigabyte, and each test process starts one or two."""
 _RENAME_LOG: Final = ("SET session_replication_role = replica", "UPDATE pycrorm_log SET id = gen_random_uuid()")
-"""Give a copied log an id of its own; as a replica the server does not run the triggers that refuse it."""
+"""Change the id of a copied log to one of its own; as a replica the server does not run the triggers that refuse it."""
 
 
 class Server:

@@ -28,7 +28,7 @@ _TESTS: Final = Path(__file__).parent
 def long_modules_first(items: Sequence[pytest.Item], processes: int) -> list[pytest.Item]:
     """Return the tests in equal shares, one for each process, with the long modules among the first half of each.
 
-    pytest-xdist gives each process a share at once, and a process that has finished its own the end of another's.
+    pytest-xdist assigns each process a share at once, and a process that has finished its own the end of another's.
     """
     modules: dict[str, list[pytest.Item]] = {}
     for item in items:

@@ -1,8 +1,8 @@
 """Count the bytes that this process has allocated, for scripts of tests that look for growth.
 
 Start the process with `ALLOCATING`: without Python's own allocator, malloc counts all bytes in use. The number of pages
-says less: how many are only partly in use changes by megabytes on a busy machine. SQLite's own memory does not count:
-each connection keeps up to 2 MB of pages of its database, and fills them whenever it happens to be used.
+is less exact: how many are only partly in use changes by megabytes on a busy machine. SQLite's own memory does not
+count: each connection keeps up to 2 MB of pages of its database, and fills them whenever it happens to be used.
 """
 
 from __future__ import annotations

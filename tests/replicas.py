@@ -57,7 +57,7 @@ class Replicas:
         self._until(self._standby, "SELECT count(*) = 0 FROM pg_stat_wal_receiver")
 
     def fail_over(self) -> None:
-        """Crash the primary, promote the standby, and give it the address."""
+        """Crash the primary, promote the standby, and move the address to it."""
         assert self._standby is not None
         self._stop(self._primary)
         gone, self._primary, self._standby = self._primary, self._standby, None

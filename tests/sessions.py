@@ -13,7 +13,7 @@ __all__ = ["session_on"]
 
 
 def session_on(log: EventLog) -> AsyncSession:
-    """Return a session whose objects load what is read of them, with the classes that the log's engine knows."""
+    """Return a session whose objects load what is read of them, with the classes of the log's engine."""
     engine = log.address.engine(read_only=True)
     vars(engine.dialect)["pycrorm_known_classes"] = known_classes(log.engine.dialect)
     on_access = LoadOnAccess(engine, log.translated)

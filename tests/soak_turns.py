@@ -4,7 +4,7 @@
     python -m pytest -m soak --soak-turn=4f1c2ab      the turn of that commit, again
     python -m pytest -m soak                          every test, in full length
 
-The hash of its node id gives a test its turn, so that other tests may come and go. Outside a git checkout the turn is
+The hash of its node id decides a test's turn, so that other tests may come and go. Outside a git checkout the turn is
 that of `FIXED`.
 """
 
@@ -21,7 +21,7 @@ FIXED: Final = "0"
 
 
 def turn_of(commit: str) -> int:
-    """Return the turn of a commit. The first seven digits of its id count, so that the short id gives the same."""
+    """Return the turn of a commit. The first seven digits of its id count, so that the short id leads to the same."""
     return int(commit[:7], 16) % TURNS
 
 

@@ -293,7 +293,7 @@ def test_a_file_that_may_only_be_read_is_refused_before_the_plan_runs_and_can_be
     assert done.returncode == 3
 
 
-def test_a_memory_without_episodes_says_so_and_how_to_record_one(folder: Path) -> None:
+def test_without_episodes_one_line_names_the_command_that_records_one(folder: Path) -> None:
     assert pycrorm("writer", "--once", "--url", "sqlite:///new.db", cwd=folder).returncode == 0
     how = "record one with `pycrorm run` or `pycrorm demo`"
     done = pycrorm("show", "last", "--url", "sqlite:///new.db", cwd=folder)

@@ -156,7 +156,7 @@ def forgets_the_last(records: list[Record]) -> list[Record]:
     return [each for each in records if each.position != last]
 
 
-def gives_the_last_twice(records: list[Record]) -> list[Record]:
+def repeats_the_last(records: list[Record]) -> list[Record]:
     return [*records, *[each for each in records if _is_kept(each)][-1:]]
 
 
@@ -170,7 +170,7 @@ def changes_one(records: list[Record]) -> list[Record]:
 
 _BREAKS = [
     (forgets_the_last, "lost"),
-    (gives_the_last_twice, "duplicated"),
+    (repeats_the_last, "duplicated"),
     (swaps_two, "misordered"),
     (changes_one, "corrupted"),
 ]

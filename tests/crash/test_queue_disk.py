@@ -74,7 +74,7 @@ async def test_a_sync_that_would_succeed_after_a_failed_one_does_not_hide_it(
     queue.put_nowait(node(), b"dropped by the kernel")
     fdatasync, failures = os.fdatasync, [OSError(errno.EIO, os.strerror(errno.EIO))]
 
-    def fail_once(descriptor: int) -> None:  # as Linux does: the next call no longer knows of the lost pages
+    def fail_once(descriptor: int) -> None:  # as Linux does: the next call does not report the lost pages
         if failures:
             queue.put_nowait(node(), b"put meanwhile")
             raise failures.pop()

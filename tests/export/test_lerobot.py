@@ -137,7 +137,7 @@ async def test_by_time_a_frame_holds_the_state_in_force(reading: Reading, tmp_pa
     assert (await export_again(reading, tmp_path / "time.manifest.json")).same
 
 
-async def test_by_time_a_frame_names_the_action_that_runs_while_the_robot_stands_still(tmp_path: Path) -> None:
+async def test_by_time_a_frame_names_the_action_that_runs_while_the_robot_does_not_move(tmp_path: Path) -> None:
     script = Script()
     put = script.put
     put(EpisodeStarted("drive and talk", "me", "host", "1.0", "3.11"))  # 1

@@ -51,7 +51,7 @@ class GreetActionPerformable(ActionAbstract):
     hand: Arms
 
     async def perform(self) -> None:
-        """Says nothing."""
+        """Do nothing."""
 
 
 POSE = '{"position":[%s],"orientation":[0.0,0.0,0.0,1.0],"frame":"map","time_ns":1700000000000000001}'

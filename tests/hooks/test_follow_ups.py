@@ -359,7 +359,7 @@ async def test_a_follow_up_whose_event_cannot_be_written_is_retried_and_every_no
     assert case.emitter.faults.total == 1
     assert case.recorder.episodes.continued_count == 1
     ended = {f"day {number} SUCCEEDED": 1 for number in range(60)} | {"other SUCCEEDED": 3}
-    if put > 1:  # it ended before the second attempt, and its end says that the episode continues
+    if put > 1:  # it ended before the second attempt, and its end names the episode that continues it
         del ended["day 41 SUCCEEDED"]
     assert outcomes(case) == Counter(ended)
     moves = [event for events in parts_of(case.sink) for _, event in only(events, ObjectMoved)]

@@ -130,7 +130,7 @@ def test_conditioned_samples_match_the_evidence_and_are_possible() -> None:
     assert region.contains(x, y).all()
 
 
-def test_the_same_generator_gives_the_same_samples_in_any_batches() -> None:
+def test_the_same_generator_draws_the_same_samples_in_any_batches() -> None:
     at_once = TWO.sample(np.random.default_rng(6), 50)
     one_by_one = np.random.default_rng(6)
     assert [TWO.sample(one_by_one)[0] for _ in range(50)] == at_once

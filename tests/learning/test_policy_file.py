@@ -76,7 +76,7 @@ def test_the_file_is_json_with_enum_members_by_name(tmp_path: Path) -> None:
     assert content["leaves"][1]["height"] == {"type": "linear", "knots": [0.5, 0.9], "cumulative": [0.0, 1.0]}
 
 
-def test_no_changed_byte_gives_another_policy(tmp_path: Path) -> None:
+def test_no_changed_byte_yields_another_policy(tmp_path: Path) -> None:
     path = tmp_path / "policy.json"
     save_policy(LEARNED, path)
     whole = path.read_bytes()
@@ -86,7 +86,7 @@ def test_no_changed_byte_gives_another_policy(tmp_path: Path) -> None:
             load_policy(path)
 
 
-def test_no_cut_gives_another_policy(tmp_path: Path) -> None:
+def test_no_cut_yields_another_policy(tmp_path: Path) -> None:
     path = tmp_path / "policy.json"
     save_policy(LEARNED, path)
     whole = path.read_bytes()

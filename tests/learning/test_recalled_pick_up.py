@@ -99,7 +99,7 @@ async def test_what_is_expected_to_be_worse_than_an_average_try_is_left_to_the_p
     assert [each.chosen_by for each in found] == ["default policy"] * 2
 
 
-async def test_a_learned_policy_comes_before_the_default_policy_and_may_not_know_the_height(stage: Stage) -> None:
+async def test_a_learned_policy_comes_before_the_default_policy_and_may_lack_the_height(stage: Stage) -> None:
     learned = default_policy().condition(Evidence(arms=frozenset({Arms.LEFT})))
     found = await alternatives(recalled(stage, Known([]), policy=learned, samples=2))
     assert [each.chosen_by for each in found] == [name_of(learned)] * 2 + ["default policy"] * 2

@@ -155,7 +155,7 @@ def test_samples_are_distributed_as_the_successes(learned: Policy, successes: li
         assert max(map(abs, apart)) < 0.05
 
 
-def test_learning_again_gives_the_same_policy(learned: Policy, successes: list[PickUpChoice]) -> None:
+def test_learning_again_yields_the_same_policy(learned: Policy, successes: list[PickUpChoice]) -> None:
     assert learn(frame_of(successes)) == learned
 
 

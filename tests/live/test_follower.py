@@ -170,7 +170,7 @@ async def test_an_event_that_cannot_be_read_is_a_fault_of_the_feed_behind_what_w
     await follower.close()
 
 
-async def test_a_full_page_says_so_and_another_begins_behind_it(
+async def test_a_full_page_is_marked_as_full_and_another_begins_behind_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(episode_fold, "_NODES_MAX", 2)

@@ -82,7 +82,7 @@ async def test_a_page_follows_a_whole_plan_of_another_process_to_its_end(
     assert milk == [1.3, 0.45, 0.9]
 
 
-def test_a_page_says_that_its_server_died_and_continues_when_it_is_back(
+def test_a_page_reports_that_its_server_died_and_continues_when_it_is_back(
     chrome: Browser, watch: Callable[..., Watch], tmp_path: Path
 ) -> None:
     with robot_in(tmp_path) as robot:

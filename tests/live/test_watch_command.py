@@ -192,7 +192,7 @@ def test_the_server_answers_its_own_pages_and_no_others(watch: Callable[..., Wat
     assert "Traceback" not in server.process.stderr.read()
 
 
-def test_a_damaged_episode_is_said_to_be_so(watch: Callable[..., Watch], folder: Path, tmp_path: Path) -> None:
+def test_a_damaged_episode_is_reported_as_damaged(watch: Callable[..., Watch], folder: Path, tmp_path: Path) -> None:
     with robot_in(tmp_path) as robot:
         robot.start("one")
     with closing(sqlite3.connect(tmp_path / "pycrorm.db")) as database, database:

@@ -111,7 +111,7 @@ async def test_the_daemon_may_start_before_the_database_exists(tmp_path: Path, s
     await started.task
 
 
-async def test_without_a_daemon_flush_says_so_and_closing_leaves_the_events_to_the_next_drainer(
+async def test_without_a_daemon_flush_raises_and_closing_leaves_the_events_to_the_next_drainer(
     database_url: str, spool: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     async with memory_at(database_url, spool, replace(QUICK, flush_timeout_s=0.3)) as memory:

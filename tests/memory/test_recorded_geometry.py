@@ -162,7 +162,7 @@ async def test_a_robot_is_seen_again_by_a_fresh_process_when_its_files_are_gone(
         assert links[link] == pytest.approx(pose, abs=1e-6), link
 
 
-async def test_the_boxes_of_an_arm_cover_its_meshes_and_the_files_give_the_meshes_themselves(
+async def test_the_boxes_of_an_arm_cover_its_meshes_and_the_files_hold_the_meshes_themselves(
     database_url: str, tmp_path: Path
 ) -> None:
     robot = made_arm(tmp_path / "files")
@@ -285,7 +285,7 @@ async def test_a_robot_under_another_name_keeps_its_description(database_url: st
         assert [(each.name, each.robot_description) for each in world.objects] == [("ada", PR2), ("bob", PR2)]
 
 
-async def test_objects_of_an_older_version_have_assumed_shapes_and_say_so(tmp_path: Path) -> None:
+async def test_objects_of_an_older_version_have_assumed_shapes_and_are_marked_so(tmp_path: Path) -> None:
     url = unpack_memory_v1(tmp_path)
     await rebuild_memory(url)
     async with Reading.open(url) as reading:

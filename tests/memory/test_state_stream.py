@@ -97,7 +97,7 @@ async def test_a_trajectory_is_recorded_with_its_values_and_times(tmp_path: Path
 
 
 async def test_the_state_at_any_moment_is_the_last_written_value_of_each_channel(tmp_path: Path) -> None:
-    """Over several motions of several parts: the samples up to the end of a motion give the robot's state after it."""
+    """Over several motions of several parts, the samples up to the end of a motion add up to the robot's state then."""
     stood: list[dict[str, float]] = []
     async with Memory.open(url_of(tmp_path), settings=Settings(sample_interval_ms=1)) as memory:
         async with memory.episode(description="moving"):

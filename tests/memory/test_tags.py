@@ -232,7 +232,7 @@ async def test_metadata_that_cannot_be_recorded_is_missing_and_counted(tmp_path:
         assert [each.metadata for each in summaries] == [{"nan": None, "nul": None, "good": [1]}, None]
 
 
-def test_the_command_tags_lists_and_says_what_it_cannot_do(tmp_path: Path) -> None:
+def test_the_command_tags_lists_and_names_what_it_cannot_do(tmp_path: Path) -> None:
     (tmp_path / "hello.py").write_text("async def plan():\n    pass\n\nasync def own(memory):\n    pass\n")
     done = pycrorm("run", "hello.py", "--tag", "kitchen", "--tag", "night", cwd=tmp_path)
     assert done.returncode == 0, done.stderr

@@ -1,6 +1,6 @@
 """Inject a fault into a fold worker: at the next batch that it has written and not committed, the fault happens.
 
-A daemon gives its workers the projection `Trapped`, so that they import this module. The daemon's own process is not
+A daemon passes its workers the projection `Trapped`, so that they import this module. The daemon's own process is not
 affected. The word in the file that PYCRORM_TRAP names is removed before the fault, so that it happens once.
 """
 

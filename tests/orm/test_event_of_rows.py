@@ -1,4 +1,4 @@
-"""Every row of what happened knows its event: as an attribute of the mapped classes, and in plain SQL."""
+"""Every row of what happened has its event: as an attribute of the mapped classes, and in plain SQL."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ async def filled(log: EventLog) -> EventLog:
     return log
 
 
-async def test_a_mapped_row_knows_its_event_and_queries_order_by_it(filled: EventLog) -> None:
+async def test_a_mapped_row_has_its_event_and_queries_order_by_it(filled: EventLog) -> None:
     async with session_on(filled) as session:
         for class_, event in EVENTS.items():
             assert list(await session.scalars(select(func.max(class_.sequence)))) == [event], class_

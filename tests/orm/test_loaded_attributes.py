@@ -81,7 +81,7 @@ async def transport(memory: Memory) -> None:
 
 
 @pytest.mark.soak_on("postgresql")
-async def test_every_attribute_is_loaded_or_says_how_to_load_it(
+async def test_every_attribute_is_loaded_or_its_error_names_how_to_load_it(
     database_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -106,7 +106,7 @@ async def test_every_attribute_is_loaded_or_says_how_to_load_it(
 
 
 @pytest.mark.soak_on("postgresql")
-async def test_attributes_on_request_are_loaded_as_the_error_says(
+async def test_attributes_on_request_are_loaded_as_the_error_advises(
     database_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)

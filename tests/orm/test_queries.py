@@ -322,7 +322,7 @@ async def test_the_parts_of_a_pose_can_be_joined(breakfast: EventLog) -> None:
         assert (await session.execute(question)).all() == [(0.5, 0.6)]
 
 
-async def test_objects_are_rows_of_moments_and_parts_know_their_whole(breakfast: EventLog) -> None:
+async def test_objects_are_rows_of_moments_and_parts_refer_to_their_whole(breakfast: EventLog) -> None:
     milk = await every(breakfast, select(Object).where(Object.identity_id == row(4)).order_by(Object.id))
     assert [(each.id, each.pose.position.x, each.node_id) for each in milk] == [
         (row(4), 1.0, None),
@@ -549,7 +549,7 @@ async def test_times_can_be_compared_and_a_naive_one_is_refused(breakfast: Event
     assert int(moment(0).timestamp()) * 10**9 == T0_NS
 
 
-async def test_a_row_knows_its_event_and_queries_filter_and_order_by_it(breakfast: EventLog) -> None:
+async def test_a_row_has_its_event_and_queries_filter_and_order_by_it(breakfast: EventLog) -> None:
     nodes = await every(breakfast, select(TaskTreeNode).order_by(TaskTreeNode.sequence.desc()))
     assert [each.sequence for each in nodes] == sorted((each.sequence for each in nodes), reverse=True)
     assert all(each.id == row(each.sequence) for each in nodes)

@@ -227,7 +227,7 @@ async def test_a_past_success_inside_furniture_is_refused_with_the_obstacle(scen
     assert any(each.reason.startswith("base in collision with kitchen") for each in recording.refused[0])
 
 
-def test_without_a_place_for_the_base_the_policy_says_so() -> None:
+def test_without_a_place_for_the_base_the_policy_raises() -> None:
     with BulletWorld(), colliding():
         Object("pr2", ObjectType.ROBOT, pose=AWAY)
         milk = Object("milk", ObjectType.MILK, pose=Pose([0, 0, 0.9]))

@@ -99,7 +99,7 @@ def test_grasping_and_perceiving_actions_accept_objects_and_handles(scene: Scene
     assert list(OpenAction(handles, both)) == [OpenActionPerformable(handle, arm) for handle in handles for arm in both]
 
 
-def test_iterating_gives_every_combination_the_last_property_fastest() -> None:
+def test_iterating_yields_every_combination_the_last_property_fastest() -> None:
     both = SetGripperAction([Arms.LEFT, Arms.RIGHT], [GripperState.OPEN, GripperState.CLOSE])
     expected = [
         SetGripperActionPerformable(Arms.LEFT, GripperState.OPEN),

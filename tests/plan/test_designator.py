@@ -23,7 +23,7 @@ class SayingActionPerformable(ActionAbstract):
     text: str
 
     async def perform(self) -> str:
-        """Say it."""
+        """Do nothing."""
         return self.text.upper()
 
 

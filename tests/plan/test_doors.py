@@ -253,7 +253,7 @@ async def test_accessing_moves_a_joint_by_a_distance(
         ({"arm": Arms.BOTH}, IllPosedGoalFailure, "does not work with BOTH"),
     ],
 )
-async def test_an_impossible_access_gives_the_reason_and_moves_nothing(
+async def test_an_impossible_access_names_the_reason_and_moves_nothing(
     scene: Scene, changed: dict[str, object], failure: type[Exception], message: str
 ) -> None:
     part = await SINK.base_placed_by(scene)

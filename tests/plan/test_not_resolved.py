@@ -1,4 +1,4 @@
-"""A description in place of a resolved designator: one line says that `.resolve()` is missing."""
+"""A description in place of a resolved designator: one line states that `.resolve()` is missing."""
 
 from __future__ import annotations
 

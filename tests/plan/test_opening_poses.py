@@ -1,4 +1,4 @@
-"""Base poses for opening and closing: every candidate works, and an impossible request gives its reason."""
+"""Base poses for opening and closing: every candidate works, and an impossible request names its reason."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An object is transported by the expected actions and locations, or the failure gives the reason."""
+"""An object is transported by the expected actions and locations, or the failure names the reason."""
 
 from __future__ import annotations
 

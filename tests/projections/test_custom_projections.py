@@ -273,7 +273,7 @@ async def test_the_reason_why_a_process_stops_folding_it_remains_until_the_proje
     assert state.fault is None
 
 
-async def test_a_rebuild_gives_the_same_rows_as_live_folding(log: EventLog) -> None:
+async def test_a_rebuild_makes_the_same_rows_as_live_folding(log: EventLog) -> None:
     projector = await folded(log, [*declarations(PICK_UP), *mixed(tries(1), tries(2))], GraspRate())
     await rebuilt(log, GraspRate())
     assert await visible_rows(log) == [*rows_of(1), *rows_of(2)]

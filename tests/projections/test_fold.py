@@ -444,7 +444,7 @@ def test_nodes_of_the_language_have_a_table_too() -> None:
     ],
     ids=["undeclared", "another type", "no pose", "no sequence", "no candidate", "no object"],
 )
-def test_an_event_that_cannot_be_folded_gives_the_reason_and_leaves_no_row(event: Any, reason: str) -> None:
+def test_an_event_that_cannot_be_folded_names_the_reason_and_leaves_no_row(event: Any, reason: str) -> None:
     script = Script()
     script.put(event)
     rows = Rows()

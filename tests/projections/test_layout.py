@@ -73,7 +73,7 @@ def test_a_contradiction_with_another_table_of_the_same_type_is_refused() -> Non
         layout_of(SAYING, declared("SayingAction", "ORMSaying", field("text", "real", 2)))
 
 
-def test_a_table_to_which_an_authors_class_gave_a_contradicting_column_cannot_join_the_type() -> None:
+def test_a_table_with_a_contradicting_column_of_an_authors_class_cannot_join_the_type() -> None:
     layout = layout_of(SAYING).with_leaves([Leaf("ORMSaying", {"text": "real"})])
     with pytest.raises(LayoutConflict, match=r"SayingAction\.text is declared as text and as real"):
         layout.with_declaration(declared("SayingAction", "ORMSaying", field("volume", "real", 2)))

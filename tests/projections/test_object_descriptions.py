@@ -1,4 +1,4 @@
-"""Objects lead to their descriptions in every row; copy, rebuild and verify know them; the log can be read by hand."""
+"""Objects lead to their descriptions in every row, also after copy and rebuild; the log can be read by hand."""
 
 from __future__ import annotations
 

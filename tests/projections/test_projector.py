@@ -94,7 +94,7 @@ async def test_every_table_has_rows_after_every_kind_of_event(log: EventLog) -> 
 @pytest.mark.parametrize(
     "batch_events", [1, *(pytest.param(size, marks=pytest.mark.soak) for size in (2, 3, 7)), 10_000]
 )
-async def test_batches_of_any_size_give_the_same_rows(log: EventLog, batch_events: int) -> None:
+async def test_batches_of_any_size_make_the_same_rows(log: EventLog, batch_events: int) -> None:
     episodes = [rich_episode(1), rich_episode(2)]
     lost = Script(3)
     lost.put(NodeStarted("action", lost.put(NodeStarted("root")), name_of(SAYING), {"text": "oh"}))
@@ -127,7 +127,7 @@ async def test_batches_of_any_size_give_the_same_rows(log: EventLog, batch_event
     }  # fmt: skip
 
 
-async def test_one_batch_and_event_by_event_give_the_same_tables(log: EventLog, tmp_path: object) -> None:
+async def test_one_batch_and_event_by_event_make_the_same_tables(log: EventLog, tmp_path: object) -> None:
     records = [*declarations(NAVIGATE, PICK_UP, VIA), *rich_episode(1).records]
     await stored_and_folded(log, records)
     in_own_loop = await all_rows(log)

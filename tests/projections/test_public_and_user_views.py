@@ -141,7 +141,7 @@ def turned(axis: tuple[float, float, float], angle: float) -> tuple[float, float
 @pytest.mark.parametrize(
     ("axis", "angle"), [((0, 0, 1), 0.0), ((0, 0, 1), math.pi / 2), ((0, 0, 1), -2.5), ((1, -2, 0.5), 2.0)]
 )
-async def test_the_pick_up_view_gives_the_robots_position_in_the_frame_of_the_object(
+async def test_the_pick_up_view_has_the_robots_position_in_the_frame_of_the_object(
     log: EventLog, axis: tuple[float, float, float], angle: float
 ) -> None:
     script = Script()
@@ -170,7 +170,7 @@ async def test_the_pick_up_view_gives_the_robots_position_in_the_frame_of_the_ob
     np.testing.assert_allclose(upwards, object_rotation.T @ [0, 0, 1], atol=1e-12)
 
 
-async def test_the_pick_up_view_gives_the_height_of_the_object_above_the_lifted_torso(log: EventLog) -> None:
+async def test_the_pick_up_view_has_the_height_of_the_object_above_the_lifted_torso(log: EventLog) -> None:
     await stored_and_folded(log, [*declarations(PICK_UP), *two_pick_ups().records])
     view = PickUpWithContextView
     async with AsyncSession(log.engine) as session:

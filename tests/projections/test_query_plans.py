@@ -92,7 +92,9 @@ async def test_the_statistics_of_a_table_follow_it_through_a_rebuild(tmp_path: P
     assert analysed_tables() == {"zz_task_tree_node__1002"}
 
 
-async def test_a_server_knows_the_rows_of_rebuilt_tables_before_they_are_shown(server: Server, tmp_path: Path) -> None:
+async def test_a_server_has_counted_the_rows_of_rebuilt_tables_before_they_are_shown(
+    server: Server, tmp_path: Path
+) -> None:
     """The server of the tests never gathers statistics by itself, and others only after a minute."""
     url = server.new_database()
     async with Memory.open(url, spool=tmp_path / "spool") as memory, memory.episode():

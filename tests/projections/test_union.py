@@ -53,7 +53,7 @@ EVERY = (TEXT, NUMBER, ENUM, POSE, TAKEN, CASE, MOTION, REMARK)
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_one_by_one_in_any_order_gives_the_tables_of_all_at_once(seed: int) -> None:
+def test_one_by_one_in_any_order_makes_the_tables_of_all_at_once(seed: int) -> None:
     payloads = bytes_of(*random.Random(seed).sample(EVERY, len(EVERY)))
     layout = Layout()
     for count in range(1, len(payloads) + 1):

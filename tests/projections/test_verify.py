@@ -284,7 +284,7 @@ async def test_a_changed_key_is_reported_as_a_missing_row_and_a_surplus_one(log:
 
 
 @pytest.mark.parametrize("events", [pytest.param(1, marks=pytest.mark.soak), 7, 20])
-async def test_an_episode_read_in_many_parts_gives_the_same_findings_as_in_one(
+async def test_an_episode_read_in_many_parts_has_the_same_findings_as_in_one(
     database_url: str, events: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     log = await opened(database_url)

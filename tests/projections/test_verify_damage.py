@@ -264,7 +264,7 @@ async def test_an_overwritten_page_of_the_log_is_reported_by_episode_and_event(f
     assert file.read_bytes() == image
 
 
-async def test_flipped_bytes_anywhere_give_findings_or_an_error_and_never_a_traceback(
+async def test_flipped_bytes_anywhere_cause_findings_or_an_error_and_never_a_traceback(
     file: Path, tmp_path: Path
 ) -> None:
     dice = random.Random(8)

@@ -204,7 +204,7 @@ async def test_new_digests_over_changed_events_differ_from_those_kept_elsewhere(
     assert lines == [f"episode 3, event 20: {reason}"]
 
 
-async def test_a_copy_has_the_same_digests_and_gives_them_to_episodes_without(
+async def test_a_copy_has_the_same_digests_and_adds_them_to_episodes_without(
     log: EventLog, filled_url: str, tmp_path: Path
 ) -> None:
     before = ask(filled_url, KEPT)

@@ -151,7 +151,7 @@ def numbers(pose: Pose) -> tuple[float, ...]:
 
 
 def assert_pose_in_bullet(world_object: Object, pose: Pose) -> None:
-    """Assert the pose of the root link in Bullet, which itself gives the centre of mass."""
+    """Assert the pose of the root link in Bullet, which itself returns the centre of mass."""
     body, client = world_object.body.number, world_object.world.client
     facts = bullet.getDynamicsInfo(body, -1, physicsClientId=client)
     to_root = bullet.invertTransform(facts[3], facts[4])

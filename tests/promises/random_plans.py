@@ -1,7 +1,7 @@
 """Plans made at random, whose parts keep a record of their own of what happened to them.
 
-A `PlanPart` is a part of a plan: it knows its place (path) and what it will do. `built` makes the performable of it, of
-classes that write into a `Journal` when they start and how they end. The journal knows nothing of the task tree: who is
+A `PlanPart` is a part of a plan: it has its place (path) and what it will do. `built` makes the performable of it, of
+classes that write into a `Journal` when they start and how they end. The journal does not use the task tree: who is
 inside whom follows from the paths alone.
 """
 

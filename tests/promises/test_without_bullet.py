@@ -113,7 +113,7 @@ LINE = "no world can be opened, because no Bullet is installed: pip install 'pyc
 
 
 @pytest.mark.parametrize("verb", ["demo", pytest.param("learn --rollouts 30", marks=pytest.mark.soak)])
-def test_a_verb_that_needs_a_world_says_first_what_to_install(tmp_path: Path, verb: str) -> None:
+def test_a_verb_that_needs_a_world_first_names_what_to_install(tmp_path: Path, verb: str) -> None:
     pytest.importorskip("jpt", reason="learn names the first missing package")
     words = ["pycrorm", *verb.split()]
     done = run(f"{ABSENT} from pycrorm_async.cli.main import main; sys.argv = {words}; main()", tmp_path)
@@ -122,7 +122,7 @@ def test_a_verb_that_needs_a_world_says_first_what_to_install(tmp_path: Path, ve
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_world_says_what_to_install_and_how_long_that_takes(tmp_path: Path) -> None:
+def test_the_error_of_a_world_names_what_to_install_and_how_long_that_takes(tmp_path: Path) -> None:
     opening = "from pycrorm_async.world import BulletWorld\ntry:\n    BulletWorld().__enter__()\n"
     done = run(f"{ABSENT}\n{opening}except Exception as error:\n    print(type(error).__mro__, error)", tmp_path)
     assert all(name in done.stdout for name in ("BulletMissing", "WorldUnavailable", "MissingExtra"))
@@ -130,7 +130,7 @@ def test_a_world_says_what_to_install_and_how_long_that_takes(tmp_path: Path) ->
     assert done.stdout.endswith(f" {LINE}{compiling if sys.version_info >= (3, 13) else ''}\n")
 
 
-def test_a_failed_plan_says_in_one_line_what_to_install(tmp_path: Path) -> None:
+def test_a_failed_plan_names_in_one_line_what_to_install(tmp_path: Path) -> None:
     plan = "from pycrorm_async.world import BulletWorld\nasync def plan():\n    with BulletWorld():\n        pass\n"
     (tmp_path / "sweep.py").write_text(plan)
     words = ["pycrorm", "run", "sweep.py"]

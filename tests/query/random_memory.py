@@ -137,7 +137,7 @@ class RandomEpisode(Script):
 
 @dataclass
 class Node:
-    """A node as its events say it."""
+    """A node according to its events."""
 
     episode: int
     sequence: int

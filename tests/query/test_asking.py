@@ -330,7 +330,7 @@ ARGUMENTS: dict[str, dict[str, Any]] = {
 OF_EPISODES = [each for each in QUESTIONS if each not in ("experience_at", "episodes")]
 
 
-async def test_the_sql_of_each_question_gives_its_rows(reading: Reading, filled_url: str) -> None:
+async def test_the_sql_of_each_question_returns_its_rows(reading: Reading, filled_url: str) -> None:
     identity = (await reading.episode("3")).id
     questions = [getattr(reading.ask, name)(**ARGUMENTS.get(name, {})) for name in QUESTIONS]
     for episode in (3, identity, "last"):

@@ -31,7 +31,7 @@ RANDOM = [RandomEpisode(number, seed=8) for number in (3, 4)]
 
 
 def trip(number: int, *, arm: str, x: float, fails: bool) -> Script:
-    """Return an episode that drives, picks up the milk, and with `fails` fails and says so at its end."""
+    """Return an episode that drives, picks up the milk, and with `fails` fails, also at its end."""
     script = Script(number)
     put = script.put
     libraries = {"numpy": "2.0", "scipy": "1.0"} if fails else {"numpy": "2.1"}

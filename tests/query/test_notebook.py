@@ -345,7 +345,7 @@ def test_a_map_of_a_world_of_any_size_is_bounded() -> None:
 
 
 @pytest.mark.slow
-async def test_a_memory_shows_its_episodes_and_says_when_it_is_closed() -> None:
+async def test_a_memory_shows_its_episodes_and_when_it_is_closed() -> None:
     memory = Memory.open("sqlite://")
     assert "not open" in harmless(memory._repr_html_()).text
     async with memory:

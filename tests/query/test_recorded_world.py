@@ -1,4 +1,4 @@
-"""A world made from a snapshot has its objects in their state, or one line gives the reason why it cannot."""
+"""A world made from a snapshot has its objects in their state, or one line names the reason why it cannot."""
 
 from __future__ import annotations
 

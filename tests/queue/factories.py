@@ -113,7 +113,7 @@ async def recover(folder: Path) -> list[Record]:
 class FolderWriter:
     """Write a recorder's folder step by step without a sync thread: the test calls each step of a sync.
 
-    `records` is what was put, including the declarations that begin a segment; `places` gives the (file, offset, size)
+    `records` is what was put, including the declarations that begin a segment; `places` is the (file, offset, size)
     of each.
     """
 

@@ -82,7 +82,7 @@ async def test_a_blob_is_on_the_disk_before_the_commit_frame_of_the_record_that_
     queue.release()
 
 
-async def test_equal_contents_are_one_file_and_release_gives_their_space_back(bound: Path) -> None:
+async def test_equal_contents_are_one_file_and_release_frees_their_space(bound: Path) -> None:
     queue = make(bound)
     queue.put_nowait(started(), b"{}")
     before = queue.bytes_spooled

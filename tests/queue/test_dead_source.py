@@ -43,7 +43,7 @@ async def test_records_come_back_in_order_and_open_episodes_end_lost_in_the_orde
     assert await recover(author.folder) == [*author.records, lost(8, 1, 4), lost(9, 2, 2)]
 
 
-async def test_recovering_twice_gives_the_same_records_and_writes_nothing(author: FolderWriter) -> None:
+async def test_recovering_twice_supplies_the_same_records_and_writes_nothing(author: FolderWriter) -> None:
     author.put(started())
     author.sync()
     author.put(node(), b"unsynced")
@@ -352,7 +352,7 @@ def test_a_segment_may_be_deleted_only_when_the_header_after_it_is_synced(author
     assert [each.number for each in author.appender.trimmable(stored=5, safe_number=2)] == [1]
 
 
-async def test_after_stored_segments_are_deleted_the_next_header_gives_the_same_ends(author: FolderWriter) -> None:
+async def test_after_stored_segments_are_deleted_the_next_header_yields_the_same_ends(author: FolderWriter) -> None:
     author.put(started(1))
     author.put(started(2))
     for _ in range(7):

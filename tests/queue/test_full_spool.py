@@ -144,7 +144,7 @@ async def test_a_queue_that_is_not_drained_accepts_records_until_it_is_full(queu
         assert queue.block_until_room(0.0) is True
         queue.put_nowait(node(), PAYLOAD, reserved=True)
     queue.close()
-    assert await queue.room() is None  # type: ignore[func-returns-value]  # putting says that it is closed
+    assert await queue.room() is None  # type: ignore[func-returns-value]  # a put raises that it is closed
     assert len(await drain(queue)) == 1 + ALL
 
 

@@ -228,7 +228,7 @@ async def test_a_batch_is_complete_at_its_age_with_the_records_that_came_until_t
 async def steps(count: int) -> None:
     """Run the ready callbacks of the loop this many times, and the sync thread before each."""
     for _ in range(count):
-        time.sleep(0.005)  # noqa: ASYNC251  the loop's own clock stands still
+        time.sleep(0.005)  # noqa: ASYNC251  the loop's own clock does not advance
         await asyncio.sleep(0)
 
 

@@ -288,7 +288,7 @@ async def test_visibility_and_the_state_of_the_database_are_published_to_a_livin
     assert claimable.queue.external_drain_status == DrainStatus(stored=20, folded=5)
 
 
-async def test_the_next_source_knows_what_a_living_recorder_waits_to_see(claimable: SourceCase) -> None:
+async def test_the_next_source_lists_what_a_living_recorder_waits_to_see(claimable: SourceCase) -> None:
     await claimable.record()
     source = claim(claimable)
     assert source.invisible == {}
@@ -304,7 +304,7 @@ async def test_the_next_source_knows_what_a_living_recorder_waits_to_see(claimab
     assert claim(claimable).invisible == {}
 
 
-async def test_a_source_knows_whether_its_recorder_lives(claimable: SourceCase) -> None:
+async def test_a_source_reports_whether_its_recorder_lives(claimable: SourceCase) -> None:
     await claimable.record()
     source = claim(claimable)
     assert source.is_alive == (claimable.kind == "living")

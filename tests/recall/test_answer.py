@@ -1,4 +1,4 @@
-"""An answer says how its cases ended, why each was found, and what they have in common."""
+"""An answer states how its cases ended, why each was found, and what they have in common."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ CUE = Cue(
 )
 
 
-def test_each_case_says_what_matched_and_what_missed_by_how_much() -> None:
+def test_each_case_names_what_matched_and_what_missed_by_how_much() -> None:
     best = asked(CUE)[0]
     assert best.case == CASES[1]
     assert [(each.feature, each.wanted) for each in best.matched] == [
@@ -62,7 +62,7 @@ def test_each_case_says_what_matched_and_what_missed_by_how_much() -> None:
     ]
 
 
-def test_an_answer_says_how_its_cases_ended_and_what_was_never_seen() -> None:
+def test_an_answer_states_how_its_cases_ended_and_what_was_never_seen() -> None:
     found = asked(CUE)
     assert len(found) == 3
     assert found.considered == 4
@@ -88,7 +88,7 @@ def test_the_interval_of_the_success_is_that_of_wilson(successes: int, tries: in
     assert (rate.share, rate.low, rate.high) == pytest.approx((successes / tries, low, high), abs=1e-3)
 
 
-def test_an_action_that_was_cancelled_or_lost_says_nothing_about_success() -> None:
+def test_an_action_that_was_cancelled_or_lost_does_not_count_for_success() -> None:
     cases = [CASES[0]._replace(status=status) for status in ("CANCELLED", "LOST", "INTERRUPTED")]
     assert success_of(cases) is None
     rate = success_of([*cases, CASES[0]])
@@ -136,7 +136,7 @@ def test_a_page_of_a_long_answer_has_a_hundred_cases_and_counts_the_others() -> 
     assert "… 50 more" in page
 
 
-def test_an_answer_without_cases_says_so() -> None:
+def test_an_answer_without_cases_states_that() -> None:
     empty = answer(Cue(type="FlyAction"), CaseLibrary([Block.of(CASES)]))
     assert list(empty) == []
     assert empty.success is None

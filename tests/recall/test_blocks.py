@@ -24,7 +24,7 @@ def kept(cases: list[Case]) -> list[Case]:
 
 @settings(max_examples=50)
 @given(CASES)
-def test_a_block_gives_back_its_cases_from_its_rows(cases: list[Case]) -> None:
+def test_a_block_returns_its_cases_from_its_rows(cases: list[Case]) -> None:
     block = decode(encode(Block.of(cases)))
     assert list(block.cases()) == kept(cases)
     assert len(block) == len(cases)

@@ -69,7 +69,7 @@ async def test_every_case_is_at_hand_once_whatever_happens_to_the_blocks() -> No
                 waiting.append(case)
                 memory.ended.append(case)
             if chance.random() < 0.2:
-                await reader.library()  # gives every case its number
+                await reader.library()  # assigns every case its number
                 assert sorted(case.node for case in await reader.library()) == sorted(happened)
             if chance.random() < 0.3 and waiting:
                 memory.store(waiting)

@@ -43,7 +43,7 @@ async def test_a_reader_sees_new_merged_and_rebuilt_blocks_and_asks_once_where_n
             statements.clear()
             assert await reader.library() is library
             assert len(statements) == 1, statements
-        await rebuilt(log)  # which drops the tables that the reader knows
+        await rebuilt(log)  # which drops the tables that the reader has found
         assert sorted(each.node for each in await reader.library()) == nodes
         statements.clear()
         await reader.library()

@@ -93,7 +93,7 @@ def test_the_outcome_is_no_feature_of_the_situation() -> None:
     assert not RESERVED & (failed.symbols.keys() | failed.numbers.keys())
 
 
-def test_an_action_knows_the_action_around_it_and_the_one_before_it_inside_that() -> None:
+def test_an_action_has_the_action_around_it_and_the_one_before_it_inside_that() -> None:
     script = CaseScript()
     outer = script.wait()
     sequential = script.put(NodeStarted("language", outer))
@@ -151,7 +151,7 @@ def test_near_ends_at_half_a_metre() -> None:
     assert [each.symbols.get("near") for each in cases_of(script)] == [("BOWL",), None]
 
 
-def test_an_object_outside_of_the_recorded_world_has_what_its_value_says() -> None:
+def test_an_object_outside_of_the_recorded_world_has_what_its_value_has() -> None:
     script = CaseScript()
     believed = {"dtype": "BelieveObject", "name": "cup", "object_type": "JEROEN_CUP"}
     for pose_ in ({}, {"pose": {"position": [2, 1, 1], "orientation": [0, 0, 0, 1], "frame": "map", "time_ns": 1}}):

@@ -265,7 +265,7 @@ async def test_events_that_found_the_buffer_full_are_read_from_the_log(
             assert {each.status for each in answer} == {"FAILED"}
 
 
-async def test_a_memory_that_makes_no_cases_says_how_to_make_them(tmp_path: Path) -> None:
+async def test_without_cases_the_error_names_how_to_make_them(tmp_path: Path) -> None:
     url = f"sqlite:///{tmp_path / 'memory.db'}"
     async with Memory.open(url, settings=Settings(recall=False)) as memory:
         await grip(Arms.LEFT, 1.5)

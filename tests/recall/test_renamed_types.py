@@ -1,4 +1,4 @@
-"""A type that was renamed is found by each of its names, with the cases of all, and the answer says so."""
+"""A type that was renamed is found by each of its names, with the cases of all, and the answer states that."""
 
 from dataclasses import dataclass
 from pathlib import Path

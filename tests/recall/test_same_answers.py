@@ -44,7 +44,7 @@ async def answers(url: str) -> list[Shape]:
 
 
 @pytest.mark.soak
-async def test_both_databases_and_a_rebuild_give_the_same_answers(tmp_path: Path, server: Server) -> None:
+async def test_both_databases_and_a_rebuild_return_the_same_answers(tmp_path: Path, server: Server) -> None:
     here, there = f"sqlite:///{tmp_path / 'memory.db'}", server.new_database()
     async with Memory.open(here) as memory:
         await record(memory)

@@ -124,7 +124,7 @@ def random_cue(chance: random.Random, cases: list[Case]) -> Cue:
 
 
 def library_of(cases: list[Case], chance: random.Random) -> CaseLibrary:
-    """The cases in blocks of any size, in any order, as the database gives them back."""
+    """The cases in blocks of any size, in any order, as the database returns them."""
     mixed = chance.sample(cases, len(cases))
     borders = sorted({0, len(cases), *(chance.randrange(len(cases)) for _ in range(chance.randrange(6)))})
     parts = [mixed[start:end] for start, end in pairwise(borders)]
@@ -154,7 +154,7 @@ def test_random_cues_find_the_cases_of_brute_force_in_its_order(
     assert answers > 250, "most cues have an answer"
 
 
-def test_a_type_alone_gives_its_newest_cases() -> None:
+def test_a_type_alone_returns_its_newest_cases() -> None:
     cue = Cue(type="PickUpAction", k=5)
     newest = sorted(
         ((case.started_us, case.node) for case in CASES if case.type == "PickUpAction" and not case.simulated),

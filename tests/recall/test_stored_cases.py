@@ -209,7 +209,7 @@ async def opened(url: str) -> AsyncIterator[EventLog]:
 
 
 async def filled(log: EventLog) -> list[Case]:
-    """Fold four episodes of which each gives one block; return their cases."""
+    """Fold four episodes of which each makes one block; return their cases."""
     random = Random(3)
     scripts = [random_script(number, random, actions=30) for number in range(1, 5)]
     await log.append(TYPES)

@@ -1,4 +1,4 @@
-"""A memory of an executive that knows no asyncio, and what its tables and log say afterwards."""
+"""A memory of an executive without asyncio, and what its tables and log hold afterwards."""
 
 from __future__ import annotations
 

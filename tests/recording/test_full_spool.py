@@ -59,7 +59,7 @@ def test_a_start_that_must_not_wait_is_left_out_and_counted(tmp_path: Path) -> N
         assert sorted(event.node for _, event in log if isinstance(event, NodeEnded)) == starts
 
 
-def test_a_start_waits_until_the_spool_has_room_and_says_so(
+def test_a_start_waits_until_the_spool_has_room_and_logs_that(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(recorder_queue, "_WAIT_WARNING_S", 0.0)

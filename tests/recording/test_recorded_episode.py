@@ -525,7 +525,7 @@ def test_a_status_given_with_a_failure_of_another_language(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("status", "root"), [("FAILED", "FAILED"), ("INTERRUPTED", "CANCELLED"), ("ERROR", "ERROR"), (None, "ERROR")]
 )
-def test_an_executive_states_the_outcome_of_a_failure_that_only_it_knows(
+def test_an_executive_states_the_outcome_of_its_own_failure(
     tmp_path: Path, status: EpisodeStatus | None, root: str
 ) -> None:
     with opened(tmp_path) as memory:

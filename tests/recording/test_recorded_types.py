@@ -24,7 +24,7 @@ AT_END = Settings(fold="at_end")
 
 @dataclass
 class AnnounceActionPerformable(ActionAbstract):
-    """Has a text, of which an executive will say that it is a number."""
+    """Has a text, which an executive will declare as a number."""
 
     words: str
 

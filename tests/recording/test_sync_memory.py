@@ -85,7 +85,7 @@ def test_it_is_used_with_with_once(tmp_path: Path) -> None:
     assert not [each for each in threading.enumerate() if each.name.startswith("pycrorm")]
 
 
-def test_a_flush_that_takes_too_long_says_so(tmp_path: Path) -> None:
+def test_a_flush_that_takes_too_long_raises(tmp_path: Path) -> None:
     with Memory.sync(url_of(tmp_path), writer="daemon", settings=Settings(flush_timeout_s=0.5)) as memory:
         step(memory)
         with pytest.raises(FlushTimeout, match=r"0\.1 s"):

@@ -117,7 +117,7 @@ class Tab:
         try:
             return bool(self.ask(condition))
         except AssertionError as error:
-            if "navigated or closed" in str(error):  # the page that was asked gave way to the next one meanwhile
+            if "navigated or closed" in str(error):  # the next page has replaced the one that was asked
                 return False
             raise
 

@@ -91,7 +91,7 @@ async def test_a_document_has_every_node_object_observation_and_time(url: str) -
     assert len(document["times"]) == document["episode"]["head"]
 
 
-async def test_an_object_without_a_description_is_a_point_and_the_page_gives_the_reason(url: str) -> None:
+async def test_an_object_without_a_description_is_a_point_and_the_page_names_the_reason(url: str) -> None:
     document = await document_of(url)
     model = document["models"][document["objects"][0]["model"]]
     assert model["assumed"] == "a point, because its description was not recorded"

@@ -29,7 +29,7 @@ def test_the_focus_stays_on_the_control_that_was_used(chrome: Browser, pages: di
         assert tab.ask("document.activeElement.id") == "panel"  # the control is gone
 
 
-def test_the_tree_is_walked_from_the_current_row_and_says_it(chrome: Browser, pages: dict[str, Path]) -> None:
+def test_the_tree_is_walked_from_the_current_row_which_is_announced(chrome: Browser, pages: dict[str, Path]) -> None:
     with chrome.open(pages["plan"]) as tab:
         tab.ask("document.getElementById('tree').focus()")
         assert tab.ask(f"{CURRENT}.getAttribute('aria-label')").startswith("TransportAction, SUCCEEDED, took ")
@@ -63,7 +63,7 @@ def test_every_control_has_a_name_that_is_no_sign(chrome: Browser, pages: dict[s
         assert [each for each in names if not any(map(str.isalnum, each[1]))] == []
 
 
-def test_a_table_of_episodes_is_sorted_by_keys_and_says_so(chrome: Browser, overview: Path) -> None:
+def test_a_table_of_episodes_is_sorted_by_keys_and_announces_it(chrome: Browser, overview: Path) -> None:
     with chrome.open(overview) as tab:
         tab.ask("document.querySelector('th button').focus()")
         assert tab.ask("document.querySelector('th').getAttribute('aria-sort')") == "descending"
@@ -104,7 +104,9 @@ def test_the_table_of_episodes_is_in_sight_without_scrolling(chrome: Browser, ov
         assert tab.problems() == []
 
 
-def test_episodes_without_a_page_say_why_and_what_still_runs_has_no_chart(chrome: Browser, overview: Path) -> None:
+def test_episodes_without_a_page_name_the_reason_and_what_still_runs_has_no_chart(
+    chrome: Browser, overview: Path
+) -> None:
     with chrome.open(overview) as tab:
         assert tab.ask("document.getElementById('trend').textContent").startswith("Success")
         assert "no page" not in tab.ask("document.getElementById('episodes').textContent")

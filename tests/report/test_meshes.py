@@ -76,7 +76,7 @@ async def test_the_map_has_the_outlines_of_meshes(chrome: Browser, tmp_path: Pat
         assert triangles == [[(x, 0), (x + 0.25, 2), (x + 0.5, 0)] for x in (0, 1, 2)]
 
 
-async def test_a_page_says_which_meshes_are_boxes_and_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_page_lists_which_meshes_are_boxes_and_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mesh_data, "_TRIANGLES_MAX", 7)
     async with Reading.open(await record(tmp_path)) as reading:
         document = await episode_document(reading, 1)

@@ -39,7 +39,7 @@ def test_a_file_is_synced_before_it_gets_its_name_and_its_folder_afterwards(
 
 
 @pytest.mark.parametrize("exists", [False, True])
-def test_a_file_system_without_links_gives_a_new_file_its_name_too(
+def test_a_new_file_gets_its_name_on_a_file_system_without_links_too(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, exists: bool
 ) -> None:
     target = tmp_path / "rows.csv"

@@ -123,7 +123,7 @@ async def test_a_memory_without_cases_of_this_version_has_pages_without_them(
     assert in_page(tmp_path / "page.html") is None
 
 
-async def test_a_page_says_that_its_cases_are_damaged(url: str, tmp_path: Path) -> None:
+async def test_a_page_reports_that_its_cases_are_damaged(url: str, tmp_path: Path) -> None:
     with closing(sqlite3.connect(copy_of(url, tmp_path))) as database, database:
         (table,) = database.execute("SELECT name FROM sqlite_master WHERE name LIKE 'zz_%_recall_column%'").fetchone()
         database.execute(f"UPDATE {table} SET data = x'00'")

@@ -1,4 +1,4 @@
-"""Computed ends: recovery knows only its folder, so that a log with more events of the episode keeps them."""
+"""Computed ends: recovery reads only its folder, so that a log with more events of the episode keeps them."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ async def test_a_connection_that_is_returned_after_its_engine_was_disposed_of_is
         assert all(each._connection is not None for each in used)
     assert [each._connection for each in used] == [None, None]
     for each in used:
-        each._thread.join(30)  # it says that it ends just before it ends
+        each._thread.join(30)  # it reports its end just before it ends
     assert [each._thread.is_alive() for each in used] == [False, False]
 
 

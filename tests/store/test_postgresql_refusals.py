@@ -1,4 +1,4 @@
-"""Refusals by PostgreSQL: one line that names the database, gives the reason, and shows no password."""
+"""Refusals by PostgreSQL: one line that names the database and the reason, and shows no password."""
 
 from __future__ import annotations
 

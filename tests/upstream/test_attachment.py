@@ -1,4 +1,4 @@
-"""PyCRAM's tests of attachments (July 2024), by name. A child knows its parent here; there is no inverse attachment."""
+"""PyCRAM's tests of attachments (July 2024), by name. A child refers to its parent here, without inverse attachment."""
 
 from __future__ import annotations
 

@@ -98,7 +98,7 @@ def test_soft_limits_are_kept_and_hard_ones_only_narrowed() -> None:
         assert 0.2 <= solve(robot, Arms.LEFT, reachable)["arm_elbow_joint"] <= 0.4
 
 
-def test_sliding_and_endless_joints_below_another_one_are_solved_where_that_one_stands() -> None:
+def test_sliding_and_endless_joints_below_another_one_are_solved_at_its_position() -> None:
     hook = ArmDescription(joints=("turn",), base_link="carriage", tool_frame="hook", tool_in_link=Pose([0, 0, 0.3]))
     both = ArmDescription(joints=("slide", "turn"), tool_frame="hook")
     slider = RobotDescription(

@@ -221,7 +221,7 @@ def test_a_map_is_read_only() -> None:
         GaussianCostmap(Pose()).map[0, 0] = 1.0
 
 
-def test_the_same_world_gives_the_same_map(world: BulletWorld) -> None:
+def test_the_same_world_yields_the_same_map(world: BulletWorld) -> None:
     Object("kitchen", ObjectType.ENVIRONMENT)
     cereal = Object("cereal", ObjectType.BREAKFAST_CEREAL, pose=Pose([1.3, 0.7, 0.95]))
     ground = Pose([1.3, 0.7, 0])

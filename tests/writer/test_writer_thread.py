@@ -219,7 +219,7 @@ async def test_damage_is_reported_once_and_raised_at_every_flush_and_at_close_wh
 
 
 @pytest.mark.slow
-async def test_a_flush_that_times_out_gives_the_reason_and_loses_nothing(address: DatabaseAddress) -> None:
+async def test_a_flush_that_times_out_names_the_reason_and_loses_nothing(address: DatabaseAddress) -> None:
     source = KeptSource()
     settings = Settings(idle_ms=10**9, flush_timeout_s=1.0)
     writer = writer_for(source, address, settings=settings, busy_timeout_s=0.01)

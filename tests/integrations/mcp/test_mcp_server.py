@@ -178,7 +178,9 @@ async def test_every_answer_is_bounded_however_long_the_recorded_texts_are(tmp_p
         halved = await agent.ask(*calls[-1][:1], **calls[-1][1])
         assert (0 < len(halved["rows"]) < 20, halved["more_rows_exist"]) == (True, True)
         names = ", ".join(f"1 AS {'c' * 3000}{number}" for number in range(200))
-        assert (await agent.refused("query", sql=f"SELECT {names}")).endswith("at most 500000 are returned: ask for less")
+        assert (await agent.refused("query", sql=f"SELECT {names}")).endswith(
+            "at most 500000 are returned: ask for less"
+        )
         assert len(await agent.refused("query", sql=f"SELECT {'x' * 50_000}")) < 1_100
 
 

@@ -37,7 +37,7 @@ def start_pycram(home: Path) -> Any:
         World.cache_manager.data_directories[:] = [str(resources)]
         World.cache_manager.cache_dir = str(resources / "cached")
         PinocchioConfig.max_iterations = 200  # a pose out of reach takes all of them
-        RobotDescriptionManager()  # says which of its robots have no URDF here
+        RobotDescriptionManager()  # prints which of its robots have no URDF here
     return bullet_world
 
 

@@ -1,7 +1,7 @@
 """Plans for PyCRAM inside `remember`: `python -m tests.integrations.pycram.plans FOLDER [endless WRITER]`.
 
 Each function is one episode in the database of its name below the folder, which also holds `facts.json`: what PyCRAM
-itself knows about the run. With `endless` only that plan is performed, until the process is killed or interrupted.
+itself keeps about the run. With `endless` only that plan is performed, until the process is killed or interrupted.
 """
 
 from __future__ import annotations
@@ -135,7 +135,7 @@ def pycrams_database(plan: Any, tables: Any) -> Facts:
 
 
 def parallel_branches() -> Facts:
-    """Perform 20 times three branches in threads; give how many of the motions PyCRAM's own plan holds."""
+    """Perform 20 times three branches in threads; return how many of the motions PyCRAM's own plan holds."""
     held = 0
     with remember(url("parallel_branches"), description="Branches"):
         for _ in range(20):
@@ -428,7 +428,7 @@ def unusual_calls() -> Facts:
 
 
 def kinds_of_objects() -> Facts:
-    """Convert what stands for an object; its concept has another name in this package."""
+    """Convert a description or a link in place of an object; its concept has another name in this package."""
     carton = Object("cereal", Cereal, "cereal.urdf", pose=pose(0, 2, 0.5))
     kinds = (
         carton,

@@ -36,7 +36,7 @@ def environment(folder: Path) -> dict[str, str]:
 
 
 class Run:
-    """One run of all plans: their databases, and what PyCRAM itself knows about them."""
+    """One run of all plans: their databases, and what PyCRAM itself keeps about them."""
 
     def __init__(self, folder: Path, output: str) -> None:
         self.folder = folder
@@ -477,7 +477,7 @@ def test_named_arguments_an_outer_except_and_a_second_call_are_recorded_as_they_
     assert argument == ("<a Unspeakable whose repr raised OSError>",)
 
 
-def test_what_stands_for_an_object_is_recorded_as_its_row_a_part_or_a_belief(run: Run) -> None:
+def test_an_object_parameter_is_recorded_as_its_row_a_part_or_a_belief(run: Run) -> None:
     assert run.facts["kinds_of_objects"]["values"] == [
         ["ObjectReference", None, None, None],
         ["ObjectValue", "ObjectPart", "cereal_link", "BREAKFAST_CEREAL"],
