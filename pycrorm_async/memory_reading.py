@@ -19,9 +19,8 @@ from pycrorm_async.memory_parts import PartsHolder
 from pycrorm_async.query.as_of import AnyEpisode
 from pycrorm_async.query.asking.ask import Ask
 from pycrorm_async.query.asking.episode_diff import EpisodeDiff
-from pycrorm_async.query.asking.question import AskedEpisode, Question
+from pycrorm_async.query.asking.question import AskedEpisode, FrameQuery, Question
 from pycrorm_async.query.frames.arrow_batches import BATCH_ROWS
-from pycrorm_async.query.frames.columns import FrameQuery
 from pycrorm_async.query.frames.dataframe import Library
 from pycrorm_async.query.notebook.listings import Episodes, TaskTree
 from pycrorm_async.query.reading import Reading

@@ -26,8 +26,7 @@ from pycrorm_async.memory_recording import RecordingMemory
 from pycrorm_async.query.as_of import AnyEpisode
 from pycrorm_async.query.asking.ask import Ask
 from pycrorm_async.query.asking.episode_diff import EpisodeDiff
-from pycrorm_async.query.asking.question import AskedEpisode, Question, SyncQuestion
-from pycrorm_async.query.frames.columns import FrameQuery
+from pycrorm_async.query.asking.question import AskedEpisode, FrameQuery, Question, SyncQuestion
 from pycrorm_async.query.frames.dataframe import Library
 from pycrorm_async.query.notebook.listings import Episodes, TaskTree
 from pycrorm_async.query.snapshot import Moment

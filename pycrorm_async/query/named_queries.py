@@ -24,6 +24,7 @@ from pycrorm_async.orm import (
 )
 from pycrorm_async.orm.base import same_row
 from pycrorm_async.query.asking.episode_list import EpisodeChoice
+from pycrorm_async.query.notebook.value_html import NotebookValue
 from pycrorm_async.query.parameter_text import with_object_names
 from pycrorm_async.query.running_episodes import RobotSummary, robots_of
 from pycrorm_async.store.episode_lookup import number_named
@@ -47,7 +48,7 @@ class SimulatingNode:
 
 
 @dataclass(frozen=True)
-class EpisodeSummary:
+class EpisodeSummary(NotebookValue):
     """One episode.
 
     Attributes:
@@ -101,11 +102,6 @@ class EpisodeSummary:
     digest: str | None = None
     tags: tuple[str, ...] = ()
     metadata: dict[str, Any] | None = None
-
-    def _repr_html_(self) -> str:
-        from pycrorm_async.query.notebook.episode_view import episode_html
-
-        return episode_html(self)
 
 
 @dataclass(frozen=True)

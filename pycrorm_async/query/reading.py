@@ -20,6 +20,7 @@ from sqlalchemy import Dialect, Row, Select
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncSession, async_sessionmaker
 
+import pycrorm_async.query.notebook.views  # noqa: F401  registers the views of values
 from pycrorm_async.errors import CallerError, DatabaseUnavailable, UnknownEpisode
 from pycrorm_async.events.blobs import Blob
 from pycrorm_async.events.ids import parse_episode_id
@@ -33,9 +34,9 @@ from pycrorm_async.query.as_of import AnyEpisode, as_of
 from pycrorm_async.query.asking.ask import Ask
 from pycrorm_async.query.asking.episode_diff import EpisodeDiff, diff_episodes
 from pycrorm_async.query.asking.episode_list import EpisodeChoice
-from pycrorm_async.query.asking.question import AskedEpisode, Question
+from pycrorm_async.query.asking.question import AskedEpisode, FrameQuery, Question
 from pycrorm_async.query.frames.arrow_batches import BATCH_ROWS, arrow_batches
-from pycrorm_async.query.frames.columns import FrameQuery, select_of
+from pycrorm_async.query.frames.columns import select_of
 from pycrorm_async.query.frames.dataframe import Library, dataframe
 from pycrorm_async.query.named_queries import EpisodeSummary
 from pycrorm_async.query.notebook.listings import Episodes, TaskTree

@@ -15,15 +15,15 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import MappingProxyType, TracebackType
 from typing import NamedTuple
-from xml.etree.ElementTree import ParseError, fromstring
+from xml.etree.ElementTree import ParseError
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.types import DescriptionDeclared
 from pycrorm_async.query.snapshot import Moment, ObjectThen, WorldThen
 from pycrorm_async.world.bullet import BulletWorld
 from pycrorm_async.world.enums import ObjectType, WorldMode
-from pycrorm_async.world.errors import DescriptionNotLoadable, DuplicateName
-from pycrorm_async.world.models.catalog import built_in_urdf
+from pycrorm_async.world.errors import DuplicateName
+from pycrorm_async.world.models.catalog import built_in_that_fits
 from pycrorm_async.world.models.mesh_boxes import with_boxes, with_mesh_files
 from pycrorm_async.world.models.primitives import point_urdf
 from pycrorm_async.world.objects import Object
@@ -177,15 +177,3 @@ def _recorded_shape(description: DescriptionDeclared, contents: Mapping[str, byt
     present = [each for each in description.meshes if each.sha256 in contents]
     urdf = with_boxes(description.text, boxes, kept=frozenset(each.reference for each in present))
     return _Shape(urdf, meshes={each.reference: f"{each.sha256}{Path(each.name).suffix}" for each in present})
-
-
-def built_in_that_fits(name: str, object_type: ObjectType, *, joints: set[str], links: set[str]) -> str | None:
-    """Return the built-in URDF for a name and a type if it has these joints and links, otherwise None."""
-    try:
-        urdf = built_in_urdf(name, object_type)
-    except DescriptionNotLoadable:  # no robot or environment of that name is built in
-        return None
-    robot = fromstring(urdf)  # noqa: S314  our own text
-    movable = {each.get("name") for each in robot.iter("joint") if each.get("type") != "fixed"}
-    fits = joints <= movable and links <= {each.get("name") for each in robot.iter("link")}
-    return urdf if fits else None

@@ -21,6 +21,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.types import DescriptionDeclared
 from pycrorm_async.query.named_queries import NodeSummary
+from pycrorm_async.query.notebook.value_html import NotebookValue
 from pycrorm_async.query.percepts_and_places import Percept, PlaceSearch
 from pycrorm_async.world.pose import Pose
 from pycrorm_async.world.state import ObjectState, WorldState
@@ -95,7 +96,7 @@ class AttachmentThen(NamedTuple):
 
 
 @dataclass(frozen=True)
-class WorldThen:
+class WorldThen(NotebookValue):
     """The world at that moment.
 
     Attributes:
@@ -137,11 +138,6 @@ class WorldThen:
 
         return world_map(self)
 
-    def _repr_html_(self) -> str:
-        from pycrorm_async.query.notebook.moment_view import world_html
-
-        return world_html(self)
-
 
 @dataclass(frozen=True)
 class ObservationThen:
@@ -163,7 +159,7 @@ class ObservationThen:
 
 
 @dataclass(frozen=True, repr=False)
-class Moment:
+class Moment(NotebookValue):
     """The state of an episode after one of its events, until the next one.
 
     Attributes:
@@ -213,8 +209,3 @@ class Moment:
     def map(self) -> Drawing:
         """Return the world from above, as SVG that a notebook draws."""
         return self.world.map()
-
-    def _repr_html_(self) -> str:
-        from pycrorm_async.query.notebook.moment_view import moment_html
-
-        return moment_html(self)

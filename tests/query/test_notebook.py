@@ -27,6 +27,7 @@ from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary
 from pycrorm_async.query.notebook.answer_view import cases_html
 from pycrorm_async.query.notebook.listings import Episodes, TaskTree
 from pycrorm_async.query.notebook.memory_view import memory_html
+from pycrorm_async.query.notebook.value_html import NotebookValue, value_html
 from pycrorm_async.query.running_episodes import RobotSummary
 from pycrorm_async.query.scene.link_frames import link_frames
 from pycrorm_async.query.scene.object_model import object_model
@@ -140,6 +141,21 @@ def test_everything_recorded_is_escaped_and_nothing_runs_or_is_requested() -> No
     views += [then.world._repr_html_(), then.map()._repr_html_(), tree.gantt("time")._repr_html_()]
     for view in views:
         assert "</script><script>" in harmless(view).text
+
+
+def test_each_value_that_a_memory_returns_has_a_view_once_a_memory_can_be_read() -> None:
+    classes = [each for each in NotebookValue.__subclasses__() if each.__module__.startswith("pycrorm_async.")]
+    assert {EpisodeSummary, Moment, WorldThen, EpisodeDiff, SqlResult} < set(classes)
+    text_only = value_html.dispatch(object)
+    assert [each.__name__ for each in classes if value_html.dispatch(each) is text_only] == []
+
+
+def test_a_value_without_a_view_is_drawn_as_its_escaped_text() -> None:
+    class Unregistered(NotebookValue):
+        def __repr__(self) -> str:
+            return "<unregistered>"
+
+    assert Unregistered()._repr_html_() == "<pre>&lt;unregistered&gt;</pre>"
 
 
 def test_a_tree_is_opened_at_its_failures_and_closed_elsewhere() -> None:

@@ -11,6 +11,7 @@ from pycrorm_async.orm import Designator, Object, PickUpAction, Pose, TaskTreeNo
 from pycrorm_async.orm.base import same_row
 from pycrorm_async.query.asking.columns import (
     FAILED,
+    EpisodeNumber,
     checked_metres,
     containing,
     json_text,
@@ -20,7 +21,6 @@ from pycrorm_async.query.asking.columns import (
     share_succeeded,
     times_with,
 )
-from pycrorm_async.query.asking.question import EpisodeNumber
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.enums import Arms, Grasp, ObjectType
 

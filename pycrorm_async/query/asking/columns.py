@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from enum import Enum
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 from sqlalchemy import ColumnElement, Double, Integer, Select, Text, case, cast, false, func, literal, or_
 
@@ -16,8 +16,8 @@ from pycrorm_async.projections.schema.views.portable_expressions import member
 from pycrorm_async.query.suggestions import nearest
 from pycrorm_async.task_status import TaskStatus
 
-if TYPE_CHECKING:
-    from pycrorm_async.query.asking.question import EpisodeNumber
+EpisodeNumber: TypeAlias = "int | ColumnElement[int] | Sequence[int]"
+"""The number of an episode, an expression that finds it, or the numbers of several."""
 
 E = TypeVar("E", bound=Enum)
 _STATEMENT = TypeVar("_STATEMENT", bound=Select[Any])

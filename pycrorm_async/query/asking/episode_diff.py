@@ -11,18 +11,17 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 import msgspec
 from sqlalchemy import Select, func, select
 
 from pycrorm_async.orm import Object, Pose, ProcessMetaData
+from pycrorm_async.query.asking.ports import EpisodeReader
 from pycrorm_async.query.asking.question import AskedEpisode, episode_name
 from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary, nodes_of
+from pycrorm_async.query.notebook.value_html import NotebookValue
 from pycrorm_async.query.parameter_text import parameters_text
-
-if TYPE_CHECKING:
-    from pycrorm_async.query.reading import Reading
 
 _SAME = 6
 """Decimals to which numbers are compared, and positions in m."""
@@ -52,7 +51,7 @@ class Difference:
 
 
 @dataclass(frozen=True)
-class EpisodeDiff:
+class EpisodeDiff(NotebookValue):
     """The differences between two episodes, in the order facts, nodes, objects.
 
     Attributes:
@@ -67,11 +66,6 @@ class EpisodeDiff:
     def __bool__(self) -> bool:
         """True if there is a difference."""
         return bool(self.differences)
-
-    def _repr_html_(self) -> str:
-        from pycrorm_async.query.notebook.answer_view import diff_html
-
-        return diff_html(self)
 
     @property
     def sql(self) -> str:
@@ -97,7 +91,7 @@ class EpisodeDiff:
         return imported("pandas").DataFrame(rows, columns=columns)
 
 
-async def diff_episodes(reading: Reading, first: AskedEpisode, second: AskedEpisode) -> EpisodeDiff:
+async def diff_episodes(reading: EpisodeReader, first: AskedEpisode, second: AskedEpisode) -> EpisodeDiff:
     """Compare two episodes of one memory. Raises `UnknownEpisode`."""
     one, other = [await reading.episode(episode_name(each)) for each in (first, second)]
     trees = [await reading.tree(each) for each in (one, other)]

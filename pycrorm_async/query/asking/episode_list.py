@@ -4,17 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from sqlalchemy import ColumnElement, Select, exists, or_, select
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.orm import EpisodeRobot, EpisodeTag, ProcessMetaData
-from pycrorm_async.query.asking.columns import check_texts, containing, limited, member_of, of_episode
+from pycrorm_async.query.asking.columns import EpisodeNumber, check_texts, containing, limited, member_of, of_episode
 from pycrorm_async.task_status import TaskStatus
-
-if TYPE_CHECKING:
-    from pycrorm_async.query.asking.question import EpisodeNumber
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,16 @@ from sqlalchemy.orm import aliased
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.ids import SEQUENCE_MAX, SLOT_MAX
 from pycrorm_async.orm import RootFailure, TaskTreeNode
-from pycrorm_async.query.asking.columns import checked_count, containing, is_named, limited, of_episode, times_with
+from pycrorm_async.query.asking.columns import (
+    EpisodeNumber,
+    checked_count,
+    containing,
+    is_named,
+    limited,
+    of_episode,
+    times_with,
+)
 from pycrorm_async.query.asking.failure_words import classes_meant_by
-from pycrorm_async.query.asking.question import EpisodeNumber
 
 _NUMBER_BITS = SEQUENCE_MAX.bit_length() + SLOT_MAX.bit_length()
 """The bits of an id below the episode's number."""

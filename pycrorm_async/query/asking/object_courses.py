@@ -22,8 +22,7 @@ from sqlalchemy import (
 )
 
 from pycrorm_async.orm import Attachment, Detection, JointChange, Object, ObjectRemoval, Pose, RootFailure, TaskTreeNode
-from pycrorm_async.query.asking.columns import is_named, limited, of_episode
-from pycrorm_async.query.asking.question import EpisodeNumber
+from pycrorm_async.query.asking.columns import EpisodeNumber, is_named, limited, of_episode
 
 _OBJECT, _POSE, _NODE = Object.__table__, Pose.__table__, TaskTreeNode.__table__
 

@@ -7,24 +7,26 @@ from collections.abc import Callable, Coroutine, Generator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
-from sqlalchemy import ColumnElement, Row, Select, func, select
+from sqlalchemy import CompoundSelect, Row, Select, func, select
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.orm import ProcessMetaData
+from pycrorm_async.query.asking.columns import EpisodeNumber
+from pycrorm_async.query.asking.ports import EpisodeReader
 from pycrorm_async.query.asking.unknown_names import unknown_name
 from pycrorm_async.query.named_queries import EpisodeSummary
+from pycrorm_async.query.notebook.value_html import NotebookValue
 
 if TYPE_CHECKING:
     from pycrorm_async.hooks.episode import Episode
     from pycrorm_async.query.frames.dataframe import Library
-    from pycrorm_async.query.reading import Reading
 
 T = TypeVar("T")
 
 AskedEpisode: TypeAlias = "int | str | Episode | EpisodeSummary"
 """An episode by its number, its id or the first digits of it, `last`, or as an `Episode` or `EpisodeSummary`."""
-EpisodeNumber: TypeAlias = "int | ColumnElement[int] | Sequence[int]"
-"""The number of an episode, an expression that finds it, or the numbers of several."""
+FrameQuery: TypeAlias = "Select[*tuple[Any, ...]] | CompoundSelect[*tuple[Any, ...]] | type[Any] | Question"
+"""A query that has a frame: a select, a union of selects, a mapped class, whose rows are all meant, or a question."""
 _DIGITS_MAX = 7
 """The largest number of an episode has seven digits."""
 _DIGITS_OF_ID = 4
@@ -45,7 +47,7 @@ class QuestionPlan:
     names: Mapping[str, str] = field(default_factory=dict)
 
 
-class Question:
+class Question(NotebookValue):
     """One question to a memory. Nothing is read until it is awaited.
 
     >>> question = memory.ask.root_failures(object="milk", episode="last")
@@ -59,7 +61,7 @@ class Question:
         name: of the method that made it.
     """
 
-    def __init__(self, reading: Reading, plan: QuestionPlan) -> None:
+    def __init__(self, reading: EpisodeReader, plan: QuestionPlan) -> None:
         self.name = plan.name
         self._reading = reading
         self._plan = plan
@@ -122,13 +124,8 @@ class Question:
     def __repr__(self) -> str:
         return f"<question {self.name}: await it for a frame, print it for its SQL>"
 
-    def _repr_html_(self) -> str:
-        from pycrorm_async.query.notebook.answer_view import question_html
 
-        return question_html(self.name, self.sql, "await it for a frame")
-
-
-class SyncQuestion:
+class SyncQuestion(NotebookValue):
     """One question to a memory of `Memory.sync`. Its methods may be called from any thread.
 
     >>> frame = memory.ask.durations().frame()
@@ -163,11 +160,6 @@ class SyncQuestion:
 
     def __repr__(self) -> str:
         return f"<question {self.name}: call frame() or rows(), print it for its SQL>"
-
-    def _repr_html_(self) -> str:
-        from pycrorm_async.query.notebook.answer_view import question_html
-
-        return question_html(self.name, self.sql, "call frame() or rows()")
 
 
 def _warn(unknown: str) -> None:

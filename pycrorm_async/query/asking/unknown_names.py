@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from sqlalchemy import select, union
 
 from pycrorm_async.orm import DesignatorType, Detection, EpisodeRobot, EpisodeTag, Object, TaskTreeNode
 from pycrorm_async.query.asking.failure_words import SEARCH_WORDS
+from pycrorm_async.query.asking.ports import EpisodeReader
 from pycrorm_async.query.suggestions import nearest
 from pycrorm_async.world.enums import Arms
-
-if TYPE_CHECKING:
-    from pycrorm_async.query.reading import Reading
 
 _OBJECTS = union(select(Object.name), select(Detection.name))
 _RECORDED: dict[str, Any] = {
@@ -36,7 +34,7 @@ CHECKED = frozenset((*_RECORDED, *_FIXED))
 """The arguments that are names."""
 
 
-async def unknown_name(reading: Reading, names: Mapping[str, str]) -> str:
+async def unknown_name(reading: EpisodeReader, names: Mapping[str, str]) -> str:
     """Return a line about the first of these arguments that the memory does not have; empty if it has them all.
 
     It reads the names of the whole memory, so it is for questions without an answer only.

@@ -7,7 +7,7 @@ columns of one name become `x` and `x_1`.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias
 
 from sqlalchemy import (
     BigInteger,
@@ -38,12 +38,6 @@ from sqlalchemy.types import TypeEngine
 from pycrorm_async.errors import CallerError
 from pycrorm_async.orm.designators import ClassOfRow
 from pycrorm_async.orm.types import EnumName, JsonText, Moment
-
-if TYPE_CHECKING:
-    from pycrorm_async.query.asking.question import Question
-
-FrameQuery: TypeAlias = "Select[*tuple[Any, ...]] | CompoundSelect[*tuple[Any, ...]] | type[Any] | Question"
-"""A query that has a frame: a select, a union of selects, a mapped class, whose rows are all meant, or a question."""
 
 ColumnKind: TypeAlias = Literal[
     "integer", "number", "bool", "text", "enum", "time", "json", "bytes", "date", "local time", "untyped"

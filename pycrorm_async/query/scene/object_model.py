@@ -12,8 +12,8 @@ from typing import Any
 from xml.etree.ElementTree import Element, ParseError, fromstring
 
 from pycrorm_async.events.types import DescriptionDeclared
-from pycrorm_async.query.recorded_world import built_in_that_fits
 from pycrorm_async.world.enums import ObjectType
+from pycrorm_async.world.models.catalog import built_in_that_fits
 from pycrorm_async.world.models.mesh_boxes import with_boxes
 from pycrorm_async.world.pose import Vector
 from pycrorm_async.world.queries.bounding_boxes import BoundingBox

@@ -26,6 +26,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
 from pycrorm_async.errors import QueryRefused
+from pycrorm_async.query.notebook.value_html import NotebookValue
 from pycrorm_async.store.log import EventLog
 
 if TYPE_CHECKING:
@@ -64,7 +65,7 @@ DEFAULT_LIMITS = SqlLimits()
 
 
 @dataclass(frozen=True)
-class SqlResult:
+class SqlResult(NotebookValue):
     """The rows of a query, as the database stores them.
 
     Attributes:
@@ -92,11 +93,6 @@ class SqlResult:
 
         frame: pd.DataFrame = imported("pandas").DataFrame(self.rows, columns=self.names)
         return frame
-
-    def _repr_html_(self) -> str:
-        from pycrorm_async.query.notebook.answer_view import sql_result_html
-
-        return sql_result_html(self)
 
 
 class Cursor(Protocol):

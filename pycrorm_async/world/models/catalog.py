@@ -9,6 +9,7 @@ similar objects of the YCB set (chips can, cracker box, bowl, mug, spoon), and a
 from __future__ import annotations
 
 from typing import NamedTuple
+from xml.etree.ElementTree import fromstring
 
 from pycrorm_async.world.enums import ObjectType
 from pycrorm_async.world.errors import DescriptionNotLoadable
@@ -58,6 +59,18 @@ def built_in_urdf(name: str, object_type: ObjectType) -> str:
     if isinstance(shape, _Box):
         return box_urdf(name, x=shape.x, y=shape.y, z=shape.z, color=shape.color, mass_kg=shape.mass_kg)
     return cylinder_urdf(name, radius=shape.radius, z=shape.z, color=shape.color, mass_kg=shape.mass_kg)
+
+
+def built_in_that_fits(name: str, object_type: ObjectType, *, joints: set[str], links: set[str]) -> str | None:
+    """Return the built-in URDF for a name and a type if it has these joints and links, otherwise None."""
+    try:
+        urdf = built_in_urdf(name, object_type)
+    except DescriptionNotLoadable:  # no robot or environment of that name is built in
+        return None
+    robot = fromstring(urdf)  # noqa: S314  our own text
+    movable = {each.get("name") for each in robot.iter("joint") if each.get("type") != "fixed"}
+    fits = joints <= movable and links <= {each.get("name") for each in robot.iter("link")}
+    return urdf if fits else None
 
 
 def _by_name(name: str, object_type: ObjectType) -> str:
