@@ -24,15 +24,9 @@ from pycrorm_async.orm.actions import (
     SetGripperAction,
     TransportAction,
 )
-from pycrorm_async.orm.base import (
-    Base,
-    Pose,
-    Position,
-    ProcessMetaData,
-    Quaternion,
-    RobotState,
-)
+from pycrorm_async.orm.base import Base
 from pycrorm_async.orm.designators import Action, Designator, DesignatorType, Language, Motion, ParameterItem
+from pycrorm_async.orm.episodes import EpisodeRobot, EpisodeTag, Pose, Position, ProcessMetaData, Quaternion, RobotState
 from pycrorm_async.orm.language import Code, Monitor, Parallel, Repeat, Retry, Sequential, TryAll, TryInOrder
 from pycrorm_async.orm.motions import (
     AccessingMotion,
@@ -62,7 +56,7 @@ from pycrorm_async.orm.objects import (
 )
 from pycrorm_async.orm.perception import Detection, Observation, ObservationValue, StateSample
 from pycrorm_async.orm.tree import LocationCandidate, LocationRefusal, LocationResolution, TaskTreeNode
-from pycrorm_async.orm.views import EpisodeRobot, EpisodeTag, PickUpWithContextView, RootFailure, SpatialRelation
+from pycrorm_async.orm.views import PickUpWithContextView, RootFailure, SpatialRelation
 
 __all__ = [
     "Base",

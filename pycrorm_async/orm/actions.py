@@ -9,7 +9,6 @@ from __future__ import annotations
 from sqlalchemy import ForeignKey
 from sqlalchemy.orm import Mapped, mapped_column, synonym
 
-from pycrorm_async.orm.base import Pose
 from pycrorm_async.orm.designators import (
     Action,
     ObjectDesignatorParameter,
@@ -18,6 +17,7 @@ from pycrorm_async.orm.designators import (
     TargetLocationParameter,
     TargetParameter,
 )
+from pycrorm_async.orm.episodes import Pose
 from pycrorm_async.orm.objects import Object
 from pycrorm_async.world.enums import Arms, Grasp, GripperState
 

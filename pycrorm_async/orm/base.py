@@ -1,4 +1,4 @@
-"""Define the base of the mapped classes, and the classes of episodes, poses and the robot's state.
+"""Define the base of the mapped classes, their relationships, and attributes that are loaded on request.
 
 All mapped classes are read-only: they select from the public views. A query loads the columns of the class that it
 selects. `orm.loading.batch_loads` loads the columns of subclasses and related rows when an attribute is read.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from datetime import datetime
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, dataclass_transform
+from typing import Any, ClassVar, TypeVar, dataclass_transform
 
 from sqlalchemy import (
     BigInteger,
@@ -16,7 +16,6 @@ from sqlalchemy import (
     ColumnElement,
     Dialect,
     Double,
-    ForeignKey,
     Text,
     and_,
     event,
@@ -29,7 +28,6 @@ from sqlalchemy.ext.hybrid import hybrid_property
 from sqlalchemy.orm import (
     DeclarativeBase,
     InstanceState,
-    Mapped,
     MappedAsDataclass,
     MappedColumn,
     Mapper,
@@ -47,12 +45,9 @@ from sqlalchemy.util.concurrency import in_greenlet
 from pycrorm_async.errors import CallerError, PycrormError
 from pycrorm_async.events.ids import SEQUENCE_MAX, SLOT_MAX, row_key
 from pycrorm_async.orm.loading.batch_loads import load_columns
-from pycrorm_async.orm.types import EnumName, JsonText, Moment
+from pycrorm_async.orm.types import EnumName, Moment
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.enums import Arms, Grasp, GripperState, ObjectType
-
-if TYPE_CHECKING:
-    from pycrorm_async.orm.views import EpisodeRobot
 
 __all__ = [
     "Base",
@@ -65,11 +60,6 @@ __all__ = [
     "inherited_from",
     "same_row",
     "EPISODE",
-    "ProcessMetaData",
-    "Position",
-    "Quaternion",
-    "Pose",
-    "RobotState",
 ]
 
 _Value = TypeVar("_Value")
@@ -270,129 +260,3 @@ class HybridOnRequest(hybrid_property[_Value]):
         if instance is None:  # `undefer` asks an attribute for its columns, which SQLAlchemy 2.1 cannot answer here
             attribute._column_strategy_attrs = lambda: [getattr(owner, f"_{self.__name__}")]  # noqa: SLF001
         return attribute
-
-
-class ProcessMetaData(Base):
-    """An episode with its user, plan, software and outcome. `id` is the episode's number in this database.
-
-    `status` is RUNNING, SUCCEEDED, FAILED, ERROR, INTERRUPTED or LOST.
-    """
-
-    __tablename__ = "process_metadata"
-
-    id: Mapped[int] = mapped_column(primary_key=True)
-    uuid: Mapped[str]
-    created_at: Mapped[datetime]
-    created_by: Mapped[str]
-    description: Mapped[str]
-    version: Mapped[str]
-    """The version of the software that recorded it; `pycram_version`, the thesis' name, is the same."""
-    host: Mapped[str]
-    python: Mapped[str]
-    plan: Mapped[str | None]
-    world: Mapped[str | None]
-    """The world in one line: at the start, or, if it was entered inside the episode, when it was left.
-
-    Of an episode that runs or is LOST: name and type of the objects in the world that was entered inside it.
-    """
-    seed: Mapped[int | None]
-    status: Mapped[str]
-    ended_at: Mapped[datetime | None]
-    end_sequence: Mapped[int | None]
-    """The sequence of its last event; None while it runs."""
-    failure_type: Mapped[str | None]
-    failure_message: Mapped[str | None]
-    simulated: Mapped[bool]
-    """True for a simulation, performed in a copy of the world."""
-    thought_by: Mapped[str | None]
-    """UUID of the episode that performed this simulation."""
-    thought_by_node: Mapped[int | None]
-    """The sequence, in that episode, of the node that performed this simulation."""
-    continues: Mapped[str | None]
-    """UUID of the episode that this one continues, because that one came near its last possible sequence."""
-    continued_in: Mapped[str | None]
-    """UUID of the episode that continues this one."""
-    plan_sha256: Mapped[str | None]
-    """SHA-256 of the plan's file; `git_commit` and `git_dirty` are those of its repository (`pycrorm run`)."""
-    git_commit: Mapped[str | None]
-    git_dirty: Mapped[bool | None]
-    libraries: Mapped[dict[str, str] | None] = mapped_column(JsonText())
-    """Version by package."""
-    settings: Mapped[dict[str, Any] | None] = mapped_column(JsonText())
-    """The settings that differ from their defaults."""
-    clock_synchronized: Mapped[bool | None]
-    """True if a time service kept the wall clock; `clock_error_us` is its estimated error, µs."""
-    clock_error_us: Mapped[int | None]
-    episode_metadata: Mapped[dict[str, Any] | None] = mapped_column("metadata", JsonText())
-    """The metadata of the executive; the column is `metadata`, a name that SQLAlchemy reserves as an attribute."""
-    tag_rows: Mapped[list[Any]] = relationship("EpisodeTag", viewonly=True, order_by="EpisodeTag.tag")
-    tags = property(lambda self: [each.tag for each in self.tag_rows], doc="The tags, in alphabetical order.")
-    _robots: Mapped[list[EpisodeRobot]] = relationship(viewonly=True, order_by="EpisodeRobot.id")
-    robots: Mapped[list[EpisodeRobot]] = synonym("_robots", descriptor=on_request("robots"))
-    """The robots that took part, in the order in which they were added. Loaded on request."""
-
-    pycram_version: Mapped[str] = synonym("version")
-
-
-class Position(Base):
-    """The position of a pose in m, with the pose's id."""
-
-    __tablename__ = "position"
-
-    id: Mapped[int] = mapped_column(primary_key=True)
-    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"))
-    x: Mapped[float]
-    y: Mapped[float]
-    z: Mapped[float]
-
-
-class Quaternion(Base):
-    """The orientation of a pose as a unit quaternion, with the pose's id."""
-
-    __tablename__ = "quaternion"
-
-    id: Mapped[int] = mapped_column(primary_key=True)
-    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"))
-    x: Mapped[float]
-    y: Mapped[float]
-    z: Mapped[float]
-    w: Mapped[float]
-
-
-class Pose(RowOfEvent, Base):
-    """A position (m) and an orientation (unit quaternion), also as columns, so that queries need no join for them."""
-
-    __tablename__ = "pose"
-
-    id: Mapped[int] = mapped_column(primary_key=True)
-    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"))
-    time: Mapped[datetime]
-    frame: Mapped[str]
-    position_id: Mapped[int] = mapped_column(ForeignKey("position.id"))
-    orientation_id: Mapped[int] = mapped_column(ForeignKey("quaternion.id"))
-    x: Mapped[float]
-    y: Mapped[float]
-    z: Mapped[float]
-    qx: Mapped[float]
-    qy: Mapped[float]
-    qz: Mapped[float]
-    qw: Mapped[float]
-
-    position: Mapped[Position] = one_of(lambda: Pose.position_id, "position")
-    orientation: Mapped[Quaternion] = one_of(lambda: Pose.orientation_id, "quaternion")
-    process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True)
-
-
-class RobotState(RowOfEvent, Base):
-    """The robot's base pose and torso position (m) when a node started. Nodes without a robot have no row."""
-
-    __tablename__ = "robot_state"
-
-    id: Mapped[int] = mapped_column(primary_key=True)
-    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"))
-    torso_height: Mapped[float | None]
-    type: Mapped[ObjectType]
-    pose_id: Mapped[int] = mapped_column(ForeignKey("pose.id"))
-
-    pose: Mapped[Pose] = one_of(lambda: RobotState.pose_id, "pose")
-    process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True)

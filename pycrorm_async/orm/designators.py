@@ -27,18 +27,8 @@ from sqlalchemy.ext.hybrid import hybrid_property
 from sqlalchemy.orm import Mapped, MappedAsDataclass, declared_attr, mapped_column, relationship, synonym
 from sqlalchemy.types import TypeDecorator
 
-from pycrorm_async.orm.base import (
-    EPISODE,
-    Base,
-    HybridOnRequest,
-    Pose,
-    ProcessMetaData,
-    RobotState,
-    RowOfEvent,
-    inherited_from,
-    many_of,
-    one_of,
-)
+from pycrorm_async.orm.base import EPISODE, Base, HybridOnRequest, RowOfEvent, inherited_from, many_of, one_of
+from pycrorm_async.orm.episodes import Pose, ProcessMetaData, RobotState
 from pycrorm_async.orm.loading.known_classes import known_classes
 from pycrorm_async.orm.objects import Object, is_concept
 from pycrorm_async.orm.types import JsonText

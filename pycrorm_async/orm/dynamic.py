@@ -28,8 +28,9 @@ from sqlalchemy.types import TypeEngine
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.types import DesignatorTypeDeclared
 from pycrorm_async.events.values import FieldDeclared, FieldType
-from pycrorm_async.orm.base import EPISODE, Base, Pose, inherited_from, one_of
+from pycrorm_async.orm.base import EPISODE, Base, inherited_from, one_of
 from pycrorm_async.orm.designators import Action, Designator, Language, Motion
+from pycrorm_async.orm.episodes import Pose
 from pycrorm_async.orm.loading.known_classes import known_classes
 from pycrorm_async.orm.objects import Object
 from pycrorm_async.orm.types import Moment

@@ -17,7 +17,8 @@ from sqlalchemy.orm import Mapped, mapped_column, relationship, synonym
 from pycrorm_async.events.codec import description_of
 from pycrorm_async.events.types import DescriptionDeclared
 from pycrorm_async.events.values import BoxValue, MeshValue
-from pycrorm_async.orm.base import Base, Pose, ProcessMetaData, RowOfEvent, on_request, one_of
+from pycrorm_async.orm.base import Base, RowOfEvent, on_request, one_of
+from pycrorm_async.orm.episodes import Pose, ProcessMetaData
 from pycrorm_async.orm.types import JsonText
 from pycrorm_async.world.enums import ObjectType
 

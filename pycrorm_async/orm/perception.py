@@ -7,7 +7,8 @@ from datetime import datetime
 from sqlalchemy import ForeignKey
 from sqlalchemy.orm import Mapped, mapped_column, relationship
 
-from pycrorm_async.orm.base import Base, ProcessMetaData, RowOfEvent, many_of, one_of
+from pycrorm_async.orm.base import Base, RowOfEvent, many_of, one_of
+from pycrorm_async.orm.episodes import ProcessMetaData
 from pycrorm_async.orm.objects import Object
 from pycrorm_async.orm.tree import TaskTreeNode
 from pycrorm_async.world.enums import ObjectType

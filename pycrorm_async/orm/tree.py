@@ -8,17 +8,9 @@ from typing import Any
 from sqlalchemy import ForeignKey
 from sqlalchemy.orm import Mapped, mapped_column, relationship, synonym
 
-from pycrorm_async.orm.base import (
-    Base,
-    Pose,
-    ProcessMetaData,
-    RowOfEvent,
-    many_of,
-    on_request,
-    one_of,
-    require_loaded,
-)
+from pycrorm_async.orm.base import Base, RowOfEvent, many_of, on_request, one_of, require_loaded
 from pycrorm_async.orm.designators import Designator
+from pycrorm_async.orm.episodes import Pose, ProcessMetaData
 from pycrorm_async.orm.types import JsonText
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.enums import Arms, Grasp

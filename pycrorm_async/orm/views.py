@@ -1,4 +1,4 @@
-"""Map the built-in views of pick-ups, failures, spatial relations, and the tags and robots of episodes."""
+"""Map the built-in views of pick-ups, failures and spatial relations."""
 
 from __future__ import annotations
 
@@ -7,12 +7,13 @@ from datetime import datetime
 from sqlalchemy import ForeignKey
 from sqlalchemy.orm import Mapped, mapped_column, relationship, synonym
 
-from pycrorm_async.orm.base import Base, ProcessMetaData, RowOfEvent, on_request, one_of
+from pycrorm_async.orm.base import Base, RowOfEvent, on_request, one_of
+from pycrorm_async.orm.episodes import ProcessMetaData
 from pycrorm_async.orm.tree import TaskTreeNode
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.enums import Arms, Grasp, ObjectType
 
-__all__ = ["EpisodeRobot", "EpisodeTag", "PickUpWithContextView", "RootFailure", "SpatialRelation"]
+__all__ = ["PickUpWithContextView", "RootFailure", "SpatialRelation"]
 
 
 class PickUpWithContextView(RowOfEvent, Base):
@@ -148,36 +149,3 @@ class SpatialRelation(RowOfEvent, Base):
     _node: Mapped[TaskTreeNode] = one_of(lambda: SpatialRelation.node_id, "task_tree_node")
     node: Mapped[TaskTreeNode] = synonym("_node", descriptor=on_request("node"))
     process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True)
-
-
-class EpisodeTag(RowOfEvent, Base):
-    """A tag that an episode has now, and the time when it was added. The view `episode_tagging` has all changes."""
-
-    __tablename__ = "episode_tag"
-
-    id: Mapped[int]
-    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"), primary_key=True)
-    tag: Mapped[str] = mapped_column(primary_key=True)
-    time: Mapped[datetime]
-
-
-class EpisodeRobot(RowOfEvent, Base):
-    """A robot that took part in an episode, as it was when it was first added to the world.
-
-    A robot that was removed and added again, also to another world, has one row. If its description has changed, it has
-    a row for each; robots of one name that differ in model or serial have a row each, too.
-
-    Attributes:
-        id: of its first row in `object`.
-        model, serial: of its `RobotDescription`; None without one, and in episodes of version 0.1.0.
-        description_fingerprint: of its `ObjectDescription`; None in episodes of version 0.1.0.
-    """
-
-    __tablename__ = "episode_robot"
-
-    id: Mapped[int] = mapped_column(ForeignKey("object.id"), primary_key=True)
-    process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"))
-    name: Mapped[str]
-    model: Mapped[str | None]
-    serial: Mapped[str | None]
-    description_fingerprint: Mapped[str | None] = mapped_column(ForeignKey("object_description.fingerprint"))
