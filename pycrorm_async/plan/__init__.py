@@ -8,6 +8,7 @@ package loads neither Bullet nor a database. The kinds of `PlanFailure` are in `
 ...     await NavigateAction([Pose([0.6, 0.4, 0])]).resolve().perform()
 """
 
+from pycrorm_async.plan.actions.action_description import ActionDescription
 from pycrorm_async.plan.actions.basic import (
     FaceAtPerformable,
     LookAtActionPerformable,
@@ -20,7 +21,6 @@ from pycrorm_async.plan.actions.basic import (
     SetGripperActionPerformable,
 )
 from pycrorm_async.plan.actions.descriptions import (
-    ActionDescription,
     CloseAction,
     DetectAction,
     GraspingAction,

@@ -15,8 +15,8 @@ from pycrorm_async.learning.policies.policy_file import name_of
 from pycrorm_async.learning.policies.recorded_policy import keep_policy
 from pycrorm_async.learning.rollouts.feasible_places import free_and_visible
 from pycrorm_async.orm import PickUpWithContextView
+from pycrorm_async.plan.actions.action_description import ActionDescription
 from pycrorm_async.plan.actions.basic import MoveAndPickUpPerformable
-from pycrorm_async.plan.actions.descriptions import ActionDescription
 from pycrorm_async.plan.current_robot import require_robot
 from pycrorm_async.plan.failures import ObjectUnreachable
 from pycrorm_async.plan.geometry.gripper_checks import lifting_arms

@@ -13,8 +13,8 @@ from pycrorm_async.learning.policies.policy import ARMS, GRASPS, PickUpChoice, P
 from pycrorm_async.learning.policies.policy_file import name_of
 from pycrorm_async.learning.rollouts.feasible_places import free_and_visible
 from pycrorm_async.learning.rollouts.move_and_pick_up import MoveAndPickUp
+from pycrorm_async.plan.actions.action_description import ActionDescription
 from pycrorm_async.plan.actions.basic import MoveAndPickUpPerformable
-from pycrorm_async.plan.actions.descriptions import ActionDescription
 from pycrorm_async.plan.current_robot import require_robot
 from pycrorm_async.plan.experience import Experience, PastSuccess, experience
 from pycrorm_async.plan.failures import ObjectUnreachable

@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, ClassVar, Self, TypeAlias
 
-from pycrorm_async.plan.actions.descriptions import ActionDescription
+from pycrorm_async.plan.actions.action_description import ActionDescription
 from pycrorm_async.plan.designator import Designator
 from pycrorm_async.plan.exceptions import describe_error
 from pycrorm_async.plan.execution.execution_context import ExecutionContext, execution_context
