@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from types import TracebackType
+from types import MappingProxyType, TracebackType
 from typing import Self
 
-from pycrorm_async.world import state
 from pycrorm_async.world.attachments import Attachments
 from pycrorm_async.world.bullet_loader import engine
 from pycrorm_async.world.enums import ObjectType, WorldMode
@@ -19,7 +18,7 @@ from pycrorm_async.world.errors import ObjectNotInWorld, WorldClosed, WorldUnava
 from pycrorm_async.world.objects import Object
 from pycrorm_async.world.observers import WorldObserver, WorldWatcher, current_world, watcher
 from pycrorm_async.world.queries import visibility
-from pycrorm_async.world.state import WorldState
+from pycrorm_async.world.state import ObjectState, WorldState, check_state, set_state
 
 _GRAVITY_M_PER_S2 = -9.8
 
@@ -206,10 +205,15 @@ class BulletWorld:
 
     def save_state(self) -> WorldState:
         """Return poses, joint positions and attachments of all objects as a frozen value."""
-        return state.save(self)
+        parents = {each.child: (each.parent.name, each.link) for each in self.attachments}
+        states = {
+            obj.name: ObjectState(obj.pose, MappingProxyType(obj.joint_positions()), parents.get(obj))
+            for obj in self.objects
+        }
+        return WorldState(MappingProxyType(states))
 
     def restore_state(self, saved: WorldState) -> None:
-        """Restore the objects of `saved`; observers get the differences only.
+        """Restore the objects of `saved`; observers get the differences only, after all poses and joints are set.
 
         An object that was added since keeps its pose and is detached from the restored ones. The following are raised
         before anything is changed: `ObjectNotInWorld` if an object of the state was removed, `UnknownJoint` if its
@@ -217,7 +221,26 @@ class BulletWorld:
         has numbers that are not finite.
         """
         _ = self.client
-        state.restore(self, saved)
+        states = {self.object(name): state for name, state in saved.objects.items()}
+        for obj, state in states.items():
+            check_state(obj.name, obj.body, state)
+        for each in self.attachments:
+            if each.child in states or each.parent in states:
+                attached_to = states[each.child].attached_to if each.child in states else None
+                if attached_to != (each.parent.name, each.link):
+                    each.parent.detach(each.child)
+        changes = {obj: set_state(obj.body, state) for obj, state in states.items()}
+        for obj, change in changes.items():
+            if change.joints:
+                self.notify_joints(obj, change.joints)
+        self.notify_moved([obj for obj, change in changes.items() if change.moved])
+        for child, state in states.items():
+            if state.attached_to is not None:
+                parent, link = self.object(state.attached_to[0]), state.attached_to[1]
+                if child.attached_to is parent:
+                    self.attachments.put(parent, child, link)
+                else:
+                    parent.attach(child, link)
 
     # --- visibility -------------------------------------------------------------------------------------------
 
@@ -232,14 +255,27 @@ class BulletWorld:
 
         Objects in `ignore` are transparent. A ray does not hit the shape it starts in. Points are in "map", m.
         """
-        return visibility.first_met(self, starts, ends, ignore=frozenset(ignore))
+        transparent = [obj.body for obj in ignore if self.has(obj)]
+        numbers = visibility.first_met(self.client, starts, ends, transparent=transparent)
+        return [self._objects.get(number) for number in numbers]
+
+    def met_towards(self, obj: Object, eye: Sequence[float], *, ignore: Iterable[Object] = ()) -> list[Object | None]:
+        """Return the first object on each ray from the point `eye` into an object's shapes: itself or an occluder.
+
+        None means the floor. The list is empty for an object without shapes.
+        """
+        obj.check_present()
+        points = visibility.inner_points(obj.body)
+        others = [each for each in ignore if each is not obj]
+        return self.ray_test([eye] * len(points), points, ignore=others) if points else []
 
     def visible(self, obj: Object, eye: Sequence[float], *, ignore: Iterable[Object] = ()) -> float:
         """Return the share of an object that is visible from the point `eye`, 0 to 1; no field of view limits it.
 
         Rays go to points spread through its shapes; a point is hidden if its ray hits another object or the floor.
         """
-        return visibility.visible_share(self, obj, eye, ignore=frozenset(ignore))
+        hits = self.met_towards(obj, eye, ignore=ignore)
+        return sum(hit is obj for hit in hits) / len(hits) if hits else 0.0
 
     # --- observers --------------------------------------------------------------------------------------------
 

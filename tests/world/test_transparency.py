@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pycrorm_async.world import Arms, BulletWorld, Object, ObjectType, Pose
-from pycrorm_async.world.queries.visibility import met_towards
 from pycrorm_async.world.robots.kinematics import solve
 
 
@@ -12,17 +11,17 @@ def test_a_transparent_hand_in_front_of_an_object_does_not_hide_it(world: Bullet
     Object("kitchen", ObjectType.ENVIRONMENT)
     cereal = Object("cereal", ObjectType.BREAKFAST_CEREAL, pose=Pose([1.56, 1.022, 0.8]))
     eye = (0.65, 0.9455, 1.2573)
-    without_hand = met_towards(world, cereal, eye, ignore=frozenset())
+    without_hand = world.met_towards(cereal, eye)
     assert {None if each is None else each.name for each in without_hand} == {"cereal", "kitchen"}
     robot = Object("pr2", ObjectType.ROBOT, pose=Pose([0.6, 0.9, 0]))
     robot.set_joint_positions(solve(robot, Arms.LEFT, Pose([1.3, 1, 0.93])))
     milk = Object("milk", ObjectType.MILK, pose=Pose([1.3, 1, 0.93]))
-    assert met_towards(world, cereal, eye, ignore=frozenset()) != without_hand
+    assert world.met_towards(cereal, eye) != without_hand
     for _ in range(2):
-        assert met_towards(world, cereal, eye, ignore=frozenset({robot, milk})) == without_hand
-    assert met_towards(world, cereal, eye, ignore=frozenset({milk})) != without_hand
+        assert world.met_towards(cereal, eye, ignore={robot, milk}) == without_hand
+    assert world.met_towards(cereal, eye, ignore={milk}) != without_hand
     world.remove(milk)
-    assert met_towards(world, cereal, eye, ignore=frozenset({robot, milk})) == without_hand
+    assert world.met_towards(cereal, eye, ignore={robot, milk}) == without_hand
 
 
 def test_an_object_is_opaque_again_after_the_query(world: BulletWorld) -> None:

@@ -19,7 +19,6 @@ from pycrorm_async.plan.task_tree import current_node
 from pycrorm_async.world.enums import ObjectType
 from pycrorm_async.world.objects import Object
 from pycrorm_async.world.pose import Pose
-from pycrorm_async.world.queries.visibility import met_towards
 from pycrorm_async.world.robots.robot_description import FieldOfView
 
 Source: TypeAlias = Literal["camera", "world_state"]
@@ -101,7 +100,7 @@ def _visibility(robot: CurrentRobot, camera: Pose, obj: Object) -> tuple[float, 
     """Return the object's visible share, and the reason why it is not perceived, or None if it is."""
     if not in_field_of_view(camera, robot.description.camera_view_rad, obj.bounding_box().centre):
         return 0.0, "is outside the camera's field of view"
-    hits = met_towards(obj.world, obj, camera.position, ignore=robot.with_load())
+    hits = obj.world.met_towards(obj, camera.position, ignore=robot.with_load())
     if not hits:
         return 0.0, "has no shape that could be seen"
     counts = Counter("the floor" if each is None else each.name for each in hits)
