@@ -1,6 +1,6 @@
-"""Style as a test: sizes of files and folders, the first words of docstrings, and words that the glossary replaces.
+"""Style as a test: sizes of files and folders, circles of imports, first words of docstrings, words of the glossary.
 
-Sizes hold for the package; the rules for prose hold for the package, for `bench/` and for `tests/`.
+Sizes and circles hold for the package; the rules for prose hold for the package, for `bench/` and for `tests/`.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
+import grimp
 import pytest
 
 ROOT = Path(__file__).parent.parent.parent
@@ -26,6 +27,30 @@ PAGES = [
 ]
 LINES_MAX = 400
 MODULES_MAX = 12
+CIRCLES = frozenset(
+    {
+        # the package names the classes that it imports on first access, and the memory records the package's version
+        ("pycrorm_async", "memory"),
+        # a world, its objects, their attachments, and the observers that are notified of all three
+        ("world.attachments", "world.bullet", "world.objects", "world.observers"),
+        # operators make expressions, which are designators, and check that their operands have operators
+        (
+            "plan.actions.action_description",
+            "plan.designator",
+            "plan.language.expressions",
+            "plan.language.monitor",
+            "plan.language.operators",
+        ),
+        # rows that refer to each other: a node, its designator, and the objects that it moved
+        ("orm.designators", "orm.objects", "orm.tree"),
+        # the world of a moment draws its own map
+        ("query.notebook.world_map", "query.scene.outlines", "query.snapshot"),
+    }
+)
+"""The modules that may import each other, also inside functions or for types only: each group is one concept.
+
+Elsewhere a module describes what it needs of its importer by a Protocol, or what both need has a module below both.
+"""
 OPENINGS = ("What", "Who", "Where", "How", "Which", "Whether")
 BENCH_OPENINGS = (*OPENINGS, "Each", "Every", "That", "So", "By", "Of", "With", "Without", "Until", "When", "All")
 """The docstrings of `bench/` also do not open with a fragment that has no subject and no verb."""
@@ -97,6 +122,15 @@ def names_of(paths: list[Path]) -> list[str]:
     return [str(each.relative_to(PACKAGE)) for each in paths]
 
 
+def circles_of(graph: grimp.ImportGraph) -> set[tuple[str, ...]]:
+    """Return the largest groups of modules of which each imports every other one, directly or not."""
+    groups = {
+        frozenset({each, *(graph.find_upstream_modules(each) & graph.find_downstream_modules(each))})
+        for each in graph.modules
+    }
+    return {tuple(sorted(each.removeprefix("pycrorm_async.") for each in group)) for group in groups if len(group) > 1}
+
+
 def replaced_in(paths: list[Path]) -> list[str]:
     """Return the places at which prose has a word that the glossary replaces."""
     violations = {
@@ -133,6 +167,12 @@ def test_no_folder_but_that_of_the_verbs_has_more_than_twelve_modules() -> None:
         if len([each for each in folder.glob("*.py") if each.stem[:2] != "__"]) > MODULES_MAX
     ]
     assert names_of(crowded) == []
+
+
+def test_only_modules_of_one_concept_import_each_other() -> None:
+    """Imports inside functions and those under `TYPE_CHECKING` count: both bind the modules to each other."""
+    circles = circles_of(grimp.build_graph("pycrorm_async", cache_dir=None))
+    assert circles == {tuple(sorted(each)) for each in CIRCLES}
 
 
 def test_every_module_has_a_docstring() -> None:
