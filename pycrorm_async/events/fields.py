@@ -21,7 +21,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import msgspec
 
@@ -40,6 +40,7 @@ __all__ = [
     "fault_in_fields",
     "fault_in_table",
     "is_reserved",
+    "AcceptedFields",
 ]
 
 RESERVED_COLUMNS = frozenset(
@@ -68,7 +69,11 @@ _DTYPE_LENGTH_MAX = 255
 """Bounds the bytes of a dtype: longer than real class names, and short enough to quote in a message."""
 _BASES_MAX = 32
 """Bounds the recorded ancestors of a type: a mapped class joins all their views, and SQLite joins at most 64."""
+_FIELDS_MAX = SLOT_MAX - SLOT_FIRST_FIELD + 1
+"""Bounds the fields of a type, because each has a slot of its own."""
 _KINDS = ("action", "motion", "language")
+_SPECIAL_KINDS = ("pose", "object")
+"""Types of fields of which the first is also an attribute with the type's name."""
 _SQL_TRUTH_VALUES = ("true", "false")
 """SQLite reads a column of such a name as the truth value, and names it `column1` in a view."""
 _WORD_START = re.compile(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])")
@@ -189,27 +194,79 @@ def fault_in_table(table: str) -> str | None:
 
 def fault_in_fields(fields: Sequence[FieldDeclared]) -> str | None:
     """Return the reason, naming the field, why these fields cannot be columns of one table; None if they can."""
-    if len(fields) > SLOT_MAX - SLOT_FIRST_FIELD + 1:
-        return f"it has {len(fields)} fields, at most {SLOT_MAX - SLOT_FIRST_FIELD + 1} are allowed"
-    fields_by_name: dict[str, str] = {}
+    if len(fields) > _FIELDS_MAX:
+        return _too_many(len(fields))
+    owners: dict[str, str] = {}
     for field in fields:
-        names = {field.name.lower(), field.column.lower()}
-        reserved = names & RESERVED_COLUMNS
-        if reserved:
-            return f"field {field.name!r} has a reserved name ({', '.join(sorted(reserved))})"
-        if len(field.column.encode()) > _NAME_LENGTH_MAX:
-            return f"field {field.name!r} has a name longer than {_NAME_LENGTH_MAX} bytes"
-        for name in names:
-            if name in fields_by_name:
-                return f"fields {fields_by_name[name]!r} and {field.name!r} would share the name {name!r}"
-        fields_by_name |= dict.fromkeys(names, field.name)
-    for kind in ("pose", "object"):
+        fault = _fault_in_names(field, owners)
+        if fault is not None:
+            return fault
+        owners[field.name.lower()] = owners[field.column.lower()] = field.name
+    for kind in _SPECIAL_KINDS:
         first = next((field.name for field in fields if field.type == kind), None)
         misnamed = _fields_named(fields, kind) - {first}
         if misnamed:
-            return f"field {misnamed.pop()!r}: the name {kind!r} is reserved for the first {kind} field"
+            return _misnamed(misnamed.pop(), kind)
+    return None
+
+
+class AcceptedFields:
+    """The fields that one table has so far; checks each further one alone, so its cost does not grow with their number.
+
+    Attributes:
+        count: the number of fields.
+    """
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._owners: dict[str, str] = {}
+        self._kinds: set[str] = set()
+
+    def fault_in(self, field: FieldDeclared) -> str | None:
+        """Return what `fault_in_fields` returns for the accepted fields followed by this one."""
+        if self.count >= _FIELDS_MAX:
+            return _too_many(self.count + 1)
+        fault = _fault_in_names(field, self._owners)
+        if fault is not None:
+            return fault
+        for kind in _SPECIAL_KINDS:
+            is_first = field.type == kind and kind not in self._kinds
+            if not is_first and _is_named(field, kind):
+                return _misnamed(field.name, kind)
+        return None
+
+    def accept(self, field: FieldDeclared) -> None:
+        """Add a field in which `fault_in` found no fault."""
+        self.count += 1
+        self._owners[field.name.lower()] = self._owners[field.column.lower()] = field.name
+        self._kinds.add(field.type)
+
+
+def _too_many(count: int) -> str:
+    return f"it has {count} fields, at most {_FIELDS_MAX} are allowed"
+
+
+def _misnamed(name: str, kind: str) -> str:
+    return f"field {name!r}: the name {kind!r} is reserved for the first {kind} field"
+
+
+def _fault_in_names(field: FieldDeclared, owners: Mapping[str, str]) -> str | None:
+    """Return the reason why a field cannot have its name and column beside these; `owners` are fields by lower name."""
+    names = {field.name.lower(), field.column.lower()}
+    reserved = names & RESERVED_COLUMNS
+    if reserved:
+        return f"field {field.name!r} has a reserved name ({', '.join(sorted(reserved))})"
+    if len(field.column.encode()) > _NAME_LENGTH_MAX:
+        return f"field {field.name!r} has a name longer than {_NAME_LENGTH_MAX} bytes"
+    for name in names:
+        if name in owners:
+            return f"fields {owners[name]!r} and {field.name!r} would share the name {name!r}"
     return None
 
 
 def _fields_named(fields: Iterable[FieldDeclared], kind: str) -> set[str]:
-    return {field.name for field in fields if {field.name.lower(), field.column.lower()} & {kind, f"{kind}_id"}}
+    return {field.name for field in fields if _is_named(field, kind)}
+
+
+def _is_named(field: FieldDeclared, kind: str) -> bool:
+    return bool({field.name.lower(), field.column.lower()} & {kind, f"{kind}_id"})

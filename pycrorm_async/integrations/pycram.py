@@ -110,6 +110,7 @@ class _PyCRAMPlans:
         self._keys = itertools.count(1)
         self._types: dict[type, DeclaredType] = {}
         self._parallel: dict[int, RunningNode] = {}
+        recording.look_up(map(_dtype, self._values.designators))
 
     @contextmanager
     def observing(self, **labels: Any) -> Iterator[RecordedEpisode]:
@@ -190,8 +191,7 @@ class _PyCRAMPlans:
         if declared is None:
             base, fields = self._pycram.ActionDescription, self._values.field_types(type_, values)
             bases = [each.__name__ for each in type_.__mro__[1:] if issubclass(each, base) and each is not base]
-            dtype = type_.__name__.removesuffix("Node")
-            declared = self._types[type_] = self.seams.recording.type(node.kind, dtype, fields, bases=bases)
+            declared = self._types[type_] = self.seams.recording.type(node.kind, _dtype(type_), fields, bases=bases)
         episode = node.episode
         # Asking Bullet for pose and torso takes as long as recording the event, so it is done where they may differ.
         is_recorded = episode is self._episodes.real and (self._world.is_followed or node.kind == "motion")
@@ -289,3 +289,7 @@ class _PyCRAMPlans:
     def _end_simulation(self, failure: BaseException | None) -> None:
         self._world.flush()
         self._episodes.end_simulation(failure)
+
+
+def _dtype(designator: type) -> str:
+    return designator.__name__.removesuffix("Node")

@@ -50,6 +50,7 @@ class PyCRAMValues:
 
     Attributes:
         pycram: the namespace of PyCRAM's classes.
+        designators: the actions and motions that are imported, and the expressions of the language.
     """
 
     def __init__(self) -> None:
@@ -58,6 +59,7 @@ class PyCRAMValues:
         used = self.pycram
         self._names: dict[type, tuple[str, ...]] = {}
         self._hints: dict[type, dict[str, Any]] = {}
+        self._annotated_types: dict[type, dict[str, FieldSpec]] = {}
         self._poses = (used.PoseStamped, used.Pose)
         self._field_types: tuple[tuple[type, ItemType], ...] = (
             (Enum, "enum"),  # before `int`, which some of PyCRAM's enums are
@@ -71,8 +73,14 @@ class PyCRAMValues:
             (used.Link, "object"),
             (used.ObjectDesignatorDescription, "object"),
         )
-        for designator in (*_descendants(used.ActionDescription), *_descendants(used.BaseMotion)):
-            self._hints_of(designator)  # slow, therefore done before the plan and not during it
+        expressions = (getattr(used, name) for name in _USED["language"].split())
+        self.designators: tuple[type, ...] = (
+            *_descendants(used.ActionDescription),
+            *_descendants(used.BaseMotion),
+            *expressions,
+        )
+        for designator in self.designators:
+            self._annotated(designator)  # slow, therefore done before the plan and not during it
 
     # --- parameters -------------------------------------------------------------------------------------------
 
@@ -120,22 +128,25 @@ class PyCRAMValues:
 
     def field_types(self, designator: type, values: dict[str, Any]) -> dict[str, FieldSpec]:
         """Return the types of the fields: those of the annotations, or of the values where these leave it open."""
-        hints = (
-            {"position": float}
-            | self._hints_of(designator)
-            | {"grasp": Enum, "approach_direction": Enum, "rotate_gripper": bool}
-        )
-        return {name: self._field_type(hints.get(name, type(each)), each) for name, each in values.items()}
+        annotated = self._annotated(designator)
+        hints = self._hints[designator]
+        return {
+            name: annotated.get(name) or self._field_type(hints.get(name, type(each)), each)
+            for name, each in values.items()
+        }
 
-    def _hints_of(self, designator: type) -> dict[str, Any]:
-        hints = self._hints.get(designator)
-        if hints is None:
-            try:
-                hints = typing.get_type_hints(designator)
-            except Exception:  # noqa: BLE001  an annotation may name what its module does not import
-                hints = {}
-            self._hints[designator] = hints
-        return hints
+    def _annotated(self, designator: type) -> dict[str, FieldSpec]:
+        """Return the types of those fields whose annotations decide them, whatever their values are."""
+        types = self._annotated_types.get(designator)
+        if types is None:
+            hints = self._hints[designator] = (
+                {"position": float}
+                | _hints_of(designator)
+                | {"grasp": Enum, "approach_direction": Enum, "rotate_gripper": bool}
+            )
+            types = {name: self._field_type(each, None) for name, each in hints.items() if not _is_bare(each)}
+            self._annotated_types[designator] = types
+        return types
 
     def _field_type(self, hint: Any, value: Any) -> FieldSpec:
         arguments = [each for each in typing.get_args(hint) if each is not NoneType]
@@ -252,6 +263,18 @@ def _descendants(root: type) -> Iterator[type]:
     for each in root.__subclasses__():
         yield each
         yield from _descendants(each)
+
+
+def _hints_of(designator: type) -> dict[str, Any]:
+    try:
+        return typing.get_type_hints(designator)
+    except Exception:  # noqa: BLE001  an annotation may name what its module does not import
+        return {}
+
+
+def _is_bare(hint: Any) -> bool:
+    """Return whether this is a list or a dict of unknown items."""
+    return (typing.get_origin(hint) or hint) in (list, dict) and not typing.get_args(hint)
 
 
 def _function_name(function: Any) -> str:

@@ -102,6 +102,17 @@ class Recording:
             self._emitter.note_fault("DesignatorTypeDeclared", error)
         return declared or _undeclared(kind, dtype)
 
+    def look_up(self, dtypes: Iterable[str]) -> None:
+        """Read the built-in types with these dtypes, so that `type` finds them; declare nothing.
+
+        The first look-up of a dtype in a process takes up to a millisecond. Raises nothing.
+        """
+        try:
+            for each in dtypes:
+                self._known_types.built_in(each)
+        except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
+            self._emitter.note_fault("DesignatorTypeDeclared", error)
+
     def _declare(
         self,
         kind: RecordedKind,

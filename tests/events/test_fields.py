@@ -1,8 +1,10 @@
 """Names of tables and columns, and the clashes that are refused."""
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
-from pycrorm_async.events.fields import column_name, fault_in_fields, fault_in_table, table_name
+from pycrorm_async.events.fields import AcceptedFields, column_name, fault_in_fields, fault_in_table, table_name
 from pycrorm_async.events.values import FieldDeclared, FieldType
 
 
@@ -51,6 +53,36 @@ def test_the_names_pose_and_object_are_reserved_for_the_first_of_their_type() ->
 def test_more_fields_than_slots_are_refused() -> None:
     assert fault_in_fields([declared(f"f{n}") for n in range(30)]) is None
     assert fault_in_fields([declared(f"f{n}") for n in range(31)]) == "it has 31 fields, at most 30 are allowed"
+
+
+CLASHING: st.SearchStrategy[FieldDeclared] = st.builds(
+    declared,
+    st.sampled_from(["pose", "Pose", "pose_id", "object", "object_id", "a", "A", "a_id", "id", "true", "x" * 61]),
+    st.sampled_from(["pose", "object", "text"]),
+)
+
+
+@given(st.lists(CLASHING, max_size=12))
+def test_a_field_checked_beside_the_accepted_ones_has_the_fault_that_all_of_them_together_have(
+    fields: list[FieldDeclared],
+) -> None:
+    accepted: list[FieldDeclared] = []
+    columns = AcceptedFields()
+    for field in fields:
+        fault = columns.fault_in(field)
+        assert fault == fault_in_fields([*accepted, field])
+        if fault is None:
+            accepted.append(field)
+            columns.accept(field)
+    assert columns.count == len(accepted)
+
+
+def test_a_field_beside_as_many_as_there_are_slots_is_refused() -> None:
+    columns = AcceptedFields()
+    for number in range(30):
+        assert columns.fault_in(declared(f"f{number}")) is None
+        columns.accept(declared(f"f{number}"))
+    assert columns.fault_in(declared("more")) == "it has 31 fields, at most 30 are allowed"
 
 
 @pytest.mark.parametrize("table", ["action", "pose", "event", "pycrorm_log", "sqlite_master", "Object", "pose__1"])

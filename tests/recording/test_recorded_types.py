@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import sys
+import threading
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +14,7 @@ import pytest
 
 from pycrorm_async import Memory, Settings
 from pycrorm_async.plan import ActionAbstract
+from pycrorm_async.recording.declarations.declared_type import DeclaredType
 from pycrorm_async.recording.declarations.known_types import KnownTypes
 from pycrorm_async.recording.declarations.recorded_type import FieldSpec, declare_type
 from pycrorm_async.world.pose import Pose
@@ -47,6 +50,11 @@ def recorded(folder: Path, dtype: str, fields: Mapping[str, Any], values: Mappin
     return missing
 
 
+def declared_dtypes(folder: Path) -> list[str]:
+    payloads = ask(folder / "memory.db", "SELECT payload FROM pycrorm_declaration ORDER BY payload")
+    return [json.loads(payload)["dtype"] for (payload,) in payloads]
+
+
 def test_a_field_that_contradicts_a_built_in_type_is_kept_under_its_type(tmp_path: Path) -> None:
     fields = {"object_designator": "text", "arm": str, "grasp": "real"}
     assert recorded(tmp_path, "PickUpAction", fields, {"object_designator": "milk", "arm": "LEFT", "grasp": 1.5}) == 2
@@ -66,6 +74,55 @@ def test_each_memory_searches_the_classes_for_a_built_in_type_once() -> None:
     for _ in range(2):
         declare_type("action", "Wipe", {}, known_types)
     assert searched == ["Wipe"]
+
+
+def test_a_type_is_declared_when_it_is_asked_for_and_has_a_table_without_a_node(tmp_path: Path) -> None:
+    with Memory.sync(url_of(tmp_path), settings=AT_END) as memory, memory.recording.episode(description="d"):
+        memory.recording.type("action", "Wipe", {"surface": "text"})
+    assert declared_dtypes(tmp_path) == ["Wipe"]
+    assert ask(tmp_path / "memory.db", "SELECT surface FROM wipe") == []
+    assert_verified(tmp_path)
+
+
+def test_looking_up_built_in_types_declares_none_and_reserves_no_name(tmp_path: Path) -> None:
+    with Memory.sync(url_of(tmp_path), settings=AT_END) as memory, memory.recording.episode(description="d"):
+        memory.recording.look_up(["PickUpAction", "Wipe"])
+        declared = memory.recording.type("action", "pickUpAction", {"arm": "integer"})
+        assert declared.dtype == "pickUpAction"
+        assert memory.status.faults == (0, None)
+    assert declared_dtypes(tmp_path) == ["pickUpAction"]
+
+
+def test_a_fault_of_looking_up_built_in_types_is_counted_and_does_not_reach_the_caller(tmp_path: Path) -> None:
+    unhashable: Any = [[]]
+    with Memory.sync(url_of(tmp_path), settings=AT_END) as memory:
+        memory.recording.look_up(unhashable)
+        assert memory.status.faults[0] == 1
+
+
+def test_threads_that_ask_for_one_type_at_once_get_one_declaration(tmp_path: Path) -> None:
+    declared: list[DeclaredType] = []
+    together = threading.Barrier(8)
+    with Memory.sync(url_of(tmp_path), settings=AT_END) as memory, memory.recording.episode(description="d"):
+
+        def declare() -> None:
+            together.wait()
+            declared.append(memory.recording.type("action", "Wipe", {f"side_{n}": "real" for n in range(30)}))
+
+        threads = [threading.Thread(target=declare) for _ in range(8)]
+        interval_s = sys.getswitchinterval()
+        sys.setswitchinterval(1e-6)
+        try:
+            for each in threads:
+                each.start()
+            for each in threads:
+                each.join()
+        finally:
+            sys.setswitchinterval(interval_s)
+        assert memory.status.faults == (0, None)
+        spooled = memory.status.written
+    assert {id(each) for each in declared} == {id(declared[0])}
+    assert spooled == 3, "the start of the episode and of its root, and one declaration"
 
 
 def test_a_built_in_type_keeps_its_concept_and_bases(tmp_path: Path) -> None:

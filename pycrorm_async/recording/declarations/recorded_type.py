@@ -14,10 +14,10 @@ from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
 from pycrorm_async.events.codec import encode, fingerprint
 from pycrorm_async.events.fields import (
+    AcceptedFields,
     column_name,
     fault_in_declaration,
     fault_in_dtype,
-    fault_in_fields,
     fault_in_table,
     table_name,
 )
@@ -36,6 +36,7 @@ FieldSpec: TypeAlias = FieldType | tuple[FieldType, ItemType] | type[Any]
 _REASON_MAX = 500
 """Bounds the characters of the reason why a field or type cannot be declared; reasons may quote a user's names."""
 _TYPES: frozenset[str] = frozenset(get_args(FieldType))
+_WITHOUT_ITEMS = _TYPES - {"list", "dict"}
 _ITEMS: frozenset[str] = frozenset(get_args(ItemType))
 
 
@@ -77,21 +78,22 @@ def declare_type(
     and concept are those of the built-in type.
     """
     own = cut(clean(str(dtype)), _REASON_MAX)
-    dtype, fault = _dtype(own, kind, known_types)
+    dtype, table, fault = _dtype(own, kind, known_types)
     renamed = Renamed(dtype, fault) if fault is not None and dtype != own else None
     built_in = known_types.built_in(dtype)
-    table = built_in.table if built_in is not None else table_name(dtype)
     if built_in is not None:
         known_types.note_stored(built_in)
     accepted: list[Field] = []
+    columns = AcceptedFields()
     undeclared: list[Undeclared] = []
     renamed_fields: dict[str, Renamed] = {}
     for name, spec in fields.items():
-        named = _named(str(name), spec, known_types, table, [each.declared for each in accepted])
+        named = _named(str(name), spec, known_types, table, columns)
         if isinstance(named, str):
             undeclared.append(Undeclared(clean(str(name)), (name,), cut(clean(named), _REASON_MAX)))
             continue
         accepted.append(named.field)
+        columns.accept(named.field.declared)
         if named.reason is not None:
             renamed_fields[clean(str(name))] = Renamed(named.field.declared.name, clean(named.reason))
     declaration = DesignatorTypeDeclared(
@@ -119,20 +121,31 @@ def declare_type(
     return Declared(declared, renamed_fields, renamed)
 
 
-def _dtype(own: str, kind: str, known_types: KnownTypes) -> tuple[str, str | None]:
-    """Return the first name that the type may have, and the reason why it is not its own; its own if none may be."""
+def _dtype(own: str, kind: str, known_types: KnownTypes) -> tuple[str, str, str | None]:
+    """Return the first name that the type may have, its table, and the reason why the name is not its own.
+
+    If it may have none of them, the name is its own.
+    """
+    tables: list[str] = []
+    first_fault: str | None = None
+    for candidate in _dtype_candidates(own, kind):
+        built_in = known_types.built_in(candidate)
+        table = built_in.table if built_in is not None else table_name(candidate)
+        tables.append(table)
+        fault = fault_in_dtype(candidate) or fault_in_table(table) or known_types.fault_in_table(table, candidate)
+        if fault is None:
+            return candidate, table, first_fault
+        first_fault = first_fault or cut(clean(fault), _REASON_MAX)
+    return own, tables[0], first_fault
+
+
+def _dtype_candidates(own: str, kind: str) -> Iterator[str]:
+    yield own
     plain = re.sub(r"[\W_]+", "_", own).strip("_") or "Unnamed"
     if not plain.isidentifier():
         plain = f"{kind}_{plain}"
-    first_fault: str | None = None
-    for candidate in (own, plain, f"{plain}{kind.title()}"):
-        built_in = known_types.built_in(candidate)
-        table = built_in.table if built_in is not None else table_name(candidate)
-        fault = fault_in_dtype(candidate) or fault_in_table(table) or known_types.fault_in_table(table, candidate)
-        if fault is None:
-            return candidate, first_fault
-        first_fault = first_fault or cut(clean(fault), _REASON_MAX)
-    return own, first_fault
+    yield plain
+    yield f"{plain}{kind.title()}"
 
 
 def _fault_in_kind(declaration: DesignatorTypeDeclared, built_in: DesignatorTypeDeclared | None) -> str | None:
@@ -151,9 +164,7 @@ def _fault_in_aliases(declaration: DesignatorTypeDeclared, known_types: KnownTyp
     return None
 
 
-def _named(
-    name: str, spec: FieldSpec, known_types: KnownTypes, table: str, accepted: Sequence[FieldDeclared]
-) -> _Named | str:
+def _named(name: str, spec: FieldSpec, known_types: KnownTypes, table: str, accepted: AcceptedFields) -> _Named | str:
     """Return the field under the first name that it may have; the reason if it may have none."""
     shape = _shape(spec)
     if shape is None:
@@ -164,7 +175,7 @@ def _named(
             name=candidate,
             column=column_name(candidate, shape.kind),
             type=shape.kind,
-            slot=SLOT_FIRST_FIELD + len(accepted),
+            slot=SLOT_FIRST_FIELD + accepted.count,
             optional=True,
             enum=f"{shape.enum.__module__}.{shape.enum.__qualname__}" if shape.enum is not None else None,
             item=shape.item,
@@ -186,16 +197,16 @@ def _candidates(name: str, shape: Shape) -> Iterator[str]:
     yield f"{plain}_{shape.kind}"
 
 
-def _fault_in_field(field: FieldDeclared, accepted: Sequence[FieldDeclared]) -> str | None:
+def _fault_in_field(field: FieldDeclared, accepted: AcceptedFields) -> str | None:
     if not field.name.isidentifier() or field.name.startswith("_"):
         return f"{cut(field.name, 100)!r} is not a valid field name"
-    return fault_in_fields([*accepted, field])
+    return accepted.fault_in(field)
 
 
 def _shape(spec: object) -> Shape | None:
     """Return the field type of a spec; None if there is none."""
     if isinstance(spec, str):
-        return Shape(spec) if spec in _TYPES - {"list", "dict"} else None  # type: ignore[arg-type]  # just checked
+        return Shape(spec) if spec in _WITHOUT_ITEMS else None  # type: ignore[arg-type]  # just checked
     if isinstance(spec, tuple) and len(spec) == 2 and spec[0] in ("list", "dict") and spec[1] in _ITEMS:
         return Shape(spec[0], item=spec[1])
     if isinstance(spec, type) and not isinstance(spec, Enum) and issubclass(spec, PoseValue | ObjectReference):
