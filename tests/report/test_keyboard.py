@@ -72,6 +72,7 @@ def test_a_table_of_episodes_is_sorted_by_keys_and_announces_it(chrome: Browser,
         assert tab.ask(FOCUSED) == "episode ▴"
 
 
+@pytest.mark.soak_on(800)
 @pytest.mark.parametrize("width", [420, 800, 1400])
 def test_the_table_of_episodes_is_in_sight_without_scrolling(chrome: Browser, overview: Path, width: int) -> None:
     with chrome.open(overview, width=width) as tab:

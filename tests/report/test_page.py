@@ -1,5 +1,6 @@
 """The page in a real Chromium: it opens by one request and shows the episode, at any width and without WebGL."""
 
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,14 @@ def assert_quiet(tab: Tab, page: Path) -> None:
     assert tab.requests() == [page.as_uri()]
 
 
+@pytest.fixture(scope="module")
+def opened(chrome: Browser, pages: dict[str, Path]) -> Iterator[Tab]:
+    """Yield the plan's page as it opens, for the tests that look at it, or open its panels, and leave the moment."""
+    with chrome.open(pages["plan"]) as tab:
+        tab.settle()
+        yield tab
+
+
 def position(tab: Tab, name: str) -> list[float]:
     return [round(each, 2) for each in tab.ask(POSE.format(name))]
 
@@ -36,7 +45,6 @@ def position(tab: Tab, name: str) -> list[float]:
     [
         (False, 420),
         (True, 800),
-        (False, 1400),
         *(pytest.param(*each, marks=pytest.mark.soak) for each in ((True, 420), (False, 800), (True, 1400))),
     ],
 )
@@ -45,24 +53,32 @@ def test_a_page_opens_by_one_request_and_is_no_wider_than_its_window(
 ) -> None:
     with chrome.open(pages["plan"], width=width, dark=dark) as tab:
         tab.settle()
-        assert tab.ask("document.documentElement.scrollWidth") == width
-        assert tab.ask("document.querySelectorAll('#tree .row').length") > 5
-        assert tab.ask("document.querySelector('#scene canvas').clientWidth") > 300
-        cut = "[...document.querySelectorAll('.row, #controls')].filter((each) => each.scrollWidth > each.clientWidth)"
-        assert tab.ask(f"{cut}.map((each) => each.textContent)") == []
+        assert_fits(tab, width)
         assert_quiet(tab, pages["plan"])
 
 
-def test_it_opens_at_the_last_moment_before_the_world_is_emptied(chrome: Browser, pages: dict[str, Path]) -> None:
-    with chrome.open(pages["plan"]) as tab:
-        assert tab.ask("pycrormPage.episode.presentAt(pycrormPage.event).map((each) => each.name)") == [
-            "kitchen",
-            "pr2",
-            "milk",
-            "cereal",
-        ]
-        assert position(tab, "milk") == [1.3, 0.45, 0.9]
-        assert tab.ask("pycrormPage.event") < tab.ask("pycrormPage.episode.last")
+def test_a_wide_page_opens_by_one_request_and_is_no_wider_than_its_window(opened: Tab, pages: dict[str, Path]) -> None:
+    assert_fits(opened, 1400)
+    assert_quiet(opened, pages["plan"])
+
+
+def assert_fits(tab: Tab, width: int) -> None:
+    assert tab.ask("document.documentElement.scrollWidth") == width
+    assert tab.ask("document.querySelectorAll('#tree .row').length") > 5
+    assert tab.ask("document.querySelector('#scene canvas').clientWidth") > 300
+    cut = "[...document.querySelectorAll('.row, #controls')].filter((each) => each.scrollWidth > each.clientWidth)"
+    assert tab.ask(f"{cut}.map((each) => each.textContent)") == []
+
+
+def test_it_opens_at_the_last_moment_before_the_world_is_emptied(opened: Tab) -> None:
+    assert opened.ask("pycrormPage.episode.presentAt(pycrormPage.event).map((each) => each.name)") == [
+        "kitchen",
+        "pr2",
+        "milk",
+        "cereal",
+    ]
+    assert position(opened, "milk") == [1.3, 0.45, 0.9]
+    assert opened.ask("pycrormPage.event") < opened.ask("pycrormPage.episode.last")
 
 
 def test_an_address_with_an_event_opens_the_page_at_that_moment(chrome: Browser, pages: dict[str, Path]) -> None:
@@ -91,22 +107,21 @@ def test_keys_and_the_slider_move_the_moment_and_the_address_follows(chrome: Bro
         assert_quiet(tab, pages["plan"])
 
 
-def test_failures_are_grouped_by_reason_with_their_count(chrome: Browser, pages: dict[str, Path]) -> None:
-    with chrome.open(pages["plan"]) as tab:
-        assert tab.ask("[...document.querySelectorAll('.failure')].map((each) => each.children[0].textContent)") == [
-            "✗ 2 × IKError"  # noqa: RUF001  the page's sign
-        ]
-        assert "4 failed from 2 causes" in tab.ask("document.getElementById('facts').textContent")
+def test_failures_are_grouped_by_reason_with_their_count(opened: Tab) -> None:
+    opened.ask("pycrormPage.panels.open('failures')")
+    assert opened.ask("[...document.querySelectorAll('.failure')].map((each) => each.children[0].textContent)") == [
+        "✗ 2 × IKError"  # noqa: RUF001  the page's sign
+    ]
+    assert "4 failed from 2 causes" in opened.ask("document.getElementById('facts').textContent")
 
 
-def test_every_tab_draws(chrome: Browser, pages: dict[str, Path]) -> None:
-    with chrome.open(pages["plan"]) as tab:
-        names = tab.ask("pycrormPage.panels.tabs.map(([name]) => name)")
-        assert names == ["details", "failures", "objects", "attachments", "states"]
-        for name in names:
-            tab.ask(f"pycrormPage.panels.open('{name}')")
-            assert len(tab.ask("document.querySelector('.panel').textContent")) > 20
-        assert_quiet(tab, pages["plan"])
+def test_every_tab_draws(opened: Tab, pages: dict[str, Path]) -> None:
+    names = opened.ask("pycrormPage.panels.tabs.map(([name]) => name)")
+    assert names == ["details", "failures", "objects", "attachments", "states"]
+    for name in names:
+        opened.ask(f"pycrormPage.panels.open('{name}')")
+        assert len(opened.ask("document.querySelector('.panel').textContent")) > 20
+    assert_quiet(opened, pages["plan"])
 
 
 def test_the_scene_is_drawn_with_forward_kinematics(chrome: Browser, pages: dict[str, Path]) -> None:
@@ -130,6 +145,7 @@ def test_a_map_takes_the_place_of_the_scene_without_webgl(chrome: Browser, pages
         assert_quiet(tab, pages["plan"])
 
 
+@pytest.mark.soak_on(1400)
 @pytest.mark.parametrize("width", [420, 1400])
 def test_the_names_on_the_map_cover_no_other_and_are_inside(
     chrome: Browser, pages: dict[str, Path], width: int
@@ -173,13 +189,12 @@ def test_a_robot_that_is_not_the_pr2_is_drawn(chrome: Browser, pages: dict[str, 
         assert_quiet(tab, pages["drives"])
 
 
-def test_recorded_text_is_never_markup(chrome: Browser, pages: dict[str, Path]) -> None:
+def test_recorded_text_is_never_markup(opened: Tab, pages: dict[str, Path]) -> None:
     description = "Bring the milk </script><b onload=alert(1)>"
     assert pages["plan"].read_text().count("</script>") == 3
-    with chrome.open(pages["plan"]) as tab:
-        assert tab.ask("document.querySelector('h1').textContent") == description
-        assert tab.ask("document.title") == f"{description} · episode 1"
-        assert tab.ask("document.querySelectorAll('h1 b, #tree b').length") == 0
+    assert opened.ask("document.querySelector('h1').textContent") == description
+    assert opened.ask("document.title") == f"{description} · episode 1"
+    assert opened.ask("document.querySelectorAll('h1 b, #tree b').length") == 0
 
 
 def test_the_policy_lets_no_other_script_run(chrome: Browser, pages: dict[str, Path]) -> None:
@@ -192,6 +207,7 @@ def test_the_policy_lets_no_other_script_run(chrome: Browser, pages: dict[str, P
         assert any("Content Security Policy" in each for each in tab.problems())
 
 
+@pytest.mark.soak_on(1400)
 @pytest.mark.parametrize("width", [420, 1400])
 def test_a_table_of_episodes_counts_failures_by_reason_and_leads_to_the_pages(
     chrome: Browser, recorded: Path, tmp_path: Path, width: int
@@ -239,13 +255,12 @@ async def test_every_link_is_where_bullet_has_it(
             assert position == pytest.approx(list(robot.link_pose(link).position), abs=2e-3), link
 
 
-def test_curves_have_values_with_units_and_their_range(chrome: Browser, pages: dict[str, Path]) -> None:
-    with chrome.open(pages["plan"]) as tab:
-        tab.ask("pycrormPage.panels.open('states')")
-        texts = "[...document.querySelectorAll('figure')].map((each) => each.innerText.split('\\n').filter(Boolean))"
-        curves = {name: rest for name, *rest in tab.ask(texts)}
-        assert curves["pr2 base.y"] == ["0.44 m", "-1.5 to 0.89 m"]
-        assert curves["pr2 l_elbow_flex_joint"][0].endswith(" rad")
+def test_curves_have_values_with_units_and_their_range(opened: Tab) -> None:
+    opened.ask("pycrormPage.panels.open('states')")
+    texts = "[...document.querySelectorAll('figure')].map((each) => each.innerText.split('\\n').filter(Boolean))"
+    curves = {name: rest for name, *rest in opened.ask(texts)}
+    assert curves["pr2 base.y"] == ["0.44 m", "-1.5 to 0.89 m"]
+    assert curves["pr2 l_elbow_flex_joint"][0].endswith(" rad")
 
 
 def test_a_moment_at_which_nothing_runs_shows_the_episode(chrome: Browser, pages: dict[str, Path]) -> None:

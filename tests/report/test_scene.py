@@ -85,6 +85,7 @@ def farthest_over(tab: Tab, moments: int) -> list[float]:
     return list(tab.ask(script))
 
 
+@pytest.mark.soak_on(420)
 @pytest.mark.parametrize("width", [420, 1400])
 def test_everything_is_in_sight_and_as_large_as_that_allows(
     chrome: Browser, pages: dict[str, Path], width: int
