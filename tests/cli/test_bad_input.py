@@ -337,11 +337,9 @@ def test_a_plan_that_ended_leaves_nothing_in_the_spool(folder: Path) -> None:
 
 
 def test_the_settings_may_come_from_the_environment(folder: Path) -> None:
-    settings = environment() | {"PYCRORM_URL": "sqlite:///mine.db", "PYCRORM_SPOOL": "mine.spool"}
-    done = subprocess.run(
-        [*COMMAND, "run", "plans.py"], cwd=folder, env=settings, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr
+    running = Started("run", "plans.py", cwd=folder, PYCRORM_URL="sqlite:///mine.db", PYCRORM_SPOOL="mine.spool")
+    _, errors = running.communicate()
+    assert running.returncode == 0, errors
     assert (folder / "mine.db").exists()
     assert (folder / "mine.spool").is_dir()
     assert not os.path.lexists(folder / "pycrorm.db")

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
+import signal
 from collections.abc import Sequence
 from importlib.metadata import version
 from importlib.util import find_spec
@@ -21,7 +20,7 @@ from pycrorm_async.recording.writing.provenance import PlanSource
 from pycrorm_async.settings import Settings
 from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose
 from tests.bullet import INSTALLED_BULLETS
-from tests.commands import answer, pycrorm
+from tests.commands import answer, pycrorm, run_script
 
 SOURCE = PlanSource("ab" * 32, "cd" * 20, git_dirty=True)
 
@@ -150,7 +149,7 @@ async def main():
                 os.kill(os.getpid(), signal.SIGKILL)
 asyncio.run(main())
 """
-    subprocess.run([sys.executable, "-c", program], cwd=tmp_path, check=False)
+    assert run_script(program, cwd=tmp_path).returncode == -signal.SIGKILL
     url = f"sqlite:///{tmp_path}/memory.db"
     assert pycrorm("writer", "--once", "--url", url, cwd=tmp_path).returncode == 0
     [episode] = answer("episodes", "--url", url, cwd=tmp_path)
@@ -173,5 +172,6 @@ async def main():
             pass
 asyncio.run(main())
 """
-    ran = subprocess.run([sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=True)
+    ran = run_script(program, cwd=tmp_path)
+    assert (ran.returncode, ran.stderr) == (0, "")
     assert "git" not in ran.stdout

@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -46,11 +48,19 @@ def as_written(tmp_path: Path) -> str:
     return unpack_memory_v1(tmp_path)
 
 
+@pytest.fixture(scope="module")
+def rebuilt(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the golden memory and the tables of this version of the fold, which tests copy."""
+    folder = tmp_path_factory.mktemp("rebuilt")
+    asyncio.run(rebuild_memory(unpack_memory_v1(folder)))
+    return folder
+
+
 @pytest.fixture
-async def golden(as_written: str) -> str:
+def golden(rebuilt: Path, tmp_path: Path) -> str:
     """The golden memory with the tables of this version of the fold."""
-    await rebuild_memory(as_written)
-    return as_written
+    shutil.copytree(rebuilt, tmp_path, dirs_exist_ok=True)
+    return f"sqlite:///{tmp_path}/memory.db"
 
 
 def id_of(number: int, sequence: int) -> int:

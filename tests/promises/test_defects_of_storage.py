@@ -44,7 +44,7 @@ from pycrorm_async.plan import (
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world import Arms, ObjectType, Pose
 from pycrorm_async.world import Object as WorldObject
-from tests.commands import environment
+from tests.commands import environment, run_script
 from tests.databases import ask
 from tests.memory.note_actions import NoteActionPerformable
 from tests.memory_in_use import ALLOCATING
@@ -168,7 +168,7 @@ asyncio.run(main())
 
 
 async def test_everything_done_before_a_kill_is_stored(tmp_path: Path) -> None:
-    done = await in_a_process(KILLED, url_of(tmp_path))
+    done = await asyncio.to_thread(run_script, KILLED, url_of(tmp_path))
     assert done.returncode == -signal.SIGKILL, done.stderr
     report = await recover(url_of(tmp_path))
     assert (len(report.lost), report.failed) == (1, {})
