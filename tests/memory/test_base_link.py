@@ -63,7 +63,7 @@ def tiago() -> RobotDescription:
     )
 
 
-@pytest.mark.soak_on("postgresql", "tiago")
+@pytest.mark.soak_on("postgresql", tiago)
 @pytest.mark.parametrize("described", [raised_robot, rail_robot, tiago])
 async def test_every_link_is_seen_again_at_its_place_after_every_action(
     database_url: str, tmp_path: Path, described: Callable[[], RobotDescription]
