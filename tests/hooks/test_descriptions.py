@@ -60,11 +60,11 @@ async def test_a_description_is_encoded_once(monkeypatch: pytest.MonkeyPatch) ->
 
 @pytest.mark.slow
 async def test_a_description_is_put_again_when_many_others_were_put_since() -> None:
-    with recorder_case(Settings(segment_bytes=2**21)) as case, case.episode(), BulletWorld():
+    with recorder_case(Settings(segment_bytes=2**20)) as case, case.episode(), BulletWorld():
         Object("first", ObjectType.GENERIC_OBJECT, box(0))
         Object("again", ObjectType.GENERIC_OBJECT, box(0))
         assert len(declared(case)) == 1
-        rest = 2**21 // 16 // 200
+        rest = 2**20 // 16 // 200
         for number in range(1, rest):
             Object(f"box {number}", ObjectType.GENERIC_OBJECT, box(number))
         Object("late", ObjectType.GENERIC_OBJECT, box(0))

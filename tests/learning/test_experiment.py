@@ -33,8 +33,8 @@ from tests.databases import ask, await_events
 
 pytestmark = pytest.mark.slow
 
-SMALL = Experiment(rollouts=700, evaluate=200, held_out=200, workers=2)
-LONGER = Experiment(rollouts=1_000, evaluate=50, held_out=50, workers=2)
+SMALL = Experiment(rollouts=600, evaluate=100, held_out=100, workers=2)
+LONGER = Experiment(rollouts=600, evaluate=50, held_out=50, workers=2)
 """At its first report most of it must remain, also when the machine is busy and reports are read late."""
 
 
@@ -66,7 +66,7 @@ async def test_a_policy_learned_from_the_memory_succeeds_several_times_as_often(
     reports: dict[str, tuple[int, int]] = {}
     learned = await run(SMALL, place, lambda name, done, total, _: reports.update({name: (done, total)}))
     assert [(each.name, each.tally.rollouts) for each in learned.phases] == [
-        ("default policy", 700), ("learned policy", 200), ("default policy, held out", 200),
+        ("default policy", 600), ("learned policy", 100), ("default policy, held out", 100),
     ]  # fmt: skip
     assert [each.seed for each in learned.phases] == [69, 70, 69 + 1_000_003]
     assert 0.11 < learned.default.tally.success_rate < 0.21
@@ -75,9 +75,9 @@ async def test_a_policy_learned_from_the_memory_succeeds_several_times_as_often(
     assert learned.coverage > 0.6
     assert len(learned.successes) == learned.default.tally.successes
     assert learned.default.grasps["TOP"].successes == 0
-    assert sum(learned.default.stages.values()) == 700 - learned.default.tally.successes
+    assert sum(learned.default.stages.values()) == 600 - learned.default.tally.successes
     assert sum((learned.default.arms | {}).values(), Tally()) == learned.default.tally
-    assert reports["learned policy"][1] == 200
+    assert reports["learned policy"][1] == 100
     assert not workers_running()
     everything = sum(each.tally.rollouts for each in learned.phases)
     assert ask(place.url, f"SELECT count(*) FROM {MoveAndPickUpAction.__tablename__}") == [(everything,)]
@@ -89,9 +89,9 @@ async def test_a_policy_learned_from_the_memory_succeeds_several_times_as_often(
     assert [each.tally for each in again.phases] == [each.tally for each in learned.phases]
 
     resumed_settings = replace(SMALL, resume=True, workers=1)
-    studied = await study(resumed_settings, learned, place, rollouts=60, report_progress=lambda *_: None)
+    studied = await study(resumed_settings, learned, place, rollouts=30, report_progress=lambda *_: None)
     assert [each.rollouts for each in studied.curve] == [500]
-    assert {each.rollouts for each in studied.costs} == {240, 200}
+    assert {each.rollouts for each in studied.costs} == {120, 100}
     turned = [each for each in studied.scenes if each.scene.yaw]
     assert turned
     for each in turned:  # in the object's own frame nothing else has changed
@@ -106,7 +106,7 @@ async def test_a_policy_learned_from_the_memory_succeeds_several_times_as_often(
 
 
 async def fails_without_resume(place: MemoryLocation) -> None:
-    with pytest.raises(CallerError, match=r"700 rollouts .* recorded already .* --resume"):
+    with pytest.raises(CallerError, match=r"600 rollouts .* recorded already .* --resume"):
         await run(SMALL, place)
 
 
@@ -137,10 +137,10 @@ async def test_a_killed_worker_is_reported_and_resuming_loses_and_doubles_nothin
     assert not workers_running()
     await recover(place.url)  # stores what the killed worker's spool still holds, as resuming does
     async with Reading.open(place.url) as reading:
-        before = await read_rollouts(reading, Scene(), name_of(default_policy()), 69, 1_000)
-    assert 0 < len(before) < 1_000
+        before = await read_rollouts(reading, Scene(), name_of(default_policy()), 69, 600)
+    assert 0 < len(before) < 600
     learned = await finished(LONGER, place)
-    assert learned.default.done_now == 1_000 - len(before)
+    assert learned.default.done_now == 600 - len(before)
 
 
 @pytest.mark.soak  # cli/test_learn interrupts and resumes too
@@ -159,7 +159,7 @@ async def test_interrupted_workers_finish_their_current_rollout_and_the_experime
     assert not workers_running()
     assert ask(place.url, "SELECT status FROM process_metadata WHERE status <> 'SUCCEEDED'") == []
     learned = await finished(LONGER, place)
-    assert 0 < learned.default.done_now < 1_000
+    assert 0 < learned.default.done_now < 600
 
 
 @pytest.mark.soak

@@ -131,10 +131,11 @@ def test_probabilities_and_conditioned_ones_equal_those_of_pyjpt(learned: Policy
             assert ours.probability(conditions) == pytest.approx(expected, rel=1e-6, abs=1e-12)
 
 
-def test_a_hundred_generators_never_fail_and_repeat_themselves(learned: Policy) -> None:
+@pytest.mark.parametrize("generators", [20, pytest.param(100, marks=pytest.mark.soak)])
+def test_many_generators_never_fail_and_repeat_themselves(learned: Policy, generators: int) -> None:
     region = Region((Rectangle(-0.9, 0.0, -0.9, 0.9), Rectangle(0.0, 0.9, 0.2, 0.9)))
     conditioned = learned.condition(Evidence(frozenset({Arms.RIGHT}), frozenset({Grasp.LEFT, Grasp.FRONT}), region))
-    for seed in range(100):
+    for seed in range(generators):
         choices = learned.sample(np.random.default_rng(seed), 2000)
         assert learned.coverage(choices) == 1.0
         assert choices == learned.sample(np.random.default_rng(seed), 2000)

@@ -23,9 +23,11 @@ from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.live.access import kept_token, refusal
 from pycrorm_async.live.follower import LogFollower
 from pycrorm_async.live.server import PORT, listen
+from pycrorm_async.memory import Memory
 from pycrorm_async.operations.destination import shared_address
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import EpisodeRow
+from pycrorm_async.world import Pose
 from tests.commands import COMMAND, Started, environment, one_line_of, pycrorm
 from tests.live.conftest import Watch, robot_in
 
@@ -214,10 +216,13 @@ def test_a_terminal_shows_the_tree_of_an_episode_to_its_end(folder: Path) -> Non
 
 @pytest.mark.slow
 def test_a_pipe_gets_the_whole_tree_and_an_end_of_line(tmp_path: Path) -> None:
-    with robot_in(tmp_path) as robot:
-        for number in range(40):
-            robot.start(str(number))
-            robot.end(str(number))
+    with Memory.sync(f"sqlite:///{tmp_path / 'pycrorm.db'}") as memory:
+        drive = memory.recording.type("action", "DriveAction", {"target": Pose})
+        with memory.recording.episode(description="a drive") as episode:
+            for number in range(40):
+                episode.start(str(number), drive, {"target": Pose([1, 2, 0])})
+                episode.end(str(number))
+        memory.flush()
     done = pycrorm("watch", "1", "--terminal", cwd=tmp_path)
     assert done.stdout.count("DriveAction") == 40
     assert "not drawn" not in done.stdout

@@ -54,16 +54,17 @@ OUT_OF_REACH = Pose([1.3, 1, 3])
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "yaw", [0.0, pytest.param(1.0, marks=pytest.mark.soak), pytest.param(math.pi, marks=pytest.mark.soak)]
+    ("yaw", "step"), [(0.0, 4), *(pytest.param(yaw, 1, marks=pytest.mark.soak) for yaw in (0.0, 1.0, math.pi))]
 )
-async def test_from_every_candidate_the_object_can_be_picked_up(scene: Scene, yaw: float) -> None:
+async def test_from_every_candidate_the_object_can_be_picked_up(scene: Scene, yaw: float, step: int) -> None:
+    """At each commit only every fourth candidate is tried."""
     await MoveTorsoActionPerformable(0.2).perform()
     await ParkArmsActionPerformable(Arms.RIGHT).perform()
     scene.milk.set_pose(Pose([1.3, 1, 0.9], yaw_quaternion(yaw)))
     before = scene.world.save_state()
     stands = list(CostmapLocation(target=scene.milk, reachable_for=scene.robot))
     assert len(stands) > 50
-    for stand in stands:
+    for stand in stands[::step]:
         for arm in stand.reachable_arms:
             await NavigateActionPerformable(stand.pose).perform()
             await PickUpActionPerformable(scene.milk, arm, Grasp.FRONT).perform()

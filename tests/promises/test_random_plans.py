@@ -20,7 +20,7 @@ from tests.promises.random_plans import AT_ONCE, Generator, Journal, JournalEntr
 pytestmark = pytest.mark.slow
 
 PLANS = 1_000
-PARTS = 4
+PARTS = 8
 """A part has plans of every kind, so that one part runs by default and the others in turns."""
 
 Row = tuple[str, int | None, str, str | None, str | None]
@@ -168,11 +168,12 @@ async def test_an_ordinary_random_plan_follows_the_rules_of_the_language(plans: 
 # --- concurrency ------------------------------------------------------------------------------------------------------
 
 
-async def test_concurrent_plans_in_tasks_never_share_a_parent(tmp_path: Path) -> None:
+@pytest.mark.parametrize("plans", [45, pytest.param(90, marks=pytest.mark.soak)])
+async def test_concurrent_plans_in_tasks_never_share_a_parent(tmp_path: Path, plans: int) -> None:
     journals: dict[int, Journal] = {}
 
     async def some(first: int) -> None:
-        for seed in range(first, 90, 3):
+        for seed in range(first, plans, 3):
             journals[seed] = await play(seed, memory)
 
     async with Memory.open(f"sqlite:///{tmp_path}/memory.db") as memory:
