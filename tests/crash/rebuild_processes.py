@@ -55,12 +55,14 @@ def _input_closed() -> threading.Event:
     return stop
 
 
-def record_until_stopped(url: str, spool: Path) -> None:
-    """Record and flush episodes of notes; print their number and the longest flush in seconds."""
-    asyncio.run(_record(url, spool, _input_closed()))
+def record_until_stopped(url: str, spool: Path, pause_s: float) -> None:
+    """Record and flush episodes of notes, with a pause after each flush; print their number and the longest flush in
+    seconds.
+    """
+    asyncio.run(_record(url, spool, pause_s, _input_closed()))
 
 
-async def _record(url: str, spool: Path, stop: threading.Event) -> None:
+async def _record(url: str, spool: Path, pause_s: float, stop: threading.Event) -> None:
     longest_s, episodes = 0.0, 0
     async with Memory.open(url, spool=spool, settings=_PATIENT) as memory:
         print("records", flush=True)
@@ -71,15 +73,18 @@ async def _record(url: str, spool: Path, stop: threading.Event) -> None:
             began = time.monotonic()
             await memory.flush()
             longest_s, episodes = max(longest_s, time.monotonic() - began), episodes + 1
+            await asyncio.sleep(pause_s)
     print("recorded", episodes, longest_s, flush=True)
 
 
-def read_until_stopped(url: str) -> None:
-    """Print counts of episodes, nodes, actions and pick-ups until the input is closed, and then the longest query."""
-    asyncio.run(_read(url, _input_closed()))
+def read_until_stopped(url: str, pause_s: float) -> None:
+    """Print counts of episodes, nodes, actions and pick-ups, with pauses, until the input is closed, and then the
+    longest query.
+    """
+    asyncio.run(_read(url, pause_s, _input_closed()))
 
 
-async def _read(url: str, stop: threading.Event) -> None:
+async def _read(url: str, pause_s: float, stop: threading.Event) -> None:
     longest_s = 0.0
     async with Reading.open(url) as reading:
         while not stop.is_set():
@@ -91,4 +96,5 @@ async def _read(url: str, stop: threading.Event) -> None:
                 picked = (await session.scalars(select(func.count()).select_from(PickUpWithContextView))).one()
             longest_s = max(longest_s, time.monotonic() - began)
             print("counted", episodes, nodes, actions, picked, flush=True)
+            await asyncio.sleep(pause_s)
     print("waited", longest_s, flush=True)

@@ -26,9 +26,9 @@ HANGS_S = 300.0
 class RobotProcess:
     """The process of one plan, and the lines that it wrote."""
 
-    def __init__(self, url: str, spool: Path, name: str, seed: int) -> None:
+    def __init__(self, url: str, spool: Path, name: str, seed: int, pause_s_max: float) -> None:
         self.name = name
-        self.forked = ForkedProcess(run_step_robot, url, str(spool), name, seed)
+        self.forked = ForkedProcess(run_step_robot, url, str(spool), name, seed, pause_s_max)
 
     def wait_until_it_performs(self) -> None:
         deadline = time.monotonic() + HANGS_S
@@ -53,12 +53,13 @@ class RobotProcess:
 class Lab:
     """One database, one spool, the robots that record into it, and at most one daemon."""
 
-    def __init__(self, folder: Path, url: str, seed: int) -> None:
+    def __init__(self, folder: Path, url: str, seed: int, *, pause_s_max: float = 0.02) -> None:
         print(f"seed {seed}")
         self.folder = folder
         self.url = url
         self.spool = folder / "spool"
         self.rng = random.Random(seed)
+        self.pause_s_max = pause_s_max
         self.robots: list[RobotProcess] = []
         self.gone: list[RobotProcess] = []
         self.daemon: Started | None = None
@@ -66,7 +67,7 @@ class Lab:
 
     def start_robot(self, name: str | None = None) -> RobotProcess:
         name = name or f"robot{len(self.robots) + len(self.gone)}"
-        robot = RobotProcess(self.url, self.spool, name, self.rng.randrange(2**31))
+        robot = RobotProcess(self.url, self.spool, name, self.rng.randrange(2**31), self.pause_s_max)
         self.robots.append(robot)
         return robot
 

@@ -44,7 +44,7 @@ def stop_requested() -> bool:
     return bool(select.select([0], [], [], 0)[0])
 
 
-async def perform_steps(url: str, spool: Path, name: str, rng: random.Random) -> None:
+async def perform_steps(url: str, spool: Path, name: str, rng: random.Random, pause_s_max: float) -> None:
     async with Memory.open(url, spool=spool, writer="daemon", settings=SETTINGS) as memory:
         report("opened")
         for number in itertools.count():
@@ -54,7 +54,7 @@ async def perform_steps(url: str, spool: Path, name: str, rng: random.Random) ->
                     await StepActionPerformable(episode, step).perform()
                     report("did", episode, step)
                     if rng.random() < 0.1:
-                        await asyncio.sleep(rng.random() * 0.02)
+                        await asyncio.sleep(rng.random() * pause_s_max)
             report("ended", episode)
             if stop_requested():
                 return
@@ -62,5 +62,6 @@ async def perform_steps(url: str, spool: Path, name: str, rng: random.Random) ->
                 await memory.synced()
 
 
-def run_step_robot(url: str, spool: str, name: str, seed: int) -> None:
-    asyncio.run(perform_steps(url, Path(spool), name, random.Random(seed)))
+def run_step_robot(url: str, spool: str, name: str, seed: int, pause_s_max: float) -> None:
+    """Perform steps until the input is closed, with a pause of at most `pause_s_max` after every tenth on average."""
+    asyncio.run(perform_steps(url, Path(spool), name, random.Random(seed), pause_s_max))

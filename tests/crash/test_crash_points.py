@@ -1,7 +1,7 @@
 """Kill a process at each step that touches the disk or the log, and its successor too: every event is stored once.
 
 A forked child does the work and exits at once, before or after the n-th such step, without closing anything; n takes
-every value in the soak, and otherwise each third from a random one on. A pipe keeps what the child was promised before
+every value in the soak, and otherwise each sixth from a random one on. A pipe keeps what the child was promised before
 it died.
 """
 
@@ -125,7 +125,7 @@ def stored(url: str, number: int) -> list[tuple[int, str, str]]:
 
 KILLS = pytest.mark.parametrize(
     ("after", "stride"),
-    [(False, 3), pytest.param(False, 1, marks=pytest.mark.soak), pytest.param(True, 1, marks=pytest.mark.soak)],
+    [(False, 6), pytest.param(False, 1, marks=pytest.mark.soak), pytest.param(True, 1, marks=pytest.mark.soak)],
 )
 """Killed before each step; a kill after the step differs only by what a process does between two steps."""
 

@@ -37,7 +37,7 @@ def kill_again_and_again(lab: Lab, *, robots: int, kills: int) -> None:
 
 @pytest.mark.soak_on("postgresql")
 def test_killed_daemons_and_plans_leave_every_step_stored_once(database_url: str, tmp_path: Path) -> None:
-    lab = Lab(tmp_path, database_url, random.randrange(2**31))
+    lab = Lab(tmp_path, database_url, random.randrange(2**31), pause_s_max=0.1)
     try:
         kill_again_and_again(lab, robots=3, kills=2)
     finally:

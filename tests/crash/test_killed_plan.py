@@ -2,6 +2,7 @@
 
 import os
 import random
+import select
 import signal
 import subprocess
 import time
@@ -49,16 +50,12 @@ def killed(folder: Path, seconds: float) -> tuple[set[int], set[int]]:
     output = process.stdout.readline()
     assert output == b"started 0\n"
     read_end = process.stdout.fileno()
-    os.set_blocking(read_end, False)
     deadline = time.monotonic() + seconds
-    while time.monotonic() < deadline:
-        try:
+    while (left_s := deadline - time.monotonic()) > 0:
+        if select.select([read_end], [], [], left_s)[0]:
             output += os.read(read_end, 1 << 16)
-        except BlockingIOError:
-            continue
     process.send_signal(signal.SIGKILL)
     process.wait()
-    os.set_blocking(read_end, True)
     output += process.stdout.read()
     process.stdout.close()
     whole = output[: output.rfind(b"\n")].decode().splitlines()

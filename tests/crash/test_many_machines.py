@@ -142,7 +142,7 @@ async def kill_repeatedly(machines: list[Machine], seconds: float) -> None:
             return
 
 
-@pytest.mark.parametrize("seconds", [6.0, pytest.param(600.0, marks=pytest.mark.soak)])
+@pytest.mark.parametrize("seconds", [4.0, pytest.param(600.0, marks=pytest.mark.soak)])
 async def test_sixteen_robots_and_two_daemons_behind_a_failing_network_lose_and_double_nothing(
     server: Server, tmp_path: Path, seconds: float, in_turn: bool
 ) -> None:

@@ -61,7 +61,7 @@ async def kill_again_and_again(url: str, kills: int, *, workers: int) -> None:
 async def test_a_rebuild_killed_anywhere_changes_nothing_readers_see_and_the_next_one_leaves_no_trace(
     database_url: str,
 ) -> None:
-    await kill_again_and_again(database_url, 3, workers=1)
+    await kill_again_and_again(database_url, 2, workers=1)
 
 
 @pytest.mark.soak  # projections/test_rebuild kills workers
@@ -95,11 +95,13 @@ async def test_a_killed_worker_costs_time_and_no_event(database_url: str, monkey
     assert differences(before, tables_of(database_url)) == []
 
 
-async def rebuild_beside_recorders(url: str, folder: Path, *, episodes: int, rebuilds: int, readers: int) -> None:
+async def rebuild_beside_recorders(
+    url: str, folder: Path, *, episodes: int, rebuilds: int, readers: int, pause_s: float = 0.0
+) -> None:
     await filled(url, episodes)
     others = [
-        ForkedProcess(record_until_stopped, url, folder / "spool"),
-        *(ForkedProcess(read_until_stopped, url) for _ in range(readers)),
+        ForkedProcess(record_until_stopped, url, folder / "spool", pause_s),
+        *(ForkedProcess(read_until_stopped, url, pause_s) for _ in range(readers)),
     ]
     for each in others:
         each.wait_for_first_output()
@@ -128,7 +130,7 @@ async def rebuild_beside_recorders(url: str, folder: Path, *, episodes: int, reb
 
 
 async def test_a_rebuild_changes_nothing_for_processes_that_record_and_read(database_url: str, tmp_path: Path) -> None:
-    await rebuild_beside_recorders(database_url, tmp_path, episodes=100, rebuilds=2, readers=1)
+    await rebuild_beside_recorders(database_url, tmp_path, episodes=30, rebuilds=2, readers=1, pause_s=0.1)
 
 
 @pytest.mark.soak
