@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import logging
-import multiprocessing
 from pathlib import Path
 
 import pytest
 
 from pycrorm_async.operations.rebuild import rebuild_memory
+from tests.commands import FORKED, fork
 from tests.projections.factories import append_and_fold
 from tests.projections.rebuild_cases import TYPES, picking
 from tests.table_comparison import differences, tables_of
@@ -27,8 +27,8 @@ def test_a_rebuild_in_a_daemonic_process_folds_without_workers(tmp_path: Path) -
     asyncio.run(append_and_fold(url, [*TYPES, *picking(1).records]))
     before = tables_of(url)
     arguments = (url, f"{tmp_path}/log")
-    process = multiprocessing.get_context("spawn").Process(target=rebuild_with_two_workers, args=arguments, daemon=True)
-    process.start()
+    process = FORKED.Process(target=rebuild_with_two_workers, args=arguments, daemon=True)
+    fork(process)
     process.join(120)
     assert process.exitcode == 0
     assert differences(before, tables_of(url)) == []

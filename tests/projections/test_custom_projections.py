@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import multiprocessing
 import os
 import re
 import signal
@@ -34,6 +33,7 @@ from pycrorm_async.projections.verify.verify import verify
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
+from tests.commands import FORKED, fork
 from tests.projections.event_script import PICK_UP, SAYING, Script, declarations, declared, field, mixed, name_of, row
 from tests.projections.sql_queries import ask, names
 
@@ -497,10 +497,8 @@ def _die_in_batch(url: str, last: int, *, rebuilding: bool) -> None:
 async def test_a_killed_fold_continues_where_it_was(log: EventLog, database_url: str, *, rebuilding: bool) -> None:
     await folded(log, [*declarations(PICK_UP), *mixed(tries(1), tries(2))], *([GraspRate()] if rebuilding else []))
     for last in (1, 2):
-        process = multiprocessing.get_context("spawn").Process(
-            target=_die_in_batch, args=(database_url, last), kwargs={"rebuilding": rebuilding}
-        )
-        process.start()
+        process = FORKED.Process(target=_die_in_batch, args=(database_url, last), kwargs={"rebuilding": rebuilding})
+        fork(process)
         await asyncio.to_thread(process.join)
         assert process.exitcode == -signal.SIGKILL
     if rebuilding:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import multiprocessing
 import os
 import signal
 from collections import Counter
@@ -26,6 +25,7 @@ from pycrorm_async.projections.replaced_tables import clear
 from pycrorm_async.projections.verify.verify import verify
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
+from tests.commands import FORKED, fork
 from tests.projections.event_script import PICK_UP, Script, declarations, mixed, name_of, row
 from tests.projections.sql_queries import ask
 
@@ -267,8 +267,8 @@ async def test_a_killed_fold_continues_with_the_state_of_its_episodes(log: Event
     plain = Projector(log)
     await plain.open()
     await plain.catch_up()
-    process = multiprocessing.get_context("spawn").Process(target=_die_in_second_batch, args=(database_url,))
-    process.start()
+    process = FORKED.Process(target=_die_in_second_batch, args=(database_url,))
+    fork(process)
     await asyncio.to_thread(process.join)
     assert process.exitcode == -signal.SIGKILL
     assert len(await rows_in(log)) == 2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import multiprocessing
 import os
 import random
 from collections.abc import Callable, Sequence
@@ -11,7 +12,6 @@ from itertools import pairwise
 from pathlib import Path
 
 import msgspec
-import psutil
 import pytest
 from sqlalchemy import func, select
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
@@ -57,7 +57,7 @@ OUR_VIEW = UserView("Failed", select(TaskTreeNode.id, TaskTreeNode.reason).where
 async def every_kind_of_episode(url: str, spool: Path) -> None:
     """Return random plans with types of their own and failures, a simulation, a lost episode, and a parked one."""
     async with Memory.open(url, spool=spool, views=[OUR_VIEW], settings=PATIENT) as memory:
-        for seed in range(6):
+        for seed in range(3):
             await play(seed, memory)
         await memory.flush()
     scripts = [*map(picking, range(1, 8)), picking(8, simulated=True), lost(9), parking(10)]
@@ -145,17 +145,18 @@ async def test_large_logs_are_rebuilt_by_two_processes_where_two_cores_are_idle(
     assert differences(before, tables_of(url)) == []
 
 
+@pytest.mark.usefixtures("forked_workers")
 async def test_workers_that_are_killed_are_restarted_and_the_tables_are_the_same(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     url = f"sqlite:///{tmp_path}/memory.db"
     episodes = [picking(number, nodes=124).records for number in range(1, 71)]  # two batches for each of two workers
     await append_and_fold(url, [*TYPES, *(record for records in episodes for record in records)])
-    before, killed = tables_of(url), set[int]()
+    before, killed = tables_of(url), set[int | None]()
 
     def kill_once(_done: int, _total: int, _what: str | None = None) -> None:
         if not killed:
-            workers = [each for each in psutil.Process().children() if "spawn_main" in " ".join(each.cmdline())]
+            workers = [each for each in multiprocessing.active_children() if each.name.startswith("fold worker")]
             killed.update(each.pid for each in workers)
             for each in workers:
                 each.kill()

@@ -19,6 +19,7 @@ from pycrorm_async.store.log import EventLog
 from tests.databases import ask, ask_each, ask_to_change, change_each
 from tests.projections.event_script import NAVIGATE, PICK_UP, name_of
 from tests.projections.verify_cases import (
+    PreparedMemory,
     assert_clean,
     fold_in_batches,
     full,
@@ -37,13 +38,23 @@ pytestmark = [pytest.mark.soak_on("postgresql"), pytest.mark.slow]
 TRIGGERS = "SELECT name FROM sqlite_master WHERE type = 'trigger'"
 
 
-@pytest.fixture
-async def log(database_url: str) -> AsyncIterator[EventLog]:
-    """Open for reading a log of three episodes with twenty events each, in a database that lets its log be changed."""
-    log = await opened(database_url)
-    await fold_in_batches(log, [full(1), full(2), full(3)], 10_000)
+async def fill(url: str, rounds_of_second: int = 1) -> None:
+    """Store and fold three episodes, and allow changes of the log."""
+    log = await opened(url)
+    await fold_in_batches(log, [full(1), full(2, rounds=rounds_of_second), full(3)], 10_000)
     await log.close()
-    unlock(database_url)
+    unlock(url)
+
+
+@pytest.fixture(scope="module")
+def prepared(tmp_path_factory: pytest.TempPathFactory) -> PreparedMemory:
+    return PreparedMemory(fill, tmp_path_factory.mktemp("prepared"))
+
+
+@pytest.fixture
+async def log(database_url: str, prepared: PreparedMemory) -> AsyncIterator[EventLog]:
+    """Open for reading a log of three episodes with twenty events each, in a database that lets its log be changed."""
+    await prepared.put_at(database_url)
     reader = await EventLog.open(DatabaseAddress.parse(database_url), create=False)
     yield reader
     await reader.close()
@@ -209,11 +220,7 @@ async def test_an_unreadable_event_is_damage_even_before_it_is_folded(
 @pytest.fixture
 async def file(tmp_path: Path) -> Path:
     """Three episodes in a SQLite file that no process has open, the second with several hundred events."""
-    url = f"sqlite:///{tmp_path / 'memory.db'}"
-    log = await opened(url)
-    await fold_in_batches(log, [full(1), full(2, rounds=30), full(3)], 10_000)
-    await log.close()
-    unlock(url)
+    await fill(f"sqlite:///{tmp_path / 'memory.db'}", 30)
     return tmp_path / "memory.db"
 
 

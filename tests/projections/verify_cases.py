@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import json
+import shutil
 import threading
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
@@ -206,6 +208,23 @@ async def fold_in_batches(log: EventLog, scripts: Sequence[Script], events: int)
     await projector.open()
     await log.append([*TYPES, *(each for script in scripts for each in script.records)])
     await projector.catch_up()
+
+
+class PreparedMemory:
+    """A memory for each test of a module: made with `fill`, on SQLite once and then copied."""
+
+    def __init__(self, fill: Callable[[str], Awaitable[None]], folder: Path) -> None:
+        self._fill = fill
+        self._file = folder / "memory.db"
+
+    async def put_at(self, url: str) -> None:
+        """Fill the new database of this URL."""
+        if url.startswith("postgresql:"):
+            await self._fill(url)
+            return
+        if not self._file.exists():
+            await self._fill(f"sqlite:///{self._file}")
+        shutil.copyfile(self._file, url.removeprefix("sqlite:///"))
 
 
 # --- changes ----------------------------------------------------------------------------------------------------------
