@@ -5,6 +5,7 @@ import os
 import signal
 import sqlite3
 import subprocess
+import sys
 import time
 from contextlib import closing
 from pathlib import Path
@@ -268,14 +269,26 @@ def test_a_database_in_a_folder_without_write_permission_is_reported_with_its_pa
     assert len(answer("episodes", cwd=folder)) == 1
 
 
+def bound() -> list[str]:
+    """Return the command that runs another one as a user whom the modes of files bind, as they do not bind root."""
+    return ["setpriv", "--bounding-set=-dac_override,-dac_read_search"] if os.geteuid() == 0 else []
+
+
 def without_rights(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
-    """Run the command as a user whom the modes of files bind, as they do not bind root."""
-    bound = ["setpriv", "--bounding-set=-dac_override,-dac_read_search"] if os.geteuid() == 0 else []
-    command = [*bound, *COMMAND, *arguments]
+    command = [*bound(), *COMMAND, *arguments]
     return subprocess.run(command, cwd=cwd, env=environment(), capture_output=True, text=True, timeout=60, check=False)
 
 
-@pytest.mark.soak
+def test_a_file_that_may_only_be_read_is_not_opened_for_recording(tmp_path: Path) -> None:
+    (tmp_path / "memory.db").touch(0o444)
+    opening = "from pycrorm_async.store.schema import make_file; make_file(Path('memory.db'), 'memory.db', 'owner')"
+    command = [*bound(), sys.executable, "-c", f"from pathlib import Path; {opening}"]
+    done = subprocess.run(command, cwd=tmp_path, env=environment(), capture_output=True, text=True, check=False)
+    reason = "this user may only read it: record with a user who may write it, or name another file"
+    assert done.stderr.endswith(f"DatabaseUnavailable: memory.db cannot be written: {reason}\n")
+
+
+@pytest.mark.soak  # the test before it opens the file only
 def test_a_file_that_may_only_be_read_is_refused_before_the_plan_runs_and_can_be_read(folder: Path) -> None:
     assert pycrorm("run", "plans.py", cwd=folder).returncode == 0
     (folder / "pycrorm.db").chmod(0o444)

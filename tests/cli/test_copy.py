@@ -12,7 +12,7 @@ from urllib.parse import quote
 import asyncpg
 import pytest
 
-from tests.commands import COMMAND, answer, environment, one_line_of, pycrorm
+from tests.commands import COMMAND, Started, answer, environment, one_line_of, pycrorm
 from tests.copying.memories import assert_same
 from tests.databases import Server
 from tests.projections.factories import append_and_fold
@@ -69,17 +69,10 @@ def test_a_copy_reports_what_it_did_and_the_copy_of_the_copy_is_the_same(folder:
     assert_same(f"sqlite:///{folder}/a.db", f"sqlite:///{folder}/b.db")
 
 
-@pytest.mark.soak
 def test_the_environment_may_name_the_source(folder: Path) -> None:
-    done = subprocess.run(
-        [*COMMAND, "copy", "--to", "sqlite:///b.db"],
-        cwd=folder,
-        env=environment() | {"PYCRORM_URL": "sqlite:///a.db"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert (done.returncode, done.stderr) == (0, "")
+    copying = Started("copy", "--to", "sqlite:///b.db", cwd=folder, PYCRORM_URL="sqlite:///a.db")
+    _, errors = copying.communicate()
+    assert (copying.returncode, errors) == (0, "")
     assert logs_of(f"sqlite:///{folder}/b.db") == logs_of(f"sqlite:///{folder}/a.db")
 
 

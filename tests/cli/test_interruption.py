@@ -61,6 +61,27 @@ async def main():
 asyncio.run(main())
 """
 
+STORING = """
+import asyncio, os, signal
+from pycrorm_async.cli import interruption
+
+interruption._NOTE_DELAY_S = 0.0
+
+async def main():
+    handling = interruption.Interruption()
+    with handling.handled():
+        os.kill(os.getpid(), signal.SIGINT)
+        try:
+            await asyncio.sleep(60)
+        except asyncio.CancelledError:  # the plan has ended, and its events are being stored
+            handling.plan_ended()
+            await asyncio.sleep(0.01)
+            os.kill(os.getpid(), signal.SIGINT)
+            print("not reached")
+
+asyncio.run(main())
+"""
+
 PLAN = """
 import pathlib, time
 from dataclasses import dataclass
@@ -88,7 +109,7 @@ def _appears(path: Path) -> bool:
     return path.exists()
 
 
-@pytest.mark.soak
+@pytest.mark.soak  # the second signal while events are stored is also sent to a script, below
 @pytest.mark.slow
 def test_a_plan_whose_database_is_unavailable_at_its_end_is_interrupted_by_ctrl_c_and_stored_later(
     tmp_path: Path,
@@ -141,6 +162,15 @@ def test_an_interrupt_during_output_comes_after_the_last_line(tmp_path: Path) ->
     )
     line = "pycrorm: interrupted; events not stored yet are safe in the spool, and the next start stores them\n"
     assert (done.returncode, done.stderr) == (130, line)
+
+
+def test_an_interrupt_while_events_are_stored_ends_at_once_and_the_line_before_announced_it(tmp_path: Path) -> None:
+    done = run_script(STORING, cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (130, "")
+    assert done.stderr.splitlines() == [
+        "recorded events are being stored; Ctrl-C again exits at once without losing any",
+        "pycrorm: interrupted; events not stored yet are safe in the spool, and the next start stores them",
+    ]
 
 
 def test_a_verb_that_writes_files_treats_sigterm_as_ctrl_c() -> None:

@@ -7,13 +7,19 @@ import json
 import signal
 import sqlite3
 import subprocess
+from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from pycrorm_async.learning import load_policy, name_of
-from tests.commands import COMMAND, answer, environment, one_line_of, pycrorm
+from pycrorm_async.cli import learn as learn_command
+from pycrorm_async.learning import default_policy, load_policy, name_of
+from pycrorm_async.learning.experiment import ExperimentResult, Phase
+from pycrorm_async.learning.rollouts.kitchen_trial import KitchenResult
+from pycrorm_async.learning.rollouts.rollouts import Tally
+from tests.commands import COMMAND, Started, answer, environment, one_line_of, pycrorm
 from tests.databases import ask, await_events
 from tests.shared_folders import made_once
 
@@ -40,7 +46,7 @@ def document(folder: Path) -> Any:
     return json.loads((folder / "document.json").read_text())
 
 
-@pytest.mark.soak  # promises/test_readme runs the command too
+@pytest.mark.soak  # the interrupted experiment is printed too
 def test_learn_prints_the_rollouts_the_rates_and_the_path_of_the_policy(document: Any, folder: Path) -> None:
     default, learned, held_out = document["phases"]
     assert (default["rollouts"], learned["rollouts"], held_out["rollouts"]) == (400, 150, 150)
@@ -83,32 +89,61 @@ def test_a_study_is_printed_as_a_table(folder: Path) -> None:
     assert "The same policies in other scenes" in done.stdout
 
 
-@pytest.mark.soak  # learning/test_experiment makes one
+@pytest.mark.soak  # the first test of learning/test_experiment makes one
 def test_a_study_evaluates_the_policy_under_other_conditions(document: Any) -> None:
     studied = document["study"]
     assert len(studied["elsewhere"]) > 8
     assert {each["default"]["rollouts"] for each in studied["elsewhere"]} == {4}
 
 
-@pytest.mark.soak
-def test_an_interrupt_is_one_line_and_resume_continues(tmp_path: Path) -> None:
-    longer = ("--rollouts", "1000")
-    command = [*COMMAND, *SMALL, *longer, "--workers", "2"]
-    process = subprocess.Popen(command, cwd=tmp_path, env=environment(), stderr=subprocess.PIPE, text=True)
-    await_events(tmp_path / "pycrorm.db", 500)
+def test_an_interrupt_is_one_line_and_resume_performs_the_rest_and_prints_all(tmp_path: Path) -> None:
+    settings = ("learn", "--evaluate", "30", "--held-out", "30", "--min-samples-leaf", "10", "--workers", "1")
+    process = Started(*settings, "--rollouts", "100000", cwd=tmp_path)
+    await_events(tmp_path / "pycrorm.db", 100)
     process.send_signal(signal.SIGINT)
-    _, said = process.communicate(timeout=120)
-    assert process.returncode == 130, said
-    *note, message = said.strip().splitlines()
+    _, printed = process.communicate(timeout=120)
+    assert process.returncode == 130, printed
+    *note, message = printed.strip().splitlines()
     assert message == "pycrorm: interrupted; all events recorded so far are kept"
     assert note in ([], ["recorded events are being stored; Ctrl-C again exits at once without losing any"])
-    document = answer(*BY_ONE, *longer, "--resume", cwd=tmp_path)
-    assert [each["rollouts"] for each in document["phases"]] == [1_000, 150, 150]
-    assert 0 < document["phases"][0]["done_now"] < 1_000
-    assert document["study"] is None
+    assert ask(tmp_path / "pycrorm.db", "SELECT DISTINCT status FROM process_metadata") == [("SUCCEEDED",)]
+
+    recorded = ask(tmp_path / "pycrorm.db", "SELECT count(*) FROM move_and_pick_up_action")[0][0]
+
+    document = answer(*settings, "--rollouts", "300", "--resume", cwd=tmp_path)
+    default, learned, held_out = document["phases"]
+    assert [each["rollouts"] for each in document["phases"]] == [300, 30, 30]
+    assert (recorded > 0, default["done_now"]) == (True, max(300 - recorded, 0))
+    assert 0.08 < default["success_rate"] < 0.25 < learned["success_rate"]
+    assert default["interval"][0] < default["success_rate"] < default["interval"][1]
+    failed = 300 - default["successes"]
+    assert (default["failures"], sum(default["stages"].values())) == ({"IKError": failed}, failed)
+    assert document["successes"] == default["successes"]
+    saved = load_policy(tmp_path / document["policy"]["file"])
+    assert (name_of(saved), len(saved.leaves)) == (document["policy"]["name"], document["policy"]["leaves"])
+    assert (learned["policy"], held_out["policy"]) == (document["policy"]["name"], default["policy"])
+    assert (tmp_path / document["figure"]).read_bytes().startswith(b"\x89PNG")
+    assert (document["kitchen"]["tries"] > 0, document["study"]) == (True, None)
 
 
-@pytest.mark.soak  # test_interruption shows it of a plan
+def test_the_result_is_printed_as_tables(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    tally = Tally(1, Counter(IKError=3))
+    before = Phase("default policy", "p", 69, tally, {"grasp": 3}, {"LEFT": tally}, {"TOP": Tally()}, 0, 0.0)
+    now = replace(before, name="learned policy", done_now=4, seconds=2.0)
+    learned = ExperimentResult((before, now), default_policy(), (), 0.5)
+    learn_command._print(learned, KitchenResult(3, None, "out of reach", "an episode"), None)
+    printed = [" ".join(line.replace("│", " ").split()) for line in capsys.readouterr().out.splitlines()]
+    assert "default policy 4 25.0% 4.6% to 69.9% from the log grasp 3" in printed
+    assert "learned policy 4 25.0% 4.6% to 69.9% 2 grasp 3" in printed
+    assert printed[-3:] == [
+        "from 0 successes, 1 leaves",
+        "coverage 50.0% of the held-out successes are possible under the learned policy",
+        "kitchen not picked up in 3 attempts: out of reach",
+    ]
+
+
+@pytest.mark.soak  # test_interruption sends the second signal to a script
 def test_a_second_interrupt_ends_at_once_and_resume_continues(tmp_path: Path) -> None:
     command = [*COMMAND, *BY_ONE, "--rollouts", "100000", "--json"]
     process = subprocess.Popen(

@@ -320,7 +320,6 @@ async def test_a_world_with_more_objects_than_an_episode_has_events_is_not_conti
     assert case.emitter.faults.total == 0
 
 
-@pytest.mark.soak
 def test_the_limit_on_the_events_of_an_episode_is_checked() -> None:
     assert Settings().episode_events_max == SEQUENCE_MAX
     for wrong in (0, 99, SEQUENCE_MAX + 1, 150.5):

@@ -143,7 +143,7 @@ async def test_a_killed_worker_is_reported_and_resuming_loses_and_doubles_nothin
     assert learned.default.done_now == 600 - len(before)
 
 
-@pytest.mark.soak  # cli/test_learn interrupts and resumes too
+@pytest.mark.soak  # cli/test_learn interrupts and resumes the command
 async def test_interrupted_workers_finish_their_current_rollout_and_the_experiment_can_be_resumed(
     tmp_path: Path,
 ) -> None:
@@ -227,7 +227,7 @@ async def test_held_out_rollouts_without_a_success_leave_the_coverage_unknown(tm
     assert learned.coverage is None
 
 
-@pytest.mark.soak  # cli/test_learn runs a study too
+@pytest.mark.soak  # the first test makes a study, and rollouts beyond those of the experiment are read below
 async def test_a_study_evaluates_the_rollouts_of_its_experiment_and_no_others(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -311,6 +311,8 @@ async def test_rollouts_without_recording_leave_no_trace_beside_recorded_ones(tm
         await workers.roll_out(replace(job, recorded=False), [(0, 30)])
     async with Reading.open(place.url) as reading:
         assert len(await read_rollouts(reading, Scene(), name_of(default_policy()), 5, 30)) == 30
+        first = await read_rollouts(reading, Scene(), name_of(default_policy()), 5, 12)
+    assert sorted(first["index"]) == list(range(12))  # an experiment of 12 rollouts reads those of no other
 
 
 async def test_an_exception_of_a_worker_is_reported_in_one_line(tmp_path: Path) -> None:

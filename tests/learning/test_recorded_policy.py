@@ -24,6 +24,7 @@ from pycrorm_async.learning import (
     save_policy,
 )
 from pycrorm_async.learning.experiment import Experiment, run
+from pycrorm_async.learning.policies.tree import learn
 from pycrorm_async.learning.rollouts.rollout_pool import MemoryLocation
 from pycrorm_async.orm import (
     BatchRolloutAction,
@@ -37,6 +38,7 @@ from pycrorm_async.orm import (
 from pycrorm_async.plan import Retry
 from pycrorm_async.plan.failures import PlanFailure
 from pycrorm_async.world import Arms
+from tests.learning.geometric_rollouts import frame_of
 
 SMALL = Experiment(rollouts=600, evaluate=30, held_out=30, rounds=2)
 
@@ -139,6 +141,7 @@ async def test_the_rollouts_of_an_experiment_lead_to_their_policy_and_its_traini
     assert (first.policy, last.policy) == (learned.phases[1].policy, evaluation.policy)
     assert (first.rollouts, last.rollouts, first.seeds, last.seeds) == (600, 1_200, [69], [69, 70])
     assert last.successes == len(learned.successes)
+    assert learn(frame_of(learned.successes), min_samples_leaf=25).leaves == learned.policy.leaves  # of both rounds
     assert (last.min_samples_leaf, last.scene) == (25, str(SMALL.scene))
     for each, seeds in ((first, {69}), (last, {69, 70})):
         training = {uuids[batch.process_metadata_id] for batch in batches if batch.seed in seeds}
