@@ -27,7 +27,7 @@ import typer
 from typer.exceptions import TyperException
 
 from pycrorm_async import __version__
-from pycrorm_async.cli.output import LogLines, problem, stdout
+from pycrorm_async.cli.output import LogLines, print_line, problem, stdout
 from pycrorm_async.errors import (
     CallerError,
     DamageError,
@@ -139,9 +139,11 @@ def app(requested: str | None = None) -> typer.Typer:
         command.command(verb)(_load_verb(verb.replace("-", "_"), verb.replace("-", "_")))
     for group, (text, verbs) in _GROUPS.items():
         if group in chosen:
-            subcommand = typer.Typer(help=text, no_args_is_help=True)
+            subcommand = typer.Typer(help=text, no_args_is_help=bool(verbs))
             for verb in verbs or import_module(f"pycrorm_async.cli.{group}").verbs():
                 subcommand.command(verb)(_load_verb(group, verb))
+            if not verbs:
+                subcommand.callback(invoke_without_command=True)(_list_verbs)
             command.add_typer(subcommand, name=group)
     return command
 
@@ -152,6 +154,12 @@ def _options(
     ] = False,
 ) -> None:
     """Parse the options of the command itself."""
+
+
+def _list_verbs(context: typer.Context) -> None:
+    """Print the verbs of a group, when it is called without one."""
+    if context.invoked_subcommand is None:
+        print_line(context.get_help())
 
 
 def _load_verb(module: str, name: str) -> Callable[..., None]:

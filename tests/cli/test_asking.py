@@ -54,6 +54,7 @@ def test_a_question_is_answered_as_a_table_and_as_json(folder: Path) -> None:
 
 def test_without_a_name_the_questions_are_listed_and_with_sql_the_statement(folder: Path) -> None:
     listed = pycrorm("ask", cwd=folder)
+    assert listed.returncode == 0
     assert all(each in listed.stdout for each in QUESTIONS)
     shown = pycrorm("ask", "moves_of", "milk", "--sql", "--limit", "3", cwd=folder)
     assert shown.stdout.startswith("WITH RECURSIVE")

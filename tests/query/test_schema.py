@@ -15,7 +15,7 @@ from pycrorm_async.orm.documentation.descriptions import comments, described
 from pycrorm_async.orm.types import Moment
 from pycrorm_async.projections.schema.views.comments import comments as stored_comments
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.query.schema.memory_schema import CORE_VIEWS, as_mermaid, as_text, read_schema
+from pycrorm_async.query.schema.memory_schema import CORE_VIEWS, as_text, read_schema
 from tests.commands import pycrorm
 from tests.databases import Server, ask, run_in_own_loop
 from tests.projections.event_script import NAVIGATE, PICK_UP, SAYING, declarations
@@ -70,14 +70,6 @@ async def test_a_memory_describes_all_of_its_views(reading: Reading) -> None:
 async def test_a_view_that_does_not_exist_is_answered_with_the_nearest(reading: Reading) -> None:
     with pytest.raises(CallerError, match=r"^this memory has no view 'actions'; did you mean action"):
         await read_schema(reading, ["pose", "actions"])
-
-
-async def test_the_readme_shows_the_diagram_of_three_views(tmp_path: Path) -> None:
-    [shown] = re.findall(r"```mermaid\n(.*?)\n```", README.read_text(), re.DOTALL)
-    url = f"sqlite:///{tmp_path}/memory.db"
-    await append_and_fold(url, [*declarations(NAVIGATE, PICK_UP), *episode(1).records[:3]])
-    async with Reading.open(url) as reading:
-        assert as_mermaid(await read_schema(reading, ["pick_up_action", "object", "pose"])) == shown
 
 
 @pytest.mark.slow

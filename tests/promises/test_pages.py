@@ -1,0 +1,340 @@
+"""Every page of the documentation can be followed: its blocks run in order, in a real shell and a real notebook."""
+
+import json
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Final
+
+import pytest
+
+from tests.commands import answer
+from tests.databases import Server, ask, await_events, server_in_memory
+from tests.promises.page_reader import PageReader
+from tests.promises.pages import PAGES, blocks_of
+
+pytestmark = pytest.mark.slow
+
+
+def the_plan_greets_and_is_recorded(reader: PageReader) -> None:
+    assert reader.shown.out.startswith("Hello, Ada!\n")
+    assert reader.shown.err == ""
+    episode = answer("show", "1", cwd=reader.folder)
+    assert episode["episode"]["description"] == "Say hello from the other side of the room."
+    assert [(node["dtype"], node["status"]) for node in episode["tree"]] == [
+        (None, "SUCCEEDED"),
+        ("MoveTorsoAction", "SUCCEEDED"),
+        ("MoveJointsMotion", "SUCCEEDED"),
+        ("NavigateAction", "SUCCEEDED"),
+        ("MoveMotion", "SUCCEEDED"),
+        ("GreetAction", "SUCCEEDED"),
+    ]
+
+
+def the_queries_have_answers(reader: PageReader) -> None:
+    reader.cell("""
+assert [each.dtype for each in actions] == ["MoveTorsoAction", "NavigateAction", "GreetAction"]
+assert picked == []
+assert [each.whom for each in greeted] == ["Ada"]
+assert len(frame) == 0
+""")
+    assert (reader.folder / "memory.db").exists()
+
+
+def the_executive_is_recorded(reader: PageReader) -> None:
+    shown = reader.shell("pycrorm show last").out
+    assert "NavigateAction  target_location=(1.00, 0.00, 0.00) speed=0.5  FAILED" in shown
+    assert "the left wheel slipped" in shown
+
+
+def every_expression_succeeds_and_the_milk_is_at_its_goal(reader: PageReader) -> None:
+    assert "no milk to be seen" not in reader.shown.out
+    tree = answer("show", "1", cwd=reader.folder)["tree"]
+    top = [node["dtype"] for node in tree if node["depth"] == 1]
+    assert top == ["Parallel", "Sequential", "Sequential", "TransportAction"]
+    assert {node["status"] for node in tree} == {"SUCCEEDED"}
+    question = "SELECT x, y, z FROM object JOIN pose ON pose.id = pose_id WHERE name = 'milk' ORDER BY object.id"
+    *_, resting = ask(reader.folder / "pycrorm.db", question)
+    assert resting == pytest.approx((1.3, 0.45, 0.95), abs=1e-6)
+
+
+def a_robot_acts_beside_another_and_each_node_names_its_robot(reader: PageReader) -> None:
+    assert "courier has no torso to lift" in reader.shown.out
+    *_, episode = answer("episodes", cwd=reader.folder)
+    assert [(each["name"], each["model"], each["serial"]) for each in episode["robots"]] == [
+        ("lifter 1", "lifter", "L-17"),
+        ("courier", "courier", None),
+    ]
+    own = "process_metadata_id = (SELECT max(id) FROM process_metadata)"
+    question = f"SELECT dtype, robot, status FROM action WHERE dtype <> 'NavigateAction' AND {own} ORDER BY dtype"
+    assert ask(reader.folder / "pycrorm.db", question) == [
+        ("MoveTorsoAction", "courier", "FAILED"),
+        ("ParkArmsAction", "lifter 1", "SUCCEEDED"),
+        ("PickUpAction", "courier", "SUCCEEDED"),
+    ]
+    question = f'SELECT robot FROM "PickUpWithContextView" WHERE {own}'
+    assert ask(reader.folder / "pycrorm.db", question) == [("courier",)]
+
+
+def the_percepts_are_in_the_table(reader: PageReader) -> None:
+    question = (
+        "SELECT name, x, confidence, source, object_id IS NULL FROM detection WHERE source = 'stereo' ORDER BY position"
+    )
+    assert ask(reader.folder / "pycrorm.db", question) == [
+        ("milk", 1.31, 0.92, "stereo", 0),
+        ("milk?", 1.2, 0.31, "stereo", 1),
+    ]
+
+
+def a_perform_in_a_later_cell_is_recorded(reader: PageReader) -> None:
+    performed = ask(reader.folder / "notebook.db", "SELECT dtype, status FROM task_tree_node ORDER BY id")
+    assert performed == [(None, "SUCCEEDED"), ("NavigateAction", "SUCCEEDED"), ("MoveMotion", "SUCCEEDED")]
+
+
+def the_projections_count_the_attempts(reader: PageReader) -> None:
+    database = reader.folder / "pycrorm.db"
+    tried = ask(database, "SELECT id, arm, grasp, status FROM grasp_try")
+    picked = ask(database, "SELECT id, arm, grasp, status FROM pick_up_action JOIN task_tree_node USING (id)")
+    assert tried == picked
+    assert [status for *_, status in tried] == ["SUCCEEDED"]
+    question = "SELECT process_metadata_id, dtype FROM task_tree_node WHERE dtype IS NOT NULL ORDER BY id"
+    performed = ask(database, question)
+    attempts = ask(database, "SELECT dtype, number FROM attempt ORDER BY id")
+    assert attempts == [(each[1], performed[: index + 1].count(each)) for index, each in enumerate(performed)]
+    assert "NavigateAction,2\n" in reader.shown.out
+
+
+def events_are_followed_until_the_memory_is_closed(reader: PageReader) -> None:
+    greeting, *events = reader.shown.out.splitlines()
+    assert greeting == "Hello again!"
+    assert [each.split("(")[0] for each in events[::5]] == ["1 EpisodeStarted", "6 EpisodeEnded"]
+
+
+def the_test_of_the_integration_passes(reader: PageReader) -> None:
+    assert "1 passed" in reader.shown.out
+
+
+def questions_about_actions_have_answers(reader: PageReader) -> None:
+    lines = [line.split(maxsplit=4) for line in reader.shown.out.splitlines()]
+    assert ("PickUpAction", "SUCCEEDED") in [(dtype, status) for dtype, status, *_ in lines]
+    durations = [float(duration) for _, _, duration, *_ in lines]
+    assert durations == sorted(durations, reverse=True)
+
+
+def successes_are_drawn(reader: PageReader) -> None:
+    reader.cell("""
+title = figure.axes[0].get_title(loc="left")
+assert title.startswith("PickUpWithContextView: success over relative_x and"), title
+""")
+    assert "<svg" in (reader.folder / "pick-ups.svg").read_text()
+
+
+def sql_finds_the_actions_of_a_concept(reader: PageReader) -> None:
+    assert "PickUpAction" in reader.shown.out
+
+
+def a_node_shows_the_nodes_around_it(reader: PageReader) -> None:
+    assert reader.shown.out.endswith("[None]\n")
+    reader.cell('assert (mover.kind, mover.dtype) == ("motion", "MoveTCPMotion"), mover.dtype')
+
+
+def episodes_have_their_robots(reader: PageReader) -> None:
+    assert reader.shown.out.endswith("[('pr2', None)]\n")
+
+
+def failures_are_counted_where_they_began(reader: PageReader) -> None:
+    reader.cell("""
+[failure] = frame.drop(columns="object").to_dict("records")
+assert failure == {"path": "root > Parallel > KnockAction", "reason": "PlanFailure", "times": 2}, failure
+assert frame.object.isna().tolist() == [True]
+""")
+
+
+def frames_and_batches_have_the_declared_types(reader: PageReader) -> None:
+    type_ = "dictionary<values=string, indices=int32, ordered=0>"
+    assert reader.shown.out == f"pyarrow.Field<obj_type: {type_}> 1\n"
+    reader.cell("assert table.num_rows == 1")
+
+
+def questions_are_answered_by_name(reader: PageReader) -> None:
+    reader.cell("""
+assert failures.sql.startswith("SELECT root_failure.process_metadata_id AS episode")
+assert frame.message.tolist() == ["no one is in"] * 2, frame
+assert causes.times.tolist() == [2], causes
+assert len(slowest) == 1, slowest
+assert near.times.sum() >= 3, near
+""")
+    assert (
+        "KnockAction,2\n"
+        in reader.shell('pycrorm query "SELECT dtype, count(*) FROM action GROUP BY dtype" --format csv').out
+    )
+
+
+def tags_are_given_changed_and_queried(reader: PageReader) -> None:
+    assert reader.shown.out == "Set the table ['good', 'kitchen', 'night'] {'batch': 7}\n"
+
+
+def observations_are_recorded_and_queried(reader: PageReader) -> None:
+    assert "Blob(content=b'the bytes of an image', media_type='image/png')" in reader.shown.out
+    reader.cell("assert frame.number.tolist() == [1.5], frame")
+
+
+def a_moment_is_restored_in_another_world(reader: PageReader) -> None:
+    question = "SELECT x, y, z FROM object JOIN pose ON pose.id = pose_id WHERE name = 'cereal' AND object.id < ?"
+    *_, place = ask(reader.folder / "pycrorm.db", f"{question} ORDER BY object.id", ((1 << 31) + (41 << 5),))
+    reader.cell(f"""
+assert [each.dtype for each in then.running][:2] == [None, "PickUpAction"], then.running
+assert cereal_in_hand
+cereal, place = then.world.object("cereal"), {place}
+assert cereal.attached_to is not None
+with world_of(await memory.as_of(1, sequence=20)) as world:
+    assert world.object("cereal").attached_to is None
+    world.restore_state(then.world.state)
+    assert world.object("cereal").attached_to is world.robot
+    for pose in (world.object("cereal").pose, cereal.pose):
+        assert max(abs(one - other) for one, other in zip(pose.position, place)) < 1e-6, (pose, place)
+""")
+
+
+def past_actions_are_recalled(reader: PageReader) -> None:
+    success, unseen, best, *why = reader.printed.splitlines()
+    assert (success, unseen) == ("1 of 1 succeeded (21-100 %)", "(('object_type', 'CACTUS'),)")
+    assert best.startswith("PickUpAction in episode 1")
+    assert "  differs object_type: wanted CACTUS, was BREAKFAST_CEREAL" in why
+    assert why[-2:] == ["NavigateAction", "['PickUpAction', 'PlaceAction']"]
+
+
+def rows_are_exported_and_made_again(reader: PageReader) -> None:
+    assert reader.shown.out == "True ()\n"
+    assert (reader.folder / "mine.csv").read_text().startswith('"arm","relative_x"\n')
+    exported = "last.parquet two.csv picks.parquet failures.jsonl cereal.csv breakfasts breakfast.rrd"
+    assert [each for each in exported.split() if not (reader.folder / each).exists()] == []
+
+
+def the_metadata_for_datasette_is_written(reader: PageReader) -> None:
+    assert "databases" in json.loads((reader.folder / "metadata.json").read_text())
+
+
+def a_policy_is_learned_from_the_recorded_rollouts(reader: PageReader) -> None:
+    reader.cell("""
+from pycrorm_async.learning import load_policy
+assert tally.rollouts == 1000
+assert len(policy.leaves) > 3
+assert load_policy("policy.json") == policy
+""")
+    statuses = ask(reader.folder / "tries.db", "SELECT status FROM task_tree_node WHERE dtype = 'Retry'")
+    assert statuses == [("SUCCEEDED",)]
+
+
+def a_recalled_way_succeeds(reader: PageReader) -> None:
+    question = "SELECT chosen_by FROM recalled_pick_up_action JOIN task_tree_node USING (id) WHERE status = 'SUCCEEDED'"
+    assert ask(reader.folder / "tries.db", question) == [("recall",)]
+
+
+def the_origins_of_the_policy_are_known(reader: PageReader) -> None:
+    reader.cell("""
+from pycrorm_async.learning import name_of
+[learned] = learned
+assert (learned.policy, learned.successes) == (name_of(policy), tally.successes)
+assert used == []
+async with Memory.open("sqlite:///tries.db") as memory:
+    [training] = [each for each in await memory.reading.episodes() if each.id in learned.training_episodes]
+    assert training.nodes > 1000
+""")
+
+
+def a_daemon_stores_the_episode_of_a_plan(reader: PageReader) -> None:
+    await_events(reader.folder / "pycrorm.db", 6)
+    assert answer("show", "last", cwd=reader.folder)["episode"]["description"] == "Greet the operator."
+
+
+def logins_with_the_documented_roles_read_and_fold(reader: PageReader) -> None:
+    done = reader.shell("""
+pycrorm query "SELECT count(*) FROM episode" --format csv --url postgresql://pycrorm_query@/memory
+pycrorm episodes --url postgresql://lab@/memory
+""")
+    assert done.out.startswith("count\n0\n"), done.out
+
+
+RESULTS: Final[Mapping[str, Mapping[str, Callable[[PageReader], None]]]] = {
+    "README.md": {
+        "A plan of your own": the_plan_greets_and_is_recorded,
+        "Ask it": the_queries_have_answers,
+        "Your own executive": the_executive_is_recorded,
+    },
+    "pycrorm_async/events/README.md": {
+        "Events as they happen": events_are_followed_until_the_memory_is_closed,
+    },
+    "pycrorm_async/learning/README.md": {
+        "Learning from recorded episodes": a_policy_is_learned_from_the_recorded_rollouts,
+        "Repeat what worked": a_recalled_way_succeeds,
+        "From which episodes a policy was learned": the_origins_of_the_policy_are_known,
+    },
+    "pycrorm_async/operations/README.md": {
+        "The daemon": a_daemon_stores_the_episode_of_a_plan,
+        "PostgreSQL": logins_with_the_documented_roles_read_and_fold,
+    },
+    "pycrorm_async/plan/README.md": {
+        "What a plan can express": every_expression_succeeds_and_the_milk_is_at_its_goal,
+        "A robot of your own": a_robot_acts_beside_another_and_each_node_names_its_robot,
+        "Perception of a robot of your own": the_percepts_are_in_the_table,
+        "In a notebook": a_perform_in_a_later_cell_is_recorded,
+    },
+    "pycrorm_async/export/README.md": {
+        "Data for other programs": rows_are_exported_and_made_again,
+        "Datasette": the_metadata_for_datasette_is_written,
+    },
+    "pycrorm_async/query/README.md": {
+        "When an action was performed, and how it ended": questions_about_actions_have_answers,
+        "Pictures of experience": successes_are_drawn,
+        "By concept": sql_finds_the_actions_of_a_concept,
+        "Around a node": a_node_shows_the_nodes_around_it,
+        "The robots of an episode": episodes_have_their_robots,
+        "Where a failure began": failures_are_counted_where_they_began,
+        "Frames": frames_and_batches_have_the_declared_types,
+        "Asking": questions_are_answered_by_name,
+        "Tags and metadata": tags_are_given_changed_and_queried,
+        "Observations of your own": observations_are_recorded_and_queried,
+        "The state at any moment": a_moment_is_restored_in_another_world,
+    },
+    "pycrorm_async/projections/README.md": {
+        "Custom projections": the_projections_count_the_attempts,
+    },
+    "pycrorm_async/recall/README.md": {
+        'Recall: "have I been here before, and how did it end?"': past_actions_are_recalled,
+    },
+    "pycrorm_async/recording/README.md": {
+        "Testing an integration": the_test_of_the_integration_passes,
+    },
+}
+"""The results by page, and by the section after which they hold."""
+
+
+OFTEN: Final = ("README.md", *(f"pycrorm_async/{each}/README.md" for each in "events plan recording".split()))
+"""The pages that are followed at each commit, in 20 s of CPU time; the others take 5 to 20 s each."""
+FOLLOWED: Final = [page for page in PAGES if any(block.kind != "not run" for block in blocks_of(page))]
+
+
+@pytest.fixture(scope="module")
+def own_server() -> Iterator[Server]:
+    """A server for the pages alone, because they make roles, which belong to a whole server."""
+    with server_in_memory() as running:
+        yield running
+
+
+@pytest.mark.soak_on(*(page for page in FOLLOWED if page not in OFTEN))
+@pytest.mark.parametrize("page", FOLLOWED)
+def test_a_reader_can_follow_the_page_from_top_to_bottom(
+    page: str, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    folder, home = tmp_path / "folder", tmp_path / "home"
+    folder.mkdir()
+    home.mkdir()
+    needs_server = any(block.kind == "sql" for block in blocks_of(page))
+    reader = PageReader(page, folder, home, request.getfixturevalue("own_server") if needs_server else None)
+    try:
+        for section, holds in RESULTS.get(page, {}).items():
+            reader.read_to_the_end_of(section)
+            holds(reader)
+        reader.read_on()
+    finally:
+        reader.close()
