@@ -24,9 +24,9 @@ from pycrorm_async.orm import (
 )
 from pycrorm_async.orm.base import same_row
 from pycrorm_async.query.asking.episode_list import EpisodeChoice
-from pycrorm_async.query.notebook.value_html import NotebookValue
 from pycrorm_async.query.parameter_text import with_object_names
 from pycrorm_async.query.running_episodes import RobotSummary, robots_of
+from pycrorm_async.query.value_html import NotebookValue
 from pycrorm_async.store.episode_lookup import number_named
 from pycrorm_async.task_status import TaskStatus
 

@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.types import DescriptionDeclared
 from pycrorm_async.query.named_queries import NodeSummary
-from pycrorm_async.query.notebook.value_html import NotebookValue
 from pycrorm_async.query.percepts_and_places import Percept, PlaceSearch
+from pycrorm_async.query.value_html import NotebookValue
 from pycrorm_async.world.pose import Pose
 from pycrorm_async.world.state import ObjectState, WorldState
 

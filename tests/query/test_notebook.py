@@ -27,13 +27,13 @@ from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary
 from pycrorm_async.query.notebook.answer_view import cases_html
 from pycrorm_async.query.notebook.listings import Episodes, TaskTree
 from pycrorm_async.query.notebook.memory_view import memory_html
-from pycrorm_async.query.notebook.value_html import NotebookValue, value_html
 from pycrorm_async.query.running_episodes import RobotSummary
 from pycrorm_async.query.scene.link_frames import link_frames
 from pycrorm_async.query.scene.object_model import object_model
 from pycrorm_async.query.scene.outlines import outlines
 from pycrorm_async.query.snapshot import Moment, ObjectThen, ObservationThen, WorldThen
 from pycrorm_async.query.sql.read_only import SqlResult
+from pycrorm_async.query.value_html import NotebookValue, value_html
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
 from pycrorm_async.world.models.courier import courier_urdf

@@ -20,8 +20,8 @@ from pycrorm_async.orm import Object, Pose, ProcessMetaData
 from pycrorm_async.query.asking.ports import EpisodeReader
 from pycrorm_async.query.asking.question import AskedEpisode, episode_name
 from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary, nodes_of
-from pycrorm_async.query.notebook.value_html import NotebookValue
 from pycrorm_async.query.parameter_text import parameters_text
+from pycrorm_async.query.value_html import NotebookValue
 
 _SAME = 6
 """Decimals to which numbers are compared, and positions in m."""

@@ -15,7 +15,7 @@ from pycrorm_async.query.asking.columns import EpisodeNumber
 from pycrorm_async.query.asking.ports import EpisodeReader
 from pycrorm_async.query.asking.unknown_names import unknown_name
 from pycrorm_async.query.named_queries import EpisodeSummary
-from pycrorm_async.query.notebook.value_html import NotebookValue
+from pycrorm_async.query.value_html import NotebookValue
 
 if TYPE_CHECKING:
     from pycrorm_async.hooks.episode import Episode

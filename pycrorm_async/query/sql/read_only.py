@@ -26,7 +26,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Protocol
 
 from pycrorm_async.errors import QueryRefused
-from pycrorm_async.query.notebook.value_html import NotebookValue
+from pycrorm_async.query.value_html import NotebookValue
 from pycrorm_async.store.log import EventLog
 
 if TYPE_CHECKING:
