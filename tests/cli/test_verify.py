@@ -210,8 +210,7 @@ async def test_on_postgresql_every_role_that_may_read_may_verify(server: Server,
     url = server.new_database()
     database = urlsplit(url).path.removeprefix("/")
     await memory(url)
-    for statement in GRANTS:
-        ask(url, statement)
+    change_each(url, GRANTS)
     ask(url, f"CREATE ROLE ada_of_{database} LOGIN IN ROLE pycrorm_reader")
     # The role may also read tables that a folder makes later.
     ask(url, f"CREATE ROLE robot_of_{database} LOGIN IN ROLE pycrorm_folder")

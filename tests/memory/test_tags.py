@@ -26,7 +26,7 @@ from pycrorm_async.store.episode_lookup import tags_of as log_tags
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.postgresql.roles import GRANTS
 from tests.commands import answer, one_line_of, pycrorm
-from tests.databases import Server, ask, ask_to_change
+from tests.databases import Server, ask, ask_to_change, change_each
 from tests.memory.note_actions import NoteActionPerformable
 from tests.projections.verify_cases import TYPES, full
 from tests.table_comparison import differences, tables_of
@@ -282,8 +282,7 @@ async def test_a_recorders_role_tags_and_a_readers_role_does_not(server: Server,
     url = server.new_database()
     async with Memory.open(url, spool=tmp_path / "spool") as memory, memory.episode(description="one"):
         pass
-    for statement in GRANTS:
-        ask(url, statement)
+    change_each(url, GRANTS)
     database = urlsplit(url).path.removeprefix("/")
     for login, role in ((f"tags_{database}", "pycrorm_recorder"), (f"reads_{database}", "pycrorm_reader")):
         ask(url, f"CREATE ROLE {login} LOGIN IN ROLE {role}")

@@ -20,7 +20,7 @@ from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.blobs import BlobSource
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.postgresql.roles import GRANTS
-from tests.databases import Server, ask
+from tests.databases import Server, ask, change_each
 from tests.store.factories import episode, record
 
 CONTENT = os.urandom(50)
@@ -140,10 +140,7 @@ async def test_a_recorders_role_stores_blobs_after_the_owner_ran_the_grants(serv
     url = server.new_database()
     owner = await EventLog.open(DatabaseAddress.parse(url), create=True)
     await Projector(owner).open()
-    for statement in GRANTS:
-        ask(url, statement)
-    for statement in GRANTS:
-        ask(url, statement)
+    change_each(url, (*GRANTS, *GRANTS))
     ask(
         url,
         "DO $$ BEGIN CREATE ROLE camera LOGIN IN ROLE pycrorm_recorder;"

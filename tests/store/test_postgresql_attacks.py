@@ -25,7 +25,7 @@ from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.postgresql.roles import GRANTS
 from tests.crash.step_robot import SETTINGS, StepActionPerformable
-from tests.databases import Server, ask
+from tests.databases import Server, ask, change_each
 
 pytestmark = pytest.mark.slow
 
@@ -104,8 +104,7 @@ async def owner(request: pytest.FixtureRequest, server: Server, tmp_path: Path) 
         ask(url, f"GRANT pycrorm_folder TO owner_of_{database}")
         url = server.url(database, user=f"owner_of_{database}")
     await _record_one(url, tmp_path / "spool", "first", 1)
-    for statement in GRANTS:
-        ask(url, statement)
+    change_each(url, GRANTS)
     return url
 
 
@@ -144,8 +143,7 @@ async def _perform_every_operation(url: str, spool: Path) -> None:
             await reading.tree(1)
     with suppress(PycrormError):
         await rebuild_memory(url, workers=1)
-    for statement in GRANTS:
-        ask(url, statement)
+    change_each(url, GRANTS)
 
 
 @pytest.mark.soak_on(

@@ -13,7 +13,7 @@ from pycrorm_async.projections.projector import Projector
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.postgresql.roles import GRANTS
-from tests.databases import Server, ask, server_in_memory
+from tests.databases import Server, ask, change_each, server_in_memory
 from tests.store.factories import episode, run_of
 
 pytestmark = pytest.mark.slow
@@ -43,8 +43,7 @@ async def make_log(url: str) -> EventLog:
 
 
 def grant(url: str) -> None:
-    for statement in GRANTS:
-        ask(url, statement)
+    change_each(url, GRANTS)
 
 
 async def test_an_owner_is_shown_the_missing_statements_has_another_login_run_them_and_keeps_the_log(

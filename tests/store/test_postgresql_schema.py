@@ -20,7 +20,7 @@ from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.postgresql.roles import GRANTS
 from pycrorm_async.store.postgresql.tables import MIGRATIONS
 from pycrorm_async.store.schema import make_or_migrate
-from tests.databases import Server, ask
+from tests.databases import Server, ask, change_each
 from tests.store.concurrent_openers import open_at_once
 from tests.store.factories import declaration, episode, record, run_of
 
@@ -141,14 +141,16 @@ async def roles(server: Server, database_url: str) -> dict[str, str]:
     await Projector(log).open()
     await log.append([started(1)])
     await log.close()
-    for statement in (*GRANTS, *GRANTS):
-        ask(database_url, statement)
+    changes = [*GRANTS, *GRANTS]
     urls = {}
     for role in ("recorder", "folder", "reader"):
         member = f"{role}_of_{database}"
-        ask(database_url, f"CREATE ROLE {member} LOGIN IN ROLE pycrorm_{role}")
-        ask(database_url, f"ALTER ROLE {member} IN DATABASE {database} SET role = 'pycrorm_{role}'")
+        changes += [
+            f"CREATE ROLE {member} LOGIN IN ROLE pycrorm_{role}",
+            f"ALTER ROLE {member} IN DATABASE {database} SET role = 'pycrorm_{role}'",
+        ]
         urls[role] = server.url(database, user=member)
+    change_each(database_url, changes)
     return urls
 
 
