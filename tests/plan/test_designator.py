@@ -23,7 +23,7 @@ class SayingActionPerformable(ActionAbstract):
     text: str
 
     async def perform(self) -> str:
-        """Do nothing."""
+        """Return the text in capitals."""
         return self.text.upper()
 
 
@@ -51,7 +51,7 @@ async def test_a_dataclass_with_perform_is_all_that_a_new_action_needs() -> None
 
 def test_the_hook_keeps_name_docstring_and_signature_of_perform() -> None:
     perform = SayingActionPerformable.perform
-    assert (perform.__name__, perform.__doc__) == ("perform", "Say it.")
+    assert (perform.__name__, perform.__doc__) == ("perform", "Return the text in capitals.")
     assert perform.__qualname__ == "SayingActionPerformable.perform"
     assert list(inspect.signature(perform).parameters) == ["self"]
     assert inspect.iscoroutinefunction(perform)
