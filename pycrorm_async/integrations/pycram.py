@@ -110,7 +110,6 @@ class _PyCRAMPlans:
         self._keys = itertools.count(1)
         self._types: dict[type, DeclaredType] = {}
         self._parallel: dict[int, RunningNode] = {}
-        recording.look_up(map(_dtype, self._values.designators))
 
     @contextmanager
     def observing(self, **labels: Any) -> Iterator[RecordedEpisode]:
@@ -120,6 +119,7 @@ class _PyCRAMPlans:
         self.seams.is_on = True
         failure: BaseException | None = None  # not `sys.exception()`, which has one also if the block is in an `except`
         try:
+            self._prepare_types()
             self._connect()
             self._add_world(world)
             yield episode
@@ -143,6 +143,13 @@ class _PyCRAMPlans:
         seams.around(used.ParallelNode, "_lang_call", self._branch)
         seams.around(used.UseProspectionWorld, "__exit__", self._leave_prospection)
         self._world.connect()
+
+    @guarded
+    def _prepare_types(self) -> None:
+        """Prepare the types of all imported designators, which is too slow to be done during the plan."""
+        for designator in self._values.designators:
+            fields, bases = self._values.expected_fields(designator), self._bases(designator)
+            self.seams.recording.prepare(self._kind(designator), _dtype(designator), fields, bases=bases)
 
     @guarded
     def _add_world(self, world: Any) -> None:
@@ -189,8 +196,7 @@ class _PyCRAMPlans:
     def _write_start(self, node: RunningNode, type_: type, values: dict[str, Any]) -> None:
         declared = self._types.get(type_)
         if declared is None:
-            base, fields = self._pycram.ActionDescription, self._values.field_types(type_, values)
-            bases = [each.__name__ for each in type_.__mro__[1:] if issubclass(each, base) and each is not base]
+            fields, bases = self._values.field_types(type_, values), self._bases(type_)
             declared = self._types[type_] = self.seams.recording.type(node.kind, _dtype(type_), fields, bases=bases)
         episode = node.episode
         # Asking Bullet for pose and torso takes as long as recording the event, so it is done where they may differ.
@@ -198,6 +204,16 @@ class _PyCRAMPlans:
         robot = self._values.robot_key() if is_recorded else self._values.robot(episode)
         cause = self._episodes.cause(episode)
         node.key = episode.start(next(self._keys), declared, values, parent=cause, robot=robot)
+
+    def _kind(self, designator: type) -> RecordedKind:
+        if issubclass(designator, self._pycram.ActionDescription):
+            return "action"
+        return "motion" if issubclass(designator, self._pycram.BaseMotion) else "language"
+
+    def _bases(self, designator: type) -> list[str]:
+        """Return the dtypes of the actions that an action descends from, nearest first; none for another type."""
+        base = self._pycram.ActionDescription
+        return [each.__name__ for each in designator.__mro__[1:] if issubclass(each, base) and each is not base]
 
     def _end(
         self, node: RunningNode, status: NodeStatus, failure: BaseException | None = None, result: Any = None

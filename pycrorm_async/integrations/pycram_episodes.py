@@ -7,7 +7,7 @@ from collections.abc import Hashable
 from typing import Any
 
 from pycrorm_async.events.values import PoseValue
-from pycrorm_async.integrations.pycram_values import PyCRAMValues
+from pycrorm_async.integrations.pycram_values import AS_THEY_ARE, PyCRAMValues
 from pycrorm_async.recording.declarations.recorded_type import RecordedKind
 from pycrorm_async.recording.recorded_episode import RecordedEpisode
 from pycrorm_async.recording.recording import Recording
@@ -65,9 +65,13 @@ class PyCRAMEpisodes:
     def open(self, world: Any, **labels: Any) -> RecordedEpisode:
         """Open an episode in this world."""
         name = type(world).__name__ if world is not None else None
+
+        def convert(value: Any) -> Any:
+            return value if type(value) in AS_THEY_ARE else self._values.value(value, episode)
+
         episode = self._recording.episode(
             world=name,
-            convert=lambda value: self._values.value(value, episode),
+            convert=convert,
             failures=(self._values.pycram.PlanFailure,),
             **labels,
         )

@@ -39,8 +39,15 @@ _USED: Final = {
 }
 _OBJECT_TYPES: Final = {"PhysicalObject": "GENERIC_OBJECT", "Cereal": "BREAKFAST_CEREAL"}
 """PyCRAM's concepts that have another name here."""
-_AS_THEY_ARE: Final = frozenset({bool, int, float, str, datetime})
+AS_THEY_ARE: Final = frozenset({bool, int, float, str, datetime})
 """The types of values that are recorded without a conversion."""
+_EXPECTED_FIELDS: Final[dict[str, dict[str, FieldSpec]]] = {
+    "MoveJointsMotion": {"names": ("list", "text"), "positions": ("list", "real")},
+    "RepeatNode": {"times": "integer"},
+    "MonitorNode": {"condition": "text", "interval_s": "real"},
+    "CodeNode": {"function": "text", "arguments": ("dict", "text")},
+}
+"""The types of fields that have no full annotation, as their usual values have them."""
 _MONITOR_INTERVAL_S: Final = 0.1
 """PyCRAM's time between two evaluations of a condition."""
 
@@ -50,7 +57,7 @@ class PyCRAMValues:
 
     Attributes:
         pycram: the namespace of PyCRAM's classes.
-        designators: the actions and motions that are imported, and the expressions of the language.
+        designators: the imported actions and motions, and the expressions of the language.
     """
 
     def __init__(self) -> None:
@@ -73,14 +80,11 @@ class PyCRAMValues:
             (used.Link, "object"),
             (used.ObjectDesignatorDescription, "object"),
         )
-        expressions = (getattr(used, name) for name in _USED["language"].split())
         self.designators: tuple[type, ...] = (
             *_descendants(used.ActionDescription),
             *_descendants(used.BaseMotion),
-            *expressions,
+            *(getattr(used, name) for name in _USED["language"].split()),
         )
-        for designator in self.designators:
-            self._annotated(designator)  # slow, therefore done before the plan and not during it
 
     # --- parameters -------------------------------------------------------------------------------------------
 
@@ -135,6 +139,15 @@ class PyCRAMValues:
             for name, each in values.items()
         }
 
+    def expected_fields(self, designator: type) -> dict[str, FieldSpec]:
+        """Return what `field_types` returns for designators of a type; for values that leave it open, a guess."""
+        values: dict[str, Any] = dict.fromkeys(self._names_of(designator))
+        if issubclass(designator, self.pycram.MoveTorsoAction):
+            values["position"] = None
+        guessed = _EXPECTED_FIELDS.get(designator.__name__, {})
+        fields = guessed | self._annotated(designator)
+        return {name: fields.get(name, "text") for name in _with_grasp(values) or guessed}
+
     def _annotated(self, designator: type) -> dict[str, FieldSpec]:
         """Return the types of those fields whose annotations decide them, whatever their values are."""
         types = self._annotated_types.get(designator)
@@ -168,7 +181,7 @@ class PyCRAMValues:
 
     def value(self, value: Any, episode: RecordedEpisode) -> Any:
         """Convert a parameter or a result for this episode; return values of other types unchanged."""
-        if type(value) in _AS_THEY_ARE or isinstance(value, Enum):
+        if isinstance(value, Enum):
             return value
         used = self.pycram
         if isinstance(value, self._poses):
@@ -188,8 +201,9 @@ class PyCRAMValues:
 
     def pose(self, pose: Any) -> PoseValue:
         """Copy a `Pose` or a `PoseStamped`."""
-        position, turn, header = pose.position, pose.orientation, getattr(pose, "header", None)
-        stamp = header.stamp if header is not None else None
+        header = getattr(pose, "header", None)
+        unstamped = pose.pose if header is not None else pose  # whose attributes are no properties
+        position, turn, stamp = unstamped.position, unstamped.orientation, header.stamp if header is not None else None
         return PoseValue(
             (float(position.x), float(position.y), float(position.z)),
             (float(turn.x), float(turn.y), float(turn.z), float(turn.w)),
@@ -274,7 +288,8 @@ def _hints_of(designator: type) -> dict[str, Any]:
 
 def _is_bare(hint: Any) -> bool:
     """Return whether this is a list or a dict of unknown items."""
-    return (typing.get_origin(hint) or hint) in (list, dict) and not typing.get_args(hint)
+    kind = typing.get_origin(hint) or hint
+    return (kind is list or kind is dict) and not typing.get_args(hint)
 
 
 def _function_name(function: Any) -> str:

@@ -71,7 +71,8 @@ class OrderedCalls:
 
     def _run(self, call: Callable[[], object]) -> None:
         with self._lock:
-            self._drain()
+            if self._left:
+                self._drain()
             call()
         while self._left:  # a thread of the memory came before the lock was released
             with self._lock:

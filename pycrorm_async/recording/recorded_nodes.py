@@ -102,7 +102,13 @@ class RecordedNodes(EpisodeWriter[_Node]):
     def _written(self, event_type: str, write: Callable[P, int], *args: P.args, **kwargs: P.kwargs) -> None:
         if self.closed:
             self._note(event_type, f"episode {self} has ended")
-        elif (noted(self.emitter, event_type, write, *args, **kwargs) or 0) >= self.continue_at:
+            return
+        try:  # not `noted`, because this is called for each event
+            sequence = write(*args, **kwargs)
+        except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
+            self.emitter.note_fault(event_type, error)
+            return
+        if sequence >= self.continue_at:
             self._episodes.continue_episode(self)
 
     def _now(self, value: Any, prepared: EpisodeId) -> Any:

@@ -69,11 +69,21 @@ class RecordedValues:
         """Return a JSON value, or a `MissingValue`. Never raises."""
         return encode_or_missing(self.converted(value), self._references)
 
-    def converted(self, value: Any, *, as_object: bool = False, is_item: bool = False) -> Any:
+    def converted(self, value: Any, *, as_object: bool = False) -> Any:
         """Return the value as the executive converts it; a `RefusedValue` with the reason if it cannot convert it.
 
         With `as_object` the key of an object becomes a reference to its row.
         """
+        value = self._item(value, as_object)
+        kind = type(value)
+        if kind is list or kind is tuple:
+            return [self._item(each, as_object) for each in value]
+        if kind is dict:
+            return {key: self._item(each, as_object) for key, each in value.items()}
+        return value
+
+    def _item(self, value: Any, as_object: bool) -> Any:  # noqa: FBT001  a keyword would cost each item of a list
+        """Convert a value, but not the items inside it."""
         if as_object and (reference := self._known_object(value)) is not None:
             return reference
         if self._convert is not None:
@@ -83,15 +93,7 @@ class RecordedValues:
                 return RefusedValue(message_of(error) if isinstance(error, ValueError) else reading_fault(error))
             if as_object and (reference := self._known_object(value)) is not None:
                 return reference
-        if isinstance(value, msgspec.Struct):
-            return self._checked(value)
-        if is_item:
-            return value
-        if type(value) in (list, tuple):
-            return [self.converted(each, as_object=as_object, is_item=True) for each in value]
-        if type(value) is dict:
-            return {key: self.converted(each, as_object=as_object, is_item=True) for key, each in value.items()}
-        return value
+        return self._checked(value) if isinstance(value, msgspec.Struct) else value
 
     def failure(self, failure: object) -> FailureValue:
         """Copy a failure: an exception, a `FailureValue`, or a text. Raises `CallerError` for anything else."""

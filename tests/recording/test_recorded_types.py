@@ -84,19 +84,55 @@ def test_a_type_is_declared_when_it_is_asked_for_and_has_a_table_without_a_node(
     assert_verified(tmp_path)
 
 
-def test_looking_up_built_in_types_declares_none_and_reserves_no_name(tmp_path: Path) -> None:
-    with Memory.sync(url_of(tmp_path), settings=AT_END) as memory, memory.recording.episode(description="d"):
-        memory.recording.look_up(["PickUpAction", "Wipe"])
-        declared = memory.recording.type("action", "pickUpAction", {"arm": "integer"})
-        assert declared.dtype == "pickUpAction"
+def test_a_prepared_type_is_declared_when_it_is_asked_for_as_one_that_was_not_prepared(tmp_path: Path) -> None:
+    fields: Mapping[str, FieldSpec] = {"arm": "integer", "grasp": "text", "surface": "pose", "_private": "real"}
+    declared = []
+    for folder, kinds in (("plain", ()), ("prepared", ("PickUpAction", "Wipe", "Unused"))):
+        (tmp_path / folder).mkdir()
+        with Memory.sync(url_of(tmp_path / folder), settings=AT_END) as memory:
+            with memory.recording.episode(description="d"):
+                for each in kinds:
+                    memory.recording.prepare("action", each, fields, bases=("Move",))
+                assert memory.status.missing.total == 0
+                types = [
+                    memory.recording.type("action", each, fields, bases=("Move",)) for each in ("PickUpAction", "Wipe")
+                ]
+            declared.append((types, memory.status.missing))
+            assert memory.status.faults == (0, None)
+        assert declared_dtypes(tmp_path / folder) == ["PickUpAction", "Wipe"]
+        assert_verified(tmp_path / folder)
+    assert declared[0] == declared[1]
+
+
+def test_a_type_declared_after_another_was_prepared_keeps_its_table_and_columns(tmp_path: Path) -> None:
+    with Memory.sync(url_of(tmp_path), settings=AT_END) as memory:
+        recording = memory.recording
+        with recording.episode(description="d"):
+            recording.prepare("action", "Wipe", {"side": "text"})
+            recording.prepare("action", "PourAction", {"cup": "text"})
+            recording.type("action", "Wipe", {"side": "real"})
+            recording.type("action", "pourAction", {"cup": "text"})
+            wipe = recording.type("action", "Wipe", {"side": "text"})
+            pour = recording.type("action", "PourAction", {"cup": "text"})
+        assert [each.declared.name for each in wipe.fields] == ["side_text"]
+        assert (pour.dtype, pour.declaration.table) == ("PourActionAction", "pour_action_action")
         assert memory.status.faults == (0, None)
+    assert_verified(tmp_path)
+
+
+def test_preparing_a_type_of_the_same_table_as_another_reserves_no_name(tmp_path: Path) -> None:
+    with Memory.sync(url_of(tmp_path), settings=AT_END) as memory, memory.recording.episode(description="d"):
+        memory.recording.prepare("action", "PickUpAction", {"arm": "text"})
+        declared = memory.recording.type("action", "pickUpAction", {"arm": "integer"})
+        assert (declared.dtype, declared.declaration.table) == ("pickUpAction", "pick_up_action")
+        assert [each.declared.name for each in declared.fields] == ["arm"]
     assert declared_dtypes(tmp_path) == ["pickUpAction"]
 
 
-def test_a_fault_of_looking_up_built_in_types_is_counted_and_does_not_reach_the_caller(tmp_path: Path) -> None:
-    unhashable: Any = [[]]
+def test_a_type_that_cannot_be_prepared_is_counted_and_does_not_reach_the_caller(tmp_path: Path) -> None:
+    unhashable: Any = {"side": []}
     with Memory.sync(url_of(tmp_path), settings=AT_END) as memory:
-        memory.recording.look_up(unhashable)
+        memory.recording.prepare("action", "Wipe", unhashable)
         assert memory.status.faults[0] == 1
 
 

@@ -54,6 +54,18 @@ class KnownTypes:
             return f"the table has {_COLUMNS_MAX} columns already"
         return None
 
+    def state_of(self, table: str) -> tuple[str | None, int]:
+        """Return the owner of a table and the number of its names; they change with each declaration that adds any."""
+        return self._tables.get(table.lower()), len(self._columns.get(table.lower(), ()))
+
+    def copy_of(self, table: str) -> KnownTypes:
+        """Return a copy that knows this table alone."""
+        copy, name = KnownTypes(self.built_in), table.lower()
+        if (owner := self._tables.get(name)) is not None:
+            copy._tables[name] = owner
+        copy._columns[name] = dict(self._columns.get(name, {}))
+        return copy
+
     def note(self, declaration: DesignatorTypeDeclared) -> None:
         """Note a declaration of this memory."""
         fields = ((each.name, type_text(each)) for each in declaration.fields)

@@ -55,6 +55,13 @@ class Declared(NamedTuple):
     dtype: Renamed | None
 
 
+class PreparedType(NamedTuple):
+    """A type that was derived ahead, and what was known of its table then (`KnownTypes.state_of`)."""
+
+    declared: Declared
+    state: tuple[str | None, int]
+
+
 class _Named(NamedTuple):
     """A field under a name that it may have, and the reason why it is not its own; None if it is."""
 
@@ -119,6 +126,30 @@ def declare_type(
     known_types.note(declaration)
     declared = DeclaredType(dtype, payload, fingerprint(payload), tuple(accepted), declaration, tuple(undeclared))
     return Declared(declared, renamed_fields, renamed)
+
+
+def prepare_type(
+    kind: str, dtype: str, fields: Mapping[str, FieldSpec], known_types: KnownTypes, *, bases: Sequence[str] = ()
+) -> PreparedType | None:
+    """Derive a type ahead, without noting it; None for one whose names depend on other tables than its own."""
+    built_in = known_types.built_in(dtype)
+    table = built_in.table if built_in is not None else table_name(dtype)
+    declared = declare_type(kind, dtype, fields, known_types.copy_of(table), bases=bases)
+    if declared.dtype is not None or not declared.type.payload:
+        return None
+    return PreparedType(declared, known_types.state_of(table))
+
+
+def declare_prepared(prepared: PreparedType, known_types: KnownTypes) -> Declared | None:
+    """Declare a prepared type; None if its table has got an owner or columns since it was prepared."""
+    declaration = prepared.declared.type.declaration
+    if known_types.state_of(declaration.table) != prepared.state:
+        return None
+    built_in = known_types.built_in(declaration.dtype)
+    if built_in is not None:
+        known_types.note_stored(built_in)
+    known_types.note(declaration)
+    return prepared.declared
 
 
 def _dtype(own: str, kind: str, known_types: KnownTypes) -> tuple[str, str, str | None]:

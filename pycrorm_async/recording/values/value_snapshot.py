@@ -182,8 +182,10 @@ def _encode_pose(value: Any, _enum: type[Enum] | None, _references: References) 
         raise _mismatch("Pose", value)
     if not math.isfinite(sum(value.position) + sum(value.orientation)):
         raise UnrecordableValue(f"the pose holds a number that is not finite: {value}")
-    if unwritable(value.frame):
-        raise UnrecordableValue(f"the pose's frame: {unwritable(value.frame)}")
+    try:
+        _require_writable(value.frame)
+    except UnrecordableValue as reason:
+        raise UnrecordableValue(f"the pose's frame: {reason}") from None
     if isinstance(value, Pose):
         return pose_value(value)
     if (len(value.position), len(value.orientation)) != (3, 4):

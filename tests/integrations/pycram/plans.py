@@ -12,6 +12,7 @@ import json
 import os
 import sys
 import threading
+import time
 import traceback
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -27,6 +28,7 @@ from pycram.datastructures.enums import (  # noqa: E402  the resources must be t
     DetectionTechnique,
     Grasp,
     GripperState,
+    TaskStatus,
     TorsoState,
 )
 from pycram.datastructures.pose import GraspDescription, PoseStamped  # noqa: E402
@@ -234,6 +236,49 @@ def language() -> Facts:
         RepeatPlan(2, CodePlan(doubled, {"number": 1})).perform()
         MonitorPlan(lambda: False, left()).perform()
     return {}
+
+
+def monitors() -> Facts:
+    """Let a condition fire during the first of two children, let a child fail, and let both happen."""
+    from pycram.ros.no_ros import ros_tools
+
+    ros_tools.time = time  # which PyCRAM forgot to import: without ROS, it would evaluate a condition only once
+
+    def monitor(fails: bool, fires: bool) -> Facts:
+        running = threading.Event()
+
+        def acts() -> None:
+            running.set()
+            if fires:
+                wait_until(lambda: plan.root.status is TaskStatus.INTERRUPTED)
+            if fails:
+                raise PlanFailure("the driver is gone")
+
+        plan = MonitorPlan(
+            lambda: fires and running.is_set(),
+            CodePlan(acts),
+            SetGripperActionDescription(Arms.LEFT, GripperState.OPEN),
+        )
+        try:
+            plan.perform()
+        except PlanFailure as failure:
+            return {"raised": str(failure)}
+        finally:
+            plan.root.kill_event.set()  # PyCRAM's thread would evaluate the condition for ever after a failure
+            Plan.current_plan = None
+        return {"raised": None}
+
+    with remember(url("monitors"), description="Monitors") as episode:
+        cases = [monitor(fails=False, fires=True), monitor(fails=True, fires=False), monitor(fails=True, fires=True)]
+        faults = episode.emitter.faults.total
+    return {"cases": [each["raised"] for each in cases], "faults": faults}
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 60
+    while not condition():
+        assert time.monotonic() < deadline, "PyCRAM did not evaluate the condition"
+        time.sleep(0.01)
 
 
 def threads() -> Facts:
@@ -482,6 +527,7 @@ PLANS: tuple[Callable[[], Facts], ...] = (
     simulation,
     nested,
     language,
+    monitors,
     threads,
     top_grasp,
     others,

@@ -380,6 +380,24 @@ def test_every_expression_of_the_language_is_a_node_with_its_outcome(run: Run) -
     )
 
 
+def test_a_monitor_is_interrupted_when_its_condition_fires_and_fails_when_its_plan_does(run: Run) -> None:
+    failure = "the driver is gone"
+    assert run.facts["monitors"] == {"cases": [None, failure, failure], "faults": 0}
+    assert run.tree("monitors") == text("""
+        root SUCCEEDED
+          Monitor INTERRUPTED
+            Code SUCCEEDED
+          Monitor FAILED
+            Code FAILED
+          Monitor FAILED
+            Code FAILED
+    """), "the action after the code is never performed, so it is not recorded"
+    reasons = run.rows(
+        "monitors", "SELECT dtype, reason, failure_message FROM task_tree_node WHERE dtype = 'Monitor' ORDER BY id"
+    )
+    assert reasons == [("Monitor", None, None)] + 2 * [("Monitor", "PlanFailure", failure)]
+
+
 def test_a_plan_in_a_thread_of_ones_own_is_recorded_and_never_below_another_threads_node(run: Run) -> None:
     assert run.tree("threads") == text("""
         root SUCCEEDED
