@@ -9,32 +9,24 @@ a language node; the outermost one has the input of the agent. A custom event is
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
-from types import TracebackType
-from typing import Any, Final, Self
+from typing import Any
 from uuid import UUID
 
-from pycrorm_async.errors import MissingExtra
-from pycrorm_async.recording.declarations.recorded_type import FieldSpec, RecordedKind
+from pycrorm_async.integrations.foreign_package import ForeignPackage
 from pycrorm_async.recording.recording import Recording
+from pycrorm_async.recording.runs import Runs
 
-try:
+with ForeignPackage("langchain-core", extra="langchain").importing():
     from langchain_core.callbacks import BaseCallbackHandler
     from langchain_core.messages import BaseMessage, get_buffer_string
     from langchain_core.outputs import LLMResult
     from langchain_core.version import VERSION
-    from pydantic import BaseModel
-except ModuleNotFoundError as missing:
-    raise MissingExtra(f"langchain-core is not installed ({missing}): pip install 'pycrorm-async[langchain]'") from None
 
 __all__ = ["RememberedRuns"]
 
-_NUMBERS: Final[Mapping[type, FieldSpec]] = {bool: "boolean", int: "real", float: "real"}
-"""Field types of inputs that are not text. A model writes the same real number as 1 and as 1.0."""
 
-
-class RememberedRuns(BaseCallbackHandler):
+class RememberedRuns(Runs, BaseCallbackHandler):
     """Records all runs that report to this handler while its `with` block is open, from any thread, as one episode.
 
     Attributes:
@@ -44,88 +36,56 @@ class RememberedRuns(BaseCallbackHandler):
     run_inline = True  # asynchronous runs would else hand each event to a thread, which takes longer than recording it
 
     def __init__(self, recording: Recording, **episode: Any) -> None:
-        self._recording = recording
-        own = {"description": "a language-model agent", "metadata": {"executive": f"langchain-core {VERSION}"}}
-        self._arguments: dict[str, Any] = own | episode
-
-    def __enter__(self) -> Self:
-        self.episode = self._recording.episode(**self._arguments)
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, frames: TracebackType | None
-    ) -> None:
-        self.episode.close(error)
+        episode.setdefault("description", "a language-model agent")
+        super().__init__(recording, f"langchain-core {VERSION}", **episode)
 
     def on_chain_start(self, serialized: Any, inputs: Any, *, run_id: UUID, **run: Any) -> None:
-        outermost = {"inputs": inputs} if run.get("parent_run_id") is None else {}
-        self._start(run_id, run, "language", "Chain", {"name": _name(serialized, run), **outermost})
+        parent = run.get("parent_run_id")
+        outermost = {"inputs": inputs} if parent is None else {}
+        self.start(run_id, "language", "Chain", {"name": _name(serialized, run), **outermost}, parent=parent)
 
     def on_llm_start(self, serialized: Any, prompts: Sequence[str], *, run_id: UUID, **run: Any) -> None:
         parameters = {"model": _name(serialized, run), "prompt": "\n\n".join(prompts)}
-        self._start(run_id, run, "action", "ModelCall", parameters)
+        self.start(run_id, "action", "ModelCall", parameters, parent=run.get("parent_run_id"))
 
     def on_chat_model_start(self, serialized: Any, messages: Any, *, run_id: UUID, **run: Any) -> None:
         self.on_llm_start(serialized, [get_buffer_string(each) for each in messages], run_id=run_id, **run)
 
     def on_retriever_start(self, serialized: Any, query: str, *, run_id: UUID, **run: Any) -> None:
-        self._start(run_id, run, "action", "Retrieval", {"name": _name(serialized, run), "query": query})
+        parameters = {"name": _name(serialized, run), "query": query}
+        self.start(run_id, "action", "Retrieval", parameters, parent=run.get("parent_run_id"))
 
     def on_tool_start(self, serialized: Any, input_str: str, *, run_id: UUID, **run: Any) -> None:
-        self._start(run_id, run, "action", _name(serialized, run), run.get("inputs") or {"input": input_str})
+        parameters = run.get("inputs") or {"input": input_str}
+        self.start(run_id, "action", _name(serialized, run), parameters, parent=run.get("parent_run_id"))
 
     def on_chain_end(self, outputs: Any, *, run_id: UUID, **_run: Any) -> None:
-        if self.episode.is_open(run_id):
-            failed = getattr(outputs, "status", None) == "error"  # the answer of a tool that handles its errors
-            self.episode.end(run_id, "FAILED" if failed else "SUCCEEDED", None, _plain(outputs))
+        has_failed = getattr(outputs, "status", None) == "error"  # the answer of a tool that handles its errors
+        self.end(run_id, "FAILED" if has_failed else "SUCCEEDED", result=outputs)
 
     def on_chain_error(self, error: BaseException, *, run_id: UUID, **_run: Any) -> None:
-        if self.episode.is_open(run_id):
-            paused = any(each.__name__ == "GraphBubbleUp" for each in type(error).__mro__)  # LangGraph asks a human
-            self.episode.end(run_id, "INTERRUPTED" if paused else None, error)
+        is_paused = any(each.__name__ == "GraphBubbleUp" for each in type(error).__mro__)  # LangGraph asks a human
+        self.end(run_id, "INTERRUPTED" if is_paused else None, error)
 
     on_llm_end = on_tool_end = on_retriever_end = on_chain_end
     on_llm_error = on_tool_error = on_retriever_error = on_chain_error
 
     def on_custom_event(self, name: str, data: Any, *, run_id: UUID, **_run: Any) -> None:
-        self.episode.observe(name, _plain(data), node=run_id if self.episode.is_open(run_id) else None)
+        self.observe(name, data, run_id)
 
-    def _start(
-        self, run_id: UUID, run: Mapping[str, Any], kind: RecordedKind, dtype: str, inputs: Mapping[str, Any]
-    ) -> None:
-        inputs = {name: value for name, value in inputs.items() if value is not None}  # None has no type
-        fields = {name: _NUMBERS.get(type(value), "text") for name, value in inputs.items()}
-        parameters = {
-            name: value if isinstance(value, str | int | float) else _plain(value, as_text=True)
-            for name, value in inputs.items()
-        }
-        parent = run.get("parent_run_id")
-        open_parent = parent if self.episode.is_open(parent) else None  # its start may have gone to other handlers only
-        self.episode.start(run_id, self._recording.type(kind, dtype, fields), parameters, parent=open_parent)
+    def simplified(self, value: Any) -> Any:
+        """Return the parts of a message, and the message of a model's answer, that matter."""
+        if isinstance(value, BaseMessage):
+            details = {name: getattr(value, name, None) for name in ("name", "tool_calls", "usage_metadata")}
+            details = {name: each for name, each in details.items() if each}
+            return {"role": value.type, "content": value.content, **details}
+        if isinstance(value, LLMResult):
+            each_answer = (getattr(each, "message", each.text) for batch in value.generations for each in batch)
+            answers = [self.simplified(each) for each in each_answer]
+            return answers[0] if len(answers) == 1 else answers
+        return value
 
 
 def _name(serialized: Mapping[str, Any] | None, run: Mapping[str, Any]) -> str:
     declared = serialized or {}
     return str(run.get("name") or declared.get("name") or (declared.get("id") or ["unknown"])[-1])
-
-
-def _plain(value: Any, *, as_text: bool = False) -> Any:
-    try:
-        return json.dumps(_copy(value), default=str) if as_text else _copy(value)
-    except Exception:  # noqa: BLE001  models of a user may raise anything
-        return value  # is recorded as missing, with the reason
-
-
-def _copy(value: Any) -> Any:
-    """Return messages, results and models of pydantic as dicts and lists."""
-    if isinstance(value, BaseMessage):
-        details = {name: getattr(value, name, None) for name in ("name", "tool_calls", "usage_metadata")}
-        return {"role": value.type, "content": value.content, **{name: each for name, each in details.items() if each}}
-    if isinstance(value, LLMResult):
-        answers = [getattr(each, "message", each.text) for batch in value.generations for each in batch]
-        return _copy(answers[0] if len(answers) == 1 else answers)
-    if isinstance(value, BaseModel):
-        return _copy(value.model_dump())
-    if isinstance(value, Mapping):
-        return {str(key): _copy(each) for key, each in value.items()}
-    return [_copy(each) for each in value] if isinstance(value, list | tuple) else value

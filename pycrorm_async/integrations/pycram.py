@@ -21,13 +21,13 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from importlib import metadata as packages
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Final
 
-from pycrorm_async.errors import CallerError, MissingExtra
+from pycrorm_async.errors import CallerError
 from pycrorm_async.events.values import NodeStatus
+from pycrorm_async.integrations.foreign_package import ForeignPackage
 from pycrorm_async.integrations.pycram_episodes import PyCRAMEpisodes, RunningNode
 from pycrorm_async.integrations.pycram_values import PyCRAMValues
 from pycrorm_async.integrations.pycram_world import PyCRAMWorld
@@ -43,6 +43,7 @@ __all__ = ["KNOWN_VERSIONS", "remember"]
 
 KNOWN_VERSIONS: Final = ("1.0.4",)
 """The versions of the distribution `pycram-robotics` whose methods this module replaces."""
+_PYCRAM: Final = ForeignPackage("PyCRAM", extra="pycram", versions=KNOWN_VERSIONS)
 _ONE_AT_A_TIME: Final[dict[int, threading.Lock]] = {}
 """A lock by the id of the process, because a forked child may have a `remember` of its own. It is held while a
 `remember` is active, because the methods that this replaces are those of the whole process."""
@@ -71,7 +72,7 @@ def remember(
         CallerError: this version of PyCRAM is unknown, or another `remember` is active in this process.
         PycrormError: `Memory.open` raised it; no method of PyCRAM is replaced then.
     """
-    _check_version()
+    _PYCRAM.check_version(_PYCRAM.installed_version("pycram-robotics"))
     active = _ONE_AT_A_TIME.setdefault(os.getpid(), threading.Lock())
     if not active.acquire(blocking=False):
         raise CallerError("another `remember` is active in this process: leave its block first, or perform inside it")
@@ -85,16 +86,6 @@ def remember(
                 yield episode
     finally:
         active.release()
-
-
-def _check_version() -> None:
-    versions, install = " or ".join(KNOWN_VERSIONS), "pip install 'pycrorm-async[pycram]'"
-    try:
-        installed = packages.version("pycram-robotics")
-    except packages.PackageNotFoundError:
-        raise MissingExtra(f"PyCRAM (pycram-robotics {versions}) is not installed: {install}") from None
-    if installed not in KNOWN_VERSIONS:
-        raise CallerError(f"PyCRAM {installed} is unknown, only {versions} can be recorded: {install}")
 
 
 class _PyCRAMPlans:

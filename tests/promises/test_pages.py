@@ -109,6 +109,11 @@ def events_are_followed_until_the_memory_is_closed(reader: PageReader) -> None:
     assert [each.split("(")[0] for each in events[::5]] == ["1 EpisodeStarted", "6 EpisodeEnded"]
 
 
+def the_states_that_ticked_are_counted(reader: PageReader) -> None:
+    question = "SELECT name, result ->> 'ticks' FROM state JOIN task_tree_node USING (id)"
+    assert ask(reader.folder / "states.db", question)[0] == ("job", 3)
+
+
 def the_test_of_the_integration_passes(reader: PageReader) -> None:
     assert "1 passed" in reader.shown.out
 
@@ -303,6 +308,7 @@ RESULTS: Final[Mapping[str, Mapping[str, Callable[[PageReader], None]]]] = {
         'Recall: "have I been here before, and how did it end?"': past_actions_are_recalled,
     },
     "pycrorm_async/recording/README.md": {
+        "Executives that tick, and executives with run ids": the_states_that_ticked_are_counted,
         "Testing an integration": the_test_of_the_integration_passes,
     },
 }

@@ -20,6 +20,7 @@ from pycrorm_async import Memory, Settings, recover
 from pycrorm_async.errors import CallerError
 from pycrorm_async.integrations import py_trees as integration
 from pycrorm_async.integrations.py_trees import RememberedTree
+from pycrorm_async.recording import activations
 from tests.commands import environment
 from tests.databases import ask
 from tests.integrations.py_trees.behaviours import (
@@ -493,7 +494,7 @@ def test_an_unknown_version_of_py_trees_is_refused_by_name(tmp_path: Path, monke
 def test_replaced_subtrees_do_not_fill_the_memory_of_the_process(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(integration, "_KNOWN_MAX", 10)
+    monkeypatch.setattr(activations, "_KNOWN_MAX", 10)
     root = sequence("job", Condition("is near", named("S")), Scripted("drive", named("R")))
     kept: list[int] = []
 
@@ -501,7 +502,7 @@ def test_replaced_subtrees_do_not_fill_the_memory_of_the_process(
         for number in range(50):
             root.replace_child(root.children[1], Scripted(f"drive {number}", named("R")))
             tick(ticked, 2)
-            kept.append(len(ticked.visitors[0]._latest))
+            kept.append(len(ticked.visitors[0]._activations._latest))
 
     status = remembered(tmp_path, root, run)
     assert max(kept) <= 10
