@@ -24,7 +24,7 @@ from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
-from tests.databases import ask, ask_to_change, change_each
+from tests.databases import ask, ask_to_change, change_each, run_in_own_loop
 from tests.table_comparison import declarations_of, differences, tables_of
 
 RED = (1.0, 0.0, 0.0, 0.5)
@@ -32,14 +32,32 @@ WEDGE = "v 0 0 0\nv 1 0 0\nv 0 2 0\nv 0 0 3\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\
 DESCRIBED = "FROM pycrorm_declaration WHERE fingerprint LIKE 'urdf-%'"
 
 
+async def fill(url: str, folder: Path) -> None:
+    """Record an episode with a robot, a red milk that moves, and a wedge whose mesh is recorded, in this folder."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        await record(url, folder / "wedge.obj")
+
+
+@pytest.fixture(scope="module")
+def described(module_database_url: str, tmp_path_factory: pytest.TempPathFactory) -> str:
+    """A memory with this episode that all tests of the module read."""
+    run_in_own_loop(fill(module_database_url, tmp_path_factory.mktemp("described")))
+    return module_database_url
+
+
 @pytest.fixture
-async def filled(database_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    """An episode with a robot, a red milk that moves, and a wedge whose mesh is recorded."""
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "wedge.obj").write_text(WEDGE)
+async def filled(database_url: str, tmp_path: Path) -> str:
+    """A memory with this episode that one test changes."""
+    await fill(database_url, tmp_path)
+    return database_url
+
+
+async def record(url: str, mesh: Path) -> None:
+    mesh.write_text(WEDGE)
     shape = '<collision><geometry><mesh filename="wedge.obj"/></geometry></collision>'
     wedge = f'<robot name="wedge">\n<link name="wedge">{shape}</link></robot>'
-    async with Memory.open(database_url, settings=Settings(record_meshes="files")) as memory:
+    async with Memory.open(url, settings=Settings(record_meshes="files")) as memory:
         async with memory.episode(description="described"):
             with BulletWorld(), simulated_robot:
                 Object("pr2", ObjectType.ROBOT)
@@ -49,8 +67,7 @@ async def filled(database_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPa
                 await NavigateAction([Pose([0.6, 0.4, 0])]).resolve().perform()
         await memory.flush()
         assert (memory.status.faults.total, memory.status.missing.total) == (0, 0)
-    (tmp_path / "wedge.obj").unlink()
-    return database_url
+    mesh.unlink()
 
 
 async def verified(url: str) -> VerifyResult:
@@ -61,8 +78,8 @@ async def verified(url: str) -> VerifyResult:
         await log.close()
 
 
-async def test_every_row_of_an_object_leads_to_its_description(filled: str) -> None:
-    async with Reading.open(filled) as reading, reading.session() as session:
+async def test_every_row_of_an_object_leads_to_its_description(described: str) -> None:
+    async with Reading.open(described) as reading, reading.session() as session:
         milks = (await session.scalars(select(ObjectRow).where(ObjectRow.name == "milk").order_by(ObjectRow.id))).all()
         assert [(each.color, each.description_fingerprint is None) for each in milks] == [([*RED], False), (None, True)]
         with pytest.raises(CallerError, match=r"^description of Object .* is not loaded"):
@@ -88,38 +105,38 @@ async def test_every_row_of_an_object_leads_to_its_description(filled: str) -> N
         assert [name for name, _ in await session.execute(joined)][:4] == ["pr2", "milk", "wedge", "milk"]
 
 
-async def test_the_log_can_be_read_by_hand(filled: str) -> None:
+async def test_the_log_can_be_read_by_hand(described: str) -> None:
     texts = []
-    for (payload,) in ask(filled, f"SELECT payload {DESCRIBED}"):
+    for (payload,) in ask(described, f"SELECT payload {DESCRIBED}"):
         texts.append(zlib.decompress(base64.b64decode(json.loads(payload)["urdf"])).decode())
     assert sorted(text[: text.index(">")] for text in texts) == [
         '<robot name="milk"', '<robot name="pr2"', '<robot name="wedge"',
     ]  # fmt: skip
 
 
-async def test_designator_types_are_read_without_the_descriptions(filled: str) -> None:
-    log = await EventLog.open(DatabaseAddress.parse(filled), create=False)
+async def test_designator_types_are_read_without_the_descriptions(described: str) -> None:
+    log = await EventLog.open(DatabaseAddress.parse(described), create=False)
     try:
         types = await log.declarations()
-        names = [name for (name,) in ask(filled, f"SELECT fingerprint {DESCRIBED}")]
+        names = [name for (name,) in ask(described, f"SELECT fingerprint {DESCRIBED}")]
         assert b"urdf" not in b"".join(types)
         assert (await log.descriptions([*names, "urdf-missing"])).keys() == {*names}
         assert await log.descriptions([]) == {}
     finally:
         await log.close()
-    assert ask(filled, "SELECT count(*) FROM pycrorm_declaration") == [(len(types) + 3,)]
-    assert ask(filled, "SELECT count(*) FROM designator_type") == [(len(types),)]
-    assert ask(filled, "SELECT count(*) FROM object_description") == [(3,)]
+    assert ask(described, "SELECT count(*) FROM pycrorm_declaration") == [(len(types) + 3,)]
+    assert ask(described, "SELECT count(*) FROM designator_type") == [(len(types),)]
+    assert ask(described, "SELECT count(*) FROM object_description") == [(3,)]
 
 
 @pytest.mark.soak_on("postgresql")
 @pytest.mark.slow
-async def test_a_copy_and_a_rebuild_have_the_same_descriptions(filled: str, tmp_path: Path) -> None:
+async def test_a_copy_and_a_rebuild_have_the_same_descriptions(described: str, tmp_path: Path) -> None:
     target = f"sqlite:///{tmp_path / 'copy.db'}"
-    await copy_episodes(filled, target)
-    assert declarations_of(target) == declarations_of(filled)
+    await copy_episodes(described, target)
+    assert declarations_of(target) == declarations_of(described)
     before = tables_of(target)
-    assert differences(tables_of(filled), before) == []
+    assert differences(tables_of(described), before) == []
     await rebuild_memory(target)
     assert differences(before, tables_of(target)) == []
     result = await verified(target)
