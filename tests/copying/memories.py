@@ -35,7 +35,7 @@ async def random_plans(url: str, seeds: Iterable[int]) -> None:
 
 async def everything(url: str) -> None:
     """Fill it with every kind of event and row: a world, motions, a simulation, random plans, and a lost episode."""
-    await random_plans(url, range(12))
+    await random_plans(url, range(6))
     async with Memory.open(url, settings=PATIENT) as memory, memory.episode(description="in the kitchen"):
         with kitchen() as scene:
             await ParkArmsAction([Arms.BOTH]).resolve().perform()

@@ -79,7 +79,7 @@ def test_a_process_killed_during_an_append_leaves_whole_batches_and_the_next_one
     ) as appender:
         assert appender.stdin is not None
         assert appender.stdout is not None
-        for _ in range(20):
+        for _ in range(12):
             appender.stdin.write(f"{max(stored_batches - 1, 0)}\n")  # the last batch again
             appender.stdin.flush()
             child, killed, appended, wanted = 0, False, stored_batches, chance.randrange(1, 4)
