@@ -272,6 +272,7 @@ async def test_a_robot_of_a_plan_that_was_killed_before_anything_was_stored_is_s
             assert arm.link_pose("tip").position == pytest.approx(tip, abs=1e-6)
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_a_robot_under_another_name_keeps_its_description(database_url: str) -> None:
     async with Memory.open(database_url) as memory:
         async with memory.episode(description="two robots"):
@@ -356,6 +357,7 @@ async def test_a_mesh_that_changed_between_two_runs_has_two_hashes_and_both_are_
     assert heights == pytest.approx([0.3, 0.5], abs=1e-6)
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_a_mesh_that_changes_in_one_process_is_hashed_again(database_url: str, tmp_path: Path) -> None:
     robot = made_arm(tmp_path)
     async with Memory.open(database_url) as memory:
@@ -371,6 +373,7 @@ async def test_a_mesh_that_changes_in_one_process_is_hashed_again(database_url: 
     assert first != second == third
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_a_mesh_that_is_too_large_is_kept_as_its_box_and_counted(database_url: str, tmp_path: Path) -> None:
     robot = made_arm(tmp_path / "files")
     size = (tmp_path / "files" / "meshes" / "wedge.obj").stat().st_size
@@ -390,6 +393,7 @@ async def test_a_mesh_that_is_too_large_is_kept_as_its_box_and_counted(database_
         assert tuple(box.size) == pytest.approx((0.1, 0.2, 0.3), abs=1e-6)
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_a_mesh_that_cannot_be_read_any_more_is_missing_with_the_reason(
     database_url: str, tmp_path: Path
 ) -> None:
@@ -412,6 +416,7 @@ async def test_a_mesh_that_cannot_be_read_any_more_is_missing_with_the_reason(
         assert world.object("arm").link_pose("tip").position == pytest.approx(tip, abs=1e-6)
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_a_description_that_fits_no_record_is_missing_with_the_reason_and_shown_as_a_point(
     database_url: str,
 ) -> None:
@@ -437,6 +442,7 @@ async def test_a_description_that_fits_no_record_is_missing_with_the_reason_and_
         assert "4,096 are allowed (record_bytes_max)" in world.assumed["hedge"]
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_a_color_that_is_not_finite_is_missing_and_the_object_is_recorded(database_url: str) -> None:
     async with Memory.open(database_url) as memory:
         async with memory.episode(description="odd"):
