@@ -18,7 +18,7 @@ and after a tick with a change.
 from __future__ import annotations
 
 import traceback
-from collections.abc import Callable, Hashable, Mapping
+from collections.abc import Callable, Hashable, Iterable, Mapping
 from dataclasses import dataclass
 from time import perf_counter
 from typing import Any, Final, Generic, Self, TypeAlias, TypeVar
@@ -144,7 +144,7 @@ class Activations(EpisodeBlock, Generic[B]):
                 if latest.is_open:
                     latest.ticks += 1
                     return
-                is_same = feedback is latest.feedback or _text_of(feedback) == latest.feedback
+                is_same = feedback is latest.feedback or str(feedback or "") == latest.feedback
                 if is_same and took_s < self._instant_s:
                     parent = latest.parent
                     if parent is None or parent.is_open:
@@ -215,8 +215,7 @@ class Activations(EpisodeBlock, Generic[B]):
         above = self._reader.parent(behaviour)
         parent = self._enter(above) if above is not None else None
         kind, dtype, fields = self._reader.node_type(behaviour)
-        parameters = {name: self._parameter(behaviour, name) for name in fields}
-        declared = self._recording.type(kind, dtype, fields)
+        declared, parameters = self._recording.type(kind, dtype, fields), self._parameters(behaviour, fields)
         node = self.episode.start(id(behaviour), declared, parameters, parent=parent.node if parent else None)
         activation = self._latest[id(behaviour)] = self._open[id(behaviour)] = _Activation(behaviour, parent, node)
         return activation
@@ -266,21 +265,20 @@ class Activations(EpisodeBlock, Generic[B]):
             activation.written = activation.ticks
             self.episode.observe("repeated", {"ticks": activation.ticks}, node=activation.node)
 
-    def _parameter(self, behaviour: B, name: str) -> object:
-        try:
-            return self._reader.parameter(behaviour, name)
-        except Exception as error:  # noqa: BLE001  a property may raise anything
-            return RefusedValue(reading_fault(error))
+    def _parameters(self, behaviour: B, names: Iterable[str]) -> dict[str, object]:
+        values: dict[str, object] = {}
+        for name in names:
+            try:
+                values[name] = self._reader.parameter(behaviour, name)
+            except Exception as error:  # noqa: BLE001  a property may raise anything
+                values[name] = RefusedValue(reading_fault(error))
+        return values
 
     def _feedback(self, behaviour: B) -> str:
         try:
-            return _text_of(self._reader.feedback(behaviour))
+            return str(self._reader.feedback(behaviour) or "")
         except Exception as error:  # noqa: BLE001  a property may raise anything
             return reading_fault(error)
-
-
-def _text_of(feedback: object) -> str:
-    return str(feedback or "")
 
 
 def _raised_by(error: BaseException | None, behaviour_class: type[B] | None) -> B | None:
