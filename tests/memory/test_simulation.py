@@ -187,15 +187,23 @@ async def test_a_simulation_whose_process_is_killed_is_lost_with_the_episode_aro
         assert await texts(reading) == ["real"]
 
 
-async def test_plain_sqlite3_shows_only_what_really_happened(tmp_path: Path) -> None:
+async def test_plain_sqlite3_shows_only_what_really_happened_and_the_command_simulations_too(tmp_path: Path) -> None:
     await fetched(url_of(tmp_path))
     connection = sqlite3.connect(tmp_path / "memory.db")
     count = "SELECT (SELECT count(*) FROM pick_up_action), (SELECT count(*) FROM process_metadata)"
     assert connection.execute(count).fetchall() == [(1, 1)]
     connection.close()
+    url = ("--url", url_of(tmp_path))
+    table = pycrorm("episodes", "--simulated", *url, cwd=tmp_path).stdout
+    assert table.count("by FetchFromAnywhereAction of episode 1") == 2
+    shown = pycrorm("show", "3", *url, cwd=tmp_path).stdout
+    assert "simulated by FetchFromAnywhereAction of episode 1" in shown
+    real = pycrorm("show", "1", *url, cwd=tmp_path).stdout
+    simulating = next(line for line in real.splitlines() if "FetchFromAnywhereAction" in line)
+    assert simulating.endswith("simulated in episodes 2, 3")
 
 
-@pytest.mark.soak
+@pytest.mark.soak  # the test before it runs three of these commands
 async def test_the_command_leaves_simulations_out_and_shows_them_on_request(tmp_path: Path) -> None:
     await fetched(url_of(tmp_path))
     url = ("--url", url_of(tmp_path))
@@ -212,12 +220,4 @@ async def test_the_command_leaves_simulations_out_and_shows_them_on_request(tmp_
         "MoveAndPickUpAction",
         "NavigateAction",
     ]
-
-    table = pycrorm("episodes", "--simulated", *url, cwd=tmp_path).stdout
-    assert table.count("by FetchFromAnywhereAction of episode 1") == 2
-    assert "thought" not in pycrorm("episodes", *url, cwd=tmp_path).stdout
-    shown = pycrorm("show", "3", *url, cwd=tmp_path).stdout
-    assert "simulated by FetchFromAnywhereAction of episode 1" in shown
-    real = pycrorm("show", "1", *url, cwd=tmp_path).stdout
-    thinker = next(line for line in real.splitlines() if "FetchFromAnywhereAction" in line)
-    assert thinker.endswith("simulated in episodes 2, 3")
+    assert "simulated" not in pycrorm("episodes", *url, cwd=tmp_path).stdout

@@ -464,16 +464,14 @@ async def test_a_foreign_view_on_the_tables_keeps_them_and_is_reported(server: S
     assert traces(url) == []
 
 
-@pytest.mark.soak
 async def test_a_foreign_table_in_the_schema_of_the_views_is_reported_in_one_line_and_stays(server: Server) -> None:
     url = server.new_database()
     await append_and_fold(url, [*TYPES, *picking(1).records])
     ask_to_change(url, "CREATE TABLE memory.mine (a int)")
-    for _ in range(2):
-        with pytest.raises(DatabaseError, match=r"memory\.mine does not belong to the memory.*: move it to"):
-            await rebuild_memory(url, report_progress=lambda done, *_: pytest.fail(f"reported after {done} events"))
-        assert ask(url, "SELECT count(*) FROM memory.mine") == [(0,)]
-        assert traces(url) == []
+    with pytest.raises(DatabaseError, match=r"memory\.mine does not belong to the memory.*: move it to"):
+        await rebuild_memory(url, report_progress=lambda done, *_: pytest.fail(f"reported after {done} events"))
+    assert ask(url, "SELECT count(*) FROM memory.mine") == [(0,)]
+    assert traces(url) == []
     ask_to_change(url, "DROP TABLE memory.mine")
     assert (await rebuild_memory(url)).left == []
     assert traces(url) == []

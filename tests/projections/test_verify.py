@@ -154,7 +154,6 @@ async def test_a_fold_between_two_parts_is_no_fault(
     await log.close()
 
 
-@pytest.mark.soak
 async def test_a_rebuild_between_two_parts_is_no_fault(
     log: EventLog, database_url: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
