@@ -6,7 +6,7 @@ import asyncio
 import hashlib
 import random
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import pytest
@@ -14,8 +14,10 @@ import pytest
 from pycrorm_async import Memory, Reading
 from pycrorm_async.errors import CallerError, DatabaseUnavailable, UnknownEpisode
 from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.events.types import NodeStarted
 from pycrorm_async.operations.copy import CopySummary, copy_episodes
+from pycrorm_async.operations.destination import LogAndTables
 from pycrorm_async.settings import Settings
 from tests.copying.memories import (
     PATIENT,
@@ -407,16 +409,23 @@ async def test_an_impossible_copy_makes_no_target(new_file: New) -> None:
     assert not path_of(target).exists()
 
 
-@pytest.mark.soak
-async def test_large_events_are_copied_in_small_batches(new_file: New) -> None:
+async def test_large_events_are_copied_in_small_batches(new_file: New, monkeypatch: pytest.MonkeyPatch) -> None:
     source, target = new_file(), new_file()
-    big = b'{"kind":"action","parameters":{"text":"%s"}}' % (b"x" * 100_000)
-    records = [record(episode(1), sequence, payload=big) for sequence in range(1, 1001)]
+    big = b'{"kind":"action","parameters":{"text":"%s"}}' % (b"x" * 5_000)
+    records = [record(episode(1), sequence, payload=big) for sequence in range(1, 601)]
     await append_and_fold(source, [*records, *run_of(episode(2), 1, 30)], folded=False)
+    batches: list[int] = []
+    append = LogAndTables.append
+
+    async def noted(self: LogAndTables, batch: Sequence[Record]) -> Mapping[EpisodeId, str]:
+        batches.append(len(batch))
+        return await append(self, batch)
+
+    monkeypatch.setattr(LogAndTables, "append", noted)
     done: list[int] = []
     await copy_episodes(
         source, target, settings=Settings(batch_bytes_max=2**20), report_progress=lambda count, *_: done.append(count)
     )
     assert logs_of(target) == logs_of(source)
-    assert done == [250, 500, 750, 1000, 1030]
-    assert len(tables_of(target)["task_tree_node"]) == 1030
+    assert (done, batches) == ([250, 500, 600, 630], [250, 250, 130])
+    assert len(tables_of(target)["task_tree_node"]) == 630
