@@ -195,6 +195,21 @@ def test_a_region_consists_of_rectangles_that_do_not_overlap(rectangles: list[Re
         Region(tuple(rectangles))
 
 
+def test_the_default_policy_places_the_base_as_in_the_thesis() -> None:
+    rng = np.random.default_rng(5)
+    drawn = rng.normal(0, math.sqrt(0.5), (30_000, 2))
+    farthest = np.abs(drawn).max(axis=1)
+    expected = np.abs(drawn[(farthest >= 0.2) & (farthest <= 2)])
+    choices = default_policy().sample(rng, 20_000)
+    places = np.abs([(each.relative_x, each.relative_y) for each in choices])
+    assert places.mean(axis=0) == pytest.approx(expected.mean(axis=0), abs=0.015)
+    farthest = places.max(axis=1)
+    assert (farthest.min() >= 0.2, farthest.min() < 0.21, farthest.max() <= 2, farthest.max() > 1.95) == (True,) * 4
+    for kind, members in (("arm", (Arms.LEFT, Arms.RIGHT)), ("grasp", Grasp)):
+        shares = [sum(getattr(each, kind) is member for each in choices) / len(choices) for member in members]
+        assert shares == pytest.approx([1 / len(shares)] * len(shares), abs=0.015)
+
+
 def test_invalid_evidence_is_refused() -> None:
     with pytest.raises(CallerError, match="evidence on arms must be members of Arms"):
         Evidence(arms=frozenset({Grasp.LEFT}))  # type: ignore[arg-type]

@@ -52,7 +52,7 @@ async def frame_of(memory: Memory, *, seed: int = 69, policy: Policy | None = No
     )
 
 
-@pytest.mark.soak  # plan/test_default_policy shows it of the policy alone
+@pytest.mark.soak  # plan/test_default_policy performs other samples, test_policy compares their distributions
 async def test_default_rollouts_succeed_as_often_as_in_the_thesis_and_never_from_the_top() -> None:
     """15.77 % there; two standard errors of 5,000 are one percent."""
     tried: Counter[Grasp] = Counter()
@@ -74,7 +74,20 @@ async def test_default_rollouts_succeed_as_often_as_in_the_thesis_and_never_from
         assert 0.18 < done[grasp] / tried[grasp] < 0.25
 
 
-@pytest.mark.soak  # world/test_arm_ik shows it of the solver
+async def test_within_hard_limits_the_same_rollouts_succeed_and_more() -> None:
+    succeeded: dict[Limits, list[bool]] = {}
+    for limits in Limits:
+        ends: list[int] = []
+        await rolled_out(
+            60, scene=Scene(limits=limits), report_progress=lambda tally, to=ends: to.append(tally.successes)
+        )
+        succeeded[limits] = np.diff([0, *ends]).astype(bool).tolist()
+    pairs = list(zip(succeeded[Limits.SOFT], succeeded[Limits.HARD], strict=True))
+    assert (False, True) in pairs
+    assert (True, False) not in pairs
+
+
+@pytest.mark.soak  # sixty rollouts above
 async def test_within_hard_limits_twice_as_many_succeed() -> None:
     tally = await rolled_out(2_000, scene=Scene(limits=Limits.HARD))
     assert 0.27 < tally.success_rate < 0.33
