@@ -37,14 +37,16 @@ from pycram.designator import ActionDescription  # noqa: E402
 from pycram.designators.action_designator import (  # noqa: E402
     DetectActionDescription,
     MoveAndPickUpActionDescription,
+    MoveTorsoAction,
     MoveTorsoActionDescription,
     NavigateActionDescription,
     ParkArmsActionDescription,
+    PickUpAction,
     PickUpActionDescription,
     PlaceActionDescription,
     SetGripperActionDescription,
 )
-from pycram.designators.motion_designator import MoveGripperMotion, MoveTCPMotion  # noqa: E402
+from pycram.designators.motion_designator import MoveGripperMotion, MoveJointsMotion, MoveTCPMotion  # noqa: E402
 from pycram.designators.object_designator import BelieveObject  # noqa: E402
 from pycram.failures import PlanFailure  # noqa: E402
 from pycram.language import (  # noqa: E402
@@ -236,6 +238,34 @@ def language() -> Facts:
         RepeatPlan(2, CodePlan(doubled, {"number": 1})).perform()
         MonitorPlan(lambda: False, left()).perform()
     return {}
+
+
+def expected_types() -> Facts:
+    """Give the types of fields of some designators, as they are expected ahead and as their values have them."""
+    plans = (
+        out_of_reach(),
+        MoveJointsMotion(["torso_lift_joint"], [0.1]),
+        MoveGripperMotion(GripperState.OPEN, Arms.RIGHT),
+        CodePlan(print, {"end": ""}),
+        RepeatPlan(2, CodePlan(print)),
+        MonitorPlan(lambda: False, CodePlan(print)),
+        SequentialPlan(CodePlan(print)),
+    )
+    roots = [plan.root for plan in plans]
+    designators = [
+        *(getattr(each, "designator_ref", None) or each for each in roots),
+        PickUpAction(milk(), Arms.LEFT, FRONT),
+        MoveTorsoAction(TorsoState.HIGH),
+    ]
+    values = PyCRAMValues()
+    kinds = [type(each) for each in designators]
+    return {
+        "expected": [[each.__name__, dict(values.expected_fields(each))] for each in kinds],
+        "actual": [
+            [kind.__name__, values.field_types(kind, values.parameters(each))]
+            for kind, each in zip(kinds, designators, strict=True)
+        ],
+    }
 
 
 def monitors() -> Facts:
@@ -527,6 +557,7 @@ PLANS: tuple[Callable[[], Facts], ...] = (
     simulation,
     nested,
     language,
+    expected_types,
     monitors,
     threads,
     top_grasp,

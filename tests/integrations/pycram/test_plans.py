@@ -380,6 +380,33 @@ def test_every_expression_of_the_language_is_a_node_with_its_outcome(run: Run) -
     )
 
 
+def test_the_types_that_are_prepared_before_a_plan_are_those_that_its_nodes_have(run: Run) -> None:
+    facts = run.facts["expected_types"]
+    assert json.dumps(facts["expected"]) == json.dumps(facts["actual"]), "also in the same order"
+    assert dict(facts["actual"]) == {
+        "MoveTCPMotion": {
+            "target": "pose",
+            "arm": "enum",
+            "allow_gripper_collision": "boolean",
+            "movement_type": "enum",
+        },
+        "MoveJointsMotion": {"names": ["list", "text"], "positions": ["list", "real"]},
+        "MoveGripperMotion": {"motion": "enum", "gripper": "enum", "allow_gripper_collision": "boolean"},
+        "CodeNode": {"function": "text", "arguments": ["dict", "text"]},
+        "RepeatNode": {"times": "integer"},
+        "MonitorNode": {"condition": "text", "interval_s": "real"},
+        "SequentialNode": {},
+        "PickUpAction": {
+            "object_designator": "object",
+            "arm": "enum",
+            "grasp": "enum",
+            "approach_direction": "enum",
+            "rotate_gripper": "boolean",
+        },
+        "MoveTorsoAction": {"torso_state": "enum", "position": "real"},
+    }
+
+
 def test_a_monitor_is_interrupted_when_its_condition_fires_and_fails_when_its_plan_does(run: Run) -> None:
     failure = "the driver is gone"
     assert run.facts["monitors"] == {"cases": [None, failure, failure], "faults": 0}
