@@ -77,8 +77,7 @@ def remember(
     if not active.acquire(blocking=False):
         raise CallerError("another `remember` is active in this process: leave its block first, or perform inside it")
     try:
-        settings = settings or Settings(fold="at_end")
-        with Memory.sync(url, spool=spool, writer=writer, settings=settings) as memory:
+        with Memory.sync(url, spool=spool, writer=writer, settings=settings or Settings(fold="at_end")) as memory:
             observer = _PyCRAMPlans(memory.recording)
             with observer.observing(
                 description=description, plan=plan, seed=seed, tags=tags, metadata=metadata
@@ -106,21 +105,20 @@ class _PyCRAMPlans:
     def observing(self, **labels: Any) -> Iterator[RecordedEpisode]:
         """Record an episode until the block ends."""
         world = self._pycram.World.current_world
-        self._episodes.real = episode = self._episodes.open(world, **labels)
-        self.seams.is_on = True
         failure: BaseException | None = None  # not `sys.exception()`, which has one also if the block is in an `except`
-        try:
-            self._prepare_types()
-            self._connect()
-            self._add_world(world)
-            yield episode
-        except BaseException as error:
-            failure = error
-            raise
-        finally:
-            self._end_simulation(failure)
-            self.seams.remove()
-            episode.close(failure)
+        with self._episodes.open(world, **labels) as episode:
+            self._episodes.real, self.seams.is_on = episode, True
+            try:
+                self._prepare_types()
+                self._connect()
+                self._add_world(world)
+                yield episode
+            except BaseException as error:
+                failure = error
+                raise
+            finally:
+                self._end_simulation(failure)
+                self.seams.remove()
 
     def _connect(self) -> None:
         plan, used, seams = self._pycram.Plan, self._pycram, self.seams
