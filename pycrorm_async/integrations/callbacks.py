@@ -19,7 +19,7 @@ from pycrorm_async.recording.runs import Runs
 
 with ForeignPackage("langchain-core", extra="langchain").importing():
     from langchain_core.callbacks import BaseCallbackHandler
-    from langchain_core.messages import BaseMessage, get_buffer_string
+    from langchain_core.messages import BaseMessage
     from langchain_core.outputs import LLMResult
     from langchain_core.version import VERSION
 
@@ -45,11 +45,9 @@ class RememberedRuns(Runs, BaseCallbackHandler):
         self.start(run_id, "language", "Chain", {"name": _name(serialized, run), **outermost}, parent=parent)
 
     def on_llm_start(self, serialized: Any, prompts: Sequence[str], *, run_id: UUID, **run: Any) -> None:
+        # Chat models too: without `on_chat_model_start` LangChain passes their messages as one text.
         parameters = {"model": _name(serialized, run), "prompt": "\n\n".join(prompts)}
         self.start(run_id, "action", "ModelCall", parameters, parent=run.get("parent_run_id"))
-
-    def on_chat_model_start(self, serialized: Any, messages: Any, *, run_id: UUID, **run: Any) -> None:
-        self.on_llm_start(serialized, [get_buffer_string(each) for each in messages], run_id=run_id, **run)
 
     def on_retriever_start(self, serialized: Any, query: str, *, run_id: UUID, **run: Any) -> None:
         parameters = {"name": _name(serialized, run), "query": query}
