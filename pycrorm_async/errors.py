@@ -100,7 +100,7 @@ class UnknownEpisode(CallerError):
 
 
 class QueryRefused(CallerError):
-    """A query in SQL would do more than read, is wrong, or took longer or returned more than it may."""
+    """A query in SQL or a select is wrong, would do more than read, or took longer or returned more than it may."""
 
 
 class MissingExtra(CallerError):

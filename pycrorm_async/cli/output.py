@@ -76,7 +76,7 @@ def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[obje
     table = Table(header_style="bold")
     for index, name in enumerate(columns):
         numeric = bool(rows) and all(isinstance(row[index], int | float) for row in rows)
-        table.add_column(name, justify="right" if numeric else "left", overflow="fold")
+        table.add_column(escape(name), justify="right" if numeric else "left", overflow="fold")
     for row in rows:
         table.add_row(*(_cell(value) for value in row))
     stdout.print(table)
@@ -94,7 +94,7 @@ def _print_block(columns: Sequence[str], row: Sequence[object]) -> None:
     """Print a row as a line for each value that is not empty, and an empty line."""
     for name, value in zip(columns, row, strict=True):
         if value not in (None, ""):
-            stdout.print(f"  [dim]{name:<{max(map(len, columns))}}[/] {_cell(value)}", soft_wrap=True)
+            stdout.print(f"  [dim]{escape(name.ljust(max(map(len, columns))))}[/] {_cell(value)}", soft_wrap=True)
     stdout.print()
 
 

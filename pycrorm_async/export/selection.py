@@ -108,6 +108,10 @@ async def select_rows(
     if len(names) == 1 and names[0] in QUESTIONS:
         return await _asked(reading, "question", _question(reading, names[0], arguments), arguments, chosen)
     for each in names:
+        if each in views or each in QUESTIONS:
+            raise CallerError(
+                f"an export is of episodes or of one view or question: export {each} to a file of its own"
+            )
         if not _may_be_episode(each):
             near = nearest(each, [*views, *QUESTIONS])
             raise CallerError(f"the memory has no episode, view, table or question {each!r}{near}")

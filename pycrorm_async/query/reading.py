@@ -34,7 +34,7 @@ from pycrorm_async.query.as_of import AnyEpisode, as_of
 from pycrorm_async.query.asking.ask import Ask
 from pycrorm_async.query.asking.episode_diff import EpisodeDiff, diff_episodes
 from pycrorm_async.query.asking.episode_list import EpisodeChoice
-from pycrorm_async.query.asking.question import AskedEpisode, FrameQuery, Question
+from pycrorm_async.query.asking.question import AskedEpisode, FrameQuery, Question, translated_errors
 from pycrorm_async.query.frames.arrow_batches import BATCH_ROWS, arrow_batches
 from pycrorm_async.query.frames.columns import select_of
 from pycrorm_async.query.frames.dataframe import Library, dataframe
@@ -172,13 +172,13 @@ class Reading:
         `pycrorm_async.query.frames` lists the types. `statement` is a select, a union of selects, a mapped class, or a
         question of `ask`. With `deferred` a mapped class contributes the columns too that its objects load on request.
 
-        Raises `MissingExtra` where the library is not installed, and `CallerError` for SQL as text, which `query` runs.
+        Raises `MissingExtra`; `QueryRefused` for a wrong select; `CallerError` for SQL as text, which `query` runs.
         """
         await self._ready()
-        statement = await self._select_of(statement)
-        with self._log.translated():
+        plain = await self._select_of(statement)
+        with translated_errors(self._log, statement):
             async with self._connection(simulated=simulated) as connection:
-                return await dataframe(connection, statement, to=to, deferred=deferred)
+                return await dataframe(connection, plain, to=to, deferred=deferred)
 
     async def batches(
         self,
@@ -198,12 +198,12 @@ class Reading:
         errors are those of `dataframe`.
         """
         await self._ready()
-        statement = await self._select_of(statement)
-        with self._log.translated():
+        plain = await self._select_of(statement)
+        with translated_errors(self._log, statement):
             async with (
                 self._connection(simulated=simulated) as connection,
                 aclosing(
-                    arrow_batches(connection, statement, rows=rows, deferred=deferred, enums_as_text=enums_as_text)
+                    arrow_batches(connection, plain, rows=rows, deferred=deferred, enums_as_text=enums_as_text)
                 ) as batches,
             ):
                 async for batch in batches:

@@ -62,7 +62,7 @@ def new_file(path: Path, *, force: bool) -> Iterator[Path]:
     except FileExistsError:
         raise CallerError(f"{path} exists: add --force to replace it, or give another name") from None
     except OSError as error:
-        raise OSError(error.errno, error.strerror, str(path)) from error  # the user knows no part
+        raise _named_after(error, path, written) from error
     finally:
         written.unlink(missing_ok=True)
         os.close(descriptor)
@@ -92,14 +92,23 @@ def new_folder(path: Path, *, force: bool, marker: str) -> Iterator[Path]:
             path.rename(replaced)
         written.rename(path)
         _sync(path.absolute().parent)
-    except BaseException:
+    except BaseException as error:
         if replaced.exists() and not path.exists():
             replaced.rename(path)
+        if isinstance(error, OSError):
+            raise _named_after(error, path, written) from error
         raise
     finally:
         shutil.rmtree(written, ignore_errors=True)
         shutil.rmtree(replaced, ignore_errors=True)
         os.close(descriptor)
+
+
+def _named_after(error: OSError, path: Path, part: Path) -> OSError:
+    """Return the error with the name that the user gave, unless it is of another file; the user knows no part."""
+    name = error.filename
+    is_of_part = name is None or Path(os.fsdecode(name)).is_relative_to(part)
+    return OSError(error.errno, error.strerror, str(path)) if is_of_part else error
 
 
 def _rename_to_new(written: Path, path: Path) -> None:

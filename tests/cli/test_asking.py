@@ -132,6 +132,15 @@ def test_a_query_is_printed_as_a_table_as_csv_and_as_json(folder: Path) -> None:
     assert "more" not in pycrorm("query", sql, "--limit", "0", cwd=folder).stderr
 
 
+def test_a_name_of_a_column_is_printed_as_it_is_also_in_brackets(folder: Path) -> None:
+    columns = "1 AS '[/x]', 2 AS '[red]y'"
+    for sql in (f"SELECT {columns}", f"SELECT task_tree_node.*, {columns} FROM task_tree_node LIMIT 1"):  # also a block
+        shown = pycrorm("query", sql, cwd=folder)
+        assert (shown.returncode, shown.stderr) == (0, "")
+        assert "[/x]" in shown.stdout
+        assert "[red]y" in shown.stdout
+
+
 @pytest.mark.parametrize(
     ("words", "says"),
     [

@@ -258,8 +258,9 @@ async def test_a_question_is_made_again_about_the_same_episodes_when_more_are_re
 
 async def test_a_full_disk_leaves_no_file(reading: Reading, tmp_path: Path) -> None:
     for name in ("a.parquet", "a.csv", "a.jsonl"):
-        with files_of_at_most(DISK_BYTES), pytest.raises(OSError, match="File too large"):
+        with files_of_at_most(DISK_BYTES), pytest.raises(OSError, match="File too large") as refused:
             await export(reading, LARGE, tmp_path / name)
+        assert refused.value.filename == str(tmp_path / name)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -355,6 +356,7 @@ async def test_an_episode_that_the_tables_hold_in_part_is_left_out(tmp_path: Pat
         ("PickUpWithContextView", ("99",), "a.csv", UnknownEpisode, "there is no episode '99'"),
         ("concept", ("2",), "a.csv", CallerError, "the rows of concept are of no episode"),
         ("2", ("2",), "a.csv", CallerError, "episodes are exported whole"),
+        (("2", "concept"), (), "a.csv", CallerError, "of one view or question: export concept to a file of its own"),
         (
             "2",
             (),
@@ -366,7 +368,13 @@ async def test_an_episode_that_the_tables_hold_in_part_is_left_out(tmp_path: Pat
     ],
 )
 async def test_mistakes_are_named_and_leave_no_file(
-    either: Reading, tmp_path: Path, what: str, episodes: tuple[str, ...], name: str, error: type, message: str
+    either: Reading,
+    tmp_path: Path,
+    what: str | tuple[str, ...],
+    episodes: tuple[str, ...],
+    name: str,
+    error: type,
+    message: str,
 ) -> None:
     with pytest.raises(error, match=message):
         await export(either, what, tmp_path / name, episodes=episodes)

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import sys
 from collections.abc import AsyncIterator
+from dataclasses import replace
 from typing import Any
 
 import pandas as pd
 import polars as pl
 import pyarrow as pa
 import pytest
-from sqlalchemy import Text, func, null, select, text, type_coerce, union_all
+from sqlalchemy import Text, func, literal_column, null, select, text, type_coerce, union_all
 
-from pycrorm_async.errors import CallerError, MissingExtra, UnknownEpisode
+from pycrorm_async.errors import CallerError, InternalError, MissingExtra, QueryRefused, UnknownEpisode
 from pycrorm_async.orm import Action, NavigateAction, PickUpAction, PickUpWithContextView, Pose, TaskTreeNode
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.store.address import DatabaseAddress
@@ -122,6 +123,23 @@ async def test_sql_as_text_is_refused_with_the_call_that_runs_it(reading: Readin
 async def test_what_has_no_rows_is_refused(reading: Reading, query: Any) -> None:
     with pytest.raises(CallerError, match="a frame can be of a select, a mapped class or a question, not of "):
         await reading.dataframe(query)
+
+
+async def test_a_select_that_the_database_refuses_is_the_callers_fault_and_a_question_is_ours(
+    reading: Reading, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wrong = select(literal_column("statu", Text).label("status")).select_from(NODE)
+    for to in ("pandas", "arrow"):
+        with pytest.raises(
+            QueryRefused, match=r'^the query is refused: (no such column: statu|column "statu" does not)'
+        ):
+            await reading.dataframe(wrong, to=to)
+    with pytest.raises(QueryRefused, match=r"^the query is refused: "):
+        [batch async for batch in reading.batches(wrong)]
+    question = reading.ask.durations()
+    monkeypatch.setattr(question, "_plan", replace(question._plan, select_of=lambda episode: wrong))
+    with pytest.raises(InternalError, match="statu"):
+        await reading.dataframe(question)
 
 
 async def test_batches_have_one_schema_and_the_rows_of_the_frame_in_order(reading: Reading) -> None:

@@ -168,10 +168,28 @@ async def test_a_wrong_name_is_answered_with_the_nearest_one(sql: _Sql) -> None:
         await sql.query("SELECT * FROM root_failures")
     with pytest.raises(QueryRefused, match=r"no table or view task_tree_nodes; did you mean task_tree_node\?$"):
         await sql.query("SELECT * FROM task_tree_nodes")
-    with pytest.raises(QueryRefused, match="no table or view weather; the README of `query` lists them"):
+    with pytest.raises(QueryRefused, match="no table or view weather; `pycrorm schema` lists them"):
         await sql.query("SELECT * FROM weather")
     with pytest.raises(QueryRefused, match="statu"):
         await sql.query("SELECT statu FROM process_metadata")
+
+
+async def test_a_server_names_a_mistake_with_its_hint_once(sql: _Sql) -> None:
+    if sql.is_sqlite:
+        return
+    refusals = {
+        "SELECT dtyp FROM action": 'column "dtyp" does not exist'
+        ' (Perhaps you meant to reference the column "action.dtype".)',
+        "SELECT action.dtype FROM action AS a": 'invalid reference to FROM-clause entry for table "action"'
+        ' (Perhaps you meant to reference the table alias "a".)',
+        "SELECT b.dtype FROM action AS a": 'missing FROM-clause entry for table "b"',
+        "SELECT dtype, count(*) FROM action": 'column "action.dtype" must appear in the GROUP BY clause'
+        " or be used in an aggregate function",
+    }
+    for text, refusal in refusals.items():
+        with pytest.raises(QueryRefused) as refused:
+            await sql.query(text)
+        assert str(refused.value) == f"the query is refused: {refusal}"
 
 
 async def test_a_cancelled_query_stops_in_the_database(sql: _Sql) -> None:

@@ -2,12 +2,14 @@
 
 import errno
 import os
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from pycrorm_async.errors import CallerError
-from pycrorm_async.report.output_files import new_folder, write_file
+from pycrorm_async.report.output_files import new_file, new_folder, write_file
 
 
 class WatchedSyncs:
@@ -77,3 +79,21 @@ def test_all_files_of_a_folder_are_synced_before_it_gets_its_name(
     }
     assert [named for *_, named in before] == [False] * 4
     assert (after[0], after[2]) == (tmp_path.name, True)
+
+
+@pytest.mark.parametrize("new", [new_file, partial(new_folder, marker="meta")])
+def test_an_error_of_a_part_names_the_file_that_the_user_asked_for_and_another_keeps_its_name(
+    new: Any, tmp_path: Path
+) -> None:
+    manifest = tmp_path / "a.manifest.json"
+    with (
+        pytest.raises(OSError, match="No space left") as refused,
+        new_file(manifest, force=False),
+        new(tmp_path / "a", force=False) as part,
+    ):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(part))
+    assert refused.value.filename == str(tmp_path / "a")
+    with pytest.raises(FileNotFoundError) as missing, new(tmp_path / "a", force=False):
+        (tmp_path / "mesh.stl").read_bytes()
+    assert missing.value.filename == str(tmp_path / "mesh.stl")
+    assert list(tmp_path.iterdir()) == []

@@ -3,19 +3,21 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Coroutine, Generator, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Generator, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 from sqlalchemy import CompoundSelect, Row, Select, func, select
 
-from pycrorm_async.errors import CallerError
+from pycrorm_async.errors import CallerError, InternalError, QueryRefused
 from pycrorm_async.orm import ProcessMetaData
 from pycrorm_async.query.asking.columns import EpisodeNumber
 from pycrorm_async.query.asking.ports import EpisodeReader
 from pycrorm_async.query.asking.unknown_names import unknown_name
 from pycrorm_async.query.named_queries import EpisodeSummary
 from pycrorm_async.query.value_html import NotebookValue
+from pycrorm_async.store.log import EventLog
 
 if TYPE_CHECKING:
     from pycrorm_async.hooks.episode import Episode
@@ -160,6 +162,22 @@ class SyncQuestion(NotebookValue):
 
     def __repr__(self) -> str:
         return f"<question {self.name}: call frame() or rows(), print it for its SQL>"
+
+
+@contextmanager
+def translated_errors(log: EventLog, query: FrameQuery) -> Iterator[None]:
+    """Translate errors of the driver; raise `QueryRefused` where the database refuses a select of the caller's own.
+
+    A question and a mapped class are selects of this package, so what it refuses in them stays an `InternalError`.
+    """
+    try:
+        with log.translated():
+            yield
+    except InternalError as error:
+        if isinstance(query, Question | type):
+            raise
+        refusal = str(error).removeprefix(f"{log.address}: ")
+        raise QueryRefused(f"the query is refused: {refusal}") from error
 
 
 def _warn(unknown: str) -> None:

@@ -117,6 +117,9 @@ _DATABASE_FAULTS = ("08", "40", "53", "55", "57", "58", "XX")
 """Classes of errors that are the database's; all others are the query's own."""
 _CANCELLED = "57014"
 _UNDEFINED_TABLE = "42P01"
+_MISSING_FROM = "errorMissingRTE"
+"""The server's function that reports a table that exists, but not in this FROM, with the same code. Its message has the
+language of the server."""
 
 
 class _Cursor:
@@ -180,17 +183,17 @@ class _Cursor:
         except TimeoutError:
             raise QueryRefused(stopped(seconds)) from None
         except asyncpg.PostgresError as error:
-            code, text = error.sqlstate or "", " ".join(str(error).split())
+            code, text = error.sqlstate or "", " ".join((error.message or "").split())
             if code == _CANCELLED:
                 raise QueryRefused(stopped(seconds)) from None
             if code.startswith(_DATABASE_FAULTS):
                 raise
-            if code == _UNDEFINED_TABLE:
+            if code == _UNDEFINED_TABLE and error.server_source_function != _MISSING_FROM:
                 raise await self._missing(text) from None
             if "multiple commands" in text:
                 raise QueryRefused(NOT_ONE) from None
-            hint = f" ({error.hint})" if getattr(error, "hint", None) else ""
-            raise QueryRefused(f"the query is refused: {text}{hint}") from None
+            notes = " ".join(each for each in (error.detail, error.hint) if each)
+            raise QueryRefused(f"the query is refused: {text}{f' ({notes})' if notes else ''}") from None
         except (OverflowError, ValueError) as error:  # a date before year 1 or after 9999, or the time 24:00
             raise QueryRefused(f"Python has no such date or time ({error}): cast the column to text") from None
 

@@ -22,4 +22,4 @@ def missing_relation(name: str, valid: Iterable[str]) -> QueryRefused:
     """Return the refusal of a query that names a table or view that does not exist."""
     public = sorted({each for each in valid if not _INTERNAL.search(each)})
     hint = nearest(name.rpartition(".")[2], public)
-    return QueryRefused(f"there is no table or view {name}{hint or '; the README of `query` lists them'}")
+    return QueryRefused(f"there is no table or view {name}{hint or '; `pycrorm schema` lists them'}")
