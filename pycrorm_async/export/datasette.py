@@ -12,6 +12,7 @@ import inspect
 import re
 from typing import Any
 
+from sqlalchemy import LargeBinary
 from sqlalchemy import inspect as inspect_database
 
 from pycrorm_async.errors import CallerError
@@ -55,7 +56,7 @@ async def datasette_metadata(reading: Reading) -> dict[str, Any]:
         "databases": {
             log.address.path.stem: {
                 "tables": {
-                    name: {"hidden": True} if _INTERNAL.fullmatch(name) else _table(name, columns, views.get(name))
+                    name: {"hidden": True} if columns is None else _table(name, columns, views.get(name))
                     for name, columns in tables.items()
                 },
                 "queries": {name: _query(reading, name) for name in QUESTIONS},
@@ -64,10 +65,21 @@ async def datasette_metadata(reading: Reading) -> dict[str, Any]:
     }
 
 
-def _columns_by_table(connection: Any) -> dict[str, list[str]]:
+def _columns_by_table(connection: Any) -> dict[str, list[str] | None]:
+    """Return the columns of each table and view; None for one to hide.
+
+    Views with bytes are hidden too: Datasette 0.65 answers their pages with an error, because it links a value of bytes
+    by its row's key, which no view has.
+    """
     inspector = inspect_database(connection)
-    names = sorted([*inspector.get_table_names(sqlite_include_internal=True), *inspector.get_view_names()])
-    return {name: [each["name"] for each in inspector.get_columns(name)] for name in names}
+    tables, views = inspector.get_table_names(sqlite_include_internal=True), inspector.get_view_names()
+    columns: dict[str, list[str] | None] = {}
+    for name in sorted([*tables, *views]):
+        described = inspector.get_columns(name)
+        has_bytes = name in views and any(isinstance(each["type"], LargeBinary) for each in described)
+        is_hidden = has_bytes or _INTERNAL.fullmatch(name) is not None
+        columns[name] = None if is_hidden else [each["name"] for each in described]
+    return columns
 
 
 def _table(name: str, columns: list[str], view: ViewDescription | None) -> dict[str, Any]:

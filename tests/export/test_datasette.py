@@ -18,6 +18,9 @@ from pycrorm_async.query.asking.ask import QUESTIONS
 from tests.commands import pycrorm
 from tests.databases import Server
 
+WITH_BYTES = {"recall_column"}
+"""The views with a column of bytes, whose pages Datasette answers with an error."""
+
 
 @pytest.fixture
 async def described(reading: Reading) -> dict[str, Any]:
@@ -37,7 +40,7 @@ async def test_internal_tables_are_hidden_and_views_are_described_sorted_and_fac
     assert tables.keys() == names.keys()
     shown = {name for name, each in tables.items() if not each.get("hidden")}
     assert {name for name in shown if names[name] == "table"} == {"event", "episode"}
-    assert {name for name in names if names[name] == "view"} <= shown
+    assert {name for name in names if names[name] == "view"} - shown == WITH_BYTES
     columns = tables["root_failure"].pop("columns")
     assert columns["message"] == "its message"
     assert columns["start_time"] == "µs since 1970-01-01 00:00 UTC"
