@@ -113,7 +113,7 @@ async def export(
     """Write rows or episodes to a file that gets its name when it is complete, and its manifest beside it.
 
     Args:
-        what: an episode or several (a row for each node), by number, id or `last`; a view or table by name, or a mapped
+        what: an episode or several (a row for each node), by number, id or `last`; a view by name, or a mapped
             class, of all episodes that have ended; a question of `memory.ask` or its name; or a select.
         path: of the file.
         file_format: `parquet`, `csv` or `jsonl` for rows; `lerobot` for episodes, into a folder; `rrd` or `mcap` for

@@ -114,7 +114,7 @@ async def select_rows(
             )
         if not _may_be_episode(each):
             near = nearest(each, [*views, *QUESTIONS])
-            raise CallerError(f"the memory has no episode, view, table or question {each!r}{near}")
+            raise CallerError(f"the memory has no episode, view, class or question {each!r}{near}")
     if chosen:
         raise CallerError("episodes are exported whole: name them all instead of choosing among them")
     of_names = await _named(reading, names, running=running)

@@ -11,10 +11,12 @@ from pathlib import Path
 
 import pytest
 
+from pycrorm_async import Memory
 from pycrorm_async.cli.main import app
 from pycrorm_async.cli.since import parse_since
 from pycrorm_async.errors import CallerError
 from pycrorm_async.query.asking.ask import QUESTIONS
+from pycrorm_async.world import Pose
 from tests.commands import COMMAND, answer, environment, one_line_of, pycrorm
 from tests.databases import Server, run_in_own_loop
 from tests.projections.factories import append_and_fold
@@ -205,6 +207,23 @@ def test_episodes_are_chosen_by_status_text_start_and_number(folder: Path) -> No
     assert numbers("--robot", "pr2") == []
     assert "did you mean RUNNING?" in one_line_of(pycrorm("episodes", "--status", "runing", cwd=folder))
     assert "is not a time" in one_line_of(pycrorm("episodes", "--since", "monday", cwd=folder))
+
+
+def test_an_unknown_tag_or_robot_is_answered_with_the_nearest_one(tmp_path: Path) -> None:
+    with (
+        Memory.sync(f"sqlite:///{tmp_path / 'pycrorm.db'}") as memory,
+        memory.recording.episode(description="a walk", tags=["kitchen"]) as episode,
+    ):
+        episode.object_added("base", "turtle", "ROBOT", Pose([0, 0, 0]))
+    for options, mistake in {
+        ("--tag", "kitchn"): "the memory has no tag kitchn; did you mean kitchen?",
+        ("--tag", "kitchen", "--tag", "nihgt"): "the memory has no tag nihgt",
+        ("--robot", "Turtle"): "the memory has no robot Turtle; did you mean turtle?",
+        ("--tag", "kitchen", "--status", "FAILED"): "`pycrorm episodes` lists all",
+    }.items():
+        done = pycrorm("episodes", *options, cwd=tmp_path)
+        assert (done.returncode, done.stdout) == (0, "")
+        assert done.stderr == f"no episode matches these options; {mistake}\n"
 
 
 @pytest.mark.parametrize("text", ["", "7", "7 years", "2026-13-01", "9999999d", "999999w"])
