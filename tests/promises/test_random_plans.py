@@ -100,9 +100,9 @@ def assert_various(journals: Iterable[Journal]) -> None:
     for each in (entry for journal in journals for entry in journal.entries):
         seen.update((each.status, each.dtype, f"reason {each.reason}"))
     for status in ("SUCCEEDED", "FAILED", "ERROR", "CANCELLED", "INTERRUPTED"):
-        assert seen[status] > 20, (status, seen)
+        assert seen[status] > 5, (status, seen)
     for name in "Sequential TryInOrder Parallel TryAll Repeat Retry Monitor Action".split():
-        assert seen[f"Journaled{name}"] > 50, (name, seen)
+        assert seen[f"Journaled{name}"] > 25, (name, seen)
     for name in "PlanFailures ExceptionGroup ResourceDeadlock ValueError Timeout".split():
         assert seen[f"reason {name}"] > 0, (name, seen)
 
