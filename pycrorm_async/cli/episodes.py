@@ -24,7 +24,7 @@ from pycrorm_async.cli.reading import read_memory
 from pycrorm_async.cli.since import parse_since
 from pycrorm_async.cli.tree import simulated_by
 from pycrorm_async.query.asking.episode_list import EpisodeChoice
-from pycrorm_async.query.asking.unknown_names import unknown_name
+from pycrorm_async.query.asking.unknown_names import absence_of_episodes
 from pycrorm_async.query.named_queries import EpisodeSummary
 from pycrorm_async.query.parameter_text import duration
 from pycrorm_async.query.reading import Reading
@@ -54,14 +54,14 @@ def episodes(
 
     async def read(reading: Reading) -> tuple[list[EpisodeSummary], str]:
         chosen = await reading.episodes(choice, simulated=simulated)
-        return chosen, "" if chosen else await _unknown_name(reading, choice)
+        return chosen, "" if chosen else await absence_of_episodes(reading, choice)
 
-    summaries, unknown = read_memory(url, spool, read)
+    summaries, absence = read_memory(url, spool, read)
     if as_json:
         print_json(summaries)
         return
     if not summaries:
-        note(f"no episode matches these options; {unknown}" if unknown else choice.absence)
+        note(absence)
         return
     numbers = {e.id: e.number for e in summaries}
     columns: tuple[str, ...] = ("episode", "started", "took", "status", "nodes", "failed", "description")
@@ -80,15 +80,6 @@ def episodes(
         columns = (*columns, "simulated")
         rows = [(*row, simulated_by(e) if e.simulated else "") for row, e in zip(rows, summaries, strict=True)]
     print_table(f"Episodes of {DatabaseAddress.parse(url)}", columns, rows)
-
-
-async def _unknown_name(reading: Reading, choice: EpisodeChoice) -> str:
-    """Return a line about the robot or a tag that no episode of the memory has; empty without one."""
-    names = [*([] if choice.robot is None else [("robot", choice.robot)]), *(("tag", each) for each in choice.tags)]
-    for argument, name in names:
-        if line := await unknown_name(reading, {argument: name}):
-            return line
-    return ""
 
 
 def _description(episode: EpisodeSummary, numbers: Mapping[str, int]) -> str:

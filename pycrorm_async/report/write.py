@@ -18,6 +18,7 @@ from urllib.parse import quote
 from pycrorm_async.errors import CallerError, DatabaseForeign, LogDamaged
 from pycrorm_async.query.as_of import AnyEpisode
 from pycrorm_async.query.asking.episode_list import EpisodeChoice
+from pycrorm_async.query.asking.unknown_names import absence_of_episodes
 from pycrorm_async.query.named_queries import EpisodeSummary
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.report.episode_data import episode_document
@@ -122,7 +123,7 @@ async def overview(
     choice = choice or EpisodeChoice()
     episodes, total = await newest_episodes(reading, choice)
     if not episodes:
-        raise CallerError(choice.absence)
+        raise CallerError(await absence_of_episodes(reading, choice))
     title = f"Episodes: {choice}" if str(choice) else "Episodes"
     successes = await success_documents(reading, [each.number for each in episodes], plots)
     with _folder_of_pages(folder):

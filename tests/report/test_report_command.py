@@ -55,7 +55,7 @@ def test_a_file_that_exists_is_replaced_only_when_asked(recorded: Path, tmp_path
         ),
         (("1", "--tag", "x"), "pycrorm: an option chooses among all episodes (tag x): add --all"),
         (("--all", "--from", "3"), "pycrorm: --from and --to choose events of one episode: name it instead of --all"),
-        (("--all", "--robot", "none"), "pycrorm: no episode matches these options; `pycrorm episodes` lists all"),
+        (("--all", "--robot", "none"), "pycrorm: no episode matches these options; the memory has no robot none"),
         (("--all", "--status", "LOTS"), "LOST"),
         (("1", "--out", "none/page.html"), "pycrorm: the folder none does not exist: create it first"),
         (("1", "--from", "9999", "--out", "window.html"), "and none from event 9999 to"),

@@ -58,13 +58,6 @@ class EpisodeChoice:
         }
         return "; ".join(f"{name} {value}" for name, value in conditions.items() if value is not None)
 
-    @property
-    def absence(self) -> str:
-        """Return the line that a verb prints if there is no such episode."""
-        if self != EpisodeChoice():
-            return "no episode matches these options; `pycrorm episodes` lists all"
-        return "no episode yet: record one with `pycrorm run` or `pycrorm demo`"
-
     def conditions(self) -> list[ColumnElement[bool]]:
         """Return the conditions on `ProcessMetaData`, without the limit. Raises `CallerError` for a wrong status."""
         episode, conditions = ProcessMetaData, []

@@ -8,6 +8,7 @@ from typing import Any
 from sqlalchemy import select, union
 
 from pycrorm_async.orm import DesignatorType, Detection, EpisodeRobot, EpisodeTag, Object, TaskTreeNode
+from pycrorm_async.query.asking.episode_list import EpisodeChoice
 from pycrorm_async.query.asking.failure_words import SEARCH_WORDS
 from pycrorm_async.query.asking.ports import EpisodeReader
 from pycrorm_async.query.suggestions import nearest
@@ -47,6 +48,17 @@ async def unknown_name(reading: EpisodeReader, names: Mapping[str, str]) -> str:
         if not _is_one(argument, name, valid):
             return f"the memory has no {_WHATS.get(argument, argument)} {name}{nearest(name, valid)}"
     return ""
+
+
+async def absence_of_episodes(reading: EpisodeReader, choice: EpisodeChoice) -> str:
+    """Return the line that a verb prints when no episode fulfils a choice, with the nearest tag or robot."""
+    if choice == EpisodeChoice():
+        return "no episode yet: record one with `pycrorm run` or `pycrorm demo`"
+    names = [*([] if choice.robot is None else [("robot", choice.robot)]), *(("tag", each) for each in choice.tags)]
+    for argument, name in names:
+        if unknown := await unknown_name(reading, {argument: name}):
+            return f"no episode matches these options; {unknown}"
+    return "no episode matches these options; `pycrorm episodes` lists all"
 
 
 def _is_one(argument: str, name: str, valid: list[str]) -> bool:
