@@ -218,7 +218,7 @@ async def test_a_source_that_fails_wakes_the_producers_of_its_recorder_that_wait
     waiting = asyncio.create_task(scene.queue.room())
     await asyncio.sleep(0.1)
     assert not waiting.done()
-    before = contents(scene.folder)
+    before = contents(scene.folder) if scene.kind == "dead" else {}  # a living recorder writes meanwhile
     source.fail("the first reason")
     source.fail("another reason")
     if scene.kind == "dead":  # the producer is the recorder of which the test copied the folder
@@ -273,7 +273,7 @@ async def test_visibility_and_the_state_of_the_database_are_published_to_a_livin
     source = claim(claimable)
     await batch(source)
     await source.acknowledge(20)
-    before = contents(claimable.folder)
+    before = contents(claimable.folder) if claimable.kind == "dead" else {}  # a living recorder writes meanwhile
     source.mark_unavailable("the server restarts")
     source.mark_visible(5, {"an episode": "a gap"})
     status = claimable.queue.external_drain_status
