@@ -82,9 +82,6 @@ def export(
             raise CallerError("--again takes all but --out and --force from the manifest: leave the other options out")
         return _again(again, out, url, spool, force=force, as_json=as_json)
     assert what, "checked above"
-    is_mcap = file_format == "mcap" or (file_format is None and out is not None and out.suffix.lower() == ".mcap")
-    if fps is not None and is_mcap and clock != "event":
-        raise CallerError("--fps of mcap is for events at equal intervals: add --clock event, or leave --fps out")
     target = out if out is not None else Path(f"{'-'.join(what)[:100]}.{file_format or 'parquet'}")
     options: dict[str, Any] = {"file_format": file_format, "clock": clock, "fps": fps}
     options["images"] = _size(images)

@@ -196,6 +196,9 @@ async def export_again(
     with tempfile.TemporaryDirectory(prefix="pycrorm-export-") as folder:
         target = Path(path) if path is not None else Path(folder, "export")
         file_format: Any = before.file_format
+        options: dict[str, Any] = dict(before.options)
+        if file_format == "mcap" and options["clock"] == "time":
+            options["fps"] = None  # its manifest has the default, which `export` refuses beside this clock
         exported = await export(
             reading,
             what,
@@ -204,7 +207,7 @@ async def export_again(
             episodes=episodes,
             force=force,
             report_progress=report_progress,
-            **before.options,
+            **options,
         )
     now = exported.manifest
     differences += _changes("version of", before.versions, now.versions)
@@ -290,6 +293,8 @@ def _options(file_format: FileFormat, clock: Clock | None, fps: int | None, imag
     """Return the options of formats with a clock. Raises `CallerError` for an option that the format does not have."""
     if file_format not in ("lerobot", "mcap") and (clock, fps) != (None, None):
         raise CallerError("clock and fps are options of the formats lerobot and mcap")
+    if file_format == "mcap" and clock != "event" and fps is not None:
+        raise CallerError("fps of mcap is for events at equal intervals: choose the clock `event`, or leave fps out")
     if file_format != "lerobot" and images is not None:
         raise CallerError("images are an option of the format lerobot")
     options = EpisodeOptions(

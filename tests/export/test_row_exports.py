@@ -422,7 +422,7 @@ def test_the_command_writes_compares_and_names_mistakes_in_one_line(kitchen: Pat
     done = pycrorm("export", "root_failures", "--with", "limit=many", "--out", tmp_path / "g.csv", cwd=kitchen)
     assert one_line_of(done) == "pycrorm: limit of root_failures must be of the type int, got 'many'"
     done = pycrorm("export", "1", "--out", tmp_path / "h.mcap", "--fps", "5", cwd=kitchen)
-    assert (done.returncode, "add --clock event" in one_line_of(done)) == (2, True)
+    assert (done.returncode, "choose the clock `event`" in one_line_of(done)) == (2, True)
     done = pycrorm("export", cwd=kitchen)
     assert (done.returncode, one_line_of(done)[:32]) == (2, "pycrorm: name what to export, fo")
 

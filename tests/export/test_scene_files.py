@@ -101,8 +101,11 @@ async def test_the_time_of_a_message_is_its_events_or_counts_events(reading: Rea
     then = await reading.as_of(1, sequence=walls[-1][1])
     assert walls[-1][2] // 1000 == int(then.at.timestamp() * 1e6 + 0.5)
     assert (events[-1][2] - events[0][2]) == (events[-1][1] - events[0][1]) * 50_000_000
-    remade = await export_again(reading, tmp_path / "events.mcap.manifest.json")
-    assert (remade.same, remade.by_bytes, remade.differences) == (True, True, ())
+    for name in ("wall", "events"):
+        remade = await export_again(reading, tmp_path / f"{name}.mcap.manifest.json")
+        assert (remade.same, remade.by_bytes, remade.differences) == (True, True, ())
+    with pytest.raises(CallerError, match="choose the clock `event`, or leave fps out"):
+        await export(reading, 1, tmp_path / "ignored.mcap", fps=20)
 
 
 @pytest.mark.slow

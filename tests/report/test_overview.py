@@ -63,8 +63,8 @@ def test_a_table_has_the_chosen_episodes_and_their_pages(
 
 
 def test_a_choice_of_no_episode_is_refused_as_by_the_list_of_episodes(url: str, tmp_path: Path) -> None:
-    code, text = report(url, tmp_path / "all.html", "--robot", "nobody")
-    assert (code, text) == (2, "pycrorm: no episode matches these options; the memory has no robot nobody\n")
+    code, text = report(url, tmp_path / "all.html", "--robot", "pr3")
+    assert (code, text) == (2, "pycrorm: no episode matches these options; the memory has no robot pr3\n")
     assert list(tmp_path.iterdir()) == []
 
 
