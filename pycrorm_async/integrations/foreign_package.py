@@ -1,4 +1,4 @@
-"""A `ForeignPackage` is the library whose executive an integration records, with the versions that it knows."""
+"""A `ForeignPackage` is the library whose executive an integration records, with the versions it supports."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class ForeignPackage:
 
     Attributes:
         name: the name in messages.
-        versions: the versions that the integration knows; empty for any.
+        versions: the versions that the integration supports, as patterns of `fnmatch`; empty for any.
     """
 
     name: str
@@ -41,13 +41,12 @@ class ForeignPackage:
         try:
             return metadata.version(distribution)
         except metadata.PackageNotFoundError:
-            raise MissingExtra(
-                f"{self.name} ({distribution} {self._known}) is not installed: {self._command}"
-            ) from None
+            wanted = " ".join(filter(None, (distribution, self._known)))
+            raise MissingExtra(f"{self.name} ({wanted}) is not installed: {self._command}") from None
 
     def check_version(self, version: str) -> None:
-        """Raise `CallerError` for a version that the integration does not know."""
-        if not any(fnmatchcase(version, each) for each in self.versions):
+        """Raise `CallerError` for a version that the integration does not support."""
+        if self.versions and not any(fnmatchcase(version, each) for each in self.versions):
             raise CallerError(f"{self.name} {version} is unknown, only {self._known} can be recorded: {self._command}")
 
     @property
