@@ -7,55 +7,40 @@ A call of a tool is an action whose dtype is the name of the tool and whose para
 a language node; the outermost one has the input of the agent. A custom event is an observation of its run.
 """
 
-from __future__ import annotations
-
-from collections.abc import Mapping, Sequence
 from typing import Any
 from uuid import UUID
 
-from pycrorm_async.integrations.foreign_package import ForeignPackage
+from pycrorm_async.integrations.callback_values import VERSION, BaseCallbackHandler, name_of, simplified
 from pycrorm_async.recording.recording import Recording
 from pycrorm_async.recording.runs import Runs
 
-with ForeignPackage("langchain-core", extra="langchain").importing():
-    from langchain_core.callbacks import BaseCallbackHandler
-    from langchain_core.messages import BaseMessage
-    from langchain_core.outputs import LLMResult
-    from langchain_core.version import VERSION
-
-__all__ = ["RememberedRuns"]
-
 
 class RememberedRuns(Runs, BaseCallbackHandler):
-    """Records all runs that report to this handler while its `with` block is open, from any thread, as one episode.
-
-    Attributes:
-        episode: the `RecordedEpisode`, whose keys of nodes are the ids of runs. The arguments are those of its making.
-    """
+    """Records the runs that report to this handler while its `with` block is open, from any thread, as one episode."""
 
     run_inline = True  # asynchronous runs would else hand each event to a thread, which takes longer than recording it
+    simplified = staticmethod(simplified)
 
-    def __init__(self, recording: Recording, **episode: Any) -> None:
-        episode.setdefault("description", "a language-model agent")
-        super().__init__(recording, f"langchain-core {VERSION}", **episode)
+    def __init__(self, recording: Recording, *, description: str = "a language-model agent", **episode: Any) -> None:
+        super().__init__(recording, f"langchain-core {VERSION}", description=description, **episode)
 
     def on_chain_start(self, serialized: Any, inputs: Any, *, run_id: UUID, **run: Any) -> None:
-        parent = run.get("parent_run_id")
-        outermost = {"inputs": inputs} if parent is None else {}
-        self.start(run_id, "language", "Chain", {"name": _name(serialized, run), **outermost}, parent=parent)
+        outermost = {} if run.get("parent_run_id") else {"inputs": inputs}
+        parameters = {"name": name_of(serialized, run), **outermost}
+        self.start(run_id, "language", "Chain", parameters, parent=run.get("parent_run_id"))
 
-    def on_llm_start(self, serialized: Any, prompts: Sequence[str], *, run_id: UUID, **run: Any) -> None:
+    def on_llm_start(self, serialized: Any, prompts: list[str], *, run_id: UUID, **run: Any) -> None:
         # Chat models too: without `on_chat_model_start` LangChain passes their messages as one text.
-        parameters = {"model": _name(serialized, run), "prompt": "\n\n".join(prompts)}
+        parameters = {"model": name_of(serialized, run), "prompt": "\n\n".join(prompts)}
         self.start(run_id, "action", "ModelCall", parameters, parent=run.get("parent_run_id"))
 
     def on_retriever_start(self, serialized: Any, query: str, *, run_id: UUID, **run: Any) -> None:
-        parameters = {"name": _name(serialized, run), "query": query}
+        parameters = {"name": name_of(serialized, run), "query": query}
         self.start(run_id, "action", "Retrieval", parameters, parent=run.get("parent_run_id"))
 
     def on_tool_start(self, serialized: Any, input_str: str, *, run_id: UUID, **run: Any) -> None:
         parameters = run.get("inputs") or {"input": input_str}
-        self.start(run_id, "action", _name(serialized, run), parameters, parent=run.get("parent_run_id"))
+        self.start(run_id, "action", name_of(serialized, run), parameters, parent=run.get("parent_run_id"))
 
     def on_chain_end(self, outputs: Any, *, run_id: UUID, **_run: Any) -> None:
         has_failed = getattr(outputs, "status", None) == "error"  # the answer of a tool that handles its errors
@@ -70,20 +55,3 @@ class RememberedRuns(Runs, BaseCallbackHandler):
 
     def on_custom_event(self, name: str, data: Any, *, run_id: UUID, **_run: Any) -> None:
         self.observe(name, data, run_id)
-
-    def simplified(self, value: Any) -> Any:
-        """Return the parts of a message, and the message of a model's answer, that matter."""
-        if isinstance(value, BaseMessage):
-            details = {name: getattr(value, name, None) for name in ("name", "tool_calls", "usage_metadata")}
-            details = {name: each for name, each in details.items() if each}
-            return {"role": value.type, "content": value.content, **details}
-        if isinstance(value, LLMResult):
-            each_answer = (getattr(each, "message", each.text) for batch in value.generations for each in batch)
-            answers = [self.simplified(each) for each in each_answer]
-            return answers[0] if len(answers) == 1 else answers
-        return value
-
-
-def _name(serialized: Mapping[str, Any] | None, run: Mapping[str, Any]) -> str:
-    declared = serialized or {}
-    return str(run.get("name") or declared.get("name") or (declared.get("id") or ["unknown"])[-1])
