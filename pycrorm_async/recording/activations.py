@@ -134,7 +134,7 @@ class Activations(EpisodeBlock, Generic[B]):
 
         Args:
             status: its status, one of the executive's own.
-            feedback: its message about the outcome, in other words the same outcome if the message is the same.
+            feedback: its message about the outcome. A visit with another message is another outcome.
         """
         try:
             visited_s = perf_counter()
