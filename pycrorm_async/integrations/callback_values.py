@@ -1,4 +1,4 @@
-"""What `RememberedRuns` records of LangChain's own values: the name of a run, the parts of messages and of answers."""
+"""`name_of` and `simplified` choose what is recorded of LangChain's values: the name of a run, the parts of a message."""
 
 from __future__ import annotations
 
