@@ -24,7 +24,7 @@ from tests.commands import Started, pycrorm
 from tests.integrations.pycram.environment import ROOT, make_environment
 from tests.shared_folders import shared_place
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.pycram]
 
 PLANS = ("-m", "tests.integrations.pycram.plans")
 RUN_S_MAX = 300
