@@ -315,8 +315,6 @@ RESULTS: Final[Mapping[str, Mapping[str, Callable[[PageReader], None]]]] = {
 """The results by page, and by the section after which they hold."""
 
 
-OFTEN: Final = ("README.md", *(f"pycrorm_async/{each}/README.md" for each in "events plan recording".split()))
-"""The pages that are followed at each commit, in 20 s of CPU time; the others take 5 to 20 s each."""
 FOLLOWED: Final = [page for page in PAGES if any(block.kind != "not run" for block in blocks_of(page))]
 
 
@@ -327,7 +325,7 @@ def own_server() -> Iterator[Server]:
         yield running
 
 
-@pytest.mark.soak_on(*(page for page in FOLLOWED if page not in OFTEN))
+@pytest.mark.soak_on(*(page for page in FOLLOWED if page != "README.md"))  # each page takes 4 to 20 s of CPU time
 @pytest.mark.parametrize("page", FOLLOWED)
 def test_a_reader_can_follow_the_page_from_top_to_bottom(
     page: str, tmp_path: Path, request: pytest.FixtureRequest
