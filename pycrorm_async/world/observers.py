@@ -6,17 +6,19 @@ Theory of operation
 Two context variables connect the world to its users, so that the world package imports none of them. `current_world`
 is the world of the innermost `with BulletWorld()` of the current task; a world entered with `BulletWorld.connect` is
 visible in every context of the process that has none of its own. `watcher` is the `WorldWatcher` of the current
-context; the memory's hooks set one.
+context; an open memory sets its recorder as one.
 
 A world reads `watcher` once, when it is entered, calls its `world_entered`, and keeps it, so that the same watcher
 gets `world_left` even if the context has another one by then. If `world_entered` raises, the world closes and the
-exception reaches the caller: a watcher can refuse a world. Copies of a world are entered without a watcher.
+exception reaches the caller: a watcher can refuse a world, and gets no `world_left` for it. Copies of a world are
+entered without a watcher.
 
 A world calls its observers in the order in which they were added, synchronously in the thread that changed the world,
 and only after the motion is complete, when all poses and joints, also those of carried objects, are set. A world
 belongs to one thread at a time, so its calls do not overlap, and observers need no lock of their own for it. The tuple
-of observers is replaced and never mutated, so an observer may add or remove observers while it is called. Trials that
-are undone, for example of inverse kinematics or collision queries, go to `Body` directly and notify no observer.
+of observers is replaced and never mutated, so an observer may add or remove observers while it is called. Collision
+queries move the objects' `Body` for a trial and restore it, without a call of the object's setters, so they notify no
+observer.
 """
 
 from __future__ import annotations
@@ -32,9 +34,10 @@ if TYPE_CHECKING:
 
 
 class WorldObserver(Protocol):
-    """Receives every change made by the world's setters, once per motion, after the motion is complete.
+    """Receives every change of one world: objects added and removed, their motions, and their attachments.
 
-    The world calls it in the thread that made the change. It must not raise: an exception would reach that caller.
+    A motion notifies once for each object with a new pose and once for each object with new joint positions. The world
+    calls in the thread that made the change. An observer must not raise: the exception would reach that thread.
     """
 
     def object_added(self, added: Object) -> None:
@@ -70,7 +73,7 @@ class WorldWatcher(Protocol):
         ...
 
     def world_left(self, world: BulletWorld) -> None:
-        """Called when the world is left, before it closes; its objects are still readable."""
+        """Called when the world is left, before it closes; its objects can still be read."""
         ...
 
 
