@@ -29,9 +29,10 @@ _UNIT = re.compile(r"(?:^|, | in )(m|rad|s|kg|ns)(?=[,;:]|$)")
 """The unit in the text of a column, as in `of the robot, m` and `s; null while it runs`."""
 _ENTRY = re.compile(r"^    (\w+(?:, \w+)*): (.*)$")
 _OF_LOADING = re.compile(r"[Ll]oaded|load them|awaitable_attrs|selectinload|undefer|[Ll]ikewise|has the field instead")
-_COURSES = (Action, Motion, Language)
+_KINDS = (Action, Motion, Language)
+"""Classes whose views also have the columns of `designator`, which their own tables do not declare."""
 _ALIKE = ("sequence", "end_sequence", "duration", "start_ns", "end_ns")
-"""Columns that have the same text everywhere."""
+"""Columns whose text is always that of `_USUAL`, even if their attribute has a docstring."""
 _USUAL = {
     "id": "of the row; computed from the episode's number, its event and a slot",
     EPISODE: "number of the episode, `process_metadata.id`",
@@ -63,10 +64,10 @@ class ViewDescription:
     Attributes:
         name: of the view.
         mapped: name of the mapped class.
-        text: one sentence.
-        columns: text by column; a column without one is left out.
-        built_in: whether every memory has the view.
+        text: the first paragraph of the class's docstring, on one line.
+        columns: text by column; a column without one is left out. May also describe columns that the view lacks.
         references: the column that a column refers to, such as `pose.id`, by column.
+        built_in: whether every memory has the view.
     """
 
     name: str
@@ -81,7 +82,7 @@ def described() -> dict[str, ViewDescription]:
     """Return the description of every mapped view of this process, by name."""
     views: dict[str, ViewDescription] = {}
     for mapper in sorted(Base.registry.mappers, key=lambda each: str(each.class_.__name__)):
-        if mapper.inherits is None or mapper.local_table is not mapper.inherits.local_table:  # else of the same view
+        if mapper.inherits is None or mapper.local_table is not mapper.inherits.local_table:  # else it shares a view
             description = describe(mapper.class_)
             views[description.name] = description
     return dict(sorted(views.items()))
@@ -106,11 +107,11 @@ def describe(class_: Any) -> ViewDescription:
         parts += ["JSON"] if isinstance(kind, JsonText) and "JSON" not in words else []
         if text := "; ".join(filter(None, parts)):
             columns[name] = text
-    if class_ in _COURSES:
+    if class_ in _KINDS:
         columns = describe(Designator).columns | columns
     references = {str(column.name): key.target_fullname for column in table.columns for key in column.foreign_keys}
     built_in = class_.__module__.startswith("pycrorm_async.orm.")
-    return ViewDescription(table.name, class_.__name__, _sentence(class_.__doc__), columns, references, built_in)
+    return ViewDescription(table.name, class_.__name__, _first_paragraph(class_.__doc__), columns, references, built_in)
 
 
 def unit_of(column: Any) -> str:
@@ -122,7 +123,7 @@ def unit_of(column: Any) -> str:
 
 
 def _unmapped(view: str) -> Iterable[str]:
-    """Return the columns of a view that no attribute of its class maps."""
+    """Return the columns without an attribute that a view may have; not all views have `sequence`."""
     return ("sequence", "parameters", "parent_id") if view == "designator" else ("sequence",)
 
 
@@ -134,12 +135,13 @@ def _of_values(text: str) -> str:
 
 
 def _key_of(mapper: Any, column: Any) -> str:
+    """Return the public name of the attribute that maps a column: without the underscore of a deferred one."""
     key = mapper.get_property_by_column(column).key if column in mapper.columns.values() else column.name
     return str(key).lstrip("_")
 
 
-def _sentence(doc: str | None) -> str:
-    """Return the first sentence of a docstring, on one line."""
+def _first_paragraph(doc: str | None) -> str:
+    """Return the first paragraph of a docstring, on one line."""
     first = inspect.cleandoc(doc or "").partition("\n\n")[0]
     return " ".join(first.split())
 
@@ -170,7 +172,7 @@ def _documented(class_: type) -> dict[str, str]:
     for assigned, text in pairwise(_classes_in(class_.__module__).get(class_.__name__, ())):
         match assigned, text:
             case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(words))):
-                texts[name] = _sentence(words)
+                texts[name] = _first_paragraph(words)
     return texts
 
 
