@@ -3,8 +3,8 @@
 The classes are those of SOMA 2.1.0 and of DOLCE+DnS Ultralite (DUL) as published with it: owl/2.1.0/SOMA-HOME.owl,
 which contains the classes of SOMA-ACT and SOMA-OBJ, and owl/2.1.0/DUL.owl of https://github.com/ease-crc/soma. The list
 is limited to what the built-in designators and object types use. The superclasses are the named ones; an intersection
-counts as each of its named classes. Classes without a superclass here have one in DUL. Two concepts of PyCRAM's
-designators are not in SOMA 2.1.0; this project chose their superclasses.
+counts as each of its named classes. Classes without a superclass here have one in DUL. The code calls a class of the
+ontology a *concept*. Two concepts of PyCRAM's designators are not in SOMA 2.1.0; this project chose their superclasses.
 """
 
 from __future__ import annotations
@@ -90,7 +90,7 @@ CONCEPT_OF_OBJECT_TYPE = {
     "GENERIC_OBJECT": "PhysicalObject",
     "HUMAN": "NaturalPerson",
 }
-"""The concept of each object type, by the name of its member."""
+"""The concept of each object type, by the name of its member in `world.enums.ObjectType`."""
 
 
 def ancestors(concept: str) -> Iterator[str]:

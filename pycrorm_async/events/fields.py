@@ -1,4 +1,4 @@
-"""Map designator names to tables and field names to columns, and reject names that cannot be mapped.
+"""Map the names of designator types to tables and their fields to columns, and reject names that cannot be mapped.
 
 | field | column |
 |---|---|
@@ -9,9 +9,9 @@
 | `true`, `false`, in any case | `_true`, `_false`, because SQLite cannot name a view's column `true` or `false` |
 | a name of more than 60 bytes | its beginning, `_` and 12 hexadecimal digits of the whole name's BLAKE2b |
 
-A mapped name depends on the field's name alone, so it is the same in every process and on both databases. Field names
-never begin with an underscore, so `_true` cannot collide with another field's column. A mapped class exposes each field
-under the field's own name, even if the column has another.
+A column's name depends on the field's name and type alone, so it is the same in every process and on both databases.
+Field names never begin with an underscore, so `_true` cannot collide with another field's column. A mapped class
+exposes each field under the field's own name, even if the column has another.
 
 A mapped class also exposes the first pose field as `pose` and the first object field as `object`, so these names are
 reserved for them.
@@ -63,8 +63,9 @@ _OF_A_GENERATION = re.compile(r"__[0-9]+$")
 
 _NAME_LENGTH_MAX = 60
 """Bounds the bytes of a table's or column's public name, because PostgreSQL truncates names to 63 bytes."""
-_MAPPED_TABLE_LENGTH_MAX = 48
-"""Bounds the bytes of a shortened table name, to leave room for the generation number behind it."""
+_SHORTENED_TABLE_LENGTH_MAX = 48
+"""Bounds the bytes of a shortened table name, so that a generation's prefix and number fit with it into PostgreSQL's
+63 bytes (`projections.table_names`)."""
 _DTYPE_LENGTH_MAX = 255
 """Bounds the bytes of a dtype: longer than real class names, and short enough to quote in a message."""
 _BASES_MAX = 32
@@ -80,12 +81,12 @@ _WORD_START = re.compile(r"(?<=[a-z0-9])(?=[A-Z])|(?<=[A-Z])(?=[A-Z][a-z])")
 
 
 def table_name(dtype: str) -> str:
-    """Return the name of a type's leaf table.
+    """Return the name of a type's leaf table, which contains the rows of this type but not those of derived types.
 
     >>> table_name("SayingAction"), table_name("MoveTCPMotion")
     ('saying_action', 'move_tcp_motion')
     """
-    return bounded(_WORD_START.sub("_", dtype).lower(), _NAME_LENGTH_MAX, _MAPPED_TABLE_LENGTH_MAX)
+    return bounded(_WORD_START.sub("_", dtype).lower(), _NAME_LENGTH_MAX, _SHORTENED_TABLE_LENGTH_MAX)
 
 
 def column_name(field: str, kind: FieldType) -> str:
@@ -140,7 +141,7 @@ def is_reserved(name: str) -> bool:
 
 
 def fault_in_declaration(declared: DesignatorTypeDeclared) -> str | None:
-    """Return the reason, naming the field, why this type cannot have a table, a view and a mapped class; else None.
+    """Return the reason why this type cannot have a table, a view and a mapped class; None if it can.
 
     The hooks check each class before recording it for the first time; readers check each declaration in a log.
     """
@@ -251,7 +252,7 @@ def _misnamed(name: str, kind: str) -> str:
 
 
 def _fault_in_names(field: FieldDeclared, owners: Mapping[str, str]) -> str | None:
-    """Return the reason why a field cannot have its name and column beside these; `owners` are fields by lower name."""
+    """Return the reason why a field cannot have its name and column beside the names in `owners`, in lower case."""
     names = {field.name.lower(), field.column.lower()}
     reserved = names & RESERVED_COLUMNS
     if reserved:

@@ -1,11 +1,13 @@
 """Ids identify episodes, events and rows.
 
-A UUIDv7 identifies an episode, (episode, sequence) an event, and (episode number, sequence, slot) a row. A row id packs
-these three into 53 bits, so that data frames (float64 where a column is nullable) and JSON hold it exactly:
+A UUIDv7 identifies an episode, (episode, sequence) an event, and (episode number, sequence, slot) a row: the slot
+distinguishes the rows of one event. A row id packs these three into 53 bits, so that data frames (float64 where a
+column is nullable) and JSON hold it exactly:
 
     episode number 22 bits | sequence 26 bits | slot 5 bits
 
-A database assigns the episode *number* at the first append; it is valid in that database only.
+The rows of a list, such as the percepts of one detection, share an id and differ in a further column. A database
+assigns the episode *number* at the first append; it is valid in that database only.
 """
 
 from __future__ import annotations
@@ -49,7 +51,7 @@ EPISODE_NUMBER_MAX = 2**22 - 1
 SEQUENCE_MAX = 2**26 - 1
 """Bounds the events of one episode: the 26 bits of a row id that hold the sequence."""
 SLOT_MAX = 2**5 - 1
-"""Bounds the rows of one event: the 5 bits of a row id that hold the slot."""
+"""Bounds the row ids of one event: the 5 bits of a row id that hold the slot."""
 
 SLOT_NODE = 0
 """Slot of the event's own row: a node and its designator, an object's state, an attachment."""
