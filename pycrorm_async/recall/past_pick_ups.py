@@ -1,13 +1,16 @@
 """Score the ways in which objects were picked up, by the tries like them: successes and failures.
 
-The score of a way at a height is the share of successes among the tries with the same arm and grasp, each counted by
-its likeness w: 1 for the same place and the same height over the torso, exp(-1/2) where one of the two is `NEAR_M` off.
+A *try* is a pick-up that succeeded or failed. A *way* is what successes with equal values have in common: the arm, the
+grasp, the pose of the robot's base in the object's frame, and the height of the torso. The score of a way at a height
+is the share of successes among the tries with the same arm and grasp, each counted by its likeness w: 1 for the same
+position of the base and the same height over the torso, exp(-1/2) where one of the two is `NEAR_M` off. The yaw does
+not count.
 
     score = (sum of w of the successes + prior) / (sum of w of all tries + 1)
 
-The prior, the share of successes among all tries, counts as one try, so that a single success does not outrank many
-successes with a few failures. A way that succeeded at another height only has little evidence at this one, and its
-score is near the prior.
+The prior, (successes + 1) / (tries + 2) among all tries with such objects, counts as one try, so that a single success
+does not outrank many successes with a few failures. A way that succeeded at another height only has little evidence at
+this one, and its score is near the prior.
 """
 
 from __future__ import annotations
@@ -35,7 +38,7 @@ TRIES_MAX: Final = 2_000
 NEAR_M: Final = 0.1
 """The distance in m, of the base in the object's frame and of the height, at which a try counts exp(-1/2)."""
 _WAYS_MAX: Final = 500
-"""Bounds the ways with one arm and grasp that are scored; those that succeeded nearest in height are taken."""
+"""Bounds the ways with one arm and grasp that are scored; those that succeeded nearest to the height are taken."""
 _DIGITS: Final = 6
 """Decimals to which lengths and angles are rounded, because cases store float32."""
 _SAME: Final = 1e-4
@@ -50,6 +53,7 @@ class Tries(NamedTuple):
         x, y, yaw: pose of the robot's base in the object's frame, m and rad.
         over_base: height of the object over the robot's base, m.
         torso: height of the torso, m; NaN for a robot without one.
+        succeeded: False for a try that failed.
     """
 
     arm: NDArray[Any]
@@ -68,7 +72,7 @@ class Tries(NamedTuple):
 
 
 def tries_of(library: CaseLibrary, types: Iterable[str], object_type: ObjectType, arm: Arms | None) -> Tries:
-    """Return the latest tries of these types with such an object, and with this arm.
+    """Return the latest tries of these designator types with objects of one type, with this arm; None means any.
 
     Leaves out simulations, tries that neither succeeded nor failed, and tries without a known place, as with an object
     that lay on its side.
@@ -83,16 +87,16 @@ def tries_of(library: CaseLibrary, types: Iterable[str], object_type: ObjectType
 
 
 def _tries(group: Group, object_type: ObjectType, arm: Arms | None) -> tuple[NDArray[np.int64], Tries] | None:
-    """Return start (µs) and values of the latest tries in a group; None if it has no such feature."""
+    """Return start (µs) and values of the latest tries in a group; None if it lacks one of `_FEATURES`."""
     if not {*group.texts, *group.numbers} >= _FEATURES:
         return None
     numbers = {name: column.values.astype(np.float64) for name, column in group.numbers.items() if name in _NUMBERS}
     torso, height = (numbers.get(name, np.full(len(group), np.nan)) for name in ("torso", "height"))
-    # Without a torso the height over the base is not known, only that in the map, where bases stand on the floor.
+    # `height` is over the torso. Without a torso only the height in the map is known; bases stand on its floor, z = 0.
     over_base = np.where(np.isnan(torso), numbers["object_z"], height + torso)
     arms, grasps = _texts(group, "arm"), _texts(group, "grasp")
     wanted = _texts(group, "object_type") == object_type.name
-    wanted &= np.isin(arms, [*Arms.__members__] if arm is None else [arm.name])  # another executive may have others
+    wanted &= np.isin(arms, [*Arms.__members__] if arm is None else [arm.name])  # another executive may have other arms
     wanted &= np.isin(grasps, [*Grasp.__members__])
     succeeded = _texts(group, "status") == "SUCCEEDED"
     wanted &= succeeded | (_texts(group, "status") == "FAILED")
@@ -116,7 +120,7 @@ def best_first(tries: Tries, *, height: float | None = None, torso: float | None
 
     Args:
         height: of the object over the robot's base, m; None means for each way the height at which it succeeded.
-        torso: height of the torso, m; None means for each way its own.
+        torso: height of the torso, m; None means for each way its own. It has no effect if `height` is None.
     """
     prior = (int(tries.succeeded.sum()) + 1) / (tries.succeeded.size + 2)
     ways = [way for rows in _alike(tries) for way in _scored(tries, rows, height, torso, prior)]
