@@ -23,7 +23,7 @@ from pycrorm_async.store.stored import StoredEvent
 def events(
     episode: EpisodeArgument,
     after: Annotated[int, typer.Option(min=0, metavar="SEQUENCE", help="Print only events after this one.")] = 0,
-    kind: Annotated[
+    event_types: Annotated[
         list[str] | None, typer.Option("--type", help="Print only events of this type; repeatable.")
     ] = None,
     url: UrlOption = DEFAULT_URL,
@@ -31,22 +31,22 @@ def events(
     as_json: JsonOption = False,  # noqa: ARG001  the output is always JSON
 ) -> None:
     """Print the events of an episode in their order, one JSON object per line."""
-    kinds = frozenset(kind or EVENT_TYPES)
-    unknown = sorted(kinds - EVENT_TYPES.keys())
+    unknown = sorted(set(event_types or ()) - EVENT_TYPES.keys())
     if unknown:
         raise CallerError(f"unknown event type {unknown[0]!r}; known types: {', '.join(sorted(EVENT_TYPES))}")
-    asyncio.run(_print(url, episode, after, kinds if kind else None))
+    asyncio.run(_print(url, episode, after, frozenset(event_types or ())))
     sys.stdout.flush()
     note_pending_events(url, spool)
 
 
-async def _print(url: str, episode: str, after: int, kinds: frozenset[str] | None) -> None:
+async def _print(url: str, episode: str, after: int, event_types: frozenset[str]) -> None:
+    """Print the events of these types; without one print all, also those of a type that this version does not know."""
     log = await EventLog.open(shared_address(url), create=False)
     try:
         row = await episode_named(log, episode)
         async for page in log.pages(row, after=after):
             for each in page:
-                if kinds is None or each.type in kinds:
+                if not event_types or each.type in event_types:
                     sys.stdout.buffer.write(_line(row.id, each))
     finally:
         await log.close()

@@ -2,8 +2,8 @@
 
 Theory of operation. The first signal cancels the plan's task, as asyncio does; the plan ends and its events are stored.
 If the plan does not end, the second signal raises `KeyboardInterrupt` in it. The next signal, and any signal once the
-plan has ended, terminates the process with exit code 130. That loses no event: all of them are in the spool, and the
-next start stores them.
+plan has ended, terminates the process with exit code 130. That loses no event: all of them are in the spool on the
+disk, and the next process that uses this spool stores them. Only a memory of `sqlite://` ends with its process.
 
 Signal handlers run in the main thread between two bytecodes, so the handler may interrupt a write to stderr. It
 therefore writes its last line with one system call (`write_last`) and leaves with `os._exit`.
@@ -29,7 +29,7 @@ _PLAN_SIGNALS_MAX = 2
 class Interruption:
     """Handles SIGINT and SIGTERM for one plan. Use it in the thread of the event loop, the main thread.
 
-    With `plan_signals_max=1` there is no plan to break off, and the second signal terminates the process.
+    With `plan_signals_max=1`, for code that performs many plans, the second signal terminates the process.
     """
 
     def __init__(self, *, plan_signals_max: int = _PLAN_SIGNALS_MAX) -> None:
@@ -74,11 +74,11 @@ class Interruption:
 
     @property
     def requested(self) -> bool:
-        """True once a signal has arrived."""
+        """True once a signal has requested the interruption."""
         return self._count > 0
 
     def plan_ended(self) -> None:
-        """Note that the plan has ended, so that the next signal terminates the process."""
+        """Let the next signal terminate the process, because the plan has ended; after a signal also print a note."""
         if self._count:
             asyncio.get_running_loop().call_later(
                 _NOTE_DELAY_S, note, "recorded events are being stored; Ctrl-C again exits at once without losing any"
@@ -87,9 +87,10 @@ class Interruption:
 
 
 def interrupt_on_termination() -> None:
-    """Let SIGTERM do what Ctrl-C does, so that a verb that writes files leaves no part of one."""
+    """Let SIGTERM do what Ctrl-C does, so that a verb of the command deletes a file that it has written in part."""
 
     def interrupt(*_: object) -> None:
+        # Python has no handler for SIGINT here, so the signal would do nothing, or end the process without clean-up.
         if signal.getsignal(signal.SIGINT) in (signal.SIG_IGN, signal.SIG_DFL):
             raise KeyboardInterrupt
         signal.raise_signal(signal.SIGINT)
@@ -98,7 +99,7 @@ def interrupt_on_termination() -> None:
 
 
 def _is_default(handler: object) -> bool:
-    """Return whether Python or asyncio installed the handler, rather than the program or a parent that ignores it."""
+    """Return whether the handler is that of the system, Python or asyncio; False if a parent ignores the signal."""
     if handler in (signal.default_int_handler, signal.SIG_DFL):
         return True
     return getattr(getattr(handler, "func", handler), "__module__", None) == "asyncio.runners"
