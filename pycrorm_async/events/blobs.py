@@ -1,7 +1,7 @@
 """Find the blobs that an event refers to in its payload, without decoding it.
 
 The bytes of a `BlobReference` are unmistakable: inside a JSON text every quotation mark is escaped, and `observe`
-accepts no key that begins with `$`.
+accepts no key that begins with `$`. The encoder writes its fields in the order of their declaration, without spaces.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Blob(NamedTuple):
 
 
 def references_in(type_name: str, payload: bytes) -> list[BlobReference]:
-    """Return the references in an event's payload, in order.
+    """Return the references in an event's payload, in order, without `dtype` and `shape` of arrays.
 
     >>> [each.size for each in references_in("Observed", b'{"$blob":"%s","media_type":"a/b","size":3}' % (b"0" * 64))]
     [3]
@@ -41,6 +41,6 @@ def references_in(type_name: str, payload: bytes) -> list[BlobReference]:
     if type_name not in REFERRING or b'"$blob"' not in payload:
         return []
     return [
-        BlobReference(name.decode(), msgspec.json.decode(media_type, type=str), int(size))
-        for name, media_type, size in _REFERENCE.findall(payload)
+        BlobReference(sha256.decode(), msgspec.json.decode(media_type, type=str), int(size))
+        for sha256, media_type, size in _REFERENCE.findall(payload)
     ]

@@ -2,8 +2,9 @@
 
 The payload bytes are the same in the queue, in the log and in an export. `encode` refuses every value that JSON cannot
 hold without changing its meaning, and names the path to it: NaN and infinities (msgspec alone would write null), lone
-surrogates, U+0000 (PostgreSQL text refuses it) and a payload above the limit. `decode` reads the payloads of this and
-all earlier versions (see `upcasters`).
+surrogates and U+0000 (PostgreSQL text refuses it). It also refuses a payload above the limit. Bytes and sets must not
+occur in an event, because msgspec writes them as a text and a list. `decode` reads the payloads of this and all earlier
+versions (see `upcasters`).
 """
 
 from __future__ import annotations
@@ -90,13 +91,13 @@ class Decoder:
             raise msgspec.DecodeError(str(error)) from None
 
     def declaration_of(self, payload: bytes) -> DesignatorTypeDeclared:
-        """Decode a designator type, whose payload carries its own version. Raises as `decode` does."""
+        """Decode a designator type of the version that its payload names, or 1. Raises as `decode` does."""
         event = self._declaration("DesignatorTypeDeclared", payload)
         assert isinstance(event, DesignatorTypeDeclared)
         return event
 
     def description_of(self, payload: bytes) -> DescriptionDeclared:
-        """Decode a description, whose payload carries its own version. Raises as `decode` does."""
+        """Decode a description of the version that its payload names, or 1. Raises as `decode` does."""
         event = self._declaration("DescriptionDeclared", payload)
         assert isinstance(event, DescriptionDeclared)
         return event
@@ -204,6 +205,7 @@ def unwritable(value: Any) -> str | None:
 
 
 def _first_fault(value: Any, path: str = "") -> NotEncodable | None:
+    """Return the error for the first part of a value that JSON cannot hold, with its path; None if there is none."""
     reason = unwritable(value)
     if reason is not None:
         return NotEncodable(path, reason)

@@ -1,7 +1,8 @@
 """Event types are frozen values, the payloads of the log.
 
-Each `Happening` class is an event type, named as in the log; `version` counts its shapes. The JSON omits null and empty
-fields. The sequence of `ObjectAdded` identifies an object, that of `NodeStarted` a node. The envelope holds the times.
+Each `Happening` class is an event type, named as in the log; `version` counts its shapes. The JSON omits each field
+that has its default value; most defaults are null or empty. The sequence of `ObjectAdded` identifies an object, that of
+`NodeStarted` a node. The envelope of an event contains its times.
 """
 
 from __future__ import annotations

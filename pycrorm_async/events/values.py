@@ -1,6 +1,6 @@
 """Values are the frozen parts of events: poses, references to objects and nodes, failures, fields of a declaration.
 
-The JSON omits null and empty fields.
+The JSON omits each field that has its default value; most defaults are null or empty.
 """
 
 from __future__ import annotations
@@ -35,12 +35,15 @@ __all__ = [
 
 NodeKind: TypeAlias = Literal["root", "action", "motion", "language"]
 NodeStatus: TypeAlias = Literal["RUNNING", "SUCCEEDED", "FAILED", "ERROR", "CANCELLED", "INTERRUPTED", "LOST"]
+"""The names of `TaskStatus`."""
 EpisodeStatus: TypeAlias = Literal["RUNNING", "SUCCEEDED", "FAILED", "ERROR", "INTERRUPTED", "LOST"]
 
 FieldType: TypeAlias = Literal[
     "integer", "real", "text", "boolean", "datetime", "enum", "pose", "object", "list", "dict"
 ]
+"""The type of a designator's field; the fields of a nested dataclass are fields of their own."""
 ItemType: TypeAlias = Literal["integer", "real", "text", "boolean", "datetime", "enum", "pose", "object"]
+"""The type of the values in a list or dict."""
 
 
 class _Value(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -67,9 +70,10 @@ class ObjectReference(_Value, frozen=True):
 
 
 class ObjectValue(_Value, frozen=True):
-    """An object without a row of its own: a part of an object, a believed object, or one outside the recorded world.
+    """A copy of an object without an ObjectAdded: a part of one, a believed one, or one outside the recorded world.
 
-    `part_of` is the object that an ObjectPart belongs to, or the reference object of a LocatedObject's place.
+    The fold makes a row of `object` from it for each parameter that is one. `part_of` is the object that an ObjectPart
+    belongs to, or the one relative to which a LocatedObject is located.
     """
 
     dtype: Literal["Object", "ObjectPart", "BelieveObject", "LocatedObject"]
@@ -82,7 +86,7 @@ class ObjectValue(_Value, frozen=True):
 class RobotValue(_Value, frozen=True):
     """The robot that acted at the start of a node: base pose, torso joint position in metres (None without a torso).
 
-    `name` is that of its object in the world; None in events of version 0.1.0.
+    `name` is that of its object in the world; None in events of older versions.
     """
 
     pose: PoseValue
@@ -155,7 +159,7 @@ class LinkBoxValue(_Value, frozen=True):
 
     Attributes:
         center, half: its centre and half of its edges, m.
-        joint, axis: the prismatic joint that slides the link, and its direction; None for a link that is fixed.
+        joint, axis: the prismatic joint that slides the link, and its direction; None and 0 for a link that is fixed.
     """
 
     link: str
@@ -199,7 +203,13 @@ class CellsValue(_Value, frozen=True):
 
 
 class SeenValue(_Value, frozen=True):
-    """A percept. `object` is None if no object matches; `source` is None if it is that of its `ObjectDetected`."""
+    """A percept: an object as perception returned it.
+
+    Attributes:
+        object: the object of the recorded world that it matches; None if none does.
+        visible: the visible share of the object, 0 to 1; None without a camera.
+        source: of the percept; None if it is that of its `ObjectDetected`.
+    """
 
     name: str
     object_type: str
