@@ -2,8 +2,8 @@
 
 The result is aligned with the axes of the root link's frame, with every joint at position 0. The shapes must be boxes
 and cylinders, unless the caller passes the boxes around the links; then the shapes are not read. The result for a link
-that a prismatic joint slides names that joint and its direction. Links without a shape and links that turn are left
-out.
+that a prismatic joint slides names that joint and its direction; of several joints in a row it names the last alone.
+Links without a shape are left out, and so are links that turn, with all links below them.
 """
 
 from __future__ import annotations
@@ -76,22 +76,23 @@ def link_boxes(urdf: str, boxes: Mapping[str, BoundingBox] | None = None) -> Ite
             center = _rounded([(low + high) / 2 for low, high in ranges])
             half = _rounded([(high - low) / 2 for low, high in ranges])
             yield LinkBox(name, center, half, frame.joint, _rounded(frame.axis))
-        moving = (joint for joint in joints.get(name, ()) if joint.get("type") in ("fixed", "prismatic"))
-        pending += [(joined_link(joint, "child"), _child(frame, joint)) for joint in moving]
+        without_rotation = (joint for joint in joints.get(name, ()) if joint.get("type") in ("fixed", "prismatic"))
+        pending += [(joined_link(joint, "child"), _child(frame, joint)) for joint in without_rotation]
 
 
 def _child(frame: _Frame, joint: Element) -> _Frame:
+    """Return the frame of the link below this joint; `frame` is that of the link above it."""
     own = _origin(joint)
     columns = [frame.turned((own.rotation[0][at], own.rotation[1][at], own.rotation[2][at])) for at in range(3)]
     first, second, third = zip(*columns, strict=True)
-    placed = _Frame((first, second, third), frame.placed(own.position), frame.joint, frame.axis)
+    child = _Frame((first, second, third), frame.placed(own.position), frame.joint, frame.axis)
     if joint.get("type") == "fixed":
-        return placed
+        return child
     axis = joint.find("axis")
     direction = (1.0, 0.0, 0.0) if axis is None else _numbers(axis.get("xyz"))
     length = math.hypot(*direction) or 1.0
     unit = direction[0] / length, direction[1] / length, direction[2] / length
-    return placed._replace(joint=joint.get("name"), axis=placed.turned(unit))
+    return child._replace(joint=joint.get("name"), axis=child.turned(unit))
 
 
 def _box_corners(box: BoundingBox | None) -> Iterator[_Vector]:
@@ -102,8 +103,8 @@ def _box_corners(box: BoundingBox | None) -> Iterator[_Vector]:
 def _shape_corners(link: Element) -> Iterator[_Vector]:
     """Yield the corners of the boxes around a link's shapes in its frame."""
     for collision in link.findall("collision"):
-        placed = _origin(collision)
-        assert placed.rotation == _Frame().rotation, "a shape of a built-in model is not rotated in its link"
+        frame = _origin(collision)
+        assert frame.rotation == _Frame().rotation, "a shape of a built-in model is not rotated in its link"
         (shape,) = collision.iterfind("geometry/*")
         if shape.tag == "box":
             size = _numbers(shape.get("size"))
@@ -112,10 +113,11 @@ def _shape_corners(link: Element) -> Iterator[_Vector]:
             diameter = 2 * float(shape.get("radius", 0))
             size = diameter, diameter, float(shape.get("length", 0))
         for x, y, z in _CORNERS:
-            yield placed.placed((x * size[0], y * size[1], z * size[2]))
+            yield frame.placed((x * size[0], y * size[1], z * size[2]))
 
 
 def _origin(element: Element) -> _Frame:
+    """Return the frame of a joint or a shape in that of its link."""
     origin = element.find("origin")
     if origin is None:
         return _Frame()
@@ -135,5 +137,5 @@ def _numbers(text: str | None) -> _Vector:
 
 
 def _rounded(values: Sequence[float]) -> _Vector:
-    x, y, z = (round(each, 6) + 0.0 for each in values)
+    x, y, z = (round(each, 6) + 0.0 for each in values)  # + 0.0 makes 0.0 of -0.0
     return x, y, z
