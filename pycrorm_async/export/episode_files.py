@@ -1,4 +1,4 @@
-"""Write episodes as LeRobot, rerun or MCAP, formats of a world that changes, from their events and not from the tables.
+"""Write episodes as LeRobot, rerun or MCAP: formats for motion over time, so they are made from events, not tables.
 
 A thread does each long step, and a cancelled task waits for its end: a writer that is closed, or a file that is
 deleted, while a thread still writes would crash the process or leave a file.
@@ -30,7 +30,13 @@ if TYPE_CHECKING:
 
 
 class EpisodeOptions(NamedTuple):
-    """The axis of an episode (events or time), the number of frames or events per second, and the size of images."""
+    """Choices for the frames of LeRobot and the messages of MCAP; see `export` for the meaning of each clock.
+
+    Attributes:
+        clock: the axis: the events one after the other, or their times.
+        fps: frames or events per second.
+        images: width and height of LeRobot's pictures; None for no pictures.
+    """
 
     clock: Clock
     fps: int = DEFAULT_FPS
@@ -55,7 +61,7 @@ async def write_lerobot(
 ) -> int:
     """Write the episodes into an empty folder; return the number of frames.
 
-    Raises `CallerError` for episodes that the format cannot hold; `MissingExtra`.
+    Raises `CallerError` for episodes that the format cannot hold, and `MissingExtra`.
     """
     progress = _Progress(report_progress, sum(each.events for each in episodes))
     dataset = LeRobotFolder(folder, fps=options.fps)
@@ -80,7 +86,10 @@ async def write_scene(
     options: EpisodeOptions,
     report_progress: ProgressCallback | None,
 ) -> int:
-    """Write one episode to a file; return the number of changes or messages. Raises as `write_lerobot` does."""
+    """Write one episode to a file; return the number of changes (`rrd`) or messages (`mcap`) in it.
+
+    Only MCAP uses the options. Raises as `write_lerobot` does.
+    """
     if len(episodes) != 1:
         raise CallerError(f"a file of the format {file_format} holds one episode, got {len(episodes)}: name one")
     progress = _Progress(report_progress, episodes[0].events)
@@ -99,7 +108,7 @@ async def write_scene(
 
 
 class _Progress:
-    """Reports how many events of all episodes are done in a phase; `before` is the number of those of earlier ones."""
+    """Reports how many events of all episodes a phase has done; `before` counts those of the earlier episodes."""
 
     def __init__(self, report_progress: ProgressCallback | None, total: int) -> None:
         self.before = 0
@@ -107,7 +116,7 @@ class _Progress:
         self._total = total
 
     def of(self, phase: str) -> Callable[[int], None]:
-        """Return the function that reports the number of events of the present episode; any thread may call it."""
+        """Return a function that takes the number of done events of the current episode; any thread may call it."""
 
         def report_events(done: int) -> None:
             if self._report_progress is not None:
