@@ -24,7 +24,7 @@ _WIDTH_PIPED = 160
 _WORD_MAX = 24
 """Bounds the longest word of a column for which a table needs room: ids and paths may be broken."""
 _READABLE = 0.75
-"""A table has at least this part of the width that its words need; with less, most words are broken."""
+"""The least part of the width its words need at which a table is printed; with less, it would break most words."""
 
 stdout = Console(highlight=False, width=None if sys.stdout and sys.stdout.isatty() else _WIDTH_PIPED)
 
@@ -51,7 +51,7 @@ def note(line: str) -> None:
 
 
 class LogLines(logging.Handler):
-    """Prints each message of a log as one line on stderr, above a progress bar."""
+    """Prints each message of a log on stderr, above a progress bar."""
 
     def emit(self, record: logging.LogRecord) -> None:
         """Print one message."""
@@ -66,7 +66,7 @@ def print_json(document: Any) -> None:
 
 
 def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    """Print a table; columns of numbers are right-aligned. In a narrow terminal print blocks."""
+    """Print a table; columns of numbers alone are right-aligned. In a narrow terminal print a block for each row."""
     rows = [tuple(row) for row in rows]
     stdout.print(f"[bold]{escape(title)}[/]")  # not the title of the table, which is wrapped to the table's width
     if stdout.width < _READABLE * _width_of_words(columns, rows):
@@ -121,7 +121,7 @@ def counted(number: int, noun: str) -> str:
 
 
 def moment(when: datetime) -> str:
-    """Format a moment in UTC to the second."""
+    """Format a moment to the second, in its own time zone; all callers pass UTC."""
     return when.strftime("%Y-%m-%d %H:%M:%S")
 
 

@@ -1,4 +1,4 @@
-"""`pycrorm report EPISODE` writes an episode as one HTML file: tree, chart, scene, failures, observations."""
+"""`pycrorm report EPISODE` writes an episode as one HTML page; `pycrorm report --all` a table and pages of many."""
 
 from __future__ import annotations
 
@@ -138,7 +138,7 @@ def _write_episode(
         return
     print_line(written.path)
     note(f"The page has {size / 1e6:.1f} MB and opens in any browser, also offline.")
-    if written.last < min(last or written.events, written.events):
+    if written.last < min(last or written.events, written.events):  # it ends before the last event asked for
         note(
             f"It shows the events {written.first} to {written.last} of {written.events}, because a page holds no more;"
             f" the next page: --from {written.last + 1}"
