@@ -1,4 +1,4 @@
-"""`name_of` and `simplified` choose what is recorded of LangChain's values: the name of a run, the parts of a message."""
+"""`name_of` and `simplified` choose what is recorded of LangChain's values: a run's name, the parts of a message."""
 
 from __future__ import annotations
 
