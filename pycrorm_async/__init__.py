@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from pycrorm_async.recording.writing.event_feed import RecordedEvent
     from pycrorm_async.settings import Settings
 
-__version__ = "0.1.0"
+__version__ = "0.2.0.dev0"
 
 __all__ = [
     "Blob",
