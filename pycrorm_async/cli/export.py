@@ -162,5 +162,7 @@ def _print(exported: Exported, *, as_json: bool) -> None:
     noun = {"lerobot": "frame", "rrd": "change", "mcap": "message"}.get(manifest.file_format, "row")
     content = f"{counted(exported.rows, noun)} of {counted(exported.episodes, 'episode')}"
     note(f"It has {content}; {exported.path}.manifest.json describes it.")
+    if exported.unknown_name:
+        note(f"no row answers; {exported.unknown_name}")
     if exported.left_out:
         note(f"{exported.left_out} episodes are left out, because they run or are not in the tables yet.")

@@ -57,6 +57,8 @@ class Exported(NamedTuple):
         episodes: number of episodes that it covers.
         left_out: number of episodes without rows in the export, because they run or are not in the tables yet.
         manifest: the description, which is in the file `PATH.manifest.json`.
+        unknown_name: a line about an argument of a question without rows, such as an object, that is nowhere in the
+            memory; empty without one.
     """
 
     path: Path
@@ -64,6 +66,7 @@ class Exported(NamedTuple):
     episodes: int
     left_out: int
     manifest: Manifest
+    unknown_name: str = ""
 
 
 class ExportComparison(NamedTuple):
@@ -138,7 +141,7 @@ async def export(
     if chosen not in get_args(FileFormat):
         raise CallerError(f"there is no format {chosen!r}{nearest(chosen, get_args(FileFormat))}; formats: {_listed()}")
     options = _options(chosen, clock, fps, images)
-    left_out = 0
+    left_out, unknown_name = 0, ""
     with new_file(manifest_path(target), force=force) as described:
         match chosen:
             case "parquet" | "csv" | "jsonl":
@@ -147,6 +150,8 @@ async def export(
                 with new_file(target, force=force) as written:
                     manifest = await _write_rows(reading, selection, written, chosen, report_progress)
                     manifest = _complete(manifest, {target.name: checksums(written)[written.name]}, described)
+                if selection.question is not None and not manifest.rows:
+                    unknown_name = await selection.question.unknown_name()
             case "lerobot":
                 covered = await _episodes(reading, what, episodes, chosen)
                 with new_folder(target, force=force, marker=MARKER) as written:
@@ -159,7 +164,7 @@ async def export(
                     changes = await write_scene(reading, covered, written, chosen, options, report_progress)
                     manifest = await _described(reading, covered, chosen, options, changes)
                     manifest = _complete(manifest, {target.name: checksums(written)[written.name]}, described)
-    return Exported(target, manifest.rows, len(manifest.episodes), left_out, manifest)
+    return Exported(target, manifest.rows, len(manifest.episodes), left_out, manifest, unknown_name)
 
 
 async def export_again(

@@ -52,6 +52,7 @@ class Selection:
         kind: `episodes`, `view`, `question` or `select`.
         name: of the view or the question.
         arguments: of the question.
+        question: the question, named or made by the caller; None for other rows.
         statement: the select.
         episodes: those that it covers, by number; for a select of the caller all that the memory has.
         simulated: True if simulations are among them.
@@ -65,6 +66,7 @@ class Selection:
     simulated: bool = False
     left_out: int = 0
     arguments: Mapping[str, Any] = field(default_factory=dict)
+    question: Question | None = None
 
 
 class _Covered(NamedTuple):
@@ -170,9 +172,8 @@ async def _asked(
         (covered, left_out), simulated = await _complete(reading), False
     if recorded.get("episode") is not None:
         recorded["episode"] = covered[0].id  # later, `last` and a number may be of another episode
-    return Selection(
-        kind, question.name, question.select_among(_numbers(covered)), covered, simulated, left_out, recorded
-    )
+    statement = question.select_among(_numbers(covered))
+    return Selection(kind, question.name, statement, covered, simulated, left_out, recorded, question)
 
 
 async def _view(reading: Reading, name: str, mapper: Mapper[Any] | None, chosen: Sequence[str]) -> Selection:

@@ -186,6 +186,18 @@ async def test_a_question_is_exported_and_made_again_by_name_and_arguments(readi
     assert (again.same, again.differences) == (True, ())
 
 
+async def test_a_question_without_rows_about_an_unknown_name_is_exported_with_the_nearest_one(
+    reading: Reading, tmp_path: Path
+) -> None:
+    unknown = "the memory has no object mlik; did you mean milk?"
+    by_name = await export(reading, "root_failures", tmp_path / "a.csv", arguments={"object": "mlik"})
+    assert (by_name.rows, by_name.unknown_name) == (0, unknown)
+    assert (await export(reading, reading.ask.moves_of("mlik"), tmp_path / "b.csv")).unknown_name == unknown
+    of_milk = {"object": "milk", "message": "no such text"}
+    named = await export(reading, "root_failures", tmp_path / "c.csv", arguments=of_milk)
+    assert (named.rows, named.unknown_name) == (0, "")
+
+
 @pytest.mark.parametrize(
     ("name", "arguments", "message"),
     [
@@ -419,6 +431,8 @@ def test_the_command_writes_compares_and_names_mistakes_in_one_line(kitchen: Pat
     with_milk = "--with", "object=milk", "--with", "limit=1", "--with", "recovered=true"
     done = pycrorm("export", "root_failures", *with_milk, "--out", tmp_path / "f.csv", "--json", cwd=kitchen)
     assert json.loads(done.stdout)["rows"] == 1
+    done = pycrorm("export", "root_failures", "--with", "object=mlik", "--out", tmp_path / "no.csv", cwd=kitchen)
+    assert done.stderr.endswith("no row answers; the memory has no object mlik; did you mean milk?\n")
     done = pycrorm("export", "root_failures", "--with", "limit=many", "--out", tmp_path / "g.csv", cwd=kitchen)
     assert one_line_of(done) == "pycrorm: limit of root_failures must be of the type int, got 'many'"
     done = pycrorm("export", "1", "--out", tmp_path / "h.mcap", "--fps", "5", cwd=kitchen)
