@@ -123,8 +123,8 @@ def _answer(
 ) -> None:
     async def ask(reading: Reading) -> tuple[list[str], list[tuple[Any, ...]], str]:
         question: Question = getattr(reading.ask, name)(**arguments)
-        columns = list(question.statement.selected_columns.keys())
         rows, unknown = await question.rows_or_unknown_name(simulated=simulated)
+        columns = list(question.statement.selected_columns.keys())
         return columns, [tuple(row) for row in rows], unknown
 
     columns, rows, unknown = read_memory(url, spool, ask)

@@ -346,6 +346,21 @@ async def test_the_sql_of_each_question_returns_its_rows(reading: Reading, fille
     assert of_three == of_identity
 
 
+@pytest.mark.parametrize("name", ["05", "005", "00", "-5", "aa"])
+async def test_a_text_that_is_neither_a_number_nor_begins_an_id_is_no_episode_of_a_statement_either(
+    reading: Reading, name: str
+) -> None:
+    question = reading.ask.durations(episode=name)
+    with pytest.raises(UnknownEpisode, match=f"there is no episode '{name}'"):
+        await question.rows()
+    for write in (lambda: question.statement, lambda: question.sql):
+        with pytest.raises(UnknownEpisode, match=f"there is no episode '{name}'; `pycrorm episodes` lists all"):
+            write()
+    for number in ("5", 5):
+        five = reading.ask.durations(episode=number)
+        assert await reading.rows(five.statement) == await five.rows() != []
+
+
 async def test_a_question_is_awaited_for_a_frame_of_its_columns(reading: Reading) -> None:
     for name in QUESTIONS:
         question = getattr(reading.ask, name)(**ARGUMENTS.get(name, {}))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias, TypeVar
 
 from sqlalchemy import CompoundSelect, Row, Select, func, select
 
-from pycrorm_async.errors import CallerError, InternalError, QueryRefused
+from pycrorm_async.errors import CallerError, InternalError, QueryRefused, UnknownEpisode
 from pycrorm_async.orm import ProcessMetaData
 from pycrorm_async.query.asking.columns import EpisodeNumber
 from pycrorm_async.query.asking.ports import EpisodeReader
@@ -70,7 +70,11 @@ class Question(NotebookValue):
 
     @property
     def statement(self) -> Select[*tuple[Any, ...]]:
-        """The select, to change or to join. It contains the subquery that finds the named episode."""
+        """The select, to change or to join. It contains the subquery that finds the named episode.
+
+        Raises `UnknownEpisode` for a text of fewer than four characters that is no number or begins with a zero: to
+        name an id takes four.
+        """
         episode = self._plan.episode
         return self._plan.select_of(episode=None if episode is None else _number_by_query(episode))
 
@@ -203,8 +207,10 @@ def _number_by_query(episode: AskedEpisode) -> EpisodeNumber:
     if name == "last":
         return select(func.max(numbered.id)).where(~numbered.simulated).scalar_subquery()
     is_number = name.isdecimal() and name.isascii() and len(name) <= _DIGITS_MAX
-    if is_number and (isinstance(episode, int) or len(name) < _DIGITS_OF_ID):
+    if is_number and (isinstance(episode, int) or len(name) < _DIGITS_OF_ID) and name == str(int(name)):
         return int(name)
+    if len(name) < _DIGITS_OF_ID:
+        raise UnknownEpisode(f"there is no episode {name!r}; `pycrorm episodes` lists all")
     begins = select(numbered.id).where(numbered.uuid.startswith(name.lower(), autoescape=True)).scalar_subquery()
     if not is_number or name.startswith("0"):
         return begins
