@@ -150,8 +150,9 @@ async def test_batches_have_one_schema_and_the_rows_of_the_frame_in_order(readin
     assert pa.Table.from_batches(batches).to_pylist() == frame.to_pylist()
     (empty,) = [each async for each in reading.batches(OF_EACH_KIND.where(NODE.id < 0))]
     assert (empty.num_rows, empty.schema) == (0, SCHEMA)
-    with pytest.raises(CallerError, match="at least one row, got rows=0"):
-        await anext(reading.batches(OF_EACH_KIND, rows=0))
+    for rows in (0, "x", None, 1.5):
+        with pytest.raises(CallerError, match=rf"^rows must be a whole number from 1 to 2147483648, got {rows!r}$"):
+            await anext(reading.batches(OF_EACH_KIND, rows=rows))  # type: ignore[arg-type]
 
 
 async def test_a_stream_that_is_left_early_returns_its_connection(reading: Reading) -> None:

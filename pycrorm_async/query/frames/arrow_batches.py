@@ -9,6 +9,7 @@ from sqlalchemy import Select
 from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.errors import CallerError, MissingExtra
+from pycrorm_async.query.asking.columns import checked_count
 from pycrorm_async.query.frames.columns import ColumnKind, FrameColumn, columns_of
 
 if TYPE_CHECKING:
@@ -58,11 +59,11 @@ async def arrow_batches(
     >>> async for batch in arrow_batches(connection, select(PickUpWithContextView)):
     ...     batch.num_rows, batch.schema
 
-    Raises `MissingExtra`; `CallerError` for `rows` below 1, and for a value that its column cannot hold.
+    Raises `MissingExtra`; `CallerError` unless `rows` is a whole number from 1, and for a value that its column cannot
+    hold.
     """
     pa = needed_pyarrow()
-    if rows < 1:
-        raise CallerError(f"a batch needs at least one row, got rows={rows}")
+    checked_count("rows", rows)
     columns = columns_of(statement, deferred=deferred)
     plain = statement.with_only_columns(*(each.expression for each in columns))
     types = [arrow_type(each.kind, enums_as_text=enums_as_text) for each in columns]
