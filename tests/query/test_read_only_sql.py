@@ -156,6 +156,12 @@ async def test_a_text_that_is_no_query_is_refused(sql: _Sql) -> None:
             pytest.fail(f"{text!r} was answered with {await sql.query(text)}")
 
 
+async def test_a_query_with_a_parameter_is_refused_with_the_way_to_write_it(sql: _Sql) -> None:
+    for text in ("SELECT $1", *(("SELECT ?", "SELECT ?, ?2", "SELECT :a, @b") if sql.is_sqlite else ())):
+        with pytest.raises(QueryRefused, match=r"^a query has no parameters such as \?, :name or \$1: write the value"):
+            await sql.query(text)
+
+
 async def test_an_open_memory_for_reading_takes_queries(reader_url: str) -> None:
     async with Reading.open(reader_url) as reading:
         assert (await reading.query("SELECT count(*) AS episodes FROM process_metadata")).rows == [(2,)]

@@ -29,7 +29,7 @@ import asyncpg
 from sqlalchemy.ext.asyncio import AsyncEngine
 
 from pycrorm_async.errors import QueryRefused
-from pycrorm_async.query.sql.refusals import NOT_ONE, ONLY_READS, missing_relation, stopped
+from pycrorm_async.query.sql.refusals import NO_PARAMETERS, NOT_ONE, ONLY_READS, missing_relation, stopped
 from pycrorm_async.store.postgresql.search_path import LOG_SCHEMA, TABLES_SCHEMA, VIEWS_SCHEMA
 
 READER = "pycrorm_reader"
@@ -139,7 +139,7 @@ class _Cursor:
             # `execute` would send several statements as they are; preparing refuses them.
             prepared = await self._connection.prepare(query)
             if prepared.get_parameters():
-                raise QueryRefused("a query has no parameters such as $1: write the value")
+                raise QueryRefused(NO_PARAMETERS)
             attributes = prepared.get_attributes()
             if not attributes:
                 raise QueryRefused(ONLY_READS)

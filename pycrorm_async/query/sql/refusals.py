@@ -10,6 +10,7 @@ from pycrorm_async.query.suggestions import nearest
 
 ONLY_READS = "a query may only read: it is one SELECT, or WITH … SELECT"
 NOT_ONE = "a query is one statement: this text has several"
+NO_PARAMETERS = "a query has no parameters such as ?, :name or $1: write the values themselves"
 _INTERNAL = re.compile(r"^zz_|__\d+$|^sqlite_|^pycrorm_")
 """Names of the tables behind the views, one for each generation, and of the bookkeeping."""
 

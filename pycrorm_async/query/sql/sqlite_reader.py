@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from pycrorm_async.errors import QueryRefused
-from pycrorm_async.query.sql.refusals import NOT_ONE, ONLY_READS, missing_relation, stopped
+from pycrorm_async.query.sql.refusals import NO_PARAMETERS, NOT_ONE, ONLY_READS, missing_relation, stopped
 
 _T = TypeVar("_T")
 _PROGRAM = Path(__file__).with_name("sqlite_process.py")
@@ -148,6 +148,8 @@ def _refusal(
         return QueryRefused(f"{ONLY_READS}; {what} is not allowed")
     if code is None and "one statement" in text:
         return QueryRefused(NOT_ONE)
+    if kind == "ProgrammingError" and "binding" in text:  # "Incorrect number of bindings supplied"
+        return QueryRefused(NO_PARAMETERS)
     if code in _NO_ROOM:
         return QueryRefused(_TOO_MUCH.format("space for temporary files"))
     if code is None or code & 0xFF in _REFUSALS:
