@@ -156,6 +156,24 @@ async def test_a_text_that_is_no_query_is_refused(sql: _Sql) -> None:
             pytest.fail(f"{text!r} was answered with {await sql.query(text)}")
 
 
+async def test_comments_may_follow_the_semicolon_of_a_query(sql: _Sql) -> None:
+    texts = {
+        "SELECT 1; -- the end": 1,
+        "SELECT 1 /* ; */ ;\n/* the; end */ -- ; (": 1,
+        "SELECT 'é; --🤖;' -- it; is\n; -- that;": "é; --🤖;",
+        "SELECT 'a''; -- b'": "a'; -- b",
+        "VALUES (';') -- no; semicolon": ";",
+    }
+    for text, value in texts.items():
+        assert (await sql.query(text))[1] == [(value,)], text
+    for text in ("SELECT 1; SELECT 2 -- the end", "SELECT 1; -- one\nSELECT 2"):
+        with pytest.raises(QueryRefused, match="a query is one statement: this text has several"):
+            await sql.query(text)
+    for text in ("DELETE FROM process_metadata; -- all", "SELECT 1) AS a; -- ("):
+        with pytest.raises(QueryRefused):
+            await sql.query(text)
+
+
 async def test_a_query_with_a_parameter_is_refused_with_the_way_to_write_it(sql: _Sql) -> None:
     for text in ("SELECT $1", *(("SELECT ?", "SELECT ?, ?2", "SELECT :a, @b") if sql.is_sqlite else ())):
         with pytest.raises(QueryRefused, match=r"^a query has no parameters such as \?, :name or \$1: write the value"):

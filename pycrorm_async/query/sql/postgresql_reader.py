@@ -143,6 +143,7 @@ class _Cursor:
             attributes = prepared.get_attributes()
             if not attributes:
                 raise QueryRefused(ONLY_READS)
+            query = await self._without_end(query)
             await (await self._connection.prepare(_declaration(query, len(attributes), self._bytes_max))).fetch()
         self.columns = tuple(each.name for each in attributes)
 
@@ -155,6 +156,24 @@ class _Cursor:
             raise QueryRefused(f"the first row of the query has {size}: select fewer columns, or parts of them")
         self._is_first = False
         return [tuple(each)[:-1] for each in within], len(within) < len(records)
+
+    async def _without_end(self, query: str) -> str:
+        """Return one statement without its semicolon and the comments behind it.
+
+        PostgreSQL's own parser finds the semicolon, outside of strings and comments: it is the first token of the
+        statement that may not be in parentheses.
+        """
+        if ";" not in query:
+            return query
+        text = f"({query}\n)"
+        await self._connection.execute("SAVEPOINT pycrorm_end")  # an error would end the transaction
+        try:
+            await self._connection.prepare(text)
+        except asyncpg.PostgresSyntaxError as error:
+            await self._connection.execute("ROLLBACK TO SAVEPOINT pycrorm_end")
+            end = int(error.position or 0) - 1
+            return text[1:end] if text[end : end + 1] == ";" else query
+        return query
 
     async def _check_login(self) -> None:
         rights = await self._connection.fetchrow(_RIGHTS)
