@@ -17,6 +17,7 @@ import gc
 import io
 import logging
 import os
+import re
 import sys
 from collections.abc import Callable, Mapping
 from importlib import import_module
@@ -37,6 +38,7 @@ from pycrorm_async.errors import (
     FlushTimeout,
     PycrormError,
 )
+from pycrorm_async.query.suggestions import did_you_mean
 
 
 def exit_code(error: PycrormError) -> int:
@@ -83,6 +85,8 @@ def _print_version(requested: bool) -> None:  # noqa: FBT001  typer passes it by
 
 
 _STDERR = 2
+_SUGGESTED = re.compile(r"(?:\. Did you mean | \(Possible options: )(.+)[?)]$")
+"""Finds the names that typer suggests at the end of a line, in forms that differ from those of our own lines."""
 _INTERRUPTED = 130
 _HELP = "Episodic memory for robots: record plans as events and query them as tables."
 _VERBS = (
@@ -217,4 +221,8 @@ def _print_usage_error(error: TyperException) -> None:
     if line:
         context = getattr(error, "ctx", None)
         verb = context.command_path if context is not None else "pycrorm"
-        problem(f"{line[0].lower()}{line[1:]}; `{verb} --help` lists the arguments")
+        listed = "commands" if line.startswith("No such command") else "arguments"
+        hint = f"; `{verb} --help` lists the {listed}"
+        if suggested := _SUGGESTED.search(line):
+            line, hint = line[: suggested.start()], did_you_mean(suggested[1].replace("'", "").split(", "))
+        problem(f"{line[0].lower()}{line[1:]}{hint}")

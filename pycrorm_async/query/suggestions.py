@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from difflib import get_close_matches
 
 
@@ -14,7 +14,14 @@ def nearest(name: str, valid: Iterable[str]) -> str:
     """
     by_folded = {each.casefold(): each for each in valid}
     names = get_close_matches(name.casefold(), by_folded, n=3, cutoff=0.6)
-    if not names:
-        return ""
-    first, *others = [by_folded[each] for each in names]
-    return f"; did you mean {', '.join([first, *others][:-1]) + ' or ' if others else ''}{[first, *others][-1]}?"
+    return did_you_mean([by_folded[each] for each in names]) if names else ""
+
+
+def did_you_mean(names: Sequence[str]) -> str:
+    """Return the question for one of these names.
+
+    >>> did_you_mean(["pose", "move"])
+    '; did you mean pose or move?'
+    """
+    *others, last = names
+    return f"; did you mean {', '.join(others) + ' or ' if others else ''}{last}?"

@@ -141,7 +141,7 @@ def folder(tmp_path: Path) -> Path:
         (["run", "plans.py", "--writer", "x"], 2, "'x' is not one of 'thread', 'daemon'; `pycrorm run --help` lists"),
         (["run", "plans.py", "--colour", "x"], 2, "no such option: --colour"),
         (["run"], 2, "missing argument 'PLAN.py[:function]'"),
-        (["ran", "plans.py"], 2, "no such command 'ran'"),
+        (["xyz", "plans.py"], 2, "no such command 'xyz'; `pycrorm --help` lists the commands"),
     ],
 )
 def test_an_impossible_call_is_reported_in_one_line(folder: Path, arguments: list[str], code: int, line: str) -> None:
@@ -149,6 +149,22 @@ def test_an_impossible_call_is_reported_in_one_line(folder: Path, arguments: lis
     assert line in one_line_of(done)
     assert done.returncode == code
     assert done.stdout == ""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (["queri", "SELECT 1"], "no such command 'queri'; did you mean query?"),
+        (["reco"], "no such command 'reco'; did you mean report or recall?"),
+        (["spool", "inspct"], "no such command 'inspct'; did you mean inspect?"),
+        (["query", "SELECT 1", "--limt", "5"], "no such option: --limt; did you mean --limit?"),
+    ],
+)
+def test_a_mistyped_verb_or_option_is_answered_with_the_nearest_ones(
+    folder: Path, arguments: list[str], line: str
+) -> None:
+    done = pycrorm(*arguments, cwd=folder)
+    assert (done.returncode, one_line_of(done)) == (2, f"pycrorm: {line}")
 
 
 @pytest.mark.parametrize(
