@@ -74,6 +74,11 @@ class Experiment:
             if getattr(self, name) < 1:
                 raise CallerError(f"an experiment needs {name.replace('_', '-')} >= 1, got {getattr(self, name)}")
         check_leaf(self.min_samples_leaf)
+        if self.rollouts < self.min_samples_leaf:
+            raise CallerError(
+                f"{self.rollouts} rollouts cannot have the {self.min_samples_leaf} successes that a leaf takes: choose"
+                " a larger --rollouts (rollouts=) or a smaller --min-samples-leaf (min_samples_leaf=)"
+            )
         if not 0 <= self.seed < 2**62:
             raise CallerError(f"seed must be >= 0 and < 2**62, got {self.seed}")
 

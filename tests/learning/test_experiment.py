@@ -252,7 +252,7 @@ def test_a_policy_is_evaluated_elsewhere_with_collisions_and_without(collisions:
 
 async def test_too_few_successes_are_reported_and_all_rollouts_kept(tmp_path: Path) -> None:
     place = MemoryLocation(f"sqlite:///{tmp_path}/memory.db")
-    with pytest.raises(NotEnoughExperience, match="too few to learn from"):
+    with pytest.raises(NotEnoughExperience, match=r"too few to learn from: a leaf takes 25; .* --min-samples-leaf"):
         await run(replace(SMALL, rollouts=40, workers=1), place)
     async with Reading.open(place.url) as reading:
         frame = await read_rollouts(reading, Scene(), name_of(default_policy()), 69, 700)
@@ -330,6 +330,9 @@ def test_an_impossible_experiment_is_refused() -> None:
         Experiment(workers=0)
     with pytest.raises(CallerError, match="a leaf needs two samples or more"):
         Experiment(min_samples_leaf=1)
+    with pytest.raises(CallerError, match=r"^24 rollouts cannot have the 25 successes that a leaf takes: choose"):
+        Experiment(rollouts=24)
+    assert Experiment(rollouts=25).rollouts == 25
     with pytest.raises(CallerError, match="seed must be >= 0"):
         Experiment(seed=-1)
     with pytest.raises(CallerError, match="worker count must be >= 1, got 0"):

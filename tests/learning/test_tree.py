@@ -305,7 +305,8 @@ def test_a_missing_column_is_named() -> None:
 
 def test_too_few_successes_are_no_experience() -> None:
     for rows in (0, 1, 24):
-        with pytest.raises(NotEnoughExperience, match=f"^{rows} successes are too few to learn from: a leaf takes 25"):
+        few = f"^{rows} successes are too few to learn from: a leaf takes 25; record more rollouts or choose a smaller"
+        with pytest.raises(NotEnoughExperience, match=rf"{few} --min-samples-leaf \(min_samples_leaf=\)$"):
             learn(pd.DataFrame(ALIKE)[:rows])
     with pytest.raises(CallerError, match="two samples or more"):
         learn(pd.DataFrame(ALIKE), min_samples_leaf=1)

@@ -65,7 +65,8 @@ def learn(successes: pd.DataFrame, *, min_samples_leaf: int = 25) -> Policy:
     check_leaf(min_samples_leaf)
     if len(successes) < min_samples_leaf:
         message = f"{len(successes)} successes are too few to learn from: a leaf takes {min_samples_leaf}"
-        raise NotEnoughExperience(f"{message}; record more rollouts or choose a smaller min_samples_leaf")
+        remedy = "record more rollouts or choose a smaller --min-samples-leaf (min_samples_leaf=)"
+        raise NotEnoughExperience(f"{message}; {remedy}")
     columns: dict[str, Any] = {name: _labels(successes, name, members) for name, members in SYMBOLS.items()}
     columns |= {name: _numbers(successes, name) for name in PLACE}
     constant_height = None
