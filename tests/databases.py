@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import atexit
 import contextlib
 import itertools
 import os
@@ -121,6 +122,9 @@ class Server:
     def kill(self) -> None:
         """Kill every process of the server at once, as when the machine's memory is full."""
         postmaster = self._server.get_postmaster_info().process
+        # Stopped, it starts no process after the others are listed. One that survived would keep the shared memory in
+        # use, and the server would refuse to start again.
+        os.kill(postmaster.pid, signal.SIGSTOP)
         processes = [postmaster, *postmaster.children(recursive=True)]
         for each in processes:
             with contextlib.suppress(ProcessLookupError):
@@ -160,6 +164,7 @@ def server_in(folder: Path, *, syncs: bool = True) -> Iterator[Server]:
         running.stop()
         server._postmaster_info = None  # where no parent reaps it, it would be stopped a second time with an error
         server.cleanup()
+        atexit.unregister(server._cleanup)  # it would take the lock again, which leaves its file behind
         lock.unlink(missing_ok=True)
 
 
