@@ -380,6 +380,19 @@ def test_an_episode_opened_while_the_memory_closes_is_counted_and_stays_empty(tm
     assert statuses <= {"SUCCEEDED", "INTERRUPTED"}
 
 
+def test_an_episode_opened_after_closing_has_begun_is_counted_and_stays_empty(tmp_path: Path) -> None:
+    with closing(Recorded(tmp_path, Settings())) as recorded:
+        recorded.episodes.refuse_new()
+        with recorded.recording.episode(description="late") as episode:
+            episode.start(1, recorded.recording.type("action", "Step"))
+            episode.end(1)
+        assert recorded.episodes.all == ()
+        assert recorded.logs() == []
+        total, last = recorded.emitter.faults
+    assert total == 3
+    assert last is not None
+
+
 def test_no_argument_of_an_end_raises(tmp_path: Path) -> None:
     class Incomparable:
         def __eq__(self, other: object) -> bool:
