@@ -6,12 +6,13 @@ import sqlite3
 
 import pytest
 
-from pycrorm_async.errors import DamageError, DatabaseUnavailable, LogDamaged
+from pycrorm_async.errors import DamageError, DatabaseUnavailable, LogDamaged, LogWentBack
 from pycrorm_async.events.codec import fingerprint
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX, episode_text
 from pycrorm_async.store.append import Appending
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.stored import Basis
 from tests.databases import ask, ask_to_change
 from tests.store.factories import declaration, episode, record, run_of
 
@@ -167,6 +168,27 @@ async def test_an_event_numbered_zero_is_damage(log: EventLog) -> None:
 
 
 # --- refused events ---------------------------------------------------------------------------------------------------
+
+
+async def test_a_log_that_holds_less_than_it_confirmed_refuses_the_batch(log: EventLog, database_url: str) -> None:
+    await log.append(run_of(episode(1), 1, 3))
+    with pytest.raises(LogWentBack, match=f"1 to 5 of episode {name(1)} and holds 3"):
+        await log.store(run_of(episode(2), 1, 2), Basis((episode(1), 5), lambda _: None, 0))
+    with pytest.raises(LogWentBack):
+        await log.store(run_of(episode(2), 1, 2), Basis((episode(3), 1), lambda _: None, 0))
+    await log.store(run_of(episode(2), 1, 1), Basis((episode(1), 3), lambda _: None, 0))
+    assert ask(database_url, "SELECT number, head FROM episode ORDER BY number") == [(1, 3), (2, 1)]
+
+
+async def test_an_episode_gets_its_former_number_unless_another_has_it(log: EventLog, database_url: str) -> None:
+    await log.append(run_of(episode(1), 1, 1))
+    former = {episode(2): 1, episode(3): 2}
+    await log.store(
+        [*run_of(episode(2), 1, 1), *run_of(episode(3), 1, 1, position=2)], Basis(None, former.__getitem__, 2)
+    )
+    numbers = dict(ask(database_url, "SELECT id, number FROM episode"))
+    assert (numbers[name(1)], numbers[name(3)]) == (1, 2)
+    assert numbers[name(2)] > 2
 
 
 async def test_a_gap_stops_its_episode_before_the_gap_and_no_other(log: EventLog, database_url: str) -> None:

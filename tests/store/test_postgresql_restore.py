@@ -103,6 +103,15 @@ async def test_a_writer_waits_while_its_tables_are_dropped_and_restored_step_by_
     await log.close()
 
 
+async def test_a_database_whose_keys_are_not_restored_yet_is_unavailable(database_url: str) -> None:
+    log = await EventLog.open(DatabaseAddress.parse(database_url), create=True)
+    await log.append(run_of(episode(1), 1, 2))
+    ask(database_url, "ALTER TABLE pycrorm.episode DROP CONSTRAINT episode_pkey")
+    with pytest.raises(DatabaseUnavailable, match="a part of the memory is missing; restore it from a backup"):
+        await log.append(run_of(episode(1), 3, 4))
+    await log.close()
+
+
 async def test_a_memory_continues_after_its_schemas_were_dropped_and_restored_while_it_recorded(
     server: Server, database_url: str, tmp_path: Path
 ) -> None:

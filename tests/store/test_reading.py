@@ -10,7 +10,7 @@ from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog, advance_folded, park
 from pycrorm_async.store.sqlite import statements
 from pycrorm_async.store.sqlite.engine import Connection
-from pycrorm_async.store.stored import EpisodeRow, Span, StoredEvent
+from pycrorm_async.store.stored import EpisodeRow, Incarnation, Span, StoredEvent
 from tests.databases import ask
 from tests.store.factories import episode, record, run_of
 
@@ -84,6 +84,14 @@ async def test_a_parked_episode_is_not_behind_and_still_takes_events(log: EventL
 
 
 @pytest.mark.slow
+async def test_each_time_the_log_went_back_is_noted_with_its_reason(log: EventLog) -> None:
+    assert await log.incarnations() == []
+    noted = [Incarnation(number, "robot 1", f"reason {number}") for number in (3, 1, 2)]
+    for each in noted:
+        await log.note_incarnation(*each)
+    assert await log.incarnations() == noted
+
+
 async def test_an_episode_row_holds_all_its_columns(log: EventLog) -> None:
     await log.append([record(episode(1), 1, wall_ns=10), record(episode(1), 2, wall_ns=20, kind="EpisodeEnded")])
     assert await log.episodes() == [EpisodeRow(1, "00000000-0000-0000-0000-000000000001", 2, 0, 10, 20, None, None)]
