@@ -32,7 +32,7 @@ from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import Span, StoredEvent
-from tests.databases import Server, ask, ask_to_change
+from tests.databases import Server, ask, ask_to_change, change_each
 from tests.projections.factories import append_and_fold
 from tests.projections.rebuild_cases import (
     TYPES,
@@ -462,6 +462,19 @@ async def test_a_foreign_view_on_the_tables_keeps_them_and_is_reported(server: S
     ask_to_change(url, "DROP VIEW public.mine")
     assert (await rebuild_memory(url)).left == []
     assert traces(url) == []
+
+
+async def test_a_foreign_view_keeps_a_replaced_view_and_its_table(
+    server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(replaced_tables, "_DROP_PAUSES_S", (0.0,))
+    url = server.new_memory()
+    views = ("CREATE VIEW public.mine AS SELECT id FROM memory.pose", "ALTER SCHEMA memory RENAME TO memory_gone_1_1")
+    change_each(url, views)
+    log = await EventLog.open(DatabaseAddress.parse(url), create=True)
+    assert await replaced_tables._drop_all(log, ["zz_pose__1001"]) == ["zz_pose__1001"]
+    await log.close()
+    assert ask(url, "SELECT count(*) FROM public.mine") == [(0,)]
 
 
 async def test_a_foreign_table_in_the_schema_of_the_views_is_reported_in_one_line_and_stays(server: Server) -> None:
