@@ -84,6 +84,17 @@ async def test_a_parked_episode_is_not_behind_and_still_takes_events(log: EventL
 
 
 @pytest.mark.slow
+async def test_a_snapshot_shows_the_same_events_while_others_are_appended(log: EventLog) -> None:
+    count = text("SELECT count(*) FROM event")
+    await log.append(run_of(episode(1), 1, 2))
+    async with log.snapshot() as snapshot:
+        assert (await snapshot.execute(count)).scalar_one() == 2
+        await log.append(run_of(episode(1), 3, 4))
+        assert (await snapshot.execute(count)).scalar_one() == 2
+    async with log.reading() as later:
+        assert (await later.execute(count)).scalar_one() == 4
+
+
 async def test_each_time_the_log_went_back_is_noted_with_its_reason(log: EventLog) -> None:
     assert await log.incarnations() == []
     noted = [Incarnation(number, "robot 1", f"reason {number}") for number in (3, 1, 2)]
