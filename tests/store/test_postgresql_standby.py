@@ -11,6 +11,7 @@ import pytest
 
 from pycrorm_async.errors import DatabaseUnavailable
 from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.dialect import StoredOn
 from pycrorm_async.store.log import EventLog
 from tests.databases import Server, ask
 from tests.store.factories import declaration, episode, run_of
@@ -72,6 +73,16 @@ async def _ended_while_waiting(committing: asyncio.Task[object], watch: asyncpg.
             return True
         await asyncio.sleep(0)
     return False
+
+
+async def test_the_standby_for_which_each_commit_waits_counts_as_a_machine_and_is_named(database_url: str) -> None:
+    log = await EventLog.open(DatabaseAddress.parse(database_url), create=True)
+    try:
+        assert await log.stored_on() == StoredOn(1)
+        async with standby_missing(database_url):
+            assert await log.stored_on() == StoredOn(2, ("nowhere",))
+    finally:
+        await log.close()
 
 
 @pytest.mark.parametrize("how", ["pg_cancel_backend", "pg_terminate_backend"])

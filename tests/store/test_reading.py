@@ -7,11 +7,12 @@ from sqlalchemy import text
 
 from pycrorm_async.errors import DatabaseUnavailable
 from pycrorm_async.store.dialects import dialect_of
+from pycrorm_async.store.limits import EPISODES_MANY, EVENTS_MANY
 from pycrorm_async.store.log import EventLog, advance_folded, park
 from pycrorm_async.store.sqlite import statements
 from pycrorm_async.store.sqlite.engine import Connection
-from pycrorm_async.store.stored import EpisodeRow, Incarnation, Span, StoredEvent
-from tests.databases import ask
+from pycrorm_async.store.stored import Basis, EpisodeRow, Incarnation, Span, StoredEvent
+from tests.databases import ask, ask_to_change
 from tests.store.factories import episode, record, run_of
 
 
@@ -84,6 +85,17 @@ async def test_a_parked_episode_is_not_behind_and_still_takes_events(log: EventL
 
 
 @pytest.mark.slow
+async def test_a_memory_and_an_open_episode_near_their_limits_are_named(log: EventLog, database_url: str) -> None:
+    await log.append([*run_of(episode(1), 1, 2), *run_of(episode(2), 1, 2, position=3)])
+    assert await log.limits_near() == []
+    late = Basis(None, {episode(3): EPISODES_MANY}.get, 0)
+    await log.store([record(episode(3), 1)], late)
+    ask_to_change(database_url, f"UPDATE episode SET head = {EVENTS_MANY} WHERE number = 1")
+    numbers, events = await log.limits_near()
+    assert numbers.startswith("3,774,873 of 4,194,303 episode numbers are used")
+    assert events.startswith("episode 1 (")
+
+
 async def test_a_snapshot_shows_the_same_events_while_others_are_appended(log: EventLog) -> None:
     count = text("SELECT count(*) FROM event")
     await log.append(run_of(episode(1), 1, 2))
