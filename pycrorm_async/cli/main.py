@@ -38,7 +38,7 @@ from pycrorm_async.errors import (
     FlushTimeout,
     PycrormError,
 )
-from pycrorm_async.query.suggestions import did_you_mean
+from pycrorm_async.query.suggestions import nearest
 
 
 def exit_code(error: PycrormError) -> int:
@@ -85,8 +85,10 @@ def _print_version(requested: bool) -> None:  # noqa: FBT001  typer passes it by
 
 
 _STDERR = 2
-_SUGGESTED = re.compile(r"(?:\. Did you mean | \(Possible options: )(.+)[?)]$")
-"""Finds the names that typer suggests at the end of a line, in forms that differ from those of our own lines."""
+_UNKNOWN = re.compile(
+    r"(?P<fault>No such (command|option:) '?(?P<name>.+?)'?)(\. Did you mean | \(Possible options: )(?P<names>.+)[?)]"
+)
+"""Finds the names that typer suggests: their form differs from that of our lines, and --json is not near --since."""
 _INTERRUPTED = 130
 _HELP = "Episodic memory for robots: record plans as events and query them as tables."
 _VERBS = (
@@ -219,10 +221,11 @@ def _print_usage_error(error: TyperException) -> None:
     """Print the fault of the command line as one line; nothing if typer has printed the help instead of an error."""
     line = error.format_message().rstrip().removesuffix(".").replace("Value error, ", "")
     if line:
-        context = getattr(error, "ctx", None)
-        verb = context.command_path if context is not None else "pycrorm"
-        listed = "commands" if line.startswith("No such command") else "arguments"
-        hint = f"; `{verb} --help` lists the {listed}"
-        if suggested := _SUGGESTED.search(line):
-            line, hint = line[: suggested.start()], did_you_mean(suggested[1].replace("'", "").split(", "))
+        hint, context = "", getattr(error, "ctx", None)
+        if context is not None:  # typer names no verb where an option lacks its value
+            listed = "commands" if line.startswith("No such command") else "arguments"
+            hint = f"; `{context.command_path} --help` lists the {listed}"
+        if unknown := _UNKNOWN.fullmatch(line):
+            line = unknown["fault"]
+            hint = nearest(unknown["name"], unknown["names"].replace("'", "").split(", ")) or hint
         problem(f"{line[0].lower()}{line[1:]}{hint}")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from difflib import get_close_matches
 
 
@@ -12,16 +12,14 @@ def nearest(name: str, valid: Iterable[str]) -> str:
     >>> nearest("root_failure", ["root_failures", "arms"])
     '; did you mean root_failures?'
     """
-    by_folded = {each.casefold(): each for each in valid}
-    names = get_close_matches(name.casefold(), by_folded, n=3, cutoff=0.6)
-    return did_you_mean([by_folded[each] for each in names]) if names else ""
+    by_folded = {_folded(each): each for each in valid}
+    names = get_close_matches(_folded(name), by_folded, n=3, cutoff=0.6)
+    if not names:
+        return ""
+    first, *others = [by_folded[each] for each in names]
+    return f"; did you mean {', '.join([first, *others][:-1]) + ' or ' if others else ''}{[first, *others][-1]}?"
 
 
-def did_you_mean(names: Sequence[str]) -> str:
-    """Return the question for one of these names.
-
-    >>> did_you_mean(["pose", "move"])
-    '; did you mean pose or move?'
-    """
-    *others, last = names
-    return f"; did you mean {', '.join(others) + ' or ' if others else ''}{last}?"
+def _folded(name: str) -> str:
+    """Return the name without what makes it no nearer to another one: capital letters and the dashes of an option."""
+    return name.casefold().lstrip("-")

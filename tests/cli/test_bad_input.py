@@ -158,6 +158,8 @@ def test_an_impossible_call_is_reported_in_one_line(folder: Path, arguments: lis
         (["reco"], "no such command 'reco'; did you mean report or recall?"),
         (["spool", "inspct"], "no such command 'inspct'; did you mean inspect?"),
         (["query", "SELECT 1", "--limt", "5"], "no such option: --limt; did you mean --limit?"),
+        (["recall", "X", "--since", "7d"], "no such option: --since; `pycrorm recall --help` lists the arguments"),
+        (["query", "SELECT 1", "--url"], "option '--url' requires an argument"),
     ],
 )
 def test_a_mistyped_verb_or_option_is_answered_with_the_nearest_ones(
