@@ -146,7 +146,10 @@ async def test_a_query_ends_at_its_limit_on_bytes(sql: _Sql) -> None:
 
 async def test_a_huge_value_does_not_reach_this_process(sql: _Sql) -> None:
     huge = "SELECT zeroblob(900000000)" if sql.is_sqlite else "SELECT repeat('x', 20000000)"
-    with pytest.raises(QueryRefused, match="too big" if sql.is_sqlite else "has 200000\\d+ bytes, and the limit is"):
+    with pytest.raises(
+        QueryRefused,
+        match="value of more than 16 MiB: select" if sql.is_sqlite else "has 200000\\d+ bytes, and the limit is",
+    ):
         await sql.query(huge)
 
 
@@ -171,6 +174,12 @@ async def test_comments_may_follow_the_semicolon_of_a_query(sql: _Sql) -> None:
             await sql.query(text)
     for text in ("DELETE FROM process_metadata; -- all", "SELECT 1) AS a; -- ("):
         with pytest.raises(QueryRefused):
+            await sql.query(text)
+
+
+async def test_a_statement_that_changes_a_view_may_only_read(sql: _Sql) -> None:
+    for text in ("UPDATE pose SET x = 1", "DELETE FROM pose", "INSERT INTO action (id) VALUES (1)"):
+        with pytest.raises(QueryRefused, match=r"^a query may only read: it is one SELECT, or WITH … SELECT"):
             await sql.query(text)
 
 

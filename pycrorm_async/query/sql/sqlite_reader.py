@@ -48,6 +48,9 @@ _NO_ROOM = (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR_WRITE)
 """Codes of a temporary file that cannot grow, because a reader writes no other."""
 _FAULT_VALUES = 5
 """The values in a message that has the reason for which the query ended."""
+_TOO_LARGE = (
+    "the query has a value of more than 16 MiB: select a part of it, as substr does, or raise the limit on bytes"
+)
 _TOO_MUCH = "the query needs more {} than it may use: select or sort less"
 
 
@@ -150,6 +153,10 @@ def _refusal(
         return QueryRefused(NOT_ONE)
     if kind == "ProgrammingError" and "binding" in text:  # "Incorrect number of bindings supplied"
         return QueryRefused(NO_PARAMETERS)
+    if text.startswith("cannot modify ") or text.endswith("may not be modified"):  # a view, a table of SQLite's own
+        return QueryRefused(ONLY_READS)
+    if code == sqlite3.SQLITE_TOOBIG and text == "string or blob too big":
+        return QueryRefused(_TOO_LARGE)
     if code in _NO_ROOM:
         return QueryRefused(_TOO_MUCH.format("space for temporary files"))
     if code is None or code & 0xFF in _REFUSALS:
