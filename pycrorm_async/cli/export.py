@@ -123,6 +123,8 @@ def _arguments(question: str, pairs: list[str]) -> dict[str, Any]:
         name, separator, text = each.partition("=")
         if not separator:
             raise CallerError(f"--with must be NAME=VALUE, as in object=milk, got {each!r}")
+        if name in arguments:
+            raise CallerError(f"{name} of {question} is given twice: give one value")
         types = str(valid[name].annotation).split(" | ") if name in valid else []
         try:
             arguments[name] = next((read(text) for type_, read in _READ.items() if type_ in types), text)

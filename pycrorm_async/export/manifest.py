@@ -58,7 +58,9 @@ def read_manifest(path: Path) -> Manifest:
     """Read a manifest. Raises `CallerError` for another file, and for a manifest of a newer version."""
     try:
         manifest = msgspec.json.decode(path.read_bytes(), type=Manifest)
-    except (OSError, msgspec.DecodeError) as error:
+    except OSError as error:
+        raise CallerError(f"the manifest {path} cannot be read: {error.strerror or error}") from None
+    except msgspec.DecodeError as error:
         raise CallerError(f"{path} is not a manifest of an export: {error}") from None
     if manifest.format > Manifest.__struct_defaults__[0]:
         raise CallerError(f"{path} has the version {manifest.format}: use a newer pycrorm")

@@ -159,6 +159,9 @@ async def test_what_differs_from_the_manifest_is_named(either: Reading, tmp_path
         file.write_text(broken)
         with pytest.raises(CallerError, match="is not a manifest of an export"):
             await export_again(either, file)
+    file.unlink()
+    with pytest.raises(CallerError, match=r"^the manifest \S+ cannot be read: No such file or directory$"):
+        await export_again(either, file)
 
 
 async def test_a_view_of_a_user_and_a_select_are_exported(reading: Reading, tmp_path: Path) -> None:
@@ -435,6 +438,8 @@ def test_the_command_writes_compares_and_names_mistakes_in_one_line(kitchen: Pat
     assert done.stderr.endswith("no row answers; the memory has no object mlik; did you mean milk?\n")
     done = pycrorm("export", "root_failures", "--with", "limit=many", "--out", tmp_path / "g.csv", cwd=kitchen)
     assert one_line_of(done) == "pycrorm: limit of root_failures must be of the type int, got 'many'"
+    done = pycrorm("export", "root_failures", "--with", "limit=1", "--with", "limit=2", cwd=kitchen)
+    assert one_line_of(done) == "pycrorm: limit of root_failures is given twice: give one value"
     done = pycrorm("export", "1", "--out", tmp_path / "h.mcap", "--fps", "5", cwd=kitchen)
     assert (done.returncode, "choose the clock `event`" in one_line_of(done)) == (2, True)
     done = pycrorm("export", cwd=kitchen)
