@@ -71,7 +71,9 @@ def report(
     --status, --since, --tag, --robot, --text and --limit choose among the episodes of --all, as in `pycrorm episodes`.
     Exit code 1 if --all met an episode whose events cannot be read; its row has the error, and all others have pages.
     """
-    if every == (episode is not None):
+    if every and episode is not None:
+        raise CallerError(f"name the episode {episode} or write all of them with --all, not both")
+    if not every and episode is None:
         raise CallerError("name an episode, for example `pycrorm report last`, or write all of them with --all")
     choice = EpisodeChoice(status, parse_since(since), tuple(tag or ()), robot, text, limit)
     if not every and choice != EpisodeChoice():

@@ -49,10 +49,7 @@ def test_a_file_that_exists_is_replaced_only_when_asked(recorded: Path, tmp_path
     [
         (("77",), "pycrorm: there is no episode '77' (`pycrorm episodes` lists all 3)"),
         ((), "pycrorm: name an episode, for example `pycrorm report last`, or write all of them with --all"),
-        (
-            ("1", "--all"),
-            "pycrorm: name an episode, for example `pycrorm report last`, or write all of them with --all",
-        ),
+        (("1", "--all"), "pycrorm: name the episode 1 or write all of them with --all, not both"),
         (("1", "--tag", "x"), "pycrorm: an option chooses among all episodes (tag x): add --all"),
         (("--all", "--from", "3"), "pycrorm: --from and --to choose events of one episode: name it instead of --all"),
         (("--all", "--robot", "none"), "pycrorm: no episode matches these options; the memory has no robot none"),
