@@ -218,6 +218,7 @@ def test_an_unknown_tag_or_robot_is_answered_with_the_nearest_one(tmp_path: Path
     for options, mistake in {
         ("--tag", "kitchn"): "the memory has no tag kitchn; did you mean kitchen?",
         ("--tag", "kitchen", "--tag", "nihgt"): "the memory has no tag nihgt",
+        ("--tag", ""): "the memory has no tag ''",
         ("--robot", "Turtle"): "the memory has no robot Turtle; did you mean turtle?",
         ("--tag", "kitchen", "--status", "FAILED"): "`pycrorm episodes` lists all",
     }.items():

@@ -46,7 +46,7 @@ async def unknown_name(reading: EpisodeReader, names: Mapping[str, str]) -> str:
             rows = await reading.rows(_RECORDED[argument], simulated=True)
             valid += [each for (each,) in rows if each is not None]
         if not _is_one(argument, name, valid):
-            return f"the memory has no {_WHATS.get(argument, argument)} {name}{nearest(name, valid)}"
+            return f"the memory has no {_WHATS.get(argument, argument)} {name or repr(name)}{nearest(name, valid)}"
     return ""
 
 
