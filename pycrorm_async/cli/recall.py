@@ -73,6 +73,8 @@ def recall(
     if follows:
         _follows(parsed, like, url, spool, status=status, reason=reason, as_json=as_json)
         return
+    if like is None and not any(parsed[:-1]):  # `only:` chooses among the cases of a cue
+        raise CallerError("name a type or features, for example `pycrorm recall PickUpAction arm=LEFT`, or add --like")
     if like is not None and cue:
         raise CallerError("--like takes the cue from an action: leave out the type and the features")
 

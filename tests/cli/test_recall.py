@@ -101,7 +101,8 @@ def test_a_type_that_never_occurred_is_an_empty_answer_with_a_note(folder: Path)
 
 
 WRONG: dict[str, tuple[list[str], dict[str, Any]]] = {
-    "the cue is empty": ([], {}),
+    "name a type or features, for example `pycrorm recall PickUpAction arm=LEFT`": ([], {}),
+    "or add --like": (["only:arm=LEFT"], {}),
     "did you mean arm?": ([GRIP, "amr=LEFT"], {}),
     "(FEATURE~NUMBER)": ([GRIP, "level=high"], {}),
     "'high' is not a number": ([GRIP, "level~high"], {}),

@@ -21,6 +21,7 @@ from pycrorm_async.recall.following import Relation
 from pycrorm_async.recall.reading import running_cases
 from pycrorm_async.recall.reading.recall import Recall
 from pycrorm_async.recall.reading.running_cases import ProcessCases
+from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world import Arms
 from tests.recall.sliding_grips import (
     FETCH,
@@ -121,6 +122,8 @@ async def test_other_wrong_arguments_are_refused_in_one_line(recall: Recall) -> 
         await recall(3)  # type: ignore[arg-type]
     with pytest.raises(CallerError, match="give the type of the actions"):
         await recall.follows(None)  # type: ignore[arg-type]
+    with pytest.raises(CallerError, match="there is no status 'FALED'; did you mean FAILED"):
+        await recall.follows(GRIP, status="FALED")
     with pytest.raises(CallerError, match="'1/20' is not a case"):
         await recall.like("1/20")  # type: ignore[arg-type]
     with pytest.raises(CallerError, match="activation must be a number, got 'often'"):
@@ -155,6 +158,8 @@ async def test_what_follows_is_counted(recall: Recall) -> None:
     after = await recall.follows(GripSlidingActionPerformable, reason=SlipperyFailure)
     assert next((each.type, each.cases) for each in after.followers) == (GRIP, 3)
     assert after.cases == 4
+    for status in ("failed", TaskStatus.FAILED):
+        assert await recall.follows(GRIP, status=status, reason="SlipperyFailure") == after
 
 
 async def test_what_is_like_a_case_does_not_contain_it(recall: Recall) -> None:

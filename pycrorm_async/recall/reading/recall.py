@@ -20,6 +20,7 @@ from pycrorm_async.clock import SYSTEM_CLOCK, Clock
 from pycrorm_async.errors import CallerError, MissingExtra
 from pycrorm_async.plan.object_designators import ObjectDesignator
 from pycrorm_async.query.as_of import AnyEpisode
+from pycrorm_async.query.asking.columns import member_of
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.snapshot import Moment
 from pycrorm_async.recall.activation import Forgotten
@@ -42,6 +43,7 @@ from pycrorm_async.recall.reading.cue_arguments import (
 )
 from pycrorm_async.recall.reading.database_source import DatabaseSource
 from pycrorm_async.recall.reading.present_situation import present_situation
+from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.objects import Object
 
 if TYPE_CHECKING:
@@ -243,10 +245,14 @@ class Recall:
         Args:
             type: a designator class or its dtype.
             status, reason: how they ended, and the class of the failure or its name; by default any.
+
+        Raises `CallerError` for a status that is none.
         """
         dtype = dtype_of(type)
         if dtype is None:
             raise CallerError("give the type of the actions, as in `follows(PickUpAction)`")
+        if status is not None:
+            status = member_of(TaskStatus, word(status), "status")
         wanted = {name: word(each) for name, each in (("status", status), ("reason", reason)) if each is not None}
         sequences = await self._reader.sequences(dtype, aliases_of(type))
         return sequences.follows(dtype, **wanted)
