@@ -177,6 +177,14 @@ async def test_comments_may_follow_the_semicolon_of_a_query(sql: _Sql) -> None:
             await sql.query(text)
 
 
+async def test_a_text_that_is_not_utf_8_is_refused_with_the_way_to_read_it(sql: _Sql) -> None:
+    if not sql.is_sqlite:
+        return
+    with pytest.raises(QueryRefused, match=r"^the query has a text that is not UTF-8: select it as bytes, with CAST"):
+        await sql.query("SELECT CAST(x'66ff' AS TEXT)")
+    assert (await sql.query("SELECT CAST(CAST(x'66ff' AS TEXT) AS BLOB)"))[1] == [(b"f\xff",)]
+
+
 async def test_a_statement_that_changes_a_view_may_only_read(sql: _Sql) -> None:
     for text in ("UPDATE pose SET x = 1", "DELETE FROM pose", "INSERT INTO action (id) VALUES (1)"):
         with pytest.raises(QueryRefused, match=r"^a query may only read: it is one SELECT, or WITH … SELECT"):

@@ -157,6 +157,8 @@ def _refusal(
         return QueryRefused(ONLY_READS)
     if code == sqlite3.SQLITE_TOOBIG and text == "string or blob too big":
         return QueryRefused(_TOO_LARGE)
+    if text.startswith("Could not decode to UTF-8 column"):
+        return QueryRefused("the query has a text that is not UTF-8: select it as bytes, with CAST(… AS BLOB)")
     if code in _NO_ROOM:
         return QueryRefused(_TOO_MUCH.format("space for temporary files"))
     if code is None or code & 0xFF in _REFUSALS:
