@@ -19,6 +19,7 @@ from pycrorm_async.events.types import NodeStarted
 from pycrorm_async.operations.copy import CopySummary, copy_episodes
 from pycrorm_async.operations.destination import LogAndTables
 from pycrorm_async.settings import Settings
+from pycrorm_async.writer.retry import Backoff
 from tests.copying.memories import (
     PATIENT,
     append_in_own_thread,
@@ -125,6 +126,32 @@ async def test_a_computed_end_is_copied_like_any_event(new_url: New, new_file: N
 
 
 # --- two sources ------------------------------------------------------------------------------------------------------
+
+
+async def test_a_copy_repeats_each_step_in_which_another_process_hinders_it(
+    new_file: New, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source, target = new_file(), new_file()
+    await append_and_fold(source, run_of(episode(1), 1, 2))
+    monkeypatch.setattr("pycrorm_async.operations.copy.BRIEF", Backoff(first_s=0, longest_s=0, attempts_max=2))
+    hindered: list[str] = []
+
+    def hinder(step: str) -> None:
+        method = getattr(LogAndTables, step)
+
+        async def fail_once(self: LogAndTables, *arguments: Sequence[Record]) -> object:
+            if step not in hindered:
+                hindered.append(step)
+                raise DatabaseUnavailable(f"another process hinders the {step}")
+            return await method(self, *arguments)
+
+        monkeypatch.setattr(LogAndTables, step, fail_once)
+
+    for step in ("append", "fold_next_batch", "fold"):
+        hinder(step)
+    await copy_episodes(source, target)
+    assert hindered == ["append", "fold_next_batch", "fold"]
+    assert_same(source, target)
 
 
 @pytest.mark.soak
