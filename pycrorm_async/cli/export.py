@@ -75,14 +75,18 @@ def export(
     as_json: JsonOption = False,
 ) -> int:
     """Write episodes, or the rows of a view, to a file, with a manifest from which it can be made again."""
-    if (again is None) == (not what):
+    if again is not None and what:
+        raise CallerError(f"name {' '.join(what)} or make an export again with --again, not both")
+    if again is None and not what:
         raise CallerError("name what to export, for example `pycrorm export last --out last.parquet`, or --again")
     if again is not None:
         if file_format is not None or episode or arguments or clock is not None or fps is not None or images:
             raise CallerError("--again takes all but --out and --force from the manifest: leave the other options out")
         return _again(again, out, url, spool, force=force, as_json=as_json)
     assert what, "checked above"
-    target = out if out is not None else Path(f"{'-'.join(what)[:100]}.{file_format or 'parquet'}")
+    if out is None:
+        file_format = file_format or "parquet"
+        out = Path(f"{'-'.join(what)[:100].replace('/', '-')}.{file_format}")
     options: dict[str, Any] = {"file_format": file_format, "clock": clock, "fps": fps}
     options["images"] = _size(images)
     options["arguments"] = _arguments(what[0], arguments or [])
@@ -90,11 +94,11 @@ def export(
     async def write(report_progress: ProgressCallback | None) -> Exported:
         async with Reading.open(url) as reading:
             return await write_export(
-                reading, what, target, episodes=episode or (), force=force, report_progress=report_progress, **options
+                reading, what, out, episodes=episode or (), force=force, report_progress=report_progress, **options
             )
 
     interrupt_on_termination()
-    with progress_bar("exporting", unit=_unit(file_format or format_of(target))) as report_progress:
+    with progress_bar("exporting", unit=_unit(file_format or format_of(out))) as report_progress:
         exported = asyncio.run(write(report_progress if stderr.is_terminal else None))
     note_pending_events(url, spool)
     _print(exported, as_json=as_json)

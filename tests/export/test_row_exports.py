@@ -442,6 +442,11 @@ def test_the_command_writes_compares_and_names_mistakes_in_one_line(kitchen: Pat
     assert one_line_of(done) == "pycrorm: limit of root_failures is given twice: give one value"
     done = pycrorm("export", "1", "--out", tmp_path / "h.mcap", "--fps", "5", cwd=kitchen)
     assert (done.returncode, "choose the clock `event`" in one_line_of(done)) == (2, True)
+    for name in ("a/b", ""):
+        done = pycrorm("export", name, cwd=kitchen)
+        assert one_line_of(done) == f"pycrorm: the memory has no episode, view, class or question '{name}'"
+    done = pycrorm("export", "last", "--again", tmp_path / "both.parquet.manifest.json", cwd=kitchen)
+    assert one_line_of(done) == "pycrorm: name last or make an export again with --again, not both"
     done = pycrorm("export", cwd=kitchen)
     assert (done.returncode, one_line_of(done)[:32]) == (2, "pycrorm: name what to export, fo")
 
