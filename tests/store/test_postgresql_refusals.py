@@ -149,12 +149,13 @@ async def test_a_login_without_rights_is_refused(
     ask(url, f"REVOKE CREATE ON DATABASE {guarded} FROM guarded")
     theirs = server.url(guarded, user="guarded", password=WRITTEN)
     error = await refused(theirs, caplog)
-    assert str(error).endswith(f"permission denied for database {guarded}")
+    advice = "use a login with this right (operations/README.md, PostgreSQL)"
+    assert str(error).endswith(f"permission denied for database {guarded}: {advice}")
     await (await EventLog.open(DatabaseAddress.parse(url), create=True)).close()
     for create in (True, False):
         error = await refused(theirs, caplog, create=create)
         assert type(error) is DatabaseUnavailable
-        assert str(error).endswith("permission denied for schema pycrorm")
+        assert str(error).endswith(f"permission denied for schema pycrorm: {advice}")
 
 
 @pytest.mark.slow

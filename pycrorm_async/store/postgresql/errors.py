@@ -32,13 +32,14 @@ _ROW_FAULTS: tuple[type[Exception], ...] = (
 )
 """The errors of a row that the database cannot store."""
 
+_NO_RIGHT = "42501"
 _UNAVAILABLE = (
     "08",  # connection
     "25",  # invalid transaction state, such as a read-only one
     "28",  # authentication failed
     "3D",  # no such database
     "40",  # rolled back: deadlock, serialisation
-    "42501",  # insufficient privilege
+    _NO_RIGHT,
     "53",  # out of memory, disk or connections
     "55",  # lock not available in time
     "57",  # shutting down, cancelled
@@ -85,6 +86,10 @@ def translate_error(error: Exception, database: str) -> PycrormError:
         return DamageError(f"{database} is damaged: {text}")
     if _is_missing(code, text):
         return DatabaseUnavailable(f"{database}: {text}: a part of the memory is missing; restore it from a backup")
+    if code == _NO_RIGHT:
+        return DatabaseUnavailable(
+            f"{database}: {text}: use a login with this right (operations/README.md, PostgreSQL)"
+        )
     if code.startswith(_UNAVAILABLE):
         return DatabaseUnavailable(f"{database}: {text}")
     if not code or isinstance(error, InterfaceError):  # the connection was refused, reset, closed or timed out
