@@ -19,7 +19,7 @@ from hypothesis import HealthCheck, settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.commands import fork_child
-from tests.databases import Server, server_in_memory
+from tests.databases import Server, put_memory, server_in_memory
 from tests.long_modules import long_modules_first
 from tests.report.browser import Browser, browser, chromium
 from tests.soak_turns import current_commit, place_of, turn_of
@@ -47,15 +47,18 @@ def chrome(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
 
 @pytest.fixture(params=["sqlite", "postgresql"])
 def database_url(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str]:
-    """The URL of a new memory, for each test on both kinds of database; on SQLite its file does not exist yet.
+    """The URL of a new, empty memory, for each test on both kinds of database.
 
-    For a test marked `empty_database` the PostgreSQL database holds no memory either.
+    For a test marked `empty_database` it holds no memory: the PostgreSQL database is empty, and the SQLite file does
+    not exist.
     """
+    is_empty = request.node.get_closest_marker("empty_database") is not None
     if request.param == "sqlite":
-        yield f"sqlite:///{tmp_path / 'memory.db'}"
+        file = tmp_path / "memory.db"
+        yield f"sqlite:///{file}" if is_empty else put_memory(file)
         return
     running: Server = request.getfixturevalue("server")
-    url = running.new_database() if request.node.get_closest_marker("empty_database") else running.new_memory()
+    url = running.new_database() if is_empty else running.new_memory()
     yield url
     running.drop_soon(url)  # several hundred files, which would be written to the disk and deleted at the end
 
@@ -72,7 +75,7 @@ async def log(database_url: str) -> AsyncIterator[EventLog]:
 def module_database_url(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """A new memory of each kind for all tests of a module, which fill it once and then only read it."""
     if request.param == "sqlite":
-        yield f"sqlite:///{tmp_path_factory.mktemp('memory') / 'memory.db'}"
+        yield put_memory(tmp_path_factory.mktemp("memory") / "memory.db")
         return
     running: Server = request.getfixturevalue("server")
     url = running.new_memory()

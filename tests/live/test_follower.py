@@ -21,6 +21,7 @@ from pycrorm_async.report import episode_fold
 from pycrorm_async.report.overview_data import newest_episodes, overview_document
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.world import Pose
+from tests.databases import put_memory
 from tests.live.conftest import robot_in
 
 
@@ -50,7 +51,8 @@ def open_files() -> list[str]:
 
 
 def url_of(folder: Path) -> str:
-    return f"sqlite:///{folder / 'pycrorm.db'}"
+    """Return the URL of the memory in this folder. The first call makes it."""
+    return put_memory(folder / "pycrorm.db")
 
 
 async def test_a_listener_gets_each_part_once_and_the_list_what_runs(database_url: str, tmp_path: Path) -> None:
@@ -136,7 +138,7 @@ async def test_one_that_is_cancelled_while_it_replaces_its_database_leaves_no_fi
 
 
 async def test_a_database_that_is_missing_is_a_fault_until_it_exists(tmp_path: Path) -> None:
-    async with followed(url_of(tmp_path)) as follower, follower.listening(follower.overview):
+    async with followed(f"sqlite:///{tmp_path / 'pycrorm.db'}") as follower, follower.listening(follower.overview):
         assert await follower.changed_since(0, 10)
         assert follower.fault is not None
         assert "does not exist" in follower.fault

@@ -8,6 +8,7 @@ from sqlalchemy import select
 
 from pycrorm_async import Memory, Reading
 from pycrorm_async.plan import ActionAbstract
+from tests.databases import put_memory
 
 
 @dataclass
@@ -25,4 +26,5 @@ async def texts(memory: Memory | Reading) -> list[str]:
 
 
 def url_of(folder: Path) -> str:
-    return f"sqlite:///{folder}/memory.db"
+    """Return the URL of the memory in this folder. The first call makes it."""
+    return put_memory(folder / "memory.db")

@@ -17,7 +17,7 @@ from pycrorm_async import Memory, RecordedEvent
 from pycrorm_async.events.types import EpisodeEnded, EpisodeStarted, NodeEnded, NodeStarted, ObjectAdded
 from pycrorm_async.plan import ActionAbstract, PlanFailure
 from pycrorm_async.world import BulletWorld, Object, ObjectType
-from tests.databases import ask
+from tests.databases import ask, put_memory
 
 pytestmark = pytest.mark.slow
 
@@ -33,7 +33,7 @@ class SayActionPerformable(ActionAbstract):
 
 @pytest.fixture
 def url(tmp_path: Path) -> str:
-    return f"sqlite:///{tmp_path}/memory.db"
+    return put_memory(tmp_path / "memory.db")
 
 
 async def test_every_event_arrives_once_in_order_including_the_end_of_a_failed_node(url: str) -> None:

@@ -15,6 +15,7 @@ from pycrorm_async.orm import Pose as PoseRow
 from pycrorm_async.orm import TaskTreeNode
 from pycrorm_async.plan import ActionAbstract, simulated_robot
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose, WorldObserver
+from tests.databases import put_memory
 
 MILK_AT = (1.3, 1.0, 0.9)
 CEREAL_AT = (1.3, 0.7, 0.95)
@@ -57,7 +58,8 @@ class FailingActionPerformable(ActionAbstract):
 
 
 def url_of(folder: Path) -> str:
-    return f"sqlite:///{folder}/memory.db"
+    """Return the URL of the memory in this folder. The first call makes it."""
+    return put_memory(folder / "memory.db")
 
 
 @asynccontextmanager

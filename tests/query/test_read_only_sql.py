@@ -23,7 +23,7 @@ from pycrorm_async.query.sql.read_only import DEFAULT_LIMITS, ReadOnlySql, SqlLi
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.postgresql.roles import GRANTS
-from tests.databases import Server, ask_each, change_each, run_in_own_loop
+from tests.databases import Server, change_each, open_connection, run_in_own_loop
 from tests.full_disk import files_of_at_most
 from tests.projections.event_script import NAVIGATE, PICK_UP, SAYING, declarations
 from tests.projections.factories import append_and_fold
@@ -345,16 +345,17 @@ ON_POSTGRESQL = {
 
 
 async def test_every_attack_is_refused_and_changes_nothing(owner_url: str, sql: _Sql, tmp_path: Path) -> None:
-    before = _state(owner_url)
-    for attack, text in {**ON_BOTH, **(ON_SQLITE if sql.is_sqlite else ON_POSTGRESQL)}.items():
-        with pytest.raises(QueryRefused):
-            pytest.fail(f"{attack} was answered with {await sql.query(text.format(folder=tmp_path))}")
-        assert list(tmp_path.iterdir()) == [], attack
-        assert _state(owner_url) == before, attack
+    async with open_connection(owner_url) as query:
+        before = [await query(each) for each in _state_of(owner_url)]
+        for attack, text in {**ON_BOTH, **(ON_SQLITE if sql.is_sqlite else ON_POSTGRESQL)}.items():
+            with pytest.raises(QueryRefused):
+                pytest.fail(f"{attack} was answered with {await sql.query(text.format(folder=tmp_path))}")
+            assert list(tmp_path.iterdir()) == [], attack
+            assert [await query(each) for each in _state_of(owner_url)] == before, attack
 
 
-def _state(url: str) -> list[list[Any]]:
-    """Return the schema, the log and a sequence, which a transaction that is rolled back would still change."""
+def _state_of(url: str) -> list[str]:
+    """Return queries of the schema, the log and a sequence, which a transaction that is rolled back would change."""
     if is_sqlite(url):
         statements = ["SELECT name, sql FROM sqlite_master", "PRAGMA user_version", "PRAGMA journal_mode"]
     else:
@@ -364,8 +365,7 @@ def _state(url: str) -> list[list[Any]]:
             "SELECT count(*) FROM pg_largeobject_metadata",
             "SELECT count(*) FROM pg_locks WHERE locktype = 'advisory'",
         ]
-    statements.append("SELECT episode, sequence, type, payload FROM event ORDER BY 1, 2")
-    return ask_each(url, statements)
+    return [*statements, "SELECT episode, sequence, type, payload FROM event ORDER BY 1, 2"]
 
 
 @pytest.mark.parametrize(

@@ -10,11 +10,12 @@ from typing import Any
 from pycrorm_async.projections.verify.verify import verify
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from tests.databases import ask
+from tests.databases import ask, put_memory
 
 
 def url_of(folder: Path) -> str:
-    return f"sqlite:///{folder / 'memory.db'}"
+    """Return the URL of the memory in this folder. The first call makes it."""
+    return put_memory(folder / "memory.db")
 
 
 def nodes(folder: Path) -> list[tuple[Any, ...]]:
