@@ -224,6 +224,7 @@ async def test_a_question_with_a_wrong_argument_is_refused(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_every_question_is_exported_with_declared_types_of_episodes_that_have_ended(
     either: Reading, tmp_path: Path
 ) -> None:
@@ -311,6 +312,7 @@ async def test_a_cancelled_export_closes_its_file_after_the_last_write(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_parts_of_killed_exports_are_deleted_and_those_of_running_ones_kept(
     either: Reading, tmp_path: Path
 ) -> None:
@@ -382,6 +384,7 @@ async def test_an_episode_that_the_tables_hold_in_part_is_left_out(tmp_path: Pat
         ("2", (), "none/a.csv", CallerError, "none does not exist: create it first"),
     ],
 )
+@pytest.mark.soak_on("postgresql")
 async def test_mistakes_are_named_and_leave_no_file(
     either: Reading,
     tmp_path: Path,
@@ -396,6 +399,7 @@ async def test_mistakes_are_named_and_leave_no_file(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_without_pyarrow_the_error_names_the_extra(
     either: Reading, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -44,6 +44,7 @@ SMALL = Experiment(rollouts=600, evaluate=30, held_out=30, rounds=2)
 
 
 @pytest.mark.slow
+@pytest.mark.soak_on("postgresql")
 async def test_a_recorded_policy_is_read_back_by_its_name(database_url: str, tmp_path: Path) -> None:
     policy = default_policy()
     async with Memory.open(database_url, spool=tmp_path / "spool") as memory:
@@ -117,6 +118,7 @@ async def test_each_try_of_a_retried_pick_up_names_its_policy_and_the_memory_hol
         assert await read_policy(memory.reading, tries[0].policy or "") == OTHER
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_a_policy_that_is_not_recorded_is_named(database_url: str, tmp_path: Path) -> None:
     async with Memory.open(database_url, spool=tmp_path / "spool") as memory:
         with pytest.raises(CallerError, match="the memory holds no policy '0123456789ab'"):

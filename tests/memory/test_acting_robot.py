@@ -71,6 +71,7 @@ async def rounds(robot: Object, y: float) -> None:
             await MoveTorsoActionPerformable(0.1 * number).perform()
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_two_tasks_move_their_own_robots_and_each_node_has_the_state_of_its_robot(
     database_url: str, robots: tuple[Object, Object], tmp_path: Path
 ) -> None:

@@ -61,6 +61,7 @@ async def test_what_is_not_known_is_null(database_url: str, tmp_path: Path) -> N
     assert (episode.clock_synchronized, episode.clock_error_us, episode.world) == (None,) * 3
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_the_scene_of_a_pick_up_is_the_world_that_its_episode_entered(database_url: str, tmp_path: Path) -> None:
     async with Memory.open(database_url, spool=tmp_path / "spool") as memory:
 
@@ -79,6 +80,7 @@ async def test_the_scene_of_a_pick_up_is_the_world_that_its_episode_entered(data
         assert await scenes() == ["BulletWorld (DIRECT): pr2 (ROBOT), milk (MILK)"]
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_a_world_that_is_entered_inside_an_episode_is_described(database_url: str, tmp_path: Path) -> None:
     async with Memory.open(database_url, spool=tmp_path / "spool") as memory:
         async with memory.episode(description="left before the end"):

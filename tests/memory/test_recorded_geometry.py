@@ -162,6 +162,7 @@ async def test_a_robot_is_seen_again_by_a_fresh_process_when_its_files_are_gone(
         assert links[link] == pytest.approx(pose, abs=1e-6), link
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_the_boxes_of_an_arm_cover_its_meshes_and_the_files_hold_the_meshes_themselves(
     database_url: str, tmp_path: Path
 ) -> None:
@@ -252,6 +253,7 @@ def killed_plan(url: str, spool: Path, robot: Path) -> list[float]:
 
 
 @pytest.mark.slow
+@pytest.mark.soak_on("postgresql")
 async def test_a_robot_of_a_plan_that_was_killed_before_anything_was_stored_is_seen_again(
     database_url: str, tmp_path: Path
 ) -> None:

@@ -55,6 +55,7 @@ async def test_a_robot_that_is_added_again_has_one_row(database_url: str, tmp_pa
         assert [[(each.name, each.serial) for each in one.robots] for one in summaries] == robots
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_an_object_that_was_too_heavy_is_recorded_with_its_mass_and_the_reason(
     database_url: str, tmp_path: Path
 ) -> None:

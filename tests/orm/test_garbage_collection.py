@@ -45,6 +45,7 @@ def collections() -> Iterator[list[int]]:
     gc.callbacks.remove(note)
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_a_query_of_many_rows_triggers_few_collections(log: EventLog, collections: list[int]) -> None:
     script = Script()
     for number in range(_ROWS):

@@ -86,12 +86,14 @@ async def test_attributes_are_loaded_after_the_memory_is_closed_and_in_other_thr
     assert rows[3].items == []
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_an_object_that_was_loaded_on_access_loads_what_is_read_of_it(reading: Reading) -> None:
     robot_pose = (await actions_of(reading))[1].robot_state.pose
     gc.collect()  # the actions that the query returned, and all that only they kept
     assert robot_pose.position.x == 1
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_a_closed_session_is_freed_with_its_last_object(reading: Reading) -> None:
     async with reading.session() as session:
         session.expunge_all()

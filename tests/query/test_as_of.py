@@ -334,6 +334,7 @@ async def test_a_snapshot_can_be_printed(reading: Reading) -> None:
 # --- naming an episode ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_an_episode_can_be_named_by_number_id_or_last(log: EventLog) -> None:
     simulation = Script(3)
     simulation.put(EpisodeStarted("a thought", "me", "h", "1", "3.11", simulated=True, thought_by=NodeReference(ID, 5)))
@@ -398,6 +399,7 @@ async def test_an_episode_of_many_events_is_read_up_to_the_moment(log: EventLog)
         ({"sequence": True}, "sequence must be an integer, got True"),
     ],
 )
+@pytest.mark.soak_on("postgresql")
 async def test_an_invalid_moment_is_refused(reading: Reading, when: dict[str, Any], message: str) -> None:
     with pytest.raises(CallerError, match=message):
         await reading.as_of(1, **when)

@@ -143,6 +143,7 @@ async def test_objects_of_one_name_correspond_in_the_order_they_were_added(readi
     ]
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_an_unknown_or_impossible_episode_is_refused(reading: Reading) -> None:
     with pytest.raises(UnknownEpisode, match="there is no episode '9'"):
         await reading.diff(1, 9)

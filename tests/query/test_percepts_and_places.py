@@ -85,6 +85,7 @@ def test_a_snapshot_keeps_the_latest_and_counts_all() -> None:
     assert then.tree[1].detected == 400
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_show_counts_them_in_the_tree_and_lists_them_in_full_and_as_json(
     reading: Reading, database_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -106,6 +106,7 @@ async def test_an_episode_is_found_by_number_by_id_or_as_the_last(reading: Readi
         ("00000000-0000", "2 episodes have an id that begins with '00000000-0000': use more of its digits"),
     ],
 )
+@pytest.mark.soak_on("postgresql")
 async def test_an_unknown_or_ambiguous_episode_is_refused(reading: Reading, name: str, message: str) -> None:
     with pytest.raises(UnknownEpisode) as raised:
         await reading.episode(name)

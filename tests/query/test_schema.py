@@ -73,6 +73,7 @@ async def test_a_view_that_does_not_exist_is_answered_with_the_nearest(reading: 
 
 
 @pytest.mark.slow
+@pytest.mark.soak_on("postgresql")
 def test_the_command_prints_text_json_and_a_diagram(url: str, tmp_path: Path) -> None:
     done = pycrorm("schema", "pose", "--json", "--url", url, cwd=tmp_path)
     [pose] = json.loads(done.stdout)

@@ -36,6 +36,14 @@ def opened(chrome: Browser, pages: dict[str, Path]) -> Iterator[Tab]:
         yield tab
 
 
+@pytest.fixture(scope="module")
+def opened_drive(chrome: Browser, pages: dict[str, Path]) -> Iterator[Tab]:
+    """Yield the page of the courier's drive in the same way."""
+    with chrome.open(pages["drives"]) as tab:
+        tab.settle()
+        yield tab
+
+
 def position(tab: Tab, name: str) -> list[float]:
     return [round(each, 2) for each in tab.ask(POSE.format(name))]
 
@@ -101,8 +109,9 @@ def test_keys_and_the_slider_move_the_moment_and_the_address_follows(chrome: Bro
         tab.wait_for("location.hash === '#e30'")
         tab.press("f")
         assert tab.ask("pycrormPage.selected.reason") == "IKError"
+        shown = tab.ask("pycrormPage.event")
         tab.press(" ", code="Space")
-        tab.wait_for("pycrormPage.event > 40")
+        tab.wait_for(f"pycrormPage.event > {shown}")
         tab.press(" ", code="Space")
         assert_quiet(tab, pages["plan"])
 
@@ -182,11 +191,10 @@ def test_the_page_of_a_lost_episode_shows_the_world_at_its_last_event(chrome: Br
         assert_quiet(tab, pages["dies"])
 
 
-def test_a_robot_that_is_not_the_pr2_is_drawn(chrome: Browser, pages: dict[str, Path]) -> None:
-    with chrome.open(pages["drives"]) as tab:
-        assert position(tab, "courier") == [1.0, 0.5, 0.0]
-        assert tab.ask("pycrormPage.bodies.of(pycrormPage.episode.objects[0]).links.size") > 5
-        assert_quiet(tab, pages["drives"])
+def test_a_robot_that_is_not_the_pr2_is_drawn(opened_drive: Tab, pages: dict[str, Path]) -> None:
+    assert position(opened_drive, "courier") == [1.0, 0.5, 0.0]
+    assert opened_drive.ask("pycrormPage.bodies.of(pycrormPage.episode.objects[0]).links.size") > 5
+    assert_quiet(opened_drive, pages["drives"])
 
 
 def test_recorded_text_is_never_markup(opened: Tab, pages: dict[str, Path]) -> None:
@@ -235,16 +243,16 @@ def test_a_table_of_episodes_counts_failures_by_reason_and_leads_to_the_pages(
 
 @pytest.mark.soak_on("courier")
 @pytest.mark.parametrize(
-    ("page", "number", "name"), [("plan", 1, "pr2"), ("drives", 3, "courier"), ("drives", 3, "other")]
+    ("page", "number", "name"), [("opened", 1, "pr2"), ("opened_drive", 3, "courier"), ("opened_drive", 3, "other")]
 )
 async def test_every_link_is_where_bullet_has_it(
-    chrome: Browser, pages: dict[str, Path], recorded: Path, page: str, number: int, name: str
+    request: pytest.FixtureRequest, recorded: Path, page: str, number: int, name: str
 ) -> None:
     body = f"pycrormPage.bodies.of(pycrormPage.episode.objects.find((each) => each.name === '{name}'))"
     point = "new THREE.Vector3().setFromMatrixPosition(link.matrixWorld).toArray()"
-    with chrome.open(pages[page]) as tab:
-        drawn = tab.ask(f"Object.fromEntries([...{body}.links].map(([name, link]) => [name, {point}]))")
-        event = tab.ask("pycrormPage.event")
+    tab: Tab = request.getfixturevalue(page)
+    drawn = tab.ask(f"Object.fromEntries([...{body}.links].map(([name, link]) => [name, {point}]))")
+    event = tab.ask("pycrormPage.event")
     async with Reading.open(f"sqlite:///{recorded / 'pycrorm.db'}") as reading:
         then = await reading.as_of(number, sequence=event)
     assert then.world.object(name).base_link == ("forearm_link" if name == "other" else None)

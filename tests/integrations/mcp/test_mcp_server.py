@@ -116,6 +116,7 @@ async def test_an_agent_asks_with_every_tool(url: str) -> None:
         assert of_bytes["rows"] == [[1.5, "00ff"]]
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_a_wrong_call_is_an_error_of_the_tool_in_one_line(url: str) -> None:
     async with agent_in_process(url) as agent:
         assert await agent.refused("show", episode=99) == ("there is no episode '99' (`pycrorm episodes` lists all 2)")
