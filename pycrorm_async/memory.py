@@ -219,7 +219,7 @@ class Memory(RecordingMemory):
         self._stack.push_async_callback(reading.close)
         if not by_daemon:
             with suppress(TablesForeign):  # recording works without tables; queries and `flush` raise this again
-                await reading.refresh()
+                await reading.refresh(maps=False)
         emitter = Emitter(queue, self._settings)
         provenance = Provenance.of(self._plan_source, self._settings, self._clock)
         episodes = OpenEpisodes(emitter, self._clock)

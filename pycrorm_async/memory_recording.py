@@ -141,7 +141,7 @@ class RecordingMemory(ReadableMemory, ABC):
             if unreported is not None:
                 raise unreported from fault
         if parts.reading.is_open:
-            await parts.reading.refresh()
+            await parts.reading.refresh(maps=False)
 
     def _unreported(self, fault: PycrormError) -> PycrormError | None:
         """Return the fault without parked episodes that a flush has reported; None if no other is left."""

@@ -3,6 +3,7 @@
     classes = DynamicClasses()
     united = unite(layout, payloads)
     classes.learn(united.accepted.values(), united.layout.renamed)
+    classes.map()
     classes.use_in(engine)                          # its rows of type SayingAction are read as SayingAction objects
     SayingAction = classes.of("SayingAction")
     classes.dispose()
@@ -65,16 +66,27 @@ class DynamicClasses:
         self._engines: list[AsyncEngine] = []
         self._declared: dict[str, list[DesignatorTypeDeclared]] = {}
         self._renamed: dict[str, str] = {}
+        self._unmapped: tuple[list[DesignatorTypeDeclared], dict[str, str]] | None = None
 
     def learn(
         self, declarations: Iterable[DesignatorTypeDeclared], renamed: Mapping[str, str] = MappingProxyType({})
     ) -> None:
-        """Generate classes for declared types without one, and add new fields to classes generated before.
+        """Take note of the declared types, for which `map` generates classes.
 
         Pass all declarations for which the memory has tables, in the order of their declaration, and no others: a class
         without tables would make every query of its base fail. `renamed` maps former names of types to present ones.
         """
-        self._renamed = dict(renamed)
+        self._unmapped = list(declarations), dict(renamed)
+
+    def map(self) -> None:
+        """Generate classes for declared types without one, and add new fields to classes generated before.
+
+        Call it before each query. It is apart from `learn` because a class takes 10 ms, and a program that only records
+        needs none.
+        """
+        if self._unmapped is None:
+            return
+        (declarations, self._renamed), self._unmapped = self._unmapped, None
         self._declared = {}
         for each in declarations:
             self._declared.setdefault(self._present_name(each.dtype), []).append(each)
@@ -93,6 +105,7 @@ class DynamicClasses:
     @property
     def present_names(self) -> dict[str, str]:
         """The present name of each type, by all its names."""
+        self.map()
         return {each: each for each in self._declared} | self._renamed
 
     def use_in(self, engine: AsyncEngine) -> None:
@@ -102,6 +115,7 @@ class DynamicClasses:
 
     def of(self, name: str | type) -> type[Designator]:
         """Return the mapped class of a dtype, a table or a designator class, also built-in. Raises `CallerError`."""
+        self.map()
         wanted = getattr(name, "dtype", name.__name__) if isinstance(name, type) else name
         of_table = (
             dtype
@@ -116,6 +130,7 @@ class DynamicClasses:
 
     def dispose(self) -> None:
         """Unmap all generated classes; existing objects keep plain values. Shared classes drop references to them."""
+        self._unmapped = None
         for engine in self._engines:
             known_classes(engine.dialect).adopt({})
             engine.sync_engine.clear_compiled_cache()

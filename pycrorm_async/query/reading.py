@@ -100,10 +100,7 @@ class Reading:
         return self._opened is not None
 
     async def close(self) -> None:
-        """Close the connections and dispose of the mapped classes. A second call has no effect.
-
-        Every query after it raises `CallerError`.
-        """
+        """Close the connections and unmap the classes, once; every query after it raises `CallerError`."""
         self._is_closed = True
         async with self._opening:
             log, self._opened = self._opened, None
@@ -111,8 +108,8 @@ class Reading:
             if log is not None:
                 await log.close()
 
-    async def refresh(self) -> None:
-        """Map the designator types that were declared since the last call; every session does this first."""
+    async def refresh(self, *, maps: bool = True) -> None:
+        """Learn the designator types that were declared since the last call, and map them unless `maps` is false."""
         await self._ready()
         declarations = await self._log.declarations()
         if declarations != self._declarations:
@@ -120,6 +117,8 @@ class Reading:
             united = unite(generation.layout, declarations)
             self._classes.learn(united.accepted.values(), united.layout.renamed)
             self._declarations = declarations
+        if maps:  # every session does this first
+            self._classes.map()
 
     async def present_names(self) -> Mapping[str, str]:
         """Return the present name of each type that was declared, by all the names that it had."""

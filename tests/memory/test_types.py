@@ -55,6 +55,17 @@ async def test_a_subclass_of_an_action_is_listed_among_that_action(tmp_path: Pat
             assert (picked.object.name, picked.object.pose.position.z) == ("cup", 3.0)
 
 
+async def test_a_memory_that_only_records_generates_no_class(tmp_path: Path) -> None:
+    identities = Designator.__mapper__.polymorphic_map
+    before = set(identities)
+    async with Memory.open(url_of(tmp_path)) as memory:
+        await NoteActionPerformable("a").perform()
+        await memory.flush()
+        assert set(identities) == before
+        mapped = memory.mapped(NoteActionPerformable)
+        assert set(identities) - before == {mapped.__mapper__.polymorphic_identity}
+
+
 async def test_a_process_that_lacks_the_class_still_reads_its_rows(tmp_path: Path) -> None:
     async with Memory.open(url_of(tmp_path)):
         await NoteActionPerformable("seen").perform()

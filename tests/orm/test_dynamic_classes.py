@@ -86,6 +86,7 @@ async def accepted(log: EventLog) -> list[DesignatorTypeDeclared]:
 async def classes_of(log: EventLog) -> AsyncIterator[DynamicClasses]:
     classes = DynamicClasses()
     classes.learn(await accepted(log))
+    classes.map()
     classes.use_in(log.engine)
     try:
         yield classes
@@ -203,6 +204,7 @@ async def test_a_type_that_appears_after_the_first_query_is_in_the_answer(log: E
         await projector.catch_up()
         assert names(await every(log, select(Action).order_by(Action.id))) == ["PickUpAction", "Action"]
         classes.learn(await accepted(log))
+        classes.map()
         assert names(await every(log, select(Action).order_by(Action.id))) == ["CarefulPickUpAction", "SayingAction"]
         assert names(await every(log, select(PickUpAction))) == ["CarefulPickUpAction"]
 
@@ -218,6 +220,7 @@ async def test_a_field_that_appears_later_is_an_attribute_of_the_existing_class(
         await log.append([*declarations(louder), *script.records])
         await projector.catch_up()
         classes.learn(await accepted(log))
+        classes.map()
         grown: Any = classes.of("SayingAction")
         assert grown is saying
         rows = await every(log, select(grown).order_by(grown.id))
@@ -253,6 +256,7 @@ def test_classes_of_memories_that_were_never_closed_do_not_collide() -> None:
         for _ in range(20):  # the next one may be at the address of the one before
             classes = DynamicClasses()
             classes.learn([saying])
+            classes.map()
             left.append((classes._registry, classes.of("UnclosedAction")))
             del classes
         assert len({each.__mapper__.polymorphic_identity for _, each in left}) == 20
@@ -343,6 +347,7 @@ gc.disable()
 for _ in range(2):
     classes = DynamicClasses()
     classes.learn([SAYING])
+    classes.map()
     classes.dispose()
 configure_mappers()
 """
