@@ -11,6 +11,7 @@ precise enough for bounding boxes, rays and pictures.
 
 from __future__ import annotations
 
+from functools import cache
 from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from xml.etree.ElementTree import Element, indent, tostring
@@ -23,6 +24,7 @@ _X, _Y, _Z = (1, 0, 0), (0, 1, 0), (0, 0, 1)
 _MESH_MODEL = "cmeel.prefix/share/example-robot-data/robots/pr2_description/urdf/pr2.urdf"
 
 
+@cache
 def pr2_urdf() -> str:
     """Return a PR2 of boxes as URDF text, with the names and dimensions of the real one; it refers to no other file.
 
