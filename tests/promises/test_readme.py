@@ -134,6 +134,6 @@ def test_the_readme_names_every_verb_and_no_other(tmp_path: Path) -> None:
     assert verbs == command.commands.keys()
     assert pycrorm("--help", cwd=tmp_path).returncode == 0
     for verb in sorted(verbs):
-        done = CliRunner().invoke(app(), [verb, "--help"])
+        done = CliRunner().invoke(app(verb), [verb, "--help"])  # as the command does
         assert done.exit_code == 0
         assert {"spool": "repair", "copy": "--from", "ask": "root_failures"}.get(verb, "--url") in done.stdout

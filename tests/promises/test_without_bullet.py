@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -112,10 +113,46 @@ ABSENT = "import sys; sys.modules |= dict.fromkeys(('pybullet', 'pycram_bullet',
 LINE = "no world can be opened, because no Bullet is installed: pip install 'pycrorm-async[world]'"
 
 
-@pytest.mark.parametrize("verb", ["demo", pytest.param("learn --rollouts 30", marks=pytest.mark.soak)])
-def test_a_verb_that_needs_a_world_first_names_what_to_install(tmp_path: Path, verb: str) -> None:
+REFUSED = """
+import contextlib, io, json, os
+
+from pycrorm_async.cli.main import main
+
+results = []
+for words in (["demo"], ["run", "sweep.py"]):
+    sys.argv = ["pycrorm", *words]
+    code = None
+    with contextlib.redirect_stderr(io.StringIO()) as printed:
+        try:
+            main()
+        except SystemExit as exiting:
+            code = exiting.code
+    results.append([code, printed.getvalue(), os.listdir()])
+print(json.dumps(results))
+"""
+SWEEP = "from pycrorm_async.world import BulletWorld\nasync def plan():\n    with BulletWorld():\n        pass\n"
+
+
+@pytest.fixture(scope="module")
+def refused(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """Return exit code, stderr and the folder's files after `demo` and then after `run sweep.py`, in one process."""
+    folder = tmp_path_factory.mktemp("refused")
+    (folder / "sweep.py").write_text(SWEEP)
+    done = run(ABSENT + "\n" + REFUSED, folder)
+    assert done.returncode == 0, done.stderr
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def test_a_verb_that_needs_a_world_first_names_what_to_install(refused: Any) -> None:
+    code, printed, files = refused[0]
+    assert (code, printed.count("\n"), files) == (2, 1, ["sweep.py"])
+    assert printed.startswith(f"pycrorm: {LINE}")
+
+
+@pytest.mark.soak
+def test_learn_first_names_what_to_install(tmp_path: Path) -> None:
     pytest.importorskip("jpt", reason="learn names the first missing package")
-    words = ["pycrorm", *verb.split()]
+    words = ["pycrorm", "learn", "--rollouts", "30"]
     done = run(f"{ABSENT} from pycrorm_async.cli.main import main; sys.argv = {words}; main()", tmp_path)
     assert done.returncode == 2
     assert one_line_of(done).startswith(f"pycrorm: {LINE}")
@@ -130,13 +167,10 @@ def test_the_error_of_a_world_names_what_to_install_and_how_long_that_takes(tmp_
     assert done.stdout.endswith(f" {LINE}{compiling if sys.version_info >= (3, 13) else ''}\n")
 
 
-def test_a_failed_plan_names_in_one_line_what_to_install(tmp_path: Path) -> None:
-    plan = "from pycrorm_async.world import BulletWorld\nasync def plan():\n    with BulletWorld():\n        pass\n"
-    (tmp_path / "sweep.py").write_text(plan)
-    words = ["pycrorm", "run", "sweep.py"]
-    done = run(f"{ABSENT} from pycrorm_async.cli.main import main; sys.argv = {words}; main()", tmp_path)
-    assert done.returncode == 1
-    assert one_line_of(done).startswith(f"pycrorm: the plan sweep.py:plan failed: BulletMissing: {LINE}")
+def test_a_failed_plan_names_in_one_line_what_to_install(refused: Any) -> None:
+    code, printed, _ = refused[1]
+    assert (code, printed.count("\n")) == (1, 1)
+    assert printed.startswith(f"pycrorm: the plan sweep.py:plan failed: BulletMissing: {LINE}")
 
 
 @pytest.mark.parametrize(

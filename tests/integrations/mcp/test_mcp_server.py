@@ -8,13 +8,11 @@ import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import pytest
-from mcp import Client, StdioServerParameters
 
 from pycrorm_async import Memory
-from pycrorm_async.integrations.mcp_server import memory_server
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.postgresql.roles import GRANTS
 from tests.commands import COMMAND, environment
@@ -22,6 +20,9 @@ from tests.databases import change_each, run_in_own_loop
 from tests.projections.event_script import NAVIGATE, PICK_UP, SAYING, declarations
 from tests.projections.factories import append_and_fold
 from tests.query.test_reading import episode
+
+if TYPE_CHECKING:  # at run time only in the process that runs these tests, because importing takes 0.5 s
+    from mcp import Client
 
 pytestmark = pytest.mark.slow
 
@@ -53,6 +54,8 @@ class Agent:
 
 @asynccontextmanager
 async def agent_of(url: str) -> AsyncIterator[Agent]:
+    from mcp import Client, StdioServerParameters
+
     command, *arguments = COMMAND
     server = StdioServerParameters(command=command, args=[*arguments, "mcp", "--url", url], env=environment())
     async with Client(server) as client:
@@ -62,6 +65,10 @@ async def agent_of(url: str) -> AsyncIterator[Agent]:
 @asynccontextmanager
 async def agent_in_process(url: str) -> AsyncIterator[Agent]:
     """Return an agent of a server in this process, because importing takes one of its own two seconds."""
+    from mcp import Client
+
+    from pycrorm_async.integrations.mcp_server import memory_server
+
     with DatabaseAddress.parse(url).located() as address:
         async with Client(memory_server(address)) as client:
             yield Agent(client)
