@@ -514,8 +514,8 @@ def test_a_memory_without_asyncio_answers_with_frames_and_rows(tmp_path: Path) -
 
 
 @pytest.mark.filterwarnings("ignore:no row answers")
-def test_names_are_found_whatever_their_letters_are(database_url: str) -> None:
-    with Memory.sync(database_url) as memory:
+def test_names_are_found_whatever_their_letters_are(database_url: str, tmp_path: Path) -> None:
+    with Memory.sync(database_url, spool=tmp_path / "spool") as memory:
         take = memory.recording.type("action", "TakeAction", {"thing": str})
         with memory.recording.episode(description="Fetch the Äpfel", tags=["harvest"]) as episode:
             episode.object_added("base", "turtle", "ROBOT", Pose([0, 0, 0]))
