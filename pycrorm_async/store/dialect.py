@@ -213,10 +213,6 @@ class Dialect(Protocol):
         """Make the transaction that begins now a snapshot."""
         ...
 
-    async def in_order(self, connection: AsyncConnection) -> None:
-        """Let ordered queries of this transaction read an index in order instead of sorting, for the first few rows."""
-        ...
-
     async def keep(self, connection: AsyncConnection, tables: Sequence[str]) -> bool:
         """Protect these tables from being dropped until the transaction ends.
 

@@ -198,10 +198,6 @@ class PostgreSQL:
     async def begin_snapshot(self, connection: AsyncConnection) -> None:
         await connection.exec_driver_sql("SET TRANSACTION ISOLATION LEVEL REPEATABLE READ")
 
-    async def in_order(self, connection: AsyncConnection) -> None:
-        # The planner overestimates the first few rows, and would read and sort all of them.
-        await connection.exec_driver_sql("SET LOCAL enable_sort = off")
-
     async def keep(self, connection: AsyncConnection, tables: Sequence[str]) -> bool:
         quote = connection.dialect.identifier_preparer.quote
         named = ", ".join(f"{TABLES_SCHEMA}.{quote(each)}" for each in tables)

@@ -179,9 +179,6 @@ class SQLite:
     async def begin_snapshot(self, connection: AsyncConnection) -> None:
         """Do nothing: a transaction is a snapshot."""
 
-    async def in_order(self, connection: AsyncConnection) -> None:
-        """Do nothing: SQLite reads an index in order if one fits."""
-
     async def keep(self, connection: AsyncConnection, tables: Sequence[str]) -> bool:  # the snapshot protects them
         existing = (await connection.exec_driver_sql("SELECT name FROM sqlite_master WHERE type = 'table'")).scalars()
         return set(tables) <= set(existing)

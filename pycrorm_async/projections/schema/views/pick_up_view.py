@@ -26,8 +26,7 @@ def _planner_hint(fact: ColumnElement[bool]) -> ColumnElement[bool]:
 
     Without it PostgreSQL read all succeeded nodes, ten times as many, to find the succeeded pick-ups; with it, it uses
     the index on the dtype (50,000 pick-ups in a good half of the time). It then underestimates the pick-ups by a factor
-    of ten, so a query for the latest of them must state its order (`Dialect.in_order`). SQLite starts with the rows of
-    the type anyway.
+    of ten, and reads and sorts all of them for the latest few. SQLite starts with the rows of the type anyway.
     """
     return PerDatabase(literal_column("1", Boolean()), postgresql=fact)
 
