@@ -1,6 +1,6 @@
 """Measure how much CPU time of its thread a plan of PyCRAM takes with and without this memory.
 
-    .venv-pycram/bin/python -m bench.pycram                              25 pairs for each writer, about two minutes
+    .venv-pycram/bin/python -m bench.pycram                              25 pairs for each writer, three minutes
     .venv-pycram/bin/python -m bench.pycram --quick                      two pairs
     .venv-pycram/bin/python -m bench.pycram --writer daemon --pairs 100  a narrow interval for one writer
 
@@ -11,8 +11,9 @@ measurement is `time.thread_time` of the plan's thread: wall times would be usel
 OpenBLAS gets one thread, because the plan's thread otherwise spins until another one has had its turn, which took up
 to twice the plan's own time on a busy machine. The garbage of the plans is collected before each of them, so that both
 kinds pay for their own; what was there before the first is left out, because its collection would take longer than a
-plan. `daemon`: no daemon drains the spool, which a process of its own would do. `thread`: the tables are made when the
-block ends, which is the default of `remember`; `idle`: whenever the plan is idle.
+plan. `daemon`: no daemon drains the spool, which a process of its own would do; `daemon-50ms`: synced every 50 ms, as
+other memories, instead of every 250. `thread`: the tables are made when the block ends, which is the default of
+`remember`; `idle`: whenever the plan is idle, synced every 50 ms.
 
 The script prints one JSON line: CPU of a plan in ms, the median ratio of a pair, its 95 % interval (of order
 statistics, which assumes no distribution) and quartiles, the median difference, and the ratio of the least times, which
@@ -60,6 +61,7 @@ def measure(folder: Path, pairs: int, only: str | None = None) -> dict[str, Any]
     gc.freeze()
     kinds: dict[str, dict[str, Any]] = {
         "daemon": {"writer": "daemon"},
+        "daemon-50ms": {"writer": "daemon", "settings": Settings(fold="at_end")},
         "thread": {"writer": "thread"},
         "idle": {"writer": "thread", "settings": Settings()},
     }
@@ -197,7 +199,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--pairs", type=int, default=_PAIRS)
-    parser.add_argument("--writer", choices=("daemon", "thread", "idle"))
+    parser.add_argument("--writer", choices=("daemon", "daemon-50ms", "thread", "idle"))
     given = parser.parse_args()
     pairs = 2 if given.quick else max(2, given.pairs)
     code = 1
