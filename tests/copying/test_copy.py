@@ -254,13 +254,14 @@ async def test_a_copy_that_is_killed_and_repeated_is_complete(new_url: New, new_
     dice = random.Random(seed)
     copied_logs: Logs = {}
     kills = 0
-    for _ in range(rounds):
+    for left in range(rounds, 0, -1):
         copying = ForkedProcess(copy_and_print, source, target)
         copying.wait_for_first_output()
-        until = sum(map(len, copied_logs.values())) + dice.randrange(2 * count // rounds)
+        copied = sum(map(len, copied_logs.values()))
+        until = copied + dice.randrange(2 * (count - copied) // (left + 1) + 1)  # leaves some for the later rounds
         while copying.process.is_alive() and int(copying.lines[-1] if copying.lines else 0) < until:  # noqa: ASYNC110
             await asyncio.sleep(0.001)
-        await asyncio.sleep(dice.random() * 0.02)
+        await asyncio.sleep(dice.random() * 0.01)
         kills += copying.process.is_alive()
         copying.kill()
         copied_logs = logs_of(target)
