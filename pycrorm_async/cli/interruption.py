@@ -3,7 +3,8 @@
 Theory of operation. The first signal cancels the plan's task, as asyncio does; the plan ends and its events are stored.
 If the plan does not end, the second signal raises `KeyboardInterrupt` in it. The next signal, and any signal once the
 plan has ended, terminates the process with exit code 130. That loses no event: all of them are in the spool on the
-disk, and the next process that uses this spool stores them. Only a memory of `sqlite://` ends with its process.
+disk, and the next process that uses this spool stores them. Only a memory of `sqlite://` ends with its process, and the
+last line says so.
 
 Signal handlers run in the main thread between two bytecodes, so the handler may interrupt a write to stderr. It
 therefore writes its last line with one system call (`write_last`) and leaves with `os._exit`.
@@ -24,16 +25,20 @@ _NOTE_DELAY_S = 1.0
 """Delays the note that events are being stored, so that it appears only if storing takes noticeably long."""
 _PLAN_SIGNALS_MAX = 2
 """Bounds the signals passed to a plan: one cancels it, one breaks off a plan that cannot be cancelled."""
+_LAST_LINE = "interrupted; events not stored yet are safe in the spool, and the next start stores them"
+_LAST_LINE_OF_PRIVATE = "interrupted; the events of sqlite:// are lost, because this memory ends with its process"
 
 
 class Interruption:
     """Handles SIGINT and SIGTERM for one plan. Use it in the thread of the event loop, the main thread.
 
-    With `plan_signals_max=1`, for code that performs many plans, the second signal terminates the process.
+    With `plan_signals_max=1`, for code that performs many plans, the second signal terminates the process. A memory
+    that `is_private`, of `sqlite://`, ends with the process.
     """
 
-    def __init__(self, *, plan_signals_max: int = _PLAN_SIGNALS_MAX) -> None:
+    def __init__(self, *, plan_signals_max: int = _PLAN_SIGNALS_MAX, is_private: bool = False) -> None:
         self._plan_signals_max = plan_signals_max
+        self._is_private = is_private
         self._count = 0
         self._storing = False
 
@@ -50,7 +55,7 @@ class Interruption:
         def handle_signal(_number: int, _frame: FrameType | None) -> None:
             self._count += 1
             if self._storing or self._count > self._plan_signals_max:
-                write_last("interrupted; events not stored yet are safe in the spool, and the next start stores them")
+                write_last(_LAST_LINE_OF_PRIVATE if self._is_private else _LAST_LINE)
                 os._exit(130)
             if self._count > 1:  # the plan never suspends, or suppresses its cancellation
                 raise KeyboardInterrupt
@@ -80,8 +85,9 @@ class Interruption:
     def plan_ended(self) -> None:
         """Let the next signal terminate the process, because the plan has ended; after a signal also print a note."""
         if self._count:
+            consequence = "and all events of sqlite:// are lost" if self._is_private else "without losing any"
             asyncio.get_running_loop().call_later(
-                _NOTE_DELAY_S, note, "recorded events are being stored; Ctrl-C again exits at once without losing any"
+                _NOTE_DELAY_S, note, f"recorded events are being stored; Ctrl-C again exits at once {consequence}"
             )
         self._storing = True
 

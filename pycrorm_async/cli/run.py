@@ -36,6 +36,7 @@ from pycrorm_async.projections.custom.discovery import load_projections
 from pycrorm_async.query.named_queries import EpisodeSummary
 from pycrorm_async.recording.values.texts import message_of
 from pycrorm_async.settings import OnFull, OnUnrecordable, RecordMeshes, Settings
+from pycrorm_async.store.address import DatabaseAddress
 
 _DRAIN_WAIT_S = 2
 """Bounds the wait until a daemon drains the new recorder; a running daemon scans the spool more often than that."""
@@ -127,7 +128,8 @@ def run(
     outcome = _Outcome()
     with redirect_stdout(sys.stderr) if as_json else nullcontext():
         try:
-            asyncio.run(_run_and_record(loaded, memory, description or loaded.description, seed, tags, outcome))
+            recorded = _run_and_record(loaded, memory, url, description or loaded.description, seed, tags, outcome)
+            asyncio.run(recorded)
         except asyncio.CancelledError as cancelled:  # the plan cancelled itself; Ctrl-C is a KeyboardInterrupt here
             outcome.failure = cancelled
         except SystemExit as system_exit:  # raised in a task of the plan, where it ends the event loop
@@ -209,12 +211,13 @@ class _Outcome:
 async def _run_and_record(
     loaded: LoadedPlan,
     opened: Memory,
+    url: str,
     description: str,
     seed: int | None,
     tags: tuple[str, ...],
     outcome: _Outcome,
 ) -> None:
-    interruption = Interruption()
+    interruption = Interruption(is_private=DatabaseAddress.parse(url).is_private)
     with interruption.handled():
         async with opened as memory:
             try:

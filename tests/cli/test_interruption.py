@@ -62,13 +62,13 @@ asyncio.run(main())
 """
 
 STORING = """
-import asyncio, os, signal
+import asyncio, os, signal, sys
 from pycrorm_async.cli import interruption
 
 interruption._NOTE_DELAY_S = 0.0
 
 async def main():
-    handling = interruption.Interruption()
+    handling = interruption.Interruption(is_private=sys.argv[1:] == ["private"])
     with handling.handled():
         os.kill(os.getpid(), signal.SIGINT)
         try:
@@ -171,6 +171,31 @@ def test_an_interrupt_while_events_are_stored_ends_at_once_and_the_line_before_a
         "recorded events are being stored; Ctrl-C again exits at once without losing any",
         "pycrorm: interrupted; events not stored yet are safe in the spool, and the next start stores them",
     ]
+
+
+def test_an_interrupt_while_a_private_memory_stores_says_what_is_lost(tmp_path: Path) -> None:
+    done = run_script(STORING, "private", cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (130, "")
+    assert done.stderr.splitlines() == [
+        "recorded events are being stored; Ctrl-C again exits at once and all events of sqlite:// are lost",
+        "pycrorm: interrupted; the events of sqlite:// are lost, because this memory ends with its process",
+    ]
+
+
+def test_a_plan_in_a_private_memory_that_is_interrupted_again_and_again_says_what_is_lost(tmp_path: Path) -> None:
+    (tmp_path / "waits.py").write_text(
+        "import asyncio, os, signal\n\n"
+        "async def plan():\n"
+        "    for _ in range(3):\n"
+        "        try:\n"
+        "            os.kill(os.getpid(), signal.SIGINT)\n"
+        "            await asyncio.sleep(60)\n"
+        "        except (asyncio.CancelledError, KeyboardInterrupt):\n"
+        "            pass\n"
+    )
+    done = pycrorm("run", "waits.py", "--url", "sqlite://", cwd=tmp_path)
+    assert done.returncode == 130
+    assert done.stderr.endswith("the events of sqlite:// are lost, because this memory ends with its process\n")
 
 
 def test_a_verb_that_writes_files_treats_sigterm_as_ctrl_c() -> None:
