@@ -57,7 +57,7 @@ interrupt() {  # press Ctrl-C when the command has printed something, or is sile
         if [ -s "$words" ] || ! kill -0 $endless; then break; fi
         sleep 0.1
     done
-    kill -INT $endless
+    kill -INT $endless 2>/dev/null || true  # it may have ended, as `watch --terminal` does behind an ended episode
     wait $endless || [ $? = 130 ] || { cat "$words" >&2; false; }
     endless=
     cat "$words"
