@@ -4,7 +4,7 @@ Theory of operation. The first signal cancels the plan's task, as asyncio does; 
 If the plan does not end, the second signal raises `KeyboardInterrupt` in it. The next signal, and any signal once the
 plan has ended, terminates the process with exit code 130. That loses no event: all of them are in the spool on the
 disk, and the next process that uses this spool stores them. Only a memory of `sqlite://` ends with its process, and the
-last line says so.
+last line states it.
 
 Signal handlers run in the main thread between two bytecodes, so the handler may interrupt a write to stderr. It
 therefore writes its last line with one system call (`write_last`) and leaves with `os._exit`.

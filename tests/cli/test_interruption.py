@@ -173,7 +173,7 @@ def test_an_interrupt_while_events_are_stored_ends_at_once_and_the_line_before_a
     ]
 
 
-def test_an_interrupt_while_a_private_memory_stores_says_what_is_lost(tmp_path: Path) -> None:
+def test_an_interrupt_while_a_private_memory_stores_ends_with_what_is_lost(tmp_path: Path) -> None:
     done = run_script(STORING, "private", cwd=tmp_path)
     assert (done.returncode, done.stdout) == (130, "")
     assert done.stderr.splitlines() == [
@@ -182,7 +182,7 @@ def test_an_interrupt_while_a_private_memory_stores_says_what_is_lost(tmp_path: 
     ]
 
 
-def test_a_plan_in_a_private_memory_that_is_interrupted_again_and_again_says_what_is_lost(tmp_path: Path) -> None:
+def test_a_plan_in_a_private_memory_that_is_interrupted_again_and_again_ends_with_what_is_lost(tmp_path: Path) -> None:
     (tmp_path / "waits.py").write_text(
         "import asyncio, os, signal\n\n"
         "async def plan():\n"
