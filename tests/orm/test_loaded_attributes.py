@@ -15,15 +15,12 @@ from pycrorm_async.errors import CallerError
 from pycrorm_async.orm import (
     Action,
     Base,
-    Designator,
     LocationResolution,
-    MoveMotion,
     Object,
     PickUpWithContextView,
     ProcessMetaData,
     TaskTreeNode,
 )
-from pycrorm_async.orm import TransportAction as TransportRow
 from pycrorm_async.plan import TransportAction, simulated_robot
 from pycrorm_async.world import Arms, BulletWorld, ObjectType, Pose
 from pycrorm_async.world import Object as WorldObject
@@ -35,8 +32,6 @@ CLASSES = [
     for each in sorted(Base.registry.mappers, key=str)
     if each.class_.__module__.startswith("pycrorm_async.orm")
 ]
-OF_DESIGNATORS = (TransportRow, MoveMotion)
-"""Two of the classes of designators, which all load in the same way, are read in an open session too."""
 ON_REQUEST = {"children", "ancestors", "node", "parameters", "refusals", "description", "robots"}
 ON_REQUEST_OF_PICK_UPS = {"object_z", "object_qx", "object_qy", "object_qz", "object_qw", "height_over_torso"}
 ON_REQUEST_OF_PICK_UPS |= {"policy", "robot", "scene"}
@@ -96,16 +91,16 @@ async def test_every_attribute_is_loaded_or_its_error_names_how_to_load_it(
         await transport(memory)
         for class_ in CLASSES:
             async with memory.session() as session:
-                rows = (await session.scalars(select(class_).limit(3))).unique().all()
-            after = {name for row in rows for _, name in unloaded(row, set(), depth=2)}
-            with_rows |= {class_.__name__} if rows else set()
-            if not issubclass(class_, Designator) or class_ in OF_DESIGNATORS:
-                async with memory.session() as session:
-                    rows = (await session.scalars(select(class_).limit(3))).unique().all()
-                    assert {name for row in rows for _, name in unloaded(row, set(), depth=2)} == after, class_
-            on_request |= after
+                rows = (await session.scalars(select(class_).limit(8))).unique().all()
+                with_rows |= {class_.__name__} if rows else set()
+                in_session = {name for row in rows for _, name in unloaded(row, set(), depth=3)}
+            async with memory.session() as session:
+                rows = (await session.scalars(select(class_).limit(8))).unique().all()
+            after = {name for row in rows for _, name in unloaded(row, set(), depth=3)}
+            assert in_session == after, class_
+            on_request |= in_session
             expected = ON_REQUEST | (ON_REQUEST_OF_PICK_UPS if class_ is PickUpWithContextView else set())
-            assert after <= expected, class_
+            assert in_session <= expected, class_
     assert on_request == ON_REQUEST | ON_REQUEST_OF_PICK_UPS
     assert {"TransportAction", "Object", "LocationResolution", "Attachment", "TaskTreeNode", "MoveMotion"} <= with_rows
 

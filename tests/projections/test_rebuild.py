@@ -57,7 +57,7 @@ OUR_VIEW = UserView("Failed", select(TaskTreeNode.id, TaskTreeNode.reason).where
 async def every_kind_of_episode(url: str, spool: Path) -> None:
     """Return random plans with types of their own and failures, a simulation, a lost episode, and a parked one."""
     async with Memory.open(url, spool=spool, views=[OUR_VIEW], settings=PATIENT) as memory:
-        for seed in range(2):
+        for seed in range(3):
             await play(seed, memory)
         await memory.flush()
     scripts = [*map(picking, range(1, 8)), picking(8, simulated=True), lost(9), parking(10)]

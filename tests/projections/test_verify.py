@@ -168,11 +168,11 @@ async def test_a_rebuild_between_two_parts_is_no_fault(
     def record_once(_done: int, _total: int, _what: str | None = None) -> None:
         nonlocal event
         event += 1
-        if event in (2, 5):
+        if event in (2, 5, 6):
             in_own_loop(rebuild)
 
     assert_clean(await verify(log, report_progress=record_once))
-    assert {table.physical.rpartition("__")[2].strip('"') for table in visible_tables(database_url)} == {"1003"}
+    assert {table.physical.rpartition("__")[2].strip('"') for table in visible_tables(database_url)} == {"1004"}
 
 
 async def test_an_episode_that_grows_between_two_parts_is_no_fault(
@@ -233,7 +233,7 @@ async def test_every_changed_value_is_reported_and_nothing_else(log: EventLog, d
 async def test_a_single_changed_value_is_reported_including_from_and_to_null(log: EventLog, database_url: str) -> None:
     for number_of_table, table in enumerate(visible_tables(database_url)):
         for row in rows_of(database_url, table)[:1]:
-            for column in table.columns[number_of_table % 8 :: 8]:  # each kind of column in some table
+            for column in table.columns[number_of_table % 5 :: 5]:  # each kind of column in some table
                 if column in table.key:
                     continue
                 value = another(None, table.kinds[column]) if row[column] is None else None

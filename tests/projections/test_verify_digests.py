@@ -64,16 +64,14 @@ async def log(filled_url: str) -> AsyncIterator[EventLog]:
     await reader.close()
 
 
-async def findings(log: EventLog, monkeypatch: pytest.MonkeyPatch, *, part_events: int) -> list[str]:
-    """Return the lines of damage, which are the same in parts of this size."""
-    lines = [str(each) for each in (await verify(log)).damages]
-    assert sorted(str(each) for each in (await in_parts(log, part_events, monkeypatch)).damages) == sorted(lines)
+async def findings(log: EventLog, digests: tuple[OutsideDigest, ...], monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Return the lines of damage, which are the same for all sizes of parts."""
+    result = await verify(log, digests=digests)
+    lines = [str(each) for each in result.damages]
+    if not digests:
+        for size in (200, 256):
+            assert sorted(str(each) for each in (await in_parts(log, size, monkeypatch)).damages) == sorted(lines)
     return lines
-
-
-async def findings_beside(log: EventLog, digests: tuple[OutsideDigest, ...]) -> list[str]:
-    """Return the lines of damage, also from digests that are kept elsewhere."""
-    return [str(each) for each in (await verify(log, digests=digests)).damages]
 
 
 async def digests_of(log: EventLog) -> tuple[OutsideDigest, ...]:
@@ -162,10 +160,7 @@ async def test_each_change_of_the_log_is_found_and_named_in_one_line(
     head = ask(filled_url, "SELECT head FROM episode WHERE number = 2")[0][0]
     for change in changes:
         ask_to_change(filled_url, change.format(last=head))
-    # At the borders of the blocks of 256 events, in parts that end there.
-    part_events = 256 if any(border in "".join(changes) for border in ("256", "257", "512")) else 200
-    damages = await findings(log, monkeypatch, part_events=part_events)
-    assert damages == [each.format(last=head) for each in lines]
+    assert await findings(log, (), monkeypatch) == [each.format(last=head) for each in lines]
 
 
 @pytest.mark.soak_on("postgresql")
@@ -184,17 +179,17 @@ async def test_each_change_of_the_log_is_found_and_named_in_one_line(
     ],
 )
 async def test_digests_kept_elsewhere_find_what_was_deleted_with_its_digests(
-    log: EventLog, filled_url: str, changes: list[str], line: str
+    log: EventLog, filled_url: str, changes: list[str], line: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     digests, head = await digests_of(log), ask(filled_url, "SELECT head FROM episode WHERE number = 2")[0][0]
-    assert await findings_beside(log, digests) == []
+    assert await findings(log, digests, monkeypatch) == []
     for change in (*changes, "DELETE FROM pycrorm_digest"):
         ask_to_change(filled_url, change)
-    assert line.format(id=ID.format(3), last=head) in "\n".join(await findings_beside(log, digests))
+    assert line.format(id=ID.format(3), last=head) in "\n".join(await findings(log, digests, monkeypatch))
 
 
 async def test_new_digests_over_changed_events_differ_from_those_kept_elsewhere(
-    log: EventLog, filled_url: str, tmp_path: Path
+    log: EventLog, filled_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     digests = await digests_of(log)
     ask_to_change(filled_url, "UPDATE event SET wall_ns = wall_ns + 1 WHERE episode = 3 AND sequence = 2")
@@ -203,7 +198,7 @@ async def test_new_digests_over_changed_events_differ_from_those_kept_elsewhere(
     await copy_episodes(filled_url, forged)
     other = await EventLog.open(DatabaseAddress.parse(forged), create=False)
     assert (await verify(other)).damage == 0
-    lines = await findings_beside(other, digests)
+    lines = await findings(other, digests, monkeypatch)
     await other.close()
     reason = "the digest at this event differs from the given one: one of the events 1 to 20 was changed"
     assert lines == [f"episode 3, event 20: {reason}"]
