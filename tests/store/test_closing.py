@@ -8,13 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from pycrorm_async.store.sqlite.engine import _connect
+from pycrorm_async.store.sqlite.engine import USE_WAL, _connect
 
 
 @pytest.fixture
 def file(tmp_path: Path) -> Path:
+    """A file in WAL mode, like every memory: in others a connection that polls can make a COMMIT fail."""
     made = tmp_path / "memory.db"
-    made.touch()
+    with closing(sqlite3.connect(made)) as connection:
+        connection.execute(USE_WAL)
     return made
 
 
@@ -46,7 +48,7 @@ async def test_a_rollback_follows_a_begin_whose_task_was_cancelled_while_it_wait
 async def test_a_reading_transaction_begins_with_its_first_statement_and_sees_one_moment(file: Path) -> None:
     connection = await _connect(f"{file.as_uri()}?mode=rw", 1.0)
     with closing(sqlite3.connect(file, isolation_level=None, timeout=0)) as other:
-        for statement in ("PRAGMA journal_mode = WAL", "CREATE TABLE node (id)", "INSERT INTO node VALUES (1)"):
+        for statement in ("CREATE TABLE node (id)", "INSERT INTO node VALUES (1)"):
             other.execute(statement)
         for end in (connection.commit, connection.rollback):
             connection.begin_to_read()
