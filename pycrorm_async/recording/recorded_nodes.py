@@ -87,8 +87,9 @@ class RecordedNodes(EpisodeWriter[_Node]):
         self._arguments = ArgumentReader(emitter.missing)
 
     def close(self, failure: BaseException | None = None, status: EpisodeStatus | None = None) -> None:
-        """End the episode. Without a failure it SUCCEEDED; nodes that are still open end LOST, and are counted.
+        """End the episode. Without a failure it SUCCEEDED, and nodes that are still open are counted.
 
+        They end LOST, or CANCELLED in an episode that was INTERRUPTED.
         `status` is FAILED, ERROR or INTERRUPTED, by default as for `end`.
         """
         if isinstance(status, str) and status in get_args(EpisodeStatus):

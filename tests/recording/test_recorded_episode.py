@@ -289,6 +289,23 @@ def test_nodes_open_at_the_end_are_lost_and_counted_once(tmp_path: Path) -> None
     assert_verified(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("failure", "status"),
+    [(KeyboardInterrupt(), "CANCELLED"), (asyncio.CancelledError(), "CANCELLED"), (ValueError(), "LOST")],
+)
+def test_nodes_open_at_the_end_of_an_interrupted_episode_end_cancelled(
+    tmp_path: Path, failure: BaseException, status: str
+) -> None:
+    with opened(tmp_path) as memory:
+        episode = memory.recording.episode(description="d")
+        for key in range(3):
+            episode.start(key, memory.recording.type("action", "Step"))
+        episode.close(failure)
+        assert memory.status.faults.total == 0
+    assert [row[2] for row in nodes(tmp_path)] == [status] * 3
+    assert_verified(tmp_path)
+
+
 def test_a_thread_that_outlives_the_episode_is_counted_and_disturbs_nothing(tmp_path: Path) -> None:
     with opened(tmp_path) as memory:
         kind = memory.recording.type("action", "Step")

@@ -2,7 +2,7 @@
 
 Theory of operation. The writer does not know the executive: `N` is an executive's own record of a node. `_open_nodes`
 holds every node that started and whose end is not written. The call that removes a node writes its end, so no node has
-two; if it raises before the end is written, it restores the node, which then ends LOST with the episode. Ctrl-C can
+two; if it raises before the end is written, it restores the node, which then ends with the episode. Ctrl-C can
 come at any call, also after the event is written: a `Receipt` shows that, and the lines that update the state by it
 make no call. `_ending` holds a node while a thread writes its end. The ends of episodes wait, for a limited time, until
 it is empty, because the end of a node must precede the end of its episode. The end of a node never waits, because the
@@ -171,7 +171,9 @@ class EpisodeWriter(ABC, Generic[N]):
         self._opening = self._opening.with_tags(tags)
 
     def end_episode(self, failure: BaseException | None) -> None:
-        """Write the end of the episode. Nodes that are still open end LOST, because no later end can be recorded.
+        """Write the end of the episode, and of nodes that are still open, because no later end can be recorded.
+
+        They end LOST; if the episode was interrupted, CANCELLED: Ctrl-C may come before a node's end is written.
 
         After a call that raised before the last event was written, the next call writes what is missing.
         """
@@ -189,10 +191,11 @@ class EpisodeWriter(ABC, Generic[N]):
         if not self._is_begun:
             return
         self._leave_world()
-        for sequence in sorted(self._open_nodes, reverse=True):
-            self._close_node(NodeEnded(sequence, "LOST"), "Episode")
-        self._wait_for_ends()
         status, root_status = self._end_statuses(failure)
+        node_status = root_status if status == "INTERRUPTED" else "LOST"
+        for sequence in sorted(self._open_nodes, reverse=True):
+            self._close_node(NodeEnded(sequence, node_status), "Episode")
+        self._wait_for_ends()
         value = failure_value(failure, self) if failure is not None else None
         self._end_root(root_status, value)
         ended = EpisodeEnded(status, value, world=self._described_world())
@@ -307,7 +310,7 @@ class EpisodeWriter(ABC, Generic[N]):
             self._put_end(event, owner, receipt)
         except BaseException:
             if not receipt.sequence:
-                self._open_nodes[event.node] = node  # so that it ends LOST with the episode
+                self._open_nodes[event.node] = node  # so that it ends with the episode
             raise
 
     def _wait_for_ends(self) -> None:
