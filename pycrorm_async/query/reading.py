@@ -36,7 +36,7 @@ from pycrorm_async.query.asking.episode_diff import EpisodeDiff, diff_episodes
 from pycrorm_async.query.asking.episode_list import EpisodeChoice
 from pycrorm_async.query.asking.question import AskedEpisode, FrameQuery, Question, translated_errors
 from pycrorm_async.query.frames.arrow_batches import BATCH_ROWS, arrow_batches
-from pycrorm_async.query.frames.columns import select_of
+from pycrorm_async.query.frames.columns import columns_of, select_of
 from pycrorm_async.query.frames.dataframe import Library, dataframe
 from pycrorm_async.query.named_queries import EpisodeSummary
 from pycrorm_async.query.notebook.listings import Episodes, TaskTree
@@ -199,11 +199,10 @@ class Reading:
         await self._ready()
         plain = await self._select_of(statement)
         with translated_errors(self._log, statement):
+            columns = columns_of(plain, deferred=deferred)
             async with (
                 self._connection(simulated=simulated) as connection,
-                aclosing(
-                    arrow_batches(connection, plain, rows=rows, deferred=deferred, enums_as_text=enums_as_text)
-                ) as batches,
+                aclosing(arrow_batches(connection, plain, columns, rows=rows, enums_as_text=enums_as_text)) as batches,
             ):
                 async for batch in batches:
                     yield batch

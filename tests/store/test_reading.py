@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import sqlite3
+from collections.abc import Callable
+from typing import Any
 
 import pytest
 from sqlalchemy import text
@@ -180,3 +182,25 @@ async def test_streamed_rows_are_whole_and_in_order(file_log: EventLog) -> None:
         assert [row[0] for row in await streamed.fetchmany(70)] == list(range(1, 71))
         assert (await streamed.fetchone()) == (71,)
         await streamed.close()
+
+
+@pytest.mark.parametrize(("rows", "visits"), [(0, 1), (63, 1), (64, 2), (65, 2), (200, 3)])
+async def test_rows_fetched_one_by_one_take_few_visits_to_the_thread(
+    file_log: EventLog, monkeypatch: pytest.MonkeyPatch, rows: int, visits: int
+) -> None:
+    await file_log.append(run_of(episode(1), 1, 200))
+    visited: list[object] = []
+    visit = Connection.visit
+
+    async def counted_visit(connection: Connection, work: Callable[[sqlite3.Connection], Any]) -> Any:
+        visited.append(work)
+        return await visit(connection, work)
+
+    async with file_log.reading() as connection:
+        monkeypatch.setattr(Connection, "visit", counted_visit)
+        streamed = await connection.stream(text(f"SELECT sequence FROM event ORDER BY sequence LIMIT {rows}"))
+        fetched = []
+        while (row := await streamed.fetchone()) is not None:
+            fetched.append(row.sequence)
+    assert fetched == list(range(1, rows + 1))
+    assert len(visited) == visits

@@ -10,7 +10,7 @@ from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.errors import CallerError, MissingExtra
 from pycrorm_async.query.asking.columns import checked_count
-from pycrorm_async.query.frames.columns import ColumnKind, FrameColumn, columns_of
+from pycrorm_async.query.frames.columns import ColumnKind, FrameColumn
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -49,14 +49,15 @@ def arrow_type(kind: ColumnKind, *, enums_as_text: bool = False) -> pa.DataType 
 async def arrow_batches(
     connection: AsyncConnection,
     statement: Select[*tuple[Any, ...]],
+    columns: Sequence[FrameColumn],
     *,
     rows: int = BATCH_ROWS,
-    deferred: bool = False,
     enums_as_text: bool = False,
 ) -> AsyncGenerator[pa.RecordBatch]:
-    """Yield the rows in batches of at most `rows`, at least one batch, which is empty if there is no row.
+    """Yield these columns of a select in batches of at most `rows`, at least one batch, empty if there is no row.
 
-    >>> async for batch in arrow_batches(connection, select(PickUpWithContextView)):
+    >>> statement = select(PickUpWithContextView)
+    >>> async for batch in arrow_batches(connection, statement, columns_of(statement)):
     ...     batch.num_rows, batch.schema
 
     Raises `MissingExtra`; `CallerError` unless `rows` is a whole number from 1, and for a value that its column cannot
@@ -64,7 +65,6 @@ async def arrow_batches(
     """
     pa = needed_pyarrow()
     checked_count("rows", rows)
-    columns = columns_of(statement, deferred=deferred)
     plain = statement.with_only_columns(*(each.expression for each in columns))
     types = [arrow_type(each.kind, enums_as_text=enums_as_text) for each in columns]
     is_first = True

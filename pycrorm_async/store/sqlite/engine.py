@@ -35,9 +35,11 @@ _IN_TURN = (_WRITE, USE_WAL)
 _POLL_S = 0.001
 """Interval at which a connection tries again to get the write lock."""
 _ROWS_AT_ONCE = 64
-"""The rows that are fetched at once from SQLite's cursor."""
+"""The rows that are fetched from SQLite's cursor at once, or more if more are asked for."""
 _CACHED_STATEMENTS = 512
 """Size of the cache of compiled statements: about ten per table that is written."""
+_READ_PRAGMAS = ("PRAGMA cache_size = -16384",)
+"""16 MB of pages: with SQLite's 2 MB, each query of a memory of 10 MB reads the same pages from the file again."""
 _WRITE_PRAGMAS = (
     "PRAGMA synchronous = FULL",  # a segment of the spool is deleted after COMMIT, so COMMIT must mean the disk
     "PRAGMA wal_autocheckpoint = 4000",  # 16 MB: about every fourth full batch instead of every one
@@ -56,8 +58,8 @@ def make_engine(path: Path, *, read_only: bool, busy_timeout_s: float) -> AsyncE
     )
     event.listen(engine.sync_engine, "begin", _begin)
     event.listen(engine.sync_engine, "invalidate", _roll_back)
-    if not read_only:
-        event.listen(engine.sync_engine, "connect", _set_write_pragmas)
+    pragmas = _READ_PRAGMAS if read_only else _WRITE_PRAGMAS
+    event.listen(engine.sync_engine, "connect", partial(_set_pragmas, pragmas))
     # SQLAlchemy would query the first connection, which has the default.
     engine.dialect.get_default_isolation_level = _isolation_level  # type: ignore[method-assign]
     return engine
@@ -181,18 +183,19 @@ class Cursor:
         return self
 
     async def execute(self, statement: str, parameters: Any = ()) -> Self:
-        def execute(connection: sqlite3.Connection) -> None:
+        def execute(connection: sqlite3.Connection) -> list[Any]:
             if statement in _IN_TURN:
-                self._take_first_rows(_wait_for_turn(connection, statement, self._connection.patience_s))
+                cursor = _wait_for_turn(connection, statement, self._connection.patience_s)
             else:
-                self._take_first_rows(connection.execute(statement, parameters))
+                cursor = connection.execute(statement, parameters)
+            return self._next_rows(cursor, _ROWS_AT_ONCE)
 
-        await self._connection.visit(execute)
+        self._rows = await self._connection.visit(execute)
         return self
 
     async def executemany(self, statement: str, parameters: Any) -> Self:
-        await self._connection.visit(
-            lambda connection: self._take_first_rows(connection.executemany(statement, parameters))
+        self._rows = await self._connection.visit(
+            lambda connection: self._next_rows(connection.executemany(statement, parameters), _ROWS_AT_ONCE)
         )
         return self
 
@@ -205,7 +208,7 @@ class Cursor:
     async def fetchmany(self, size: int | None = None) -> list[Any]:
         size = size or self.arraysize
         if len(self._rows) < size and (cursor := self._cursor) is not None:
-            self._rows += await self._connection.visit(lambda _: cursor.fetchmany(size))
+            self._rows += await self._connection.visit(lambda _: self._next_rows(cursor, max(size, _ROWS_AT_ONCE)))
         rows, self._rows = self._rows[:size], self._rows[size:]
         return rows
 
@@ -218,13 +221,15 @@ class Cursor:
             self._cursor = None
             await self._connection.visit(lambda _: cursor.close())
 
-    def _take_first_rows(self, cursor: sqlite3.Cursor) -> None:
-        self._rows = cursor.fetchmany(_ROWS_AT_ONCE)
+    def _next_rows(self, cursor: sqlite3.Cursor, count: int) -> list[Any]:
+        rows = cursor.fetchmany(count)
         self.description, self.rowcount, self.lastrowid = cursor.description, cursor.rowcount, cursor.lastrowid
-        if len(self._rows) == _ROWS_AT_ONCE:
+        if len(rows) == count:
             self._cursor = cursor
         else:
+            self._cursor = None
             cursor.close()
+        return rows
 
 
 async def _connect(uri: str, busy_timeout_s: float) -> Connection:
@@ -295,8 +300,8 @@ def _begin(connection: SyncConnection) -> None:
         connection.exec_driver_sql(statement)
 
 
-def _set_write_pragmas(connection: Any, _record: Any) -> None:
-    connection.run_async(lambda driver: driver.execute_in_turn((each, ()) for each in _WRITE_PRAGMAS))
+def _set_pragmas(pragmas: Sequence[str], connection: Any, _record: Any) -> None:
+    connection.run_async(lambda driver: driver.execute_in_turn((each, ()) for each in pragmas))
 
 
 def _isolation_level(dbapi_conn: object) -> IsolationLevel:  # noqa: ARG001  SQLAlchemy's name
