@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import sqlite3
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -71,6 +72,46 @@ def test_a_task_cancelled_at_any_await_leaves_no_connection_open(
         assert [at for at, each in enumerate(connections) if is_open(each)] == [], f"cancelled at await {cancelled}"
     assert cancelled > 3
     assert len(connections) > 3
+
+
+@pytest.mark.parametrize("is_started", [True, False], ids=["its start is known", "its start is not known yet"])
+def test_ctrl_c_while_the_thread_of_a_connection_starts_is_raised_and_the_thread_ends(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_started: bool
+) -> None:
+    (tmp_path / "memory.db").touch()
+    start = threading.Thread.start
+    threads: list[threading.Thread] = []
+    raised: list[BaseException] = []
+
+    def start_interrupted(thread: threading.Thread) -> None:
+        def start_later() -> None:
+            time.sleep(0.02)
+            start(thread)
+
+        threads.append(thread)
+        start(thread if is_started else threading.Thread(target=start_later))
+        raise KeyboardInterrupt
+
+    async def connect() -> None:
+        engine = make_engine(tmp_path / "memory.db", read_only=False, busy_timeout_s=1)
+        monkeypatch.setattr(threading.Thread, "start", start_interrupted)
+        async with engine.connect():
+            pass
+
+    def run() -> None:
+        try:
+            asyncio.run(connect())
+        except BaseException as error:  # noqa: BLE001  KeyboardInterrupt, which a thread cannot pass on
+            raised.append(error)
+        finally:
+            monkeypatch.undo()
+
+    running = threading.Thread(target=run, daemon=True)
+    running.start()
+    running.join(20)
+    assert not running.is_alive(), "opening the connection hangs"
+    assert [type(each) for each in raised] == [KeyboardInterrupt]
+    assert [each.is_alive() for each in threads] == [False]
 
 
 def is_open(connection: sqlite3.Connection) -> bool:

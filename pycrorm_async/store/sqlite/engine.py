@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import sqlite3
+import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
@@ -34,6 +35,8 @@ USE_WAL = "PRAGMA journal_mode = WAL"
 _IN_TURN = (_WRITE, USE_WAL)
 _POLL_S = 0.001
 """Interval at which a connection tries again to get the write lock."""
+_START_S = 1.0
+"""Bounds the wait for the start of a thread after Ctrl-C; a loaded machine starts one in milliseconds."""
 _ROWS_AT_ONCE = 64
 """The rows that are fetched from SQLite's cursor at once, or more if more are asked for."""
 _CACHED_STATEMENTS = 512
@@ -257,11 +260,24 @@ async def _connect(uri: str, busy_timeout_s: float) -> Connection:
     except BaseException:
         # The thread reports its end to this loop; if the loop were closed by then, it would print a traceback. The
         # driver drops what the thread opened after the task had been cancelled, and does not close it.
-        thread.join()
+        connection.stop()  # the driver has not done so if Ctrl-C came while it waited for the thread to start
+        _join(thread)
         for each in opened:
             each.close()
         raise
     return connection
+
+
+def _join(thread: threading.Thread) -> None:
+    """Wait for the end of a thread that was stopped, and that may not have started yet."""
+    until_s = time.monotonic() + _START_S
+    while time.monotonic() < until_s:
+        try:
+            thread.join()
+        except RuntimeError:  # it is starting, or Ctrl-C came before it was to start
+            time.sleep(_POLL_S)
+        else:
+            return
 
 
 def _wait_for_turn(connection: sqlite3.Connection, statement: str, patience_s: float) -> sqlite3.Cursor:
