@@ -2,30 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
-from datetime import UTC, datetime, timedelta
-from typing import Any
+from datetime import UTC, datetime
 
 import pytest
 from sqlalchemy import func, select
-from sqlalchemy.orm import Mapped, selectinload, undefer
+from sqlalchemy.orm import selectinload, undefer
 
 import pycrorm_async.orm
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.ids import row_key
-from pycrorm_async.events.types import (
-    EpisodeEnded,
-    EpisodeStarted,
-    JointsMoved,
-    LocationResolved,
-    NodeEnded,
-    NodeStarted,
-    ObjectAdded,
-    ObjectAttached,
-    ObjectMoved,
-    ObjectRemoved,
-)
-from pycrorm_async.events.values import CandidateValue, FailureValue, ObjectReference, ObjectValue, RobotValue
+from pycrorm_async.events.types import NodeStarted, ObjectAdded
+from pycrorm_async.events.values import ObjectReference
 from pycrorm_async.orm import (
     Action,
     Attachment,
@@ -56,112 +43,21 @@ from pycrorm_async.orm import (
 )
 from pycrorm_async.orm.types import Moment
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.query.reading import Reading
-from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.enums import Arms, Grasp, ObjectType
-from tests.databases import run_in_own_loop
-from tests.projections.event_script import (
-    MOVE,
-    NAVIGATE,
-    PICK_UP,
-    T0_NS,
-    Script,
-    declarations,
-    declared,
-    field,
-    name_of,
-    pose,
-    row,
-    time_us,
-)
-from tests.projections.sql_queries import ask, stored_and_folded
+from tests.orm.recorded_breakfast import every, moment
+from tests.projections.event_script import PICK_UP, T0_NS, Script, declarations, name_of, pose, row
+from tests.projections.sql_queries import stored_and_folded
 from tests.sessions import session_on
 
 pytestmark = pytest.mark.slow
-
-OPEN = declared("OpenAction", "open_action", field("object_designator", "object", 2), field("arm", "enum", 3))
-MOVE_JOINTS = declared(
-    "MoveJointsMotion",
-    "move_joints_motion",
-    field("names", "list", 2, item="text"),
-    field("positions", "list", 3, item="real"),
-    kind="motion",
-)
-RETRY = declared("Retry", "retry", field("times", "integer", 2), kind="language")
-WAIT = declared("WaitAction", "orm_wait", field("duration", "real", 2), field("status", "text", 3))
-
-
-class ORMWait(Action):
-    """A class whose fields have the names of attributes that every action has."""
-
-    __tablename__ = "orm_wait"
-
-    duration: Mapped[float]
-    status: Mapped[str]  # type: ignore[assignment]
 
 
 CLASSES = sorted(
     (each for each in vars(pycrorm_async.orm).values() if isinstance(each, type) and issubclass(each, Base)),
     key=lambda each: each.__name__,
 )
-
-
-def moment(sequence: int) -> datetime:
-    return datetime(2023, 11, 14, 22, 13, 20, tzinfo=UTC) + timedelta(seconds=sequence)
-
-
-async def fill(url: str) -> None:
-    """Record that a robot drives (with a motion inside), picks up the milk, and opens the fridge, in one episode."""
-    script = Script()
-    put = script.put
-    put(EpisodeStarted("Tutorial", "me", "host", "1.0", "3.11", plan="breakfast"))  # 1
-    root = put(NodeStarted("root"))  # 2
-    robot = put(ObjectAdded("pr2", "ROBOT", pose(0.5), {"torso": 0.25}))  # 3
-    milk = put(ObjectAdded("milk", "MILK", pose(1, 2, 3)))  # 4
-    fridge = put(ObjectAdded("fridge", "ENVIRONMENT", pose()))  # 5
-    state = RobotValue(pose(0.5, 0, 0, turned=0.6), "ROBOT", 0.25, ObjectReference(robot, robot))
-    drive = put(NodeStarted("action", root, name_of(NAVIGATE), {"target_location": pose(7, 8)}, state))  # 6
-    put(LocationResolved("CostmapLocation", (CandidateValue(pose(7, 8), ("LEFT",)),), 0, 9, drive))  # 7
-    move = put(NodeStarted("motion", drive, name_of(MOVE), {"target": pose(7, 8)}, state))  # 8
-    put(NodeEnded(move, "SUCCEEDED"))  # 9
-    put(NodeEnded(drive, "SUCCEEDED"))  # 10
-    seen = ObjectReference(milk, milk)
-    grasp = {"object_designator": seen, "arm": "LEFT", "grasp": "TOP"}
-    pick = put(NodeStarted("action", root, name_of(PICK_UP), grasp, state))  # 11
-    put(ObjectMoved(milk, "milk", "MILK", pose(9, 9, 9), pick))  # 12
-    put(ObjectAttached(ObjectReference(robot, robot), seen, "l_gripper_tool_frame", pick))  # 13
-    put(NodeEnded(pick, "FAILED", FailureValue("plan.failures.IKError", "too far", ["LEFT"])))  # 14
-    handle = ObjectValue("ObjectPart", "handle", "GENERIC_OBJECT", pose(1), ObjectReference(fridge, fridge))
-    put(NodeStarted("action", root, name_of(OPEN), {"object_designator": handle, "arm": "RIGHT"}, None))  # 15
-    joints = {"names": ["a", "b"], "positions": [0.5, -1.0]}
-    put(NodeStarted("motion", root, name_of(MOVE_JOINTS), joints, state))  # 16
-    put(JointsMoved(ObjectReference(robot, robot), {"a": 0.5}, root))  # 17
-    put(ObjectRemoved(seen))  # 18
-    put(EpisodeEnded("LOST"))  # 19
-    log = await EventLog.open(DatabaseAddress.parse(url), create=True)
-    await stored_and_folded(log, [*declarations(NAVIGATE, PICK_UP, MOVE, OPEN, MOVE_JOINTS), *script.records])
-    await log.close()
-
-
-@pytest.fixture(scope="module")
-def filled_url(module_database_url: str) -> str:
-    run_in_own_loop(fill(module_database_url))
-    return module_database_url
-
-
-@pytest.fixture
-async def breakfast(filled_url: str) -> AsyncIterator[EventLog]:
-    """The log of that episode, open for reading."""
-    log = await EventLog.open(DatabaseAddress.parse(filled_url), create=False)
-    yield log
-    await log.close()
-
-
-async def every(log: EventLog, question: Any) -> list[Any]:
-    async with session_on(log) as session:
-        return list((await session.scalars(question)).unique().all())
 
 
 async def test_a_fresh_memory_has_no_rows_of_any_class(log: EventLog) -> None:
@@ -360,173 +256,6 @@ async def test_the_recorded_parameters_are_loaded_on_request(breakfast: EventLog
         assert awaited_parameters == {"object_designator": {"object": 4, "row": 4}, "arm": "LEFT", "grasp": "TOP"}
     (joints,) = await every(breakfast, select(MoveJointsMotion).options(undefer(MoveJointsMotion.parameters)))
     assert joints.parameters == {"names": ["a", "b"], "positions": [0.5, -1.0]}
-
-
-async def test_an_action_loads_its_node_on_request(breakfast: EventLog) -> None:
-    async with session_on(breakfast) as session:
-        pick = (await session.scalars(select(PickUpAction))).one()
-        assert (await pick.awaitable_attrs.node).status == TaskStatus.FAILED
-    (pick,) = await every(breakfast, select(PickUpAction).options(selectinload(PickUpAction.node)))
-    assert (pick.node.status, pick.node.reason) == (TaskStatus.FAILED, "IKError")
-
-
-async def test_an_action_has_its_times_and_its_outcome(breakfast: EventLog) -> None:
-    drive, pick, opening = await every(breakfast, select(Action).order_by(Action.start_time))
-    assert (drive.status, drive.reason, drive.duration) == (TaskStatus.SUCCEEDED, None, 4.0)
-    assert (pick.status, pick.reason, pick.duration) == (TaskStatus.FAILED, "IKError", 3.0)
-    assert (pick.start_time, pick.end_time) == (moment(11), moment(14))
-    assert (opening.status, opening.end_time, opening.duration) == (TaskStatus.LOST, None, None)
-    assert pick.episode is pick.process_metadata
-    (move,) = await every(breakfast, select(MoveMotion))
-    assert (move.status, move.duration) == (TaskStatus.SUCCEEDED, 1.0)
-
-
-@pytest.mark.parametrize(
-    ("condition", "expected"),
-    [
-        (Action.status == TaskStatus.FAILED, [11]),
-        (Action.duration >= 3, [6, 11]),
-        (Action.end_time.is_(None), [15]),
-        (Action.start_time > moment(6), [11, 15]),
-        (Action.reason == "IKError", [11]),
-        (Action.episode.has(description="Tutorial"), [6, 11, 15]),
-    ],
-)
-async def test_actions_are_filtered_and_ordered_by_times_and_outcome(
-    breakfast: EventLog, condition: Any, expected: list[int]
-) -> None:
-    slowest_last = select(Action.id).where(condition).order_by(Action.duration.is_(None), Action.start_time)
-    assert await every(breakfast, slowest_last) == [row(each) for each in expected]
-
-
-async def test_an_action_joins_its_episode(breakfast: EventLog) -> None:
-    question = select(ProcessMetaData.description, PickUpAction.duration).join(PickUpAction.episode)
-    async with session_on(breakfast) as session:
-        assert (await session.execute(question)).all() == [("Tutorial", 3.0)]
-
-
-@pytest.mark.parametrize("view", ["action", "motion", "designator", "task_tree_node"])
-async def test_plain_sql_reads_times_and_outcome_of_an_action_from_one_view(breakfast: EventLog, view: str) -> None:
-    columns = "process_metadata_id, dtype, status, start_time, end_time, duration, reason"
-    course = await ask(
-        breakfast, f"SELECT {columns} FROM {view} WHERE dtype IN ('PickUpAction', 'MoveMotion') ORDER BY id"
-    )
-    move = (1, "MoveMotion", "SUCCEEDED", time_us(8), time_us(9), 1.0, None)
-    pick = (1, "PickUpAction", "FAILED", time_us(11), time_us(14), 3.0, "IKError")
-    assert course == {"action": [pick], "motion": [move]}.get(view, [move, pick])
-
-
-def failing() -> Script:
-    """A transport fails in a motion of its second attempt, and the plan continues; then the plan itself raises."""
-    script = Script()
-    put = script.put
-    put(EpisodeStarted("Breakfast", "me", "host", "1.0", "3.11"))  # 1
-    root = put(NodeStarted("root"))  # 2
-    milk = put(ObjectAdded("milk", "MILK", pose(1, 2, 3)))  # 3
-    retry = put(NodeStarted("language", root, name_of(RETRY), {"times": 2}))  # 4
-    for arm in ("LEFT", "RIGHT"):  # 5 to 9, 10 to 14
-        seen = {"object_designator": ObjectReference(milk, milk), "arm": arm, "grasp": "TOP"}
-        pick = put(NodeStarted("action", retry, name_of(PICK_UP), seen))
-        move = put(NodeStarted("motion", pick, name_of(MOVE), {"target": pose(7, 8)}))
-        put(ObjectMoved(milk, "milk", "MILK", pose(9, 9, 9), move))
-        fault = FailureValue("plan.failures.IKError", f"{arm} is too short", [])
-        put(NodeEnded(move, "FAILED", fault))
-        put(NodeEnded(pick, "FAILED", fault))
-    put(NodeEnded(retry, "SUCCEEDED"))  # 15
-    handle = ObjectValue("ObjectPart", "handle", "GENERIC_OBJECT", pose(1))
-    opening = put(NodeStarted("action", root, name_of(OPEN), {"object_designator": handle, "arm": "LEFT"}))  # 16
-    put(NodeEnded(opening, "CANCELLED"))  # 17
-    drive = put(NodeStarted("action", root, name_of(NAVIGATE), {"target_location": pose(7)}))  # 18
-    put(NodeEnded(drive, "SUCCEEDED"))  # 19
-    opening = put(NodeStarted("action", root, name_of(OPEN), {"object_designator": handle, "arm": "LEFT"}))  # 20
-    put(NodeEnded(opening, "ERROR", FailureValue("builtins.KeyError", "door")))  # 21
-    put(NodeEnded(root, "ERROR", FailureValue("builtins.KeyError", "door")))  # 22
-    put(EpisodeEnded("ERROR"))  # 23
-    put = (second := Script(2)).put
-    put(EpisodeStarted("Lunch", "me", "host", "1.0", "3.11"))  # 1
-    root = put(NodeStarted("root"))  # 2
-    put(NodeEnded(root, "ERROR", FailureValue("builtins.ValueError", "no table")))  # 3
-    script.records += second.records
-    return script
-
-
-async def test_a_failure_is_listed_where_it_began_with_path_object_arm_and_message(log: EventLog) -> None:
-    await stored_and_folded(log, [*declarations(PICK_UP, MOVE, OPEN, NAVIGATE, RETRY), *failing().records])
-    first, second, opening, plan = await every(log, select(RootFailure).order_by(RootFailure.id))
-    path = "root > Retry > PickUpAction > MoveMotion"
-    assert (first.id, first.dtype, first.status) == (row(6), "MoveMotion", TaskStatus.FAILED)
-    assert (first.path, first.object, first.arm) == (path, "milk", Arms.LEFT)
-    assert (first.reason, first.message, first.recovered) == ("IKError", "LEFT is too short", True)
-    assert (first.start_time, first.end_time, first.episode.description) == (moment(6), moment(8), "Breakfast")
-    assert (second.id, second.path, second.arm, second.message) == (row(11), path, Arms.RIGHT, "RIGHT is too short")
-    assert (opening.id, opening.path, opening.status) == (row(20), "root > OpenAction", TaskStatus.ERROR)
-    assert (opening.object, opening.arm, opening.reason) == ("handle", Arms.LEFT, "KeyError")
-    assert (opening.message, opening.recovered) == ("door", False)
-    assert (plan.id, plan.dtype, plan.path, plan.object) == (row(2, number=2), None, "root", None)
-    assert (plan.arm, plan.message, plan.recovered) == (None, "no table", False)
-    lost = select(RootFailure.path).where(~RootFailure.recovered, RootFailure.object == "handle")
-    assert await every(log, lost) == ["root > OpenAction"]
-
-
-async def test_object_and_arm_of_a_failure_are_those_of_the_nearest_node(log: EventLog) -> None:
-    script = Script()
-    put = script.put
-    milk = put(ObjectAdded("milk", "MILK", pose(1, 2, 3)))
-    seen = {"object_designator": ObjectReference(milk, milk), "arm": "RIGHT", "grasp": "TOP"}
-    pick = put(NodeStarted("action", None, name_of(PICK_UP), seen))
-    handle = {"object_designator": ObjectValue("ObjectPart", "handle"), "arm": "LEFT"}
-    opening = put(NodeStarted("action", pick, name_of(OPEN), handle))
-    for node in (opening, pick):
-        put(NodeEnded(node, "FAILED", FailureValue("plan.failures.PlanFailure", "")))
-    await stored_and_folded(log, [*declarations(PICK_UP, OPEN), *script.records])
-    (failure,) = await every(log, select(RootFailure))
-    assert (failure.path, failure.object, failure.arm) == ("PickUpAction > OpenAction", "handle", Arms.LEFT)
-
-
-async def test_a_dict_field_is_no_object_of_a_failure(log: EventLog) -> None:
-    note = declared("NoteAction", "note_action", field("lines", "dict", 2, item="text"))
-    script = Script()
-    lines = {"object": "milk", "row": "first"}
-    node = script.put(NodeStarted("action", None, name_of(note), {"lines": lines}))
-    script.put(NodeEnded(node, "FAILED", FailureValue("plan.failures.PlanFailure", "")))
-    await stored_and_folded(log, [*declarations(note), *script.records])
-    (failure,) = await every(log, select(RootFailure))
-    assert (failure.path, failure.object, failure.recovered) == ("NoteAction", None, False)
-
-
-async def test_simulations_are_left_out_of_failures_unless_asked_for(log: EventLog) -> None:
-    script = failing()
-    for place, each in enumerate(script.records[:-3]):  # the second episode has none
-        if each.type in ("EpisodeStarted", "NodeStarted"):
-            simulated = each.payload.replace(b"{", b'{"simulated":true,', 1)
-            script.records[place] = each._replace(payload=simulated)
-    await stored_and_folded(log, [*declarations(PICK_UP, MOVE, OPEN, NAVIGATE, RETRY), *script.records])
-    reading = Reading(log)
-    counts = []
-    for also in (False, True):
-        async with reading.session(simulated=also) as session:
-            counts.append(len((await session.scalars(select(RootFailure))).all()))
-    assert counts == [1, 4]
-
-
-async def test_plain_sql_counts_where_failures_began(log: EventLog) -> None:
-    await stored_and_folded(log, [*declarations(PICK_UP, MOVE, OPEN, NAVIGATE, RETRY), *failing().records])
-    question = "SELECT path, object, count(*) FROM root_failure GROUP BY path, object ORDER BY path"
-    assert await ask(log, question) == [
-        ("root", None, 1),
-        ("root > OpenAction", "handle", 1),
-        ("root > Retry > PickUpAction > MoveMotion", "milk", 2),
-    ]
-
-
-async def test_a_field_with_the_name_of_an_action_attribute_hides_it(log: EventLog) -> None:
-    script = Script()
-    node = script.put(NodeStarted("action", None, name_of(WAIT), {"duration": 60.0, "status": "patient"}))
-    script.put(NodeEnded(node, "SUCCEEDED"))
-    await stored_and_folded(log, [*declarations(WAIT), *script.records])
-    (wait,) = await every(log, select(ORMWait).where(ORMWait.duration > 50, Action.duration < 50))
-    assert (wait.duration, wait.status, wait.reason) == (60.0, "patient", None)
-    assert await every(log, select(Action.duration)) == [1.0]
 
 
 async def test_an_object_type_that_is_unknown_to_this_process_is_its_name_and_an_arm_is_a_named_one(

@@ -1,0 +1,76 @@
+"""Record one episode with rows of most classes, and read the mapped objects of a log."""
+
+from __future__ import annotations
+
+from datetime import UTC, datetime, timedelta
+from typing import Any
+
+from pycrorm_async.events.types import (
+    EpisodeEnded,
+    EpisodeStarted,
+    JointsMoved,
+    LocationResolved,
+    NodeEnded,
+    NodeStarted,
+    ObjectAdded,
+    ObjectAttached,
+    ObjectMoved,
+    ObjectRemoved,
+)
+from pycrorm_async.events.values import CandidateValue, FailureValue, ObjectReference, ObjectValue, RobotValue
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.log import EventLog
+from tests.projections.event_script import MOVE, NAVIGATE, PICK_UP, Script, declarations, declared, field, name_of, pose
+from tests.projections.sql_queries import stored_and_folded
+from tests.sessions import session_on
+
+OPEN = declared("OpenAction", "open_action", field("object_designator", "object", 2), field("arm", "enum", 3))
+MOVE_JOINTS = declared(
+    "MoveJointsMotion",
+    "move_joints_motion",
+    field("names", "list", 2, item="text"),
+    field("positions", "list", 3, item="real"),
+    kind="motion",
+)
+
+
+def moment(sequence: int) -> datetime:
+    return datetime(2023, 11, 14, 22, 13, 20, tzinfo=UTC) + timedelta(seconds=sequence)
+
+
+async def fill(url: str) -> None:
+    """Record that a robot drives (with a motion inside), picks up the milk, and opens the fridge, in one episode."""
+    script = Script()
+    put = script.put
+    put(EpisodeStarted("Tutorial", "me", "host", "1.0", "3.11", plan="breakfast"))  # 1
+    root = put(NodeStarted("root"))  # 2
+    robot = put(ObjectAdded("pr2", "ROBOT", pose(0.5), {"torso": 0.25}))  # 3
+    milk = put(ObjectAdded("milk", "MILK", pose(1, 2, 3)))  # 4
+    fridge = put(ObjectAdded("fridge", "ENVIRONMENT", pose()))  # 5
+    state = RobotValue(pose(0.5, 0, 0, turned=0.6), "ROBOT", 0.25, ObjectReference(robot, robot))
+    drive = put(NodeStarted("action", root, name_of(NAVIGATE), {"target_location": pose(7, 8)}, state))  # 6
+    put(LocationResolved("CostmapLocation", (CandidateValue(pose(7, 8), ("LEFT",)),), 0, 9, drive))  # 7
+    move = put(NodeStarted("motion", drive, name_of(MOVE), {"target": pose(7, 8)}, state))  # 8
+    put(NodeEnded(move, "SUCCEEDED"))  # 9
+    put(NodeEnded(drive, "SUCCEEDED"))  # 10
+    seen = ObjectReference(milk, milk)
+    grasp = {"object_designator": seen, "arm": "LEFT", "grasp": "TOP"}
+    pick = put(NodeStarted("action", root, name_of(PICK_UP), grasp, state))  # 11
+    put(ObjectMoved(milk, "milk", "MILK", pose(9, 9, 9), pick))  # 12
+    put(ObjectAttached(ObjectReference(robot, robot), seen, "l_gripper_tool_frame", pick))  # 13
+    put(NodeEnded(pick, "FAILED", FailureValue("plan.failures.IKError", "too far", ["LEFT"])))  # 14
+    handle = ObjectValue("ObjectPart", "handle", "GENERIC_OBJECT", pose(1), ObjectReference(fridge, fridge))
+    put(NodeStarted("action", root, name_of(OPEN), {"object_designator": handle, "arm": "RIGHT"}, None))  # 15
+    joints = {"names": ["a", "b"], "positions": [0.5, -1.0]}
+    put(NodeStarted("motion", root, name_of(MOVE_JOINTS), joints, state))  # 16
+    put(JointsMoved(ObjectReference(robot, robot), {"a": 0.5}, root))  # 17
+    put(ObjectRemoved(seen))  # 18
+    put(EpisodeEnded("LOST"))  # 19
+    log = await EventLog.open(DatabaseAddress.parse(url), create=True)
+    await stored_and_folded(log, [*declarations(NAVIGATE, PICK_UP, MOVE, OPEN, MOVE_JOINTS), *script.records])
+    await log.close()
+
+
+async def every(log: EventLog, question: Any) -> list[Any]:
+    async with session_on(log) as session:
+        return list((await session.scalars(question)).unique().all())
