@@ -1,4 +1,4 @@
-"""Fixtures of the export's tests: one memory with real episodes, which the tests only read."""
+"""Fixtures of the export's tests: a memory of real episodes and one written by a script, which the tests only read."""
 
 from __future__ import annotations
 
@@ -24,6 +24,10 @@ from pycrorm_async.plan import (
 )
 from pycrorm_async.settings import Settings
 from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose
+from tests.databases import run_in_own_loop
+from tests.projections.event_script import NAVIGATE, PICK_UP, SAYING, declarations
+from tests.projections.factories import append_and_fold
+from tests.query.test_reading import episode
 from tests.shared_folders import made_once
 
 LONGEST = UserView(
@@ -80,4 +84,18 @@ def kitchen(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 async def reading(kitchen: Path) -> AsyncIterator[Reading]:
     async with Reading.open(f"sqlite:///{kitchen}/pycrorm.db") as opened:
+        yield opened
+
+
+@pytest.fixture(scope="module")
+def scripted(module_database_url: str) -> str:
+    """Return the URL of a memory in which episode 1 still runs and episode 2 has ended."""
+    records = [*declarations(NAVIGATE, PICK_UP, SAYING), *episode(1).records, *episode(2).records]
+    run_in_own_loop(append_and_fold(module_database_url, records))
+    return module_database_url
+
+
+@pytest.fixture
+async def either(scripted: str) -> AsyncIterator[Reading]:
+    async with Reading.open(scripted) as opened:
         yield opened
