@@ -1,269 +1,28 @@
-"""Queries in SQL on real databases: rows and bounds, and attacks, which the database itself must refuse."""
+"""Queries in SQL cannot change anything or exceed their bounds: the database itself refuses attacks."""
 
 from __future__ import annotations
 
 import asyncio
-import json
-import math
 import time
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
 from pathlib import Path
-from typing import Any
 from urllib.parse import urlsplit
 
-import msgspec
 import psutil
 import pytest
 
-from pycrorm_async.errors import DatabaseUnavailable, QueryRefused
-from pycrorm_async.query.reading import Reading
-from pycrorm_async.query.sql.json_values import json_rows
-from pycrorm_async.query.sql.read_only import DEFAULT_LIMITS, ReadOnlySql, SqlLimits
+from pycrorm_async.errors import QueryRefused
+from pycrorm_async.query.sql.read_only import SqlLimits
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.postgresql.roles import GRANTS
-from tests.databases import Server, change_each, open_connection, run_in_own_loop
+from tests.databases import Server, change_each, open_connection
 from tests.full_disk import files_of_at_most
-from tests.projections.event_script import NAVIGATE, PICK_UP, SAYING, declarations
 from tests.projections.factories import append_and_fold
-from tests.query.test_reading import episode
+from tests.query.read_only_queries import ENDLESS, RECORDS, SqlReader, is_sqlite, login, opened_reader
 
 pytestmark = pytest.mark.slow
-
-RECORDS = [*declarations(NAVIGATE, PICK_UP, SAYING), *episode(1).records, *episode(2).records]
-ENDLESS = "WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM n) SELECT "
 QUICK = SqlLimits(seconds=0.3)
-
-
-@pytest.fixture(scope="module")
-def owner_url(module_database_url: str) -> str:
-    """The URL of the owner of a memory with two episodes, on PostgreSQL a superuser who has made the roles."""
-    run_in_own_loop(append_and_fold(module_database_url, RECORDS))
-    if not is_sqlite(module_database_url):
-        change_each(module_database_url, GRANTS)
-    return module_database_url
-
-
-@pytest.fixture(scope="module")
-def reader_url(owner_url: str) -> str:
-    """The URL of a login that can only read."""
-    return owner_url if is_sqlite(owner_url) else login(owner_url, "IN ROLE pycrorm_reader")
-
-
-@pytest.fixture
-async def sql(reader_url: str) -> AsyncIterator[_Sql]:
-    async with _opened(reader_url) as opened:
-        yield opened
-
-
-class _Sql:
-    """Runs queries on an open log."""
-
-    def __init__(self, log: EventLog) -> None:
-        self.is_sqlite = log.address.is_sqlite
-        self.stream = ReadOnlySql(log).stream
-        self._query = ReadOnlySql(log).query
-
-    async def query(self, text: str, limits: SqlLimits = DEFAULT_LIMITS) -> tuple[tuple[str, ...], list[Any], bool]:
-        result = await self._query(text, limits)
-        return result.columns, result.rows, result.more
-
-
-@asynccontextmanager
-async def _opened(url: str) -> AsyncIterator[_Sql]:
-    log = await EventLog.open(DatabaseAddress.parse(url), create=False)
-    yield _Sql(log)
-    await log.close()
-
-
-def is_sqlite(url: str) -> bool:
-    return url.startswith("sqlite")
-
-
-def login(url: str, attributes: str, *after: str) -> str:
-    """Return the URL of a new login with these attributes."""
-    name = f"login_{next(_NUMBERS)}_of_{urlsplit(url).path.removeprefix('/')}"
-    change_each(url, [f"CREATE ROLE {name} LOGIN {attributes}", *(each.format(name=name) for each in after)])
-    return url.replace("postgres@", f"{name}@")
-
-
-_NUMBERS = iter(range(1, 1_000))
-
-
-# --- reading --------------------------------------------------------------------------------------------------
-
-
-async def test_a_query_returns_its_columns_and_rows(sql: _Sql) -> None:
-    text = "SELECT id, status, status FROM process_metadata ORDER BY id DESC; "
-    columns, rows, more = await sql.query(text)
-    assert columns == ("id", "status", "status")
-    assert rows == [(2, "SUCCEEDED", "SUCCEEDED"), (1, "RUNNING", "RUNNING")]
-    assert not more
-    assert await sql.query("WITH one AS (SELECT 1 AS x) SELECT x FROM one -- the end") == (("x",), [(1,)], False)
-    assert (await sql.query("SELECT sequence FROM event WHERE episode = -1"))[1] == []
-    assert (await sql.query("VALUES (1), (2)"))[1] == [(1,), (2,)]
-    text = "SELECT count(*) FROM event, json_each(payload) AS member"
-    if not sql.is_sqlite:
-        text = "SELECT count(*) FROM event, jsonb_each(payload::jsonb) AS member"
-    assert (await sql.query(text))[1][0] > (20,)
-
-
-async def test_rows_are_the_same_json_on_both_databases(sql: _Sql) -> None:
-    written = (
-        "x'00ff', 1e999, -1e999" if sql.is_sqlite else r"'\x00ff'::bytea, 'Infinity'::float8, '-Infinity'::numeric"
-    )
-    rows = (await sql.query(f"SELECT sum(id), avg(id), NULL, {written} FROM process_metadata"))[1]
-    encoded = msgspec.json.Encoder(decimal_format="number").encode(json_rows(rows))
-    assert json.loads(encoded) == [[3, 1.5, None, "00ff", "Infinity", "-Infinity"]]
-
-
-async def test_an_answer_is_a_frame_of_pandas(reader_url: str) -> None:
-    async with Reading.open(reader_url) as reading:
-        frame = (await reading.query("SELECT id AS n, status, id AS n FROM process_metadata ORDER BY id")).frame()
-    assert [*frame.columns] == ["n", "status", "n_1"]
-    assert frame.n.tolist() == [1, 2]
-
-
-async def test_more_rows_than_the_limit_are_reported(sql: _Sql) -> None:
-    text = "SELECT sequence FROM event WHERE episode = 2 ORDER BY sequence"
-    assert await sql.query(text, SqlLimits(rows=3)) == (("sequence",), [(1,), (2,), (3,)], True)
-    assert (await sql.query(text, SqlLimits(rows=11)))[1:] == ([(each,) for each in range(1, 12)], False)
-    assert (await sql.query(text, SqlLimits(rows=10)))[2] is True
-    long = "SELECT a.sequence FROM event a, event b, event c ORDER BY 1"
-    _, rows, more = await sql.query(long, SqlLimits(rows=None))
-    assert len(rows) == (len(RECORDS) - 3) ** 3
-    assert not more
-
-
-async def test_a_query_ends_at_its_limit_on_bytes(sql: _Sql) -> None:
-    ones = "'" + "1" * 1_000 + "'"
-    text = f"{ENDLESS} {ones} FROM n"
-    _, rows, more = await sql.query(text, SqlLimits(rows=None, bytes=50_000))
-    assert 40 <= len(rows) <= 50
-    assert more
-
-
-async def test_a_huge_value_does_not_reach_this_process(sql: _Sql) -> None:
-    huge = "SELECT zeroblob(900000000)" if sql.is_sqlite else "SELECT repeat('x', 20000000)"
-    with pytest.raises(
-        QueryRefused,
-        match="value of more than 16 MiB: select" if sql.is_sqlite else "has 200000\\d+ bytes, and the limit is",
-    ):
-        await sql.query(huge)
-
-
-async def test_a_text_that_is_no_query_is_refused(sql: _Sql) -> None:
-    for text in ("", ";", "-- nothing", "SELEC 1", "SELECT", "SELECT $1", "SELECT 'a", "SELECT \0", "SELECT '\ud800'"):
-        with pytest.raises(QueryRefused):
-            pytest.fail(f"{text!r} was answered with {await sql.query(text)}")
-
-
-async def test_comments_may_follow_the_semicolon_of_a_query(sql: _Sql) -> None:
-    texts = {
-        "SELECT 1; -- the end": 1,
-        "SELECT 1 /* ; */ ;\n/* the; end */ -- ; (": 1,
-        "SELECT 'é; --🤖;' -- it; is\n; -- that;": "é; --🤖;",
-        "SELECT 'a''; -- b'": "a'; -- b",
-        "VALUES (';') -- no; semicolon": ";",
-    }
-    for text, value in texts.items():
-        assert (await sql.query(text))[1] == [(value,)], text
-    for text in ("SELECT 1; SELECT 2 -- the end", "SELECT 1; -- one\nSELECT 2"):
-        with pytest.raises(QueryRefused, match="a query is one statement: this text has several"):
-            await sql.query(text)
-    for text in ("DELETE FROM process_metadata; -- all", "SELECT 1) AS a; -- ("):
-        with pytest.raises(QueryRefused):
-            await sql.query(text)
-
-
-async def test_a_text_that_is_not_utf_8_is_refused_with_the_way_to_read_it(sql: _Sql) -> None:
-    if not sql.is_sqlite:
-        return
-    with pytest.raises(QueryRefused, match=r"^the query has a text that is not UTF-8: select it as bytes, with CAST"):
-        await sql.query("SELECT CAST(x'66ff' AS TEXT)")
-    assert (await sql.query("SELECT CAST(CAST(x'66ff' AS TEXT) AS BLOB)"))[1] == [(b"f\xff",)]
-
-
-async def test_a_statement_that_changes_a_view_may_only_read(sql: _Sql) -> None:
-    for text in ("UPDATE pose SET x = 1", "DELETE FROM pose", "INSERT INTO action (id) VALUES (1)"):
-        with pytest.raises(QueryRefused, match=r"^a query may only read: it is one SELECT, or WITH … SELECT"):
-            await sql.query(text)
-
-
-async def test_a_query_with_a_parameter_is_refused_with_the_way_to_write_it(sql: _Sql) -> None:
-    for text in ("SELECT $1", *(("SELECT ?", "SELECT ?, ?2", "SELECT :a, @b") if sql.is_sqlite else ())):
-        with pytest.raises(QueryRefused, match=r"^a query has no parameters such as \?, :name or \$1: write the value"):
-            await sql.query(text)
-
-
-async def test_an_open_memory_for_reading_takes_queries(reader_url: str) -> None:
-    async with Reading.open(reader_url) as reading:
-        assert (await reading.query("SELECT count(*) AS episodes FROM process_metadata")).rows == [(2,)]
-        with pytest.raises(QueryRefused):
-            await reading.query("DELETE FROM event", SqlLimits(rows=1))
-
-
-async def test_a_wrong_name_is_answered_with_the_nearest_one(sql: _Sql) -> None:
-    with pytest.raises(QueryRefused, match=r"no table or view root_failures; did you mean root_failure\?"):
-        await sql.query("SELECT * FROM root_failures")
-    with pytest.raises(QueryRefused, match=r"no table or view task_tree_nodes; did you mean task_tree_node\?$"):
-        await sql.query("SELECT * FROM task_tree_nodes")
-    with pytest.raises(QueryRefused, match="no table or view weather; `pycrorm schema` lists them"):
-        await sql.query("SELECT * FROM weather")
-    with pytest.raises(QueryRefused, match="statu"):
-        await sql.query("SELECT statu FROM process_metadata")
-
-
-async def test_a_server_names_a_mistake_with_its_hint_once(sql: _Sql) -> None:
-    if sql.is_sqlite:
-        return
-    refusals = {
-        "SELECT dtyp FROM action": 'column "dtyp" does not exist'
-        ' (Perhaps you meant to reference the column "action.dtype".)',
-        "SELECT action.dtype FROM action AS a": 'invalid reference to FROM-clause entry for table "action"'
-        ' (Perhaps you meant to reference the table alias "a".)',
-        "SELECT b.dtype FROM action AS a": 'missing FROM-clause entry for table "b"',
-        "SELECT dtype, count(*) FROM action": 'column "action.dtype" must appear in the GROUP BY clause'
-        " or be used in an aggregate function",
-    }
-    for text, refusal in refusals.items():
-        with pytest.raises(QueryRefused) as refused:
-            await sql.query(text)
-        assert str(refused.value) == f"the query is refused: {refusal}"
-
-
-async def test_a_cancelled_query_stops_in_the_database(sql: _Sql) -> None:
-    task = asyncio.create_task(sql.query(f"{ENDLESS} count(*) FROM n", SqlLimits(seconds=60)))
-    await asyncio.sleep(0.3)
-    task.cancel()
-    started_s = time.monotonic()
-    with pytest.raises(asyncio.CancelledError):
-        await task
-    assert time.monotonic() - started_s < 20
-
-
-async def test_a_query_on_a_file_that_is_gone_is_unavailable(tmp_path: Path) -> None:
-    url = f"sqlite:///{tmp_path / 'memory.db'}"
-    await append_and_fold(url, RECORDS)
-    log = await EventLog.open(DatabaseAddress.parse(url), create=False)
-    for each in tmp_path.glob("memory.db*"):
-        each.unlink()
-    with pytest.raises(DatabaseUnavailable):
-        await ReadOnlySql(log).query("SELECT 1")
-    await log.close()
-    assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize(
-    "limits",
-    [{"rows": 0}, {"bytes": -1}, {"seconds": 0.0}, {"seconds": math.nan}, {"seconds": math.inf}, {"bytes": math.nan}],
-)
-def test_a_limit_of_nothing_or_of_no_number_is_refused(limits: dict[str, Any]) -> None:
-    with pytest.raises(QueryRefused, match="must be > 0 and finite"):
-        SqlLimits(**limits)
-    with pytest.raises(QueryRefused, match="is at most 86400"):
-        SqlLimits(seconds=1e9)
 
 
 # --- attacks --------------------------------------------------------------------------------------------------
@@ -344,7 +103,7 @@ ON_POSTGRESQL = {
 }
 
 
-async def test_every_attack_is_refused_and_changes_nothing(owner_url: str, sql: _Sql, tmp_path: Path) -> None:
+async def test_every_attack_is_refused_and_changes_nothing(owner_url: str, sql: SqlReader, tmp_path: Path) -> None:
     async with open_connection(owner_url) as query:
         before = [await query(each) for each in _state_of(owner_url)]
         for attack, text in {**ON_BOTH, **(ON_SQLITE if sql.is_sqlite else ON_POSTGRESQL)}.items():
@@ -376,7 +135,7 @@ def _state_of(url: str) -> list[str]:
         "SELECT count(*) FROM event a, event b, event c, event d, event e, event f, event g, event h",
     ],
 )
-async def test_an_endless_query_is_stopped(endless: str, sql: _Sql) -> None:
+async def test_an_endless_query_is_stopped(endless: str, sql: SqlReader) -> None:
     started_s = time.monotonic()
     with pytest.raises(QueryRefused, match=r"was stopped after 0[.]3 s: select less, or allow it more time"):
         await sql.query(endless, QUICK)
@@ -388,15 +147,15 @@ ONE_LONG_STEP = "SELECT instr(zeroblob(15000000), zeroblob(7000000) || x'01')"
 
 
 @pytest.fixture
-async def file_sql(tmp_path: Path) -> AsyncIterator[_Sql]:
+async def file_sql(tmp_path: Path) -> AsyncIterator[SqlReader]:
     """A SQLite memory without tables."""
     url = f"sqlite:///{tmp_path / 'memory.db'}"
     await (await EventLog.open(DatabaseAddress.parse(url), create=True)).close()
-    async with _opened(url) as opened:
+    async with opened_reader(url) as opened:
         yield opened
 
 
-async def test_a_single_step_of_sqlite_is_stopped_and_cancelled(file_sql: _Sql) -> None:
+async def test_a_single_step_of_sqlite_is_stopped_and_cancelled(file_sql: SqlReader) -> None:
     started_s = time.monotonic()
     with pytest.raises(QueryRefused, match=r"was stopped after 0[.]3 s"):
         await file_sql.query(ONE_LONG_STEP, QUICK)
@@ -408,7 +167,7 @@ async def test_a_single_step_of_sqlite_is_stopped_and_cancelled(file_sql: _Sql) 
     assert time.monotonic() - started_s < 20
 
 
-async def test_a_query_on_a_file_fills_neither_the_memory_nor_the_disk(file_sql: _Sql) -> None:
+async def test_a_query_on_a_file_fills_neither_the_memory_nor_the_disk(file_sql: SqlReader) -> None:
     with pytest.raises(QueryRefused, match="needs more memory than it may use"):
         await file_sql.query(f"SELECT {', '.join(['zeroblob(16000000)'] * 60)}")
     numbers = "WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM n LIMIT 20) "
@@ -421,7 +180,7 @@ async def test_a_query_on_a_file_fills_neither_the_memory_nor_the_disk(file_sql:
     assert [each[0] for each in rows] == [*range(20, 0, -1)]
 
 
-async def test_a_process_of_a_query_that_dies_is_named(file_sql: _Sql) -> None:
+async def test_a_process_of_a_query_that_dies_is_named(file_sql: SqlReader) -> None:
     task = asyncio.create_task(file_sql.query(ONE_LONG_STEP, SqlLimits(seconds=60)))
     process = await asyncio.to_thread(_process_of_a_query)
     process.kill()
@@ -438,7 +197,7 @@ def _process_of_a_query() -> psutil.Process:
         time.sleep(0.02)
 
 
-async def test_time_at_which_the_rows_are_not_read_does_not_count(sql: _Sql) -> None:
+async def test_time_at_which_the_rows_are_not_read_does_not_count(sql: SqlReader) -> None:
     async with sql.stream(ENDLESS + "x FROM n", SqlLimits(rows=1_500, seconds=1)) as rows:
         count = 0
         async for _ in rows:
@@ -494,11 +253,11 @@ async def test_a_login_with_more_rights_than_a_reader_is_refused(server: Server)
         "GRANT USAGE ON SCHEMA lab TO {name}",
         "GRANT SELECT ON lab.notes TO {name}",
     )
-    async with _opened(reader) as sql:  # reading more is no excess, nor is what every login may
+    async with opened_reader(reader) as sql:  # reading more is no excess, nor is what every login may
         assert (await sql.query("SELECT count(*) FROM lab.notes"))[1] == [(0,)]
     for right, (attributes, *after) in MORE_RIGHTS.items():
         url = login(owner_url, attributes, *(each.format(database=database, name="{name}") for each in after))
-        async with _opened(url) as sql:
+        async with opened_reader(url) as sql:
             with pytest.raises(QueryRefused) as refused:
                 await sql.query("SELECT 1")
         assert right in str(refused.value)
@@ -512,7 +271,7 @@ async def test_a_function_with_effects_is_refused_although_every_login_may_call_
         owner_url,
         [f"CREATE FUNCTION public.effect() RETURNS integer LANGUAGE sql SECURITY DEFINER AS $$ {effect} $$"],
     )
-    async with _opened(login(owner_url, "IN ROLE pycrorm_reader")) as sql:
+    async with opened_reader(login(owner_url, "IN ROLE pycrorm_reader")) as sql:
         with pytest.raises(QueryRefused, match="the function effect can do more and is not allowed"):
             await sql.query("SELECT public.effect()")
         assert (await sql.query("SELECT 1 AS effect"))[0] == ("effect",)  # a name alone calls nothing
@@ -540,7 +299,7 @@ async def test_a_volatile_function_is_refused_however_its_name_is_written_and_be
     )
     calls = [f"{name if '.' in name else f'public.{name}'}()" for name in names]
     calls += [f"'\"' || {each} || '\"'" for each in calls]
-    async with _opened(login(owner_url, "IN ROLE pycrorm_reader")) as sql:
+    async with opened_reader(login(owner_url, "IN ROLE pycrorm_reader")) as sql:
         for call in (*calls, "1 OPERATOR(public.@+@) 2", "public.folded(1)"):
             with pytest.raises(QueryRefused, match=r"the (function|operator) .* can do more and is not allowed"):
                 pytest.fail(f"{call} was answered with {await sql.query(f'SELECT {call}')}")
@@ -550,7 +309,7 @@ async def test_a_volatile_function_is_refused_however_its_name_is_written_and_be
 
 
 async def test_a_date_that_python_lacks_is_refused_with_the_way_to_read_it(server: Server) -> None:
-    async with _opened(login(await _with_roles(server), "IN ROLE pycrorm_reader")) as sql:
+    async with opened_reader(login(await _with_roles(server), "IN ROLE pycrorm_reader")) as sql:
         for value in ("'200000-01-01'::timestamp", "'4000-01-01 BC'::timestamptz", "'24:00'::time"):
             with pytest.raises(QueryRefused, match=r"Python has no such date or time .*: cast the column to text"):
                 await sql.query(f"SELECT {value}")
