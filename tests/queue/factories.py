@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import shutil
 from pathlib import Path
 
@@ -33,6 +34,7 @@ SMALL = Settings(
 # reserve is 8192 bytes: of the last three segments (3 x 3856) 3376 may be used, which hold 3 nodes.
 ORDINARY, ALL = 18, 24
 PAYLOAD = b"x" * 900
+LONG_S = 30.0
 
 RECORDER = episode_id(1_700_000_000_000_000_000, b"recorder..")
 
@@ -174,3 +176,9 @@ def overwrite(path: Path, offset: int, content: bytes) -> None:
     with path.open("rb+") as file:
         file.seek(offset)
         file.write(content)
+
+
+def batch_of(
+    queue: RecorderQueue, events: int, *, bytes_max: int = 2**22, age_s: float = 0.0
+) -> asyncio.Task[list[Record]]:
+    return asyncio.ensure_future(queue.get_batch(events_max=events, bytes_max=bytes_max, age_s_max=age_s))
