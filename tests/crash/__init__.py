@@ -6,7 +6,7 @@
         test_queue_kill (48 rounds, 10,000 in the soak), test_killed_plan, test_daemon_kill, test_many_machines,
         store/test_crash
  2  killed at each step that touches disk or log, and once more
-        test_crash_points; queue/test_dead_source (sealing, removing), queue/test_repair
+        test_crash_points; queue/test_dead_source_deletion (sealing, removing), queue/test_repair
  3  power cut: any sectors of what was not synced
         test_queue_power; a mounted image of a disk: the bench
  4  torn write at every byte

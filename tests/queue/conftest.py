@@ -1,12 +1,13 @@
-"""Provide one small live queue to a test, released afterwards."""
+"""Fixtures with a recorder's folder in one spool: of a live queue, drained here or elsewhere, or of a dead recorder."""
 
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.queue import RecorderQueue
-from tests.queue.factories import make
+from tests.queue.factories import FolderWriter, make
 
 
 @pytest.fixture
@@ -19,3 +20,15 @@ def queue(spool: Path) -> Iterator[RecorderQueue]:
     queue = make(spool)
     yield queue
     queue.release()
+
+
+@pytest.fixture
+def offered(spool: Path) -> Iterator[RecorderQueue]:
+    queue = make(spool, clock=SYSTEM_CLOCK, offered=True)
+    yield queue
+    queue.release()
+
+
+@pytest.fixture
+def author(spool: Path) -> FolderWriter:
+    return FolderWriter(spool)
