@@ -4,13 +4,23 @@ from __future__ import annotations
 
 import asyncio
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from pycrorm_async import Memory, Settings
 from pycrorm_async.projections.verify.verify import verify
+from pycrorm_async.recording.recorded_episode import RecordedEpisode
+from pycrorm_async.recording.recording import Recording
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
+from pycrorm_async.sync_memory import SyncMemory
+from pycrorm_async.world.pose import Pose
 from tests.databases import ask, put_memory
+
+HERE = Pose([1, 2, 3])
+AT_END = Settings(fold="at_end")
+SMALL = Settings(fold="at_end", episode_events_max=100)
 
 
 def url_of(folder: Path) -> str:
@@ -52,3 +62,26 @@ def problems(url: str) -> list[str]:
 
 def assert_verified(folder: Path) -> None:
     assert problems(url_of(folder)) == []
+
+
+def record(folder: Path, write: Callable[[Recording, RecordedEpisode], None], settings: Settings = SMALL) -> Any:
+    """Let `write` record one episode; check that nothing was parked, and return the status of the memory."""
+    with Memory.sync(url_of(folder), settings=settings) as memory:
+        with memory.recording.episode(description="d") as episode:
+            write(memory.recording, episode)
+        memory.flush()
+        status = memory.status
+    assert_verified(folder)
+    return status
+
+
+def opened(folder: Path, settings: Settings = AT_END) -> SyncMemory:
+    return Memory.sync(url_of(folder), settings=settings)
+
+
+def faults_of(folder: Path, write: Callable[[Recording, RecordedEpisode], None]) -> tuple[int, str | None]:
+    """Return how many faults were counted while `write` ran in an episode, and the last one."""
+    with opened(folder) as memory:
+        with memory.recording.episode(description="d") as episode:
+            write(memory.recording, episode)
+        return memory.status.faults

@@ -4,47 +4,29 @@ from __future__ import annotations
 
 import asyncio
 import gc
-import subprocess
-import sys
 import threading
-from collections.abc import Callable
 from enum import Enum
 from pathlib import Path
 from typing import Any, cast
 
 import pytest
 
-from pycrorm_async import Memory, Settings, recover
 from pycrorm_async.errors import CallerError
-from pycrorm_async.events.values import EpisodeStatus, FailureValue, ObjectReference, PoseValue, RobotValue, SeenValue
+from pycrorm_async.events.values import PoseValue, SeenValue
 from pycrorm_async.plan.failures import NavigationGoalInCollision
 from pycrorm_async.recording import recorded_nodes
 from pycrorm_async.recording.recorded_episode import RecordedEpisode
 from pycrorm_async.recording.recording import Recording
-from pycrorm_async.sync_memory import SyncMemory
 from pycrorm_async.world.pose import Pose
-from tests.commands import environment, pycrorm
+from tests.commands import pycrorm
 from tests.databases import ask
-from tests.recording.recorded_memory import assert_verified, events, nodes, url_of
+from tests.recording.recorded_memory import assert_verified, events, faults_of, nodes, opened, url_of
 
-AT_END = Settings(fold="at_end")
 HERE = Pose([1, 2, 3])
 
 
 class Side(Enum):
     LEFT = 1
-
-
-def opened(folder: Path, settings: Settings = AT_END) -> SyncMemory:
-    return Memory.sync(url_of(folder), settings=settings)
-
-
-def faults_of(folder: Path, write: Callable[[Recording, RecordedEpisode], None]) -> tuple[int, str | None]:
-    """Return how many faults were counted while `write` ran in an episode, and the last one."""
-    with opened(folder) as memory:
-        with memory.recording.episode(description="d") as episode:
-            write(memory.recording, episode)
-        return memory.status.faults
 
 
 def test_a_move_to_the_last_pose_writes_nothing_and_one_to_no_pose_is_counted(tmp_path: Path) -> None:
@@ -195,18 +177,6 @@ def test_an_end_without_a_start_is_counted(tmp_path: Path) -> None:
     assert "no open node has the key 'never'" in last
 
 
-def test_an_unknown_status_is_counted_and_the_node_ends_with_an_error(tmp_path: Path) -> None:
-    def write(recording: Recording, episode: RecordedEpisode) -> None:
-        episode.start(1, recording.type("action", "Step"))
-        episode.end(1, cast("Any", "DONE"))
-
-    total, last = faults_of(tmp_path, write)
-    assert total == 1
-    assert last is not None
-    assert "'DONE' is not a status" in last
-    assert [row[2] for row in nodes(tmp_path)] == ["ERROR"]
-
-
 def test_a_key_in_use_ends_its_first_node_lost_and_starts_the_second(tmp_path: Path) -> None:
     def write(recording: Recording, episode: RecordedEpisode) -> None:
         kind = recording.type("action", "Twice")
@@ -306,29 +276,6 @@ def test_nodes_open_at_the_end_of_an_interrupted_episode_end_cancelled(
     assert_verified(tmp_path)
 
 
-def test_a_thread_that_outlives_the_episode_is_counted_and_disturbs_nothing(tmp_path: Path) -> None:
-    with opened(tmp_path) as memory:
-        kind = memory.recording.type("action", "Step")
-        ended = threading.Event()
-        with memory.recording.episode(description="d") as episode:
-            episode.start("in time", kind)
-
-            def late() -> None:
-                ended.wait()
-                episode.end("in time")
-                episode.start("late", kind)
-                episode.observe("late", 1.0)
-
-            thread = threading.Thread(target=late)
-            thread.start()
-            episode.end("in time")
-        ended.set()
-        thread.join()
-        assert memory.status.faults.total == 3
-    assert len(nodes(tmp_path)) == 1
-    assert events(tmp_path, "Observed") == []
-
-
 @pytest.mark.parametrize("misuse", ["unhashable", "no pose", "unknown object", "no type", "bad status"])
 def test_misuse_is_counted_and_never_raises(tmp_path: Path, misuse: str) -> None:
     def write(recording: Recording, episode: RecordedEpisode) -> None:
@@ -380,206 +327,6 @@ def test_a_simulation_names_the_node_that_imagined_it(tmp_path: Path) -> None:
     assert_verified(tmp_path)
 
 
-def test_a_failure_that_leaves_the_block_ends_the_episode_with_its_status(tmp_path: Path) -> None:
-    with opened(tmp_path) as memory:
-        for failure in (NavigationGoalInCollision("n"), ValueError("v"), KeyboardInterrupt()):
-            with pytest.raises(type(failure)), memory.recording.episode(description="d"):
-                raise failure
-        memory.recording.episode(description="left open")
-    statuses = [each for (each,) in ask(tmp_path / "memory.db", "SELECT status FROM process_metadata ORDER BY id")]
-    assert statuses == ["FAILED", "ERROR", "INTERRUPTED", "INTERRUPTED"]
-
-
-def test_a_long_episode_continues_with_its_open_nodes_and_its_objects(tmp_path: Path) -> None:
-    with opened(tmp_path, Settings(episode_events_max=200)) as memory:
-        kind = memory.recording.type("action", "Step", {"number": int, "what": "object"})
-        with memory.recording.episode(description="long") as episode:
-            episode.object_added("x", "cup", "CUP", HERE)  # so that the follow-ups have the others at other sequences
-            episode.object_added("r", "pr2", "ROBOT", HERE, {"j": 1.0})
-            episode.object_added("m", "milk", "MILK", HERE)
-            episode.object_attached("r", "m")
-            episode.object_removed("x")
-            episode.start("outer", kind, {"what": "m"}, robot="r")
-            for number in range(300):
-                episode.start(number, kind, {"number": number, "what": "m"}, parent="outer", robot="r")
-                episode.object_moved("m", Pose([number, 0, 0]), node=number)
-                episode.end(number)
-            episode.end("outer")
-        assert memory.status.faults == (0, None)
-        continued = memory.status.episodes_continued
-        assert continued > 3
-    assert_verified(tmp_path)
-    file = tmp_path / "memory.db"
-    numbers = ask(file, "SELECT number FROM step JOIN task_tree_node USING (id) WHERE status = 'SUCCEEDED' ORDER BY id")
-    assert [each for (each,) in numbers if each is not None] == list(range(300))
-    outers = [
-        each for each in events(tmp_path, "NodeStarted") if "designator" in each and "number" not in each["parameters"]
-    ]
-    assert len(outers) == continued + 1
-    rows = [each["parameters"]["what"] for each in outers]
-    assert rows[0] == {"object": 5, "row": 5}
-    assert {each["object"] for each in rows[1:]} == {4}  # as the follow-ups number it
-    assert len(events(tmp_path, "ObjectAttached")) == continued + 1
-
-
-def test_threads_that_reach_the_limit_together_continue_the_episode_once(tmp_path: Path) -> None:
-    interval = sys.getswitchinterval()
-    sys.setswitchinterval(1e-6)
-    try:
-        with opened(tmp_path, Settings(episode_events_max=200)) as memory:
-            kind = memory.recording.type("action", "Step", {"thread": int, "number": int})
-            with memory.recording.episode(description="long") as episode:
-
-                def work(thread: int) -> None:
-                    episode.start(thread, kind, {"thread": thread})
-                    for number in range(300):
-                        episode.start((thread, number), kind, {"thread": thread, "number": number}, parent=thread)
-                        episode.end((thread, number))
-                    episode.end(thread)
-
-                threads = [threading.Thread(target=work, args=(each,)) for each in range(4)]
-                for each in threads:
-                    each.start()
-                for each in threads:
-                    each.join()
-            assert memory.status.faults == (0, None)
-    finally:
-        sys.setswitchinterval(interval)
-    assert_verified(tmp_path)
-    rows = ask(
-        tmp_path / "memory.db",
-        "SELECT step.thread, step.number, above.thread FROM step JOIN task_tree_node AS node USING (id)"
-        " JOIN step AS above ON above.id = node.parent_id"
-        " WHERE node.status = 'SUCCEEDED' AND step.number IS NOT NULL ORDER BY 1, 2",
-    )
-    assert rows == [(thread, number, thread) for thread in range(4) for number in range(300)]
-
-
-@pytest.mark.slow
-def test_a_forked_child_records_nothing_and_does_not_hang(tmp_path: Path) -> None:
-    script = (
-        "import os, sys, threading\n"
-        "from pycrorm_async import Memory\n"
-        "with Memory.sync(sys.argv[1]) as memory, memory.recording.episode(description='d') as episode:\n"
-        "    kind = memory.recording.type('action', 'Step')\n"
-        "    episode.start('a', kind)\n"
-        "    recording = memory.recording\n"
-        "    with episode._calls._lock, recording._lock:\n"
-        "        child = os.fork()\n"
-        "        if child == 0:\n"
-        "            def work():\n"
-        "                episode.start('child', recording.type('action', 'Other'))\n"
-        "                episode.node_reference('a')\n"
-        "                episode.tag('late')\n"
-        "            late = threading.Thread(target=work, daemon=True)\n"
-        "            late.start()\n"
-        "            late.join(10)\n"
-        "            memory.__exit__(None, None, None)\n"
-        "            os._exit(8 if late.is_alive() else 7)\n"
-        "    _, status = os.waitpid(child, 0)\n"
-        "    assert os.waitstatus_to_exitcode(status) == 7\n"
-        "    episode.end('a')\n"
-    )
-    done = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", script, url_of(tmp_path)],
-        env=environment(), capture_output=True, text=True, timeout=60, check=False,
-    )  # fmt: skip
-    assert (done.returncode, done.stderr) == (0, "")
-    assert nodes(tmp_path) == [("Step", None, "SUCCEEDED", None)]
-
-
-@pytest.mark.slow
-def test_what_was_written_before_a_kill_is_stored_by_the_next_memory(tmp_path: Path) -> None:
-    script = (
-        "import os, sys\n"
-        "from pycrorm_async import Memory\n"
-        "memory = Memory.sync(sys.argv[1]).__enter__()\n"
-        "episode = memory.recording.episode(description='d')\n"
-        "kind = memory.recording.type('action', 'Step', {'number': int})\n"
-        "for number in range(10**6):\n"
-        "    episode.start(number, kind, {'number': number})\n"
-        "    episode.end(number)\n"
-        "    os.write(1, b'%d\\n' % number)\n"
-    )
-    with subprocess.Popen(
-        [sys.executable, "-c", script, url_of(tmp_path)], env=environment(), stdout=subprocess.PIPE
-    ) as process:
-        assert process.stdout is not None
-        announced = [int(process.stdout.readline()) for _ in range(500)]
-        process.kill()
-        announced += map(int, process.stdout.read().rpartition(b"\n")[0].split())
-    asyncio.run(recover(url_of(tmp_path)))
-    succeeded = "SELECT number FROM step JOIN task_tree_node USING (id) WHERE status = 'SUCCEEDED'"
-    assert set(announced) <= {number for (number,) in ask(tmp_path / "memory.db", succeeded)}
-    assert_verified(tmp_path)
-
-
-def test_a_full_spool_is_waited_for_by_a_thread(tmp_path: Path) -> None:
-    small = Settings(spool_bytes_max=2**20, spool_reserve_bytes=2**18, segment_bytes=2**16, record_bytes_max=2**14)
-    with Memory.sync(url_of(tmp_path), settings=small, writer="daemon") as memory:
-        kind = memory.recording.type("action", "Step", {"text": str})
-        with memory.recording.episode(description="d") as episode:
-            assert episode.wait_for_room(0.0)
-            for number in range(10_000):
-                if not episode.wait_for_room(0.0):
-                    break
-                episode.start(number, kind, {"text": "x" * 1_000})
-                episode.end(number)
-            assert number < 9_999
-            assert not episode.wait_for_room(0.05)
-        assert memory.status.faults == (0, None)
-
-
-def test_a_status_given_with_a_failure_of_another_language(tmp_path: Path) -> None:
-    with opened(tmp_path) as memory, memory.recording.episode(description="d") as episode:
-        episode.start("a", memory.recording.type("action", "Step"), robot=RobotValue(
-            PoseValue((0, 0, 0), (0, 0, 0, 1), "map", 0), "ROBOT", None, ObjectReference(1, 1), "r"
-        ))  # fmt: skip
-        episode.end("a", "INTERRUPTED", FailureValue("bt.Preempted", "a higher priority"))
-    assert nodes(tmp_path) == [("Step", None, "INTERRUPTED", "a higher priority")]
-
-
-@pytest.mark.parametrize(
-    ("status", "root"), [("FAILED", "FAILED"), ("INTERRUPTED", "CANCELLED"), ("ERROR", "ERROR"), (None, "ERROR")]
-)
-def test_an_executive_states_the_outcome_of_its_own_failure(
-    tmp_path: Path, status: EpisodeStatus | None, root: str
-) -> None:
-    with opened(tmp_path) as memory:
-        memory.recording.episode(description="d").close(ValueError("a failure of its own"), status)
-    ended = ask(tmp_path / "memory.db", "SELECT status, failure_type, failure_message FROM process_metadata")
-    assert [tuple(each) for each in ended] == [(status or "ERROR", "builtins.ValueError", "a failure of its own")]
-    roots = ask(tmp_path / "memory.db", "SELECT status FROM task_tree_node WHERE kind = 'root'")
-    assert [tuple(each) for each in roots] == [(root,)]
-
-
-class Slip(Exception):
-    """A plan failure of an executive of its own."""
-
-
-def test_without_a_status_a_node_and_its_episode_have_that_of_the_failure(tmp_path: Path) -> None:
-    expected: list[tuple[Any, str, str]] = [
-        (None, "SUCCEEDED", "SUCCEEDED"),
-        (NavigationGoalInCollision("n"), "FAILED", "FAILED"),
-        (Slip("s"), "FAILED", "FAILED"),
-        ("the wheel slipped", "FAILED", "SUCCEEDED"),
-        (FailureValue("Slip", "s"), "FAILED", "SUCCEEDED"),
-        (ValueError("v"), "ERROR", "ERROR"),
-        (KeyboardInterrupt(), "CANCELLED", "INTERRUPTED"),
-        (SystemExit(0), "CANCELLED", "INTERRUPTED"),
-        (asyncio.CancelledError(), "CANCELLED", "INTERRUPTED"),
-    ]
-    with opened(tmp_path) as memory:
-        for failure, *_ in expected:
-            episode = memory.recording.episode(failures=(Slip,))
-            episode.start("a", memory.recording.type("action", "Step"))
-            episode.end("a", failure=failure)
-            episode.close(failure if isinstance(failure, BaseException) else None)
-        assert memory.status.faults == (0, None)
-    assert [row[2] for row in nodes(tmp_path)] == [status for _, status, _ in expected]
-    assert [each["status"] for each in events(tmp_path, "EpisodeEnded")] == [status for *_, status in expected]
-
-
 def test_an_end_can_end_the_nodes_that_are_open_below(tmp_path: Path) -> None:
     def write(recording: Recording, episode: RecordedEpisode) -> None:
         step = recording.type("action", "Step")
@@ -606,8 +353,3 @@ def test_an_end_can_end_the_nodes_that_are_open_below(tmp_path: Path) -> None:
         (15, "SUCCEEDED"), (2, "SUCCEEDED"),
     ]  # fmt: skip
     assert_verified(tmp_path)
-
-
-def test_failures_that_are_no_classes_are_refused(tmp_path: Path) -> None:
-    with opened(tmp_path) as memory, pytest.raises(CallerError, match="failures must be a tuple of classes"):
-        memory.recording.episode(failures=cast("Any", Slip))
