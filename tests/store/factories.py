@@ -5,7 +5,9 @@ from __future__ import annotations
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.events.ids import EpisodeId
 
-__all__ = ["episode", "record", "run_of", "declaration"]
+__all__ = ["episode", "record", "run_of", "declaration", "name", "HEADS"]
+
+HEADS = "SELECT number, id, head, folded, started_wall_ns, ended_wall_ns, refused, parked FROM episode ORDER BY number"
 
 
 def episode(number: int) -> EpisodeId:
@@ -44,3 +46,7 @@ def run_of(of: EpisodeId, first: int, last: int, *, position: int | None = None)
 
 def declaration(payload: bytes, *, position: int = 1) -> Record:
     return Record(position, None, 0, "DesignatorTypeDeclared", 1, 7, 8, payload)
+
+
+def name(number: int) -> str:
+    return f"00000000-0000-0000-0000-{number:012x}"

@@ -16,9 +16,9 @@ from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.writer.ports import Source
 from tests.databases import ask
-from tests.store.factories import episode, record, run_of
+from tests.store.factories import episode, name, record, run_of
 from tests.writer.fakes import KeptSource
-from tests.writer.writer_threads import QUICK, name, until, until_answer, writer_for, writers_alive
+from tests.writer.writer_threads import QUICK, until, until_answer, writer_for, writers_alive
 
 
 async def test_the_folders_of_dead_recorders_are_stored_and_folded(address: DatabaseAddress) -> None:

@@ -18,10 +18,6 @@ QUICK = Settings(batch_events_max=1000, idle_ms=1)
 NEVER_IDLE = Settings(batch_events_max=1000, idle_ms=10**9)
 
 
-def name(number: int) -> str:
-    return f"00000000-0000-0000-0000-{number:012x}"
-
-
 def writers_alive() -> list[str]:
     return [each.name for each in threading.enumerate() if each.name.startswith("pycrorm writer")]
 
