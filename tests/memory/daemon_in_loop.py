@@ -2,9 +2,11 @@
 
 import asyncio
 import re
+from collections.abc import Callable
+from contextlib import AbstractAsyncContextManager
 from pathlib import Path
 
-from pycrorm_async import Settings
+from pycrorm_async import Memory, Settings
 from pycrorm_async.operations.daemon import serve
 
 QUICK = Settings(sync_interval_ms=5, flush_timeout_s=60)
@@ -27,3 +29,10 @@ class Daemon:
     async def stop(self) -> None:
         self.leave.set()
         await self.task
+
+
+Start = Callable[..., AbstractAsyncContextManager[Daemon]]
+
+
+def memory_at(url: str, spool: Path, settings: Settings = QUICK) -> Memory:
+    return Memory.open(url, spool=spool, writer="daemon", settings=settings)

@@ -28,11 +28,6 @@ STORED = "SELECT count(*) FROM event"
 
 
 @pytest.fixture
-def spool(tmp_path: Path) -> Path:
-    return tmp_path / "spool"
-
-
-@pytest.fixture
 def crafted(spool: Path) -> FolderWriter:
     """Its only event has a name that is no text. It is the oldest folder, so that others are drained after it."""
     author = FolderWriter(spool, settings=QUICK)

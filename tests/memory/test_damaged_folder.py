@@ -32,11 +32,6 @@ MISSING = "position 13 is missing"
 
 
 @pytest.fixture
-def spool(tmp_path: Path) -> Path:
-    return tmp_path / "spool"
-
-
-@pytest.fixture
 def damaged(spool: Path) -> FolderWriter:
     """Twenty synced events, two in each file, of which the thirteenth is changed."""
     author = FolderWriter(spool)

@@ -58,11 +58,6 @@ def take_backup(database_url: str, request: pytest.FixtureRequest) -> TakeBackup
     return take
 
 
-@pytest.fixture
-def spool(tmp_path: Path) -> Path:
-    return tmp_path / "spool"
-
-
 @asynccontextmanager
 async def memory_at(url: str, spool: Path, settings: Settings = QUICK) -> AsyncIterator[Memory]:
     async with Memory.open(url, spool=spool, settings=settings) as memory:

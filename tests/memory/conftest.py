@@ -1,0 +1,34 @@
+"""Fixtures with a spool, a daemon that drains it in the test's own loop, and a current folder for one test."""
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import pytest
+
+from pycrorm_async import Settings
+from tests.memory.daemon_in_loop import QUICK, Daemon, Start
+
+
+@pytest.fixture
+def spool(tmp_path: Path) -> Path:
+    return tmp_path / "spool"
+
+
+@pytest.fixture
+def daemon(database_url: str, spool: Path) -> Start:
+    @asynccontextmanager
+    async def running(settings: Settings = QUICK) -> AsyncIterator[Daemon]:
+        started = Daemon(database_url, spool, settings)
+        yield started
+        started.leave.set()
+        await started.task
+
+    return running
+
+
+@pytest.fixture
+def in_a_folder_of_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The default spool of a database on a server is in the current folder."""
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
