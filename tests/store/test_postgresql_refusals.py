@@ -105,15 +105,21 @@ async def test_a_missing_server_is_refused(place: str, reason: str, caplog: pyte
     assert str(error).startswith("postgresql://ada:***@")
 
 
-async def test_another_program_at_the_port_is_refused(caplog: pytest.LogCaptureFixture) -> None:
-    async def other(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        writer.write(b"HTTP/1.1 400 Bad Request\r\n\r\n")
+@pytest.mark.parametrize("parameters", ["", "?sslmode=require"])
+@pytest.mark.parametrize("answer", [b"HTTP/1.1 400 Bad Request\r\n\r\n", b""])
+async def test_another_program_at_the_port_is_refused(
+    caplog: pytest.LogCaptureFixture, answer: bytes, parameters: str
+) -> None:
+    async def other(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        await reader.read(8)
+        writer.write(answer)
         writer.close()
 
     listening = await asyncio.start_server(other, "127.0.0.1", 0)
     port = listening.sockets[0].getsockname()[1]
-    error = await refused(f"postgresql://ada:s3cr@127.0.0.1:{port}/memory", caplog)
+    error = await refused(f"postgresql://ada:s3cr@127.0.0.1:{port}/memory{parameters}", caplog)
     assert type(error) is DatabaseUnavailable
+    assert "another program answers at this address" in str(error)
     listening.close()
     await listening.wait_closed()
 

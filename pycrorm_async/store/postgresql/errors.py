@@ -56,6 +56,8 @@ _OF_THE_MEMORY = re.compile(
     r"""|pycrorm_\w+|\w+__\d+\b)"""
 )
 """Names of the log's schemas and tables and of derived tables, in the quotes of the server's language."""
+_NO_TLS = re.compile("rejected SSL upgrade|unexpected connection_lost")
+"""The driver's messages about a first answer that is not PostgreSQL's consent to encrypt."""
 _DROPPED_MEANWHILE = re.compile("could not open relation with OID|cache lookup failed for relation")
 """Messages of a statement that looked up a table just before it was dropped."""
 
@@ -145,4 +147,6 @@ def _text(fault: BaseException) -> str:
     message = " ".join(str(cause).split())
     if isinstance(cause, TimeoutError):
         return message or "no answer in time"
+    if isinstance(cause, ConnectionError) and _NO_TLS.search(message):
+        return "another program answers at this address, or a PostgreSQL server that does not encrypt: correct the URL"
     return f"{message or type(cause).__name__}{_HINTS.get(_code(fault), '')}"
