@@ -17,10 +17,13 @@ from pycrorm_async.query.reading import Reading
 from pycrorm_async.recall.answer import Answer, RecalledCase
 from pycrorm_async.recall.cue import closest
 from pycrorm_async.recall.following import Following
+from pycrorm_async.recall.reading.cue_arguments import EpisodeNames
 from pycrorm_async.recall.reading.recall import Recall
 
 _TERM = re.compile(r"(?P<how>not:|only:)?(?P<feature>[^=~]+)(?P<sign>[=~])(?P<value>.*)", re.DOTALL)
 _NODE = re.compile(r"(?P<episode>.+)/e?(?P<sequence>\d+)")
+_K = 10
+"""The number of actions by default: as many as a terminal shows with the command that asked for them."""
 
 
 def recall(
@@ -43,7 +46,7 @@ def recall(
     ] = False,
     status: Annotated[str | None, typer.Option(help="With --follows: only after actions that ended so.")] = None,
     reason: Annotated[str | None, typer.Option(help="With --follows: only after actions that failed so.")] = None,
-    k: Annotated[int, typer.Option("--k", help="The number of actions.")] = 10,
+    k: Annotated[int, typer.Option("--k", help="The number of actions.")] = _K,
     before: Annotated[
         str | None, typer.Option(metavar="MOMENT", help="Started before: 2026-11-20, with time, in UTC.")
     ] = None,
@@ -70,6 +73,10 @@ def recall(
     }  # fmt: skip
     if (status or reason) and not follows:
         raise CallerError("--status and --reason belong to --follows; to compare them write status=FAILED")
+    if follows or like is not None:
+        _refuse_conditions(
+            conditions, "--follows" if follows else "--like", taken=() if follows else ("simulated", "k")
+        )
     if follows:
         _follows(parsed, like, url, spool, status=status, reason=reason, as_json=as_json)
         return
@@ -86,6 +93,8 @@ def recall(
             answer = await memory(
                 parsed.type, has=parsed.has, near=parsed.near, lacks=parsed.lacks, only=parsed.only, **conditions
             )
+        if robot is not None and ("robot", robot) in answer.never_seen:
+            await EpisodeNames(reading).check_robot(robot)
         return answer, await memory.types()
 
     answer, types = read_memory(url, spool, query)
@@ -140,6 +149,16 @@ def _number(text: str, term: str) -> float:
         raise CallerError(
             f"{term[:60]!r}: {text[:40]!r} is not a number: write FEATURE~NUMBER or FEATURE=TEXT"
         ) from None
+
+
+def _refuse_conditions(conditions: dict[str, Any], option: str, *, taken: tuple[str, ...]) -> None:
+    """Raise `CallerError` for a condition that a search with this option does not have."""
+    defaults: dict[str, Any] = {"simulated": False, "k": _K, "minimum": 0.0}
+    ignored = [f"--{name}" for name, each in conditions.items() if name not in taken and each != defaults.get(name)]
+    if ignored:
+        raise CallerError(
+            f"{option} does not take {', '.join(ignored)}: leave {'it' if len(ignored) == 1 else 'them'} out"
+        )
 
 
 async def _node(reading: Reading, like: str) -> int:
@@ -226,12 +245,15 @@ def _follows(
     if dtype is None or like is not None or any(parsed[1:]):
         raise CallerError("--follows takes one type, as in `pycrorm recall --follows PickUpAction --reason IKError`")
 
-    async def query(reading: Reading) -> tuple[Following, tuple[str, ...]]:
+    async def query(reading: Reading) -> tuple[Following, tuple[str, ...], tuple[str, ...]]:
         memory = Recall.of(reading)
-        return await memory.follows(dtype, status=status, reason=reason), await memory.types()
+        following = await memory.follows(dtype, status=status, reason=reason)
+        return following, await memory.types(), await memory.reasons(dtype)
 
-    following, types = read_memory(url, spool, query)
+    following, types, reasons = read_memory(url, spool, query)
     _note_unknown(dtype, types)
+    if reason is not None and dtype in types and reason not in reasons:
+        note(f"no {dtype} has ended with the reason {reason}{closest(reason, reasons)}")
     if as_json:
         followers = [
             each._asdict() | {"success": each.success and each.success._asdict()} for each in following.followers

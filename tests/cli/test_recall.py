@@ -12,21 +12,29 @@ from pycrorm_async import Memory
 from pycrorm_async.cli.recall import _parse, recall
 from pycrorm_async.errors import CallerError
 from pycrorm_async.recall import blocks
-from pycrorm_async.world import Arms
+from pycrorm_async.world import Arms, Pose
 from tests.commands import answer, one_line_of, pycrorm
 from tests.recall.sliding_grips import FETCH, GRIP, GripSlidingActionPerformable, record
 
 pytestmark = pytest.mark.slow
 
+DRIVE = "DriveAction"
+
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a memory of two episodes."""
+    """A folder with a memory of two episodes without a robot, and one with two robots, of which one drives."""
     folder = tmp_path_factory.mktemp("recall")
 
     async def fill() -> None:
         async with Memory.open(f"sqlite:///{folder / 'pycrorm.db'}") as memory:
             await record(memory)
+            drive = memory.recording.type("action", DRIVE, {"speed": float})
+            with memory.recording.episode(description="a drive") as episode:
+                for robot in ("pr2", "turtle"):
+                    episode.object_added(robot, robot, "ROBOT", Pose([0, 0, 0]))
+                episode.start("go", drive, {"speed": 0.5}, robot="pr2")
+                episode.end("go", "SUCCEEDED")
 
     asyncio.run(fill())
     return folder
@@ -85,6 +93,7 @@ def test_what_follows_is_a_table_of_types(folder: Path) -> None:
     done = pycrorm("recall", "--follows", GRIP, "--reason", "SlipperyFailure", cwd=folder)
     assert f"After 4 {GRIP} (SlipperyFailure)" in done.stdout
     assert "(nothing)" in done.stdout
+    assert done.stderr == ""
     document = answer("recall", "--follows", FETCH, cwd=folder)
     assert document["cases"] == 2
     assert [each["type"] for each in document["followers"]] == [None, FETCH]
@@ -98,6 +107,28 @@ def test_a_type_that_never_occurred_is_an_empty_answer_with_a_note(folder: Path)
         done.stderr
         == "no GripSlidingActon has ended in this memory; did you mean GripSlidingAction or FetchSlidingAction?\n"
     )
+
+
+@pytest.mark.parametrize(
+    ("dtype", "line"),
+    [
+        (GRIP, "no GripSlidingAction has ended with the reason SlipyFailure; did you mean SlipperyFailure?\n"),
+        (FETCH, "no FetchSlidingAction has ended with the reason SlipyFailure\n"),
+        ("FlySlidingAction", "no FlySlidingAction has ended in this memory; did you mean"),
+    ],
+)
+def test_a_reason_that_never_occurred_is_an_empty_answer_with_a_note(folder: Path, dtype: str, line: str) -> None:
+    done = pycrorm("recall", "--follows", dtype, "--reason", "SlipyFailure", cwd=folder)
+    assert done.returncode == 0
+    assert f"After 0 {dtype} (SlipyFailure)" in done.stdout
+    assert done.stderr.startswith(line)
+    assert done.stderr.count("\n") == 1
+
+
+def test_a_robot_without_an_action_of_the_type_is_an_empty_answer(folder: Path) -> None:
+    done = pycrorm("recall", DRIVE, "--robot", "turtle", cwd=folder)
+    assert done.returncode == 0
+    assert done.stdout.splitlines() == ["0 of 1 cases for DriveAction", "  never seen: robot=turtle"]
 
 
 WRONG: dict[str, tuple[list[str], dict[str, Any]]] = {
@@ -122,6 +153,9 @@ WRONG: dict[str, tuple[list[str], dict[str, Any]]] = {
     "there is no case of event 1 of episode 1": ([], {"like": "1/1"}),
     "leave out the type and the features": ([GRIP], {"like": "1/e3"}),
     "--follows takes one type": ([GRIP, "arm=LEFT"], {"follows": True}),
+    "--follows does not take --tag, --k: leave them out": ([GRIP], {"follows": True, "tag": "kitchen", "k": 3}),
+    "--like does not take --episode: leave it out": ([], {"like": "1/e3", "episode": "1"}),
+    "no episode has the robot 'pr22'; did you mean pr2?": ([DRIVE], {"robot": "pr22"}),
     "arm is a text of 100,000 characters": ([GRIP, f"arm={'x' * 100_000}"], {}),
     "the cue has 300 features": ([GRIP, *(f"f{number}=x" for number in range(300))], {}),
 }

@@ -11,7 +11,7 @@ from sqlalchemy import select
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.ids import row_key
-from pycrorm_async.orm import EpisodeTag
+from pycrorm_async.orm import EpisodeRobot, EpisodeTag
 from pycrorm_async.query.as_of import AnyEpisode
 from pycrorm_async.query.named_queries import EpisodeSummary
 from pycrorm_async.query.reading import Reading
@@ -49,7 +49,7 @@ class Conditions(NamedTuple):
 
 
 class EpisodeNames:
-    """The episodes of a memory by name and by tag."""
+    """The episodes of a memory by name and by tag, and the robots that took part in them."""
 
     def __init__(self, reading: Reading) -> None:
         self._reading = reading
@@ -69,6 +69,13 @@ class EpisodeNames:
         if not numbers:
             raise CallerError(f"no episode has the tag {tag!r}{closest(tag, {each for _, each in rows})}")
         return numbers
+
+    async def check_robot(self, robot: str) -> None:
+        """Raise `CallerError` if no robot of this name took part in any episode."""
+        async with self._reading.session(simulated=True) as session:
+            names = set((await session.scalars(select(EpisodeRobot.name).distinct())).all())
+        if robot not in names:
+            raise CallerError(f"no episode has the robot {robot!r}{closest(robot, names)}")
 
 
 async def make_cue(

@@ -113,6 +113,7 @@ class Recall:
             as_of: the answer at this moment: it had ended by then.
             prohibit: cases that are left out, such as the one that the cue describes.
             episode, robot, tag: it belongs to this episode or one of these; the robot's name; the episode has the tag.
+                A robot without a case gives an empty answer, because a plan may ask before its robot has ever acted.
             simulated: simulations are included.
             k: the number of actions, 1 to 10,000.
             minimum: the lowest score, 0 to 1.
@@ -200,6 +201,12 @@ class Recall:
         """Return the types of the actions that have ended, those that were renamed by each name."""
         library = await self._reader.library()
         return tuple(sorted({*library.types, *library.recorded_types}))
+
+    async def reasons(self, type: str | type) -> tuple[str, ...]:  # noqa: A002
+        """Return the classes of the failures with which actions of a type have ended, in alphabetical order."""
+        dtype = dtype_of(type)
+        library = await self._reader.library(dtype, aliases_of(type))
+        return tuple(sorted(each for each in library.words("reason") if library.seen(dtype, "reason", each)))
 
     # --- around a case ----------------------------------------------------------------------------------------
 
