@@ -89,17 +89,20 @@ async def test_a_text_that_is_no_query_is_refused(sql: SqlReader) -> None:
             pytest.fail(f"{text!r} was answered with {await sql.query(text)}")
 
 
-async def test_comments_may_follow_the_semicolon_of_a_query(sql: SqlReader) -> None:
+async def test_comments_and_empty_statements_may_follow_the_semicolon_of_a_query(sql: SqlReader) -> None:
     texts = {
         "SELECT 1; -- the end": 1,
         "SELECT 1 /* ; */ ;\n/* the; end */ -- ; (": 1,
         "SELECT 'é; --🤖;' -- it; is\n; -- that;": "é; --🤖;",
         "SELECT 'a''; -- b'": "a'; -- b",
         "VALUES (';') -- no; semicolon": ";",
+        "SELECT 1;;": 1,
+        "SELECT 1; ;\n-- the; end\n; /* ' */ ;": 1,
+        "SELECT ';\"' AS \"a;'b\";;": ';"',
     }
     for text, value in texts.items():
         assert (await sql.query(text))[1] == [(value,)], text
-    for text in ("SELECT 1; SELECT 2 -- the end", "SELECT 1; -- one\nSELECT 2"):
+    for text in ("SELECT 1; SELECT 2 -- the end", "SELECT 1; -- one\nSELECT 2", "SELECT 1;; SELECT 2;;"):
         with pytest.raises(QueryRefused, match="a query is one statement: this text has several"):
             await sql.query(text)
     for text in ("DELETE FROM process_metadata; -- all", "SELECT 1) AS a; -- ("):
@@ -113,6 +116,19 @@ async def test_a_text_that_is_not_utf_8_is_refused_with_the_way_to_read_it(sql: 
     with pytest.raises(QueryRefused, match=r"^the query has a text that is not UTF-8: select it as bytes, with CAST"):
         await sql.query("SELECT CAST(x'66ff' AS TEXT)")
     assert (await sql.query("SELECT CAST(CAST(x'66ff' AS TEXT) AS BLOB)"))[1] == [(b"f\xff",)]
+
+
+async def test_a_limit_that_is_no_integer_is_named(sql: SqlReader) -> None:
+    refusal = "LIMIT and OFFSET must be integers$" if sql.is_sqlite else 'type bigint: "x"'
+    for clause in ("LIMIT 'x'", "LIMIT 1 OFFSET 'x'"):
+        with pytest.raises(QueryRefused, match=f"^the query is refused: .*{refusal}"):
+            await sql.query(f"SELECT id FROM process_metadata {clause}")
+
+
+async def test_vacuum_is_refused_by_its_name(sql: SqlReader) -> None:
+    with pytest.raises(QueryRefused, match=r"^a query may only read: it is one SELECT, or WITH … SELECT") as refused:
+        await sql.query("VACUUM")
+    assert not sql.is_sqlite or str(refused.value).endswith("; ATTACH or VACUUM is not allowed")
 
 
 async def test_a_statement_that_changes_a_view_may_only_read(sql: SqlReader) -> None:

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import asyncio
 import marshal
+import re
 import sqlite3
 import subprocess
 import sys
@@ -40,9 +41,9 @@ _ACTIONS = {
         "SQLITE_INSERT", "SQLITE_UPDATE", "SQLITE_DELETE", "SQLITE_PRAGMA", "SQLITE_ATTACH", "SQLITE_DETACH",
         "SQLITE_TRANSACTION", "SQLITE_SAVEPOINT", "SQLITE_REINDEX", "SQLITE_ANALYZE",
     )
-}  # fmt: skip
-"""The action's name by its code, which other constants share."""
-_REFUSALS = (sqlite3.SQLITE_ERROR, sqlite3.SQLITE_AUTH, sqlite3.SQLITE_TOOBIG, sqlite3.SQLITE_MISMATCH)
+} | {sqlite3.SQLITE_ATTACH: "ATTACH or VACUUM"}  # fmt: skip
+"""The action's name by its code, which other constants share. VACUUM attaches a database itself."""
+_REFUSALS = (sqlite3.SQLITE_ERROR, sqlite3.SQLITE_AUTH, sqlite3.SQLITE_TOOBIG)
 """Codes of errors that are the query's own; all others are the database's."""
 _NO_ROOM = (sqlite3.SQLITE_FULL, sqlite3.SQLITE_IOERR_WRITE)
 """Codes of a temporary file that cannot grow, because a reader writes no other."""
@@ -51,6 +52,17 @@ _FAULT_VALUES = 5
 _TOO_LARGE = (
     "the query has a value of more than 16 MiB: select a part of it, as substr does, or raise the limit on bytes"
 )
+_WITH_EMPTY_END = re.compile(
+    r"""((?>'[^']*'?|"[^"]*"?|`[^`]*`?|\[[^]]*]?|--[^\n]*|/\*(?:.*?\*/|.*)|[^;])*+);"""
+    r"""(?>[ \t\n\f\r;]|--[^\n]*|/\*(?:.*?\*/|.*))*+""",
+    re.DOTALL,
+)
+"""A statement, a semicolon outside of its strings, quoted names and comments, and behind it no other statement.
+
+What has no end reaches to the end of the text, so that matching takes time in proportion to its length.
+"""
+_NO_INTEGER = "the query is refused: LIMIT and OFFSET must be integers"
+"""A query converts values strictly only there, so no other one has the code SQLITE_MISMATCH."""
 _TOO_MUCH = "the query needs more {} than it may use: select or sort less"
 
 
@@ -63,7 +75,7 @@ class _Cursor:
     async def start(self, path: Path, sql: str, bytes_max: int, seconds: float) -> None:
         self._seconds = seconds
         await self._run(self._open, _START_S)
-        await self._exchange((f"{path.as_uri()}?mode=ro", sql, bytes_max, seconds), _START_S)
+        await self._exchange((f"{path.as_uri()}?mode=ro", _without_end(sql), bytes_max, seconds), _START_S)
         self.columns = tuple(await self._exchange(None, seconds))
         if not self.columns:
             raise QueryRefused(ONLY_READS)
@@ -139,6 +151,16 @@ class _Cursor:
         self._process.wait()
 
 
+def _without_end(sql: str) -> str:
+    """Return one statement without its semicolon and the empty statements and comments behind it.
+
+    The driver refuses empty statements as further ones. SQLite and the authorizer check what is returned, so a text
+    that SQLite divides in another way gains nothing.
+    """
+    match = _WITH_EMPTY_END.fullmatch(sql)
+    return match[1] if match else sql
+
+
 def _refusal(
     kind: str, code: int | None, text: str, denied: tuple[int, str | None] | None, names: list[str]
 ) -> Exception:
@@ -159,6 +181,8 @@ def _refusal(
         return QueryRefused(_TOO_LARGE)
     if text.startswith("Could not decode to UTF-8 column"):
         return QueryRefused("the query has a text that is not UTF-8: select it as bytes, with CAST(… AS BLOB)")
+    if code is not None and code & 0xFF == sqlite3.SQLITE_MISMATCH:
+        return QueryRefused(_NO_INTEGER)
     if code in _NO_ROOM:
         return QueryRefused(_TOO_MUCH.format("space for temporary files"))
     if code is None or code & 0xFF in _REFUSALS:
