@@ -72,8 +72,9 @@ class Question(NotebookValue):
     def statement(self) -> Select[*tuple[Any, ...]]:
         """The select, to change or to join. It contains the subquery that finds the named episode.
 
-        Raises `UnknownEpisode` for a text of fewer than four characters that is no number or begins with a zero: to
-        name an id takes four.
+        It has no row if no id, or more than one, begins with these digits, because a select cannot raise errors on all
+        databases; `rows` and `frame` raise `UnknownEpisode` then. It raises that itself for a text of fewer than four
+        characters that is no number or begins with a zero: to name an id takes four.
         """
         episode = self._plan.episode
         return self._plan.select_of(episode=None if episode is None else _number_by_query(episode))
@@ -211,7 +212,9 @@ def _number_by_query(episode: AskedEpisode) -> EpisodeNumber:
         return int(name)
     if len(name) < _DIGITS_OF_ID:
         raise UnknownEpisode(f"there is no episode {name!r}; `pycrorm episodes` lists all")
-    begins = select(numbered.id).where(numbered.uuid.startswith(name.lower(), autoescape=True)).scalar_subquery()
+    is_named = numbered.uuid.startswith(name.lower(), autoescape=True)
+    # Without HAVING, SQLite would take the first of several episodes, and PostgreSQL refuse the select.
+    begins = select(func.min(numbered.id)).where(is_named).having(func.count() == 1).scalar_subquery()
     if not is_number or name.startswith("0"):
         return begins
     return func.coalesce(select(numbered.id).where(numbered.id == int(name)).scalar_subquery(), begins)
