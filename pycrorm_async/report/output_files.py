@@ -26,6 +26,9 @@ def refuse_existing(path: Path, *, force: bool, folder: bool = False) -> None:
     """
     if path.is_dir() and not folder:
         raise CallerError(f"{path} is a folder: give the name of a file in it")
+    file = next((each for each in path.parents if each.exists() and not each.is_dir()), None)
+    if file is not None:
+        raise CallerError(f"{file} is a file, so {path} cannot be written below it: give the name of a folder")
     if path.exists() and not force:
         raise CallerError(f"{path} exists: add --force to replace it, or give another name")
     if not path.absolute().parent.is_dir():

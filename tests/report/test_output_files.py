@@ -40,6 +40,19 @@ def test_a_file_is_synced_before_it_gets_its_name_and_its_folder_afterwards(
     assert [each.name for each in tmp_path.iterdir()] == ["rows.csv"]
 
 
+@pytest.mark.parametrize("below", ["rows.csv", "folder/rows.csv"])
+@pytest.mark.parametrize("force", [False, True])
+def test_a_file_that_is_named_as_a_folder_is_called_a_file(tmp_path: Path, below: str, *, force: bool) -> None:
+    file = tmp_path / "notes.txt"
+    file.write_bytes(b"notes")
+    with pytest.raises(CallerError) as refused:
+        write_file(b"rows", file / below, force=force)
+    assert str(refused.value) == (
+        f"{file} is a file, so {file / below} cannot be written below it: give the name of a folder"
+    )
+    assert file.read_bytes() == b"notes"
+
+
 @pytest.mark.parametrize("exists", [False, True])
 def test_a_new_file_gets_its_name_on_a_file_system_without_links_too(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, exists: bool
