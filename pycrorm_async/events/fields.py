@@ -187,7 +187,7 @@ def fault_in_table(table: str) -> str | None:
     if is_reserved(table):
         return f"its table would be {table!r}, which the memory itself uses (set another dtype)"
     if not table.isprintable() or not table.strip() or '"' in table:
-        return f"its table would be {table!r}, which is not a name (letters, digits and single underscores)"
+        return f"its table would be {table!r}, which is not a name (printable characters without quotation marks)"
     if len(table.encode()) > _NAME_LENGTH_MAX:
         return f"its table's name {table!r} is longer than {_NAME_LENGTH_MAX} bytes (set a shorter dtype)"
     return None

@@ -92,5 +92,12 @@ def test_the_name_of_a_table_of_the_memory_itself_is_refused(table: str) -> None
     assert table in fault
 
 
-def test_an_ordinary_table_is_free() -> None:
-    assert fault_in_table("saying_action") is None
+@pytest.mark.parametrize("table", ["saying_action", "saying__action", "saying action!"])
+def test_another_printable_name_of_a_table_is_free(table: str) -> None:
+    assert fault_in_table(table) is None
+
+
+@pytest.mark.parametrize("table", ["", " ", "saying\naction", 'saying"action'])
+def test_a_name_of_a_table_that_cannot_be_printed_or_quoted_is_refused(table: str) -> None:
+    refusal = f"its table would be {table!r}, which is not a name (printable characters without quotation marks)"
+    assert fault_in_table(table) == refusal
