@@ -86,6 +86,9 @@ def demo(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None, as_json: JsonO
         return
     answers.print()
     address = DatabaseAddress.parse(url)
+    if address.is_private:
+        note(f"The database was {address}, which ended with this process; without --url the demonstration is kept.")
+        return
     option = "" if url == DEFAULT_URL else f" --url {shlex.quote(address.to_type)}"
     verbs = ("episodes", f"show {answers.episode}", f"report {answers.episode}")
     note(f"The database is {address}. Next: {' | '.join(f'pycrorm {verb}{option}' for verb in verbs)}")

@@ -19,6 +19,7 @@ from pycrorm_async.errors import CallerError
 from pycrorm_async.export.export import EPISODE_FORMATS, ExportComparison, Exported, export_again, format_of
 from pycrorm_async.export.export import export as write_export
 from pycrorm_async.export.manifest import read_manifest
+from pycrorm_async.operations.destination import shared_address
 from pycrorm_async.progress_bar import ProgressCallback, progress_bar, stderr
 from pycrorm_async.query.asking.ask import QUESTIONS, Ask
 from pycrorm_async.query.reading import Reading
@@ -75,6 +76,7 @@ def export(
     as_json: JsonOption = False,
 ) -> int:
     """Write episodes, or the rows of a view, to a file, with a manifest from which it can be made again."""
+    shared_address(url)
     if again is not None and what:
         raise CallerError(f"name {' '.join(what)} or make an export again with --again, not both")
     if again is None and not what:

@@ -6,7 +6,7 @@ import asyncio
 
 from pycrorm_async.cli.options import DEFAULT_URL, SpoolOption, UrlOption
 from pycrorm_async.cli.pending_events import note_pending_events
-from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.operations.destination import shared_address
 
 
 def mcp(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None) -> None:
@@ -15,8 +15,8 @@ def mcp(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None) -> None:
     Needs the extra 'mcp'. The agent's program starts this command; `pycrorm_async/integrations/README.md` shows how to
     enter it there.
     """
+    address = shared_address(url)
     from pycrorm_async.integrations.mcp_server import memory_server  # here, because it needs the extra
 
     note_pending_events(url, spool)  # on stderr, which the agent's program shows or keeps
-    with DatabaseAddress.parse(url).located() as address:
-        asyncio.run(memory_server(address).run_stdio_async())
+    asyncio.run(memory_server(address).run_stdio_async())

@@ -49,6 +49,8 @@ def picture(
     if at is not None:
         parse_moment(at, "--at")
     if out is not None:
+        if out.suffix.lower() != ".png":
+            raise CallerError(f"--out {out} must end in .png")
         refuse_existing(out, force=force)
 
     async def write(reading: Reading) -> Path:

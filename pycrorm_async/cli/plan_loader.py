@@ -39,6 +39,8 @@ def load_plan(reference: str) -> LoadedPlan:
     path_text, _, function_name = reference.rpartition(":") if ".py:" in reference else (reference, "", "")
     function_name = function_name or "plan"
     path = Path(path_text)
+    if path.is_dir():
+        raise PlanNotLoadable(f"{path_text!r} is a folder: name the plan file in it")
     if not path.is_file():
         raise PlanNotLoadable(f"the plan file {path_text!r} does not exist")
     sha256 = hashlib.sha256(path.read_bytes()).hexdigest()

@@ -8,13 +8,18 @@ from pathlib import Path
 from typing import TypeVar
 
 from pycrorm_async.cli.pending_events import note_pending_events
+from pycrorm_async.operations.destination import shared_address
 from pycrorm_async.query.reading import Reading
 
 T = TypeVar("T")
 
 
 def read_memory(url: str, spool: Path | None, read: Callable[[Reading], Awaitable[T]]) -> T:
-    """Open the memory at the URL, call `read` with it, and return the result; then note pending events."""
+    """Open the memory at the URL, call `read` with it, and return the result; then note pending events.
+
+    Raises `CallerError` for `sqlite://`, as every verb that opens the memory of another process.
+    """
+    shared_address(url)
 
     async def run() -> T:
         async with Reading.open(url) as reading:

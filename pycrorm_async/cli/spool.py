@@ -23,6 +23,7 @@ from pycrorm_async.cli.output import moment, note, print_facts, print_json, prin
 from pycrorm_async.cli.writer import store_once
 from pycrorm_async.errors import PycrormError
 from pycrorm_async.operations import recovery
+from pycrorm_async.operations.destination import shared_address
 from pycrorm_async.operations.recovery import Rebinding
 from pycrorm_async.projections.custom.discovery import load_projections
 from pycrorm_async.queue.files.names import REFUSED
@@ -31,7 +32,6 @@ from pycrorm_async.queue.maintenance.inspection import Damage, RecorderReport, S
 from pycrorm_async.queue.maintenance.repair import RepairReport, finish_repairs, repair_folder
 from pycrorm_async.queue.maintenance.salvage import Range
 from pycrorm_async.settings import Settings
-from pycrorm_async.store.address import DatabaseAddress
 
 FolderArgument = Annotated[
     Path | None, typer.Argument(metavar="DIR", help="The spool; default: that of --spool, or the one of --url.")
@@ -107,7 +107,7 @@ def repair(
 
 
 def _spool_folder(folder: Path | None, url: str, spool: Path | None) -> Path:
-    return folder or spool or DatabaseAddress.parse(url).default_spool
+    return folder or spool or shared_address(url).default_spool
 
 
 def rebind(

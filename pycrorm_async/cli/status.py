@@ -338,7 +338,8 @@ def _print(
             ],
         )
     else:
-        stdout.print(f"No recorders below {place.path}", markup=False)
+        absence = "" if place.path.is_dir() else ", which does not exist"
+        stdout.print(f"No recorders below {place.path}{absence}", markup=False)
     stdout.print("A daemon drains this spool." if has_daemon else "No daemon drains this spool.")
     if episodes:
         print_table(

@@ -99,9 +99,16 @@ def make_file(path: Path, name: str, access: FileAccess, *, belongs_to: str | No
 
 
 def must_exist(path: Path, name: str) -> None:
-    """Raise `DatabaseUnavailable` for a missing file, with the command that creates one."""
-    if not path.is_file():
-        raise DatabaseUnavailable(f"{name} does not exist: {_HOW_TO_CREATE}")
+    """Raise `DatabaseUnavailable` for a missing file, with the command that creates one, and for what is no file."""
+    try:
+        mode = path.stat().st_mode
+    except FileNotFoundError:
+        raise DatabaseUnavailable(f"{name} does not exist: {_HOW_TO_CREATE}") from None
+    except OSError as error:
+        raise DatabaseUnavailable(f"{name} cannot be opened: {error.strerror} ({path})") from error
+    if not stat.S_ISREG(mode):
+        reason = "Is a directory" if stat.S_ISDIR(mode) else "Is no file"
+        raise DatabaseUnavailable(f"{name} cannot be opened: {reason} ({path})")
 
 
 def _missing_log(log_id: str) -> str:

@@ -83,6 +83,13 @@ def test_the_environment_may_select_the_writer_and_without_a_daemon_nothing_is_l
     assert len(answer("episodes", cwd=folder)) == 1
 
 
+def test_status_names_a_spool_that_does_not_exist(folder: Path) -> None:
+    (folder / "empty").mkdir()
+    for spool, line in {"empty": "empty", "none": "none, which does not exist"}.items():
+        shown = pycrorm("status", "--spool", spool, cwd=folder)
+        assert shown.stdout.splitlines()[0] == f"No recorders below {line}"
+
+
 def test_a_second_daemon_is_one_line_and_exit_code_3(folder: Path, daemon: Started) -> None:
     done = pycrorm("writer", cwd=folder)
     assert done.returncode == 3

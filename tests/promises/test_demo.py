@@ -33,7 +33,7 @@ from pycrorm_async.plan.task_tree import TaskTreeNode as Node
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world import Arms, BulletWorld, Grasp, ObjectType, Pose
 from pycrorm_async.world import Object as WorldObject
-from tests.commands import answer
+from tests.commands import answer, pycrorm
 
 pytestmark = [pytest.mark.slow, pytest.mark.soak_on("postgresql")]
 """Files and processes keep this promise, without SQL of their own, so that servers test it in turns."""
@@ -270,3 +270,10 @@ def test_the_demo_command_prints_the_tree_and_the_answers(tmp_path: Path) -> Non
     assert names == THESIS_TREE.split()
     assert [len(rows) for rows in first["answers"].values()] == [1, 2, 8, 1, 1]
     assert answer("demo", cwd=tmp_path)["episode"] == first["episode"] + 2
+
+
+def test_the_demonstration_in_a_private_database_offers_no_verb_that_could_open_it(tmp_path: Path) -> None:
+    done = pycrorm("demo", "--url", "sqlite://", cwd=tmp_path)
+    assert done.returncode == 0
+    line = "The database was sqlite://, which ended with this process; without --url the demonstration is kept."
+    assert done.stderr.splitlines() == [line]

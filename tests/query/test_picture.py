@@ -120,6 +120,8 @@ async def test_a_mesh_is_drawn_where_its_file_is_recorded_and_as_its_box_elsewhe
         ("1", {"at": "noon"}, "at takes seconds since the episode's start, or an event such as e300, got 'noon'"),
         ("1", {"width": 3}, "at least 16 x 16 and at most 4,000,000 pixels, not 3 x 480"),
         ("1", {"pitch_deg": 90.0}, "pitch_deg must be -89 to 89, got 90"),
+        ("1", {"yaw_deg": float("nan")}, "yaw_deg must be a finite number, got nan"),
+        ("1", {"yaw_deg": float("inf")}, "yaw_deg must be a finite number, got inf"),
     ],
 )
 async def test_what_cannot_be_drawn_is_one_line(

@@ -69,7 +69,7 @@ async def picture(
         focus: name of the object to frame instead.
 
     Raises `UnknownEpisode`; `CallerError` for a moment without objects or without recorded shapes, an unknown `focus`,
-    or a size that is too small or too large; `BulletMissing`.
+    an angle that is none, or a size that is too small or too large; `BulletMissing`.
     """
     if min(width, height) < _PIXELS_LEAST or width * height > _PIXELS_MAX:
         raise CallerError(
@@ -78,6 +78,8 @@ async def picture(
         )
     if not (math.isfinite(pitch_deg) and -89 <= pitch_deg <= 89):
         raise CallerError(f"pitch_deg must be -89 to 89, got {pitch_deg}")
+    if yaw_deg is not None and not math.isfinite(yaw_deg):
+        raise CallerError(f"yaw_deg must be a finite number, got {yaw_deg}")
     then = await _moment(reading, episode, at)
     if not then.world.objects:
         raise CallerError(await _emptiness(reading, then))
