@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 from pycrorm_async import Memory
 from pycrorm_async.events.envelope import LOST, Record
@@ -18,11 +18,13 @@ from tests.plan.conftest import kitchen
 from tests.projections.event_script import Script
 from tests.projections.factories import append_and_fold
 from tests.promises.test_random_plans import play
+from tests.store.factories import declaration
 from tests.table_comparison import declarations_of, differences, logs_of, tables_of, united
 from tests.test_table_comparison import episode as hand_written
 from tests.test_table_comparison import fill
 from tests.upstream.conftest import common_plan
 
+New = Callable[[], str]
 PATIENT = Settings(connect_timeout_s=120)
 
 
@@ -87,3 +89,8 @@ def assert_merged(target: str, *sources: str) -> None:
 
 def assert_nothing_is_behind(url: str) -> None:
     assert ask(url, "SELECT id, folded, head, refused, parked FROM episode WHERE folded < head") == []
+
+
+def declarations_as_records(url: str) -> list[Record]:
+    rows = ask(url, "SELECT payload FROM pycrorm_declaration ORDER BY ordinal")
+    return [declaration(payload.encode()) for (payload,) in rows]
