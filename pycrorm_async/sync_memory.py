@@ -68,8 +68,8 @@ class SyncMemory:
         if self._thread is not None:
             raise CallerError("a memory can be entered once: call Memory.sync again")
         self._thread = threading.Thread(target=self._run, name="memory of pycrorm", daemon=True)
-        self._thread.start()
         try:
+            self._thread.start()
             self._opened.result()
         except BaseException:  # Ctrl-C, which must not leave the memory open; or what opening raised
             self._opened.add_done_callback(self._close_unused)

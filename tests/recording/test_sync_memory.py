@@ -85,6 +85,24 @@ def test_it_is_used_with_with_once(tmp_path: Path) -> None:
     assert not [each for each in threading.enumerate() if each.name.startswith("pycrorm")]
 
 
+def test_ctrl_c_while_its_thread_starts_closes_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    start = threading.Thread.start
+    started: list[threading.Thread] = []
+
+    def start_interrupted(thread: threading.Thread) -> None:
+        start(thread)
+        if thread.name == "memory of pycrorm":
+            started.append(thread)
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(threading.Thread, "start", start_interrupted)
+    with pytest.raises(KeyboardInterrupt), Memory.sync(url_of(tmp_path)):
+        pytest.fail("the block was entered")
+    (thread,) = started
+    thread.join(20)
+    assert not thread.is_alive()
+
+
 def test_a_flush_that_takes_too_long_raises(tmp_path: Path) -> None:
     with Memory.sync(url_of(tmp_path), writer="daemon", settings=Settings(flush_timeout_s=0.5)) as memory:
         step(memory)
