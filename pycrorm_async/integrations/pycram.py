@@ -18,7 +18,6 @@ from __future__ import annotations
 import itertools
 import os
 import sys
-import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -44,9 +43,9 @@ KNOWN_VERSIONS: Final = ("1.0.4",)
 """The versions of the distribution `pycram-robotics` whose methods this module replaces."""
 _PYCRAM: Final = ForeignPackage("PyCRAM", extra="pycram", versions=KNOWN_VERSIONS)
 _SETTINGS: Final = Settings(fold="at_end", sync_interval_ms=250)
-_ONE_AT_A_TIME: Final[dict[int, threading.Lock]] = {}
-"""A lock by the id of the process, because a forked child may have a `remember` of its own. It is held while a
-`remember` is active, because the methods that this replaces are those of the whole process."""
+_ACTIVE: Final[dict[int, object]] = {}
+"""The active `remember` by the id of the process, because a forked child may have one of its own. There is one at a
+time, because the methods that it replaces are those of the whole process."""
 
 
 @contextmanager
@@ -73,10 +72,12 @@ def remember(
         PycrormError: `Memory.open` raised it; no method of PyCRAM is replaced then.
     """
     _PYCRAM.check_version(_PYCRAM.installed_version("pycram-robotics"))
-    active = _ONE_AT_A_TIME.setdefault(os.getpid(), threading.Lock())
-    if not active.acquire(blocking=False):
-        raise CallerError("another `remember` is active in this process: leave its block first, or perform inside it")
-    try:
+    process, this = os.getpid(), object()
+    try:  # before `this` becomes the active one, because Ctrl-C may come directly after that
+        if _ACTIVE.setdefault(process, this) is not this:
+            raise CallerError(
+                "another `remember` is active in this process: leave its block first, or perform inside it"
+            )
         labels = {"description": description, "plan": plan, "seed": seed, "tags": tags, "metadata": metadata}
         with (
             Memory.sync(url, spool=spool, writer=writer, settings=settings or _SETTINGS) as memory,
@@ -84,7 +85,8 @@ def remember(
         ):
             yield episode
     finally:
-        active.release()
+        if process in _ACTIVE and _ACTIVE[process] is this:  # no call, so Ctrl-C cannot come before the next line
+            del _ACTIVE[process]
 
 
 class _PyCRAMPlans:
