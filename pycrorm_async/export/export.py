@@ -135,6 +135,7 @@ async def export(
     `UnknownEpisode`; `MissingExtra`; `OSError` if the disk is full, and then leaves no file.
     """
     target = Path(path)
+    _refuse_other_encodings(target)
     refuse_existing(target, force=force, folder=True)
     refuse_existing(manifest_path(target), force=force)
     chosen = file_format or format_of(target)
@@ -224,6 +225,14 @@ async def export_again(
     by_bytes = before.file_format != "rrd"
     same = [*before.files.values()] == [*now.files.values()] if by_bytes else not differences
     return ExportComparison(same, tuple(differences), exported if path is not None else None, by_bytes)
+
+
+def _refuse_other_encodings(path: Path) -> None:
+    """Raise `CallerError` for a name that is not UTF-8, which neither a manifest nor Arrow can hold."""
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        raise CallerError(f"the name {str(path)!r} is not UTF-8: give another name") from None
 
 
 def _named_by(

@@ -66,8 +66,9 @@ class DatabaseAddress:
     def parse(cls, url: str) -> DatabaseAddress:
         """Parse a URL. Raises `UnknownUrl`, with the valid forms, for any other scheme or form."""
         try:
+            url.encode()  # of an argument that is not UTF-8, the interpreter makes halves of surrogate pairs
             parsed = make_url(url)
-        except (ArgumentError, ValueError):  # neither message repeats the URL, which may hold a password
+        except (ArgumentError, ValueError):  # no message repeats the URL, which may hold a password
             raise UnknownUrl(f"this is not a database URL; {_VALID_URLS}") from None
         database = _SCHEMES.get(parsed.drivername)
         if database is None:

@@ -27,6 +27,7 @@ pytestmark = pytest.mark.slow
         (["show", "1", "--url", f"sqlite:///{'x' * 300}.db"], 3, "cannot be opened: File name too long ("),
         (["show", "1", "--url", "sqlite://"], 2, "sqlite:// exists only in its own process"),
         (["export", "1", "--url", "sqlite://"], 2, "sqlite:// exists only in its own process"),
+        (["show", "1", "--url", "sqlite:///\udcff.db"], 2, "this is not a database URL"),
         (["mcp", "--url", "sqlite://"], 2, "sqlite:// exists only in its own process"),
         (["spool", "inspect", "--url", "sqlite://"], 2, "sqlite:// exists only in its own process"),
         (["picture", "1", "--out", "scene.jpg"], 2, "--out scene.jpg must end in .png"),

@@ -272,6 +272,7 @@ async def test_an_episode_that_the_tables_hold_in_part_is_left_out(tmp_path: Pat
             r"names no format: add --format .* one of parquet, csv",
         ),
         ("2", (), "none/a.csv", CallerError, "none does not exist: create it first"),
+        ("2", (), "\udcff.csv", CallerError, r"\\udcff.csv. is not UTF-8: give another name"),
     ],
 )
 @pytest.mark.soak_on("postgresql")

@@ -55,6 +55,7 @@ def test_the_scheme_of_another_program_names_the_same_database(scheme: str) -> N
 @pytest.mark.parametrize(
     ("url", "reason"),
     [
+        ("sqlite:///\udcff.db", "this is not a database URL"),
         ("mysql://u:s3cret@h/db", "mysql:// is not a supported database"),
         ("sqlite+pysqlcipher:///x.db", "sqlite+pysqlcipher:// is not a supported database"),
         ("postgresql+pg8000://u:s3cret@h/db", "postgresql+pg8000:// is not a supported database"),
