@@ -7,9 +7,12 @@ from pycrorm_async.queue import LiveSource, RecorderQueue
 
 
 def take(queue: RecorderQueue) -> LiveSource:
-    source = LiveSource.take(queue.folder)
-    assert source is not None
-    return source
+    """Take the folder; again if the recorder deletes stored segments just then."""
+    for _ in range(10):
+        source = LiveSource.take(queue.folder)
+        if source is not None:
+            return source
+    raise AssertionError("the folder is not offered")
 
 
 async def next_positions(source: LiveSource, *, events_max: int = 10_000, bytes_max: int = 2**22) -> list[int]:

@@ -13,7 +13,24 @@ from pycrorm_async.errors import SpoolDamaged, SpoolStuck
 from pycrorm_async.events.envelope import Record
 from pycrorm_async.queue import LiveSource, RecorderQueue
 from pycrorm_async.queue.files.drain_status import DrainStatus, Progress, RecorderStatus
-from tests.queue.factories import ALL, DECLARED, ORDINARY, PAYLOAD, SMALL, ended, fill, make, node, record, started
+from pycrorm_async.queue.files.locks import FileLock
+from pycrorm_async.queue.files.names import ALIVE
+from pycrorm_async.queue.files.reader import Batch, Reader
+from pycrorm_async.queue.files.segment import segment_numbers, segment_path
+from tests.queue.factories import (
+    ALL,
+    DECLARED,
+    ORDINARY,
+    PAYLOAD,
+    SMALL,
+    crashed_copy,
+    ended,
+    fill,
+    make,
+    node,
+    record,
+    started,
+)
 from tests.queue.live_sources import eventually, next_positions, take
 
 
@@ -221,6 +238,44 @@ async def test_a_waiting_producer_learns_why_nothing_more_is_stored_and_waits_ag
         await asyncio.wait_for(waiting, 30)
     await asyncio.wait_for(offered.room(), 30)
     source.release()
+
+
+async def test_a_folder_whose_stored_segments_are_deleted_meanwhile_is_no_damage(
+    spool: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The recorder deletes the oldest segments just after the next drainer has opened the first one."""
+    queue = make(spool, offered=True)
+    for number in range(60):
+        queue.put_nowait(started() if not number else node(), b"x" * 200)
+    await queue.synced_to()
+    folder = crashed_copy(queue, tmp_path / "other")  # no recorder deletes anything here by itself
+    queue.release()
+    alive = FileLock.take(folder / ALIVE)
+    assert alive is not None
+    progress = Progress.open(folder, writing=True)
+    assert progress is not None
+    progress.write_drain_status(DrainStatus(stored=60, folded=0))
+    progress.close()
+    numbers = segment_numbers(folder)
+    assert len(numbers) > 4
+    read, deleted = Reader.read, iter([numbers[:2]])
+
+    def read_after_deletion(reader: Reader, *, last: int, events_max: int, bytes_max: int) -> Batch:
+        read(reader, last=reader.cursor.position + 1, events_max=1, bytes_max=bytes_max)  # opens the first segment
+        for each in next(deleted, ()):
+            segment_path(folder, each).unlink()
+        return read(reader, last=last, events_max=events_max, bytes_max=bytes_max)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Reader, "read", read_after_deletion)
+        assert LiveSource.take(folder) is None
+    source = LiveSource.take(folder)
+    assert source is not None
+    source.release()
+    segment_path(folder, numbers[3]).unlink()  # an older one is still there
+    with pytest.raises(SpoolDamaged, match="is missing"):
+        LiveSource.take(folder)
+    alive.release()
 
 
 async def test_impossible_progress_is_ignored(offered: RecorderQueue) -> None:

@@ -21,6 +21,7 @@ from pycrorm_async.queue.files.scan import survey
 from pycrorm_async.queue.files.segment import read_segment, segment_path
 from pycrorm_async.writer.ports import ClaimedSource, Source
 from tests.queue.factories import RECORDER, crashed_copy, ended, episode, fill, make, node, started
+from tests.queue.live_sources import take
 
 AnySource = RecorderQueue | LiveSource | DeadSource
 Opened = TypeVar("Opened")
@@ -56,7 +57,7 @@ class SourceCase:
         if self.kind == "own" and not self._opened:
             return self.queue
         if self.kind == "living":
-            return _present(LiveSource.take(self.queue.folder))
+            return take(self.queue)
         if self.kind == "dead" and self._left is None:
             self._left = crashed_copy(self.queue, self._other)
         return _present(open_dead(self._left or self.queue.folder))

@@ -70,7 +70,8 @@ class Reader:
         """Extend `partial`, or a batch that begins at the cursor, by the records up to position `last`.
 
         The batch holds at most `events_max` records, and payloads of at most `bytes_max` bytes unless its first record
-        is larger. The cursor stays; set it to `after` when the batch is handed out. Raises `SpoolDamaged`.
+        is larger. The cursor stays; set it to `after` when the batch is handed out. Raises `SpoolDamaged`; and
+        `FileNotFoundError` if the segments at the cursor were deleted.
         """
         records, total, (number, offset, position), _ = partial or Batch([], 0, self.cursor, complete=False)
         types = self._types
@@ -126,11 +127,17 @@ class Reader:
         self._number = number
 
     def _next_segment(self, number: int, offset: int, position: int) -> int:
-        """Open the segment that continues the current one; return the offset of its first frame."""
+        """Open the segment that continues the current one; return the offset of its first frame.
+
+        Raises `FileNotFoundError` if both were deleted: the recorder deletes the oldest first. Otherwise a missing one
+        is damage.
+        """
         before = self._path
         try:
             self._open_segment(number)
         except FileNotFoundError:
+            if not before.exists():
+                raise
             raise SpoolDamaged(before, offset, f"position {position + 1} is missing") from None
         header = decode_header(self._buffer)
         if header is None or header.base != position + 1:

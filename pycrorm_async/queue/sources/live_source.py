@@ -93,7 +93,7 @@ class LiveSource:
                 return None
             try:
                 source = cls(folder, parse_episode_id(folder.name), drain, progress)
-            except FileNotFoundError:  # the recorder deleted a stored segment meanwhile: the next attempt succeeds
+            except FileNotFoundError:  # the recorder deleted stored segments meanwhile: the next attempt succeeds
                 return None
             opened.pop_all()
             return source
