@@ -23,7 +23,7 @@ __all__ = [
     "with_children",
 ]
 
-MISSING: Final = "missing: pip install '.[bench]'"
+MISSING: Final = "missing: install the extra 'bench'"
 """Replaces a figure if the library to compare with is not installed."""
 
 

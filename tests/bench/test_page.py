@@ -143,7 +143,7 @@ def _grown(times: float, mb: float) -> dict[str, float]:
 
 
 def test_a_missing_library_leaves_its_budget_unmeasured_and_is_on_the_page() -> None:
-    message = "missing: pip install '.[bench]'"
+    message = "missing: install the extra 'bench'"
     lines = {"others": {"bench": "others", **ABOUT, "postgresql": {"eventsource-py": message}}}
     assert verdict("full spool → log against eventsource-py", lines) == Verdict("not measured", None)
     assert f"| postgresql, eventsource-py | {message} |" in page(lines, [])
