@@ -102,11 +102,12 @@ class _PyCRAMPlans:
         self._keys = itertools.count(1)
         self._types: dict[type, DeclaredType] = {}
         self._parallel: dict[int, RunningNode] = {}
+        self._handled: BaseException | None = None
 
     @contextmanager
     def observing(self, **labels: Any) -> Iterator[RecordedEpisode]:
         """Record an episode until the block ends."""
-        world = self._pycram.World.current_world
+        world, self._handled = self._pycram.World.current_world, sys.exception()
         failure: BaseException | None = None  # not `sys.exception()`, which has one also if the block is in an `except`
         with self._episodes.open(world, **labels) as episode:
             self._episodes.real, self.seams.is_on = episode, True
@@ -121,6 +122,8 @@ class _PyCRAMPlans:
             finally:
                 self._end_simulation(failure)
                 self.seams.remove()
+                if self._is_interruption(failure):
+                    episode.close(failure, "INTERRUPTED")
 
     def _connect(self) -> None:
         plan, used, seams = self._pycram.Plan, self._pycram, self.seams
@@ -211,16 +214,29 @@ class _PyCRAMPlans:
     ) -> None:
         """End a node, and those inside it whose end PyCRAM did not report; a failure's class decides the status."""
         self._world.flush()
-        nodes = self._thread.nodes
+        nodes, interrupted = self._thread.nodes, self._is_interruption(failure)
         while nodes and (inner := nodes.pop()) is not node:
             if inner.key is not None:
-                inner.episode.end(inner.key, "ERROR", failure)
+                inner.episode.end(inner.key, "CANCELLED" if interrupted else "ERROR", failure)
         if node.is_description and status != "SUCCEEDED":
             self._write_start(node, node.of.action, self._values.options(node.of))
         if node.key is not None:
             if type(getattr(node.of, "designator_ref", None)).__name__ == "DetectingMotion" and result:
                 self._world.detected(node, result)
-            node.episode.end(node.key, status if failure is None else None, failure, result)
+            by_failure: NodeStatus | None = "CANCELLED" if interrupted else None
+            node.episode.end(node.key, status if failure is None else by_failure, failure, result)
+
+    def _is_interruption(self, failure: BaseException | None) -> bool:
+        """Return whether Ctrl-C ended what this left, also if another exception took the place of its own.
+
+        PyCRAM's signal handler removes the robot and exits; what PyCRAM still does to record an action then fails.
+        """
+        plan_failure = self._pycram.PlanFailure
+        while failure is not None and failure is not self._handled and not isinstance(failure, plan_failure):
+            if isinstance(failure, KeyboardInterrupt | SystemExit):
+                return True
+            failure = failure.__context__
+        return False
 
     def _whole_plan(self, call: Callable[[], Any], _plan: Any) -> Any:
         """Perform a plan, and end the nodes that a callback of another library kept PyCRAM from ending."""
@@ -295,7 +311,7 @@ class _PyCRAMPlans:
     @guarded
     def _end_simulation(self, failure: BaseException | None) -> None:
         self._world.flush()
-        self._episodes.end_simulation(failure)
+        self._episodes.end_simulation(failure, "INTERRUPTED" if self._is_interruption(failure) else None)
 
 
 def _dtype(designator: type) -> str:

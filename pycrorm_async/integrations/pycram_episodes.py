@@ -6,7 +6,7 @@ import threading
 from collections.abc import Hashable
 from typing import Any
 
-from pycrorm_async.events.values import PoseValue
+from pycrorm_async.events.values import EpisodeStatus, PoseValue
 from pycrorm_async.integrations.pycram_values import AS_THEY_ARE, PyCRAMValues
 from pycrorm_async.recording.declarations.recorded_type import RecordedKind
 from pycrorm_async.recording.recorded_episode import RecordedEpisode
@@ -112,9 +112,9 @@ class PyCRAMEpisodes:
                 return each.key
         return None
 
-    def end_simulation(self, failure: BaseException | None) -> None:
-        """End the simulation, if there is one."""
+    def end_simulation(self, failure: BaseException | None, status: EpisodeStatus | None) -> None:
+        """End the simulation, if there is one; the arguments are those of `RecordedEpisode.close`."""
         with self._lock:
             simulation, self._simulation = self._simulation, None
         if simulation is not None:
-            simulation.close(failure)
+            simulation.close(failure, status)

@@ -153,6 +153,20 @@ def broken_plan() -> Facts:
     return {"seams": seams()}
 
 
+def interrupted_plan() -> Facts:
+    """Exit as PyCRAM's handler of Ctrl-C does, without a robot, which PyCRAM then asks for its pose."""
+
+    def is_interrupted() -> None:
+        try:
+            sys.exit(0)
+        finally:
+            raise AttributeError("'NoneType' object has no attribute 'pose'")
+
+    with contextlib.suppress(AttributeError), remember(url("interrupted_plan"), description="Interrupted"):
+        CodePlan(is_interrupted).perform()
+    return {"seams": seams()}
+
+
 def simulation() -> Facts:
     """Try in the prospection world before acting, twice; enter it once more without performing anything."""
     milk()
@@ -294,6 +308,7 @@ PLANS: tuple[Callable[[], Facts], ...] = (
     failures,
     failed_plan,
     broken_plan,
+    interrupted_plan,
     simulation,
     nested,
     language,

@@ -202,13 +202,25 @@ def test_failures_of_both_kinds_differ_and_recoveries_succeed(run: Run) -> None:
     assert [reason for reason, _ in reasons[2:]] == ["IKError", "StopIteration", "StopIteration"]
 
 
-@pytest.mark.parametrize(("plan", "status"), [("failed_plan", "FAILED"), ("broken_plan", "ERROR")])
+@pytest.mark.parametrize(
+    ("plan", "status", "root"),
+    [
+        ("failed_plan", "FAILED", "FAILED"),
+        ("broken_plan", "ERROR", "ERROR"),
+        ("interrupted_plan", "INTERRUPTED", "CANCELLED"),
+    ],
+)
 def test_a_failure_that_leaves_the_block_is_the_episodes_and_all_seams_are_removed(
-    run: Run, plan: str, status: str
+    run: Run, plan: str, status: str, root: str
 ) -> None:
     assert run.rows(plan, "SELECT status FROM process_metadata") == [(status,)]
-    assert run.rows(plan, "SELECT status FROM task_tree_node WHERE kind = 'root'") == [(status,)]
+    assert run.rows(plan, "SELECT status FROM task_tree_node WHERE kind = 'root'") == [(root,)]
     assert run.facts[plan]["seams"] == []
+
+
+def test_an_exception_that_takes_the_place_of_an_exit_leaves_the_nodes_cancelled(run: Run) -> None:
+    nodes = run.rows("interrupted_plan", "SELECT status, reason FROM task_tree_node WHERE kind != 'root'")
+    assert nodes == [("CANCELLED", "AttributeError")]
 
 
 async def test_plans_in_the_prospection_world_are_simulated_episodes_of_the_node_that_thinks(run: Run) -> None:
