@@ -83,8 +83,9 @@ def learn(
 
     The thesis used 50,000 rollouts: --rollouts 50000 --evaluate 10000 --workers 2. Needs the extra 'learning'.
     """
-    # These checks come first, so that a missing package or a bad path does not fail after an hour of rollouts.
-    _check_packages()
+    # These checks come first, so that a missing package or a bad path does not fail after an hour of rollouts; of them
+    # that of the packages comes last, because importing them takes half a second.
+    DatabaseAddress.parse(url)
     _check_files(policy, figure)
     experiment = Experiment(
         rollouts=rollouts,
@@ -98,6 +99,7 @@ def learn(
         episode_each=episode_each,
         resume=resume,
     )
+    _check_packages()
     place = MemoryLocation(url, spool)
     with progress_bar("rollouts", unit="rollouts") as bar:
 
