@@ -214,9 +214,11 @@ class Activations(EpisodeBlock, Generic[B]):
                 self._put_repeated(self._latest.pop(id(each.behaviour)))
         above = self._reader.parent(behaviour)
         parent = self._enter(above) if above is not None else None
-        kind, dtype, fields = self._reader.node_type(behaviour)
-        declared, parameters = self._recording.type(kind, dtype, fields), self._parameters(behaviour, fields)
-        node = self.episode.start(id(behaviour), declared, parameters, parent=parent.node if parent else None)
+        node: Hashable = id(behaviour)
+        if not self.episode.is_open(node):  # it is open if Ctrl-C came directly after its start was written
+            kind, dtype, fields = self._reader.node_type(behaviour)
+            declared, parameters = self._recording.type(kind, dtype, fields), self._parameters(behaviour, fields)
+            node = self.episode.start(node, declared, parameters, parent=parent.node if parent else None)
         activation = self._latest[id(behaviour)] = self._open[id(behaviour)] = _Activation(behaviour, parent, node)
         return activation
 
