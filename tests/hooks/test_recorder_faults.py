@@ -87,7 +87,8 @@ async def test_a_result_that_is_too_large_is_recorded_as_missing() -> None:
         (ExceptionGroup("spilled", [PlanFailure("a"), PlanFailure("b")]), "FAILED", "FAILED"),
         (ExceptionGroup("spilled", [PlanFailure("a"), ValueError("b")]), "ERROR", "ERROR"),
         (asyncio.CancelledError("spilled", 3), "CANCELLED", "INTERRUPTED"),
-        (KeyboardInterrupt("spilled", 3), "ERROR", "INTERRUPTED"),
+        (KeyboardInterrupt("spilled", 3), "CANCELLED", "INTERRUPTED"),
+        (SystemExit("spilled", 3), "ERROR", "ERROR"),
     ],
 )
 def test_a_failure_keeps_class_message_and_arguments(

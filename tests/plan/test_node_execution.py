@@ -96,8 +96,8 @@ async def test_every_outcome_has_its_status_and_is_passed_on(
     assert all(node.ended_ns is not None and node.ended_ns >= node.started_ns for node in tree)
 
 
-@pytest.mark.parametrize("raised", [KeyboardInterrupt, SystemExit])
-def test_an_exception_that_ends_the_process_is_an_error_of_its_nodes(raised: type[BaseException]) -> None:
+@pytest.mark.parametrize(("raised", "status"), [(KeyboardInterrupt, "CANCELLED"), (SystemExit, "ERROR")])
+def test_an_exception_that_ends_the_process_ends_its_nodes(raised: type[BaseException], status: str) -> None:
     recording = Recording()
 
     async def plan() -> None:
@@ -106,7 +106,7 @@ def test_an_exception_that_ends_the_process_is_an_error_of_its_nodes(raised: typ
 
     with pytest.raises(raised):
         asyncio.run(plan())
-    assert recording.notes == ["start Inside", "start Raising", "end Raising ERROR", "end Inside ERROR"]
+    assert recording.notes == ["start Inside", "start Raising", f"end Raising {status}", f"end Inside {status}"]
 
 
 async def test_a_recorder_is_notified_of_each_start_and_end_once_in_legal_order() -> None:

@@ -167,6 +167,8 @@ def _status(error: BaseException, around: ExecutionContext | None) -> TaskStatus
     if isinstance(error, asyncio.CancelledError):
         interrupted = around is not None and around.interrupted
         return TaskStatus.INTERRUPTED if interrupted else TaskStatus.CANCELLED
+    if isinstance(error, KeyboardInterrupt):
+        return TaskStatus.CANCELLED
     return TaskStatus.FAILED if is_plan_failure(error) else TaskStatus.ERROR
 
 
