@@ -147,7 +147,7 @@ def test_a_name_of_a_column_is_printed_as_it_is_also_in_brackets(folder: Path) -
     ("words", "says"),
     [
         (["DELETE FROM event"], "a query may only read: it is one SELECT, or WITH … SELECT; DELETE is not allowed"),
-        (["ATTACH 'planted.db' AS planted"], "ATTACH is not allowed"),
+        (["ATTACH 'planted.db' AS planted"], "ATTACH or VACUUM is not allowed"),
         pytest.param(
             ["SELECT * FROM root_failures"],
             "there is no table or view root_failures; did you mean root_failure?",
