@@ -165,6 +165,8 @@ def test_what_was_written_before_a_kill_is_stored_by_the_next_memory(tmp_path: P
     assert_verified(tmp_path)
 
 
+@pytest.mark.slow
+@pytest.mark.every_python
 def test_a_full_spool_is_waited_for_by_a_thread(tmp_path: Path) -> None:
     small = Settings(spool_bytes_max=2**20, spool_reserve_bytes=2**18, segment_bytes=2**16, record_bytes_max=2**14)
     with Memory.sync(url_of(tmp_path), settings=small, writer="daemon") as memory:

@@ -80,6 +80,8 @@ async def test_a_refusal_without_dead_letters_is_a_failure_of_its_source(log: Ev
     assert (full.kept, healthy.kept) == ([1, 2, 3, 5, 6], [])
 
 
+@pytest.mark.slow
+@pytest.mark.every_python
 async def test_a_database_that_stays_unavailable_is_raised(log: EventLog) -> None:
     holder = sqlite3.connect(log.address.path, isolation_level=None)
     holder.execute("BEGIN IMMEDIATE")
@@ -118,6 +120,8 @@ async def test_a_fold_on_a_locked_database_is_retried(log: EventLog) -> None:
     assert ask(log.address.path, "SELECT head, folded FROM episode") == [(3, 3)]
 
 
+@pytest.mark.slow
+@pytest.mark.every_python
 async def test_a_database_that_stays_locked_during_the_fold_is_raised_and_stored_records_remain(log: EventLog) -> None:
     destination = LockedAfterAppend(log, folds_met=99)
     source = KeptSource(run_of(episode(1), 1, 3), closed=True)

@@ -93,6 +93,8 @@ async def test_flushes_during_the_close_end_with_it(address: DatabaseAddress) ->
             await asyncio.gather(*flushing)
 
 
+@pytest.mark.slow
+@pytest.mark.every_python
 async def test_a_flush_that_closing_stops_waiting_for_reports_that(address: DatabaseAddress) -> None:
     entered = threading.Event()
 

@@ -234,6 +234,8 @@ async def test_a_fold_that_fails_is_raised_at_flush(address: DatabaseAddress) ->
     assert writers_alive() == []
 
 
+@pytest.mark.slow
+@pytest.mark.every_python
 async def test_a_fold_on_an_unavailable_database_is_retried(address: DatabaseAddress) -> None:
     class OftenUnavailable(ForwardingDestination):
         requests = 0
