@@ -9,8 +9,7 @@ threads and so loses nodes of parallel branches or assigns wrong parents. The st
 parallel node; that of a thread that the plan starts itself is empty, so its first node is a child of the root. PyCRAM
 has two nodes for an action, a description and what it resolves to; only the latter is recorded, unless the description
 fails before it is resolved. The first node in the prospection world opens a simulated episode, which ends with PyCRAM's
-`with` block; objects have the same keys in it as in the real one. An exception of this package is counted in
-`memory.status` and does not reach the plan.
+`with` block; objects have their real keys in it. An exception of this package is counted and does not reach the plan.
 """
 
 from __future__ import annotations
@@ -44,8 +43,7 @@ KNOWN_VERSIONS: Final = ("1.0.4",)
 _PYCRAM: Final = ForeignPackage("PyCRAM", extra="pycram", versions=KNOWN_VERSIONS)
 _SETTINGS: Final = Settings(fold="at_end", sync_interval_ms=250)
 _ACTIVE: Final[dict[int, object]] = {}
-"""The active `remember` by the id of the process, because a forked child may have one of its own. There is one at a
-time, because the methods that it replaces are those of the whole process."""
+"""The active `remember` by process id: it replaces methods of the whole process; a forked child may have its own."""
 
 
 @contextmanager
@@ -75,9 +73,7 @@ def remember(
     process, this = os.getpid(), object()
     try:  # before `this` becomes the active one, because Ctrl-C may come directly after that
         if _ACTIVE.setdefault(process, this) is not this:
-            raise CallerError(
-                "another `remember` is active in this process: leave its block first, or perform inside it"
-            )
+            raise CallerError("another `remember` is active in this process: leave its block, or perform inside it")
         labels = {"description": description, "plan": plan, "seed": seed, "tags": tags, "metadata": metadata}
         with (
             Memory.sync(url, spool=spool, writer=writer, settings=settings or _SETTINGS) as memory,
@@ -102,12 +98,11 @@ class _PyCRAMPlans:
         self._keys = itertools.count(1)
         self._types: dict[type, DeclaredType] = {}
         self._parallel: dict[int, RunningNode] = {}
-        self._handled: BaseException | None = None
 
     @contextmanager
     def observing(self, **labels: Any) -> Iterator[RecordedEpisode]:
         """Record an episode until the block ends."""
-        world, self._handled = self._pycram.World.current_world, sys.exception()
+        world = self._pycram.World.current_world
         failure: BaseException | None = None  # not `sys.exception()`, which has one also if the block is in an `except`
         with self._episodes.open(world, **labels) as episode:
             self._episodes.real, self.seams.is_on = episode, True
@@ -122,7 +117,7 @@ class _PyCRAMPlans:
             finally:
                 self._end_simulation(failure)
                 self.seams.remove()
-                if self._is_interruption(failure):
+                if self._episodes.is_interruption(failure):
                     episode.close(failure, "INTERRUPTED")
 
     def _connect(self) -> None:
@@ -196,8 +191,7 @@ class _PyCRAMPlans:
         # Asking Bullet for pose and torso takes as long as recording the event, so it is done where they may differ.
         is_recorded = episode is self._episodes.real and (self._world.is_followed or node.kind == "motion")
         robot = self._values.robot_key() if is_recorded else self._values.robot(episode)
-        cause = self._episodes.cause(episode)
-        node.key = episode.start(next(self._keys), declared, values, parent=cause, robot=robot)
+        node.key = episode.start(next(self._keys), declared, values, parent=self._episodes.cause(episode), robot=robot)
 
     def _kind(self, designator: type) -> RecordedKind:
         if issubclass(designator, self._pycram.ActionDescription):
@@ -214,29 +208,17 @@ class _PyCRAMPlans:
     ) -> None:
         """End a node, and those inside it whose end PyCRAM did not report; a failure's class decides the status."""
         self._world.flush()
-        nodes, interrupted = self._thread.nodes, self._is_interruption(failure)
+        nodes = self._thread.nodes
+        by_failure: NodeStatus | None = "CANCELLED" if self._episodes.is_interruption(failure) else None
         while nodes and (inner := nodes.pop()) is not node:
             if inner.key is not None:
-                inner.episode.end(inner.key, "CANCELLED" if interrupted else "ERROR", failure)
+                inner.episode.end(inner.key, by_failure or "ERROR", failure)
         if node.is_description and status != "SUCCEEDED":
             self._write_start(node, node.of.action, self._values.options(node.of))
         if node.key is not None:
             if type(getattr(node.of, "designator_ref", None)).__name__ == "DetectingMotion" and result:
                 self._world.detected(node, result)
-            by_failure: NodeStatus | None = "CANCELLED" if interrupted else None
             node.episode.end(node.key, status if failure is None else by_failure, failure, result)
-
-    def _is_interruption(self, failure: BaseException | None) -> bool:
-        """Return whether Ctrl-C ended what this left, also if another exception took the place of its own.
-
-        PyCRAM's signal handler removes the robot and exits; what PyCRAM still does to record an action then fails.
-        """
-        plan_failure = self._pycram.PlanFailure
-        while failure is not None and failure is not self._handled and not isinstance(failure, plan_failure):
-            if isinstance(failure, KeyboardInterrupt | SystemExit):
-                return True
-            failure = failure.__context__
-        return False
 
     def _whole_plan(self, call: Callable[[], Any], _plan: Any) -> Any:
         """Perform a plan, and end the nodes that a callback of another library kept PyCRAM from ending."""
@@ -311,7 +293,7 @@ class _PyCRAMPlans:
     @guarded
     def _end_simulation(self, failure: BaseException | None) -> None:
         self._world.flush()
-        self._episodes.end_simulation(failure, "INTERRUPTED" if self._is_interruption(failure) else None)
+        self._episodes.end_simulation(failure)
 
 
 def _dtype(designator: type) -> str:

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import sys
 import threading
 from collections.abc import Hashable
 from typing import Any
 
-from pycrorm_async.events.values import EpisodeStatus, PoseValue
+from pycrorm_async.events.values import PoseValue
 from pycrorm_async.integrations.pycram_values import AS_THEY_ARE, PyCRAMValues
 from pycrorm_async.recording.declarations.recorded_type import RecordedKind
 from pycrorm_async.recording.recorded_episode import RecordedEpisode
@@ -61,6 +62,7 @@ class PyCRAMEpisodes:
         self._values = values
         self._simulation: RecordedEpisode | None = None
         self._lock = threading.Lock()
+        self._handled = sys.exception()  # the block may be in an `except`, whose exception has not ended it
 
     def open(self, world: Any, **labels: Any) -> RecordedEpisode:
         """Open an episode in this world."""
@@ -112,9 +114,21 @@ class PyCRAMEpisodes:
                 return each.key
         return None
 
-    def end_simulation(self, failure: BaseException | None, status: EpisodeStatus | None) -> None:
-        """End the simulation, if there is one; the arguments are those of `RecordedEpisode.close`."""
+    def is_interruption(self, failure: BaseException | None) -> bool:
+        """Return whether Ctrl-C ended what this left, also if another exception took the place of its own.
+
+        PyCRAM's signal handler removes the robot and exits; what PyCRAM still does to record an action then fails.
+        """
+        plan_failure = self._values.pycram.PlanFailure
+        while failure is not None and failure is not self._handled and not isinstance(failure, plan_failure):
+            if isinstance(failure, KeyboardInterrupt | SystemExit):
+                return True
+            failure = failure.__context__
+        return False
+
+    def end_simulation(self, failure: BaseException | None) -> None:
+        """End the simulation, if there is one."""
         with self._lock:
             simulation, self._simulation = self._simulation, None
         if simulation is not None:
-            simulation.close(failure, status)
+            simulation.close(failure, "INTERRUPTED" if self.is_interruption(failure) else None)
