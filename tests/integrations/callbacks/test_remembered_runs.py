@@ -9,6 +9,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from langchain_core.callbacks import dispatch_custom_event
+from langchain_core.documents import Document
+from langchain_core.messages import AIMessage
+from langchain_core.retrievers import BaseRetriever
+from langchain_core.runnables import RunnableLambda, RunnableParallel
+from langchain_core.tools import ToolException, tool
+from langgraph.checkpoint.memory import InMemorySaver
+from langgraph.graph import START, MessagesState, StateGraph
+from langgraph.types import interrupt
 
 from pycrorm_async import Memory, Settings
 from pycrorm_async.integrations import callbacks
@@ -17,24 +26,15 @@ from pycrorm_async.plan.failures import NavigationGoalNotReached
 from pycrorm_async.recording.recording import Recording
 from pycrorm_async.testing.contracts import check_executive
 from tests.databases import ask
-from tests.integrations.callbacks import names_at_first_use as lang
+from tests.integrations.callbacks.agents import agent, call, pick_up, request
 from tests.recording.recorded_memory import assert_verified, nodes, url_of
 
 pytestmark = pytest.mark.slow
 
-
-def bring_milk() -> Any:
-    """Return an agent that brings the milk."""
-    return lang.agent(
-        lang.AIMessage(
-            "",
-            tool_calls=[
-                lang.call("pick_up", "1", object_name="milk", force_n=5),
-                lang.call("drive", "2", place=[1, 2.5]),
-            ],
-        ),
-        lang.AIMessage("here is the milk", usage_metadata={"input_tokens": 40, "output_tokens": 5, "total_tokens": 45}),
-    )
+BRING_MILK = [
+    AIMessage("", tool_calls=[call("pick_up", "1", object_name="milk", force_n=5), call("drive", "2", place=[1, 2.5])]),
+    AIMessage("here is the milk", usage_metadata={"input_tokens": 40, "output_tokens": 5, "total_tokens": 45}),
+]
 
 
 def remembered(folder: Path, run: Any) -> Any:
@@ -48,15 +48,15 @@ def remembered(folder: Path, run: Any) -> Any:
 
 
 def _invoke(runs: RememberedRuns) -> None:
-    bring_milk().invoke(lang.request("bring milk"), {"callbacks": [runs]})
+    agent(*BRING_MILK).invoke(request("bring milk"), {"callbacks": [runs]})
 
 
 def _ainvoke(runs: RememberedRuns) -> None:
-    asyncio.run(bring_milk().ainvoke(lang.request("bring milk"), {"callbacks": [runs]}))
+    asyncio.run(agent(*BRING_MILK).ainvoke(request("bring milk"), {"callbacks": [runs]}))
 
 
 def _stream(runs: RememberedRuns) -> None:
-    list(bring_milk().stream(lang.request("bring milk"), {"callbacks": [runs]}))
+    list(agent(*BRING_MILK).stream(request("bring milk"), {"callbacks": [runs]}))
 
 
 @pytest.mark.parametrize("run", [_invoke, _ainvoke, _stream])
@@ -112,15 +112,15 @@ def test_the_input_of_a_tool_is_its_parameters(tmp_path: Path) -> None:
 def test_a_number_with_and_without_a_decimal_point_is_in_one_column(tmp_path: Path) -> None:
     def run(runs: RememberedRuns) -> None:
         for force in (5, 5.5):
-            lang.pick_up.invoke({"object_name": "milk", "force_n": force}, {"callbacks": [runs]})
-        lang.pick_up.invoke({"object_name": "milk"}, {"callbacks": [runs]})
+            pick_up.invoke({"object_name": "milk", "force_n": force}, {"callbacks": [runs]})
+        pick_up.invoke({"object_name": "milk"}, {"callbacks": [runs]})
 
     assert remembered(tmp_path, run).missing.total == 0
     assert ask(tmp_path / "memory.db", "SELECT force_n FROM pick_up ORDER BY id") == [(5.0,), (5.5,), (None,)]
 
 
 def test_an_argument_without_a_value_adds_no_column_and_is_not_missing(tmp_path: Path) -> None:
-    @lang.tool
+    @tool
     def push(force: float | None) -> str:
         """Push."""
         return "pushed"
@@ -139,25 +139,25 @@ def _columns(folder: Path, table: str) -> set[str]:
 
 
 def test_an_error_that_a_tool_answers_with_is_the_error_of_the_tool_only(tmp_path: Path) -> None:
-    answers = [lang.AIMessage("", tool_calls=[lang.call("pick_up", "1", object_name="cup")]), lang.AIMessage("sorry")]
-    remembered(tmp_path, lambda runs: lang.agent(*answers).invoke(lang.request("cup"), {"callbacks": [runs]}))
+    answers = [AIMessage("", tool_calls=[call("pick_up", "1", object_name="cup")]), AIMessage("sorry")]
+    remembered(tmp_path, lambda runs: agent(*answers).invoke(request("cup"), {"callbacks": [runs]}))
     assert [each for each in nodes(tmp_path) if each[2] != "SUCCEEDED"] == [
         ("pick_up", "Chain", "ERROR", "the cup is too hot")
     ]
 
 
 def test_an_error_that_leaves_the_agent_ends_every_chain_above_it(tmp_path: Path) -> None:
-    answer = lang.AIMessage("", tool_calls=[lang.call("pick_up", "1", object_name="cup")])
-    broken = lang.agent(answer, handle_tool_errors=False)
+    answer = AIMessage("", tool_calls=[call("pick_up", "1", object_name="cup")])
+    broken = agent(answer, handle_tool_errors=False)
     with pytest.raises(ValueError, match="the cup is too hot"):
-        remembered(tmp_path, lambda runs: broken.invoke(lang.request("cup"), {"callbacks": [runs]}))
+        remembered(tmp_path, lambda runs: broken.invoke(request("cup"), {"callbacks": [runs]}))
     assert [each[0] for each in nodes(tmp_path) if each[2] == "ERROR"] == ["Chain", "Chain", "pick_up"]
     assert ask(tmp_path / "memory.db", "SELECT status FROM process_metadata") == [("ERROR",)]
     assert_verified(tmp_path)
 
 
 def test_a_plan_failure_in_a_tool_is_a_failure_and_no_error(tmp_path: Path) -> None:
-    @lang.tool
+    @tool
     def navigate(place: str) -> str:
         """Drive."""
         raise NavigationGoalNotReached(f"{place} is blocked")
@@ -171,43 +171,44 @@ def test_a_plan_failure_in_a_tool_is_a_failure_and_no_error(tmp_path: Path) -> N
 
 
 def test_a_tool_that_answers_with_an_error_has_failed(tmp_path: Path) -> None:
-    @lang.tool
+    @tool
     def grasp(object_name: str) -> str:
         """Grasp an object."""
-        raise lang.ToolException(f"{object_name} is slippery")
+        raise ToolException(f"{object_name} is slippery")
 
     grasp.handle_tool_error = True
-    slippery = {"type": "tool_call", **lang.call("grasp", "1", object_name="soap")}
+    slippery = {"type": "tool_call", **call("grasp", "1", object_name="soap")}
     remembered(tmp_path, lambda runs: grasp.invoke(slippery, {"callbacks": [runs]}))
     (row,) = ask(tmp_path / "memory.db", "SELECT status, result FROM grasp JOIN task_tree_node USING (id)")
     assert (row[0], json.loads(row[1])["content"]) == ("FAILED", "soap is slippery")
 
 
 def test_a_graph_that_waits_for_a_human_is_interrupted(tmp_path: Path) -> None:
-    graph = lang.StateGraph(lang.MessagesState)
-    graph.add_node("ask", lambda _state: {"messages": [("ai", str(lang.interrupt("may I?")))]})
-    graph.add_edge(lang.START, "ask")
-    compiled = graph.compile(checkpointer=lang.InMemorySaver())
+    graph = StateGraph(MessagesState)
+    graph.add_node("ask", lambda _state: {"messages": [("ai", str(interrupt("may I?")))]})
+    graph.add_edge(START, "ask")
+    compiled = graph.compile(checkpointer=InMemorySaver())
 
     def run(runs: RememberedRuns) -> None:
-        compiled.invoke(lang.request("open"), {"callbacks": [runs], "configurable": {"thread_id": "1"}})
+        compiled.invoke(request("open"), {"callbacks": [runs], "configurable": {"thread_id": "1"}})
 
     remembered(tmp_path, run)
     assert [each[:3] for each in nodes(tmp_path)] == [("Chain", None, "SUCCEEDED"), ("Chain", "Chain", "INTERRUPTED")]
 
 
+class Shelf(BaseRetriever):
+    """Finds what is on a shelf."""
+
+    def _get_relevant_documents(self, query: str, *, run_manager: Any) -> list[Document]:
+        return [Document("milk, left", metadata={"row": 2})]
+
+
 def test_retrievers_and_custom_events_are_recorded(tmp_path: Path) -> None:
-    class Shelf(lang.BaseRetriever):
-        """Finds what is on a shelf."""
-
-        def _get_relevant_documents(self, query: str, *, run_manager: Any) -> list[Any]:
-            return [lang.Document("milk, left", metadata={"row": 2})]
-
     def report(query: str) -> str:
-        lang.dispatch_custom_event("battery", {"volts": 23.5})
+        dispatch_custom_event("battery", {"volts": 23.5})
         return query
 
-    chain = lang.RunnableLambda(report) | Shelf()
+    chain = RunnableLambda(report) | Shelf()
     remembered(tmp_path, lambda runs: chain.invoke("milk?", {"callbacks": [runs]}))
     file = tmp_path / "memory.db"
     assert ask(file, "SELECT name, query FROM retrieval") == [("Shelf", "milk?")]
@@ -221,11 +222,9 @@ def test_retrievers_and_custom_events_are_recorded(tmp_path: Path) -> None:
 
 def test_branches_in_threads_hang_below_their_own_chain(tmp_path: Path) -> None:
     def branch(number: int) -> Any:
-        return lang.RunnableLambda(
-            lambda _each: lang.pick_up.invoke({"object_name": str(number)}), name=f"branch {number}"
-        )
+        return RunnableLambda(lambda _each: pick_up.invoke({"object_name": str(number)}), name=f"branch {number}")
 
-    fan = lang.RunnableParallel({str(number): branch(number) for number in range(8)})
+    fan = RunnableParallel({str(number): branch(number) for number in range(8)})
     remembered(tmp_path, lambda runs: [fan.invoke("go", {"callbacks": [runs]}) for _ in range(5)])
     below = "SELECT chain.name, object_name FROM pick_up JOIN task_tree_node AS node ON node.id = pick_up.id"
     rows = ask(tmp_path / "memory.db", f"{below} JOIN chain ON chain.id = node.parent_id")
@@ -234,8 +233,8 @@ def test_branches_in_threads_hang_below_their_own_chain(tmp_path: Path) -> None:
 
 def test_a_run_whose_parent_reports_elsewhere_is_below_the_root(tmp_path: Path) -> None:
     def run(runs: RememberedRuns) -> None:
-        inner = lang.RunnableLambda(lambda each: each, name="inner").with_config(callbacks=[runs])
-        lang.RunnableLambda(inner.invoke, name="outer").invoke("go")
+        inner = RunnableLambda(lambda each: each, name="inner").with_config(callbacks=[runs])
+        RunnableLambda(inner.invoke, name="outer").invoke("go")
 
     status = remembered(tmp_path, run)
     assert nodes(tmp_path) == [("Chain", None, "SUCCEEDED", None)]
@@ -247,15 +246,15 @@ def test_values_that_cannot_be_recorded_reach_no_run(tmp_path: Path) -> None:
     endless.append(endless)
 
     def run(runs: RememberedRuns) -> None:
-        assert lang.RunnableLambda(lambda _each: endless).invoke(object(), {"callbacks": [runs]}) is endless
-        assert lang.RunnableLambda(lambda _each: float("nan")).invoke("\ud800", {"callbacks": [runs]}) != 0
+        assert RunnableLambda(lambda _each: endless).invoke(object(), {"callbacks": [runs]}) is endless
+        assert RunnableLambda(lambda _each: float("nan")).invoke("\ud800", {"callbacks": [runs]}) != 0
 
     remembered(tmp_path, run)
     assert [each[2] for each in nodes(tmp_path)] == ["SUCCEEDED", "SUCCEEDED"]
 
 
 def test_a_handler_used_after_its_block_and_after_its_memory_disturbs_no_run(tmp_path: Path) -> None:
-    step = lang.RunnableLambda(lambda each: each)
+    step = RunnableLambda(lambda each: each)
     with Memory.sync(url_of(tmp_path)) as memory:
         with RememberedRuns(memory.recording) as runs:
             step.invoke(1, {"callbacks": [runs]})
