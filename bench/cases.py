@@ -31,14 +31,13 @@ from bench.reporting.figures import console, cpu_s_of, percentiles, spread, with
 from pycrorm_async import Reading
 from pycrorm_async.bulk_records import collect_seldom
 from pycrorm_async.operations.recovery import recover
-from pycrorm_async.projections.custom.discovery import own_projections
+from pycrorm_async.projections.custom import own_projections
+from pycrorm_async.projections.generations import PROJECTION, read_generation
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.projections.rebuild import Rebuild, claimed
-from pycrorm_async.projections.replaced_tables import clear
-from pycrorm_async.projections.schema.generations import PROJECTION, read_generation
+from pycrorm_async.projections.rebuild import Rebuild, claimed, clear
 from pycrorm_async.recall.answer import answer
-from pycrorm_async.recall.cases.stored_blocks import read_headings, rows_of
-from pycrorm_async.recall.reading.recall import Recall
+from pycrorm_async.recall.cases import read_headings, rows_of
+from pycrorm_async.recall.recall import Recall
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog

@@ -25,11 +25,9 @@ from typing import Any, NamedTuple
 
 from pycrorm_async.bulk_records import collect_seldom
 from pycrorm_async.clock import SYSTEM_CLOCK
-from pycrorm_async.events.codec import encode
-from pycrorm_async.events.envelope import Heading
+from pycrorm_async.events.codec import Heading, encode
 from pycrorm_async.events.ids import episode_id
-from pycrorm_async.events.types import EpisodeStarted, NodeEnded, NodeStarted
-from pycrorm_async.events.values import ObjectReference, PoseValue, RobotValue
+from pycrorm_async.events.types import EpisodeStarted, NodeEnded, NodeStarted, ObjectReference, PoseValue, RobotValue
 from pycrorm_async.queue import RecorderQueue
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress

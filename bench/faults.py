@@ -48,7 +48,7 @@ from bench.breaking import (
 )
 from bench.breaking.outcome import Outcome, Step
 from bench.breaking.report import Report, Slice, summed
-from pycrorm_async.store.temporary_database import usual_place
+from pycrorm_async.store.address import usual_place
 from tests.databases import Server, server_in
 
 Inject = Callable[[int, random.Random, Path, Step], Outcome]

@@ -45,11 +45,11 @@ from rich.table import Table
 from pycrorm_async import Memory, Reading
 from pycrorm_async.errors import NotEnoughExperience
 from pycrorm_async.learning import MoveAndPickUp, Policy, RecalledPickUp, Scene, Tally, learn
-from pycrorm_async.learning.rollouts.kitchen_trial import KITCHEN
-from pycrorm_async.learning.rollouts.scene import Stage
-from pycrorm_async.plan.actions.basic import MoveAndPickUpPerformable
+from pycrorm_async.learning.experiment import KITCHEN
+from pycrorm_async.learning.rollouts import Stage
+from pycrorm_async.plan.actions import MoveAndPickUpPerformable
 from pycrorm_async.plan.failures import PlanFailure
-from pycrorm_async.plan.locations.surfaces import surface_poses
+from pycrorm_async.plan.locations import surface_poses
 from pycrorm_async.recall.experience import PickUpExperience
 from pycrorm_async.world import Arms, Object, ObjectType, Pose
 from pycrorm_async.world.pose import yaw_quaternion

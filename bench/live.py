@@ -31,7 +31,7 @@ from urllib.parse import urlsplit
 
 from bench.reporting.figures import console, cpu_s_of, percentiles
 from pycrorm_async import Memory
-from pycrorm_async.recording.recorded_episode import RecordedEpisode
+from pycrorm_async.record.recorded_episode import RecordedEpisode
 from pycrorm_async.world import Pose
 from tests.databases import ask
 from tests.report.browser import browser, chromium

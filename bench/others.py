@@ -38,7 +38,7 @@ from bench.material.rollouts import tree
 from bench.material.spool_recording import spool_tree
 from bench.reporting.figures import MISSING, console, spread
 from pycrorm_async.bulk_records import collect_seldom
-from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.codec import Record
 from pycrorm_async.queue import Spool, open_dead
 from tests.databases import Server, server_in
 

@@ -23,7 +23,7 @@ import numpy as np
 from bench.daemon import start_daemon, stop
 from pycrorm_async import Memory
 from pycrorm_async.plan import MoveAndPickUpPerformable, PlanFailure, simulated_robot
-from pycrorm_async.plan.object_designators import designator_of
+from pycrorm_async.plan.objects import designator_of
 from pycrorm_async.settings import Writer
 from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose
 

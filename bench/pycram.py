@@ -53,7 +53,7 @@ def measure(folder: Path, pairs: int, only: str | None = None) -> dict[str, Any]
 
     from pycrorm_async.integrations.pycram import remember
     from pycrorm_async.settings import Settings
-    from pycrorm_async.writer import delegated_writer
+    from pycrorm_async.writer import plan_writer as delegated_writer
 
     delegated_writer._UNDRAINED_S = 0.0  # noqa: SLF001  each block would wait 2 s for a daemon
     leave_out_mesh_checks()
@@ -109,7 +109,8 @@ def compare(remembered: Callable[[], AbstractContextManager[Any]], pairs: int) -
 
 def seams_ms(remembered: Callable[[], AbstractContextManager[Any]], blocks: int) -> tuple[list[float], list[float]]:
     """Return the CPU time that the observer's calls take in the first and in the second plan of each block, ms."""
-    from pycrorm_async.integrations import pycram, pycram_world
+    from pycrorm_async.integrations import pycram
+    from pycrorm_async.integrations import pycram as pycram_world
 
     taken_ns: list[int] = []
     depth = 0

@@ -33,7 +33,7 @@ from rich.table import Table
 
 from bench.concurrent_processes import ConcurrentProcesses
 from pycrorm_async.bulk_records import collect_seldom
-from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.codec import Record
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.operations.rebuild import rebuild_memory
 from pycrorm_async.projections.projector import Projector

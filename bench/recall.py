@@ -30,12 +30,9 @@ from typing import Any
 from bench.material.actions import BLOCK_CASES, CUES, Actions
 from bench.material.soar_memory import SoarMemory
 from bench.reporting.figures import MISSING, console, percentiles, spread
-from pycrorm_async.recall.activation import forgotten
-from pycrorm_async.recall.answer import answer
-from pycrorm_async.recall.block_rows import decode, encode
-from pycrorm_async.recall.blocks import Block, merge
-from pycrorm_async.recall.following import Sequences
-from pycrorm_async.recall.library import CaseLibrary
+from pycrorm_async.recall.answer import Sequences, answer
+from pycrorm_async.recall.blocks import Block, CaseLibrary, decode, encode, merge
+from pycrorm_async.recall.search import forgotten
 
 _SEED = 69
 _SOAR_CUES = 60

@@ -26,8 +26,8 @@ from rich.table import Table
 
 from bench.material.turns import NothingActionPerformable, nothing_action
 from pycrorm_async import Memory, Settings
-from pycrorm_async.recording.recorded_episode import RecordedEpisode
-from pycrorm_async.recording.recording import Recording
+from pycrorm_async.record.recorded_episode import RecordedEpisode
+from pycrorm_async.record.recording import Recording
 from pycrorm_async.world import BulletWorld, Pose
 
 NODES = 1_000

@@ -32,17 +32,16 @@ from bench.material.turns import NothingActionPerformable, TurnTaker, nothing_ac
 from bench.reporting.figures import console, percentiles, spread
 from pycrorm_async import Memory, Settings
 from pycrorm_async.clock import SYSTEM_CLOCK
-from pycrorm_async.events.codec import encode
-from pycrorm_async.events.envelope import Heading
+from pycrorm_async.events.codec import Heading, encode
 from pycrorm_async.events.ids import EpisodeId, episode_id
 from pycrorm_async.events.types import EpisodeStarted, NodeEnded, NodeStarted
-from pycrorm_async.hooks.declaration import Declarations
-from pycrorm_async.hooks.plan_recorder import current_episode
 from pycrorm_async.plan import BaseMotion
-from pycrorm_async.plan.execution.observer import recorder
-from pycrorm_async.plan.task_tree import TaskTreeNode
+from pycrorm_async.plan.execution import recorder
+from pycrorm_async.plan.task import TaskTreeNode
 from pycrorm_async.queue import RecorderQueue
-from pycrorm_async.recording.values.value_snapshot import encode_parameter
+from pycrorm_async.record.declarations import Declarations
+from pycrorm_async.record.plan_recorder import current_episode
+from pycrorm_async.record.values import encode_parameter
 from pycrorm_async.world import BulletWorld
 
 _TASKS = 100

@@ -17,15 +17,14 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from pycrorm_async.errors import PycrormError
-    from pycrorm_async.events.blobs import Blob
+    from pycrorm_async.events.types import Blob
     from pycrorm_async.memory import Memory, MemoryStatus
     from pycrorm_async.operations.recovery import recover
-    from pycrorm_async.projections.custom.projection import EpisodeProjection, Projection
-    from pycrorm_async.projections.schema.user_views import UserView
+    from pycrorm_async.projections.custom import EpisodeProjection, Projection
+    from pycrorm_async.projections.mapped_tables import UserView
+    from pycrorm_async.query.again import performable_of, world_of
     from pycrorm_async.query.reading import Reading
-    from pycrorm_async.query.recorded_designator import performable_of
-    from pycrorm_async.query.recorded_world import world_of
-    from pycrorm_async.recording.writing.event_feed import RecordedEvent
+    from pycrorm_async.record.event_feed import RecordedEvent
     from pycrorm_async.settings import Settings
 
 __version__ = "0.2.0.dev0"
@@ -47,19 +46,19 @@ __all__ = [
 ]
 
 _MODULES = {
-    "Blob": "events.blobs",
-    "EpisodeProjection": "projections.custom.projection",
+    "Blob": "events.types",
+    "EpisodeProjection": "projections.custom",
     "Memory": "memory",
     "MemoryStatus": "memory",
-    "Projection": "projections.custom.projection",
+    "Projection": "projections.custom",
     "PycrormError": "errors",
     "Reading": "query.reading",
-    "RecordedEvent": "recording.writing.event_feed",
+    "RecordedEvent": "record.event_feed",
     "Settings": "settings",
-    "UserView": "projections.schema.user_views",
-    "performable_of": "query.recorded_designator",
+    "UserView": "projections.mapped_tables",
+    "performable_of": "query.again",
     "recover": "operations.recovery",
-    "world_of": "query.recorded_world",
+    "world_of": "query.again",
 }
 
 

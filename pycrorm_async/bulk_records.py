@@ -7,8 +7,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Final
 
-__all__ = ["collect_seldom", "collecting_seldom", "make"]
-
 make: Final = tuple.__new__
 """`make(Record, values)` equals `Record(*values)` at half the cost, because it does not check the number of values."""
 
@@ -32,7 +30,7 @@ def collecting_seldom() -> Iterator[None]:
     The objects live on, so each collection walks all of them and frees none: for 25,000 rows half of the time. The
     block raises the threshold, and leaves the collector on: garbage that other code makes meanwhile, in this thread or
     another, stays bounded. Nor does the block turn the collector off and on, because turning it on would let it run a
-    finalizer in a thread that holds the recorder's lock (`queue.live.gc_safe_lock`).
+    finalizer in a thread that holds the recorder's lock (`queue.appender`).
 
     Blocks may overlap, in threads and in tasks: only one that finds a lower threshold raises it, and puts it back if it
     is still the raised one. A block that ends early costs the others collections, and no order leaves the threshold

@@ -11,8 +11,6 @@ from collections.abc import Callable
 from functools import cache
 from typing import NamedTuple
 
-__all__ = ["Clock", "ClockQuality", "SYSTEM_CLOCK", "clock_quality", "monotonic_ns"]
-
 _CLOCK_UNSYNCHRONIZED = 5
 """TIME_ERROR of adjtimex(2): no time service has synchronized the clock."""
 

@@ -15,8 +15,6 @@ from contextlib import contextmanager, suppress
 from contextvars import ContextVar, Token
 from typing import Any, Generic, TypeVar
 
-__all__ = ["ConnectedVar", "set_inside"]
-
 T = TypeVar("T")
 
 

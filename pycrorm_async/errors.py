@@ -10,42 +10,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-__all__ = [
-    "PycrormError",
-    "CallerError",
-    "UnknownUrl",
-    "Unrecordable",
-    "DeclarationRefused",
-    "EpisodeRefused",
-    "UnknownEpisode",
-    "QueryRefused",
-    "MissingExtra",
-    "ImpossibleCondition",
-    "NotEnoughExperience",
-    "PolicyFileRefused",
-    "FilesError",
-    "SpoolUnavailable",
-    "SpoolTaken",
-    "SpoolFull",
-    "SpoolStuck",
-    "SpoolClosed",
-    "SpoolForeign",
-    "DatabaseError",
-    "DatabaseUnavailable",
-    "LogWentBack",
-    "DatabaseForeign",
-    "TablesForeign",
-    "TablesOutdated",
-    "TablesUntrusted",
-    "EpisodeParked",
-    "FlushTimeout",
-    "DamageError",
-    "SpoolDamaged",
-    "LogDamaged",
-    "PolicyDamaged",
-    "InternalError",
-]
-
 
 class PycrormError(Exception):
     """The root of the tree: `except PycrormError` catches every error that the memory itself can raise."""

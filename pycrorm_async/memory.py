@@ -6,6 +6,16 @@
 ...     await memory.flush()
 ...     async with memory.session() as session:
 ...         actions = (await session.scalars(select(Action))).all()
+
+**Sync memory.** `SyncMemory` is a memory for code without asyncio: one thread of its own holds the asynchronous one.
+
+>>> with Memory.sync("sqlite:///memory.db") as memory:
+...     with memory.recording.episode(description="Tutorial") as episode:
+...         executive.run(observer=episode)
+...     memory.flush()
+
+The thread ends with the process if the memory is never closed; its events are then in the spool, and the next memory
+of that database stores them.
 """
 
 from __future__ import annotations
@@ -13,45 +23,663 @@ from __future__ import annotations
 import asyncio
 import logging
 import os
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager, AsyncExitStack, suppress
+import threading
+from abc import ABC, abstractmethod
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Coroutine, Iterator, Mapping, Sequence
+from concurrent.futures import Future
+from contextlib import (
+    AbstractAsyncContextManager,
+    AbstractContextManager,
+    AsyncExitStack,
+    ExitStack,
+    asynccontextmanager,
+    contextmanager,
+    suppress,
+)
 from dataclasses import replace
+from datetime import datetime
 from functools import partial
+from os import PathLike
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from types import MappingProxyType, TracebackType
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self, TypeVar, overload
+
+from sqlalchemy import Select
+from sqlalchemy.ext.asyncio import AsyncSession
 
 from pycrorm_async import __version__
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
-from pycrorm_async.errors import CallerError, EpisodeParked, PycrormError, TablesForeign
+from pycrorm_async.connected_var import ConnectedVar, set_inside
+from pycrorm_async.errors import CallerError, EpisodeParked, FlushTimeout, PycrormError, TablesForeign
 from pycrorm_async.events.codec import declaration_of
+from pycrorm_async.events.fields import checked_tags
 from pycrorm_async.events.ids import episode_id
-from pycrorm_async.hooks.observations import Observations
-from pycrorm_async.hooks.plan_recorder import Recorder
-from pycrorm_async.memory_parts import MemoryStatus, Parts
-from pycrorm_async.memory_recording import RecordingMemory
+from pycrorm_async.events.types import Blob
+from pycrorm_async.operations.copy import tag_episode
 from pycrorm_async.operations.destination import expected_log, open_destination
 from pycrorm_async.operations.recovery import dead_queues
-from pycrorm_async.projections.custom.discovery import validate_projections
-from pycrorm_async.projections.custom.projection import Projection
-from pycrorm_async.projections.schema.user_views import UserView
+from pycrorm_async.plan.execution import called_performs, recorder
+from pycrorm_async.plan.task import TaskTreeNode, experience
+from pycrorm_async.projections.custom import Projection, validate_projections
+from pycrorm_async.projections.mapped_tables import UserView
+from pycrorm_async.query.episode_diff import EpisodeDiff
+from pycrorm_async.query.frames import BATCH_ROWS, Library
+from pycrorm_async.query.named_queries import EpisodeSummary
+from pycrorm_async.query.notebook_html import Episodes, TaskTree
+from pycrorm_async.query.question import AskedEpisode, FrameQuery, Question, SyncQuestion
+from pycrorm_async.query.questions import Ask
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.queue.files.locks import call_in_forked_child
-from pycrorm_async.queue.files.spool import Spool
-from pycrorm_async.queue.live.recorder_queue import RecorderQueue
+from pycrorm_async.query.snapshot import AnyEpisode, Moment
+from pycrorm_async.query.sql import DEFAULT_LIMITS, SqlLimits, SqlResult
+from pycrorm_async.queue.locks import call_in_forked_child
+from pycrorm_async.queue.recorder_queue import RecorderQueue
+from pycrorm_async.queue.spool import Spool
+from pycrorm_async.recall.answer import Answer
 from pycrorm_async.recall.experience import PickUpExperience
-from pycrorm_async.recording.recording import Recording
-from pycrorm_async.recording.writing.emitter import Emitter
-from pycrorm_async.recording.writing.open_episodes import OpenEpisodes
-from pycrorm_async.recording.writing.provenance import PlanSource, Provenance
+from pycrorm_async.recall.recall import CaseReader, DatabaseSource, ProcessCases, Recall
+from pycrorm_async.record.episode import Episode
+from pycrorm_async.record.episode_writer import Emitter, Faults, OpenEpisodes, PlanSource, Provenance, read_labels
+from pycrorm_async.record.event_feed import BUFFER_EVENTS, EventStream, RecordedEvent, Subscription
+from pycrorm_async.record.plan_recorder import Observations, Recorder, current_episode, observations
+from pycrorm_async.record.recording import Recording
+from pycrorm_async.record.values import Missing
+from pycrorm_async.report.write import Report
+from pycrorm_async.report.write import report as write_report
 from pycrorm_async.settings import Settings, Writer
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.sync_memory import SyncMemory
-from pycrorm_async.writer.delegated_writer import DelegatedWriter
-from pycrorm_async.writer.writer_thread import WriterThread
+from pycrorm_async.world.bullet import watcher
+from pycrorm_async.writer.plan_writer import DelegatedWriter, WriterState, WriterThread
 
-__all__ = ["Memory", "MemoryStatus"]
+if TYPE_CHECKING:
+    import pandas as pd
+    import pyarrow as pa
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+    from pycrorm_async.export.export import ExportComparison, Exported, FileFormat
+    from pycrorm_async.export.lerobot import ImageSize
+    from pycrorm_async.export.scenes import Clock as StateClock
+    from pycrorm_async.export.selection import Exportable
+    from pycrorm_async.query.picture import MomentReference
+    from pycrorm_async.query.success import Kind, Source
+
+
+# === memory parts =============================================================================================
+#
+# Hold the parts of an open memory, connect plans to them in one context or the whole process, report their state.
+
+
+class Parts(NamedTuple):
+    """The parts of an open memory."""
+
+    queue: RecorderQueue
+    writer: WriterThread | DelegatedWriter
+    reading: Reading
+    emitter: Emitter
+    recorder: Recorder
+    recording: Recording
+    observations: Observations
+    experience: PickUpExperience
+
+    async def flush(self) -> None:
+        """Wait until all events recorded so far are stored and visible. Raises as `Memory.flush` does."""
+        position = self.queue.written
+        await self.queue.synced_to(position)
+        await self.writer.flush(position)
+
+    @contextmanager
+    def in_context(self) -> Iterator[None]:
+        """Record plans and worlds of this context, and give its plans the experience of this memory."""
+        with ExitStack() as stack:
+            for variable, value in self._variables():
+                stack.enter_context(set_inside(variable, value))
+            yield
+
+    @contextmanager
+    def in_process(self) -> Iterator[None]:
+        """Do so for all contexts of this process that have no memory of their own."""
+        for variable, value in self._variables():
+            variable.connect(value)
+        try:
+            yield
+        finally:
+            for variable, value in self._variables():
+                variable.disconnect(value)
+
+    def _variables(self) -> tuple[tuple[ConnectedVar[Any], object], ...]:
+        return (
+            (recorder, self.recorder),
+            (watcher, self.recorder),
+            (called_performs, self.recorder.calls),
+            (experience, self.experience),
+            (observations, self.observations),
+        )
+
+
+class PartsHolder:
+    """A memory as its methods see it: with parts while it is open."""
+
+    _parts: Parts | None
+    _clock: Clock
+    _address: DatabaseAddress
+    _located: DatabaseAddress
+
+    @property
+    def _open_parts(self) -> Parts:
+        if self._parts is None:
+            raise CallerError("this memory is not open: use `async with Memory.open(url) as memory`")
+        return self._parts
+
+
+class MemoryStatus(NamedTuple):
+    """The state of a memory.
+
+    Attributes:
+        written, synced, stored: positions up to which records survive a killed process, survive a power loss, and are
+            in the database.
+        bytes_spooled: the size of the queue on disk.
+        faults: events that the hooks failed to record, and performs that were never awaited.
+        unawaited: one sentence for each designator type whose perform was called but never awaited.
+        missing: the number of values that could not be recorded, and the reason of the last.
+        samples_left_out, episodes_continued: the number of samples dropped for lack of space, and of episodes that were
+            continued in a follow-up episode.
+        folded: position up to which records are visible, as reported by the daemon; None with a writer thread.
+        drained: whether a process drains the queue now.
+        writer: the state of the writer thread; None with a daemon.
+        unadopted: by folder of a dead recorder that could not be recovered, the error.
+        spool_fault: the last fault of the queue's files (a failed sync; deleted or replaced files, and the folder in
+            which recording continues); None without one.
+        spool_lost: the records lost with deleted files, one line for each run of positions.
+        declarations_unrepeated: the number of declarations that one segment contains and the later ones had no space
+            to repeat: if the log goes back, their episodes can be healed only while that segment is kept.
+    """
+
+    written: int
+    synced: int
+    stored: int
+    bytes_spooled: int
+    folded: int | None
+    drained: bool
+    faults: Faults
+    unawaited: tuple[str, ...]
+    missing: Missing
+    samples_left_out: int
+    episodes_continued: int
+    writer: WriterState | None
+    unadopted: Mapping[str, PycrormError]
+    spool_fault: str | None
+    spool_lost: tuple[str, ...]
+    declarations_unrepeated: int
+
+    @classmethod
+    def of(cls, parts: Parts, unadopted: Mapping[str, PycrormError]) -> Self:
+        """Collect the present state of the memory with these parts."""
+        queue, emitter, recorder = parts.queue, parts.emitter, parts.recorder
+        drain_status = queue.external_drain_status
+        return cls(
+            written=queue.written,
+            synced=queue.synced,
+            stored=queue.stored,
+            bytes_spooled=queue.bytes_spooled,
+            folded=None if drain_status is None else drain_status.folded,
+            drained=queue.is_drained,
+            faults=emitter.faults,
+            unawaited=emitter.unawaited,
+            missing=emitter.missing.count,
+            samples_left_out=recorder.samples_left_out,
+            episodes_continued=recorder.episodes.continued_count,
+            writer=parts.writer.state if isinstance(parts.writer, WriterThread) else None,
+            unadopted=dict(unadopted),
+            spool_fault=queue.setback,
+            spool_lost=queue.lost,
+            declarations_unrepeated=queue.declarations_unrepeated,
+        )
+
+
+# === memory reading ===========================================================================================
+#
+# `ReadableMemory` holds the queries of an open memory.
+
+
+class ReadableMemory(PartsHolder):
+    """The queries of a memory. Each raises `CallerError` while the memory is not open.
+
+    "Up to the last flush" means that events recorded since the last `flush` may be missing from the result.
+    """
+
+    _recall: Recall | None = None
+
+    def __repr__(self) -> str:
+        return f"<Memory {self._address}, {'open' if self._parts is not None else 'not open'}>"
+
+    def _repr_html_(self) -> str:
+        from pycrorm_async.query.notebook_html import memory_html
+
+        return memory_html(self._address, self._located if self._parts is not None else None)
+
+    @property
+    def reading(self) -> Reading:
+        """The reading side of this memory: named queries, sessions, data frames."""
+        return self._open_parts.reading
+
+    def session(self, *, simulated: bool = False) -> AbstractAsyncContextManager[AsyncSession]:
+        """Return an ordinary SQLAlchemy `AsyncSession` on this memory, as an async context manager.
+
+        With `simulated` it also sees simulations (`SimulatedTaskTree`).
+        """
+        return self._open_parts.reading.session(simulated=simulated)
+
+    @overload
+    async def dataframe(
+        self,
+        statement: FrameQuery,
+        *,
+        to: Literal["pandas"] = "pandas",
+        simulated: bool = False,
+        deferred: bool = False,
+    ) -> pd.DataFrame: ...
+
+    @overload
+    async def dataframe(
+        self,
+        statement: FrameQuery,
+        *,
+        to: Library,
+        simulated: bool = False,
+        deferred: bool = False,
+    ) -> Any: ...
+
+    async def dataframe(
+        self,
+        statement: FrameQuery,
+        *,
+        to: Library = "pandas",
+        simulated: bool = False,
+        deferred: bool = False,
+    ) -> Any:
+        """Return the rows as a frame of pandas, polars or Arrow (extra `frames`), typed as the columns are declared.
+
+        Args:
+            statement: a select, a union of selects, a mapped class, or a question of `ask`.
+            to: the library: `pandas`, `polars` or `arrow`.
+            simulated: include the rows of simulations.
+            deferred: include the columns of mapped classes that their objects load on request.
+        """
+        return await self._open_parts.reading.dataframe(statement, to=to, simulated=simulated, deferred=deferred)
+
+    def batches(
+        self,
+        statement: FrameQuery,
+        *,
+        rows: int = BATCH_ROWS,
+        simulated: bool = False,
+        deferred: bool = False,
+        enums_as_text: bool = False,
+    ) -> AsyncGenerator[pa.RecordBatch]:
+        """Return the rows as a stream of Arrow record batches of at most `rows` rows; see `Reading.batches`."""
+        reading = self._open_parts.reading
+        return reading.batches(
+            statement, rows=rows, simulated=simulated, deferred=deferred, enums_as_text=enums_as_text
+        )
+
+    @property
+    def ask(self) -> Ask[Question]:
+        """The named questions: `await memory.ask.root_failures(object="milk")` is a frame, up to the last flush."""
+        return self._open_parts.reading.ask
+
+    async def diff(self, first: AskedEpisode, second: AskedEpisode) -> EpisodeDiff:
+        """Compare two episodes, up to the last flush; see `Reading.diff`."""
+        return await self._open_parts.reading.diff(first, second)
+
+    @property
+    def recall(self) -> Recall:
+        """The past actions most like a cue: `await memory.recall(type=PickUpAction, has={"arm": Arms.LEFT})`."""
+        parts = self._open_parts
+        if self._recall is None:
+            running = ProcessCases(
+                parts.emitter,
+                open_episodes=lambda: [*parts.recorder.episodes.by_id],
+                flush=parts.flush,
+                log=parts.reading.log,
+                clock=self._clock,
+            )
+            reader = CaseReader(DatabaseSource(parts.reading), running)
+            self._recall = Recall(reader, parts.reading, self._clock)
+        return self._recall
+
+    async def query(self, sql: str, limits: SqlLimits = DEFAULT_LIMITS) -> SqlResult:
+        """Return the rows of one query in SQL that can only read, up to the last flush; see `Reading.query`."""
+        return await self._open_parts.reading.query(sql, limits)
+
+    def mapped(self, designator: str | type) -> Any:
+        """Return the mapped class of a designator type, by its dtype or its class.
+
+        The type is known after a flush of its first use. A memory with a daemon has no connection before its first
+        query, so query it first.
+        """
+        reading = self._open_parts.reading
+        if not reading.is_open:
+            raise CallerError("this memory has not read its types yet: open a session first")
+        return reading.mapped(designator)
+
+    async def episodes(self, *, simulated: bool = False) -> Episodes:
+        """Return every episode, the oldest first, up to the last flush, as a list that a notebook draws as a table."""
+        return await self._open_parts.reading.episodes(simulated=simulated)
+
+    async def tree(self, episode: AnyEpisode) -> TaskTree:
+        """Return the task tree of an episode up to the last flush, as a list that a notebook draws; see `Reading.tree`.
+
+        >>> tree = await memory.tree("last")
+        >>> [node.dtype for node in tree if node.status == "FAILED"]
+        """
+        return await self._open_parts.reading.tree(episode)
+
+    async def as_of(
+        self,
+        episode: AnyEpisode,
+        *,
+        time: float | datetime | None = None,
+        sequence: int | None = None,
+        meshes: bool = False,
+    ) -> Moment:
+        """Return the task tree and the world at any moment of an episode, up to the last flush; see `Reading.as_of`."""
+        return await self._open_parts.reading.as_of(episode, time=time, sequence=sequence, meshes=meshes)
+
+    async def report(
+        self,
+        episode: AnyEpisode,
+        path: str | PathLike[str] | None = None,
+        *,
+        force: bool = False,
+        first: int | None = None,
+        last: int | None = None,
+    ) -> Report:
+        """Write an episode, up to the last flush, as one HTML file; see `pycrorm_async.report.write.report`."""
+        reading = self._open_parts.reading
+        return await write_report(reading, episode, path, force=force, first=first, last=last)
+
+    async def picture(self, episode: AnyEpisode, *, at: MomentReference = None, **view: Any) -> bytes:
+        """Return the scene of an episode at a moment as PNG, up to the last flush.
+
+        >>> Path("scene.png").write_bytes(await memory.picture("last", at="e115"))
+
+        `view` are the size and the camera, see `pycrorm_async.query.picture.picture`. It needs the extra `world`.
+        """
+        from pycrorm_async.query.picture import picture  # loads a world, which most programs have no need of
+
+        return await picture(self._open_parts.reading, episode, at=at, **view)
+
+    async def export(
+        self,
+        what: Exportable,
+        path: str | PathLike[str],
+        *,
+        file_format: FileFormat | None = None,
+        episodes: Sequence[str | int] = (),
+        force: bool = False,
+        arguments: Mapping[str, Any] = MappingProxyType({}),
+        clock: StateClock | None = None,
+        fps: int | None = None,
+        images: ImageSize | None = None,
+    ) -> Exported:
+        """Write episodes or rows to a file, up to the last flush; see `pycrorm_async.export.export.export`."""
+        from pycrorm_async.export.export import export  # here, because most memories write no file
+
+        return await export(
+            self._open_parts.reading,
+            what,
+            path,
+            file_format=file_format,
+            episodes=episodes,
+            arguments=arguments,
+            force=force,
+            clock=clock,
+            fps=fps,
+            images=images,
+        )
+
+    async def export_again(
+        self,
+        manifest: str | PathLike[str],
+        path: str | PathLike[str] | None = None,
+        *,
+        statement: Question | Select[*tuple[Any, ...]] | None = None,
+        force: bool = False,
+    ) -> ExportComparison:
+        """Make an export again from its manifest and compare; see `pycrorm_async.export.export.export_again`."""
+        from pycrorm_async.export.export import export_again
+
+        return await export_again(self._open_parts.reading, manifest, path, statement=statement, force=force)
+
+    async def plot_success(
+        self,
+        x: str,
+        y: str,
+        *,
+        of: Source = "PickUpWithContextView",
+        kind: Kind = "auto",
+        bins: int | None = None,
+        axes: Axes | None = None,
+    ) -> Figure:
+        """Draw how often the actions of a view succeeded over two of its columns, up to the last flush.
+
+        >>> figure = await memory.plot_success("relative_x", "relative_y")  # pick-ups, as in the thesis' figure 5.1
+        >>> figure.savefig("pick-ups.svg")
+        >>> await memory.plot_success("arm", "duration", of=PickUpAction, axes=axes)
+
+        Args:
+            x, y: names of columns: numbers, times, texts, enums or bools.
+            of: the view: a mapped class, the name of one or of a view or designator type, or a select with a column
+                `status`.
+            kind: `heatmap` of the share of successes, with the number of rows and the 95 % interval in cells that are
+                large enough; `scatter` of the rows; by default a scatter of up to 500 rows with two numbers.
+            bins: the largest number of ranges of a numeric column; by default it grows with the number of rows.
+            axes: draw into these instead of a new figure.
+
+        It needs the extra `pictures`. Raises `CallerError` for an unknown view or column, and if no row is left.
+        """
+        from pycrorm_async.query.success import success_figure, success_samples
+
+        samples = await success_samples(self._open_parts.reading, x, y, of)
+        return success_figure(samples, kind=kind, bins=bins, axes=axes)
+
+    async def blob(self, name: str) -> Blob | None:
+        """Return the blob with this SHA-256, up to the last flush; None if it is not stored."""
+        return await self._open_parts.reading.blob(name)
+
+    async def number_of(self, episode: Episode) -> int:
+        """Return the number that this database gave to the episode, after `flush`."""
+        return await self._open_parts.reading.number_of(str(episode))
+
+
+# === memory recording =========================================================================================
+#
+# `RecordingMemory` is an open memory as plans and programs use it: episodes, observations, flushes, subscriptions.
+
+
+class RecordingMemory(ReadableMemory, ABC):
+    """The recording methods of a memory. Each raises `CallerError` while the memory is not open."""
+
+    _unadopted: dict[str, PycrormError]
+    _reported: set[str]
+
+    @abstractmethod
+    async def __aenter__(self) -> Self:
+        """Open the memory, once."""
+
+    @abstractmethod
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        """Store and fold all recorded events; open episodes end as INTERRUPTED."""
+
+    @property
+    def status(self) -> MemoryStatus:
+        """The present state of the memory."""
+        return MemoryStatus.of(self._open_parts, self._unadopted)
+
+    @property
+    def is_open(self) -> bool:
+        """True while the memory is open."""
+        return self._parts is not None
+
+    # --- episodes ---------------------------------------------------------------------------------------------
+
+    @asynccontextmanager
+    async def episode(
+        self,
+        *,
+        description: str | None = None,
+        plan: str | None = None,
+        seed: int | None = None,
+        tags: Sequence[str] = (),
+        metadata: Mapping[str, Any] = MappingProxyType({}),
+    ) -> AsyncIterator[Episode]:
+        """Record an episode: plans performed inside, and the world that was entered before or is entered inside.
+
+        If the spool is full, waits for space or raises `SpoolFull`, according to `Settings.on_full`.
+
+        Args:
+            description: the purpose; default: the plan's name.
+            plan: the plan's name.
+            seed: of the plan's random numbers, 64 bits, so that it can be repeated.
+            tags: short texts to find the episode by; `tag` changes them later.
+            metadata: JSON values of your own, at most 64 KiB.
+
+        Raises:
+            EpisodeRefused: an episode is open in this task already. A child task may open its own.
+            CallerError: for an argument of the wrong type, and a tag that is not a text of 1 to 100 characters.
+        """
+        parts = self._open_parts
+        recorder = parts.recorder
+        if (room := recorder.admit()) is not None:
+            await room
+        labels = read_labels(tags, metadata, parts.emitter)
+        text = description or plan or "an episode"
+        episode = recorder.open_episode(description=text, plan=plan, seed=seed, labels=labels)
+        failure: BaseException | None = None
+        with (
+            parts.in_context(),
+            set_inside(current_episode, episode),
+            set_inside(called_performs, episode.calls),
+        ):
+            try:
+                yield episode
+            except BaseException as raised:
+                failure = raised
+                raise
+            finally:
+                recorder.close_episode(episode, failure)
+
+    async def tag(self, episode: AnyEpisode, *tags: str, remove: Sequence[str] = ()) -> None:
+        """Add and remove tags of an episode of this database: a number, id, `last`, or object.
+
+        Tags of an episode that is open in this memory are recorded in it; those of one that has ended are written
+        directly to the log, after a flush.
+
+        Raises `CallerError` for an episode that another process still records, and for a removed tag that the episode
+        does not have; `UnknownEpisode`; `DatabaseUnavailable`, also if this login may not append.
+        """
+        parts = self._open_parts
+        added, removed = checked_tags(tags), checked_tags(remove)
+        name = str(episode.id if isinstance(episode, EpisodeSummary) else episode)
+        for each in parts.recorder.episodes.all:
+            if str(each) == name:
+                each.change_tags(added, removed)
+                return
+        await self.flush()
+        await tag_episode(self._located, name, added, removed, clock=self._clock)
+
+    async def synced(self) -> None:
+        """Wait until all events recorded so far survive a power loss.
+
+        Raises `SpoolUnavailable` if the disk fails, or if files of the spool were deleted or replaced. Recording then
+        continues in a new folder if one can be created, and `status` lists the lost records.
+        """
+        await self._open_parts.queue.synced_to(self._open_parts.queue.written)
+
+    async def flush(self) -> None:
+        """Wait until all events recorded so far are stored and visible in the tables.
+
+        Raises:
+            EpisodeParked: an episode could not be stored or folded, with the reason; each episode is reported once.
+            FlushTimeout: nothing was stored or folded for `flush_timeout_s`. The events are safe in the spool.
+        """
+        parts = self._open_parts
+        try:
+            await parts.flush()
+        except EpisodeParked as fault:
+            unreported = self._unreported(fault)
+            if unreported is not None:
+                raise unreported from fault
+        if parts.reading.is_open:
+            await parts.reading.refresh(maps=False)
+
+    def _unreported(self, fault: PycrormError) -> PycrormError | None:
+        """Return the fault without parked episodes that a flush has reported; None if no other is left."""
+        if not isinstance(fault, EpisodeParked):
+            return fault
+        reasons = {episode: reason for episode, reason in fault.reasons.items() if episode not in self._reported}
+        self._reported.update(reasons)
+        return EpisodeParked(reasons) if reasons else None
+
+    # --- other executives and programs ------------------------------------------------------------------------
+
+    @property
+    def recording(self) -> Recording:
+        """Writes episodes of an executive that is not ours, from any thread and without asyncio."""
+        return self._open_parts.recording
+
+    @property
+    def recent_episodes(self) -> tuple[str, ...]:
+        """The ids of the last hundred episodes this memory opened."""
+        return self._open_parts.recorder.episodes.recent
+
+    @property
+    def opened_count(self) -> int:
+        """The number of episodes this memory opened."""
+        return self._open_parts.recorder.episodes.opened_count
+
+    def observe(self, name: str, values: object, *, node: TaskTreeNode | None = None) -> None:
+        """Record an observation of your own in the open episode: a measurement, a message, an image.
+
+        >>> memory.observe("wrist force", {"x": 1.5, "y": -0.25, "contact": True})
+        >>> memory.observe("camera", Blob(png, "image/png"))
+
+        May be called from any thread. A thread outside the plan's context observes for the episode opened last. A value
+        that cannot be recorded, or finds no space in the spool, is recorded as missing and counted; a plan never waits.
+
+        Args:
+            name: by which observations are queried.
+            values: a number, bool, text, array or `Blob`, or a dict or list of these. An array of more than 64 elements
+                is stored as a blob of the media type `application/x-npy`.
+            node: the node that observed it; by default the current one, or the root of the episode.
+
+        Raises `Unrecordable` with `on_unrecordable="refuse"` only.
+        """
+        self._open_parts.observations.observe(name, values, node=node)
+
+    # --- subscribing ------------------------------------------------------------------------------------------
+
+    def subscribe(self, callback: Callable[[RecordedEvent], object], *, buffer: int = BUFFER_EVENTS) -> Subscription:
+        """Call `callback` with each event from now on, in a thread of its own, until closed or the memory is closed.
+
+        Use the result as a context manager, or call its `close()`. The plan never waits: an event that finds more than
+        `buffer` others waiting is left out, and `left_out` counts it. Exceptions of the callback are counted in
+        `failed`, and the first is logged.
+        """
+        return self._open_parts.emitter.feed.subscribe(callback, buffer=buffer)
+
+    def events(self, *, buffer: int = BUFFER_EVENTS) -> EventStream:
+        """Return each event from now on as an asynchronous iterator in this loop, which ends when the memory is closed.
+
+        A plan that never suspends lets no other task of its loop run: observe it from a thread, or after the plan.
+        """
+        return self._open_parts.emitter.feed.stream(buffer=buffer)
+
+
+# === memory ===================================================================================================
 
 _log = logging.getLogger("pycrorm_async")
 
@@ -280,3 +908,190 @@ class Memory(RecordingMemory):
         if self._parts is not None:
             self._parts.emitter.is_closed = self._parts.experience.is_closed = True
             self._parts = None
+
+
+# === sync memory ==============================================================================================
+
+T = TypeVar("T")
+
+
+class SyncMemory:
+    """A memory to use with `with`, once; `Memory.sync` makes it. Its methods may be called from any thread."""
+
+    def __init__(self, memory: RecordingMemory) -> None:
+        self._memory = memory
+        self._thread: threading.Thread | None = None
+        self._opened: Future[asyncio.AbstractEventLoop] = Future()
+        self._closing: asyncio.Future[BaseException | None] | None = None
+        self._closed: Future[None] = Future()
+
+    def __repr__(self) -> str:
+        return f"<Sync{repr(self._memory)[1:]}"
+
+    def _repr_html_(self) -> str:
+        return self._memory._repr_html_()
+
+    def __enter__(self) -> Self:
+        if self._thread is not None:
+            raise CallerError("a memory can be entered once: call Memory.sync again")
+        self._thread = threading.Thread(target=self._run, name="memory of pycrorm", daemon=True)
+        try:
+            self._thread.start()
+            self._opened.result()
+        except BaseException:  # Ctrl-C, which must not leave the memory open; or what opening raised
+            self._opened.add_done_callback(self._close_unused)
+            raise
+        return self
+
+    def _close_unused(self, opened: Future[asyncio.AbstractEventLoop]) -> None:
+        if opened.exception() is None and self._closing is not None:
+            opened.result().call_soon_threadsafe(self._closing.set_result, None)
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        if not self._memory.is_open:  # in a forked child it belongs to the parent
+            return
+        assert self._closing is not None
+        self._opened.result().call_soon_threadsafe(self._closing.set_result, error)
+        self._closed.result()
+
+    def _run(self) -> None:
+        try:
+            asyncio.run(self._hold())
+        except BaseException as error:  # noqa: BLE001  it is raised where the memory is used
+            (self._closed if self._opened.done() else self._opened).set_exception(error)
+        else:
+            self._closed.set_result(None)
+
+    async def _hold(self) -> None:
+        """Hold the memory open, in one task, until it is closed."""
+        loop = asyncio.get_running_loop()
+        self._closing = loop.create_future()
+        await self._memory.__aenter__()
+        self._opened.set_result(loop)
+        error = await self._closing
+        await self._memory.__aexit__(type(error) if error is not None else None, error, None)
+
+    def _await(self, coroutine: Coroutine[Any, Any, T], timeout_s: float | None = None) -> T:
+        """Run a coroutine in the memory's thread and return its result. Raises `TimeoutError` after `timeout_s`."""
+        if not self._memory.is_open:
+            coroutine.close()
+            raise CallerError("this memory is not open: use `with Memory.sync(url) as memory`")
+        future = asyncio.run_coroutine_threadsafe(coroutine, self._opened.result())
+        try:
+            return future.result(timeout_s)
+        except BaseException:  # also Ctrl-C, which must not leave the coroutine running
+            future.cancel()
+            raise
+
+    @property
+    def recording(self) -> Recording:
+        """Writes episodes; see `Recording`."""
+        return self._memory.recording
+
+    @property
+    def status(self) -> MemoryStatus:
+        """The present state of the memory."""
+        return self._memory.status
+
+    @property
+    def recent_episodes(self) -> tuple[str, ...]:
+        """The ids of the last hundred episodes this memory opened."""
+        return self._memory.recent_episodes
+
+    def synced(self) -> None:
+        """Wait until all events recorded so far survive a power loss; raises as `Memory.synced` does."""
+        self._await(self._memory.synced())
+
+    def flush(self, timeout_s: float | None = None) -> None:
+        """Wait until all events recorded so far are visible in the tables; raises as `Memory.flush` does.
+
+        Raises `FlushTimeout` also after `timeout_s`, if it is given. The events are safe in the spool.
+        """
+        try:
+            self._await(self._memory.flush(), timeout_s)
+        except TimeoutError as error:
+            assert timeout_s is not None, "only a limited wait ends"
+            raise FlushTimeout(timeout_s) from error
+
+    @property
+    def ask(self) -> Ask[SyncQuestion]:
+        """The named questions: `memory.ask.root_failures(object="milk").frame()`."""
+        reading = self._memory.reading
+        return Ask(lambda plan: SyncQuestion(Question(reading, plan), self._await))
+
+    def episodes(self, *, simulated: bool = False) -> Episodes:
+        """Return every episode, the oldest first; see `Memory.episodes`."""
+        return self._await(self._memory.episodes(simulated=simulated))
+
+    def tree(self, episode: AnyEpisode) -> TaskTree:
+        """Return the task tree of an episode; see `Memory.tree`."""
+        return self._await(self._memory.tree(episode))
+
+    def as_of(
+        self, episode: AnyEpisode, *, time: float | datetime | None = None, sequence: int | None = None
+    ) -> Moment:
+        """Return the task tree and the world at any moment of an episode; see `Memory.as_of`."""
+        return self._await(self._memory.as_of(episode, time=time, sequence=sequence))
+
+    def picture(self, episode: AnyEpisode, *, at: MomentReference = None, **view: Any) -> bytes:
+        """Return the scene of an episode at a moment as PNG; see `Memory.picture`."""
+        return self._await(self._memory.picture(episode, at=at, **view))
+
+    def report(self, episode: AnyEpisode, path: str | PathLike[str] | None = None, **options: Any) -> Report:
+        """Write an episode as one HTML page that opens offline; see `Memory.report`, which has the same options."""
+        return self._await(self._memory.report(episode, path, **options))
+
+    def plot_success(self, x: str, y: str, **options: Any) -> Figure:
+        """Draw how often the actions of a view succeeded over two of its columns; see `Memory.plot_success`."""
+        return self._await(self._memory.plot_success(x, y, **options))
+
+    def diff(self, first: AskedEpisode, second: AskedEpisode) -> EpisodeDiff:
+        """Compare two episodes; see `Reading.diff`."""
+        return self._await(self._memory.diff(first, second))
+
+    def recall(self, type: str | type | None = None, **cue: Any) -> Answer:  # noqa: A002  the feature's name
+        """Return the past actions most like a cue; see `Recall.__call__`."""
+        return self._await(self._memory.recall(type, **cue))
+
+    def query(self, sql: str, limits: SqlLimits = DEFAULT_LIMITS) -> SqlResult:
+        """Return the rows of one query in SQL that can only read; see `Reading.query`."""
+        return self._await(self._memory.query(sql, limits))
+
+    @overload
+    def dataframe(
+        self,
+        statement: FrameQuery | SyncQuestion,
+        *,
+        to: Literal["pandas"] = "pandas",
+        simulated: bool = False,
+        deferred: bool = False,
+    ) -> pd.DataFrame: ...
+
+    @overload
+    def dataframe(
+        self,
+        statement: FrameQuery | SyncQuestion,
+        *,
+        to: Library,
+        simulated: bool = False,
+        deferred: bool = False,
+    ) -> Any: ...
+
+    def dataframe(
+        self,
+        statement: FrameQuery | SyncQuestion,
+        *,
+        to: Library = "pandas",
+        simulated: bool = False,
+        deferred: bool = False,
+    ) -> Any:
+        """Return the rows as a frame of pandas, polars or Arrow; see `Memory.dataframe`."""
+        query = statement.question if isinstance(statement, SyncQuestion) else statement
+        return self._await(self._memory.reading.dataframe(query, to=to, simulated=simulated, deferred=deferred))
+
+    def export(self, what: Exportable | SyncQuestion, path: str | PathLike[str], **options: Any) -> Exported:
+        """Write episodes or rows to a file; see `Memory.export`, which has the same options."""
+        exported = what.question if isinstance(what, SyncQuestion) else what
+        return self._await(self._memory.export(exported, path, **options))

@@ -9,8 +9,6 @@ from typing import Protocol
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-__all__ = ["stderr", "progress_bar", "ProgressCallback"]
-
 stderr = Console(stderr=True, highlight=False, soft_wrap=True)
 """The only console for stderr, because rich redraws a bar below other output only if both use one console."""
 

@@ -13,8 +13,6 @@ from typing import Any, Final, Literal, get_args
 
 from pycrorm_async.errors import CallerError
 
-__all__ = ["FILE_MODES", "FileAccess", "Fold", "Settings", "OnFull", "OnUnrecordable", "RecordMeshes", "Writer"]
-
 OnFull = Literal["wait", "fail"]
 RecordMeshes = Literal["boxes", "files"]
 OnUnrecordable = Literal["record_missing", "refuse"]

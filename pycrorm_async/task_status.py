@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from enum import Enum
 
-__all__ = ["TaskStatus"]
-
 
 class TaskStatus(Enum):
     """The status of a node: running, or the way in which it ended."""

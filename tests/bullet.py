@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib.util import find_spec
 from typing import Any
 
-from pycrorm_async.world.bullet_loader import engine
+from pycrorm_async.world.bullet_body import engine
 
 INSTALLED_BULLETS = tuple(name for name in ("pybullet", "pycram-bullet") if find_spec(name.replace("-", "_")))
 """The installed packages that contain Bullet."""

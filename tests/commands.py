@@ -22,7 +22,7 @@ from types import ModuleType
 from typing import IO, Any, Final, NoReturn
 from unittest import mock
 
-from pycrorm_async.operations.processes import ChildProcess
+from pycrorm_async.operations.workers import ChildProcess
 
 COMMAND = [sys.executable, "-W", "error", "-m", "pycrorm_async"]
 

@@ -86,7 +86,7 @@ def module_database_url(request: pytest.FixtureRequest, tmp_path_factory: pytest
 @pytest.fixture
 def forked_workers(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let the fold workers that the test starts be forked instead of spawned, see `fork_child`."""
-    monkeypatch.setattr("pycrorm_async.operations.fold_worker.ChildProcess", SimpleNamespace(start=fork_child))
+    monkeypatch.setattr("pycrorm_async.operations.workers.ChildProcess", SimpleNamespace(start=fork_child))
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

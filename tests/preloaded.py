@@ -13,19 +13,16 @@ from typer.testing import CliRunner
 import pycrorm_async.orm  # noqa: F401
 from pycrorm_async.cli.main import app
 from pycrorm_async.clock import SYSTEM_CLOCK
-from pycrorm_async.projections.schema.core_columns import CORE, OF_NO_EPISODE
-from pycrorm_async.projections.schema.generations import built_in_texts, table_texts
-from pycrorm_async.projections.schema.layout import Layout
-from pycrorm_async.projections.schema.mapped_tables import mapped_leaves
-from pycrorm_async.projections.schema.public_views import Tables
-from pycrorm_async.projections.schema.tables import leaf_columns
-from pycrorm_async.projections.table_names import next_number
-from pycrorm_async.recording.writing.provenance import Provenance
+from pycrorm_async.projections.columns import CORE, OF_NO_EPISODE, Layout, leaf_columns, next_number
+from pycrorm_async.projections.generations import built_in_texts, table_texts
+from pycrorm_async.projections.mapped_tables import mapped_leaves
+from pycrorm_async.projections.views import Tables
+from pycrorm_async.record.episode_writer import Provenance
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.dialects import dialect_of
-from pycrorm_async.world.bullet_loader import engine
-from pycrorm_async.world.errors import BulletMissing
+from pycrorm_async.world.bullet_body import engine
+from pycrorm_async.world.pose import BulletMissing
 
 configure_mappers()
 FIRST = next_number(())

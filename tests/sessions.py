@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from sqlalchemy.ext.asyncio import AsyncSession
 
-from pycrorm_async.orm.loading.known_classes import known_classes
-from pycrorm_async.query.sessions.episode_session import EpisodeSession
-from pycrorm_async.query.sessions.load_on_access import LoadOnAccess
+from pycrorm_async.orm.base import known_classes
+from pycrorm_async.query.reading import EpisodeSession, LoadOnAccess
 from pycrorm_async.store.log import EventLog
 
 __all__ = ["session_on"]

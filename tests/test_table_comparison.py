@@ -10,9 +10,16 @@ from pathlib import Path
 
 import pytest
 
-from pycrorm_async.events.envelope import Record
-from pycrorm_async.events.types import EpisodeEnded, EpisodeStarted, JointsMoved, NodeEnded, NodeStarted, ObjectAdded
-from pycrorm_async.events.values import ObjectReference
+from pycrorm_async.events.codec import Record
+from pycrorm_async.events.types import (
+    EpisodeEnded,
+    EpisodeStarted,
+    JointsMoved,
+    NodeEnded,
+    NodeStarted,
+    ObjectAdded,
+    ObjectReference,
+)
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.databases import Server, ask, ask_to_change

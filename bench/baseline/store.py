@@ -25,7 +25,7 @@ from bench.baseline.tables import (
     TaskTreeNodeRow,
 )
 from bench.material.rollouts import Node, Place, Robot, Tree, WorldObject
-from pycrorm_async.world.enums import Arms, Grasp, GripperState, ObjectType
+from pycrorm_async.world.pose import Arms, Grasp, GripperState, ObjectType
 
 __all__ = ["engine_of", "Statements", "store"]
 

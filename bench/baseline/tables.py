@@ -12,7 +12,7 @@ from datetime import datetime
 from sqlalchemy import ForeignKey, String, func
 from sqlalchemy.orm import DeclarativeBase, Mapped, MappedAsDataclass, declared_attr, mapped_column, relationship
 
-from pycrorm_async.world.enums import Arms, Grasp, GripperState, ObjectType
+from pycrorm_async.world.pose import Arms, Grasp, GripperState, ObjectType
 
 __all__ = [
     "ActionRow",

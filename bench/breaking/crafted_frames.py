@@ -14,8 +14,7 @@ from bench.breaking.outcome import Outcome, Step
 from pycrorm_async.errors import PycrormError
 from pycrorm_async.operations.recovery import recover
 from pycrorm_async.queue import Spool
-from pycrorm_async.queue.maintenance.inspection import inspect_spool
-from pycrorm_async.queue.maintenance.repair import repair_folder
+from pycrorm_async.queue.maintenance import inspect_spool, repair_folder
 from tests.databases import ask
 from tests.queue.factories import FolderWriter, ended, episode, node, started
 from tests.queue.forged_segments import change_a_frame, change_the_header

@@ -18,14 +18,13 @@ import asyncpg
 from bench.breaking.files import small_disk
 from bench.breaking.outcome import Event, Outcome, Step
 from pycrorm_async.errors import DatabaseUnavailable
-from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.codec import Record
 from pycrorm_async.events.ids import episode_text
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.testing.postgresql_proxy import Proxy, proxy_before
-from pycrorm_async.writer.drain import Drain
-from pycrorm_async.writer.retry import Backoff
+from pycrorm_async.writer.drain import Backoff, Drain
 from tests.databases import Server, ask
 from tests.store.factories import episode, run_of
 from tests.store.faults import cancel_at_await

@@ -12,15 +12,20 @@ from typing import Any
 import msgspec
 
 from bench.breaking.outcome import Event, Outcome, Step
-from pycrorm_async.events.codec import declaration_of, encode, fingerprint
-from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.codec import Record, declaration_of, encode, fingerprint
 from pycrorm_async.events.fields import column_name, table_name
 from pycrorm_async.events.ids import episode_text
-from pycrorm_async.events.types import DesignatorTypeDeclared, EpisodeEnded, EpisodeStarted, NodeEnded, NodeStarted
-from pycrorm_async.events.values import FieldDeclared
+from pycrorm_async.events.types import (
+    DesignatorTypeDeclared,
+    EpisodeEnded,
+    EpisodeStarted,
+    FieldDeclared,
+    NodeEnded,
+    NodeStarted,
+)
 from pycrorm_async.operations.rebuild import rebuild_memory
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.projections.verify.verify import verify
+from pycrorm_async.projections.verify import verify
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.databases import ask

@@ -20,7 +20,7 @@ from bench.breaking.images import NOT_MADE, DiskImage
 from bench.breaking.outcome import Event, Outcome, Step
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import SpoolDamaged, SpoolFull, SpoolUnavailable
-from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.codec import Record
 from pycrorm_async.events.ids import episode_id, episode_text
 from pycrorm_async.queue import RecorderQueue, Spool, open_dead
 from pycrorm_async.settings import Settings

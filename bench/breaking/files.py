@@ -17,10 +17,10 @@ from pathlib import Path
 from bench.breaking.outcome import Event, Outcome, Step
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
 from pycrorm_async.errors import SpoolDamaged, SpoolForeign, SpoolFull, SpoolUnavailable
-from pycrorm_async.events.envelope import LOST, Record
+from pycrorm_async.events.codec import LOST, Record
 from pycrorm_async.events.ids import episode_text
 from pycrorm_async.queue import RecorderQueue, open_dead
-from pycrorm_async.queue.maintenance.repair import RepairReport, repair_folder
+from pycrorm_async.queue.maintenance import RepairReport, repair_folder
 from tests.crash.test_queue_disk import ON_A_SMALL_DISK, SLOW, break_next_sync
 from tests.crash.test_queue_power import live_through_cuts, machine_on
 from tests.queue.factories import RECORDER, SMALL, FolderWriter, drain, ended, make, node, recover, started

@@ -21,7 +21,7 @@ from bench.breaking.child_process import SPAWN, ChildProcess, kill_me_after
 from bench.breaking.files import ROOMY, events_of, put
 from bench.breaking.outcome import Outcome, Step
 from pycrorm_async.errors import SpoolClosed, SpoolFull
-from pycrorm_async.events.envelope import LOST
+from pycrorm_async.events.codec import LOST
 from pycrorm_async.events.ids import episode_text
 from pycrorm_async.queue import Spool, open_dead
 from pycrorm_async.store.address import DatabaseAddress

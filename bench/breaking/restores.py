@@ -22,7 +22,7 @@ from typing import Any, Final
 from bench.breaking.outcome import Event, Outcome, Step
 from pycrorm_async import Memory, Settings
 from pycrorm_async.plan import ActionAbstract
-from pycrorm_async.projections.verify.verify import verify
+from pycrorm_async.projections.verify import verify
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.backups import Backup

@@ -19,14 +19,13 @@ from pathlib import Path
 from bench.breaking.files import events_of
 from bench.breaking.outcome import Event, Outcome, Step
 from pycrorm_async.errors import DatabaseUnavailable
-from pycrorm_async.events.envelope import LOST, Heading, Record
+from pycrorm_async.events.codec import LOST, Heading, Record
 from pycrorm_async.events.ids import EpisodeId, episode_id
 from pycrorm_async.queue import open_dead
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.writer.drain import Drain
-from pycrorm_async.writer.retry import Backoff
+from pycrorm_async.writer.drain import Backoff, Drain
 from tests.crash.test_queue_power import Machine, machine_on
 from tests.databases import ask
 from tests.writer.fakes import CountingFold, ForwardingDestination

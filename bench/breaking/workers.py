@@ -19,10 +19,10 @@ from bench.breaking.child_process import ChildProcess
 from bench.breaking.outcome import Outcome, Step
 from bench.breaking.robots import RecordedSteps, compare_steps, walk
 from pycrorm_async.operations.daemon import serve
-from pycrorm_async.operations.fold_workers import DaemonNote
 from pycrorm_async.operations.recovery import recover
-from pycrorm_async.projections.verify.verify import verify
-from pycrorm_async.queue.files.spool import Spool
+from pycrorm_async.operations.workers import DaemonNote
+from pycrorm_async.projections.verify import verify
+from pycrorm_async.queue.spool import Spool
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.crash.step_robot import SETTINGS, report

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from pycrorm_async.events.ids import row_id
 from pycrorm_async.recall.blocks import Block, Spread
 from pycrorm_async.recall.columns import Numbers, Sets, Symbols, Words
-from pycrorm_async.recall.cue import Cue, Wanted
+from pycrorm_async.recall.search import Cue, Wanted
 
 __all__ = ["Actions", "BLOCK_CASES", "CUES"]
 

@@ -23,8 +23,7 @@ from sqlalchemy.ext.asyncio import create_async_engine
 
 from bench.material.spool_recording import Recording
 from pycrorm_async.clock import SYSTEM_CLOCK
-from pycrorm_async.events.codec import decode, encode
-from pycrorm_async.events.envelope import Heading, Record
+from pycrorm_async.events.codec import Heading, Record, decode, encode
 from pycrorm_async.events.types import Happening
 from pycrorm_async.operations.destination import open_destination
 from pycrorm_async.queue import Spool, open_dead

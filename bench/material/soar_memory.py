@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.material.actions import Actions
-from pycrorm_async.recall.cue import Cue
+from pycrorm_async.recall.search import Cue
 
 __all__ = ["SoarMemory"]
 

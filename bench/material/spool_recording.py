@@ -12,30 +12,33 @@ from typing import Any
 from bench.material.rollouts import MILK, SHARES, Node, Place, Robot, Tree, WorldObject, tree_of
 from pycrorm_async import __version__
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
-from pycrorm_async.events.envelope import Heading
+from pycrorm_async.events.codec import Heading
 from pycrorm_async.events.ids import EpisodeId, episode_id
 from pycrorm_async.events.types import (
     DesignatorTypeDeclared,
     EpisodeEnded,
     EpisodeStarted,
+    FailureValue,
     Happening,
     NodeEnded,
     NodeStarted,
     ObjectAdded,
+    ObjectReference,
+    PoseValue,
+    RobotValue,
 )
-from pycrorm_async.events.values import FailureValue, ObjectReference, PoseValue, RobotValue
-from pycrorm_async.hooks.declaration import declared_type
-from pycrorm_async.plan.actions.basic import (
+from pycrorm_async.plan.actions import (
     FaceAtPerformable,
     LookAtActionPerformable,
     NavigateActionPerformable,
     PickUpActionPerformable,
 )
-from pycrorm_async.plan.designator import Designator
-from pycrorm_async.plan.motions.motions import LookingMotion, MoveGripperMotion, MoveMotion, MoveTCPMotion
+from pycrorm_async.plan.language import Designator
+from pycrorm_async.plan.motions import LookingMotion, MoveGripperMotion, MoveMotion, MoveTCPMotion
 from pycrorm_async.queue import RecorderQueue
-from pycrorm_async.recording.declarations.declared_type import DeclaredType
-from pycrorm_async.recording.writing.emitter import Emitter
+from pycrorm_async.record.declarations import declared_type
+from pycrorm_async.record.episode_writer import Emitter
+from pycrorm_async.record.parameters import DeclaredType
 from pycrorm_async.settings import Settings
 
 __all__ = ["spool_tree", "spool_rollouts", "Recording", "DECLARED"]

@@ -8,7 +8,7 @@ from collections.abc import Awaitable, Callable
 from contextlib import AsyncExitStack
 
 from pycrorm_async.plan import PickUpActionPerformable
-from pycrorm_async.plan.object_designators import designator_of
+from pycrorm_async.plan.objects import designator_of
 from pycrorm_async.world import Arms, Grasp, Object, ObjectType, Pose
 
 __all__ = ["TurnTaker", "NothingActionPerformable", "nothing_action"]

@@ -12,14 +12,23 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
-from pycrorm_async.cli.output import moment, note, print_json, print_line, print_table
+from pycrorm_async.cli.output import (
+    DEFAULT_URL,
+    JsonOption,
+    SpoolOption,
+    UrlOption,
+    moment,
+    note,
+    parse_since,
+    print_json,
+    print_line,
+    print_table,
+)
 from pycrorm_async.cli.reading import read_memory
-from pycrorm_async.cli.since import parse_since
-from pycrorm_async.query.asking.ask import QUESTIONS, Ask
-from pycrorm_async.query.asking.question import Question
-from pycrorm_async.query.parameter_text import duration
+from pycrorm_async.query.question import Question
+from pycrorm_async.query.questions import QUESTIONS, Ask
 from pycrorm_async.query.reading import Reading
+from pycrorm_async.query.text import duration
 from pycrorm_async.store.address import DatabaseAddress
 
 _SqlOption = Annotated[bool, typer.Option("--sql", help="Print the question's SQL instead of asking it.")]

@@ -8,9 +8,8 @@ from typing import Annotated
 import typer
 
 from pycrorm_async.bulk_records import collect_seldom
-from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption
-from pycrorm_async.cli.output import print_json, print_table, problem
-from pycrorm_async.cli.pending_events import note_pending_events
+from pycrorm_async.cli.output import DEFAULT_URL, JsonOption, SpoolOption, print_json, print_table, problem
+from pycrorm_async.cli.reading import note_pending_events
 from pycrorm_async.operations.copy import CopySummary, copy_episodes
 from pycrorm_async.progress_bar import progress_bar
 

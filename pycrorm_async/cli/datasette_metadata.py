@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
-from pycrorm_async.cli.output import print_json
+from pycrorm_async.cli.output import DEFAULT_URL, JsonOption, SpoolOption, UrlOption, print_json
 from pycrorm_async.cli.reading import read_memory
-from pycrorm_async.export.datasette import datasette_metadata as describe
+from pycrorm_async.export.export import datasette_metadata as describe
 
 
 def datasette_metadata(

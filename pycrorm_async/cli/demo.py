@@ -15,9 +15,17 @@ from typing import Any
 
 from sqlalchemy import select
 
-from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
-from pycrorm_async.cli.output import note, print_json, print_table, stdout
-from pycrorm_async.cli.tree import print_tree
+from pycrorm_async.cli.output import (
+    DEFAULT_URL,
+    JsonOption,
+    SpoolOption,
+    UrlOption,
+    note,
+    print_json,
+    print_table,
+    stdout,
+)
+from pycrorm_async.cli.show import print_tree
 from pycrorm_async.memory import Memory
 from pycrorm_async.orm import Action, NavigateAction, Object, PickUpAction, ProcessMetaData
 from pycrorm_async.orm import Pose as PoseRow
@@ -31,20 +39,14 @@ from pycrorm_async.plan import (
     SemanticCostmapLocation,
     simulated_robot,
 )
-from pycrorm_async.plan import (
-    NavigateAction as Navigate,
-)
-from pycrorm_async.plan import (
-    PickUpAction as PickUp,
-)
-from pycrorm_async.plan import (
-    PlaceAction as Place,
-)
+from pycrorm_async.plan import NavigateAction as Navigate
+from pycrorm_async.plan import PickUpAction as PickUp
+from pycrorm_async.plan import PlaceAction as Place
 from pycrorm_async.query.named_queries import NodeSummary
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.world import Arms, BulletWorld, Grasp, ObjectType, Pose
 from pycrorm_async.world import Object as WorldObject
-from pycrorm_async.world.bullet_loader import engine
+from pycrorm_async.world.bullet_body import engine
 
 
 def kitchen_world() -> None:

@@ -6,11 +6,21 @@ from typing import Annotated
 
 import typer
 
-from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
-from pycrorm_async.cli.output import counted, note, print_json, print_line, print_table, stdout
+from pycrorm_async.cli.output import (
+    DEFAULT_URL,
+    JsonOption,
+    SpoolOption,
+    UrlOption,
+    counted,
+    note,
+    print_json,
+    print_line,
+    print_table,
+    stdout,
+)
 from pycrorm_async.cli.reading import read_memory
 from pycrorm_async.query.named_queries import EpisodeSummary
-from pycrorm_async.query.parameter_text import duration
+from pycrorm_async.query.text import duration
 
 _HELP = "The episode's number, its id or first digits of the id, or `last`."
 

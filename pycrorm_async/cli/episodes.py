@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from pycrorm_async.cli.options import (
+from pycrorm_async.cli.output import (
     DEFAULT_URL,
     JsonOption,
     LimitOption,
@@ -18,16 +18,19 @@ from pycrorm_async.cli.options import (
     TagOption,
     TextOption,
     UrlOption,
+    moment,
+    note,
+    parse_since,
+    print_json,
+    print_table,
+    stdout,
 )
-from pycrorm_async.cli.output import moment, note, print_json, print_table, stdout
 from pycrorm_async.cli.reading import read_memory
-from pycrorm_async.cli.since import parse_since
-from pycrorm_async.cli.tree import simulated_by
-from pycrorm_async.query.asking.episode_list import EpisodeChoice
-from pycrorm_async.query.asking.unknown_names import absence_of_episodes
-from pycrorm_async.query.named_queries import EpisodeSummary
-from pycrorm_async.query.parameter_text import duration
+from pycrorm_async.cli.show import simulated_by
+from pycrorm_async.query.named_queries import EpisodeChoice, EpisodeSummary
+from pycrorm_async.query.question import absence_of_episodes
 from pycrorm_async.query.reading import Reading
+from pycrorm_async.query.text import duration
 from pycrorm_async.store.address import DatabaseAddress
 
 _WIDTH_WITH_ROBOTS = 100

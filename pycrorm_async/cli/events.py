@@ -10,13 +10,12 @@ from typing import Annotated
 import msgspec
 import typer
 
-from pycrorm_async.cli.options import DEFAULT_URL, EpisodeArgument, JsonOption, SpoolOption, UrlOption
-from pycrorm_async.cli.pending_events import note_pending_events
+from pycrorm_async.cli.output import DEFAULT_URL, EpisodeArgument, JsonOption, SpoolOption, UrlOption
+from pycrorm_async.cli.reading import note_pending_events
 from pycrorm_async.errors import CallerError, LogDamaged
 from pycrorm_async.events.types import EVENT_TYPES
 from pycrorm_async.operations.destination import shared_address
-from pycrorm_async.store.episode_lookup import episode_named
-from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.log import EventLog, episode_named
 from pycrorm_async.store.stored import StoredEvent
 
 

@@ -11,17 +11,25 @@ from typing import Annotated, Any
 import typer
 
 from pycrorm_async.cli.interruption import interrupt_on_termination
-from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
-from pycrorm_async.cli.output import counted, note, print_json, print_line
-from pycrorm_async.cli.pending_events import note_pending_events
-from pycrorm_async.cli.since import parse_since
+from pycrorm_async.cli.output import (
+    DEFAULT_URL,
+    JsonOption,
+    SpoolOption,
+    UrlOption,
+    counted,
+    note,
+    parse_since,
+    print_json,
+    print_line,
+)
+from pycrorm_async.cli.reading import note_pending_events
 from pycrorm_async.errors import CallerError
 from pycrorm_async.export.export import EPISODE_FORMATS, ExportComparison, Exported, export_again, format_of
 from pycrorm_async.export.export import export as write_export
-from pycrorm_async.export.manifest import read_manifest
+from pycrorm_async.export.selection import read_manifest
 from pycrorm_async.operations.destination import shared_address
 from pycrorm_async.progress_bar import ProgressCallback, progress_bar, stderr
-from pycrorm_async.query.asking.ask import QUESTIONS, Ask
+from pycrorm_async.query.questions import QUESTIONS, Ask
 from pycrorm_async.query.reading import Reading
 
 _READ: Mapping[str, Callable[[str], Any]] = {

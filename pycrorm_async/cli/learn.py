@@ -15,23 +15,35 @@ from typing import Annotated, Any
 import typer
 
 from pycrorm_async.cli.interruption import Interruption
-from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
-from pycrorm_async.cli.output import note, print_facts, print_json, print_table
+from pycrorm_async.cli.output import (
+    DEFAULT_URL,
+    JsonOption,
+    SpoolOption,
+    UrlOption,
+    note,
+    print_facts,
+    print_json,
+    print_table,
+)
 from pycrorm_async.errors import CallerError, MissingExtra
 from pycrorm_async.learning import experiment as experiments
-from pycrorm_async.learning.evaluation import Study, study
-from pycrorm_async.learning.experiment import Experiment, ExperimentResult, Phase
-from pycrorm_async.learning.policies.default_policy import default_policy
-from pycrorm_async.learning.policies.policy_file import name_of, save_policy
-from pycrorm_async.learning.policies.policy_plot import draw_policies
-from pycrorm_async.learning.rollouts.kitchen_trial import KITCHEN, KitchenResult, pick_up_in_kitchen
-from pycrorm_async.learning.rollouts.rollout_pool import MemoryLocation
-from pycrorm_async.learning.rollouts.rollouts import Tally
-from pycrorm_async.learning.rollouts.scene import Scene
+from pycrorm_async.learning.experiment import (
+    KITCHEN,
+    Experiment,
+    ExperimentResult,
+    KitchenResult,
+    Phase,
+    Study,
+    pick_up_in_kitchen,
+    study,
+)
+from pycrorm_async.learning.policy import default_policy, draw_policies, name_of, save_policy
+from pycrorm_async.learning.pool import MemoryLocation
+from pycrorm_async.learning.rollouts import Scene, Tally
 from pycrorm_async.progress_bar import progress_bar
 from pycrorm_async.store.address import DatabaseAddress
-from pycrorm_async.world.bullet_loader import engine
-from pycrorm_async.world.robots.robot_description import Limits
+from pycrorm_async.world.bullet_body import engine
+from pycrorm_async.world.urdf import Limits
 
 _FIGURE_SUFFIXES = (".png", ".svg", ".pdf")
 

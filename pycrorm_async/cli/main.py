@@ -38,7 +38,7 @@ from pycrorm_async.errors import (
     FlushTimeout,
     PycrormError,
 )
-from pycrorm_async.query.suggestions import nearest
+from pycrorm_async.query.text import nearest
 
 
 def exit_code(error: PycrormError) -> int:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import asyncio
 
-from pycrorm_async.cli.options import DEFAULT_URL, SpoolOption, UrlOption
-from pycrorm_async.cli.pending_events import note_pending_events
+from pycrorm_async.cli.output import DEFAULT_URL, SpoolOption, UrlOption
+from pycrorm_async.cli.reading import note_pending_events
 from pycrorm_async.operations.destination import shared_address
 
 

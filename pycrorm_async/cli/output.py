@@ -4,19 +4,24 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 import sys
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from datetime import datetime
-from typing import Any
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Annotated, Any, overload
 
 import msgspec
+import typer
 from rich.cells import cell_len
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from pycrorm_async.errors import CallerError
 from pycrorm_async.progress_bar import stderr
+from pycrorm_async.settings import FileAccess, Writer
 
 _WIDTH_PIPED = 160
 """Width of tables in characters if stdout is not a terminal; wide enough to keep most rows on one line."""
@@ -131,3 +136,122 @@ def _cell(value: object) -> str:
     if isinstance(value, float):
         return f"{value:.3f}"
     return escape(str(value))
+
+
+# === options ==================================================================================================
+#
+# Define the command-line options that several verbs share.
+
+DEFAULT_URL = "sqlite:///pycrorm.db"
+
+UrlOption = Annotated[
+    str,
+    typer.Option(
+        "--url",
+        envvar="PYCRORM_URL",
+        help="The database: sqlite:///memory.db, sqlite:////absolute/path.db, postgresql://user@host/database."
+        " The list of processes shows a password in this option; put it into the environment variable or ~/.pgpass.",
+        show_envvar=True,
+    ),
+]
+SpoolOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--spool", envvar="PYCRORM_SPOOL", help="Folder of the write-ahead queue; default: beside the database."
+    ),
+]
+WriterOption = Annotated[
+    Writer,
+    typer.Option(
+        "--writer",
+        envvar="PYCRORM_WRITER",
+        help="The writer that moves events to the database: a thread of this process, or the daemon `pycrorm writer`.",
+        show_envvar=True,
+    ),
+]
+FileAccessOption = Annotated[
+    FileAccess,
+    typer.Option(
+        "--file-access",
+        envvar="PYCRORM_FILE_ACCESS",
+        help="Permissions of a new spool and a new SQLite file: owner only (0700, 0600), or also the folder's group.",
+        show_envvar=True,
+    ),
+]
+ProjectionOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--projection",
+        metavar="MODULE:CLASS",
+        help="Custom projection to use, in addition to those of installed packages; repeatable.",
+    ),
+]
+EpisodeArgument = Annotated[
+    str, typer.Argument(help="The episode's number, its id or first digits of the id, or `last`.")
+]
+StatusOption = Annotated[
+    str | None, typer.Option("--status", metavar="STATUS", help="Only episodes of this status: RUNNING, SUCCEEDED, …")
+]
+SinceOption = Annotated[
+    str | None,
+    typer.Option(
+        "--since",
+        metavar="WHEN",
+        help="Only episodes that started then or later: 2026-11-23, 2026-11-23T14:30, 90min, 7d.",
+    ),
+]
+TagOption = Annotated[
+    list[str] | None, typer.Option("--tag", metavar="TAG", help="Only episodes with this tag; repeatable: with all.")
+]
+RobotOption = Annotated[
+    str | None, typer.Option("--robot", metavar="ROBOT", help="Only episodes with a robot of this name or model.")
+]
+TextOption = Annotated[
+    str | None,
+    typer.Option("--text", metavar="TEXT", help="Only episodes whose description, plan or a tag has this text."),
+]
+LimitOption = Annotated[
+    int | None, typer.Option("--limit", metavar="N", min=1, help="Only the newest N of these episodes.")
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document.")]
+
+
+# === since ====================================================================================================
+#
+# Parse the earliest start of an episode, as a date, a time, or an age.
+
+_AGE = re.compile(r"(\d{1,6})\s*(min|h|d|w)")
+_UNITS = {
+    "min": timedelta(minutes=1),
+    "h": timedelta(hours=1),
+    "d": timedelta(days=1),
+    "w": timedelta(weeks=1),
+}
+
+
+@overload
+def parse_since(text: str, now: datetime | None = None) -> datetime: ...
+@overload
+def parse_since(text: str | None, now: datetime | None = None) -> datetime | None: ...
+def parse_since(text: str | None, now: datetime | None = None) -> datetime | None:
+    """Return the time, or None without a text.
+
+    A time without a zone is in UTC, as the verbs print times; an age counts back from `now`.
+
+    >>> parse_since("2026-11-23 14:30").isoformat()
+    '2026-11-23T14:30:00+00:00'
+
+    Raises `CallerError` for another text.
+    """
+    if text is None:
+        return None
+    try:
+        if age := _AGE.fullmatch(text.strip()):
+            return (now or datetime.now(UTC)) - int(age[1]) * _UNITS[age[2]]
+        moment = datetime.fromisoformat(text.strip())
+    except (ValueError, OverflowError):
+        raise CallerError(
+            f"{text!r} is not a time: write 2026-11-23, '2026-11-23 14:30' (UTC), 2026-11-23T14:30+01:00,"
+            " or an age such as 90min, 12h, 7d, 2w"
+        ) from None
+    return moment if moment.tzinfo is not None else moment.replace(tzinfo=UTC)

@@ -7,13 +7,20 @@ from typing import Annotated
 
 import typer
 
-from pycrorm_async.cli.options import DEFAULT_URL, EpisodeArgument, JsonOption, SpoolOption, UrlOption
-from pycrorm_async.cli.output import print_json, print_line
+from pycrorm_async.cli.output import (
+    DEFAULT_URL,
+    EpisodeArgument,
+    JsonOption,
+    SpoolOption,
+    UrlOption,
+    print_json,
+    print_line,
+)
 from pycrorm_async.cli.reading import read_memory
 from pycrorm_async.errors import CallerError
-from pycrorm_async.query.as_of import parse_moment
+from pycrorm_async.query.picture import picture as draw
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.query.scene.picture import picture as draw
+from pycrorm_async.query.snapshot import parse_moment
 from pycrorm_async.report.output_files import refuse_existing, write_file
 
 

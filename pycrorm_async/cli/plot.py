@@ -8,13 +8,10 @@ from typing import Annotated, Any
 
 import typer
 
-from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
-from pycrorm_async.cli.output import note, print_json, print_line
+from pycrorm_async.cli.output import DEFAULT_URL, JsonOption, SpoolOption, UrlOption, note, print_json, print_line
 from pycrorm_async.cli.reading import read_memory
 from pycrorm_async.errors import CallerError
-from pycrorm_async.query.success.figure import Kind, success_figure
-from pycrorm_async.query.success.samples import success_samples
-from pycrorm_async.query.success.success_table import SuccessTable, success_table
+from pycrorm_async.query.success import Kind, SuccessTable, success_figure, success_samples, success_table
 from pycrorm_async.report.output_files import refuse_existing, write_file
 
 _SUFFIXES = (".png", ".svg", ".pdf")

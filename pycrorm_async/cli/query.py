@@ -9,13 +9,20 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
-from pycrorm_async.cli.output import counted, note, print_json, print_table
+from pycrorm_async.cli.output import (
+    DEFAULT_URL,
+    JsonOption,
+    SpoolOption,
+    UrlOption,
+    counted,
+    note,
+    print_json,
+    print_table,
+)
 from pycrorm_async.cli.reading import read_memory
 from pycrorm_async.errors import CallerError
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.query.sql.json_values import json_rows
-from pycrorm_async.query.sql.read_only import SqlLimits, SqlResult
+from pycrorm_async.query.sql import SqlLimits, SqlResult, json_rows
 
 _ROWS = 1_000
 """Bounds the printed rows by default; `--limit 0` prints all."""

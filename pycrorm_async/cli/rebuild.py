@@ -9,16 +9,23 @@ from typing import Annotated
 import typer
 
 from pycrorm_async.bulk_records import collect_seldom
-from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, ProjectionOption, SpoolOption, UrlOption
-from pycrorm_async.cli.output import counted, note, print_json, stdout
-from pycrorm_async.cli.pending_events import note_pending_events
+from pycrorm_async.cli.output import (
+    DEFAULT_URL,
+    JsonOption,
+    ProjectionOption,
+    SpoolOption,
+    UrlOption,
+    counted,
+    note,
+    print_json,
+    stdout,
+)
+from pycrorm_async.cli.reading import note_pending_events
 from pycrorm_async.errors import CallerError
 from pycrorm_async.operations.rebuild import RebuildSummary, projections_of, rebuild_memory, rebuild_projection
 from pycrorm_async.progress_bar import progress_bar
-from pycrorm_async.projections.custom.discovery import installed_projections, load_projections
-from pycrorm_async.projections.custom.packed_projection import PackedProjection
-from pycrorm_async.projections.custom.projection import Projection
-from pycrorm_async.query.parameter_text import duration
+from pycrorm_async.projections.custom import PackedProjection, Projection, installed_projections, load_projections
+from pycrorm_async.query.text import duration
 
 _TABLES = "tables"
 

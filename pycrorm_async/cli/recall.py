@@ -8,17 +8,23 @@ from typing import Annotated, Any, NamedTuple
 
 import typer
 
-from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
-from pycrorm_async.cli.output import note, print_json, print_table, stdout
+from pycrorm_async.cli.output import (
+    DEFAULT_URL,
+    JsonOption,
+    SpoolOption,
+    UrlOption,
+    note,
+    print_json,
+    print_table,
+    stdout,
+)
 from pycrorm_async.cli.reading import read_memory
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.ids import SEQUENCE_MAX, row_id
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.recall.answer import Answer, RecalledCase
-from pycrorm_async.recall.cue import closest
-from pycrorm_async.recall.following import Following
-from pycrorm_async.recall.reading.cue_arguments import EpisodeNames
-from pycrorm_async.recall.reading.recall import Recall
+from pycrorm_async.recall.answer import Answer, Following, RecalledCase
+from pycrorm_async.recall.recall import EpisodeNames, Recall
+from pycrorm_async.recall.search import closest
 
 _TERM = re.compile(r"(?P<how>not:|only:)?(?P<feature>[^=~]+)(?P<sign>[=~])(?P<value>.*)", re.DOTALL)
 _NODE = re.compile(r"(?P<episode>.+)/e?(?P<sequence>\d+)")

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from pycrorm_async.cli.options import (
+from pycrorm_async.cli.output import (
     DEFAULT_URL,
     JsonOption,
     LimitOption,
@@ -18,14 +18,17 @@ from pycrorm_async.cli.options import (
     TagOption,
     TextOption,
     UrlOption,
+    counted,
+    note,
+    parse_since,
+    print_json,
+    print_line,
+    problem,
 )
-from pycrorm_async.cli.output import counted, note, print_json, print_line, problem
 from pycrorm_async.cli.reading import read_memory
-from pycrorm_async.cli.since import parse_since
 from pycrorm_async.errors import CallerError
-from pycrorm_async.query.asking.episode_list import EpisodeChoice
-from pycrorm_async.report.success_data import Plot
-from pycrorm_async.report.write import overview
+from pycrorm_async.query.named_queries import EpisodeChoice
+from pycrorm_async.report.write import Plot, overview
 from pycrorm_async.report.write import report as write_report
 
 

@@ -4,19 +4,24 @@ from __future__ import annotations
 
 import asyncio
 import gc
+import hashlib
+import importlib.util
+import inspect
+import os
+import subprocess
 import sys
 import sysconfig
 import traceback
-from collections.abc import Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from contextlib import nullcontext, redirect_stdout, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, get_args
+from typing import Annotated, Any, NamedTuple, get_args
 
 import typer
 
 from pycrorm_async.cli.interruption import Interruption
-from pycrorm_async.cli.options import (
+from pycrorm_async.cli.output import (
     DEFAULT_URL,
     FileAccessOption,
     JsonOption,
@@ -24,17 +29,19 @@ from pycrorm_async.cli.options import (
     SpoolOption,
     UrlOption,
     WriterOption,
+    note,
+    print_json,
+    print_table,
+    problem,
 )
-from pycrorm_async.cli.output import note, print_json, print_table, problem
-from pycrorm_async.cli.plan_loader import LoadedPlan, load_plan
-from pycrorm_async.cli.plan_source import plan_source
 from pycrorm_async.errors import CallerError, EpisodeParked
-from pycrorm_async.events.tags import checked_tags
+from pycrorm_async.events.fields import checked_tags
 from pycrorm_async.memory import Memory
 from pycrorm_async.progress_bar import stderr
-from pycrorm_async.projections.custom.discovery import load_projections
+from pycrorm_async.projections.custom import load_projections
 from pycrorm_async.query.named_queries import EpisodeSummary
-from pycrorm_async.recording.values.texts import message_of
+from pycrorm_async.record.episode_writer import PlanSource
+from pycrorm_async.record.values import message_of
 from pycrorm_async.settings import OnFull, OnUnrecordable, RecordMeshes, Settings
 from pycrorm_async.store.address import DatabaseAddress
 
@@ -282,3 +289,121 @@ def _place(failure: BaseException) -> str:
         if "pycrorm_async" not in Path(frame.filename).parts and not frame.filename.startswith((library, "<"))
     ]
     return f" ({Path(own[-1].filename).name}:{own[-1].lineno})" if own else ""
+
+
+# === plan loader ==============================================================================================
+#
+# Load the plan function that `PLAN.py[:function]` names.
+
+
+class PlanNotLoadable(CallerError):
+    """The plan file or its function cannot be used; the message is one line."""
+
+
+class LoadedPlan(NamedTuple):
+    """A plan: an async function that takes the memory or no argument, its file, and the hash of that file."""
+
+    name: str
+    function: Callable[..., Awaitable[Any]]
+    takes_memory: bool
+    path: Path
+    sha256: str
+
+    @property
+    def description(self) -> str:
+        """Return the first line of the function's docstring, or the plan's name."""
+        documentation = inspect.getdoc(self.function)
+        return documentation.splitlines()[0] if documentation else self.name
+
+
+def load_plan(reference: str) -> LoadedPlan:
+    """Import `path.py` and return its function; without `:function`, the function `plan`. Raises `PlanNotLoadable`."""
+    path_text, _, function_name = reference.rpartition(":") if ".py:" in reference else (reference, "", "")
+    function_name = function_name or "plan"
+    path = Path(path_text)
+    if path.is_dir():
+        raise PlanNotLoadable(f"{path_text!r} is a folder: name the plan file in it")
+    if not path.is_file():
+        raise PlanNotLoadable(f"the plan file {path_text!r} does not exist")
+    sha256 = hashlib.sha256(path.read_bytes()).hexdigest()
+    module = _import_file(path)
+    function = getattr(module, function_name, None)
+    if function is None:
+        functions = [name for name, each in vars(module).items() if inspect.iscoroutinefunction(each)]
+        hint = f"; its async functions: {', '.join(functions)}" if functions else "; it has no async function"
+        raise PlanNotLoadable(f"{path} has no function {function_name!r}{hint}")
+    if not inspect.iscoroutinefunction(function):
+        raise PlanNotLoadable(f"{path}:{function_name} is not an async function: write `async def {function_name}()`")
+    required = [
+        each
+        for each in inspect.signature(function).parameters.values()
+        if each.default is each.empty and each.kind not in (each.VAR_POSITIONAL, each.VAR_KEYWORD)
+    ]
+    if len(required) > 1:
+        names = ", ".join(each.name for each in required)
+        raise PlanNotLoadable(f"{path}:{function_name} takes {names}: a plan takes the memory or no argument")
+    return LoadedPlan(f"{path.name}:{function_name}", function, bool(required), path, sha256)
+
+
+def _import_file(path: Path) -> Any:
+    name = path.stem
+    if name in sys.modules or name in sys.stdlib_module_names:
+        raise PlanNotLoadable(f"{path} has the name of a standard or already loaded module: rename the file")
+    specification = importlib.util.spec_from_file_location(name, path.resolve())
+    if specification is None or specification.loader is None:
+        raise PlanNotLoadable(f"{path} is not a Python file")
+    module = importlib.util.module_from_spec(specification)
+    sys.modules[name] = module
+    sys.path.insert(0, str(path.resolve().parent))
+    try:
+        specification.loader.exec_module(module)
+    except SystemExit as error:
+        del sys.modules[name]
+        raise PlanNotLoadable(f"{path} exits the program when it is imported (exit code {error.code})") from error
+    except Exception as error:
+        del sys.modules[name]
+        frames = traceback.extract_tb(error.__traceback__)
+        line = getattr(error, "lineno", None) or next(
+            (frame.lineno for frame in reversed(frames) if frame.filename == str(path.resolve())), None
+        )
+        where = f"{path}:{line}" if line else str(path)
+        raise PlanNotLoadable(f"{where} cannot be imported: {type(error).__name__}: {error}") from error
+    return module
+
+
+# === plan source ==============================================================================================
+#
+# Read the source of a plan that `pycrorm run` starts: the hash of its file, and the state of its git repository.
+
+_GIT_TIMEOUT_S = 2.0
+"""Bounds each call of git, so that a repository on a slow disk delays a plan by at most three times as much."""
+
+
+def plan_source(path: Path, sha256: str) -> PlanSource:
+    """Return the plan's source; without its commit outside a repository, without git, or if git takes too long."""
+    commit = _git(path, "rev-parse", "--verify", "HEAD")
+    if commit is None:
+        return PlanSource(sha256)
+    if _git(path, "ls-files", "--error-unmatch", "--", path.name) is None:
+        return PlanSource(sha256, commit, git_dirty=True)
+    changes = _git(path, "status", "--porcelain", "--untracked-files=no")
+    return PlanSource(sha256, commit, None if changes is None else bool(changes))
+
+
+def _git(path: Path, *arguments: str) -> str | None:
+    """Return the output of git in the folder of the file; None if it fails."""
+    environment = os.environ | {"GIT_OPTIONAL_LOCKS": "0"}  # `git status` must not write into the repository
+    try:
+        result = subprocess.run(  # noqa: S603  fixed arguments; the path is that of the plan, which runs anyway
+            ["git", "-c", "core.fsmonitor=false", *arguments],  # noqa: S607  the git of the user's own path
+            cwd=path.resolve().parent,
+            env=environment,
+            capture_output=True,
+            text=True,
+            errors="replace",
+            timeout=_GIT_TIMEOUT_S,
+            check=False,
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return result.stdout.strip() if result.returncode == 0 else None

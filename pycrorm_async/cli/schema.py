@@ -7,11 +7,10 @@ from typing import Annotated, Literal
 
 import typer
 
-from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, SpoolOption, UrlOption
-from pycrorm_async.cli.output import print_json
+from pycrorm_async.cli.output import DEFAULT_URL, JsonOption, SpoolOption, UrlOption, print_json
 from pycrorm_async.cli.reading import read_memory
 from pycrorm_async.errors import CallerError
-from pycrorm_async.query.schema.memory_schema import CORE_VIEWS, as_mermaid, as_text, read_schema
+from pycrorm_async.query.memory_schema import CORE_VIEWS, as_mermaid, as_text, read_schema
 
 
 def schema(

@@ -2,22 +2,44 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, TypeAlias
 
 import typer
+from rich.markup import escape
+from rich.text import Text
+from rich.tree import Tree
 
-from pycrorm_async.cli.options import DEFAULT_URL, EpisodeArgument, JsonOption, SpoolOption, UrlOption
-from pycrorm_async.cli.output import moment, print_facts, print_json
+from pycrorm_async.cli.output import (
+    DEFAULT_URL,
+    EpisodeArgument,
+    JsonOption,
+    SpoolOption,
+    UrlOption,
+    moment,
+    print_facts,
+    print_json,
+    print_table,
+    stdout,
+)
+from pycrorm_async.cli.output import moment as wall_clock
 from pycrorm_async.cli.reading import read_memory
-from pycrorm_async.cli.snapshot_view import print_percepts, print_places, print_snapshot
-from pycrorm_async.cli.tree import print_tree, simulated_by
-from pycrorm_async.query.as_of import parse_moment
-from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary
-from pycrorm_async.query.parameter_text import duration, one_line
-from pycrorm_async.query.percepts_and_places import Percept, PlaceSearch, percepts_of, searches_of
+from pycrorm_async.events.ids import row_key
+from pycrorm_async.events.types import BLOB_KEY
+from pycrorm_async.query.named_queries import (
+    EpisodeSummary,
+    NodeSummary,
+    Percept,
+    PlaceSearch,
+    counts_text,
+    percepts_of,
+    searches_of,
+)
 from pycrorm_async.query.reading import Reading
+from pycrorm_async.query.snapshot import Moment, ObjectThen, ObservationThen, RobotThen, parse_moment
+from pycrorm_async.query.text import duration, one_line, parameters_text
 
 _Answers: TypeAlias = "tuple[Sequence[Percept], Sequence[PlaceSearch]]"
 
@@ -123,3 +145,216 @@ def _show_moment(
         print_json(snapshot)
     else:
         print_snapshot(snapshot, at if sequence is not None else f"{time:g} s", events=events, full=full)
+
+
+# === snapshot view ============================================================================================
+#
+# Print the snapshot of an episode at one moment: the running nodes, the robot and the objects.
+
+_LATEST_MAX = 10
+"""Bounds the printed percepts and searches for places, each, unless all are asked for."""
+_JOINTS_MAX = 3
+"""Bounds the joints listed for an object, so that its row stays short."""
+
+
+def print_snapshot(snapshot: Moment, requested: str, *, events: bool = False, full: bool = False) -> None:
+    """Print the episode's facts, its task tree, and a table of the objects in the world.
+
+    With `full` no text is cut and no number rounded, and the objects have their orientations, their colours and the
+    fingerprints of their descriptions.
+    """
+    print_facts(
+        f"Episode {snapshot.number}: {snapshot.description}",
+        {
+            "id": snapshot.id,
+            "started": f"{wall_clock(snapshot.started_at)} UTC",
+            "by": snapshot.created_by,
+            "at": (
+                f"{requested}: after event {snapshot.sequence}, {snapshot.time_s:.6f} s, {wall_clock(snapshot.at)} UTC"
+            ),
+            "status": snapshot.status,
+            "simulated": "yes" if snapshot.simulated else None,
+            "running": _running_text(snapshot),
+            "robot": "; ".join(_robot_text(each, full=full) for each in snapshot.world.robots) or None,
+        },
+    )
+    print_tree(snapshot.tree, events=events, full=full)
+    if snapshot.world.objects:
+        columns = ("object", "type", "x", "y", "z", "heading", "attached to", "joints")
+        print_table("World", columns, [_row(each, full=full) for each in snapshot.world.objects])
+        if full:
+            print_table(
+                "Shapes", ("object", "orientation", "color", "description"), map(_shape_row, snapshot.world.objects)
+            )
+    if snapshot.observations:
+        observed = [_observed_row(name, each, full=full) for name, each in snapshot.observations.items()]
+        print_table("Observations", ("name", "at", "event", "values"), observed)
+    latest = slice(None) if full else slice(-_LATEST_MAX, None)
+    print_percepts(snapshot.percepts[latest], "Latest percepts")
+    print_places(snapshot.places[latest], "Latest searches for places")
+
+
+def print_percepts(percepts: Sequence[Percept], title: str = "Percepts") -> None:
+    """Print a table of percepts; nothing without any."""
+    if percepts:
+        columns = ("event", "node", "percept", "type", "x", "y", "z", "source", "confidence", "visible", "object")
+        print_table(title, columns, map(_percept_row, percepts))
+
+
+def _percept_row(each: Percept) -> tuple[object, ...]:
+    shares = (f"{share:g}" if share is not None else "" for share in (each.confidence, each.visible))
+    matched = "none" if each.object_id is None else _event_of(each.object_id)
+    at = f"e{each.sequence}", _event_of(each.node)
+    return *at, each.name, each.object_type, *each.position, each.source, *shares, matched
+
+
+def print_places(places: Sequence[PlaceSearch], title: str = "Searches for places") -> None:
+    """Print a table of searches for places; nothing without any."""
+    if places:
+        columns = ("event", "node", "location", "considered", "offered", "taken", "refused")
+        print_table(title, columns, map(_search_row, places))
+
+
+def _search_row(each: PlaceSearch) -> tuple[object, ...]:
+    taken = f"({', '.join(f'{part:.3f}' for part in each.taken)})" if each.taken is not None else ""
+    refused = ", ".join(f"{count} {reason}" for reason, count in each.refused.items())
+    at = f"e{each.sequence}", _event_of(each.node)
+    return *at, each.location, each.considered, each.offered, taken, refused
+
+
+def _event_of(row: int | None) -> str:
+    """Return the event that made a row, as in `e5`."""
+    return "" if row is None else f"e{row_key(row).sequence}"
+
+
+def _observed_row(name: str, observation: ObservationThen, *, full: bool) -> tuple[object, ...]:
+    values = observation.values
+    if not isinstance(values, dict) or BLOB_KEY in values:
+        values = {"value": values}
+    return (
+        name,
+        f"{observation.time_s:.3f} s",
+        f"e{observation.sequence}",
+        parameters_text(values, full=full, exact=full),
+    )
+
+
+def _running_text(snapshot: Moment) -> str:
+    """Join the running nodes from the root down with ` > `; a comma separates parallel branches."""
+    text, depth = "", 0
+    for each in snapshot.running:
+        if each.dtype is not None:
+            text += f"{' > ' if each.depth > depth else ', '}{each.dtype}" if text else each.dtype
+            depth = each.depth
+    return text
+
+
+def _robot_text(robot: RobotThen, *, full: bool) -> str:
+    x, y, _ = (_number(each, full=full) for each in robot.pose.position)
+    torso = f", torso at {_number(robot.torso_height, full=full)} m" if robot.torso_height is not None else ""
+    return f"{robot.name} at ({x}, {y}), heading {_degrees(robot.pose.yaw, full=full)}{torso}"
+
+
+def _row(each: ObjectThen, *, full: bool) -> tuple[object, ...]:
+    parent = each.attached_to
+    attached = " ".join(filter(None, parent)) if parent is not None else ""
+    joints = _joints_text(each, full=full)
+    position = (str(value) if full else value for value in each.pose.position)  # the table rounds numbers
+    return each.name, each.object_type, *position, _degrees(each.pose.yaw, full=full), attached, joints
+
+
+def _shape_row(each: ObjectThen) -> tuple[object, ...]:
+    color = " ".join(map(str, each.color)) if each.color is not None else ""
+    return each.name, " ".join(map(str, each.pose.orientation)), color, each.description_fingerprint or "not recorded"
+
+
+def _degrees(angle: float, *, full: bool) -> str:
+    degrees = math.degrees(angle)
+    return f"{degrees}°" if full else f"{degrees:.1f}°"
+
+
+def _number(value: float, *, full: bool) -> str:
+    return str(value) if full else f"{value:.3f}"
+
+
+def _joints_text(each: ObjectThen, *, full: bool) -> str:
+    """List the joints whose position is not 0."""
+    positions = [
+        f"{joint} {_number(position, full=full)}" for joint, position in each.joints.items() if position != 0.0
+    ]
+    listed = positions if full else positions[:_JOINTS_MAX]
+    more = f" and {len(positions) - len(listed)} more" if len(positions) > len(listed) else ""
+    return ", ".join(listed) + more
+
+
+# === tree =====================================================================================================
+#
+# Draw a recorded task tree with types, statuses, durations and failures.
+
+_MESSAGE_MAX = 100
+"""Bounds the characters of a failure's message, so that a failed node takes few lines."""
+_SIMULATIONS_MAX = 10
+"""Bounds the episode numbers listed at a node, because a node may run hundreds of simulations."""
+
+_STYLES = {"SUCCEEDED": "green", "RUNNING": "cyan", "LOST": "yellow", "CANCELLED": "yellow", "INTERRUPTED": "yellow"}
+
+
+def print_tree(nodes: Sequence[NodeSummary], *, events: bool = False, full: bool = False) -> None:
+    """Print the nodes of one episode as a tree; `nodes` lists each parent before its children.
+
+    With `events` each line has the events of the node's start and end. Long texts are cut and end in an ellipsis,
+    unless `full` is True.
+    """
+    root = tree_of(nodes, events=events, full=full)
+    if root is not None:
+        stdout.print(root)
+
+
+def tree_of(
+    nodes: Iterable[NodeSummary], *, events: bool = False, full: bool = False, no_wrap: bool = False
+) -> Tree | None:
+    """Return the tree that `print_tree` prints; None without nodes. With `no_wrap` each node takes one line."""
+    drawn: dict[int, Tree] = {}
+    root: Tree | None = None
+    for node in nodes:
+        line = _line(node, events=events, full=full)
+        if no_wrap:
+            line.no_wrap, line.overflow = True, "ellipsis"
+        parent = drawn.get(node.parent_id) if node.parent_id is not None else None
+        if parent is not None:
+            drawn[node.id] = parent.add(line)
+        else:
+            drawn[node.id] = root = Tree(line)
+    return root
+
+
+def _line(node: NodeSummary, *, events: bool, full: bool) -> Text:
+    line = Text.from_markup(escape(node.dtype or node.kind))
+    if node.parameters:
+        line.append(f"  {parameters_text(node.parameters, full=full, exact=full)}", style="dim")
+    line.append(f"  {node.status}", style=_STYLES.get(node.status, "red"))
+    line.append(f"  {duration(node.duration_ns)}", style="dim")
+    if events:
+        end = f"e{node.end_sequence}" if node.end_sequence is not None else ""
+        line.append(f"  e{node.sequence}-{end}", style="dim")
+    if node.observations:
+        line.append(f"  {node.observations} observation{'s' * (node.observations > 1)}", style="dim")
+    if counts := counts_text(node):
+        line.append(f"  {counts}", style="dim")
+    if node.reason:
+        message = one_line(node.failure_message or "", None if full else _MESSAGE_MAX)
+        line.append(f"  {node.reason}{': ' if message else ''}{message}", style="red")
+    if node.thoughts:
+        listed = node.thoughts if full else node.thoughts[:_SIMULATIONS_MAX]
+        numbers = ", ".join(map(str, listed))
+        more = f" and {len(node.thoughts) - len(listed)} more" if len(node.thoughts) > len(listed) else ""
+        line.append(f"  simulated in episode{'s' * (len(node.thoughts) > 1)} {numbers}{more}", style="magenta")
+    return line
+
+
+def simulated_by(episode: EpisodeSummary) -> str:
+    """Describe the node that ran a simulated episode, for example `by PickUpAction of episode 3`."""
+    by = episode.thought_by
+    if by is None:
+        return "outside any episode"
+    return f"by {by.dtype or 'the plan'} of episode {by.episode if by.episode is not None else by.id}"

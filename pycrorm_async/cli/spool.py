@@ -11,26 +11,39 @@ from typing import Annotated
 
 import typer
 
-from pycrorm_async.cli.options import (
+from pycrorm_async.cli.output import (
     DEFAULT_URL,
     FileAccessOption,
     JsonOption,
     ProjectionOption,
     SpoolOption,
     UrlOption,
+    moment,
+    note,
+    print_facts,
+    print_json,
+    print_line,
+    print_table,
+    problem,
 )
-from pycrorm_async.cli.output import moment, note, print_facts, print_json, print_line, print_table, problem
 from pycrorm_async.cli.writer import store_once
 from pycrorm_async.errors import PycrormError
 from pycrorm_async.operations import recovery
 from pycrorm_async.operations.destination import shared_address
 from pycrorm_async.operations.recovery import Rebinding
-from pycrorm_async.projections.custom.discovery import load_projections
-from pycrorm_async.queue.files.names import REFUSED
-from pycrorm_async.queue.files.recorder_folder import folder_error
-from pycrorm_async.queue.maintenance.inspection import Damage, RecorderReport, SpoolReport, inspect_spool
-from pycrorm_async.queue.maintenance.repair import RepairReport, finish_repairs, repair_folder
-from pycrorm_async.queue.maintenance.salvage import Range
+from pycrorm_async.projections.custom import load_projections
+from pycrorm_async.queue.locks import REFUSED
+from pycrorm_async.queue.maintenance import (
+    Damage,
+    Range,
+    RecorderReport,
+    RepairReport,
+    SpoolReport,
+    finish_repairs,
+    inspect_spool,
+    repair_folder,
+)
+from pycrorm_async.queue.spool import folder_error
 from pycrorm_async.settings import Settings
 
 FolderArgument = Annotated[

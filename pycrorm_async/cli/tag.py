@@ -7,13 +7,21 @@ from typing import Annotated
 
 import typer
 
-from pycrorm_async.cli.options import DEFAULT_URL, EpisodeArgument, JsonOption, SpoolOption, UrlOption
-from pycrorm_async.cli.output import note, print_json, print_line
-from pycrorm_async.cli.pending_events import note_pending_events
+from pycrorm_async.cli.output import (
+    DEFAULT_URL,
+    EpisodeArgument,
+    JsonOption,
+    SpoolOption,
+    UrlOption,
+    note,
+    print_json,
+    print_line,
+)
+from pycrorm_async.cli.reading import note_pending_events
 from pycrorm_async.errors import CallerError
-from pycrorm_async.events.tags import checked_tags
+from pycrorm_async.events.fields import checked_tags
+from pycrorm_async.operations.copy import tag_episode
 from pycrorm_async.operations.destination import shared_address
-from pycrorm_async.operations.tag import tag_episode
 
 
 def tag(

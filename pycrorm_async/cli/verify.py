@@ -12,19 +12,26 @@ import msgspec
 import typer
 
 from pycrorm_async.bulk_records import collect_seldom
-from pycrorm_async.cli.options import DEFAULT_URL, JsonOption, ProjectionOption, SpoolOption, UrlOption
-from pycrorm_async.cli.output import counted, note, print_json, stdout
-from pycrorm_async.cli.pending_events import note_pending_events
+from pycrorm_async.cli.output import (
+    DEFAULT_URL,
+    JsonOption,
+    ProjectionOption,
+    SpoolOption,
+    UrlOption,
+    counted,
+    note,
+    print_json,
+    stdout,
+)
+from pycrorm_async.cli.reading import note_pending_events
 from pycrorm_async.errors import CallerError
 from pycrorm_async.operations.destination import shared_address
 from pycrorm_async.progress_bar import progress_bar
-from pycrorm_async.projections.custom.discovery import installed_projections, load_projections
-from pycrorm_async.projections.custom.projection import Projection
-from pycrorm_async.projections.verify.digest_check import OutsideDigest
-from pycrorm_async.projections.verify.findings import VerifyResult
-from pycrorm_async.projections.verify.verify import verify as verify_log
-from pycrorm_async.store.episode_lookup import episode_named
-from pycrorm_async.store.log import EventLog
+from pycrorm_async.projections.custom import Projection, installed_projections, load_projections
+from pycrorm_async.projections.findings import VerifyResult
+from pycrorm_async.projections.verify import OutsideDigest
+from pycrorm_async.projections.verify import verify as verify_log
+from pycrorm_async.store.log import EventLog, episode_named
 
 _FINDINGS_MAX = 20
 """Bounds the printed findings of each kind; the rest is only counted."""

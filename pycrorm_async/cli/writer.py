@@ -15,23 +15,25 @@ from typing import Annotated
 import typer
 
 from pycrorm_async.bulk_records import collect_seldom
-from pycrorm_async.cli.options import (
+from pycrorm_async.cli.output import (
     DEFAULT_URL,
     FileAccessOption,
     JsonOption,
     ProjectionOption,
     SpoolOption,
     UrlOption,
+    counted,
+    note,
+    print_json,
+    problem,
+    stdout,
 )
-from pycrorm_async.cli.output import counted, note, print_json, problem, stdout
 from pycrorm_async.errors import DamageError, SpoolDamaged
 from pycrorm_async.operations.daemon import serve
-from pycrorm_async.operations.fold_workers import WORKERS, forked
-from pycrorm_async.operations.processes import ChildProcess
 from pycrorm_async.operations.recovery import RecoveryReport, recover
+from pycrorm_async.operations.workers import WORKERS, ChildProcess, forked
 from pycrorm_async.progress_bar import stderr
-from pycrorm_async.projections.custom.discovery import load_projections
-from pycrorm_async.projections.custom.projection import Projection
+from pycrorm_async.projections.custom import Projection, load_projections
 from pycrorm_async.settings import Settings
 from pycrorm_async.writer.daemon import STOP_S, DaemonSummary
 

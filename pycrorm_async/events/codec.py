@@ -5,37 +5,46 @@ hold without changing its meaning, and names the path to it: NaN and infinities 
 surrogates and U+0000 (PostgreSQL text refuses it). It also refuses a payload above the limit. Bytes and sets must not
 occur in an event, because msgspec writes them as a text and a list. `decode` reads the payloads of this and all earlier
 versions (see `upcasters`).
+
+**Upcasters.** Upcasters convert the JSON of an event of an older version to that of the next version.
+
+The log is never rewritten. A change of a shape in `types.py` raises the class' `version` and adds an upcaster here: a
+pure function of the old object, which it may modify and return.
+
+    def _object_added_1(old: dict[str, Any]) -> dict[str, Any]:
+        return old | {"mass_kg": None}
+
+    UPCASTERS = {("ObjectAdded", 1): _object_added_1}
+
+A new field whose default means the same as its absence did before does not change the shape and needs no upcaster.
+
+Some code reads fields by key, without the shape, so these keep their place in every version: `parameters` and
+`designator` of NodeStarted, `simulated` of EpisodeStarted, and all fields of DesignatorTypeDeclared that the view
+`designator_type` shows. The log stores only the bytes of a declaration, so a declaration of a version above 1 carries
+its version in them, under the key `version`.
 """
 
 from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Mapping
-from typing import Any, Final
+from collections.abc import Callable, Mapping
+from typing import Any, Final, NamedTuple, TypeAlias
 
 import msgspec
 
+from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.events.types import EVENT_TYPES, DescriptionDeclared, DesignatorTypeDeclared, Happening
-from pycrorm_async.events.upcasters import UPCASTERS, Upcaster
 
-__all__ = [
-    "NotEncodable",
-    "UnknownShape",
-    "Decoder",
-    "encode",
-    "encoded_bytes",
-    "decode",
-    "DECLARATION_TYPES",
-    "DESCRIPTION_PREFIX",
-    "fingerprint",
-    "declaration_type",
-    "declared_dtype",
-    "declaration_of",
-    "description_of",
-    "unwritable",
-]
+# === upcasters ================================================================================================
 
+Upcaster: TypeAlias = Callable[[dict[str, Any]], dict[str, Any]]
+
+UPCASTERS: Final[Mapping[tuple[str, int], Upcaster]] = {}
+"""Upcasters by event type and old version; empty while every shape is at version 1."""
+
+
+# === codec ====================================================================================================
 
 DESCRIPTION_PREFIX: Final = "urdf-"
 """The prefix of the fingerprints of descriptions; those of designator types are hexadecimal digits alone."""
@@ -230,3 +239,73 @@ def _first_fault(value: Any, path: str = "") -> NotEncodable | None:
         if fault is not None:
             return fault
     return None
+
+
+# === envelope =================================================================================================
+#
+# An envelope carries an event from a hook to the log: first as a `Heading`, then as a `Record`.
+#
+# The caller of the queue passes a `Heading` and the payload's bytes. The queue, under its lock, adds position, sequence
+# and both times, which makes them a `Record`. Queue files, writer batches and database hold the same payload bytes.
+
+LOST: Final = b'{"status":"LOST"}'
+"""Payload of the `EpisodeEnded` that recovery computes for an episode left open.
+
+It stays at version 1 of `EpisodeEnded`, so that recovering a folder twice yields the same bytes.
+"""
+
+
+class Heading(NamedTuple):
+    """The envelope without position, sequence and times.
+
+    `episode` is None for a recorder-level record (a declaration).
+    """
+
+    episode: EpisodeId | None
+    type: str
+    version: int
+
+
+class Receipt:
+    """The sequence of one event, 0 until the event is written.
+
+    The queue sets it in the same step as it writes the event. So the caller of a put that raised, as Ctrl-C makes it do
+    at any call, can determine whether the event was written before.
+    """
+
+    __slots__ = ("sequence",)
+
+    def __init__(self) -> None:
+        self.sequence = 0
+
+
+class Record(NamedTuple):
+    """One event with its complete envelope. A recorder-level record has no episode and sequence 0.
+
+    Attributes:
+        position: 1, 2, 3 … over all records of one recorder.
+        episode: 16 bytes of a UUIDv7, or None.
+        sequence: 1, 2, 3 … inside the episode, without gaps; 0 without an episode.
+        type: name of the event type, as in `pycrorm_async.events.types`.
+        version: version of that type's shape.
+        wall_ns: UTC, ns since 1970.
+        monotonic_ns: ns, comparable inside one process life only.
+        payload: the event as JSON, UTF-8.
+    """
+
+    position: int
+    episode: EpisodeId | None
+    sequence: int
+    type: str
+    version: int
+    wall_ns: int
+    monotonic_ns: int
+    payload: bytes
+
+
+def is_computed_end(record: Record) -> bool:
+    """Return whether recovery computed this end.
+
+    Such an end marks the last record kept in one folder; later events of the episode may exist elsewhere.
+    """
+    return record.type == "EpisodeEnded" and record.payload == LOST

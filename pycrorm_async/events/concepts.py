@@ -12,8 +12,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import NamedTuple
 
-__all__ = ["Concept", "CONCEPTS", "CONCEPT_OF_OBJECT_TYPE", "ancestors"]
-
 _SOMA, _DUL, _PYCRAM = "SOMA 2.1.0", "DUL 3.32", "PyCRAM"
 
 

@@ -21,27 +21,15 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from typing import Final
 
 import msgspec
 
+from pycrorm_async.errors import CallerError
+from pycrorm_async.events.codec import unwritable
 from pycrorm_async.events.ids import SLOT_FIRST_FIELD, SLOT_MAX
-from pycrorm_async.events.types import DesignatorTypeDeclared
-from pycrorm_async.events.values import FieldDeclared, FieldType
-
-__all__ = [
-    "RESERVED_COLUMNS",
-    "table_name",
-    "column_name",
-    "bounded",
-    "mapped_declaration",
-    "fault_in_declaration",
-    "fault_in_dtype",
-    "fault_in_fields",
-    "fault_in_table",
-    "is_reserved",
-    "AcceptedFields",
-]
+from pycrorm_async.events.types import DesignatorTypeDeclared, FieldDeclared, FieldType
 
 RESERVED_COLUMNS = frozenset(
     "id dtype kind process_metadata process_metadata_id robot_state robot_state_id parameters items node node_id"
@@ -65,7 +53,7 @@ _NAME_LENGTH_MAX = 60
 """Bounds the bytes of a table's or column's public name, because PostgreSQL truncates names to 63 bytes."""
 _SHORTENED_TABLE_LENGTH_MAX = 48
 """Bounds the bytes of a shortened table name, so that a generation's prefix and number fit with it into PostgreSQL's
-63 bytes (`projections.table_names`)."""
+63 bytes (`projections.columns`)."""
 _DTYPE_LENGTH_MAX = 255
 """Bounds the bytes of a dtype: longer than real class names, and short enough to quote in a message."""
 _BASES_MAX = 32
@@ -271,3 +259,55 @@ def _fields_named(fields: Iterable[FieldDeclared], kind: str) -> set[str]:
 
 def _is_named(field: FieldDeclared, kind: str) -> bool:
     return bool({field.name.lower(), field.column.lower()} & {kind, f"{kind}_id"})
+
+
+# === tags =====================================================================================================
+#
+# Check the tags of an episode, and apply a change to them. A change is an `EpisodeTagged`.
+
+_CHARACTERS_MAX: Final = 100
+"""Bounds a tag, so that a list of tags fits into a line."""
+_TAGS_MAX: Final = 100
+"""Bounds the tags of one event."""
+
+
+def checked_tags(tags: object) -> tuple[str, ...]:
+    """Return these tags, each once. Raises `CallerError` for one that is not a text of 1 to 100 characters.
+
+    >>> checked_tags(["kitchen", "good", "kitchen"])
+    ('kitchen', 'good')
+    """
+    if isinstance(tags, str) or not isinstance(tags, Iterable):
+        raise CallerError(f"tags must be a list of texts, not {tags!r:.100}")
+    checked: dict[str, None] = {}
+    for tag in tags:
+        if not isinstance(tag, str) or not 0 < len(tag.strip()) <= len(tag) <= _CHARACTERS_MAX:
+            raise CallerError(f"a tag must be a text of 1 to {_CHARACTERS_MAX} characters, not {tag!r:.110}")
+        if (reason := unwritable(tag)) is not None:
+            raise CallerError(f"the tag {tag!r:.110} cannot be recorded: {reason}")
+        checked[tag] = None
+    if len(checked) > _TAGS_MAX:
+        raise CallerError(f"at most {_TAGS_MAX} tags may be given at once, not {len(checked)}")
+    return tuple(checked)
+
+
+def changed_tags(tags: Iterable[str], added: Iterable[str], removed: Iterable[str]) -> tuple[str, ...]:
+    """Return the tags after a change. Raises `CallerError` for a removed tag that the episode does not have.
+
+    >>> changed_tags(("kitchen", "good"), ("night",), ("good",))
+    ('kitchen', 'night')
+    """
+    now, removed = tuple(tags), tuple(removed)
+    for tag in removed:
+        if tag not in now:
+            raise CallerError(f"the episode has no tag {tag!r}; its tags: {', '.join(now) or 'none'}")
+    return retagged(now, added, removed)
+
+
+def retagged(tags: Iterable[str], added: Iterable[str], removed: Collection[str]) -> tuple[str, ...]:
+    """Return the tags after a recorded change, as `changed_tags` does; ignore a removed tag that is not there.
+
+    >>> retagged(("kitchen", "good"), ("night",), ("good", "late"))
+    ('kitchen', 'night')
+    """
+    return tuple(dict.fromkeys([*(tag for tag in tags if tag not in removed), *added]))

@@ -15,27 +15,6 @@ from __future__ import annotations
 import uuid
 from typing import NamedTuple, NewType
 
-__all__ = [
-    "EpisodeId",
-    "EpisodeNumber",
-    "Sequence",
-    "Position",
-    "RowId",
-    "RowKey",
-    "SEQUENCE_MAX",
-    "EPISODE_NUMBER_MAX",
-    "SLOT_MAX",
-    "SLOT_NODE",
-    "SLOT_ROBOT_POSE",
-    "SLOT_FIRST_FIELD",
-    "episode_id",
-    "episode_text",
-    "parse_episode_id",
-    "row_id",
-    "row_id_min",
-    "row_key",
-]
-
 EpisodeId = NewType("EpisodeId", bytes)
 """The 16 bytes of a UUIDv7."""
 EpisodeNumber = NewType("EpisodeNumber", int)

@@ -40,9 +40,6 @@ from pycrorm_async.events.types import (
     StateSampled,
 )
 
-__all__ = ["Finding", "OrderCheck"]
-
-
 _NODE, _OBJECT = 1, 2
 
 

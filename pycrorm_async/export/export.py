@@ -2,46 +2,66 @@
 
 >>> await export(reading, "PickUpWithContextView", "picks.parquet")
 Exported(path=PosixPath('picks.parquet'), rows=1204, episodes=30, left_out=0, manifest=...)
+
+**Datasette.** Describe a memory for Datasette: hidden tables, meanings and sort orders of views, and the named
+questions.
+
+    pycrorm datasette-metadata > metadata.json
+    datasette -i pycrorm.db --metadata metadata.json
+
+The names of hidden tables carry the number of a generation, so the description is made again after a rebuild.
 """
 
 from __future__ import annotations
 
+import asyncio
+import inspect
+import re
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import aclosing
+from base64 import b64encode
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, aclosing, contextmanager
 from os import PathLike
 from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias, get_args
 
 import msgspec
-from sqlalchemy import Select, func, select
+import numpy as np
+from sqlalchemy import LargeBinary, Select, func, select
+from sqlalchemy import inspect as inspect_database
 from sqlalchemy.exc import CompileError
 
 from pycrorm_async.errors import CallerError
-from pycrorm_async.export.episode_files import EpisodeOptions, write_lerobot, write_scene
-from pycrorm_async.export.lerobot.dataset import DEFAULT_FPS, MARKER
-from pycrorm_async.export.lerobot.images import ImageSize
-from pycrorm_async.export.lerobot.states import Clock
-from pycrorm_async.export.manifest import (
+from pycrorm_async.export.lerobot import DEFAULT_FPS, MARKER, ImageSize, LeRobotFolder, check_size, draw_frames
+from pycrorm_async.export.scenes import Clock, frames_of, read_episode, scene_objects, write_mcap, write_rerun
+from pycrorm_async.export.selection import (
+    CoveredEpisode,
+    Exportable,
     Manifest,
+    Selection,
     checksums,
     episode_differences,
     manifest_path,
     read_manifest,
+    select_rows,
     versions_of,
 )
-from pycrorm_async.export.row_files import RowFormat, write_rows
-from pycrorm_async.export.selection import CoveredEpisode, Exportable, Selection, select_rows
-from pycrorm_async.projections.schema.generations import PROJECTION_VERSION
-from pycrorm_async.query.asking.question import Question
-from pycrorm_async.query.frames.columns import columns_of
+from pycrorm_async.orm.documentation.descriptions import ViewDescription, described
+from pycrorm_async.projections.generations import PROJECTION_VERSION
+from pycrorm_async.query.frames import columns_of, needed_pyarrow
+from pycrorm_async.query.question import Question
+from pycrorm_async.query.questions import QUESTIONS, Ask
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.query.suggestions import nearest
+from pycrorm_async.query.text import nearest
 from pycrorm_async.report.output_files import new_file, new_folder, refuse_existing
+from pycrorm_async.writer.drain import run_to_completion
 
 if TYPE_CHECKING:
+    import pyarrow as pa
+
     from pycrorm_async.progress_bar import ProgressCallback
+
 
 FileFormat: TypeAlias = Literal["parquet", "csv", "jsonl", "lerobot", "rrd", "mcap"]
 EPISODE_FORMATS = frozenset(("lerobot", "rrd", "mcap"))
@@ -359,3 +379,294 @@ def _sql(statement: Select[*tuple[Any, ...]], dialect: Any) -> str:
         return str(statement.compile(dialect=dialect, compile_kwargs={"literal_binds": True}))
     except (CompileError, NotImplementedError):
         return str(statement.compile(dialect=dialect))
+
+
+# === episode files ============================================================================================
+#
+# Write episodes as LeRobot, rerun or MCAP: formats for motion over time, so they are made from events, not tables.
+#
+# A thread does each long step, and a cancelled task waits for its end: a writer that is closed, or a file that is
+# deleted, while a thread still writes would crash the process or leave a file.
+
+
+class EpisodeOptions(NamedTuple):
+    """Choices for the frames of LeRobot and the messages of MCAP; see `export` for the meaning of each clock.
+
+    Attributes:
+        clock: the axis: the events one after the other, or their times.
+        fps: frames or events per second.
+        images: width and height of LeRobot's pictures; None for no pictures.
+    """
+
+    clock: Clock
+    fps: int = DEFAULT_FPS
+    images: ImageSize | None = None
+
+    def check(self) -> None:
+        """Raise `CallerError` for an unknown clock, and for a rate or an image size out of range."""
+        if self.clock not in ("event", "time"):
+            raise CallerError(f"clock must be 'event' or 'time', got {self.clock!r}")
+        if self.images is not None:
+            check_size(self.images)
+        if not 1 <= self.fps <= 1000:
+            raise CallerError(f"fps must be 1 to 1000, got {self.fps}")
+
+
+async def write_lerobot(
+    reading: Reading,
+    episodes: Sequence[CoveredEpisode],
+    folder: Path,
+    options: EpisodeOptions,
+    report_progress: ProgressCallback | None,
+) -> int:
+    """Write the episodes into an empty folder; return the number of frames.
+
+    Raises `CallerError` for episodes that the format cannot hold, and `MissingExtra`.
+    """
+    progress = _Progress(report_progress, sum(each.events for each in episodes))
+    dataset = LeRobotFolder(folder, fps=options.fps)
+    for each in episodes:
+        episode = await read_episode(reading, each, progress.of("reading"))
+        frames = await run_to_completion(asyncio.to_thread(frames_of, episode, options.clock, options.fps))
+        pictures = None
+        if options.images is not None:
+            pictures = np.stack(await draw_frames(reading, episode, frames, options.images, progress.of("drawing")))
+        await run_to_completion(asyncio.to_thread(dataset.add, episode, frames, pictures))
+        progress.of("writing")(each.events)
+        progress.before += each.events
+    await run_to_completion(asyncio.to_thread(dataset.finish))
+    return dataset.frames
+
+
+async def write_scene(
+    reading: Reading,
+    episodes: Sequence[CoveredEpisode],
+    path: Path,
+    file_format: Literal["rrd", "mcap"],
+    options: EpisodeOptions,
+    report_progress: ProgressCallback | None,
+) -> int:
+    """Write one episode to a file; return the number of changes (`rrd`) or messages (`mcap`) in it.
+
+    Only MCAP uses the options. Raises as `write_lerobot` does.
+    """
+    if len(episodes) != 1:
+        raise CallerError(f"a file of the format {file_format} holds one episode, got {len(episodes)}: name one")
+    progress = _Progress(report_progress, episodes[0].events)
+    episode = await read_episode(reading, episodes[0], progress.of("reading"))
+    objects = await scene_objects(reading, episode)
+    report = progress.of("writing")
+    if file_format == "rrd":
+        written = await run_to_completion(asyncio.to_thread(write_rerun, episode, objects, path, report))
+    else:
+        clock, fps = options.clock, options.fps
+        written = await run_to_completion(
+            asyncio.to_thread(lambda: write_mcap(episode, objects, path, report, clock=clock, fps=fps))
+        )
+    report(episodes[0].events)
+    return written
+
+
+class _Progress:
+    """Reports how many events of all episodes a phase has done; `before` counts those of the earlier episodes."""
+
+    def __init__(self, report_progress: ProgressCallback | None, total: int) -> None:
+        self.before = 0
+        self._report_progress = report_progress
+        self._total = total
+
+    def of(self, phase: str) -> Callable[[int], None]:
+        """Return a function that takes the number of done events of the current episode; any thread may call it."""
+
+        def report_events(done: int) -> None:
+            if self._report_progress is not None:
+                self._report_progress(self.before + done, self._total, phase)
+
+        return report_events
+
+
+# === row files ================================================================================================
+#
+# Write the rows of a select as Parquet, CSV or JSON lines, one batch after the other.
+
+RowFormat: TypeAlias = Literal["parquet", "csv", "jsonl"]
+_Write: TypeAlias = "Callable[[pa.RecordBatch], object]"
+
+
+async def write_rows(
+    batches: AsyncIterator[pa.RecordBatch],
+    path: Path,
+    file_format: RowFormat,
+    json_columns: frozenset[str],
+    report_rows: Callable[[int], object],
+) -> tuple[int, pa.Schema]:
+    """Write the batches to a file; return the number of rows and their schema. `report_rows` gets the number so far.
+
+    `batches` has at least one, which may be empty.
+    """
+    rows, schema = 0, None
+    with ExitStack() as stack:
+        async for batch in batches:
+            if schema is None:
+                schema = batch.schema
+                write = stack.enter_context(_WRITERS[file_format](path, schema, json_columns))
+            await run_to_completion(asyncio.to_thread(write, batch))
+            rows += batch.num_rows
+            report_rows(rows)
+    return rows, schema
+
+
+@contextmanager
+def _parquet(path: Path, schema: pa.Schema, _json_columns: frozenset[str]) -> Iterator[_Write]:
+    needed_pyarrow()
+    from pyarrow import parquet
+
+    # A batch is a row group, so that a reader that wants some episodes or columns reads no others.
+    with parquet.ParquetWriter(path, schema, compression="zstd") as writer:
+        yield writer.write_batch
+
+
+@contextmanager
+def _csv(path: Path, schema: pa.Schema, _json_columns: frozenset[str]) -> Iterator[_Write]:
+    pa = needed_pyarrow()
+    from pyarrow import csv
+
+    binary = [number for number, each in enumerate(schema) if pa.types.is_binary(each.type)]
+    for number in binary:
+        schema = schema.set(number, schema.field(number).with_type(pa.string()))
+
+    def in_base64(column: Any) -> Any:  # as in JSON lines, because a text file cannot hold bytes
+        return pa.array([None if each is None else b64encode(each).decode() for each in column.to_pylist()], "string")
+
+    def write(batch: Any) -> None:
+        columns = list(batch.columns)
+        for number in binary:
+            columns[number] = in_base64(columns[number])
+        writer.write_batch(pa.RecordBatch.from_arrays(columns, schema=schema))
+
+    with csv.CSVWriter(path, schema) as writer:
+        yield write if binary else writer.write_batch
+
+
+@contextmanager
+def _jsonl(path: Path, _schema: pa.Schema, json_columns: frozenset[str]) -> Iterator[_Write]:
+    def value(name: str, each: Any) -> Any:
+        return msgspec.Raw(each.encode()) if name in json_columns and each is not None else each
+
+    with path.open("wb") as file:
+        encoder = msgspec.json.Encoder()
+
+        def write(batch: pa.RecordBatch) -> None:
+            rows = ({name: value(name, each) for name, each in row.items()} for row in batch.to_pylist())
+            file.write(encoder.encode_lines(rows))
+
+        yield write
+
+
+_WRITERS: dict[str, Callable[[Path, Any, frozenset[str]], AbstractContextManager[_Write]]] = {
+    "parquet": _parquet,
+    "csv": _csv,
+    "jsonl": _jsonl,
+}
+
+
+# === datasette ================================================================================================
+
+_INTERNAL = re.compile(r"zz_.*|.*__\d+|pycrorm_.*|sqlite_stat\d")
+"""The tables of a generation, the bookkeeping of the log, and the statistics of SQLite's planner."""
+_LOG = {
+    "event": "The log: every event with its payload as JSON. All views can be made from it again.",
+    "episode": "How far each episode is stored (head) and visible in the views (folded).",
+}
+"""The tables that no class maps."""
+_FACETS = ("dtype", "kind", "status", "reason", "arm", "grasp", "obj_type", "robot", "relation", "source", "recovered")
+_FACETS_MAX = 4
+"""Datasette counts the values of each facet at every visit."""
+_NEWEST = ("id", "node_id", "process_metadata_id", "global_position", "number")
+"""Columns by which the newest rows come first, the first that a table has."""
+_TIMES = " Times are integers, in µs since 1970-01-01 00:00 UTC, and durations are in s."
+_TEXT, _NUMBER = "pycrorm-value-", 200_000_000
+"""Placeholders (a text, numbers in m) in a question's SQL that become Datasette parameters."""
+
+
+async def datasette_metadata(reading: Reading) -> dict[str, Any]:
+    """Return the metadata of a SQLite memory, for Datasette 0.65.
+
+    Raises `CallerError` for another database, which Datasette cannot open.
+    """
+    log = await reading.log()
+    if not log.address.is_sqlite:
+        raise CallerError(
+            f"Datasette opens SQLite files: copy {log.address} with `pycrorm copy --to sqlite:///copy.db`"
+        )
+    async with log.reading() as connection:
+        tables = await connection.run_sync(_columns_by_table)
+    views = described()
+    return {
+        "title": "Episodic memory of robots",
+        "description": "The views of a memory of pycrorm-async, and the questions of `pycrorm ask`." + _TIMES,
+        "databases": {
+            log.address.path.stem: {
+                "tables": {
+                    name: {"hidden": True} if columns is None else _table(name, columns, views.get(name))
+                    for name, columns in tables.items()
+                },
+                "queries": {name: _query(reading, name) for name in QUESTIONS},
+            }
+        },
+    }
+
+
+def _columns_by_table(connection: Any) -> dict[str, list[str] | None]:
+    """Return the columns of each table and view; None for one to hide.
+
+    Views with bytes are hidden too: Datasette 0.65 answers their pages with an error, because it links a value of bytes
+    by its row's key, which no view has.
+    """
+    inspector = inspect_database(connection)
+    tables, views = inspector.get_table_names(sqlite_include_internal=True), inspector.get_view_names()
+    columns: dict[str, list[str] | None] = {}
+    for name in sorted([*tables, *views]):
+        described = inspector.get_columns(name)
+        has_bytes = name in views and any(isinstance(each["type"], LargeBinary) for each in described)
+        is_hidden = has_bytes or _INTERNAL.fullmatch(name) is not None
+        columns[name] = None if is_hidden else [each["name"] for each in described]
+    return columns
+
+
+def _table(name: str, columns: list[str], view: ViewDescription | None) -> dict[str, Any]:
+    table: dict[str, Any] = {"description": _LOG[name]} if name in _LOG else {}
+    if view is not None:
+        table["description"] = view.text
+        table["columns"] = {name: text for name, text in view.columns.items() if name in columns}
+    newest = next((each for each in _NEWEST if each in columns), None)
+    if newest is not None:
+        table["sort_desc"] = newest
+    facets = [each for each in _FACETS if each in columns][:_FACETS_MAX]
+    if facets:
+        table["facets"] = facets
+    return table
+
+
+def _query(reading: Reading, name: str) -> dict[str, str]:
+    """Return a question as a canned query of Datasette; its required arguments are parameters of the query."""
+    parameters = [*inspect.signature(getattr(Ask, name)).parameters.values()][1:]
+    needed = {each.name: str(each.annotation) for each in parameters if each.default is each.empty}
+    numbers = {each: _NUMBER * (index + 1) for index, each in enumerate(needed) if needed[each] == "float"}
+    texts = {each: f"{_TEXT}{each}" for each in needed if each not in numbers}
+    sql = getattr(reading.ask, name)(**numbers, **texts).sql
+    for each, text in texts.items():
+        sql = sql.replace(f"'{text}'", f":{each}")
+
+    def with_parameter(number: re.Match[str]) -> str:
+        for each, place in numbers.items():
+            if abs(float(number[0]) - place) < _NUMBER / 2:
+                return f"(:{each} + {float(number[0]) - place:g})"  # Datasette passes texts: the sum is a number
+        return number[0]
+
+    sql = re.sub(r"\b\d{9,}(?:\.\d+)?\b", with_parameter, sql)
+    return {"sql": sql, "title": name.replace("_", " "), "description": _first_sentence(getattr(Ask, name))}
+
+
+def _first_sentence(documented: Any) -> str:
+    return " ".join((inspect.getdoc(documented) or "").partition("\n\n")[0].split())

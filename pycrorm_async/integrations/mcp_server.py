@@ -19,15 +19,12 @@ from sqlalchemy import Row
 
 from pycrorm_async import __version__
 from pycrorm_async.errors import CallerError, DatabaseError, DatabaseUnavailable, MissingExtra, PycrormError
-from pycrorm_async.query.as_of import parse_moment
-from pycrorm_async.query.asking.episode_list import EpisodeChoice
-from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary
-from pycrorm_async.query.parameter_text import duration, one_line, parameters_text
+from pycrorm_async.query.memory_schema import as_text, read_schema
+from pycrorm_async.query.named_queries import EpisodeChoice, EpisodeSummary, NodeSummary
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.query.schema.memory_schema import as_text, read_schema
-from pycrorm_async.query.sql.json_values import json_rows
-from pycrorm_async.query.sql.read_only import SqlLimits
-from pycrorm_async.query.suggestions import nearest
+from pycrorm_async.query.snapshot import parse_moment
+from pycrorm_async.query.sql import SqlLimits, json_rows
+from pycrorm_async.query.text import duration, nearest, one_line, parameters_text
 from pycrorm_async.store.address import DatabaseAddress
 
 try:

@@ -11,12 +11,11 @@ from operator import attrgetter
 from typing import Any, Final
 
 from pycrorm_async.integrations.foreign_package import ForeignPackage
-from pycrorm_async.recording.activations import Activations, BehaviourReader, NodeType
-from pycrorm_async.recording.declarations.recorded_type import FieldSpec
-from pycrorm_async.recording.recorded_episode import RecordedEpisode
-from pycrorm_async.recording.recording import Recording
-from pycrorm_async.recording.value_changes import ValueChanges
-from pycrorm_async.recording.values.texts import reading_fault
+from pycrorm_async.record.declarations import FieldSpec
+from pycrorm_async.record.executives import Activations, BehaviourReader, NodeType, ValueChanges
+from pycrorm_async.record.recorded_episode import RecordedEpisode
+from pycrorm_async.record.recording import Recording
+from pycrorm_async.record.values import reading_fault
 
 _PY_TREES: Final = ForeignPackage("py_trees", extra="py_trees", versions=["2.*"])
 with _PY_TREES.importing():
@@ -27,8 +26,6 @@ with _PY_TREES.importing():
     from py_trees.trees import BehaviourTree
     from py_trees.version import __version__
     from py_trees.visitors import VisitorBase
-
-__all__ = ["RememberedTree"]
 
 
 class RememberedTree(VisitorBase):

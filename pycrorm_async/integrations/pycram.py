@@ -17,26 +17,128 @@ from __future__ import annotations
 import itertools
 import os
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from functools import partial, wraps
+from inspect import Signature, signature
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 from pycrorm_async.errors import CallerError
-from pycrorm_async.events.values import NodeStatus
+from pycrorm_async.events.types import NodeStatus, SeenValue
 from pycrorm_async.integrations.foreign_package import ForeignPackage
-from pycrorm_async.integrations.pycram_episodes import PyCRAMEpisodes, RunningNode
-from pycrorm_async.integrations.pycram_values import PyCRAMValues
-from pycrorm_async.integrations.pycram_world import PyCRAMWorld
-from pycrorm_async.integrations.seams import Seams, guarded
+from pycrorm_async.integrations.pycram_values import Change, PyCRAMEpisodes, PyCRAMValues, RunningNode
 from pycrorm_async.memory import Memory
-from pycrorm_async.recording.declarations.declared_type import DeclaredType
-from pycrorm_async.recording.declarations.recorded_type import RecordedKind
-from pycrorm_async.recording.recorded_episode import RecordedEpisode
-from pycrorm_async.recording.recording import Recording
+from pycrorm_async.record.declarations import RecordedKind
+from pycrorm_async.record.parameters import DeclaredType
+from pycrorm_async.record.recorded_episode import RecordedEpisode
+from pycrorm_async.record.recording import Recording
 from pycrorm_async.settings import Settings, Writer
 
-__all__ = ["KNOWN_VERSIONS", "remember"]
+# === seams ====================================================================================================
+#
+# `Seams` replace methods of another library's classes, and restore them whichever way the block ends.
+
+
+class _Observer(Protocol):
+    seams: Seams
+
+
+class Seams:
+    """The methods replaced and the callbacks added since `is_on` was set; `remove` removes all of them.
+
+    A method that another library has replaced in turn is not restored; the seam inside it then only calls the original.
+    """
+
+    def __init__(self, recording: Recording) -> None:
+        self.recording = recording
+        self.is_on = False
+        self._undo = ExitStack()
+
+    def remove(self) -> None:
+        """Remove all seams; those that still run in other threads do nothing from now on."""
+        self.is_on = False
+        self._undo.close()
+
+    def around(self, owner: type, name: str, perform: Callable[..., Any]) -> None:
+        """Call `perform(call, subject, *args)` in place of a method, where `call()` performs the method itself.
+
+        Arguments that the caller passes by name reach `perform` by position, as far as they have one.
+        """
+        original = vars(owner)[name]
+        parameters = signature(original)
+
+        def seam(subject: Any, *args: Any, **kwargs: Any) -> Any:
+            call = partial(original, subject, *args, **kwargs)
+            if kwargs:
+                args, kwargs = _by_position(parameters, subject, args, kwargs)
+            return perform(call, subject, *args, **kwargs) if self.is_on else call()
+
+        self._replace(owner, name, seam)
+
+    def after(self, owner: type, name: str, report: Callable[..., Any]) -> None:
+        """Call `report(subject, *args)` after a method; named arguments are passed by position where they have one."""
+        original = vars(owner)[name]
+        parameters = signature(original)
+
+        def seam(subject: Any, *args: Any, **kwargs: Any) -> Any:
+            result = original(subject, *args, **kwargs)
+            if kwargs:
+                args, kwargs = _by_position(parameters, subject, args, kwargs)
+            if self.is_on:
+                report(subject, *args, **kwargs)
+            return result
+
+        self._replace(owner, name, seam)
+
+    def _replace(self, owner: type, name: str, method: Callable[..., Any]) -> None:
+        original = vars(owner)[name]
+        seam = wraps(original)(method)
+
+        def restore() -> None:
+            if vars(owner).get(name) is seam:
+                setattr(owner, name, original)
+
+        setattr(owner, name, seam)
+        self._undo.callback(restore)
+
+    def callback(self, add: Callable[[Any], None], remove: Callable[[Any], None], callback: Callable[..., Any]) -> None:
+        """Add a callback; remove it with the seams, unless another library has removed it."""
+        add(callback)
+        self._undo.callback(_without_fault, remove, callback)
+
+
+def _by_position(
+    parameters: Signature, subject: Any, args: tuple[Any, ...], kwargs: dict[str, Any]
+) -> tuple[tuple[Any, ...], dict[str, Any]]:
+    """Move named arguments to their positions; return them unchanged if they do not fit the method."""
+    try:
+        bound = parameters.bind(subject, *args, **kwargs)
+    except TypeError:
+        return args, kwargs
+    return bound.args[1:], bound.kwargs
+
+
+def _without_fault(remove: Callable[[Any], None], callback: Callable[..., Any]) -> None:
+    with suppress(ValueError, KeyError):
+        remove(callback)
+
+
+def guarded(method: Callable[..., Any]) -> Callable[..., Any]:
+    """Count the exceptions of an observer's method, so that none reaches the plan; do nothing without the seams."""
+
+    @wraps(method)
+    def call(self: _Observer, *args: Any, **kwargs: Any) -> Any:
+        try:
+            return method(self, *args, **kwargs) if self.seams.is_on else None
+        except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
+            self.seams.recording.note_fault(f"{type(self).__name__}.{method.__name__}", error)
+            return None
+
+    return call
+
+
+# === pycram ===================================================================================================
 
 KNOWN_VERSIONS: Final = ("1.0.4",)
 """The versions of the distribution `pycram-robotics` whose methods this module replaces."""
@@ -298,3 +400,146 @@ class _PyCRAMPlans:
 
 def _dtype(designator: type) -> str:
     return designator.__name__.removesuffix("Node")
+
+
+# === pycram world =============================================================================================
+#
+# `PyCRAMWorld` records the objects of PyCRAM's Bullet worlds: poses, joints, attachments, also of worlds made later.
+#
+# PyCRAM sets joints one by one and each time moves the objects that the robot holds, so the changes of a motion are
+# collected in its thread and recorded once, when the motion ends.
+
+
+class PyCRAMWorld:
+    """Observes the worlds of this process.
+
+    Attributes:
+        is_followed: whether all that has moved was seen; False once physics or a restored state may have moved more.
+    """
+
+    def __init__(self, seams: Seams, values: PyCRAMValues, episodes: PyCRAMEpisodes) -> None:
+        self.seams = seams
+        self._values = values
+        self._episodes = episodes
+        self.is_followed = True
+
+    def connect(self) -> None:
+        """Add the seams."""
+        used = self._values.pycram
+        self.seams.after(used.World, "add_object", self._object_added)
+        self.seams.around(used.World, "remove_object", self._remove_object)
+        self.seams.after(used.BulletWorld, "reset_object_base_pose", self._object_moved)
+        self.seams.after(used.BulletWorld, "_reset_joint_position", self._joint_moved)
+        self.seams.around(used.Object, "set_multiple_joint_positions", self._joints_moved)
+        for unseen in ("step", "set_realtime", "restore_physics_simulator_state"):
+            self.seams.after(used.BulletWorld, unseen, self._moved_unseen)
+        self.seams.after(used.Object, "attach", self._attached)
+        self.seams.after(used.Object, "detach", self._detached)
+
+    @guarded
+    def _object_added(self, world: Any, added: Any) -> None:
+        if (episode := self._episodes.of(world)) is not None:
+            cause = self._episodes.cause(episode)
+            episode.object_added(self._values.key(added), **self._values.description(added), node=cause)
+
+    def _remove_object(self, call: Callable[[], Any], world: Any, *removed: Any, **_: Any) -> Any:
+        key = self._key(*removed)  # the prospection world forgets what it is a copy of
+        result = call()
+        self._object_removed(world, key)
+        return result
+
+    @guarded
+    def _key(self, removed: Any) -> Hashable:
+        return self._values.key(removed)
+
+    @guarded
+    def _object_removed(self, world: Any, key: Any) -> None:
+        self.flush()
+        if (episode := self._episodes.of(world)) is not None and episode.reference(key) is not None:
+            episode.object_removed(key, node=self._episodes.cause(episode))
+
+    @guarded
+    def _object_moved(self, world: Any, moved: Any, pose: Any) -> None:
+        if self._episodes.of(world) is not None:
+            self._change(moved).pose = self._values.pose(pose)
+            self._flush_unless_moving()
+
+    @guarded
+    def _joint_moved(self, world: Any, joint: Any, position: float) -> None:
+        thread, owner = self._episodes.thread, joint.object
+        change = thread.changes.get(id(owner))
+        if change is None:  # for the first of up to fourteen joints
+            if self._episodes.of(world) is None:
+                return
+            change = self._change(owner)
+        change.joints[joint.name] = float(position)
+        if not thread.is_collecting:
+            self._flush_unless_moving()
+
+    def _joints_moved(self, call: Callable[[], Any], *_: Any, **__: Any) -> Any:
+        """Record the joints that one call sets as one change, also outside a motion."""
+        thread = self._episodes.thread
+        is_outermost, thread.is_collecting = not thread.is_collecting, True
+        try:
+            return call()
+        finally:
+            if is_outermost:
+                thread.is_collecting = False
+                self._flush_unless_moving()
+
+    def _change(self, changed: Any) -> Change:
+        changes = self._episodes.thread.changes
+        change = changes.get(id(changed))
+        if change is None:
+            changes[id(changed)] = change = Change(changed)
+        return change
+
+    @guarded
+    def _moved_unseen(self, *_: Any, **__: Any) -> None:
+        self.is_followed = False
+
+    @guarded
+    def _attached(self, parent: Any, child: Any, *_: Any, **__: Any) -> None:
+        self.flush()
+        if (episode := self._episodes.of(parent.world)) is not None:
+            keys, link = (self._values.key(parent), self._values.key(child)), parent.attachments[child].parent_link.name
+            episode.object_attached(*keys, link, node=self._episodes.cause(episode))
+
+    @guarded
+    def _detached(self, parent: Any, child: Any, *_: Any, **__: Any) -> None:
+        self.flush()
+        if (episode := self._episodes.of(parent.world)) is not None:
+            keys = self._values.key(parent), self._values.key(child)
+            episode.object_detached(*keys, node=self._episodes.cause(episode))
+
+    def detected(self, node: RunningNode, result: Any) -> None:
+        """Record the result of a detecting motion."""
+        values, episode = self._values, node.episode
+        seen = []
+        for each in result:
+            if isinstance(each, values.pycram.Object):
+                row = episode.reference(values.key(each))
+                seen.append(SeenValue(each.name, values.object_type(each), values.pose(each.pose), row))
+        episode.detected(seen, node=node.key)
+
+    @guarded
+    def _flush_unless_moving(self) -> None:
+        thread = self._episodes.thread
+        if not thread.is_collecting and not (thread.nodes and thread.nodes[-1].kind == "motion"):
+            self.flush()
+
+    def flush(self) -> None:
+        """Record the changes of the world by this thread."""
+        thread = self._episodes.thread
+        if not thread.changes:
+            return
+        changes, thread.changes = thread.changes, {}
+        for change in changes.values():
+            episode, key = self._episodes.of(change.of.world), self._values.key(change.of)
+            if episode is None or episode.reference(key) is None:
+                continue
+            cause = self._episodes.cause(episode)
+            if change.pose is not None:
+                episode.object_moved(key, change.pose, node=cause)
+            if change.joints:
+                episode.joints_moved(key, change.joints, node=cause)

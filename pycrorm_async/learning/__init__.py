@@ -4,18 +4,30 @@
 >>> await Retry(MoveAndPickUp(milk, policy=policy), max_tries=20).perform()
 """
 
-from pycrorm_async.learning.policies.default_policy import default_policy
-from pycrorm_async.learning.policies.evidence import Evidence, Rectangle, Region
-from pycrorm_async.learning.policies.policy import PickUpChoice, Policy
-from pycrorm_async.learning.policies.policy_file import load_policy, name_of, save_policy
-from pycrorm_async.learning.policies.policy_plot import draw_policies
-from pycrorm_async.learning.policies.recorded_policy import read_policy, record_policy
-from pycrorm_async.learning.policies.tree import learn
-from pycrorm_async.learning.rollouts.move_and_pick_up import MoveAndPickUp
-from pycrorm_async.learning.rollouts.recalled_pick_up import RecalledPickUp, RecalledPickUpPerformable
-from pycrorm_async.learning.rollouts.recorded_rollouts import rollouts_question
-from pycrorm_async.learning.rollouts.rollouts import Tally, batch_rollout
-from pycrorm_async.learning.rollouts.scene import Scene, Stage
+from pycrorm_async.learning.policy import (
+    Evidence,
+    PickUpChoice,
+    Policy,
+    Rectangle,
+    Region,
+    default_policy,
+    draw_policies,
+    load_policy,
+    name_of,
+    save_policy,
+)
+from pycrorm_async.learning.recorded_policy import read_policy, record_policy
+from pycrorm_async.learning.rollouts import (
+    MoveAndPickUp,
+    RecalledPickUp,
+    RecalledPickUpPerformable,
+    Scene,
+    Stage,
+    Tally,
+    batch_rollout,
+    rollouts_question,
+)
+from pycrorm_async.learning.tree import learn
 
 __all__ = [
     "MoveAndPickUp",

@@ -26,23 +26,24 @@ import msgspec
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import DatabaseForeign, SpoolTaken
 from pycrorm_async.operations.destination import open_destination, shared_address
-from pycrorm_async.operations.fold_requests import Assignment
-from pycrorm_async.operations.fold_worker import FoldWorkerState
-from pycrorm_async.operations.fold_workers import DaemonNote, FoldWorkers, FoldWorkerTables
-from pycrorm_async.operations.processes import ChildProcess
-from pycrorm_async.projections.custom.discovery import validate_projections
-from pycrorm_async.projections.custom.projection import Projection
-from pycrorm_async.queue.files.locks import FileIdentity, FileLock
-from pycrorm_async.queue.files.recorder_folder import folder_error
-from pycrorm_async.queue.files.spool import RecorderFolder, Spool
-from pycrorm_async.queue.retention.stored_segments import StoredSegments
-from pycrorm_async.queue.sources.dead_source import open_dead
-from pycrorm_async.queue.sources.live_source import LiveSource
+from pycrorm_async.operations.workers import (
+    Assignment,
+    ChildProcess,
+    DaemonNote,
+    FoldWorkers,
+    FoldWorkerState,
+    FoldWorkerTables,
+)
+from pycrorm_async.projections.custom import Projection, validate_projections
+from pycrorm_async.queue.locks import FileIdentity, FileLock
+from pycrorm_async.queue.sources import LiveSource, open_dead
+from pycrorm_async.queue.spool import RecorderFolder, Spool, folder_error
+from pycrorm_async.queue.stored_segments import StoredSegments
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.writer.daemon import Daemon, DaemonSummary
-from pycrorm_async.writer.ports import ClaimedSource, ScanResult, Tables
+from pycrorm_async.writer.drain import ClaimedSource, ScanResult, Tables
 
 
 async def serve(

@@ -13,15 +13,12 @@ from typing import TYPE_CHECKING, NamedTuple
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
 from pycrorm_async.errors import DatabaseError
 from pycrorm_async.operations.destination import shared_address
-from pycrorm_async.operations.fold_requests import Assignment
-from pycrorm_async.operations.fold_worker import FoldWorker, FoldWorkerLost
-from pycrorm_async.operations.fold_workers import FoldWorkers
-from pycrorm_async.projections.custom.projection import Projection
-from pycrorm_async.projections.rebuild import Rebuild, claimed, recorded
-from pycrorm_async.projections.replaced_tables import clear
-from pycrorm_async.projections.run.targets import Share
-from pycrorm_async.projections.schema.generations import projections_in, read_generations
-from pycrorm_async.projections.schema.user_views import UserView
+from pycrorm_async.operations.workers import Assignment, FoldWorker, FoldWorkerLost, FoldWorkers
+from pycrorm_async.projections.custom import Projection
+from pycrorm_async.projections.generations import projections_in, read_generations
+from pycrorm_async.projections.mapped_tables import UserView
+from pycrorm_async.projections.pipeline import Share
+from pycrorm_async.projections.rebuild import Rebuild, claimed, clear, recorded
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import BUSY_TIMEOUT_S, DatabaseAddress
 from pycrorm_async.store.log import EventLog

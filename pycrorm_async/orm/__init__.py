@@ -1,61 +1,77 @@
 """Map the public views to classes with the thesis' names, which editors can complete.
 
 `select(PickUpAction)`, `select(Action)`, `select(TaskTreeNode)` … are ordinary SQLAlchemy. In a session of a memory the
-attributes that a query does not load are loaded when they are read (`orm.loading.batch_loads`).
+attributes that a query does not load are loaded when they are read (`orm.base`).
 """
 
 from pycrorm_async.orm.actions import (
+    AccessingMotion,
     BatchRolloutAction,
     CloseAction,
+    ClosingMotion,
+    Code,
     DetectAction,
+    DetectingMotion,
     FaceAtAction,
     GraspingAction,
     GripAction,
     LearnPolicyAction,
     LookAtAction,
-    MoveAndPickUpAction,
-    MoveTorsoAction,
-    NavigateAction,
-    OpenAction,
-    ParkArmsAction,
-    PickUpAction,
-    PlaceAction,
-    ReleaseAction,
-    SetGripperAction,
-    TransportAction,
-)
-from pycrorm_async.orm.base import Base
-from pycrorm_async.orm.designators import Action, Designator, DesignatorType, Language, Motion, ParameterItem
-from pycrorm_async.orm.episodes import EpisodeRobot, EpisodeTag, Pose, Position, ProcessMetaData, Quaternion, RobotState
-from pycrorm_async.orm.language import Code, Monitor, Parallel, Repeat, Retry, Sequential, TryAll, TryInOrder
-from pycrorm_async.orm.motions import (
-    AccessingMotion,
-    ClosingMotion,
-    DetectingMotion,
     LookingMotion,
+    Monitor,
+    MoveAndPickUpAction,
     MoveArmJointsMotion,
     MoveGripperMotion,
     MoveJointsMotion,
     MoveMotion,
     MoveTCPMotion,
+    MoveTorsoAction,
+    NavigateAction,
+    OpenAction,
     OpeningMotion,
+    Parallel,
+    ParkArmsAction,
+    PickUpAction,
+    PlaceAction,
+    ReleaseAction,
+    Repeat,
+    Retry,
+    Sequential,
+    SetGripperAction,
+    TransportAction,
+    TryAll,
+    TryInOrder,
     WorldStateDetectingMotion,
 )
-from pycrorm_async.orm.objects import (
+from pycrorm_async.orm.base import Base
+from pycrorm_async.orm.episodes import EpisodeRobot, EpisodeTag, Pose, Position, ProcessMetaData, Quaternion, RobotState
+from pycrorm_async.orm.rows import (
+    Action,
     Attachment,
     BelieveObject,
     Concept,
     ConceptAncestor,
+    Designator,
+    DesignatorType,
+    Detection,
     JointChange,
+    Language,
     LocatedObject,
+    LocationCandidate,
+    LocationRefusal,
+    LocationResolution,
+    Motion,
     Object,
     ObjectConcept,
     ObjectDescription,
     ObjectPart,
     ObjectRemoval,
+    Observation,
+    ObservationValue,
+    ParameterItem,
+    StateSample,
+    TaskTreeNode,
 )
-from pycrorm_async.orm.perception import Detection, Observation, ObservationValue, StateSample
-from pycrorm_async.orm.tree import LocationCandidate, LocationRefusal, LocationResolution, TaskTreeNode
 from pycrorm_async.orm.views import PickUpWithContextView, RootFailure, SpatialRelation
 
 __all__ = [

@@ -1,7 +1,14 @@
 """Map the built-in actions: those of the thesis' table 4.1, and further ones of this package.
 
-Columns have the names of the designators' fields; `orm.designators` has those of poses and objects. Enum columns return
+Columns have the names of the designators' fields; `orm.rows` has those of poses and objects. Enum columns return
 and accept members.
+
+**Language.** Map the expressions of the plan language.
+
+Each expression is a node of the task tree, and the nodes of its operands are its children (`TaskTreeNode.parent_id`).
+`select(Language)` returns all expressions; `select(Action)` and `select(Motion)` return none.
+
+>>> interrupted = select(Monitor).join(Monitor.node).where(TaskTreeNode.status == TaskStatus.INTERRUPTED)
 """
 
 from __future__ import annotations
@@ -9,38 +16,20 @@ from __future__ import annotations
 from sqlalchemy import ForeignKey
 from sqlalchemy.orm import Mapped, mapped_column, synonym
 
-from pycrorm_async.orm.designators import (
+from pycrorm_async.orm.episodes import Pose
+from pycrorm_async.orm.rows import (
     Action,
+    Language,
+    Motion,
+    Object,
     ObjectDesignatorParameter,
     ObjectParameter,
+    ObjectPartParameter,
     PoseParameter,
     TargetLocationParameter,
     TargetParameter,
 )
-from pycrorm_async.orm.episodes import Pose
-from pycrorm_async.orm.objects import Object
-from pycrorm_async.world.enums import Arms, Grasp, GripperState
-
-__all__ = [
-    "NavigateAction",
-    "ParkArmsAction",
-    "MoveTorsoAction",
-    "SetGripperAction",
-    "ReleaseAction",
-    "GripAction",
-    "PickUpAction",
-    "PlaceAction",
-    "TransportAction",
-    "LookAtAction",
-    "DetectAction",
-    "OpenAction",
-    "CloseAction",
-    "GraspingAction",
-    "FaceAtAction",
-    "MoveAndPickUpAction",
-    "BatchRolloutAction",
-    "LearnPolicyAction",
-]
+from pycrorm_async.world.pose import Arms, Grasp, GripperState, ObjectType
 
 
 class NavigateAction(TargetLocationParameter, Action):
@@ -240,3 +229,195 @@ class LearnPolicyAction(Action):
     def training_episodes(self) -> list[str]:
         """The ids of the first 10,000 episodes that hold the samples."""
         return self.entries("episodes")
+
+
+# === language =================================================================================================
+
+
+class Sequential(Language):
+    """Performs its operands in order, up to the first that fails."""
+
+    __tablename__ = "sequential"
+
+
+class TryInOrder(Language):
+    """Performs its operands in order, up to the first that succeeds."""
+
+    __tablename__ = "try_in_order"
+
+
+class Parallel(Language):
+    """Performs its operands concurrently; succeeds if all do."""
+
+    __tablename__ = "parallel"
+
+
+class TryAll(Language):
+    """Performs its operands concurrently; succeeds if one does."""
+
+    __tablename__ = "try_all"
+
+
+class Repeat(Language):
+    """Performs its operand `times` times."""
+
+    __tablename__ = "repeat"
+
+    times: Mapped[int]
+
+
+class Monitor(Language):
+    """Performs its operand until that ends or a condition holds; in the latter case its node becomes INTERRUPTED.
+
+    Attributes:
+        condition: the qualified name of the condition.
+        interval_s: the time between two evaluations of it.
+    """
+
+    __tablename__ = "monitor"
+
+    condition: Mapped[str]
+    interval_s: Mapped[float]
+
+
+class Code(Language):
+    """Calls a function.
+
+    Attributes:
+        function: its qualified name.
+    """
+
+    __tablename__ = "code"
+
+    function: Mapped[str]
+
+    @property
+    def arguments(self) -> dict[str, str]:
+        """The call's arguments by name, each as a short text."""
+        return self.mapping("arguments")
+
+
+class Retry(Language):
+    """Repeats its operand, or its next alternative, until one succeeds, at most `max_tries` times."""
+
+    __tablename__ = "retry"
+
+    max_tries: Mapped[int]
+
+
+# === motions ==================================================================================================
+#
+# Map the built-in motions: those of the thesis' table 4.1, and those that set joints.
+#
+# The joints of `MoveArmJointsMotion` and `MoveJointsMotion` are rows of `parameter_item`.
+
+
+class MoveMotion(TargetParameter, Motion):
+    """Drive the base to a pose."""
+
+    __tablename__ = "move_motion"
+
+
+class MoveTCPMotion(TargetParameter, Motion):
+    """Bring the tool frame of one arm to a pose."""
+
+    __tablename__ = "move_tcp_motion"
+
+    arm: Mapped[Arms]
+    allow_gripper_collision: Mapped[bool | None]
+
+
+class LookingMotion(TargetParameter, Motion):
+    """Turn the head to a point."""
+
+    __tablename__ = "looking_motion"
+
+
+class MoveGripperMotion(Motion):
+    """Open or close a gripper."""
+
+    __tablename__ = "move_gripper_motion"
+
+    motion: Mapped[GripperState]
+    gripper: Mapped[Arms]
+    allow_gripper_collision: Mapped[bool | None]
+
+
+class MoveArmJointsMotion(Motion):
+    """Move arm joints to positions (rad), by name."""
+
+    __tablename__ = "move_arm_joints_motion"
+
+    @property
+    def left_arm_poses(self) -> dict[str, float]:
+        """Target positions of the left arm by joint name, rad."""
+        return self.mapping("left_arm_poses")
+
+    @property
+    def right_arm_poses(self) -> dict[str, float]:
+        """Target positions of the right arm by joint name, rad."""
+        return self.mapping("right_arm_poses")
+
+
+class MoveJointsMotion(Motion):
+    """Move joints to positions (rad or m)."""
+
+    __tablename__ = "move_joints_motion"
+
+    @property
+    def names(self) -> list[str]:
+        """The joints' names, in the designator's order."""
+        return self.entries("names")
+
+    @property
+    def positions(self) -> list[float]:
+        """The target positions, in the order of `names`."""
+        return self.entries("positions")
+
+
+class DetectingMotion(Motion):
+    """Look for objects of a type."""
+
+    __tablename__ = "detecting_motion"
+
+    object_type: Mapped[ObjectType]
+
+
+class OpeningMotion(ObjectPartParameter, Motion):
+    """Move an arm so that the container whose handle it grasps opens."""
+
+    __tablename__ = "opening_motion"
+
+    arm: Mapped[Arms]
+
+
+class ClosingMotion(ObjectPartParameter, Motion):
+    """Move an arm so that the container whose handle it grasps closes."""
+
+    __tablename__ = "closing_motion"
+
+    arm: Mapped[Arms]
+
+
+class WorldStateDetectingMotion(Motion):
+    """Read objects of a type from the state of the world instead of a camera."""
+
+    __tablename__ = "world_state_detecting_motion"
+
+    object_type: Mapped[ObjectType]
+
+
+class AccessingMotion(ObjectParameter, Motion):
+    """Open or close a drawer by its handle."""
+
+    __tablename__ = "accessing_motion"
+
+    arm: Mapped[Arms]
+    gripper: Mapped[str]
+    drawer_joint: Mapped[str]
+    drawer_handle: Mapped[str]
+    distance: Mapped[float]
+
+    object_id: Mapped[int] = mapped_column("part_of_id", ForeignKey("object.id"), sort_order=-1)
+    part_of_id: Mapped[int] = synonym("object_id")
+    part_of: Mapped[Object] = synonym("object")

@@ -1,26 +1,39 @@
 """Define the base of the mapped classes, their relationships, and attributes that are loaded on request.
 
 All mapped classes are read-only: they select from the public views. A query loads the columns of the class that it
-selects. `orm.loading.batch_loads` loads the columns of subclasses and related rows when an attribute is read.
+selects. `orm.base` loads the columns of subclasses and related rows when an attribute is read.
+
+**Types.** Define column types for times, enum members and JSON.
+
+| Python | column |
+|---|---|
+| aware `datetime` | integer, µs since 1970-01-01 00:00 UTC |
+| enum member | its name as text; a name that the enum lacks is read as `str`, see `EnumName` |
+| what JSON can hold; None is NULL | JSON text |
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from datetime import datetime
+from collections.abc import Callable, Mapping
+from datetime import UTC, datetime, timedelta
+from enum import Enum
 from typing import Any, ClassVar, TypeVar, dataclass_transform
 
+import msgspec
 from sqlalchemy import (
     BigInteger,
     Boolean,
     ColumnElement,
     Dialect,
     Double,
+    String,
     Text,
     and_,
+    bindparam,
     event,
     inspect,
     literal_column,
+    select,
 )
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.ext.asyncio import AsyncAttrs
@@ -31,36 +44,116 @@ from sqlalchemy.orm import (
     MappedAsDataclass,
     MappedColumn,
     Mapper,
+    ORMExecuteState,
     RelationshipProperty,
+    Session,
     Synonym,
     foreign,
+    load_only,
     mapped_column,
     object_session,
     relationship,
     remote,
+    selectinload,
     synonym,
 )
+from sqlalchemy.orm.exc import DetachedInstanceError, ObjectDeletedError
+from sqlalchemy.types import TypeDecorator
 from sqlalchemy.util.concurrency import in_greenlet
 
 from pycrorm_async.errors import CallerError, PycrormError
+from pycrorm_async.events.fields import table_name
 from pycrorm_async.events.ids import SEQUENCE_MAX, SLOT_MAX, row_key
-from pycrorm_async.orm.loading.batch_loads import load_columns
-from pycrorm_async.orm.types import EnumName, Moment
 from pycrorm_async.task_status import TaskStatus
-from pycrorm_async.world.enums import Arms, Grasp, GripperState, ObjectType
+from pycrorm_async.world.pose import Arms, Grasp, GripperState, ObjectType
 
-__all__ = [
-    "Base",
-    "RowOfEvent",
-    "require_loaded",
-    "on_request",
-    "HybridOnRequest",
-    "one_of",
-    "many_of",
-    "inherited_from",
-    "same_row",
-    "EPISODE",
-]
+# === types ====================================================================================================
+
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+_MICROSECOND = timedelta(microseconds=1)
+
+
+def _moment(value: int | None) -> datetime | None:
+    return None if value is None else _EPOCH + _MICROSECOND * value
+
+
+def _decoded(text: str | None) -> Any:
+    return None if text is None else msgspec.json.decode(text)
+
+
+class Moment(TypeDecorator[datetime]):
+    """An aware datetime, exact to the microsecond and read in UTC. A naive one is refused: it names no time zone."""
+
+    impl = BigInteger
+    cache_ok = True
+    storage = "time"
+    """The storage of its columns (`projections.schema`)."""
+
+    def process_bind_param(self, value: datetime | None, dialect: Dialect) -> int | None:  # noqa: ARG002
+        if value is None:
+            return None
+        if value.tzinfo is None:
+            raise ValueError(f"{value!r} has no time zone: write datetime(..., tzinfo=UTC)")
+        return (value - _EPOCH) // _MICROSECOND
+
+    def result_processor(self, dialect: Dialect, coltype: object) -> Callable[[int | None], datetime | None]:  # noqa: ARG002
+        return _moment
+
+
+class EnumName(TypeDecorator[Any]):
+    """A member of `enum`, stored by name. A query may compare the column with members and with names.
+
+    A column that a synchronous connection selects is read as the name. `pandas.read_sql` uses such a connection, and
+    would turn the members of an `IntEnum` into their numbers. Objects have members on every connection (`orm.base`).
+    """
+
+    impl = String
+    cache_ok = True
+
+    def __init__(self, enum: type[Enum]) -> None:
+        super().__init__()
+        self.enum = enum
+        self._members = _Members(enum)
+
+    def process_bind_param(self, value: Enum | str | None, dialect: Dialect) -> str | None:  # noqa: ARG002
+        return value.name if isinstance(value, Enum) else value
+
+    def result_processor(self, dialect: Dialect, coltype: object) -> Callable[[str | None], Any] | None:  # noqa: ARG002
+        return self._members.__getitem__ if dialect.is_async else None
+
+    def member(self, name: str) -> Enum | str:
+        """Return the member of this name, or the name if the enum lacks it; a further arm of a robot is one too."""
+        member: Enum | str = self._members[name]
+        return member
+
+
+class _Members(dict[str | None, Any]):
+    """The members of an enum by name, and the names it lacks as `EnumName.member` returns them; NULL is None."""
+
+    def __init__(self, enum: type[Enum]) -> None:
+        super().__init__(**enum.__members__)
+        self._enum = enum
+
+    def __missing__(self, name: str | None) -> Enum | str | None:
+        if name is not None and self._enum is Arms and name.isidentifier():
+            return Arms.named(name)
+        return name
+
+
+class JsonText(TypeDecorator[Any]):
+    """A value stored as JSON text; None is NULL."""
+
+    impl = Text
+    cache_ok = True
+
+    def process_bind_param(self, value: Any, dialect: Dialect) -> str | None:  # noqa: ARG002
+        return None if value is None else msgspec.json.encode(value).decode()
+
+    def result_processor(self, dialect: Dialect, coltype: object) -> Callable[[str | None], Any]:  # noqa: ARG002
+        return _decoded
+
+
+# === base =====================================================================================================
 
 _Value = TypeVar("_Value")
 
@@ -260,3 +353,132 @@ class HybridOnRequest(hybrid_property[_Value]):
         if instance is None:  # `undefer` asks an attribute for its columns, which SQLAlchemy 2.1 cannot answer here
             attribute._column_strategy_attrs = lambda: [getattr(owner, f"_{self.__name__}")]  # noqa: SLF001
         return attribute
+
+
+# === batch loads ==============================================================================================
+#
+# Load an attribute of many objects at once, at the first access to one that is not loaded.
+#
+# A query for a base class, such as `select(Action)`, loads the columns of the base only, and no relationship. The first
+# time that `arm` of one action is read, the columns of its class are loaded for up to `BATCH` objects of this class in
+# the session, beginning with that one. A relationship such as `robot_state` is loaded in the same way. So a query for
+# 25,000 actions loads only the attributes that are read, and reading one of each takes 50 queries, not 25,000.
+
+BATCH = 500
+"""Bounds the objects for which one query loads an attribute. SQLAlchemy passes as many keys to a query."""
+
+KEYS = "primary_keys"
+"""The parameter in which SQLAlchemy's loads and those of this module pass the ids."""
+
+
+def load_related(state: ORMExecuteState) -> None:
+    """Load a relationship for further objects too, when SQLAlchemy loads it for one: a hook of a session.
+
+    SQLAlchemy's own load follows, and takes the related rows from those that are loaded by then.
+    """
+    if not state.is_relationship_load:
+        return
+    loaded, path = state.lazy_loaded_from, state.loader_strategy_path
+    if loaded is None or not path or not isinstance(path[-1], RelationshipProperty):
+        return
+    related = path[-1]
+    class_ = related.parent.class_
+    peers = _peers(state.session, loaded, class_, related.key)
+    if len(peers) > 1:
+        _load(state.session, class_, peers, load_only(_key(class_)), selectinload(getattr(class_, related.key)))
+
+
+def load_columns(state: InstanceState[Any], toload: set[str], passive: Any) -> None:  # noqa: ARG001  SQLAlchemy's
+    """Load columns of an object's class that the query for its base did not, and those of further such objects."""
+    session = state.session
+    if session is None:
+        raise DetachedInstanceError(f"{sorted(toload)} of {state.class_.__name__} {state.identity} are not loaded")
+    by_class: dict[Any, list[str]] = {}
+    for key in sorted(toload.intersection(state.mapper.column_attrs.keys())):
+        by_class.setdefault(state.mapper.column_attrs[key].parent.class_, []).append(key)
+    for class_, keys in by_class.items():
+        _load(
+            session, class_, _peers(session, state, class_, *keys), load_only(*(getattr(class_, key) for key in keys))
+        )
+        if not state.dict.keys() >= set(keys):
+            raise ObjectDeletedError(state)
+
+
+def _peers(session: Session, state: InstanceState[Any], class_: type, *names: str) -> list[InstanceState[Any]]:
+    """Return this object and those behind it in the session that lack one of these attributes, at most `BATCH`."""
+    states = session.identity_map.all_states()
+    position = states.index(state)
+    peers = []
+    for each in (*states[position:], *states[:position]):
+        if issubclass(each.class_, class_) and any(name not in each.dict for name in names) and each.obj() is not None:
+            peers.append(each)
+            if len(peers) == BATCH:
+                break
+    return peers
+
+
+def _load(session: Session, class_: Any, states: list[InstanceState[Any]], *options: Any) -> None:
+    rows = [each.obj() for each in states]  # so that no row is collected, and made again, during the load
+    keys = sorted({each.identity[0] for each in states if each.identity})
+    statement = select(class_).where(_key(class_).in_(bindparam(KEYS, expanding=True))).options(*options)
+    session.execute(statement, {KEYS: keys}).unique().all()
+    del rows
+
+
+def _key(class_: Any) -> Any:
+    """Return the first attribute of the class's key: the id of its row, or of the row that it belongs to."""
+    mapper: Mapper[Any] = class_.__mapper__
+    return getattr(class_, mapper.get_property_by_column(mapper.primary_key[0]).key)
+
+
+# === known classes ============================================================================================
+#
+# Resolve the lineage of a designator's row to the nearest class that this process maps.
+
+
+class KnownClasses:
+    """Resolves lineages to mapped classes in one engine: the first name of a lineage that has a class wins.
+
+    The names are types and tables. `own` maps those of one memory's generated classes to their identities.
+    """
+
+    def __init__(self) -> None:
+        self.own: dict[str, str] = {}
+        self._identities: dict[str, str] = {}
+        self._size = -1
+
+    def identity(self, lineage: str, mapped: Mapping[str, Any]) -> str:
+        """Return the polymorphic identity for this lineage; its last name always has a class.
+
+        `mapped` has all mapped classes by identity. Classes of another kind are skipped, because an author may map as
+        an action a type that another process declares as a motion.
+        """
+        if self._size != len(mapped):  # a class was mapped since the last call
+            self._identities.clear()
+            self._size = len(mapped)
+        identity = self._identities.get(lineage)
+        if identity is None:
+            tables = {mapper.local_table.name: key for key, mapper in list(mapped.items()) if "@" not in key}
+            identities = {name: name for name in mapped} | tables | self.own
+            *names, root = lineage.split(" ")
+            candidates = (identities.get(each) for name in names for each in (name, table_name(name)))
+            fitting = (each for each in candidates if each is not None and _root(mapped[each]) == root)
+            identity = self._identities[lineage] = next(fitting, root)
+        return identity
+
+    def adopt(self, own: Mapping[str, str]) -> None:
+        """Replace the identities of generated classes in this engine."""
+        self.own = dict(own)
+        self._identities.clear()
+
+
+def _root(mapper: Mapper[Any]) -> str:
+    """Return the nearest of Action, Motion, Language and Designator."""
+    identities = (str(each.polymorphic_identity) for each in mapper.iterate_to_root())
+    return next(each for each in identities if each in ("Action", "Motion", "Language", "Designator"))
+
+
+def known_classes(dialect: Dialect) -> KnownClasses:
+    """Return the `KnownClasses` of the engine that this dialect belongs to, which owns them."""
+    classes: KnownClasses = vars(dialect).setdefault("pycrorm_known_classes", KnownClasses())
+    return classes

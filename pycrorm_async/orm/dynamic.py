@@ -27,16 +27,10 @@ from sqlalchemy.orm import registry, synonym
 from sqlalchemy.types import TypeEngine
 
 from pycrorm_async.errors import CallerError
-from pycrorm_async.events.types import DesignatorTypeDeclared
-from pycrorm_async.events.values import FieldDeclared, FieldType
-from pycrorm_async.orm.base import EPISODE, Base, inherited_from, one_of
-from pycrorm_async.orm.designators import Action, Designator, Language, Motion
+from pycrorm_async.events.types import DesignatorTypeDeclared, FieldDeclared, FieldType
+from pycrorm_async.orm.base import EPISODE, Base, Moment, inherited_from, known_classes, one_of
 from pycrorm_async.orm.episodes import Pose
-from pycrorm_async.orm.loading.known_classes import known_classes
-from pycrorm_async.orm.objects import Object
-from pycrorm_async.orm.types import Moment
-
-__all__ = ["DynamicClasses"]
+from pycrorm_async.orm.rows import Action, Designator, Language, Motion, Object
 
 _DEPTH_MAX = 32
 """Bounds the ancestors of a class: a query joins the view of each, and SQLite joins at most 64 tables and views."""

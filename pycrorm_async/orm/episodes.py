@@ -8,11 +8,8 @@ from typing import Any
 from sqlalchemy import ForeignKey
 from sqlalchemy.orm import Mapped, mapped_column, relationship, synonym
 
-from pycrorm_async.orm.base import Base, RowOfEvent, on_request, one_of
-from pycrorm_async.orm.types import JsonText
-from pycrorm_async.world.enums import ObjectType
-
-__all__ = ["ProcessMetaData", "EpisodeTag", "EpisodeRobot", "Position", "Quaternion", "Pose", "RobotState"]
+from pycrorm_async.orm.base import Base, JsonText, RowOfEvent, on_request, one_of
+from pycrorm_async.world.pose import ObjectType
 
 
 class ProcessMetaData(Base):

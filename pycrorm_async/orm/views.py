@@ -9,11 +9,9 @@ from sqlalchemy.orm import Mapped, mapped_column, relationship, synonym
 
 from pycrorm_async.orm.base import Base, RowOfEvent, on_request, one_of
 from pycrorm_async.orm.episodes import ProcessMetaData
-from pycrorm_async.orm.tree import TaskTreeNode
+from pycrorm_async.orm.rows import TaskTreeNode
 from pycrorm_async.task_status import TaskStatus
-from pycrorm_async.world.enums import Arms, Grasp, ObjectType
-
-__all__ = ["PickUpWithContextView", "RootFailure", "SpatialRelation"]
+from pycrorm_async.world.pose import Arms, Grasp, ObjectType
 
 
 class PickUpWithContextView(RowOfEvent, Base):
@@ -123,7 +121,7 @@ class RootFailure(RowOfEvent, Base):
 class SpatialRelation(RowOfEvent, Base):
     """A spatial relation of an object when it was picked up, or after it was placed.
 
-    `projections.schema.views.spatial_relation_view` defines the relations.
+    `projections.derived_views` defines the relations.
 
     Attributes:
         node_id: of the pick-up or the placing; `sequence` is the event of its start.

@@ -1,6 +1,6 @@
 """Write and perform robot plans: designators, built-in actions and motions, the plan language, the task tree.
 
-Plans run without a memory; a memory implements the observer of `pycrorm_async.plan.execution.observer`. Importing this
+Plans run without a memory; a memory implements the observer of `pycrorm_async.plan.execution`. Importing this
 package loads neither Bullet nor a database. The kinds of `PlanFailure` are in `pycrorm_async.plan.failures`.
 
 >>> with BulletWorld() as world, simulated_robot:
@@ -8,63 +8,75 @@ package loads neither Bullet nor a database. The kinds of `PlanFailure` are in `
 ...     await NavigateAction([Pose([0.6, 0.4, 0])]).resolve().perform()
 """
 
-from pycrorm_async.plan.actions.action_description import ActionDescription
-from pycrorm_async.plan.actions.basic import (
+from pycrorm_async.plan.actions import (
+    CloseAction,
+    CloseActionPerformable,
+    DetectAction,
+    DetectActionPerformable,
     FaceAtPerformable,
+    GraspingAction,
+    GraspingActionPerformable,
+    GripAction,
+    GripActionPerformable,
+    LookAtAction,
     LookAtActionPerformable,
     MoveAndPickUpPerformable,
-    MoveTorsoActionPerformable,
-    NavigateActionPerformable,
-    ParkArmsActionPerformable,
-    PickUpActionPerformable,
-    PlaceActionPerformable,
-    SetGripperActionPerformable,
-)
-from pycrorm_async.plan.actions.descriptions import (
-    CloseAction,
-    DetectAction,
-    GraspingAction,
-    GripAction,
-    LookAtAction,
     MoveTorsoAction,
+    MoveTorsoActionPerformable,
     NavigateAction,
+    NavigateActionPerformable,
     OpenAction,
-    ParkArmsAction,
-    PickUpAction,
-    PlaceAction,
-    ReleaseAction,
-    SetGripperAction,
-    TransportAction,
-)
-from pycrorm_async.plan.actions.manipulation import (
-    CloseActionPerformable,
-    GraspingActionPerformable,
-    GripActionPerformable,
     OpenActionPerformable,
+    ParkArmsAction,
+    ParkArmsActionPerformable,
+    PickUpAction,
+    PickUpActionPerformable,
+    PlaceAction,
+    PlaceActionPerformable,
+    ReleaseAction,
     ReleaseActionPerformable,
+    SetGripperAction,
+    SetGripperActionPerformable,
+    TransportAction,
+    TransportActionPerformable,
 )
-from pycrorm_async.plan.actions.transport import DetectActionPerformable, TransportActionPerformable
-from pycrorm_async.plan.designator import ActionAbstract, BaseMotion, Designator
-from pycrorm_async.plan.errors import NoRobotChosen, NoRobotHere, PerformNotAsync, ResolutionError
-from pycrorm_async.plan.execution.observer import Seen
-from pycrorm_async.plan.execution.simulation import SimulatedTaskTree
-from pycrorm_async.plan.failures import IKError, PlanFailure, PlanFailures
-from pycrorm_async.plan.language.expressions import Code, Parallel, Repeat, Sequential, TryAll, TryInOrder
-from pycrorm_async.plan.language.monitor import Monitor
-from pycrorm_async.plan.language.outcome import Outcome
-from pycrorm_async.plan.language.resources import Resource
-from pycrorm_async.plan.language.retry import Retry
-from pycrorm_async.plan.locations.designators import (
+from pycrorm_async.plan.execution import Seen
+from pycrorm_async.plan.failures import (
+    IKError,
+    NoRobotChosen,
+    NoRobotHere,
+    PerformNotAsync,
+    PlanFailure,
+    PlanFailures,
+    ResolutionError,
+    Resource,
+)
+from pycrorm_async.plan.language import (
+    ActionAbstract,
+    ActionDescription,
+    BaseMotion,
+    Code,
+    Designator,
+    Monitor,
+    Outcome,
+    Parallel,
+    Repeat,
+    Sequential,
+    TryAll,
+    TryInOrder,
+)
+from pycrorm_async.plan.locations import (
     AccessingLocation,
     CostmapLocation,
+    DatabaseCostmapLocation,
     Location,
     LocationDesignator,
     ObjectRelativeLocation,
     SemanticCostmapLocation,
 )
-from pycrorm_async.plan.locations.from_experience import DatabaseCostmapLocation
-from pycrorm_async.plan.motions.motions import (
+from pycrorm_async.plan.motions import (
     AccessingMotion,
+    ChosenRobot,
     ClosingMotion,
     DetectingMotion,
     LookingMotion,
@@ -73,17 +85,14 @@ from pycrorm_async.plan.motions.motions import (
     MoveJointsMotion,
     MoveMotion,
     MoveTCPMotion,
-    OpeningMotion,
-    WorldStateDetectingMotion,
-)
-from pycrorm_async.plan.motions.process_modules import (
-    ChosenRobot,
     MovingModules,
+    OpeningMotion,
     ProcessModules,
+    WorldStateDetectingMotion,
     simulated_robot,
     simulated_robot_within,
 )
-from pycrorm_async.plan.object_designators import (
+from pycrorm_async.plan.objects import (
     BelieveObject,
     LocatedObject,
     LocatedObjectDescription,
@@ -91,7 +100,8 @@ from pycrorm_async.plan.object_designators import (
     ObjectDesignatorDescription,
     ObjectPart,
 )
-from pycrorm_async.plan.task_tree import CollectedTree, TaskTreeNode, collected_tree
+from pycrorm_async.plan.retry import Retry, SimulatedTaskTree
+from pycrorm_async.plan.task import CollectedTree, TaskTreeNode, collected_tree
 from pycrorm_async.task_status import TaskStatus
 
 __all__ = [

@@ -7,16 +7,30 @@ the classes must stay in this module.
 >>> raise ObjectUnreachable("cereal is out of reach", "cereal", 1.7)
 Traceback (most recent call last):
 pycrorm_async.plan.failures.ObjectUnreachable: cereal is out of reach
+
+**Resources.** Parts of the robot that a designator uses exclusively while it runs, so that parallel branches take
+turns.
+
+A part is also needed if it only must not move: an arm that reaches for a place in the map needs the base and the torso.
+Looking does not need the base, so a robot may turn its head while it drives. `execution` decides which
+designator waits.
+
+>>> PickUpActionPerformable(milk, Arms.LEFT, Grasp.FRONT).resources() == reaching(Arms.LEFT)
+True
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Self
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from enum import Enum
+from typing import TYPE_CHECKING, Final, Self
 
-from pycrorm_async.plan.language.resources import Resource
-from pycrorm_async.world.enums import Arms
-from pycrorm_async.world.pose import Pose
+from pycrorm_async.errors import CallerError
+from pycrorm_async.world.pose import Arms, Pose
+
+if TYPE_CHECKING:
+    from pycrorm_async.world.urdf import RobotDescription
 
 __all__ = [
     "PlanFailure",
@@ -397,3 +411,178 @@ class ReasoningError(PlanFailure):
 
 class CollisionError(PlanFailure):
     """The robot collided with an object."""
+
+
+# === resources ================================================================================================
+
+
+class Resource(Enum):
+    """A part of the robot that one designator at a time can use."""
+
+    LEFT_ARM = "LEFT_ARM"
+    RIGHT_ARM = "RIGHT_ARM"
+    BASE = "BASE"
+    OTHER_ARM = "OTHER_ARM"
+    """Any arm but the left and the right one: the further arms of a robot take turns."""
+    TORSO = "TORSO"
+    HEAD = "HEAD"
+
+
+NOTHING: frozenset[Resource] = frozenset()
+_ARMS = {
+    Arms.LEFT: frozenset({Resource.LEFT_ARM}),
+    Arms.RIGHT: frozenset({Resource.RIGHT_ARM}),
+    Arms.BOTH: frozenset({Resource.LEFT_ARM, Resource.RIGHT_ARM}),
+}
+_OTHER_ARM = frozenset({Resource.OTHER_ARM})
+_STANDING = frozenset({Resource.BASE, Resource.TORSO})
+
+
+def arms(arm: Arms) -> frozenset[Resource]:
+    """Return the arm, or both, with its gripper."""
+    return _ARMS.get(arm, _OTHER_ARM)
+
+
+def reaching(arm: Arms) -> frozenset[Resource]:
+    """Return the parts for reaching a place in the map: the arm, and base and torso, which must not move."""
+    return arms(arm) | _STANDING
+
+
+def moving(joints: Iterable[str], robot: RobotDescription) -> frozenset[Resource]:
+    """Return the parts that these joints belong to; a joint of no part is ignored."""
+    parts = dict.fromkeys(robot.head_joints, Resource.HEAD)
+    if robot.torso_joint is not None:
+        parts[robot.torso_joint] = Resource.TORSO
+    for arm, description in robot.arms.items():
+        (part,) = arms(arm)
+        parts |= dict.fromkeys(description.joints, part)
+        for positions in description.gripper_joints.values():
+            parts |= dict.fromkeys(positions, part)
+    return frozenset(parts[joint] for joint in joints if joint in parts)
+
+
+# === errors ===================================================================================================
+#
+# Errors in the code of a plan: designators that are declared or used in a wrong way.
+#
+# Three modules share the exceptions of plans. `errors` has the mistakes of a plan's author, which are a `CallerError`
+# and need a change of code. `failures` has the outcomes of actions, such as an unreachable object, which a plan catches
+# to try an alternative. `exceptions` defines no class; its functions classify and describe any exception.
+#
+# A *description*, such as `NavigateAction([pose_1, pose_2])`, lists alternatives. `resolve()` chooses one and returns a
+# *designator*, such as `NavigateActionPerformable(pose_1)`, which can be performed.
+
+
+class PerformNotAsync(CallerError, TypeError):
+    """A designator class declares a `perform` that is not `async def perform(self)`."""
+
+    def __init__(self, designator: str) -> None:
+        super().__init__(f"{designator}.perform must be declared as `async def perform(self)`")
+        self.designator = designator
+
+
+class ResourcesNotAMethod(CallerError, TypeError):
+    """A designator class declares `resources` as a field or value and not as a method."""
+
+    def __init__(self, designator: str) -> None:
+        super().__init__(
+            f"{designator}.resources must be a method that returns a frozenset of Resource: rename the field"
+        )
+        self.designator = designator
+
+
+class NotResolved(CallerError, AttributeError):
+    """A description is used where a resolved designator is needed: `.resolve()` is missing."""
+
+    def __init__(self, description: str, name: str) -> None:
+        super().__init__(
+            f"{description} is a description and has no {name!r}: resolve it first, as in {description}(…).resolve()"
+            f"{'.perform()' if name == 'perform' else ''}"
+        )
+        self.description = description
+
+
+class ResolutionError(CallerError):
+    """The arguments of a designator do not fit its declared properties.
+
+    Attributes:
+        designator: the class name.
+        missing: properties that are None and must not be.
+        wrong: properties of another type than declared, each as "name: expected …, got …".
+    """
+
+    def __init__(self, designator: str, *, missing: Sequence[str] = (), wrong: Sequence[str] = ()) -> None:
+        parts = []
+        if missing:
+            parts.append(f"missing: {', '.join(missing)}")
+        if wrong:
+            parts.append(f"wrong: {'; '.join(wrong)}")
+        super().__init__(f"{designator} cannot be built; {'. '.join(parts)}")
+        self.designator = designator
+        self.missing = tuple(missing)
+        self.wrong = tuple(wrong)
+
+
+class NoRobotChosen(CallerError):
+    """A motion was performed in a context without a chosen robot."""
+
+    def __init__(self, motion: str) -> None:
+        super().__init__(f"{motion} moves a robot: perform it inside `with simulated_robot:`")
+        self.motion = motion
+
+
+class NoRobotHere(CallerError):
+    """The call needs an acting robot with a robot description in the current world."""
+
+
+# === exceptions ===============================================================================================
+#
+# Classify exceptions of plans, describe them in a line, and name the object for which an arm reached.
+
+_DESCRIPTION_LENGTH_MAX: Final = 200
+"""Bounds the characters of a description, so that a list of failed alternatives stays readable."""
+
+
+def describe_error(error: BaseException) -> str:
+    """Describe an exception by class and message in one short line. Never raises.
+
+    >>> describe_error(ObjectLost("the gripper is empty"))
+    'ObjectLost: the gripper is empty'
+    """
+    name = type(error).__name__
+    try:
+        message = " ".join(str(error).split())
+    except Exception:  # noqa: BLE001  a user's __str__ may raise anything
+        return name
+    if len(message) > _DESCRIPTION_LENGTH_MAX:
+        message = f"{message[: _DESCRIPTION_LENGTH_MAX - 1]}…"
+    return f"{name}: {message}" if message else name
+
+
+def is_plan_failure(error: BaseException) -> bool:
+    """Return whether it is a plan failure, or a group of plan failures only (as a `TaskGroup` raises)."""
+    if isinstance(error, ExceptionGroup):
+        return all(map(is_plan_failure, error.exceptions))
+    return isinstance(error, PlanFailure)
+
+
+@contextmanager
+def reaching_for(name: str | None) -> Iterator[None]:
+    """Add the object's name to the message and, as the last one, to the arguments of a failed reach; None adds nothing.
+
+    Failed reaches are `IKError`, `ManipulationGoalInCollision` and the subclasses of `ManipulationLowLevelFailure`.
+
+    >>> with reaching_for("milk"):
+    ...     raise ManipulationGoalNotReached("the arm stopped at 0.3 m", 0.3)
+    Traceback (most recent call last):
+    pycrorm_async.plan.failures.ManipulationGoalNotReached: the arm stopped at 0.3 m, reaching for milk
+    """
+    try:
+        yield
+    except (IKError, ManipulationGoalInCollision, ManipulationLowLevelFailure) as failure:
+        if name is not None:
+            message = f"{failure.message}, reaching for {name}"
+            first = failure.args[:1] if isinstance(failure, IKError) else (message,)
+            failure.args = (*first, *failure.args[1:], name)
+            failure.message = message
+        raise

@@ -14,22 +14,18 @@ from dataclasses import replace
 from sqlalchemy import text
 
 from pycrorm_async.errors import CallerError, DatabaseForeign
-from pycrorm_async.projections.custom.projection import Projection
-from pycrorm_async.projections.custom.projection_tables import CustomTables
-from pycrorm_async.projections.run.batch_fold import BatchFold, BatchPreview
-from pycrorm_async.projections.run.parked_release import release_parked
-from pycrorm_async.projections.run.pipeline import FoldPipeline
-from pycrorm_async.projections.run.targets import LiveTarget
-from pycrorm_async.projections.schema.generations import (
+from pycrorm_async.projections.columns import next_number
+from pycrorm_async.projections.custom import CustomTables, Projection
+from pycrorm_async.projections.generations import (
+    ViewRefused,
     current_generation,
     grow_tables,
     make_generation,
+    refresh_some,
     show,
 )
-from pycrorm_async.projections.schema.mapped_tables import mapped_leaves
-from pycrorm_async.projections.schema.materialised_views import ViewRefused, refresh_some
-from pycrorm_async.projections.schema.user_views import UserView, with_user_views
-from pycrorm_async.projections.table_names import next_number
+from pycrorm_async.projections.mapped_tables import UserView, mapped_leaves, with_user_views
+from pycrorm_async.projections.pipeline import BatchFold, BatchPreview, FoldPipeline, LiveTarget, release_parked
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import Span

@@ -25,6 +25,7 @@ Queries that began before the switch may still read the replaced tables. The swi
 
 from __future__ import annotations
 
+import asyncio
 from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import asynccontextmanager
 from dataclasses import replace
@@ -34,21 +35,17 @@ from sqlalchemy import text
 from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.errors import CallerError, DatabaseForeign, DatabaseUnavailable, InternalError
-from pycrorm_async.projections.custom.projection import Projection
-from pycrorm_async.projections.custom.projection_tables import (
+from pycrorm_async.projections import pipeline
+from pycrorm_async.projections.columns import CORE, OF_NO_EPISODE, next_number, physical_name
+from pycrorm_async.projections.custom import (
     CustomFoldDefinition,
+    Projection,
     events_of_batch,
     layout_of,
     make_projection_tables,
     refuse_taken,
 )
-from pycrorm_async.projections.replaced_tables import REPLACED, readable_generations
-from pycrorm_async.projections.run import checkpoints
-from pycrorm_async.projections.run.batch_fold import TABLES, BatchFold
-from pycrorm_async.projections.run.pipeline import FoldPipeline
-from pycrorm_async.projections.run.targets import WHOLE, Share, SideTarget
-from pycrorm_async.projections.schema.core_columns import CORE, OF_NO_EPISODE
-from pycrorm_async.projections.schema.generations import (
+from pycrorm_async.projections.generations import (
     MAKING,
     PROJECTION,
     PROJECTION_VERSION,
@@ -57,21 +54,22 @@ from pycrorm_async.projections.schema.generations import (
     built_in_texts,
     current_generation,
     delete_generation,
+    grow,
     grow_tables,
     make_empty,
     make_generation,
+    materialised_tables,
     projections_in,
     read_generation,
+    read_generations,
+    refresh_some,
     show,
+    with_views,
     write_generation,
 )
-from pycrorm_async.projections.schema.growth import grow
-from pycrorm_async.projections.schema.mapped_tables import mapped_leaves
-from pycrorm_async.projections.schema.materialised_views import refresh_some
-from pycrorm_async.projections.schema.public_views import Tables
-from pycrorm_async.projections.schema.session_views import with_views
-from pycrorm_async.projections.schema.user_views import UserView, with_user_views
-from pycrorm_async.projections.table_names import next_number, physical_name
+from pycrorm_async.projections.mapped_tables import UserView, mapped_leaves, with_user_views
+from pycrorm_async.projections.pipeline import TABLES, WHOLE, BatchFold, FoldPipeline, Share, SideTarget
+from pycrorm_async.projections.views import Tables
 from pycrorm_async.store.dialect import RowRefused
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
@@ -124,7 +122,7 @@ class Rebuild:
         self._projection = projection
         self._key = SHOWN if projection is None else f"{PROJECTION}{projection.name}"
         name = None if projection is None else projection.name
-        self._place = checkpoints.place_of(generation.number, name)
+        self._place = pipeline.place_of(generation.number, name)
         key = f"{self._key}{_MAKING}"
         self._making = SideTarget(log, key, name, generation.version, number=generation.number, share=share)
         definition = TABLES if projection is None else CustomFoldDefinition(projection)
@@ -157,7 +155,7 @@ class Rebuild:
                 if making is None:
                     numbers = [each.number for key, each in generations.items() if not key.startswith(PROJECTION)]
                     making = await make_generation(connection, next_number(numbers))
-                    await make_empty(connection, {checkpoints.TABLE: checkpoints.COLUMNS}, making.number)
+                    await make_empty(connection, {pipeline.TABLE: pipeline.COLUMNS}, making.number)
                 making = await grow_tables(connection, making, making.layout.with_leaves(mapped_leaves()))
                 await write_generation(connection, MAKING, making)
             target = SideTarget(log, MAKING, None, making.version, number=making.number)
@@ -187,12 +185,12 @@ class Rebuild:
     async def left(self) -> int:
         """Return the number of events in the log that the new tables lack, without those of parked episodes."""
         async with self._log.reading() as connection:
-            return await checkpoints.left(connection, self._place)
+            return await pipeline.left(connection, self._place)
 
     async def parked(self) -> dict[int, str]:
         """Return the parked episodes by number, with the reasons."""
         async with self._log.reading() as connection:
-            return await checkpoints.parked(connection, self._place)
+            return await pipeline.parked(connection, self._place)
 
     async def fold_next_batch(self) -> int | None:
         """Fold a batch; return the number of events, None when none is left of this share."""
@@ -239,9 +237,7 @@ class Rebuild:
         async with with_views(self._log.engine, views | users) as connection:
             more = True
             while more:
-                more = await refresh_some(
-                    connection, making.layout, self.number, folded=checkpoints.folded(self._place)
-                )
+                more = await refresh_some(connection, making.layout, self.number, folded=pipeline.folded(self._place))
                 await connection.commit()
 
     async def _show_if_complete(self) -> bool:
@@ -251,12 +247,10 @@ class Rebuild:
             # Every fold shares this row's lock while it writes, so no fold writes to the old tables from here on.
             old = await read_generation(connection, self._key, hold="change")
             new = await self._making.generation(connection, "change")
-            seen = checkpoints.SEEN
+            seen = pipeline.SEEN
             if self._projection is not None:
-                seen = checkpoints.folded(
-                    checkpoints.place_of(old.number, self._projection.name) if old else self._place
-                )
-            late = await checkpoints.late(connection, self._place, seen=seen, limit=_LATE_EVENTS_MAX + 1)
+                seen = pipeline.folded(pipeline.place_of(old.number, self._projection.name) if old else self._place)
+            late = await pipeline.late(connection, self._place, seen=seen, limit=_LATE_EVENTS_MAX + 1)
             if sum(each.head - each.folded for each in late) > _LATE_EVENTS_MAX:
                 return False
             if late:
@@ -286,7 +280,7 @@ class Rebuild:
             # Above both revisions, so that every process that folded for either of them notices the switch.
             new = replace(new, revision=max(new.revision, old.revision) + 1)
         new = await show(connection, new)
-        await checkpoints.carry_over(connection, self._place)
+        await pipeline.carry_over(connection, self._place)
         while await refresh_some(connection, new.layout, new.number):
             pass
 
@@ -330,3 +324,97 @@ async def _begin_projection(
         connection, generations, key, lambda each: each.version == projection.version and each.layout == layout
     )
     return making or await make_projection_tables(connection, projection, f"{key}{_MAKING}")
+
+
+# === replaced tables ==========================================================================================
+#
+# Drop the tables of generations that a rebuild has replaced, in slices, while queries may still read them.
+
+REPLACED = "/gone/"
+"""Separates owner and number in the key of a replaced generation."""
+_SLICE_ROWS = 10_000
+"""Bounds the rows of a replaced table that one transaction deletes."""
+_PAUSE_S = 0.02
+"""The pause between two slices. SQLite connections poll for the write lock and would never find it free otherwise."""
+_DROP_PAUSES_S = (0.0, 0.1, 0.2, 0.4, 0.8, 1.6, 3.2)
+"""The pauses before the attempts to drop a table, in which queries that began before the switch end."""
+
+
+async def clear(log: EventLog) -> list[str]:
+    """Empty and drop replaced tables in slices; return the names of tables that are still in use and were left."""
+    left: list[str] = []
+    with log.translated():
+        async with log.reading() as connection:
+            generations = await readable_generations(log, connection)
+        await _sweep(log)
+        for key, generation in generations.items():
+            if key == SHOWN:
+                await _drop(log, pipeline.place_of(generation.number))
+            owner, separator, _ = key.partition(REPLACED)
+            if not separator:
+                continue
+            is_built_in = owner == SHOWN
+            tables = [
+                *(CORE | OF_NO_EPISODE if is_built_in else ()),
+                *generation.layout.leaves,
+                *materialised_tables(generation.layout),
+                pipeline.TABLE if is_built_in else f"{pipeline.TABLE}_{owner.removeprefix(PROJECTION)}",
+            ]
+            named = [physical_name(each, generation.number) for each in tables]
+            in_use = await _drop_all(log, named)
+            left += in_use
+            if not in_use:
+                async with log.engine.begin() as connection:
+                    await delete_generation(connection, key)
+    return left
+
+
+async def readable_generations(log: EventLog, connection: AsyncConnection) -> dict[str, Generation]:
+    """Read all generations. Raises `DatabaseForeign` if a newer version made one, whose tables this one cannot list."""
+    generations = await read_generations(connection)
+    newest = max((each.version for key, each in generations.items() if not key.startswith(PROJECTION)), default=0)
+    if newest > PROJECTION_VERSION:
+        versions = f"there are tables made by version {newest} of the fold, this is version {PROJECTION_VERSION}"
+        raise DatabaseForeign(f"{log.address}: {versions}: use a newer pycrorm")
+    return generations
+
+
+async def _sweep(log: EventLog) -> None:
+    async with log.engine.begin() as connection:
+        await dialect_of(connection).sweep(connection)
+
+
+async def _drop_all(log: EventLog, tables: list[str]) -> list[str]:
+    """Drop these tables; return those that stay in use after the last attempt."""
+    for pause_s in _DROP_PAUSES_S:
+        await asyncio.sleep(pause_s)
+        await _sweep(log)  # drops replaced views first, because a table cannot be dropped before its views
+        while tables and await _drop(log, tables[0]):
+            tables = tables[1:]
+        if not tables:
+            return []
+    return [each for each in tables if not await _drop(log, each)]
+
+
+async def _drop(log: EventLog, table: str) -> bool:
+    """Empty and drop this table if it exists; False if a query still reads it.
+
+    A table of one slice costs one transaction: there are dozens, and most are empty.
+    """
+    dialect = dialect_of(log.engine)
+    dropping = False
+    try:
+        while not dropping:
+            async with log.engine.begin() as connection:
+                if not await dialect.has_table(connection, table):
+                    return True
+                dropping = not await dialect.empty(connection, table, rows_max=_SLICE_ROWS)
+                if dropping:
+                    await dialect.drop(connection, table)
+            if not dropping:
+                await asyncio.sleep(_PAUSE_S)
+    except dialect.faults:
+        if not dropping:
+            raise
+        return False
+    return True

@@ -2,33 +2,123 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, replace
-from datetime import datetime, timedelta
-from typing import Any
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime, timedelta
+from enum import Enum
+from typing import Any, TypeAlias
 
-from sqlalchemy import Select, and_, func, select
-from sqlalchemy.ext.asyncio import AsyncConnection
+from sqlalchemy import BigInteger, ColumnElement, Select, and_, column, exists, func, or_, select, table
+from sqlalchemy.ext.asyncio import AsyncConnection, AsyncSession
 from sqlalchemy.orm import aliased
 
+from pycrorm_async.errors import CallerError
 from pycrorm_async.events.ids import SLOT_NODE, row_id, row_key
+from pycrorm_async.events.types import LocationResolved, ObjectDetected
 from pycrorm_async.orm import (
     Designator,
     Detection,
+    EpisodeRobot,
     EpisodeTag,
+    LocationRefusal,
     LocationResolution,
     Object,
     Observation,
+    Pose,
     ProcessMetaData,
     TaskTreeNode,
 )
 from pycrorm_async.orm.base import same_row
-from pycrorm_async.query.asking.episode_list import EpisodeChoice
-from pycrorm_async.query.parameter_text import with_object_names
-from pycrorm_async.query.running_episodes import RobotSummary, robots_of
-from pycrorm_async.query.value_html import NotebookValue
-from pycrorm_async.store.episode_lookup import number_named
+from pycrorm_async.query.frames import EpisodeNumber, check_texts, containing, limited, member_of, of_episode
+from pycrorm_async.query.text import NotebookValue, with_object_names
+from pycrorm_async.store.log import number_named
+from pycrorm_async.store.stored import StoredEvent
 from pycrorm_async.task_status import TaskStatus
+
+# === running episodes =========================================================================================
+#
+# Query the episodes that run, and the robots of episodes, without the mapped classes.
+#
+# `pycrorm status` asks nothing else of the tables, and mapping the classes would take half of its time.
+
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+_episode = table("process_metadata", *(column(name) for name in ("id", "uuid", "created_at", "description", "status")))
+_robot = table(
+    "episode_robot",
+    column("id", BigInteger()),
+    column("process_metadata_id", BigInteger()),
+    *(column(name) for name in ("name", "model", "serial", "description_fingerprint")),
+)
+
+
+@dataclass(frozen=True)
+class RobotSummary:
+    """A robot that took part in an episode.
+
+    Attributes:
+        name: of its object in the world.
+        model, serial: of its `RobotDescription`; None without one, and in episodes of version 0.1.0.
+        description: fingerprint of its recorded description; None likewise.
+    """
+
+    name: str
+    model: str | None
+    serial: str | None
+    description: str | None
+
+    def __str__(self) -> str:
+        """Return the name, with model and serial as far as they add to it."""
+        model = " ".join(each for each in (self.model, self.serial) if each is not None)
+        return f"{self.name} ({model})" if model not in ("", self.name) else self.name
+
+
+@dataclass(frozen=True)
+class RunningEpisode:
+    """An episode that has not ended, as far as the tables show it, and the robots that took part so far."""
+
+    number: int
+    id: str
+    started_at: datetime
+    description: str
+    robots: tuple[RobotSummary, ...]
+
+
+async def running_episodes(connection: AsyncConnection, limit: int) -> tuple[list[RunningEpisode], int]:
+    """Return the running episodes that started last, at most `limit`, the newest first; and the number of all."""
+    own = _episode.c
+    query = select(own.id, own.uuid, own.created_at, own.description, func.count().over().label("total"))
+    query = query.where(own.status == TaskStatus.RUNNING.name).order_by(own.id.desc()).limit(limit)
+    rows = (await connection.execute(query)).all()
+    robots = await robots_of(connection, [each.id for each in rows])
+    episodes = [
+        RunningEpisode(
+            each.id,
+            each.uuid,
+            _EPOCH + timedelta(microseconds=each.created_at),
+            each.description,
+            tuple(robots.get(each.id, ())),
+        )
+        for each in rows
+    ]
+    return episodes, rows[0].total if rows else 0
+
+
+async def robots_of(
+    connection: AsyncConnection, numbers: Collection[int] | Select[*tuple[int]] | None
+) -> dict[int, list[RobotSummary]]:
+    """Return the robots of every episode, or of those with these numbers, by episode."""
+    query = select(_robot).order_by(_robot.c.id)
+    if numbers is not None:
+        query = query.where(_robot.c.process_metadata_id.in_(numbers))
+    robots: dict[int, list[RobotSummary]] = {}
+    for row in await connection.execute(query):
+        summary = RobotSummary(row.name, row.model, row.serial, row.description_fingerprint)
+        robots.setdefault(row.process_metadata_id, []).append(summary)
+    return robots
+
+
+# === named queries ============================================================================================
 
 
 @dataclass(frozen=True)
@@ -315,3 +405,276 @@ def _depth_first(children: dict[int | None, list[NodeSummary]]) -> Iterator[Node
 
 def _nanoseconds(start: datetime, end: datetime | None) -> int | None:
     return None if end is None else (end - start) // timedelta(microseconds=1) * 1000
+
+
+# === episode list =============================================================================================
+#
+# Choose episodes by status, start, tags, robot, text: for `memory.ask.episodes`, `pycrorm episodes` and reports.
+
+
+@dataclass(frozen=True)
+class EpisodeChoice:
+    """Conditions on episodes; None means no condition.
+
+    Attributes:
+        status: the name of a `TaskStatus`.
+        since: the earliest start, with a time zone.
+        tags: an episode has all of them.
+        robot: name or model of a robot that took part.
+        text: a part of the description, the plan's name or a tag.
+        limit: the largest number of episodes; the newest that fulfil all conditions are taken.
+    """
+
+    status: str | None = None
+    since: datetime | None = None
+    tags: tuple[str, ...] = ()
+    robot: str | None = None
+    text: str | None = None
+    limit: int | None = None
+
+    def __post_init__(self) -> None:
+        check_texts({"status": self.status, "robot": self.robot, "text": self.text})
+        for each in self.tags:
+            check_texts({"tag": each})
+        if self.since is not None and not isinstance(self.since, datetime):
+            raise CallerError(f"since must be a datetime with a time zone, got {self.since!r}")
+        if self.since is not None and self.since.tzinfo is None:
+            raise CallerError(f"since has no time zone: {self.since.isoformat()}")
+        # Both are built again for each query; here they raise where the choice is made.
+        self.conditions()
+        limited(select(), self.limit)
+
+    def __str__(self) -> str:
+        """Return the conditions as `status FAILED; tags night, kitchen; the newest 10`; empty if there is none."""
+        conditions = {
+            "status": self.status,
+            "since": None if self.since is None else f"{self.since.astimezone(UTC):%Y-%m-%d %H:%M:%S} UTC",
+            "tags" if len(self.tags) > 1 else "tag": ", ".join(self.tags) or None,
+            "robot": self.robot,
+            "text": self.text,
+            "the newest": self.limit,
+        }
+        return "; ".join(f"{name} {value}" for name, value in conditions.items() if value is not None)
+
+    def conditions(self) -> list[ColumnElement[bool]]:
+        """Return the conditions on `ProcessMetaData`, without the limit. Raises `CallerError` for a wrong status."""
+        episode, conditions = ProcessMetaData, []
+        if self.status is not None:
+            conditions.append(episode.status == member_of(TaskStatus, self.status, "status"))
+        if self.since is not None:
+            conditions.append(episode.created_at >= self.since)
+        conditions += [
+            exists().where(EpisodeTag.process_metadata_id == episode.id, EpisodeTag.tag == each) for each in self.tags
+        ]
+        if self.robot is not None:
+            robot = EpisodeRobot
+            named = or_(robot.name == self.robot, robot.model == self.robot)
+            conditions.append(exists().where(robot.process_metadata_id == episode.id, named))
+        if self.text is not None:
+            tagged = exists().where(EpisodeTag.process_metadata_id == episode.id, containing(self.text, EpisodeTag.tag))
+            conditions.append(or_(containing(self.text, episode.description, episode.plan), tagged))
+        return conditions
+
+    def newest(self) -> Select[*tuple[int]]:
+        """Return the select of the numbers of the chosen episodes."""
+        return limited(
+            select(ProcessMetaData.id).where(*self.conditions()).order_by(ProcessMetaData.id.desc()), self.limit
+        )
+
+
+def episode_list(episode: EpisodeNumber | None, choice: EpisodeChoice) -> Select[*tuple[Any, ...]]:
+    """Select the chosen episodes with their outcomes, the newest first."""
+    listed = ProcessMetaData
+    statement = select(
+        listed.id.label("episode"),
+        listed.uuid.label("id"),
+        listed.created_at.label("started_at"),
+        listed.ended_at,
+        listed.status,
+        listed.description,
+        listed.plan,
+        listed.created_by,
+        listed.world,
+        listed.failure_type,
+        listed.failure_message,
+        listed.continues,
+    )
+    if episode is not None:
+        statement = statement.where(of_episode(listed.id, episode))
+    return limited(statement.where(*choice.conditions()).order_by(listed.id.desc()), choice.limit)
+
+
+# === percepts and places ======================================================================================
+#
+# List the percepts of an episode and its searches for places, from its events or from the tables.
+
+Position: TypeAlias = "tuple[float, ...]"
+
+
+@dataclass(frozen=True)
+class Percept:
+    """A percept.
+
+    Attributes:
+        sequence: of the event of its detection.
+        node: id of the node that asked perception.
+        looked_for: the type that was searched for; None for any type.
+        object_id: of the matching object's row in `orm.Object`; None if the percept matches no object.
+        position, orientation: in m, and as a unit quaternion (x, y, z, w).
+    """
+
+    sequence: int
+    node: int | None
+    name: str
+    object_type: str
+    source: str
+    looked_for: str | None
+    object_id: int | None
+    position: Position
+    orientation: Position
+    confidence: float | None
+    visible: float | None
+
+
+@dataclass(frozen=True)
+class PlaceSearch:
+    """The answer of a location designator to one request for a place.
+
+    Attributes:
+        sequence: of its event.
+        node: id of the node that made the request.
+        location: class of the location designator.
+        considered, offered: the number of places it checked, and of those it offered.
+        taken: position of the place that the plan used, in m; None if it used none.
+        refused: the number of recorded refusals, by reason, the most frequent first.
+    """
+
+    sequence: int
+    node: int | None
+    location: str
+    considered: int
+    offered: int
+    taken: Position | None
+    refused: Mapping[str, int] = field(default_factory=dict)
+
+
+def counts_text(node: NodeSummary) -> str:
+    """Return how many places were considered and offered at a node and how many percepts it had; empty without any."""
+    places = f"considered {node.considered}, offered {node.offered}" if node.considered or node.offered else ""
+    return "; ".join(filter(None, (places, f"detected {node.detected}" if node.detected else "")))
+
+
+# --- from events --------------------------------------------------------------------------------------------------
+
+
+def percepts_in(number: int, event: StoredEvent, detected: ObjectDetected) -> list[Percept]:
+    """Return the percepts of a detection in the episode with this number."""
+    return [
+        Percept(
+            event.sequence,
+            _row(number, detected.node),
+            each.name,
+            each.object_type,
+            each.source or detected.source,
+            detected.object_type,
+            _row(number, each.object.row if each.object is not None else None),
+            tuple(each.pose.position),
+            tuple(each.pose.orientation),
+            each.confidence,
+            each.visible,
+        )
+        for each in detected.seen
+    ]
+
+
+def search_in(number: int, event: StoredEvent, resolved: LocationResolved) -> PlaceSearch:
+    """Return the search for a place of an event in the episode with this number."""
+    taken = resolved.taken
+    at = resolved.offered[taken].pose.position if taken is not None and 0 <= taken < len(resolved.offered) else None
+    return PlaceSearch(
+        event.sequence,
+        _row(number, resolved.node),
+        resolved.location,
+        resolved.considered,
+        len(resolved.offered) + resolved.offered_beyond,
+        tuple(at) if at is not None else None,
+        _by_frequency(Counter(each.reason for each in resolved.refused)),
+    )
+
+
+def _row(number: int, sequence: int | None) -> int | None:
+    return None if sequence is None else row_id(number, sequence, SLOT_NODE)
+
+
+def _by_frequency(counts: Mapping[str, int]) -> dict[str, int]:
+    return dict(sorted(counts.items(), key=lambda each: (-each[1], each[0])))
+
+
+# --- from the tables ----------------------------------------------------------------------------------------------
+
+
+async def percepts_of(session: AsyncSession, number: int) -> Sequence[Percept]:
+    """Read the percepts of an episode, in the order of the events."""
+    seen = Detection.__table__
+    of_episode = select(seen).where(seen.c.process_metadata_id == number)
+    rows = await session.execute(of_episode.order_by(seen.c.id, seen.c.position))
+    return [
+        Percept(
+            row_key(row.id).sequence,
+            row.node_id,
+            row.name,
+            _name(row.obj_type),
+            row.source,
+            _name(row.looked_for),
+            row.object_id,
+            (row.x, row.y, row.z),
+            (row.qx, row.qy, row.qz, row.qw),
+            row.confidence,
+            row.visible,
+        )
+        for row in rows
+    ]
+
+
+def _name(value: Any) -> Any:
+    """Return the name of an enum's member; other values unchanged, such as a type of a newer version."""
+    return value.name if isinstance(value, Enum) else value
+
+
+async def searches_of(session: AsyncSession, number: int) -> Sequence[PlaceSearch]:
+    """Read the searches for places of an episode, in the order of the events."""
+    resolution, place, refusal = LocationResolution, Pose, LocationRefusal
+    counted = select(refusal.resolution_id, refusal.reason, func.count()).where(refusal.process_metadata_id == number)
+    reasons: dict[int, dict[str, int]] = {}
+    for key, reason, count in await session.execute(counted.group_by(refusal.resolution_id, refusal.reason)):
+        reasons.setdefault(key, {})[reason] = count
+    columns = (
+        resolution.id,
+        resolution.node_id,
+        resolution.location,
+        resolution.considered,
+        resolution.offered,
+        place.x,
+        place.y,
+        place.z,
+    )
+    rows = await session.execute(
+        select(*columns)
+        .outerjoin(
+            place, and_(place.id == resolution.pose_id, place.process_metadata_id == resolution.process_metadata_id)
+        )
+        .where(resolution.process_metadata_id == number)
+        .order_by(resolution.id)
+    )
+    return [
+        PlaceSearch(
+            row_key(row.id).sequence,
+            row.node_id,
+            row.location,
+            row.considered,
+            row.offered,
+            None if row.x is None else (row.x, row.y, row.z),
+            _by_frequency(reasons.get(row.id, {})),
+        )
+        for row in rows
+    ]

@@ -9,41 +9,45 @@ async with Reading.open("sqlite:///memory.db") as reading:
 from __future__ import annotations
 
 import asyncio
-from collections.abc import AsyncGenerator, AsyncIterator, Mapping
-from contextlib import aclosing, asynccontextmanager
+from collections.abc import AsyncGenerator, AsyncIterator, Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractAsyncContextManager, AbstractContextManager, aclosing, asynccontextmanager
+from contextvars import ContextVar
 from dataclasses import replace
 from datetime import datetime
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal, Self, overload
+from threading import Lock
+from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar, overload
+from weakref import ref
 
-from sqlalchemy import Dialect, Row, Select
+from sqlalchemy import BinaryExpression, ColumnElement, Connection, Dialect, Result, Row, Select, event
 from sqlalchemy.dialects import postgresql, sqlite
-from sqlalchemy.ext.asyncio import AsyncConnection, AsyncSession, async_sessionmaker
+from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine, AsyncSession, async_sessionmaker
+from sqlalchemy.orm import ORMExecuteState, Session
+from sqlalchemy.orm.identity import IdentityMap
+from sqlalchemy.sql import visitors
+from sqlalchemy.sql.operators import in_op
+from sqlalchemy.util.concurrency import in_greenlet
 
-import pycrorm_async.query.notebook.views  # noqa: F401  registers the views of values
+import pycrorm_async.query.notebook_html  # noqa: F401  registers the views of values
+from pycrorm_async.bulk_records import collecting_seldom
 from pycrorm_async.errors import CallerError, DatabaseUnavailable, UnknownEpisode
-from pycrorm_async.events.blobs import Blob
-from pycrorm_async.events.ids import parse_episode_id
-from pycrorm_async.orm.designators import Designator
+from pycrorm_async.events.ids import parse_episode_id, row_key
+from pycrorm_async.events.types import Blob
+from pycrorm_async.orm.base import EPISODE, KEYS, load_related
 from pycrorm_async.orm.dynamic import DynamicClasses
-from pycrorm_async.projections.schema.generations import Generation, current_generation
-from pycrorm_async.projections.schema.session_views import all_views, with_views
-from pycrorm_async.projections.schema.union import unite
+from pycrorm_async.orm.rows import Designator
+from pycrorm_async.projections.columns import unite
+from pycrorm_async.projections.generations import Generation, all_views, current_generation, with_views
 from pycrorm_async.query import named_queries
-from pycrorm_async.query.as_of import AnyEpisode, as_of
-from pycrorm_async.query.asking.ask import Ask
-from pycrorm_async.query.asking.episode_diff import EpisodeDiff, diff_episodes
-from pycrorm_async.query.asking.episode_list import EpisodeChoice
-from pycrorm_async.query.asking.question import AskedEpisode, FrameQuery, Question, translated_errors
-from pycrorm_async.query.frames.arrow_batches import BATCH_ROWS, arrow_batches
-from pycrorm_async.query.frames.columns import columns_of, select_of
-from pycrorm_async.query.frames.dataframe import Library, dataframe
-from pycrorm_async.query.named_queries import EpisodeSummary
-from pycrorm_async.query.notebook.listings import Episodes, TaskTree
-from pycrorm_async.query.sessions.episode_session import EpisodeSession
-from pycrorm_async.query.sessions.load_on_access import LoadOnAccess
-from pycrorm_async.query.snapshot import Moment
-from pycrorm_async.query.sql.read_only import DEFAULT_LIMITS, ReadOnlySql, SqlLimits, SqlResult, SqlRows
+from pycrorm_async.query.episode_diff import EpisodeDiff, diff_episodes
+from pycrorm_async.query.frames import BATCH_ROWS, Library, arrow_batches, columns_of, dataframe, select_of
+from pycrorm_async.query.named_queries import EpisodeChoice, EpisodeSummary
+from pycrorm_async.query.notebook_html import Episodes, TaskTree
+from pycrorm_async.query.question import AskedEpisode, FrameQuery, Question, translated_errors
+from pycrorm_async.query.questions import Ask
+from pycrorm_async.query.snapshot import AnyEpisode, Moment, as_of
+from pycrorm_async.query.sql import DEFAULT_LIMITS, ReadOnlySql, SqlLimits, SqlResult, SqlRows
 from pycrorm_async.store.address import DatabaseAddress, no_tables
 from pycrorm_async.store.log import EventLog
 
@@ -211,7 +215,7 @@ class Reading:
         return await query.resolved() if isinstance(query, Question) else select_of(query)
 
     async def query(self, sql: str, limits: SqlLimits = DEFAULT_LIMITS) -> SqlResult:
-        """Return the rows of one query in SQL that can only read; see `pycrorm_async.query.sql.read_only`.
+        """Return the rows of one query in SQL that can only read; see `pycrorm_async.query.sql`.
 
         >>> await reading.query("SELECT dtype, count(*) AS nodes FROM task_tree_node GROUP BY dtype")
 
@@ -396,3 +400,156 @@ async def _generation(log: EventLog) -> Generation:
     if generation is None:
         raise DatabaseUnavailable(no_tables(log.address))
     return generation
+
+
+# === episode session ==========================================================================================
+#
+# Load related rows from the part of the tables that has their episode, and unloaded attributes at the first access.
+#
+# SQLAlchemy loads subclasses' columns and related rows by their ids. An id contains the number of its episode, but no
+# database can know that: where the tables are divided by episode, it would look for these ids in every part. So a load
+# of rows of one episode names the episode too. A load of rows of several episodes remains as it is.
+
+
+class _MapReference(ref[IdentityMap]):
+    """The reference to a session's identity map that each of its objects holds; keeps `session` alive with them."""
+
+    session: Session | None = None
+
+
+class EpisodeSession(Session):
+    """A session whose objects load attributes at the first access, also without `await` or after it is closed.
+
+    Its loads of related rows name their episode.
+
+    Args:
+        on_access: runs the loads of attributes that are read without `await`.
+        connect: opens the connections for these loads.
+    """
+
+    def __init__(
+        self,
+        *arguments: Any,
+        on_access: LoadOnAccess,
+        connect: Callable[[AsyncEngine], AbstractAsyncContextManager[AsyncConnection]] = AsyncEngine.connect,
+        **options: Any,
+    ) -> None:
+        super().__init__(*arguments, **options)
+        self._on_access = on_access
+        self._connect = connect
+        self._reference = self._refer()
+
+    def execute(self, *arguments: Any, **options: Any) -> Result[Any]:
+        """Execute a statement; a load of an attribute that is read without `await` runs in a thread of its own."""
+        if in_greenlet():
+            with collecting_seldom():
+                return super().execute(*arguments, **options)
+        # frozen: read while the load's connection is open
+        load = super().execute
+        return self._on_access.run(lambda: load(*arguments, **options).freeze(), self._connect)()
+
+    def close(self) -> None:
+        """Release the connection. The objects stay in the session, and it lives as long as one of them does."""
+        if self.identity_map:
+            self._reference.session = self
+        transaction = self.get_transaction()
+        while transaction is not None:
+            parent = transaction.parent
+            transaction.close()
+            transaction = parent
+
+    def expunge_all(self) -> None:
+        """Remove all objects from the session, which has a new identity map then."""
+        super().expunge_all()
+        self._reference = self._refer()
+
+    def _refer(self) -> _MapReference:
+        # There is no public way to share a reference among the objects, and one of each object would double the time
+        # of `close`, which made half a dictionary for each.
+        reference = _MapReference(self.identity_map)
+        self.identity_map._wr = reference  # noqa: SLF001
+        return reference
+
+    def _connection_for_bind(self, engine: Any, *arguments: Any, **options: Any) -> Connection:
+        # There is no public way to execute a statement of a session on a connection outside its transaction.
+        return self._on_access.connection or super()._connection_for_bind(engine, *arguments, **options)
+
+
+event.listen(EpisodeSession, "do_orm_execute", load_related)
+
+
+@event.listens_for(EpisodeSession, "do_orm_execute")
+def _name_episode(state: ORMExecuteState) -> None:
+    keys = state.parameters.get(KEYS) if isinstance(state.parameters, Mapping) else None
+    if not keys or not isinstance(state.statement, Select) or not all(isinstance(each, int) for each in keys):
+        return
+    number = row_key(min(keys)).number
+    if number != row_key(max(keys)).number:
+        return
+    column = _loaded_by(state.statement)
+    if column is not None and column.key != EPISODE and EPISODE in column.table.c:  # else the keys are episodes
+        state.statement = state.statement.where(column.table.c[EPISODE] == number)
+
+
+def _loaded_by(statement: Select[Any]) -> Any:
+    """Return the column that a load compares with the ids."""
+    criteria: ColumnElement[bool] | None = statement.whereclause
+    for each in visitors.iterate(criteria) if criteria is not None else ():
+        if isinstance(each, BinaryExpression) and each.operator is in_op and getattr(each.right, "key", None) == KEYS:
+            return each.left
+    return None
+
+
+# === load on access ===========================================================================================
+#
+# Load attributes that are read without `await`, on a connection of their own.
+#
+# Theory of operation. Reading `action.arm` is not a coroutine, so the loop of the session cannot await the database
+# meanwhile, and the session's connection belongs to that loop. So the load runs in a loop of its own, in a thread, on
+# another connection, and blocks the loop of the reader until it has ended, for the time of a query or two. Only that
+# thread uses the session meanwhile, because the session's loop is blocked. Each load sees the present state of the
+# database, as each statement of a PostgreSQL session does. The engine keeps no connection between two loads, because a
+# connection belongs to the loop that opened it; a lock makes the loads of several threads take turns.
+
+_Result = TypeVar("_Result")
+
+
+class LoadOnAccess:
+    """Runs loads of attributes in a thread, on connections of an engine that nothing else uses.
+
+    Args:
+        engine: of the memory; its connections are opened and closed for each load.
+        translated: translates the driver's errors.
+    """
+
+    def __init__(self, engine: AsyncEngine, translated: Callable[[], AbstractContextManager[None]]) -> None:
+        self.engine = engine
+        self._translated = translated
+        self._lock = Lock()
+        self._connection: ContextVar[Connection | None] = ContextVar("connection_of_load", default=None)
+
+    @property
+    def connection(self) -> Connection | None:
+        """The connection of the load that runs in this context; None outside of loads."""
+        return self._connection.get()
+
+    def run(
+        self,
+        load: Callable[[], _Result],
+        connect: Callable[[AsyncEngine], AbstractAsyncContextManager[AsyncConnection]] = AsyncEngine.connect,
+    ) -> _Result:
+        """Run a load with a connection from `connect`, and wait for its result. Raises as the load does."""
+
+        def with_connection(connection: Connection) -> _Result:
+            self._connection.set(connection)
+            return load()
+
+        async def in_own_loop() -> _Result:
+            try:
+                async with connect(self.engine) as connection:
+                    return await connection.run_sync(with_connection)
+            finally:
+                await self.engine.dispose()
+
+        with self._lock, self._translated(), ThreadPoolExecutor(1, thread_name_prefix="pycrorm-load") as thread:
+            return thread.submit(asyncio.run, in_own_loop()).result()

@@ -13,21 +13,51 @@ Pose(position=[1.3, 1.0, 0.9], orientation=[0.0, 0.0, 0.0, 1.0], frame='map')
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import html
+import itertools
+import math
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
-from datetime import datetime
-from typing import TYPE_CHECKING, Any, NamedTuple
+from datetime import UTC, datetime, timedelta
+from numbers import Integral, Real
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
-from pycrorm_async.errors import CallerError
-from pycrorm_async.events.types import DescriptionDeclared
-from pycrorm_async.query.named_queries import NodeSummary
-from pycrorm_async.query.percepts_and_places import Percept, PlaceSearch
-from pycrorm_async.query.value_html import NotebookValue
-from pycrorm_async.world.pose import Pose
-from pycrorm_async.world.state import ObjectState, WorldState
+import numpy as np
+from numpy.typing import NDArray
+
+from pycrorm_async.errors import CallerError, DatabaseForeign, LogDamaged, PycrormError, UnknownEpisode
+from pycrorm_async.events.codec import description_of
+from pycrorm_async.events.fields import retagged
+from pycrorm_async.events.ids import SLOT_NODE, row_id
+from pycrorm_async.events.types import (
+    EVENT_TYPES,
+    DescriptionDeclared,
+    EpisodeEnded,
+    EpisodeStarted,
+    EpisodeTagged,
+    FailureValue,
+    Happening,
+    LocationResolved,
+    NodeEnded,
+    NodeStarted,
+    ObjectDetected,
+    Observed,
+)
+from pycrorm_async.projections.fold import WorldFold, WorldObject, happening_of
+from pycrorm_async.projections.row_batch import CannotFold
+from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary, Percept, PlaceSearch, percepts_in, search_in
+from pycrorm_async.query.scene import Frame, assumed_model, link_frames, object_model, placed, triangles_of
+from pycrorm_async.query.text import Drawing, NotebookValue, one_line, with_object_names
+from pycrorm_async.store.log import EventLog, episode_named
+from pycrorm_async.store.stored import StoredEvent
+from pycrorm_async.world.bullet_body import ObjectState, WorldState
+from pycrorm_async.world.pose import MalformedPose, Pose
+from pycrorm_async.world.urdf import robot_description
 
 if TYPE_CHECKING:
-    from pycrorm_async.query.notebook.markup import Drawing
+    from pycrorm_async.record.episode import Episode
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -134,7 +164,6 @@ class WorldThen(NotebookValue):
 
     def map(self) -> Drawing:
         """Return the world from above, as SVG that a notebook draws."""
-        from pycrorm_async.query.notebook.world_map import world_map
 
         return world_map(self)
 
@@ -209,3 +238,576 @@ class Moment(NotebookValue):
     def map(self) -> Drawing:
         """Return the world from above, as SVG that a notebook draws."""
         return self.world.map()
+
+
+# === as of ====================================================================================================
+#
+# Compute the task tree and the world of an episode at any moment by folding its events up to then.
+#
+# It reads the log and not the tables, which contain only the final state of each node. So it also works for events that
+# are not folded yet, and for parked episodes. It reads no further than one page beyond the moment.
+
+AnyEpisode: TypeAlias = "int | str | Episode | EpisodeSummary"
+"""An episode by its number, its id or the first digits of it, `last`, or as an `Episode` or `EpisodeSummary`."""
+
+_NUMBERS_END = 1e15
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+
+_Within: TypeAlias = Callable[[StoredEvent, StoredEvent], bool]
+"""Takes the episode's first event and another event; returns whether the other is not later than the moment."""
+
+
+async def as_of(
+    log: EventLog,
+    episode: AnyEpisode,
+    *,
+    time: float | datetime | None = None,
+    sequence: int | None = None,
+    meshes: bool = False,
+) -> Moment:
+    """Return the episode's state at a moment; see `Reading.as_of`."""
+    limit, within = _limit(time, sequence)
+    row = await episode_named(log, str(episode.number if isinstance(episode, EpisodeSummary) else episode))
+    if row.head == 0:
+        raise UnknownEpisode(f"the log has no event of episode {row.number}")
+    fold = MomentFold(row.number, row.id)
+    async for page in log.pages(row):
+        if not _read(fold, page, within, log):
+            break
+    if fold.first is None:
+        raise CallerError(f"{limit} is before episode {row.number} began")
+    payloads = await log.descriptions(fold.descriptions)
+    descriptions = {name: _description(payload) for name, payload in payloads.items()}
+    return fold.moment(await log.dtypes(), descriptions, await _meshes(log, descriptions.values()) if meshes else {})
+
+
+async def _meshes(log: EventLog, descriptions: Iterable[DescriptionDeclared]) -> dict[str, bytes]:
+    """Read the mesh files that are recorded; one that is missing or damaged in the log is left out."""
+    recorded = {mesh.content.hash for each in descriptions for mesh in each.meshes if mesh.content is not None}
+    with log.translated():
+        contents = {name: await log.blobs.read_blob(name) for name in recorded}
+    return {name: content for name, content in contents.items() if content is not None}
+
+
+def _description(payload: bytes) -> DescriptionDeclared:
+    """Decode a description; one that this version cannot read is missing, with the reason."""
+    try:
+        return description_of(payload)
+    except ValueError as error:
+        return DescriptionDeclared(missing=f"it cannot be read: {error}")
+
+
+def _read(fold: MomentFold, page: Sequence[StoredEvent], within: _Within, log: EventLog) -> bool:
+    """Fold the events of a page up to the moment; return whether the next page may have more."""
+    for event in page:
+        if not within(fold.first if fold.first is not None else event, event):
+            return False
+        try:
+            fold.read(event)
+        except CannotFold as reason:
+            raise unreadable(fold.id, event, str(reason), log) from None
+    return True
+
+
+def _limit(time: float | datetime | None, sequence: int | None) -> tuple[str, _Within]:
+    """Return the moment as text and as a condition. Raises `CallerError`."""
+    if (time is None) == (sequence is None):
+        raise CallerError("a moment needs either a time or the sequence of an event: pass exactly one of them")
+    if sequence is not None:
+        last = _number(sequence, Integral)
+        if last is None:
+            raise CallerError(f"sequence must be an integer, got {sequence!r}")
+        return f"event {last:.0f}", lambda _, event: event.sequence <= last
+    if isinstance(time, datetime):
+        if time.utcoffset() is None:
+            raise CallerError(f"{time!r} has no time zone: add one, for example .replace(tzinfo=UTC)")
+        wall_us = (time - _EPOCH) // timedelta(microseconds=1)
+        return time.isoformat(" "), lambda _, event: event.wall_ns // 1000 <= wall_us
+    seconds = _number(time, Real)
+    if seconds is None:
+        raise CallerError(f"time must be seconds since the episode's start or a datetime, got {time!r}")
+    since_ns = round(seconds * 1e9)
+    return f"{seconds:g} s", lambda first, event: event.monotonic_ns - first.monotonic_ns <= since_ns
+
+
+def parse_moment(text: str, option: str = "at") -> tuple[float | None, int | None]:
+    """Parse the text of a moment as seconds or as the sequence of an event. Raises `CallerError`.
+
+    >>> parse_moment("12.5"), parse_moment("e300"), parse_moment("#300")
+    ((12.5, None), (None, 300), (None, 300))
+    """
+    try:
+        return (None, int(text[1:])) if text[:1] in ("e", "#") else (float(text), None)
+    except ValueError:
+        raise CallerError(
+            f"{option} takes seconds since the episode's start, or an event such as e300, got {text!r}"
+        ) from None
+
+
+def _number(value: Any, kind: type) -> float | None:
+    """Return a Python or NumPy number as a float; None if it is not finite or of another kind."""
+    is_number = isinstance(value, kind) and not isinstance(value, bool)
+    return float(value) if is_number and abs(value) < _NUMBERS_END else None
+
+
+def unreadable(episode: str, event: StoredEvent, reason: str, log: EventLog) -> PycrormError:
+    """Return the error for an event that cannot be folded: of a newer version, or damaged."""
+    shape = EVENT_TYPES.get(event.type)
+    if shape is not None and event.version <= shape.version:
+        return LogDamaged(episode, event.sequence, reason)
+    return DatabaseForeign(
+        f"{log.address}: episode {episode}, event {event.sequence}: {reason}: use a newer pycrorm, or ask for a moment"
+        f" before event {event.sequence}"
+    )
+
+
+# === world map ================================================================================================
+#
+# Draw the world of a moment from above, as SVG on a light ground.
+
+_SIZE_PX = 460.0
+"""The longer side of a map in pixels."""
+_SIZE_MIN_M = 2.0
+"""The least longer side of a map in m, so that a single small object does not fill it."""
+_MARGIN_M = 0.3
+"""The least margin around the objects, in m."""
+_LINES_MAX = 40
+"""Bounds the lines of the grid along an axis."""
+_OUTLINES_MAX = 3_000
+"""Bounds the shapes of a map; of more, the highest are drawn."""
+_NAMES_MAX = 60
+"""Bounds the objects whose names are drawn."""
+
+
+def world_map(world: WorldThen) -> Drawing:
+    """Return the outlines of all objects from above, with the names of those that are not the environment."""
+    shapes = outlines(world)[-_OUTLINES_MAX:]
+    left, right, low, high = _extent([point for each in shapes for point in each.corners])
+    scale = _SIZE_PX / max(right - left, high - low)
+    width, height = (right - left) * scale, (high - low) * scale
+
+    def at(point: Point) -> Point:
+        return (point[0] - left) * scale, (high - point[1]) * scale
+
+    parts = [f'<rect width="{width:.0f}" height="{height:.0f}" fill="#f4f6f9"/>']
+    parts += [f'<path d="{_line(at((x, low)), at((x, high)))}" stroke="#d3d9e2"/>' for x in _grid(left, right)]
+    parts += [f'<path d="{_line(at((left, y)), at((right, y)))}" stroke="#d3d9e2"/>' for y in _grid(low, high)]
+    parts += [_polygon(each, [at(corner) for corner in each.corners]) for each in shapes]
+    named = [each for each in world.objects if each.object_type != "ENVIRONMENT"][:_NAMES_MAX]
+    parts += _names(named, [at((each.pose.position.x, each.pose.position.y)) for each in named])
+    step = _step(right - left)
+    parts.append(f'<text x="6" y="{height - 6:.0f}" fill="#5a6675" stroke="none">grid of {step:g} m</text>')
+    return Drawing(
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:.0f} {height:.0f}" role="img"'
+        f' aria-label="map of {len(world.objects)} objects from above" font-family="system-ui,sans-serif"'
+        f' font-size="12" style="width:100%;max-width:{width:.0f}px">{"".join(parts)}</svg>'
+    )
+
+
+def _extent(points: Sequence[Point]) -> tuple[float, float, float, float]:
+    if not points:
+        return -1.0, 1.0, -1.0, 1.0
+    (left, right), (low, high) = ((min(each), max(each)) for each in zip(*points, strict=True))
+    margin = max(_MARGIN_M, (_SIZE_MIN_M - max(right - left, high - low)) / 2)
+    return left - margin, right + margin, low - margin, high + margin
+
+
+def _step(width: float) -> float:
+    return float(10 ** max(0, math.ceil(math.log10(width / _LINES_MAX))))
+
+
+def _grid(low: float, high: float) -> Iterator[float]:
+    step = _step(high - low)
+    yield from (index * step for index in range(math.ceil(low / step), math.floor(high / step) + 1))
+
+
+def _line(start: Point, end: Point) -> str:
+    return f"M{start[0]:.1f} {start[1]:.1f}L{end[0]:.1f} {end[1]:.1f}"
+
+
+def _polygon(shape: Outline, corners: Iterable[Point]) -> str:
+    red, green, blue, opacity = (min(max(each, 0.0), 1.0) for each in shape.color)
+    points = " ".join(f"{x:.1f},{y:.1f}" for x, y in corners)
+    color = f"#{round(red * 255):02x}{round(green * 255):02x}{round(blue * 255):02x}"
+    paint = f'fill="{color}" fill-opacity="{opacity:.2g}" stroke="#1a2330" stroke-opacity=".55" stroke-width=".7"'
+    return f'<polygon points="{points}" {paint}/>'
+
+
+def _names(objects: Sequence[ObjectThen], positions: Sequence[Point]) -> Iterator[str]:
+    """Yield the names above the objects, each moved up until it covers no other name."""
+    taken: list[tuple[float, float, float]] = []
+    for each, (x, y) in zip(objects, positions, strict=True):
+        name = one_line(each.name, 30)
+        half, y = len(name) * 3.4, y - 8
+        while any(abs(x - other) < half + width and abs(y - top) < 13 for other, top, width in taken):
+            y -= 13
+        taken.append((x, y, half))
+        paint = 'fill="#1a2330" stroke="#f4f6f9" stroke-width="3" paint-order="stroke" text-anchor="middle"'
+        yield f'<text x="{x:.1f}" y="{y:.1f}" {paint}>{html.escape(name)}</text>'
+
+
+# === outlines =================================================================================================
+#
+# Compute the outlines from above of the objects of a moment: the convex hull of each shape.
+#
+# A mesh has the hull of its vertices where the moment has its file, otherwise that of the box around its link.
+
+Point: TypeAlias = tuple[float, float]
+_Points: TypeAlias = NDArray[np.floating]
+
+_GREY = (0.62, 0.64, 0.68, 1.0)
+_CORNERS = np.array(list(itertools.product((-0.5, 0.5), repeat=3)))
+_DIRECTIONS = np.array([(math.cos(angle), math.sin(angle)) for angle in np.arange(128) * math.tau / 128])
+"""The directions in which a mesh's outermost vertices are sought: a drawing of 460 pixels shows no more."""
+_CIRCLE = np.c_[_DIRECTIONS[::4], np.zeros(len(_DIRECTIONS[::4]))]
+"""The corners of a circle of radius 1 m."""
+_DECIMALS = 6
+"""Rounds corners to 1 µm, so that those above each other are one."""
+
+
+class Outline(NamedTuple):
+    """The outline of one shape: its corners and its highest point in "map", m, and red, green, blue, opacity."""
+
+    object: ObjectThen
+    corners: tuple[Point, ...]
+    top: float
+    color: tuple[float, ...]
+
+
+class _Model(NamedTuple):
+    """A model from `object_model`, and the vertices of the meshes that it draws, by their references."""
+
+    model: Mapping[str, Any]
+    meshes: Mapping[str, _Points]
+
+
+def outlines(world: WorldThen) -> list[Outline]:
+    """Return the outlines of all shapes of a world, the lowest first, so that higher ones are drawn over them."""
+    models: dict[str, _Model] = {}
+    every: list[Outline] = []
+    for then in world.objects:
+        fingerprint = then.description_fingerprint
+        if fingerprint is None or fingerprint not in world.descriptions:
+            model = _Model(assumed_model(then.name, then.object_type, set(then.joints)), {})
+        else:
+            if fingerprint not in models:
+                models[fingerprint] = _recorded_model(world.descriptions[fingerprint], world.meshes)
+            model = models[fingerprint]
+        every.extend(_outlines(then, model))
+    return sorted(every, key=lambda each: each.top)
+
+
+def _recorded_model(description: DescriptionDeclared, contents: Mapping[str, bytes]) -> _Model:
+    meshes: dict[str, _Points] = {}
+    for mesh in description.meshes:
+        if mesh.content is None or mesh.content.hash not in contents:
+            continue
+        with suppress(ValueError):  # a file that cannot be read is drawn as the box
+            meshes[mesh.reference] = triangles_of(mesh.name, contents[mesh.content.hash]).vertices
+    return _Model(object_model(description, drawn=frozenset(meshes)), meshes)
+
+
+def _outlines(then: ObjectThen, model: _Model) -> Iterator[Outline]:
+    frames = link_frames(model.model, then.pose, then.joints, then.base_link)
+    for link, shapes in model.model["shapes"].items():
+        if link not in frames:  # a description with two root links
+            continue
+        for kind, sizes, xyz, rpy, color in shapes:
+            points = _points(kind, sizes, frames[link] @ placed(xyz, rpy), model.meshes)
+            top = float(points[:, 2].max())
+            yield Outline(then, _hull(_outermost(points[:, :2])), top, tuple(then.color or color or _GREY))
+
+
+def _points(kind: str, sizes: Sequence[Any], frame: Frame, meshes: Mapping[str, _Points]) -> _Points:
+    """Return points in "map" whose outline from above is that of the shape, the highest one among them."""
+    points: _Points
+    if kind in ("sphere", "capsule"):
+        radius, half = sizes[0], sizes[1] / 2 if kind == "capsule" else 0.0
+        ends = _moved(np.array([(0, 0, -half), (0, 0, half)]), frame)
+        ball = radius * np.vstack([_CIRCLE, (0, 0, 1)])
+        points = (ends[:, None] + ball).reshape(-1, 3)
+        return points
+    if kind == "cylinder":
+        radius, height = sizes
+        ends = np.array([(0, 0, -height / 2), (0, 0, height / 2)])
+        return _moved((ends[:, None] + radius * _CIRCLE).reshape(-1, 3), frame)
+    points = meshes[sizes[0]] * sizes[1:] if kind == "mesh" else _CORNERS * sizes
+    return _moved(points, frame)
+
+
+def _moved(points: _Points, frame: Frame) -> _Points:
+    return np.asarray(points @ frame[:3, :3].T + frame[:3, 3])
+
+
+def _outermost(points: _Points) -> list[Point]:
+    """Return the points in the plane, each once; of many, those that lie outermost in one of some directions."""
+    if len(points) > len(_DIRECTIONS):
+        points = points[(points @ _DIRECTIONS.T).argmax(axis=0)]
+    return [(float(x), float(y)) for x, y in np.unique(points.round(_DECIMALS), axis=0)]
+
+
+def _hull(points: Sequence[Point]) -> tuple[Point, ...]:
+    """Return the corners of the convex hull of points in the plane, counterclockwise (Andrew's monotone chain)."""
+    ordered = sorted(points)
+
+    def chain(passed: Sequence[Point]) -> list[Point]:
+        corners: list[Point] = []
+        for x, y in passed:
+            while len(corners) > 1:
+                (a, b), (c, d) = corners[-2:]
+                if (c - a) * (y - b) - (d - b) * (x - a) > 0:
+                    break
+                corners.pop()
+            corners.append((x, y))
+        return corners[:-1]
+
+    return (*chain(ordered), *chain(ordered[::-1]))
+
+
+# === snapshot fold ============================================================================================
+#
+# Fold an episode's events into the state of its task tree and world at a moment.
+#
+# The fold is pure, and its memory grows with the state it describes. It ignores StateSampled: every pose and joint in a
+# sample had an exact event of its own, while the sample may be older than the event before it.
+
+_LATEST_MAX = 100
+"""Bounds the percepts and the searches for places of a snapshot, each: an episode may have many thousands."""
+
+
+@dataclass(slots=True)
+class _Node:
+    """The state of a node, without the robot's state and the result, to save memory."""
+
+    kind: str
+    parent: int | None
+    designator: str | None
+    parameters: dict[str, Any]
+    simulated: bool
+    wall_ns: int
+    monotonic_ns: int
+    status: str = "RUNNING"
+    ended_ns: int | None = None
+    end_sequence: int | None = None
+    failure: FailureValue | None = None
+    considered: int = 0
+    offered: int = 0
+    detected: int = 0
+
+
+class MomentFold:
+    """The state of an episode after the events read so far.
+
+    Attributes:
+        first: the first event; None before it is read.
+    """
+
+    def __init__(self, number: int, identity: str) -> None:
+        self.number = number
+        self.id = identity
+        self.first: StoredEvent | None = None
+        self._started: EpisodeStarted | None = None
+        self._last: StoredEvent | None = None
+        self._status = "RUNNING"
+        self._nodes: dict[int, _Node] = {}
+        self._fold = WorldFold()
+        self._tags: tuple[str, ...] = ()
+        self._observed: dict[str, tuple[StoredEvent, Observed]] = {}
+        self._percepts: deque[Percept] = deque(maxlen=_LATEST_MAX)
+        self._places: deque[PlaceSearch] = deque(maxlen=_LATEST_MAX)
+
+    def read(self, event: StoredEvent) -> None:
+        """Apply the next event. Raises `CannotFold`."""
+        if self.first is None and event.type != "EpisodeStarted":
+            raise CannotFold(f"the episode begins with {event.type} instead of EpisodeStarted")
+        if event.type != "StateSampled":
+            self._happened(event, happening_of(event))
+        self.first = event if self.first is None else self.first
+        self._last = event
+
+    def _happened(self, event: StoredEvent, happening: Happening) -> None:
+        match happening:
+            case NodeStarted():
+                if happening.parent is not None and happening.parent not in self._nodes:
+                    raise CannotFold(f"its parent {happening.parent} never started")
+                self._nodes[event.sequence] = _Node(
+                    happening.kind,
+                    happening.parent,
+                    happening.designator,
+                    happening.parameters,
+                    happening.simulated,
+                    event.wall_ns,
+                    event.monotonic_ns,
+                )
+            case NodeEnded():
+                if (node := self._nodes.get(happening.node)) is None:
+                    raise CannotFold(f"node {happening.node} ends and never started")
+                node.status, node.failure = happening.status, happening.failure
+                if happening.status != "LOST":
+                    node.ended_ns, node.end_sequence = event.monotonic_ns, event.sequence
+            case EpisodeStarted():
+                if self._started is not None:
+                    raise CannotFold("the episode starts a second time")
+                self._started = happening
+                self._tags = retagged((), happening.tags, ())
+            case EpisodeTagged():
+                self._tags = retagged(self._tags, happening.added, happening.removed)
+            case EpisodeEnded():
+                self._ended(happening.status)
+            case Observed():
+                self._observed[happening.name] = event, happening
+            case ObjectDetected() | LocationResolved():
+                self._answered(event, happening)
+            case _:
+                self._fold.read(event.sequence, happening)
+
+    def _answered(self, event: StoredEvent, answer: ObjectDetected | LocationResolved) -> None:
+        """Keep the answer of perception or of a location designator, and count it at the node that asked."""
+        node = self._nodes.get(answer.node or 0)
+        if isinstance(answer, ObjectDetected):
+            percepts = percepts_in(self.number, event, answer)
+            self._percepts.extend(percepts)
+            if node is not None:
+                node.detected += len(percepts)
+            return
+        search = search_in(self.number, event, answer)
+        self._places.append(search)
+        if node is not None:
+            node.considered += search.considered
+            node.offered += search.offered
+
+    def _ended(self, status: str) -> None:
+        self._status = status
+        if status == "LOST":  # the process died, so the outcome of its running nodes is unknown
+            for node in self._nodes.values():
+                if node.status == "RUNNING":
+                    node.status = "LOST"
+
+    # --- the result -------------------------------------------------------------------------------------------
+
+    @property
+    def descriptions(self) -> set[str]:
+        """The fingerprints of the objects' descriptions."""
+        return {each.description for each in self._fold.objects.values() if each.description is not None}
+
+    def moment(
+        self,
+        dtypes: Mapping[str, str],
+        descriptions: Mapping[str, DescriptionDeclared],
+        meshes: Mapping[str, bytes],
+    ) -> Moment:
+        """Return the state as values. Raises `LogDamaged`.
+
+        Args:
+            dtypes: the dtype of each declaration, by fingerprint.
+            descriptions: those of the objects, by fingerprint.
+            meshes: contents of their mesh files, by SHA-256.
+        """
+        started, first, last = self._started, self.first, self._last
+        assert started is not None
+        assert first is not None
+        assert last is not None
+        return Moment(
+            number=self.number,
+            id=self.id,
+            description=started.description,
+            created_by=started.created_by,
+            started_at=_moment(first.wall_ns),
+            simulated=started.simulated,
+            sequence=last.sequence,
+            time_s=(last.monotonic_ns - first.monotonic_ns) / 1e9,
+            at=_moment(last.wall_ns),
+            status=self._status,
+            tree=tuple(self._tree(dtypes, first.monotonic_ns)),
+            world=self._world(descriptions, meshes),
+            observations={name: self._observation(*each) for name, each in self._observed.items()},
+            tags=self._tags,
+            percepts=tuple(self._percepts),
+            places=tuple(self._places),
+        )
+
+    def _observation(self, event: StoredEvent, observed: Observed) -> ObservationThen:
+        assert self.first is not None
+        return ObservationThen(
+            values=observed.values,
+            sequence=event.sequence,
+            time_s=(event.monotonic_ns - self.first.monotonic_ns) / 1e9,
+            node=row_id(self.number, observed.node, SLOT_NODE) if observed.node is not None else None,
+            missing=observed.missing,
+        )
+
+    def _tree(self, dtypes: Mapping[str, str], start_ns: int) -> Iterator[NodeThen]:
+        children: dict[int | None, list[int]] = {}
+        for sequence, node in self._nodes.items():
+            children.setdefault(node.parent, []).append(sequence)
+        stack = [(sequence, 0) for sequence in reversed(children.get(None, []))]
+        while stack:
+            sequence, depth = stack.pop()
+            yield self._node(sequence, depth, dtypes, start_ns)
+            stack.extend((child, depth + 1) for child in reversed(children.get(sequence, [])))
+
+    def _node(self, sequence: int, depth: int, dtypes: Mapping[str, str], start_ns: int) -> NodeThen:
+        node = self._nodes[sequence]
+        if node.designator is not None and node.designator not in dtypes:
+            raise LogDamaged(self.id, sequence, f"the designator type {node.designator} was never declared")
+        return NodeThen(
+            id=row_id(self.number, sequence, SLOT_NODE),
+            parent_id=row_id(self.number, node.parent, SLOT_NODE) if node.parent is not None else None,
+            depth=depth,
+            dtype=dtypes[node.designator] if node.designator is not None else None,
+            kind=node.kind,
+            parameters=with_object_names(node.parameters, lambda each: self._fold.names.get(each["object"])),
+            status=node.status,
+            started_at=_moment(node.wall_ns),
+            duration_ns=node.ended_ns - node.monotonic_ns if node.ended_ns is not None else None,
+            reason=node.failure.type.rpartition(".")[2] if node.failure is not None else None,
+            failure_message=node.failure.message if node.failure is not None else None,
+            simulated=node.simulated,
+            sequence=sequence,
+            end_sequence=node.end_sequence,
+            start_s=(node.monotonic_ns - start_ns) / 1e9,
+            end_s=(node.ended_ns - start_ns) / 1e9 if node.ended_ns is not None else None,
+            considered=node.considered,
+            offered=node.offered,
+            detected=node.detected,
+        )
+
+    def _world(self, descriptions: Mapping[str, DescriptionDeclared], meshes: Mapping[str, bytes]) -> WorldThen:
+        objects = tuple(self._object(identity, each) for identity, each in self._fold.objects.items())
+        robots = tuple(_robot(each) for each in objects if each.object_type == "ROBOT")
+        return WorldThen(objects, robots[0] if robots else None, descriptions, meshes, robots)
+
+    def _object(self, identity: int, value: WorldObject) -> ObjectThen:
+        at = value.pose
+        try:
+            pose = Pose(at.position, at.orientation, at.frame, at.time_ns)
+        except MalformedPose as error:
+            raise LogDamaged(self.id, value.row, str(error)) from None
+        parent = value.attached_to
+        return ObjectThen(
+            id=row_id(self.number, value.row, SLOT_NODE),
+            identity_id=row_id(self.number, identity, SLOT_NODE),
+            name=value.name,
+            object_type=value.object_type,
+            pose=pose,
+            joints=value.joints,
+            attached_to=(self._fold.names[parent[0]], parent[1])
+            if parent is not None and parent[0] in self._fold.objects
+            else None,
+            description_fingerprint=value.description,
+            color=value.color,
+            model=value.model,
+            serial=value.serial,
+            mass_kg=value.mass_kg,
+            base_link=value.base_link,
+        )
+
+
+def _robot(robot: ObjectThen) -> RobotThen:
+    description = robot_description(robot.model or robot.name)
+    torso = description.torso_joint if description is not None else None
+    return RobotThen(robot.name, robot.pose, robot.joints.get(torso) if torso is not None else None)
+
+
+def _moment(wall_ns: int) -> datetime:
+    return _EPOCH + timedelta(microseconds=wall_ns // 1000)

@@ -7,12 +7,12 @@
       <recorder>/              one recorder, one life of a process; the name is its UUID, so names sort by time
         alive                  locked (flock) by the recorder as long as it lives
         drain                  locked by the process that drains the folder
-        progress               how far another process has drained the folder (`files/drain_status.py`)
+        progress               how far another process has drained the folder (`spool.py`)
         00000001.segment       append-only, numbered without gaps, oldest deleted first, never reused
         00000002.segment       the last one may be allocated ahead: all zero
         00000001.segment.tail  the torn bytes cut off the end of a segment
-        blobs/<sha256>         a content too large for an event (`blobs/blob_files.py`)
-      <recorder>.<episode>.refused/   dead letters of this episode (`sources/dead_letters.py`), in the same format
+        blobs/<sha256>         a content too large for an event (`blobs.py`)
+      <recorder>.<episode>.refused/   dead letters of this episode (`sources.py`), in the same format
       <recorder>.damaged/      a damaged folder, unchanged, after `repair` replaced it
 
 All numbers in segments are little endian, and every structure begins at a multiple of 8 bytes.
@@ -63,9 +63,8 @@ if its base is the next position. The oldest segment's header lists the open epi
 when the segments that began them are deleted: a segment is deleted only after the next one's header is on the disk.
 """
 
-from pycrorm_async.queue.files.spool import RecorderFolder, Spool
-from pycrorm_async.queue.live.recorder_queue import RecorderQueue
-from pycrorm_async.queue.sources.dead_source import DeadSource, open_dead
-from pycrorm_async.queue.sources.live_source import LiveSource
+from pycrorm_async.queue.recorder_queue import RecorderQueue
+from pycrorm_async.queue.sources import DeadSource, LiveSource, open_dead
+from pycrorm_async.queue.spool import RecorderFolder, Spool
 
 __all__ = ["RecorderQueue", "LiveSource", "DeadSource", "open_dead", "Spool", "RecorderFolder"]

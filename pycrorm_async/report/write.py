@@ -7,26 +7,48 @@ Report(path=PosixPath('breakfast.html'), first=1, last=188, events=188)
 from __future__ import annotations
 
 import asyncio
+import base64
+import hashlib
+import html
+import re
 import shutil
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
+from functools import cache
+from importlib import resources
 from os import PathLike
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, Final, NamedTuple
 from urllib.parse import quote
 
-from pycrorm_async.errors import CallerError, DatabaseForeign, LogDamaged
-from pycrorm_async.query.as_of import AnyEpisode
-from pycrorm_async.query.asking.episode_list import EpisodeChoice
-from pycrorm_async.query.asking.unknown_names import absence_of_episodes
-from pycrorm_async.query.named_queries import EpisodeSummary
+import msgspec
+import numpy as np
+from sqlalchemy import func, select
+from sqlalchemy.orm import aliased
+
+from pycrorm_async.errors import (
+    CallerError,
+    DamageError,
+    DatabaseForeign,
+    DatabaseUnavailable,
+    LogDamaged,
+    TablesOutdated,
+)
+from pycrorm_async.events.ids import SLOT_NODE, row_id
+from pycrorm_async.orm import TaskTreeNode
+from pycrorm_async.query.named_queries import EpisodeChoice, EpisodeSummary
+from pycrorm_async.query.question import absence_of_episodes
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.report.episode_data import episode_document
-from pycrorm_async.report.html_page import overview_page_of, page_of, write_page
-from pycrorm_async.report.output_files import refuse_existing
-from pycrorm_async.report.overview_data import newest_episodes, overview_document
-from pycrorm_async.report.similar_cases import SimilarCases, page_name
-from pycrorm_async.report.success_data import Plot, success_documents
+from pycrorm_async.query.snapshot import AnyEpisode
+from pycrorm_async.query.success import PICK_UPS, Axis, success_samples, success_table
+from pycrorm_async.recall.answer import Answer, Compared, RecalledCase, answer
+from pycrorm_async.recall.blocks import CaseLibrary, Group
+from pycrorm_async.recall.columns import Case
+from pycrorm_async.recall.recall import CaseReader, DatabaseSource, cue_like
+from pycrorm_async.report.document import episode_document
+from pycrorm_async.report.output_files import refuse_existing, write_file
+from pycrorm_async.task_status import TaskStatus
 
 _PAGES_MAX = 200
 """Bounds the pages behind an overview: one has about 0.7 MB."""
@@ -164,3 +186,379 @@ async def _write_pages(
         except (LogDamaged, DatabaseForeign) as error:
             unreadable[each.number] = str(error)
     return unreadable
+
+
+# === html page ================================================================================================
+#
+# Write the document of an episode into one HTML file that opens offline and makes no request.
+#
+# The Content-Security-Policy allows the page's own style and scripts by their hashes, and nothing else. Recorded text
+# is in the page only as JSON in which `<` is escaped, and in its title; the scripts set it as text.
+#
+# A document with a `live` entry becomes a live page, which has one more module, `stream.js`, and may connect to its own
+# server for the parts of the document that follow.
+
+_EPISODE = (
+    "dom episode bodies extent path_lines scene_camera scene_view map_view tree_view gantt_bars gantt_view"
+    " similar panels playback main"
+).split()
+_OVERVIEW = "dom episode success overview".split()
+"""The modules of each page's program, every one behind those that it imports."""
+_STREAM = ("stream",)
+_SELF = "'self'"
+_TITLE_MAX = 200
+"""Bounds the characters of the description in title and heading."""
+_ESCAPES = {
+    b"<": rb"\u003c",
+    b">": rb"\u003e",
+    b"&": rb"\u0026",
+    b"\xe2\x80\xa8": rb"\u2028",
+    b"\xe2\x80\xa9": rb"\u2029",
+}
+_CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]")
+_IMPORT = re.compile(r"^import \{[^}]*\} from \"\./\w+\.js\";\n", re.MULTILINE)
+_EXPORT = re.compile(r"^export (?=(const|class|function) )", re.MULTILINE)
+
+
+def page_of(document: Mapping[str, Any]) -> str:
+    """Return the page of a document from `episode_document`."""
+    episode = document["episode"]
+    heading = episode["description"] or f"Episode {episode['number']}"
+    scripts = (_asset("assets/three.bundle.js"), _program(*_EPISODE, *_stream_of(document)))
+    return _page(document, heading, f" · episode {episode['number']}", _asset("web/episode_body.html"), scripts)
+
+
+def overview_page_of(document: Mapping[str, Any]) -> str:
+    """Return the page of a document from `overview_document`."""
+    scripts = (_program(*_OVERVIEW, *_stream_of(document)),)
+    return _page(document, document["title"], "", _asset("web/overview_body.html"), scripts)
+
+
+def _stream_of(document: Mapping[str, Any]) -> tuple[str, ...]:
+    return _STREAM if "live" in document else ()
+
+
+def _page(document: Mapping[str, Any], heading: str, suffix: str, body: str, scripts: Sequence[str]) -> str:
+    heading, style = heading[:_TITLE_MAX], _asset("web/page.css")
+    policy = (
+        f"default-src 'none'; script-src {' '.join(map(_hash, scripts))}; style-src {_hash(style)};"
+        f" img-src data:; base-uri 'none'; form-action 'none'{'; connect-src ' + _SELF if 'live' in document else ''}"
+    )
+    parts = {
+        "policy": policy,
+        "title": html.escape(_CONTROL.sub(_visible, heading) + suffix),
+        "style": style,
+        "body": body.replace("{heading}", html.escape(heading)),
+        "document": _safe_json(document),
+        "scripts": "\n".join(f"<script>{each}</script>" for each in scripts),
+    }
+    return re.sub(r"\{(\w+)\}", lambda match: parts[match[1]], _asset("web/page.html"))
+
+
+def _visible(control: re.Match[str]) -> str:
+    """Return a sign for a control character, which would reorder or break the title of a window."""
+    code = ord(control[0])
+    return chr(0x2400 + code) if code < 0x20 else f"<U+{code:04X}>"
+
+
+def write_page(page: str, path: Path, *, force: bool = False) -> None:
+    """Write a page to a file that is complete as soon as it has its name. Raises `CallerError`, `OSError`."""
+    write_file(page.encode(), path, force=force)
+
+
+def _safe_json(document: Mapping[str, Any]) -> str:
+    """Encode as JSON that ends no <script> element, whatever the document holds."""
+    encoded = msgspec.json.encode(document)
+    for each, escaped in _ESCAPES.items():
+        encoded = encoded.replace(each, escaped)
+    return encoded.decode()
+
+
+@cache
+def _program(*modules: str) -> str:
+    """Return modules of the page as one, without the imports among them."""
+    text = "\n".join(_EXPORT.sub("", _IMPORT.sub("", _asset(f"web/{name}.js"))) for name in modules)
+    return f'"use strict";\n{{\n{text}}}\n'
+
+
+@cache
+def _asset(name: str) -> str:
+    return resources.files("pycrorm_async.report").joinpath(name).read_text(encoding="utf-8")
+
+
+def _hash(text: str) -> str:
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'"
+
+
+# === overview data ============================================================================================
+#
+# Collect the episodes of a memory into the document of an overview: outcomes, durations, failures by reason.
+
+_EPISODES_MAX = 20_000
+"""Bounds the episodes of an overview: it then has about 5 MB."""
+_DESCRIPTION_MAX = 200
+"""Bounds the characters of a description in the table."""
+_REASON_MAX = 500
+"""Bounds the characters of the reason for which an episode cannot be read."""
+_FAILED = (TaskStatus.FAILED, TaskStatus.ERROR)
+
+
+async def newest_episodes(reading: Reading, choice: EpisodeChoice | None = None) -> tuple[list[EpisodeSummary], int]:
+    """Return the newest of all episodes, or of a choice, the oldest first, and the number of all of them."""
+    summaries = await reading.episodes(choice)
+    return summaries[-_EPISODES_MAX:], len(summaries)
+
+
+async def overview_document(
+    reading: Reading,
+    title: str,
+    episodes: Collection[EpisodeSummary],
+    total: int,
+    pages: Mapping[int, str],
+    unreadable: Mapping[int, str],
+) -> dict[str, Any]:
+    """Return the document of an overview of these episodes.
+
+    `pages` are the addresses of their pages, `unreadable` the reasons why others have none, both by number.
+    """
+    reasons = await _reasons(reading)
+    return {
+        "title": title,
+        "total": total,
+        "episodes": [
+            {
+                "number": each.number,
+                "started": f"{each.started_at:%Y-%m-%d %H:%M:%S}",
+                "description": each.description[:_DESCRIPTION_MAX],
+                "status": each.status,
+                "robots": [robot.name for robot in each.robots],
+                "seconds": None if each.duration_ns is None else round(each.duration_ns / 1e9, 6),
+                "nodes": each.nodes,
+                "failed": each.failed,
+                "reasons": reasons.get(each.number, {}),
+                "page": pages.get(each.number),
+                "unreadable": unreadable.get(each.number, "")[:_REASON_MAX],
+            }
+            for each in episodes
+        ],
+    }
+
+
+async def _reasons(reading: Reading) -> dict[int, dict[str, int]]:
+    """Count the root failures of each episode by reason: failed nodes below which no node failed."""
+    below = aliased(TaskTreeNode)
+    episode, reason = TaskTreeNode.process_metadata_id, TaskTreeNode.reason
+    of_node = below.parent_id == TaskTreeNode.id, below.process_metadata_id == episode
+    caused = select(below.id).where(*of_node, below.status.in_(_FAILED)).exists()
+    counts: dict[int, dict[str, int]] = {}
+    query = select(episode, reason, func.count()).where(TaskTreeNode.status.in_(_FAILED), ~caused)
+    async with reading.session() as session:
+        for number, name, count in await session.execute(query.group_by(episode, reason)):
+            counts.setdefault(number, {})[name or "no reason"] = count
+    return counts
+
+
+# === similar cases ============================================================================================
+#
+# Find the past actions most like those of an episode, each with its equal and its different features, for the page.
+
+ACTIONS_MAX: Final = 200
+"""Bounds the actions of a page that are compared, failures first."""
+ACTIONS_MIN: Final = 5
+"""The actions of a page that are compared in any memory."""
+_COMPARED_MAX: Final = 50_000_000
+"""Bounds actions times cases of a report, because each pair takes 50 to 100 ns: 2 to 5 s."""
+SHOWN: Final = 5
+"""The cases that the page shows for an action."""
+COUNTED: Final = 20
+"""The cases among which successes and reasons are counted."""
+_LISTED_MAX: Final = 12
+"""Bounds the features of a case that are listed as alike, and as different; those that weigh most are taken."""
+_CHARACTERS_MAX: Final = 2_000_000
+"""Bounds the characters of all listed features of a page, of which most are shared by many cases."""
+_FAILED_STATUSES = ("FAILED", "ERROR")
+
+
+def page_name(episode: int) -> str:
+    """Return the name of an episode's page, to which other pages in its folder link."""
+    return f"episode-{episode}.html"
+
+
+class SimilarCases:
+    """The cases of one memory, for the pages of one report.
+
+    Args:
+        pages: numbers of the episodes that have a page in the same folder.
+    """
+
+    def __init__(self, reading: Reading, pages: Collection[int] = ()) -> None:
+        self._reader = CaseReader(DatabaseSource(reading))
+        self._pages = frozenset(pages)
+
+    async def document(self, episode: int, starts: Collection[int]) -> dict[str, Any] | None:
+        """Return the cases most like the actions of an episode that started with these events.
+
+        They started earlier, in the same episode or in another one. None for a memory without cases, and for one whose
+        cases are of another version; with a `fault` if the stored cases are damaged.
+        """
+        try:
+            library = await self._reader.library()
+        except (DatabaseUnavailable, TablesOutdated):
+            return None
+        except DamageError as fault:
+            return {"fault": str(fault)}
+        cases = _cases_of(library, episode, starts)
+        nodes: dict[str, dict[str, Any]] = {}
+        texts = _Texts()
+        for group, row in cases[: self._actions_max(len(library))]:
+            if texts.characters > _CHARACTERS_MAX:
+                break
+            case = group.case(row)
+            nodes[str(case.sequence)] = _entry(_earlier(case, library), texts)
+        mentioned = {each[0] for entry in nodes.values() for each in entry["cases"]}
+        pages = {str(each): page_name(each) for each in sorted(mentioned & self._pages - {episode})}
+        return {"actions": len(cases), "pages": pages, "texts": [*texts.numbers], "nodes": nodes}
+
+    def _actions_max(self, cases: int) -> int:
+        """Return the number of actions of a page to compare, in a memory with this many cases."""
+        bound = _COMPARED_MAX // max(cases, 1) // max(len(self._pages), 1)
+        return min(ACTIONS_MAX, max(ACTIONS_MIN, bound))
+
+
+class _Texts:
+    """Texts by number, each once."""
+
+    def __init__(self) -> None:
+        self.numbers: dict[str, int] = {}
+        self.characters = 0
+
+    def all(self, texts: Sequence[str]) -> list[int]:
+        for each in texts:
+            if each not in self.numbers:
+                self.numbers[each] = len(self.numbers)
+                self.characters += len(each)
+        return [self.numbers[each] for each in texts]
+
+
+def _cases_of(library: CaseLibrary, episode: int, starts: Collection[int]) -> list[tuple[Group, int]]:
+    """Return group and row of the cases of these nodes: the failed ones first, then by their start."""
+    wanted = np.array([row_id(episode, each, SLOT_NODE) for each in starts], np.int64)
+    entries: list[tuple[bool, int, Group, int]] = []
+    for group in library.groups():
+        rows = np.flatnonzero(group.episodes == episode)
+        rows = rows[np.isin(group.nodes[rows], wanted)] if rows.size else rows
+        status = group.texts["status"].value
+        entries += [(status(row) not in _FAILED_STATUSES, int(group.nodes[row]), group, row) for row in rows.tolist()]
+    return [(group, row) for _, _, group, row in sorted(entries, key=lambda each: each[:2])]
+
+
+def _earlier(case: Case, library: CaseLibrary) -> Answer:
+    """Return the cases most like this one that started before it."""
+    return answer(replace(cue_like(case, library), before_us=case.started_us, k=COUNTED), library)
+
+
+def _entry(similar: Answer, texts: _Texts) -> dict[str, Any]:
+    reasons = ", ".join(f"{name} {count}" for name, count in similar.reasons)
+    success = similar.success
+    return {
+        "success": "" if success is None else str(success),
+        "reasons": reasons,
+        "cases": [_case(each, texts) for each in similar[:SHOWN]],
+    }
+
+
+def _case(recalled: RecalledCase, texts: _Texts) -> list[Any]:
+    """Return a case as `web/panels.js` reads it."""
+    case = recalled.case
+    return [
+        case.episode,
+        case.sequence,
+        round(recalled.score, 3),
+        case.status,
+        case.reason or "",
+        f"{case.started_at:%Y-%m-%d %H:%M:%S}",
+        texts.all(_listed(recalled.matched, _alike)),
+        texts.all(_listed(recalled.missed, _differs)),
+    ]
+
+
+def _listed(compared: Sequence[Compared], text: Callable[[Compared], str]) -> list[str]:
+    """Return the features that weigh most as texts, and how many others there are."""
+    heaviest = sorted(compared, key=lambda each: -each.weight * max(each.similarity, 0.01))
+    left = len(compared) - _LISTED_MAX
+    return [*map(text, heaviest[:_LISTED_MAX]), *([f"{left} more"] if left > 0 else [])]
+
+
+def _alike(compared: Compared) -> str:
+    """Return a feature that is alike, as `arm LEFT` or `height 0.9 (0.03 off)`."""
+    off = f" ({compared.difference:.2g} off)" if compared.difference and compared.similarity < 1 else ""
+    return f"{compared.feature} {_value(compared.wanted if off == '' else compared.found)}{off}"
+
+
+def _differs(compared: Compared) -> str:
+    """Return a feature that differs, as `arm RIGHT, here LEFT`."""
+    actual = "not known" if compared.found is None else _value(compared.found)
+    return f"{compared.feature} {actual}, here {_value(compared.wanted)}"
+
+
+def _value(value: str | tuple[str, ...] | float | None) -> str:
+    match value:
+        case float():
+            return f"{value:.4g}"
+        case tuple():
+            return ", ".join(value)
+    return str(value)
+
+
+# === success data =============================================================================================
+#
+# Count successes of episodes over two columns, pick-ups by default, for the heat maps of an overview.
+
+
+class Plot(NamedTuple):
+    """Two columns of a view over which successes are counted; the names are those of `pycrorm plot`."""
+
+    x: str
+    y: str
+    of: str = PICK_UPS
+
+
+_PICK_UPS = (Plot("relative_x", "relative_y"), Plot("arm", "grasp"))
+
+
+async def success_documents(
+    reading: Reading, numbers: Collection[int], plots: Collection[Plot] = ()
+) -> list[dict[str, Any]]:
+    """Return a table of successes of these episodes for each plot.
+
+    Raises `CallerError` as `success_samples` does. Without plots the tables are those of pick-ups, if any has ended.
+    """
+    if plots:
+        return [await _document(reading, numbers, each) for each in plots]
+    try:
+        return [await _document(reading, numbers, each) for each in _PICK_UPS]
+    except CallerError:  # no pick-up, or more than are counted
+        return []
+
+
+async def _document(reading: Reading, numbers: Collection[int], plot: Plot) -> dict[str, Any]:
+    table = success_table(await success_samples(reading, plot.x, plot.y, plot.of, episodes=numbers))
+    return {
+        "of": table.source,
+        "x": _axis(table.x),
+        "y": _axis(table.y),
+        "cells": [list(each) for each in table.cells],
+        "succeeded": table.succeeded,
+        "rows": table.rows,
+    }
+
+
+def _axis(axis: Axis) -> dict[str, Any]:
+    """Return the name, the labels of the cells or the texts of the edges between them, and the number of cells."""
+    return {
+        "name": axis.name,
+        "unit": axis.unit,
+        "labels": axis.labels,
+        "edges": [axis.text(each) for each in axis.edges],
+        "cells": axis.cells,
+    }

@@ -22,27 +22,314 @@ no other episode has it.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from typing import Any, Final, NamedTuple
+import asyncio
+import logging
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractAsyncContextManager
+from dataclasses import dataclass, field
+from hashlib import sha256
+from typing import Any, Final, NamedTuple, Protocol
 
+import msgspec
+from sqlalchemy import bindparam, inspect, text
 from sqlalchemy.ext.asyncio import AsyncConnection
 
-from pycrorm_async.errors import LogDamaged, LogWentBack
-from pycrorm_async.events.envelope import Record
-from pycrorm_async.events.ids import EpisodeId, episode_text
-from pycrorm_async.store.append_rules import (
-    EpisodeStep,
-    NumbersExhausted,
-    SortedBatch,
-    differing,
-    new_episode,
-    sort,
-    step,
-)
+from pycrorm_async.errors import DamageError, LogDamaged, LogWentBack
+from pycrorm_async.events.codec import DECLARATION_TYPES, Record, fingerprint, is_computed_end
+from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX, EpisodeId, episode_text, parse_episode_id
+from pycrorm_async.events.types import Blob, BlobReference, references_in
 from pycrorm_async.store.dialect import Dialect, Insertion
-from pycrorm_async.store.digests.digest_table import Extension, RunningDigests
-from pycrorm_async.store.limits import warnings_of
-from pycrorm_async.store.stored import NOTHING_KNOWN, Basis, EpisodeRow, Stored, StoredEvent
+from pycrorm_async.store.stored import (
+    BLOCK_EVENTS,
+    NOTHING_KNOWN,
+    Basis,
+    DigestRow,
+    EpisodeRow,
+    RunningDigest,
+    Stored,
+    StoredEvent,
+)
+
+# === append rules =============================================================================================
+#
+# Decide about each record of a batch: new, repeated or refused, and why. Pure.
+#
+# An episode's events are stored without a gap: the next accepted sequence is always `head + 1`. A record at or below
+# the head is a repeat, to be compared with the stored event. The first record that cannot be accepted stops the episode
+# for this batch: the records before it are stored, the reason is kept, and other episodes are not affected.
+#
+# An end that recovery computed is not a repeat, because a folder that was damaged or restored from a backup may lack
+# events that the log holds. Such an end follows the log's last event; it is left out if the log holds an end already or
+# waits for missing events.
+
+_CHECKED_AT_ONCE: Final = 256
+"""Bounds the payloads that are joined to be checked by one call, so that they stay in the processor's cache: joining
+10,000 takes five times as long."""
+
+
+@dataclass(frozen=True, slots=True)
+class SortedBatch:
+    """A batch split into declarations, by fingerprint, and episodes, each in the order of arrival."""
+
+    declarations: dict[str, bytes]
+    episodes: dict[EpisodeId, list[Record]]
+
+
+@dataclass(frozen=True, slots=True)
+class EpisodeStep:
+    """The effect of a batch on one episode: the row afterwards, the records to insert, and the repeats to compare.
+
+    `skipped_ends` counts the computed ends that are left out.
+    """
+
+    after: EpisodeRow
+    fresh: list[Record]
+    again: list[Record] = field(default_factory=list)
+    skipped_ends: int = 0
+
+
+class NumbersExhausted(ValueError):
+    """All episode numbers are used."""
+
+    def __init__(self) -> None:
+        super().__init__(
+            f"all {EPISODE_NUMBER_MAX:,} episode numbers of this memory are used:"
+            " move its spool to a new memory with `pycrorm spool rebind`"
+        )
+
+
+def sort(records: Iterable[Record]) -> SortedBatch:
+    """Split a batch by episode. Raises `DamageError` for a record without an episode that is not a declaration."""
+    declarations: dict[str, bytes] = {}
+    episodes: dict[EpisodeId, list[Record]] = {}
+    for record in records:
+        episode = record.episode
+        if episode is None:
+            declared = _declaration(record)
+            declarations[fingerprint(declared, record.type)] = declared
+        elif episode in episodes:
+            episodes[episode].append(record)
+        else:
+            episodes[episode] = [record]
+    return SortedBatch(declarations, episodes)
+
+
+def step(records: Sequence[Record], row: EpisodeRow) -> EpisodeStep:
+    """Compute the effect of these records, all of one episode, on its row."""
+    first = records[0].sequence
+    if first == row.head + 1 and _consecutive(records) and _sound(records):
+        return EpisodeStep(_advanced(row, records, refused=None), list(records))
+    return _careful_step(records, row)
+
+
+def new_episode(episode: EpisodeId, first: Record, number: int) -> EpisodeRow:
+    """Create the row of an episode without stored events. Raises `NumbersExhausted`."""
+    if number > EPISODE_NUMBER_MAX:
+        raise NumbersExhausted
+    return EpisodeRow(number, episode_text(episode), head=0, folded=0, started_wall_ns=first.wall_ns)
+
+
+def differing(again: Iterable[Record], stored: Mapping[int, StoredEvent]) -> int | None:
+    """Return the first sequence whose stored event differs from the record; None if all are equal."""
+    return min((each.sequence for each in again if not _same(each, stored.get(each.sequence))), default=None)
+
+
+def _same(record: Record, stored: StoredEvent | None) -> bool:
+    # From the type on, a record and a stored event have the same fields in the same order.
+    return stored is not None and tuple(record[3:]) == tuple(stored[2:])
+
+
+def _careful_step(records: Sequence[Record], row: EpisodeRow) -> EpisodeStep:
+    fresh: list[Record] = []
+    again: list[Record] = []
+    refused: str | None = None
+    skipped_ends = 0
+    expected = row.head + 1
+    for record in records:
+        if record.sequence < expected:
+            if not is_computed_end(record):
+                again.append(record)
+                continue
+            if row.ended_wall_ns is not None or row.refused is not None:
+                skipped_ends += 1
+                continue
+            record = record._replace(sequence=expected)
+        refused = _refusal(record, expected)
+        if refused is not None:
+            break
+        fresh.append(record)
+        expected += 1
+    return EpisodeStep(_advanced(row, fresh, refused=refused), fresh, again, skipped_ends)
+
+
+def _refusal(record: Record, expected: int) -> str | None:
+    if record.sequence > expected:
+        missing = (
+            f"event {expected}" if record.sequence == expected + 1 else f"events {expected} to {record.sequence - 1}"
+        )
+        return f"{missing} did not arrive before event {record.sequence}"
+    if record.sequence > SEQUENCE_MAX:
+        return f"event {record.sequence}: an episode holds at most {SEQUENCE_MAX:,} events"
+    if not _is_text(record.payload):
+        return f"event {record.sequence}: its payload is not text that a database can hold"
+    return None
+
+
+def _advanced(row: EpisodeRow, fresh: Sequence[Record], *, refused: str | None) -> EpisodeRow:
+    if not fresh:  # repeats alone do not end an earlier refusal
+        return row._replace(refused=row.refused or refused)
+    last = fresh[-1]
+    end = next((each for each in reversed(fresh) if each.type != "EpisodeTagged"), last)  # tags may follow the end
+    ended = end.wall_ns if end.type == "EpisodeEnded" else row.ended_wall_ns
+    return row._replace(head=last.sequence, ended_wall_ns=ended, refused=refused)
+
+
+def _consecutive(records: Sequence[Record]) -> bool:
+    first = records[0].sequence
+    return [record.sequence for record in records] == list(range(first, first + len(records)))
+
+
+def _sound(records: Sequence[Record]) -> bool:
+    return records[-1].sequence <= SEQUENCE_MAX and all(
+        _is_text(b"\n".join([each.payload for each in records[start : start + _CHECKED_AT_ONCE]]))
+        for start in range(0, len(records), _CHECKED_AT_ONCE)
+    )
+
+
+def _is_text(payload: bytes) -> bool:
+    if b"\0" in payload:
+        return False
+    try:
+        payload.decode()
+    except UnicodeDecodeError:
+        return False
+    return True
+
+
+def _declaration(record: Record) -> bytes:
+    if record.type not in DECLARATION_TYPES:
+        raise DamageError(f"record {record.position} belongs to no episode and is a {record.type}, not a declaration")
+    if not _is_text(record.payload):
+        raise DamageError(f"record {record.position}: the declaration is not text that a database can hold")
+    return record.payload
+
+
+# === digest table =============================================================================================
+#
+# Keep the digests of episodes in the table `pycrorm_digest`, in the transactions that append their events.
+#
+# Theory of operation. `RunningDigests` keeps a running digest for each episode that this process appends to. An append
+# copies it into an `Extension`, adds the events while their rows are made, inserts the digests of completed blocks in
+# the same transaction, and replaces the running digest by the copy after the commit. A running digest counts only if it
+# is at the head that the transaction sees under its lock; otherwise, as after a restart or when another process has
+# appended, it is computed again from the kept digest before the current block and the block's events in the log. So a
+# process that restarts takes over the events of an incomplete block as the log holds them.
+#
+# The table only grows: a digest is inserted once and never changed, like an event. It is not part of the log's format:
+# older programs still use the log, and the episodes that they append get no digests. If the digest before the current
+# block is missing, the episode gets no further ones. On PostgreSQL a login that may not insert digests, because the
+# owner has not run `GRANTS` again, appends without them.
+
+_EPISODES_MAX: Final = 1_000
+"""Bounds the running digests that a process keeps, half a kilobyte each; without one, a block is read again."""
+
+_AT = text("SELECT digest FROM pycrorm_digest WHERE episode = :number AND sequence = :sequence")
+_LAST = text("""
+SELECT episode, sequence, digest
+FROM (SELECT episode, max(sequence) AS sequence FROM pycrorm_digest GROUP BY episode) AS last
+JOIN pycrorm_digest USING (episode, sequence)""")
+
+
+class Extension:
+    """The digests after an append: rows to insert, and running digests by number; None: the episode gets no digests."""
+
+    def __init__(self, running: Mapping[int, RunningDigest | None]) -> None:
+        self.rows: list[DigestRow] = []
+        self.running = running
+
+    def add(self, number: int, events: Sequence[Record], *, last: bool = False) -> None:
+        """Add the next events of an episode; with `last`, keep the digest behind them also inside a block."""
+        digest = self.running[number]
+        if digest is None:
+            return
+        self.rows += [DigestRow(number, *each) for each in digest.add(events)]
+        if last and digest.sequence % BLOCK_EVENTS:
+            self.rows.append(DigestRow(number, digest.sequence, digest.digest()))
+
+
+class RunningDigests:
+    """The running digests of the episodes that a process appends to one log."""
+
+    def __init__(self, dialect: Dialect) -> None:
+        self._dialect = dialect
+        self._insertable: bool | None = None
+        self._running: dict[int, RunningDigest | None] = {}
+
+    async def begin(self, connection: AsyncConnection, rows: Iterable[EpisodeRow]) -> Extension | None:
+        """Begin an append to the episodes of these rows; None if digests cannot be stored."""
+        if self._insertable is None:
+            self._insertable = await has_digests(self._dialect, connection, insert=True)
+        if not self._insertable:
+            return None
+        return Extension({each.number: await self._at_head(connection, each) for each in rows})
+
+    async def insert(self, connection: AsyncConnection, extension: Extension) -> None:
+        """Insert the digests in the transaction that appends the events."""
+        if not extension.rows:
+            return
+        rows = msgspec.json.encode(extension.rows).decode()
+        try:
+            await connection.exec_driver_sql(self._dialect.digest_statements.insert, (rows,))
+        except BaseException:
+            self._insertable = None  # a database that was restored meanwhile may lack the table
+            raise
+
+    def keep(self, extension: Extension) -> None:
+        """Keep the running digests of an append that was committed."""
+        self._running |= extension.running
+        while len(self._running) > _EPISODES_MAX:
+            del self._running[next(iter(self._running))]
+
+    async def _at_head(self, connection: AsyncConnection, row: EpisodeRow) -> RunningDigest | None:
+        """Return a running digest at the episode's head, to be changed by the caller; None if it cannot continue."""
+        if row.number in self._running:
+            kept = self._running[row.number]
+            if kept is None or kept.sequence == row.head:
+                return kept and kept.copy()
+        start = row.head - row.head % BLOCK_EVENTS
+        if start == 0:
+            running = RunningDigest.at_start(parse_episode_id(row.id))
+        else:
+            at_start = (await connection.execute(_AT, {"number": row.number, "sequence": start})).scalar()
+            if at_start is None:
+                return None
+            running = RunningDigest(bytes.fromhex(at_start), start)
+        if row.head > start:
+            events = await self._dialect.events(connection, row.number, after=start, limit=row.head - start)
+            running.add(events)
+        return running if running.sequence == row.head else None  # else events are missing, which `verify` reports
+
+
+async def create_digest_table(dialect: Dialect, connection: AsyncConnection) -> None:
+    """Create the table in the transaction that opens the log, unless it exists or this login may not."""
+    if (await connection.exec_driver_sql(dialect.digest_statements.creatable)).scalar_one():
+        await dialect.execute_all(connection, dialect.digest_statements.table)
+
+
+async def has_digests(dialect: Dialect, connection: AsyncConnection, *, insert: bool = False) -> bool:
+    """Return whether the table exists and this login may read it, and with `insert` also extend it."""
+    row = (await connection.exec_driver_sql(dialect.digest_statements.usable)).one()
+    return bool(row[1 if insert else 0])
+
+
+async def last_digests(dialect: Dialect, connection: AsyncConnection) -> dict[int, DigestRow]:
+    """Read the last digest of each episode, by number."""
+    if not await has_digests(dialect, connection):
+        return {}
+    return {each.episode: DigestRow(*each) for each in await connection.execute(_LAST)}
+
+
+# === append ===================================================================================================
 
 _PART_EVENTS: Final = 1_024
 """Bounds the events whose digests and rows are computed at once. PostgreSQL stores the rows of one part while those of
@@ -203,3 +490,201 @@ async def _compare(dialect: Dialect, connection: AsyncConnection, steps: Sequenc
         sequence = differing(each.again, stored.get(each.after.number, {}))
         if sequence is not None:
             raise LogDamaged(each.after.id, sequence, "another event is stored under this number already")
+
+
+# === limits ===================================================================================================
+#
+# Warn before an episode or a memory has used up its numbers.
+#
+# Row ids have 53 bits: 22 for the episode's number, 26 for the event's sequence. Both limits are distant (a thousand
+# episodes a day for eleven years, a week of a hundred events a second). From nine tenths of a limit on, `status` warns
+# and the process that stores the events logs one line, so that a user has time to act.
+
+EPISODES_MANY = EPISODE_NUMBER_MAX * 9 // 10 + 1
+"""Episode number from which a memory counts as nearly full: 3,774,873, nine tenths of the limit."""
+
+EVENTS_MANY = SEQUENCE_MAX * 9 // 10 + 1
+"""Sequence from which an episode counts as nearly full: 60,397,977, nine tenths of the limit."""
+
+
+def number_warning(number: int) -> str | None:
+    """Return the warning for a memory's latest episode number; None below nine tenths.
+
+    >>> number_warning(4_000_000)
+    '4,000,000 of 4,194,303 episode numbers are used (95 %): record into a new database before none is left'
+    """
+    if number < EPISODES_MANY:
+        return None
+    if number >= EPISODE_NUMBER_MAX:
+        return (
+            f"all {EPISODE_NUMBER_MAX:,} episode numbers are used: new episodes are kept in the spool until it belongs"
+            " to a new database"
+        )
+    share = number * 100 // EPISODE_NUMBER_MAX
+    return (
+        f"{number:,} of {EPISODE_NUMBER_MAX:,} episode numbers are used ({share} %): record into a new database before"
+        " none is left"
+    )
+
+
+def events_warning(episode: EpisodeRow) -> str | None:
+    """Return the warning for an episode that has not ended; None below nine tenths."""
+    if episode.head < EVENTS_MANY or episode.ended_wall_ns is not None:
+        return None
+    share = episode.head * 100 // SEQUENCE_MAX
+    return (
+        f"episode {episode.number} ({episode.id}) has {episode.head:,} of {SEQUENCE_MAX:,} events ({share} %): it"
+        " continues in a follow-up episode before the last of these"
+    )
+
+
+def warnings_of(episodes: Sequence[EpisodeRow]) -> dict[str, str]:
+    """Return the warnings for these rows, by "numbers" or an episode's id."""
+    last = max((each.number for each in episodes), default=0)
+    warnings = {"numbers": number_warning(last)} | {each.id: events_warning(each) for each in episodes}
+    return {subject: warning for subject, warning in warnings.items() if warning is not None}
+
+
+# === blobs ====================================================================================================
+#
+# Store blobs beside the log: contents too large for an event, named by their SHA-256.
+#
+# A large blob is divided into parts, each a row and a transaction of its own, so that no other writer waits long. The
+# parts are inserted in order and never changed, so several processes may store the same blob at once, and one continues
+# where another was killed. The last part makes a blob complete. A blob is stored before the events that refer to it.
+
+PART_BYTES: Final = 4 * 2**20
+"""Bounds one row and transaction: SQLite's write lock is held for some ten milliseconds."""
+_HASHES_MAX: Final = 500
+"""Bounds the blobs that one statement asks for."""
+
+_EXISTS: Final = "pycrorm_blob"
+_INSERT = text(
+    "INSERT INTO pycrorm_blob (hash, part, parts, media_type, size, content)"
+    " VALUES (:hash, :part, :parts, :media_type, :size, :content) ON CONFLICT DO NOTHING"
+)
+_COMPLETE = text("SELECT hash FROM pycrorm_blob WHERE hash IN :hashes AND part = parts - 1").bindparams(
+    bindparam("hashes", expanding=True)
+)
+_SELECT = text("SELECT parts, media_type, content FROM pycrorm_blob WHERE hash = :hash AND part = :part")
+
+_log = logging.getLogger("pycrorm_async")
+
+
+class BlobSource(Protocol):
+    """The place from which the blobs of appended records come: the files of a spool, or another log."""
+
+    async def read_blob(self, name: str) -> bytes | None:
+        """Return the content with this SHA-256; None if it is missing or has other bytes."""
+        ...
+
+
+class Blobs:
+    """The blobs of one log; `reading` and `writing` open its transactions."""
+
+    def __init__(
+        self,
+        dialect: Dialect,
+        reading: Callable[[], AbstractAsyncContextManager[AsyncConnection]],
+        writing: Callable[[], AbstractAsyncContextManager[AsyncConnection]],
+    ) -> None:
+        self._dialect = dialect
+        self._reading = reading
+        self._writing = writing
+        self.source: BlobSource | None = None
+
+    async def store_for(self, records: Sequence[Record]) -> None:
+        """Store the blobs that these records refer to and that are not stored yet, durable on return.
+
+        A blob that the source no longer has is reported and left out: waiting would not bring it back.
+        """
+        wanted = {each.hash: each for record in records for each in references_in(record.type, record.payload)}
+        if not wanted or self.source is None:
+            return
+        for name in wanted.keys() - await self.complete(wanted):
+            content = await self.source.read_blob(name)
+            if content is None:
+                _log.error("blob %s is missing: `pycrorm verify` names the event that refers to it", name)
+            else:
+                await self.add(wanted[name], content)
+
+    async def add(self, reference: BlobReference, content: bytes) -> None:
+        """Store a blob; its parts that are stored already stay unchanged."""
+        parts = max(1, -(-len(content) // PART_BYTES))
+        await self._create_table()
+        for part in range(parts):
+            row = {
+                "hash": reference.hash,
+                "part": part,
+                "parts": parts,
+                "media_type": reference.media_type.replace("\0", ""),
+                "size": len(content),
+                "content": content[part * PART_BYTES : (part + 1) * PART_BYTES],
+            }
+            async with self._writing() as connection:
+                await connection.execute(_INSERT, row)
+
+    async def complete(self, hashes: Iterable[str]) -> set[str]:
+        """Return those of these blobs that are stored completely."""
+        names = list(hashes)
+        stored: set[str] = set()
+        async with self._reading() as connection:
+            if await _has_table(connection):
+                for start in range(0, len(names), _HASHES_MAX):
+                    part = {"hashes": names[start : start + _HASHES_MAX]}
+                    stored.update((await connection.execute(_COMPLETE, part)).scalars())
+        return stored
+
+    async def read(self, name: str) -> Blob | None:
+        """Return a stored blob; None if it is missing or incomplete."""
+        parts = [each async for each in self._parts(name)]
+        if not parts or len(parts) < parts[0].parts:
+            return None
+        return Blob(b"".join(each.content for each in parts), parts[0].media_type)
+
+    async def read_blob(self, name: str) -> bytes | None:
+        """Implement `BlobSource`, for a copy of this log."""
+        blob = await self.read(name)
+        if blob is None or sha256(blob.content).hexdigest() != name:
+            return None
+        return blob.content
+
+    async def fault(self, name: str) -> str | None:
+        """Return the fault of a stored blob; None if its content has this SHA-256."""
+        digest, count, parts = sha256(), 0, 1
+        async for each in self._parts(name):
+            count, parts = count + 1, each.parts
+            await asyncio.to_thread(digest.update, each.content)
+        if count < parts:
+            return "is missing" if not count else f"is incomplete: {count} of {parts} parts are stored"
+        return None if digest.hexdigest() == name else "has a content that does not match its hash"
+
+    async def _parts(self, name: str) -> AsyncIterator[_Part]:
+        part, parts = 0, 1
+        while part < parts:
+            async with self._reading() as connection:
+                if not await _has_table(connection):
+                    return
+                row = (await connection.execute(_SELECT, {"hash": name, "part": part})).first()
+            if row is None:
+                return
+            parts, part = row.parts, part + 1
+            yield _Part(parts, row.media_type, bytes(row.content))
+
+    async def _create_table(self) -> None:
+        async with self._reading() as connection:
+            if await _has_table(connection):
+                return
+        async with self._writing() as connection:
+            await self._dialect.lock_log_changes(connection)
+            await self._dialect.execute_all(connection, self._dialect.blob_table)
+
+
+class _Part(NamedTuple):
+    parts: int
+    media_type: str
+    content: bytes
+
+
+async def _has_table(connection: AsyncConnection) -> bool:
+    return await connection.run_sync(lambda each: inspect(each).has_table(_EXISTS))

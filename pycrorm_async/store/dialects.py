@@ -20,11 +20,11 @@ def _dialect(name: str) -> Dialect:
     # Imported on demand: the server's driver takes a tenth of a second to import.
     match name:
         case "sqlite":
-            from pycrorm_async.store.sqlite.dialect import SQLite
+            from pycrorm_async.store.sqlite import SQLite
 
             return SQLite()
         case "postgresql":
-            from pycrorm_async.store.postgresql.dialect import PostgreSQL
+            from pycrorm_async.store.postgresql import PostgreSQL
 
             return PostgreSQL()
     raise InternalError(f"there is no dialect for {name}")

@@ -11,33 +11,42 @@ from __future__ import annotations
 import asyncio
 import logging
 import os
+import sqlite3
+import stat
 import uuid
 from collections.abc import AsyncIterator, Collection, Iterator, Mapping, Sequence
 from contextlib import asynccontextmanager, contextmanager, nullcontext
 from pathlib import Path
 from types import MappingProxyType
 
+import msgspec
+from sqlalchemy import bindparam, text
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
-from pycrorm_async.errors import DatabaseUnavailable, LogDamaged, PycrormError
-from pycrorm_async.events.codec import declared_dtype, fingerprint
-from pycrorm_async.events.envelope import Record
+from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable, LogDamaged, PycrormError, UnknownEpisode
+from pycrorm_async.events.codec import Record, declared_dtype, fingerprint
+from pycrorm_async.events.fields import retagged
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, EpisodeId, episode_text
-from pycrorm_async.settings import FileAccess
+from pycrorm_async.settings import FILE_MODES, FileAccess
 from pycrorm_async.store.address import BUSY_TIMEOUT_S, DatabaseAddress
-from pycrorm_async.store.append import Appending
-from pycrorm_async.store.blobs import Blobs
-from pycrorm_async.store.dialect import Birth, Dialect, Progress, StoredOn
+from pycrorm_async.store.append import (
+    EVENTS_MANY,
+    Appending,
+    Blobs,
+    RunningDigests,
+    create_digest_table,
+    events_warning,
+    last_digests,
+    number_warning,
+)
+from pycrorm_async.store.dialect import Birth, Dialect, LogIdentity, Migrations, Progress, StoredOn
 from pycrorm_async.store.dialects import dialect_of
-from pycrorm_async.store.digests.digest_table import RunningDigests, last_digests
-from pycrorm_async.store.digests.episode_digest import DigestRow
-from pycrorm_async.store.limits import EVENTS_MANY, events_warning, number_warning
-from pycrorm_async.store.schema import make_file, make_or_migrate, must_exist, recognise
-from pycrorm_async.store.sqlite.engine import BEGIN, READ
+from pycrorm_async.store.sqlite_engine import BEGIN, READ, move_leftovers
 from pycrorm_async.store.stored import (
     NOTHING_KNOWN,
     Basis,
+    DigestRow,
     EpisodeRow,
     Incarnation,
     Span,
@@ -359,3 +368,208 @@ async def advance_folded(connection: AsyncConnection, steps: Sequence[Progress])
 async def park(connection: AsyncConnection, number: int, reason: str | None) -> None:
     """Stop folding an episode, with the reason; None releases it. The log still accepts its events."""
     await dialect_of(connection).park(connection, number, reason)
+
+
+# === schema ===================================================================================================
+#
+# Recognise, create and migrate the log in a database, without changing a foreign one.
+#
+# Opening for writing creates a log in an empty database and migrates an older format, in one transaction. Opening for
+# reading never writes.
+
+_HOW_TO_CREATE = "record one with `pycrorm run` or `pycrorm demo`"
+
+
+async def recognise(connection: AsyncConnection, name: str, migrations: Migrations | None = None) -> str:
+    """Return the id of the log in this database. Raises `DatabaseUnavailable` without one, and `DatabaseForeign`."""
+    dialect = dialect_of(connection)
+    migrations = dialect.migrations if migrations is None else migrations
+    identity = await _find_log(dialect, connection, name, len(migrations))
+    if identity is None:
+        raise DatabaseUnavailable(f"{name} holds no memory yet: {_HOW_TO_CREATE}")
+    if identity.format < len(migrations):
+        raise DatabaseUnavailable(f"{name} was made by an older version: `pycrorm writer --once` brings it up to date")
+    return identity.log_id
+
+
+async def make_or_migrate(
+    engine: AsyncEngine,
+    name: str,
+    *,
+    birth: Birth,
+    migrations: Migrations | None = None,
+    belongs_to: str | None = None,
+) -> str:
+    """Create or migrate the log in this database if necessary; return its id.
+
+    With `belongs_to`, the id of the log that should be here, raises `DatabaseUnavailable` instead of creating another.
+    """
+    dialect = dialect_of(engine)
+    migrations = dialect.migrations if migrations is None else migrations
+    await dialect.prepare(engine, name)
+    async with engine.begin() as connection:
+        await dialect.lock_log_changes(connection)
+        identity = await _find_log(dialect, connection, name, len(migrations))
+        if identity is None and belongs_to is not None:
+            raise DatabaseUnavailable(f"{name} {_missing_log(belongs_to)}")
+        for statements in migrations[identity.format if identity else 0 :]:
+            await dialect.execute_all(connection, statements)
+        await create_digest_table(dialect, connection)
+        if identity is None:
+            await dialect.insert_log(connection, birth, len(migrations))
+            return birth.log_id
+        if identity.format < len(migrations):
+            await dialect.set_format(connection, len(migrations))
+        return identity.log_id
+
+
+def make_file(path: Path, name: str, access: FileAccess, *, belongs_to: str | None = None) -> None:
+    """Create an empty file, an empty database for SQLite, unless it exists.
+
+    SQLite creates its side files with the same mode. An existing file keeps its mode. Raises `DatabaseUnavailable`;
+    with `belongs_to`, the id of the log whose file should be here, also instead of creating another.
+
+    Creates the file without opening it, because closing a descriptor drops all POSIX locks of the process on that file,
+    SQLite's included; another process that closes the database could then delete the write-ahead log in use.
+    """
+    if sqlite3.sqlite_version_info < (3, 38):
+        raise DatabaseUnavailable(f"SQLite 3.38 or newer is needed, this is {sqlite3.sqlite_version}")
+    if belongs_to is not None and not path.exists():
+        raise DatabaseUnavailable(f"{name} {_missing_log(belongs_to)}")
+    try:
+        real = Path(os.path.realpath(path))
+        if not real.exists():
+            move_leftovers(real)
+        os.mknod(real, 0o600 | stat.S_IFREG)
+        real.chmod(FILE_MODES[access])  # independent of the umask
+    except FileExistsError:
+        if path.is_dir():
+            raise DatabaseUnavailable(f"{name} cannot be opened: Is a directory ({path})") from None
+        if not os.access(real, os.W_OK):
+            reason = "this user may only read it: record with a user who may write it, or name another file"
+            raise DatabaseUnavailable(f"{name} cannot be written: {reason}") from None
+    except FileNotFoundError as error:
+        reason = f"{error.strerror} ({path}): create the folder {path.parent} first"
+        raise DatabaseUnavailable(f"{name} cannot be opened: {reason}") from error
+    except OSError as error:
+        raise DatabaseUnavailable(f"{name} cannot be opened: {error.strerror} ({path})") from error
+
+
+def must_exist(path: Path, name: str) -> None:
+    """Raise `DatabaseUnavailable` for a missing file, with the command that creates one, and for what is no file."""
+    try:
+        mode = path.stat().st_mode
+    except FileNotFoundError:
+        raise DatabaseUnavailable(f"{name} does not exist: {_HOW_TO_CREATE}") from None
+    except OSError as error:
+        raise DatabaseUnavailable(f"{name} cannot be opened: {error.strerror} ({path})") from error
+    if not stat.S_ISREG(mode):
+        reason = "Is a directory" if stat.S_ISDIR(mode) else "Is no file"
+        raise DatabaseUnavailable(f"{name} cannot be opened: {reason} ({path})")
+
+
+def _missing_log(log_id: str) -> str:
+    return (
+        f"holds no memory, and the spool belongs to log {log_id}: restore that log, choose another spool, or"
+        " move the spool's records to a new log with `pycrorm spool rebind`"
+    )
+
+
+async def _find_log(dialect: Dialect, connection: AsyncConnection, name: str, format_max: int) -> LogIdentity | None:
+    identity = await dialect.find_log(connection, name)
+    if identity is not None and identity.format > format_max:
+        raise DatabaseForeign(
+            f"{name} was made by a newer version: its format is {identity.format}, this version reads {format_max}"
+        )
+    return identity
+
+
+# === episode lookup ===========================================================================================
+#
+# Find an episode by its number, its id, the first digits of its id, or `last`.
+#
+# `last` is the newest episode that is not a simulation. The lookup reads only the log, so it works without tables.
+
+
+def number_named(name: str, ids: Mapping[int, str], *, listed: int) -> int:
+    """Return the number of the named episode among these ids by number.
+
+    `listed` is the number of episodes that `pycrorm episodes` lists. Raises `UnknownEpisode`, also if several ids
+    match.
+    """
+    # Four digits may be a number, or the beginning of an id without a letter: the number wins.
+    numbers = [number for number in ids if str(number) == name] or [
+        number for number, identity in ids.items() if len(name) >= 4 and identity.startswith(name.lower())
+    ]
+    if len(numbers) > 1:
+        raise UnknownEpisode(f"{len(numbers)} episodes have an id that begins with {name!r}: use more of its digits")
+    if not numbers:
+        raise UnknownEpisode(f"there is no episode {name!r} ({_present(listed)})")
+    return numbers[0]
+
+
+def _present(listed: int) -> str:
+    if listed == 0:
+        return "this memory has none yet: record one with `pycrorm run` or `pycrorm demo`"
+    return f"`pycrorm episodes` lists {'the only one' if listed == 1 else f'all {listed}'}"
+
+
+async def episode_named(log: EventLog, name: str) -> EpisodeRow:
+    """Find the named episode. Raises `UnknownEpisode`."""
+    rows = {row.number: row for row in await log.episodes()}
+    if name == "last":
+        for row in reversed(rows.values()):
+            if not await is_simulated(log, row):
+                return row
+    return rows[number_named(name, {number: row.id for number, row in rows.items()}, listed=len(rows))]
+
+
+_GROWN = text(
+    "SELECT number, id, head, folded, started_wall_ns, ended_wall_ns, refused, parked FROM episode"
+    " WHERE number > :above OR ended_wall_ns IS NULL OR number IN :numbers ORDER BY number"
+).bindparams(bindparam("numbers", expanding=True))
+
+
+async def grown_episodes(log: EventLog, *, above: int, numbers: Collection[int]) -> list[EpisodeRow]:
+    """Read the episodes that may have grown: with a number above `above`, not ended, or with one of these numbers."""
+    async with log.reading() as connection:
+        rows = await connection.execute(_GROWN, {"above": above, "numbers": sorted(numbers)})
+        return [EpisodeRow(*row) for row in rows]
+
+
+async def tags_of(log: EventLog, row: EpisodeRow) -> tuple[str, ...]:
+    """Return the tags of an episode according to its events. Raises `LogDamaged` if one of these cannot be read."""
+    tags: tuple[str, ...] = ()
+    query = text(
+        "SELECT sequence, payload FROM event WHERE episode = :number AND type IN ('EpisodeStarted', 'EpisodeTagged')"
+        " ORDER BY sequence"
+    )
+    async with log.reading() as connection:
+        for sequence, payload in await connection.execute(query, {"number": row.number}):
+            try:
+                change = msgspec.json.decode(payload, type=_Tagging)
+            except msgspec.DecodeError as error:
+                raise LogDamaged(row.id, sequence, f"its payload cannot be read: {error}") from error
+            tags = retagged(tags, (*change.tags, *change.added), change.removed)
+    return tags
+
+
+class _Tagging(msgspec.Struct):
+    """The parts of `EpisodeStarted` and `EpisodeTagged` that concern tags."""
+
+    tags: tuple[str, ...] = ()
+    added: tuple[str, ...] = ()
+    removed: tuple[str, ...] = ()
+
+
+class _Started(msgspec.Struct):
+    simulated: bool = False
+
+
+async def is_simulated(log: EventLog, row: EpisodeRow) -> bool:
+    """Return whether the episode is a simulation, according to its first event."""
+    first = await log.events(row.number, limit=1)
+    try:
+        return bool(first) and msgspec.json.decode(first[0].payload, type=_Started).simulated
+    except msgspec.DecodeError:  # damaged; reading the episode reports it
+        return False

@@ -23,11 +23,10 @@ from pycrorm_async.operations.destination import shared_address
 from pycrorm_async.operations.rebuild import rebuild_projection
 from pycrorm_async.orm import TaskTreeNode
 from pycrorm_async.plan import ActionAbstract
-from pycrorm_async.projections.custom.projection import Projection, columns_of
-from pycrorm_async.projections.custom.projection_tables import states
-from pycrorm_async.projections.verify.verify import verify
+from pycrorm_async.projections.custom import Projection, columns_of, states
+from pycrorm_async.projections.verify import verify
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.recording.recording import Recording
+from pycrorm_async.record.recording import Recording
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.task_status import TaskStatus

@@ -15,21 +15,28 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from pycrorm_async.world.bullet import BulletWorld
-    from pycrorm_async.world.enums import Arms, Grasp, GripperState, JointType, ObjectType, WorldMode
-    from pycrorm_async.world.objects import Object
-    from pycrorm_async.world.observers import WorldObserver, WorldWatcher, current_world, watcher
-    from pycrorm_async.world.pose import Pose, Quaternion, Vector
-    from pycrorm_async.world.queries.bounding_boxes import BoundingBox
-    from pycrorm_async.world.queries.costmaps import (
+    from pycrorm_async.world.bounding_boxes import BoundingBox
+    from pycrorm_async.world.bullet import BulletWorld, Object, WorldObserver, WorldWatcher, current_world, watcher
+    from pycrorm_async.world.bullet_body import WorldState
+    from pycrorm_async.world.pose import (
+        Arms,
+        Grasp,
+        GripperState,
+        JointType,
+        ObjectType,
+        Pose,
+        Quaternion,
+        Vector,
+        WorldMode,
+    )
+    from pycrorm_async.world.queries import (
         Costmap,
         GaussianCostmap,
         OccupancyCostmap,
         SemanticCostmap,
         VisibilityCostmap,
     )
-    from pycrorm_async.world.robots.acting_robot import acting_robot, robot_acting
-    from pycrorm_async.world.robots.robot_description import (
+    from pycrorm_async.world.urdf import (
         COURIER,
         PR2,
         ArmDescription,
@@ -38,12 +45,12 @@ if TYPE_CHECKING:
         FieldOfView,
         Limits,
         RobotDescription,
+        describe_arm,
+        describe_robot,
         register_robot,
         robot_description,
     )
-    from pycrorm_async.world.robots.urdf_description import describe_arm, describe_robot
-    from pycrorm_async.world.state import WorldState
-    from pycrorm_async.world.world_copy import copied
+    from pycrorm_async.world.world_copy import acting_robot, copied, robot_acting
 
 __all__ = [
     "BulletWorld",
@@ -86,14 +93,14 @@ __all__ = [
 ]
 
 _NAMES_BY_MODULE = {
-    "queries.bounding_boxes": ("BoundingBox",),
+    "bounding_boxes": ("BoundingBox",),
     "bullet": ("BulletWorld",),
     "world_copy": ("copied",),
-    "queries.costmaps": ("Costmap", "OccupancyCostmap", "GaussianCostmap", "VisibilityCostmap", "SemanticCostmap"),
+    "queries": ("Costmap", "OccupancyCostmap", "GaussianCostmap", "VisibilityCostmap", "SemanticCostmap"),
     "enums": ("Arms", "Grasp", "GripperState", "JointType", "ObjectType", "WorldMode"),
     "objects": ("Object",),
     "pose": ("Pose", "Quaternion", "Vector"),
-    "robots.robot_description": (
+    "urdf": (
         "COURIER",
         "PR2",
         "ArmDescription",
@@ -105,8 +112,8 @@ _NAMES_BY_MODULE = {
         "register_robot",
         "robot_description",
     ),
-    "robots.urdf_description": ("describe_arm", "describe_robot"),
-    "robots.acting_robot": ("acting_robot", "robot_acting"),
+    "urdf": ("describe_arm", "describe_robot"),
+    "world_copy": ("acting_robot", "robot_acting"),
     "state": ("WorldState",),
     "observers": ("WorldObserver", "WorldWatcher", "current_world", "watcher"),
 }

@@ -2,23 +2,66 @@
 
 Motions are kinematic: setters place objects and joints, the simulation is never stepped, and objects do not fall. Any
 number of worlds can be open at once, in tasks and threads; one world belongs to one thread at a time.
+
+**Objects.** Objects of a world: poses, joints and attachments. Each motion notifies the observers once per changed
+object.
+
+>>> with BulletWorld() as world:
+...     milk = Object("milk", ObjectType.MILK, pose=Pose([1.3, 1, 0.9]))
+...     milk.set_pose(Pose([1.3, 1.2, 0.9]))
+...     round(milk.bounding_box().size.z, 3)
+0.194
 """
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 from types import MappingProxyType, TracebackType
-from typing import Self
+from typing import TYPE_CHECKING, Protocol, Self
 
-from pycrorm_async.world.attachments import Attachments
-from pycrorm_async.world.bullet_loader import engine
-from pycrorm_async.world.enums import ObjectType, WorldMode
-from pycrorm_async.world.errors import ObjectNotInWorld, WorldClosed, WorldUnavailable
-from pycrorm_async.world.objects import Object
-from pycrorm_async.world.observers import WorldObserver, WorldWatcher, current_world, watcher
-from pycrorm_async.world.queries import visibility
-from pycrorm_async.world.state import ObjectState, WorldState, check_state, set_state
+from pycrorm_async.connected_var import ConnectedVar
+from pycrorm_async.world import bullet_body
+from pycrorm_async.world.bounding_boxes import BoundingBox
+from pycrorm_async.world.bullet_body import (
+    Body,
+    Color,
+    ObjectState,
+    WorldState,
+    check_state,
+    engine,
+    set_state,
+    visual_boxes,
+)
+from pycrorm_async.world.model_boxes import described_mass_kg, visuals_as_collisions
+from pycrorm_async.world.models import built_in_urdf
+from pycrorm_async.world.pose import (
+    COORDINATE_MAX,
+    Arms,
+    AttachmentRefused,
+    DuplicateName,
+    JointLimitExceeded,
+    JointType,
+    NoWorld,
+    ObjectNotInWorld,
+    ObjectRefused,
+    ObjectType,
+    Pose,
+    PoseRefused,
+    UnknownJoint,
+    UnknownLink,
+    WorldClosed,
+    WorldMode,
+    WorldUnavailable,
+)
+from pycrorm_async.world.urdf import RobotDescription, robot_description, urdf_text
+
+if TYPE_CHECKING:
+    from pycrorm_async.world.arms import Chain
+
 
 _GRAVITY_M_PER_S2 = -9.8
 
@@ -256,7 +299,7 @@ class BulletWorld:
         Objects in `ignore` are transparent. A ray does not hit the shape it starts in. Points are in "map", m.
         """
         transparent = [obj.body for obj in ignore if self.has(obj)]
-        numbers = visibility.first_met(self.client, starts, ends, transparent=transparent)
+        numbers = bullet_body.first_met(self.client, starts, ends, transparent=transparent)
         return [self._objects.get(number) for number in numbers]
 
     def met_towards(self, obj: Object, eye: Sequence[float], *, ignore: Iterable[Object] = ()) -> list[Object | None]:
@@ -265,7 +308,7 @@ class BulletWorld:
         None means the floor. The list is empty for an object without shapes.
         """
         obj.check_present()
-        points = visibility.inner_points(obj.body)
+        points = bullet_body.inner_points(obj.body)
         others = [each for each in ignore if each is not obj]
         return self.ray_test([eye] * len(points), points, ignore=others) if points else []
 
@@ -323,3 +366,523 @@ def _connect(mode: WorldMode) -> int:
     floor = bullet.createCollisionShape(bullet.GEOM_PLANE, physicsClientId=client)
     bullet.createMultiBody(0, floor, physicsClientId=client)
     return client
+
+
+# === attachments ==============================================================================================
+#
+# Keep the attachments of one world, and carry attached objects along with a motion.
+#
+# A child is attached to one link of one parent and keeps its pose relative to that link. Chains are allowed, cycles are
+# not.
+
+
+@dataclass(frozen=True, slots=True)
+class Attachment:
+    """A child that moves with `link` of `parent` (None: its base link) at the pose `relative` to that link."""
+
+    parent: Object
+    child: Object
+    link: str | None
+    relative: Pose
+
+
+class Attachments:
+    """All attachments of one world. Changing them moves no object and notifies no observer."""
+
+    def __init__(self) -> None:
+        self._of_child: dict[Object, Attachment] = {}
+
+    def __iter__(self) -> Iterator[Attachment]:
+        """Iterate over the attachments in the order of their creation."""
+        return iter(tuple(self._of_child.values()))
+
+    def of(self, child: Object) -> Attachment | None:
+        """Return the attachment of `child` to its parent."""
+        return self._of_child.get(child)
+
+    def on(self, parent: Object) -> tuple[Attachment, ...]:
+        """Return the attachments of direct children of `parent`."""
+        return tuple(each for each in self._of_child.values() if each.parent is parent)
+
+    def below(self, parent: Object) -> tuple[Object, ...]:
+        """Return all descendants of `parent`, parents before their children."""
+        return tuple(obj for each in self.on(parent) for obj in (each.child, *self.below(each.child)))
+
+    def add(self, parent: Object, child: Object, link: str | None) -> None:
+        """Attach `child` at its current pose. Raises `AttachmentRefused`."""
+        if parent.world is not child.world:
+            raise AttachmentRefused(f"{child.name!r} and {parent.name!r} are in different worlds")
+        present = self._of_child.get(child)
+        if present is not None:
+            raise AttachmentRefused(
+                f"{child.name!r} is attached to {present.parent.name!r} already; detach it there first"
+            )
+        above: Object | None = parent
+        while above is not None:
+            if above is child:
+                raise AttachmentRefused(f"{child.name!r} cannot be attached to itself (through {parent.name!r})")
+            above = attachment.parent if (attachment := self._of_child.get(above)) else None
+        self.put(parent, child, link)
+
+    def put(self, parent: Object, child: Object, link: str | None) -> None:
+        """Store the attachment of `child` to that link at its current pose, without checks."""
+        relative = child.pose.relative_to(parent.link_pose(link))
+        self.keep(Attachment(parent, child, link, relative))
+
+    def keep(self, attachment: Attachment) -> None:
+        """Store an attachment; the caller ensures that the child is at its relative pose."""
+        self._of_child[attachment.child] = attachment
+
+    def remove(self, parent: Object, child: Object) -> Attachment:
+        """Remove an attachment and return it. Raises `AttachmentRefused` if `child` is not attached to `parent`."""
+        present = self._of_child.get(child)
+        if present is None or present.parent is not parent:
+            raise AttachmentRefused(f"{child.name!r} is not attached to {parent.name!r}")
+        return self._of_child.pop(child)
+
+    def carry(self, parent: Object, joints: Iterable[str] | None = None) -> list[Object]:
+        """Move all descendants of `parent` to their poses relative to its links; return them, parents first.
+
+        With `joints`, only the children on links that these joints move, and their descendants.
+        """
+        carried: list[Object] = []
+        moved = None if joints is None else set(joints)
+        for each in self.on(parent) if self._of_child else ():
+            link_moved = moved is None or not moved.isdisjoint(parent.joints_above(each.link))
+            if link_moved:
+                each.child.body.place(parent.link_pose(each.link) @ each.relative)
+                carried.append(each.child)
+                carried += self.carry(each.child)
+        return carried
+
+
+# === objects ==================================================================================================
+
+_PAST_LIMIT_MAX = 1e-6  # rad or m; tolerates positions that rounding puts past a limit
+
+
+class Object:
+    """One object of one world, compared by identity.
+
+    Args:
+        name: unique in its world.
+        object_type: the kind of object; the first one of type ROBOT becomes `world.robot`.
+        description: URDF text, or the path of a .urdf file; None means the built-in shape for that name and type.
+        pose: pose of the base link's frame, in "map"; None means the root link's at the origin. `reset` restores it.
+        world: the world to add it to; None means the current world of this context.
+        color: red, green, blue, opacity, 0 to 1.
+        mass_kg: None means the sum of the masses in the description, if it has any; unknown for a robot or environment.
+        robot: the description of a robot; None means the built-in or registered one with the object's name. Without
+            `description` the model is that of the robot's description, or the built-in one of its name.
+        base_link: the link whose pose is the robot's pose, empty for the root link; None means that of the robot's
+            description. The base link of any other object is its root link.
+
+    Raises:
+        ObjectRefused, NoWorld, WorldClosed, DuplicateName, DescriptionNotLoadable, PoseRefused, UnknownLink.
+    """
+
+    name: str
+    object_type: ObjectType
+    world: BulletWorld
+    original_pose: Pose
+    description_text: str
+    color: Color | None
+    robot_description: RobotDescription | None
+    chains: dict[Arms, Chain]
+    """The chains of a robot's arms that were needed so far, for `kinematics`."""
+    body: Body
+    """The body in Bullet, for this package only: moving it notifies no observer."""
+    copy_of: Object | None
+    """The object of the original world of which this one is a copy; None outside copied worlds."""
+
+    def __init__(
+        self,
+        name: str,
+        object_type: ObjectType,
+        description: str | Path | None = None,
+        pose: Pose | None = None,
+        *,
+        world: BulletWorld | None = None,
+        color: Color | None = None,
+        mass_kg: float | None = None,
+        robot: RobotDescription | None = None,
+        base_link: str | None = None,
+    ) -> None:
+        _check_identity(name, object_type)
+        _check_mass(name, mass_kg)
+        world = world if world is not None else current_world.get()
+        if world is None:
+            raise NoWorld(f"object {name!r}")
+        client = world.client
+        if any(present.name == name for present in world.objects):
+            raise DuplicateName(name)
+        self.name = name
+        self.object_type = object_type
+        self.world = world
+        self.copy_of = None
+        if pose is not None:
+            _check_pose(name, pose)
+        is_robot = object_type is ObjectType.ROBOT
+        if base_link and not is_robot:
+            raise ObjectRefused(f"only a robot has a base link other than its root, but {name!r} is {object_type.name}")
+        if robot is None and is_robot:
+            robot = robot_description(name)
+        if base_link is None and is_robot and robot is not None:
+            base_link = robot.base_link
+        if description is None and robot is not None:
+            description = robot.urdf
+        if description is None:
+            description = built_in_urdf(name if robot is None else robot.name, object_type)
+        self.description_text = urdf_text(name, description)
+        self.robot_description = robot
+        self.color = color
+        self._mass_kg = mass_kg
+        self.chains = {}
+        self.body = Body(name, self.description_text, client, pose, color, base_link or "")
+        self.original_pose = self.body.pose
+        world.add(self)
+
+    def __repr__(self) -> str:
+        return f"Object({self.name!r}, {self.object_type.name}, {self.pose!r})"
+
+    # --- pose and extent --------------------------------------------------------------------------------------
+
+    @property
+    def pose(self) -> Pose:
+        """The pose that was set last, or to which the object was carried, unrounded. Readable after removal."""
+        return self.body.pose
+
+    def set_pose(self, pose: Pose) -> None:
+        """Move the base link's frame to this pose, together with the objects attached to this one.
+
+        An object that is attached to a parent stays attached, at its new pose relative to the parent.
+
+        Raises:
+            PoseRefused, WorldClosed, ObjectNotInWorld: before anything is moved.
+        """
+        self.check_present()
+        self.body.place(_check_pose(self.name, pose))
+        self._keep_attached()
+        self.world.notify_moved([self, *self.world.attachments.carry(self)])
+
+    @property
+    def base_link(self) -> str:
+        """The link whose frame is a robot's pose; empty for the root link."""
+        return "" if self.body.base == self.body.root else self.body.base
+
+    def root_pose(self, pose: Pose | None = None) -> Pose:
+        """Return the pose of the root link's frame, now or with the object at `pose` and its joints as they are."""
+        return self.body.root_pose if pose is None else self.body.root_at(pose)
+
+    def link_pose(self, link: str | None = None) -> Pose:
+        """Return the pose of a link's frame in "map"; None means the base link. Raises `UnknownLink`."""
+        if link is None or link == self.body.base:
+            return self.body.pose
+        if link == self.body.root:
+            return self.body.root_pose
+        self._check_link(link)
+        self.check_present()
+        position, orientation = self.body.link_frame(link)
+        return Pose(position, orientation)
+
+    def link_pose_at(self, link: str, positions: Mapping[str, float]) -> Pose:
+        """Return the pose that a link's frame would have in "map" at these joint positions (rad or m).
+
+        Nothing is moved and limits are not checked. Raises `UnknownLink`, `UnknownJoint`.
+        """
+        self._check_link(link)
+        for joint in positions:
+            self.joint_position(joint)
+        self.check_present()
+        position, orientation = self.body.link_frame_at(link, positions)
+        return Pose(position, orientation)
+
+    def bounding_box(self, link: str | None = None) -> BoundingBox:
+        """Return the box along the axes of "map" around the whole object or one link, without margin.
+
+        Without a collision shape it is a box of size zero at the frame's origin. Raises `UnknownLink`.
+        """
+        links = self.body.links if link is None else (self._check_link(link),)
+        self.check_present()
+        box = self.body.box(links)
+        if box is None:
+            position = self.link_pose(link).position
+            return BoundingBox(position, position)
+        return box
+
+    def box_in_link(self, link: str) -> BoundingBox | None:
+        """Return the box around a link's collision shapes, in its own frame; None without any. Raises `UnknownLink`."""
+        return self.body.box_in_link(self._check_link(link))
+
+    def visual_boxes(self, links: Collection[str]) -> dict[str, BoundingBox]:
+        """Return the boxes around the visual shapes of links, in their frames, where Bullet can load the shapes."""
+        return visual_boxes(visuals_as_collisions(self.description_text, links), self.body.client)
+
+    @property
+    def mass_kg(self) -> float | None:
+        """The given mass, else that of the description; None if it is not known.
+
+        The description counts for objects that grippers lift, not for robots and environments, whose models often have
+        guessed masses.
+        """
+        if self._mass_kg is not None or self.object_type in (ObjectType.ROBOT, ObjectType.ENVIRONMENT):
+            return self._mass_kg
+        return described_mass_kg(self.description_text)
+
+    def label(self, text: str) -> None:
+        """Show a text at the object, if the world has a window."""
+        self.check_present()
+        self.body.label(text)
+
+    # --- joints -----------------------------------------------------------------------------------------------
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """The names of the movable joints."""
+        return tuple(self.body.positions)
+
+    @property
+    def links(self) -> tuple[str, ...]:
+        """The names of all links, the root first."""
+        return self.body.links
+
+    def joint_position(self, joint: str) -> float:
+        """Return the position that was set last, rad or m. Raises `UnknownJoint`."""
+        try:
+            return self.body.positions[joint]
+        except KeyError:
+            raise UnknownJoint(self.name, joint, self.joints) from None
+
+    def joint_positions(self) -> dict[str, float]:
+        """Return the positions of all movable joints by name, rad or m; a copy."""
+        return dict(self.body.positions)
+
+    def joint_limits(self, joint: str) -> tuple[float, float]:
+        """Return the lower and upper hard limit, rad or m; infinite for a continuous joint. Raises `UnknownJoint`."""
+        try:
+            return self.body.limits[joint]
+        except KeyError:
+            raise UnknownJoint(self.name, joint, self.joints) from None
+
+    def joint_type(self, joint: str) -> JointType:
+        """Return the type of a joint, also of a fixed one. Raises `UnknownJoint`."""
+        try:
+            return self.body.joint_types[joint]
+        except KeyError:
+            raise UnknownJoint(self.name, joint, self.joints) from None
+
+    def joints_above(self, link: str | None) -> tuple[str, ...]:
+        """Return the movable joints between a link (None: the base link) and the root, nearest first.
+
+        Raises `UnknownLink`.
+        """
+        return self.body.movable_above[self.body.base if link is None else self._check_link(link)]
+
+    def set_joint_position(self, joint: str, position: float) -> None:
+        """Set one joint; see `set_joint_positions`."""
+        self.set_joint_positions({joint: position})
+
+    def set_joint_positions(self, positions: Mapping[str, float]) -> None:
+        """Set joints, rad or m, in one motion, and carry along the objects attached to the links they move.
+
+        A joint above the base link moves the base too. All errors are raised before anything is moved.
+
+        Raises:
+            JointLimitExceeded: a position is outside its hard limits (by more than 1e-6) or not finite.
+            UnknownJoint, WorldClosed, ObjectNotInWorld.
+        """
+        self.check_present()
+        targets = {joint: float(position) for joint, position in positions.items()}
+        for joint, position in targets.items():
+            lower, upper = self.joint_limits(joint)
+            within = lower - _PAST_LIMIT_MAX <= position <= upper + _PAST_LIMIT_MAX
+            if not (within and abs(position) <= COORDINATE_MAX):
+                raise JointLimitExceeded(self.name, joint, position, (lower, upper))
+        if targets:
+            before = self.body.pose
+            self.body.turn(targets)
+            moved = [self] if self.body.pose != before else []
+            if moved:
+                self._keep_attached()
+            moved += self.world.attachments.carry(self, targets)
+            self.world.notify_joints(self, targets)
+            self.world.notify_moved(moved)
+
+    # --- attachments ------------------------------------------------------------------------------------------
+
+    @property
+    def attachments(self) -> dict[Object, str | None]:
+        """The attached objects, each with the link it moves with (None: the base link)."""
+        return {each.child: each.link for each in self.world.attachments.on(self)}
+
+    @property
+    def attached_to(self) -> Object | None:
+        """The object that this one is attached to."""
+        attachment = self.world.attachments.of(self)
+        return None if attachment is None else attachment.parent
+
+    def attach(self, child: Object, link: str | None = None) -> None:
+        """Attach `child` at its current pose to `link` (None: the base link), so that it moves with it.
+
+        Raises:
+            AttachmentRefused: the child is attached already, to this or another object, or it carries this one.
+            UnknownLink, WorldClosed, ObjectNotInWorld.
+        """
+        self.check_present()
+        if not isinstance(child, Object):
+            raise AttachmentRefused(f"only an Object can be attached to {self.name!r}, got {child!r}")
+        child.check_present()
+        if link is not None:
+            self._check_link(link)
+        self.world.attachments.add(self, child, link)
+        for observer in self.world.observers:
+            observer.object_attached(self, child, link)
+
+    def detach(self, child: Object) -> None:
+        """Detach `child`, which keeps its pose. Raises `AttachmentRefused` if it is not attached to this object."""
+        self.check_present()
+        attachment = self.world.attachments.remove(self, child)
+        for observer in self.world.observers:
+            observer.object_detached(self, child, attachment.link)
+
+    def detach_all(self) -> None:
+        """Detach all children, and the object itself from its parent."""
+        for child in self.attachments:
+            self.detach(child)
+        if (parent := self.attached_to) is not None:
+            parent.detach(self)
+
+    # --- reset and removal ------------------------------------------------------------------------------------
+
+    def reset(self) -> None:
+        """Detach the object, set its joints to 0, and move it to its original pose; notify of differences only."""
+        self.check_present()
+        self.detach_all()
+        joints = {joint: 0.0 for joint, position in self.body.positions.items() if position != 0.0}
+        before = self.body.pose
+        if joints:
+            self.body.turn(joints)
+        if self.body.pose != self.original_pose:
+            self.body.place(self.original_pose)
+        if joints:
+            self.world.notify_joints(self, joints)
+        if self.body.pose != before:
+            self.world.notify_moved([self])
+
+    def remove(self) -> None:
+        """Detach the object and remove it from the world; its last pose and joints can still be read."""
+        self.world.remove(self)
+
+    def check_present(self) -> None:
+        """Raise `WorldClosed` if the world is closed, `ObjectNotInWorld` if the object was removed."""
+        _ = self.world.client
+        if not self.world.has(self):
+            raise ObjectNotInWorld(self.name, tuple(present.name for present in self.world.objects))
+
+    def _keep_attached(self) -> None:
+        """Keep the attachment to the parent at the object's new pose."""
+        attachments = self.world.attachments
+        if (attachment := attachments.of(self)) is not None:
+            attachments.put(attachment.parent, self, attachment.link)
+
+    def _check_link(self, link: str) -> str:
+        if link not in self.body.movable_above:
+            raise UnknownLink(self.name, link, self.links)
+        return link
+
+
+def _check_identity(name: object, object_type: object) -> None:
+    """Raise `ObjectRefused` unless both have the right type; every record of an object holds them."""
+    if not isinstance(name, str):
+        raise ObjectRefused(f"an object's name must be a str, got {name!r}")
+    if not isinstance(object_type, ObjectType):
+        raise ObjectRefused(f"the type of object {name!r} must be an ObjectType, got {object_type!r}")
+
+
+def _check_mass(name: str, mass_kg: object) -> None:
+    """Raise `ObjectRefused` unless the mass is None or a finite number > 0."""
+    if mass_kg is not None and not (isinstance(mass_kg, int | float) and 0 < mass_kg < math.inf):
+        raise ObjectRefused(f"the mass of object {name!r} must be a number of kg > 0, got {mass_kg!r}")
+
+
+def _check_pose(name: str, pose: Pose) -> Pose:
+    """Return the pose. Raises `PoseRefused` if the object cannot be moved to it."""
+    if not isinstance(pose, Pose):
+        raise PoseRefused(name, pose, "it is not a Pose")
+    if pose.frame != "map":
+        raise PoseRefused(name, pose, f"its frame is {pose.frame!r}: transform it to 'map' first")
+    if not all(abs(value) <= COORDINATE_MAX for value in (*pose.position, *pose.orientation)):
+        raise PoseRefused(name, pose, f"its numbers must be finite and at most {COORDINATE_MAX:g}")
+    return pose
+
+
+# === observers ================================================================================================
+#
+# Protocols for observing worlds: observers of one world's changes, and watchers of worlds that are entered.
+#
+# Theory of operation -------------------
+#
+# Two context variables connect the world to its users, so that the world package imports none of them. `current_world`
+# is the world of the innermost `with BulletWorld()` of the current task; a world entered with `BulletWorld.connect` is
+# visible in every context of the process that has none of its own. `watcher` is the `WorldWatcher` of the current
+# context; an open memory sets its recorder as one.
+#
+# A world reads `watcher` once, when it is entered, calls its `world_entered`, and keeps it, so that the same watcher
+# gets `world_left` even if the context has another one by then. If `world_entered` raises, the world closes and the
+# exception reaches the caller: a watcher can refuse a world, and gets no `world_left` for it. Copies of a world are
+# entered without a watcher.
+#
+# A world calls its observers in the order in which they were added, synchronously in the thread that changed the world,
+# and only after the motion is complete, when all poses and joints, also those of carried objects, are set. A world
+# belongs to one thread at a time, so its calls do not overlap, and observers need no lock of their own for it. The
+# tuple of observers is replaced and never mutated, so an observer may add or remove observers while it is called.
+# Collision queries move the objects' `Body` for a trial and restore it, without a call of the object's setters, so they
+# notify no observer.
+
+
+class WorldObserver(Protocol):
+    """Receives every change of one world: objects added and removed, their motions, and their attachments.
+
+    A motion notifies once for each object with a new pose and once for each object with new joint positions. The world
+    calls in the thread that made the change. An observer must not raise: the exception would reach that thread.
+    """
+
+    def object_added(self, added: Object) -> None:
+        """Called after an object was added, with its pose and joints set."""
+        ...
+
+    def object_removed(self, removed: Object) -> None:
+        """Called after an object was removed; its last pose can still be read."""
+        ...
+
+    def object_moved(self, moved: Object) -> None:
+        """Called after an object's pose was set, or changed because its parent carried it."""
+        ...
+
+    def joints_moved(self, moved: Object, positions: Mapping[str, float]) -> None:
+        """Called after one motion set these joints (by name, rad or m)."""
+        ...
+
+    def object_attached(self, parent: Object, child: Object, link: str | None) -> None:
+        """Called after `child` was attached to `link` of `parent` (None: its base link)."""
+        ...
+
+    def object_detached(self, parent: Object, child: Object, link: str | None) -> None:
+        """Called after `child` was detached from `link` of `parent`."""
+        ...
+
+
+class WorldWatcher(Protocol):
+    """Receives the worlds that are entered and left in its context."""
+
+    def world_entered(self, world: BulletWorld) -> None:
+        """Called when a world is entered, by `with` or `connect`; an exception closes it and reaches the caller."""
+        ...
+
+    def world_left(self, world: BulletWorld) -> None:
+        """Called when the world is left, before it closes; its objects can still be read."""
+        ...
+
+
+current_world: ConnectedVar[BulletWorld] = ConnectedVar("current_world")
+watcher: ConnectedVar[WorldWatcher] = ConnectedVar("watcher")

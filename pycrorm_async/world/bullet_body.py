@@ -11,18 +11,37 @@ joint above the base moves the base, and the root keeps its pose.
 
 from __future__ import annotations
 
+import ctypes
 import math
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
-from typing import Any
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from functools import cache
+from importlib import import_module
+from importlib.util import find_spec
+from threading import Lock
+from typing import Any, NamedTuple
 
-from pycrorm_async.world.bullet_loader import captured, engine
-from pycrorm_async.world.enums import JointType
-from pycrorm_async.world.errors import DescriptionNotLoadable, UnknownLink
-from pycrorm_async.world.pose import IDENTITY, Pose, Quaternion, Vector, product, rotated
-from pycrorm_async.world.queries.bounding_boxes import BoundingBox, Frame, Solid, box_around, solids_of
-from pycrorm_async.world.robots.joint_chain import Joint, along, chains, divided
+import numpy as np
+
+from pycrorm_async.world.bounding_boxes import BoundingBox, Frame, Solid, box_around, rotation_matrix, solids_of
+from pycrorm_async.world.pose import (
+    IDENTITY,
+    BulletMissing,
+    DescriptionNotLoadable,
+    JointLimitExceeded,
+    JointType,
+    Pose,
+    PoseRefused,
+    Quaternion,
+    UnknownJoint,
+    UnknownLink,
+    Vector,
+    product,
+    rotated,
+)
+from pycrorm_async.world.urdf import Joint, along, chains, divided
 
 Color = tuple[float, float, float, float]
 """Red, green, blue, opacity, each 0 to 1."""
@@ -271,3 +290,186 @@ def _invert(frame: Frame) -> Frame:
     back = Quaternion(-x, -y, -z, w)
     moved = rotated(back, position)
     return Vector(-moved.x, -moved.y, -moved.z), back
+
+
+# === bullet loader ============================================================================================
+#
+# Load Bullet when the first world is entered, and keep its output away from stdout and stderr.
+#
+# Two packages ship the same Bullet: pybullet has wheels up to Python 3.11, and pycram-bullet, the fork of the institute
+# behind PyCRAM, has wheels for 3.11 and 3.12 and calls its module `pycram_bullet`. Either one works; no other module of
+# this package imports one of them.
+#
+# Bullet prints with C's `printf`, which cannot be switched off: a greeting at import, warnings when it loads a body.
+# Meanwhile this module points C's own `stdout` and `stderr` to a buffer in memory. Python and child processes write to
+# the file descriptors and not through those pointers, so their output is not affected. The buffer holds Bullet's error
+# message if a description does not load.
+
+_MODULES = ("pybullet", "pycram_bullet")
+_STREAMS_LOCK = Lock()  # a process has one C stdout
+
+
+@cache
+def engine() -> Any:
+    """Return the module of Bullet, imported at the first call: `pybullet` or else `pycram_bullet`.
+
+    Raises `BulletMissing` if neither is installed.
+    """
+    for name in _MODULES:
+        spec = find_spec(name)
+        if spec is None or spec.origin is None:
+            continue
+        # Load the library before the streams are redirected: its C++ runtime keeps the streams it finds when it
+        # starts, and would flush the freed memory buffer at exit.
+        ctypes.CDLL(spec.origin)
+        with captured():
+            return import_module(name)
+    raise BulletMissing
+
+
+@contextmanager
+def captured() -> Iterator[list[str]]:
+    """Capture the output of C code inside the context; afterwards the list holds it as one string.
+
+    One thread at a time can capture, others block; not reentrant. Without glibc nothing is captured.
+    """
+    output: list[str] = []
+    libc = ctypes.CDLL(None)
+    if not hasattr(libc, "gnu_get_libc_version"):  # only glibc lets its streams be assigned
+        yield output
+        return
+    libc.open_memstream.restype = ctypes.c_void_p
+    text, size = ctypes.c_char_p(), ctypes.c_size_t()
+    streams = [ctypes.c_void_p.in_dll(libc, name) for name in ("stdout", "stderr")]
+    with _STREAMS_LOCK:
+        memory: int | None = libc.open_memstream(ctypes.byref(text), ctypes.byref(size))
+        if memory is None:
+            raise MemoryError
+        before = [stream.value for stream in streams]
+        for stream in streams:
+            stream.value = memory
+        try:
+            yield output
+        finally:
+            for stream, value in zip(streams, before, strict=True):
+                stream.value = value
+            libc.fclose(ctypes.c_void_p(memory))
+            output.append((text.value or b"").decode(errors="replace"))
+            libc.free(text)
+
+
+# === visibility ===============================================================================================
+#
+# Cast rays through a Bullet client, into the shapes of bodies and through transparent ones.
+
+_RAYS_AT_ONCE = 16_000  # Bullet accepts at most 16,384 rays per call
+
+
+def first_met(
+    client: int,
+    starts: Sequence[Sequence[float]],
+    ends: Sequence[Sequence[float]],
+    *,
+    transparent: Collection[Body],
+) -> list[int]:
+    """Return Bullet's number of the first body on every ray, see `BulletWorld.ray_test`."""
+    if len(starts) != len(ends):
+        raise ValueError(f"every ray needs a start and an end, got {len(starts)} starts and {len(ends)} ends")
+    with _without_collisions(transparent):
+        return _hits(client, starts, ends)
+
+
+@contextmanager
+def _without_collisions(transparent: Collection[Body]) -> Iterator[None]:
+    """Let rays pass through these bodies inside the context, by removing them from all of Bullet's collision groups.
+
+    Casting a new ray from behind each hit would not work: Bullet may let a ray that starts just inside a shape hit the
+    same shape again and again.
+    """
+    try:
+        for body in transparent:
+            _group(body, 0)
+        yield
+    finally:
+        for body in transparent:
+            _group(body, 1)
+
+
+def _group(body: Body, group: int) -> None:
+    for link in range(-1, len(body.links) - 1):
+        engine().setCollisionFilterGroupMask(body.number, link, group, -1, physicsClientId=body.client)
+
+
+def inner_points(body: Body) -> list[list[float]]:
+    """Return points in "map", m, that are spread through the shapes of a body; none for a body without shapes."""
+    return [point for link, solids in body.solids.items() if solids for point in _inner_points(body, link)]
+
+
+def _inner_points(body: Body, link: str) -> list[list[float]]:
+    position, turn = body.link_frame(link)
+    inner = np.concatenate([solid.inner_points for solid in body.solids[link]])
+    placed: list[list[float]] = (inner @ rotation_matrix(turn).T + np.array(position)).tolist()
+    return placed
+
+
+def _hits(client: int, starts: Sequence[Sequence[float]], ends: Sequence[Sequence[float]]) -> list[int]:
+    """Return Bullet's number of the first body on every ray."""
+    numbers: list[int] = []
+    for begin in range(0, len(starts), _RAYS_AT_ONCE):
+        chunk = slice(begin, begin + _RAYS_AT_ONCE)
+        numbers += [hit[0] for hit in engine().rayTestBatch(starts[chunk], ends[chunk], physicsClientId=client)]
+    return numbers
+
+
+# === state ====================================================================================================
+#
+# Save the state of a world as a frozen value and restore it: poses, joint positions and attachments by object name.
+#
+# `BulletWorld.restore_state` sets the states of bodies by the functions here, and restores the attachments itself.
+#
+# Bullet's own saving of states is not used: it costs ten times as much and does not include attachments.
+
+
+@dataclass(frozen=True, slots=True)
+class ObjectState:
+    """The state of one object: pose, joint positions (rad or m), and parent's name and link if it was attached."""
+
+    pose: Pose
+    joints: Mapping[str, float]
+    attached_to: tuple[str, str | None] | None
+
+
+@dataclass(frozen=True, slots=True)
+class WorldState:
+    """The states of all objects by name; later changes of the world do not affect it."""
+
+    objects: Mapping[str, ObjectState]
+
+
+class StateChange(NamedTuple):
+    """The differences that setting a state made: the joints that got another position, and whether the pose changed."""
+
+    joints: dict[str, float]
+    moved: bool
+
+
+def check_state(name: str, body: Body, state: ObjectState) -> None:
+    """Raise `UnknownJoint`, `PoseRefused` or `JointLimitExceeded` if the body of that object cannot take this state."""
+    if not all(map(math.isfinite, (*state.pose.position, *state.pose.orientation))):
+        raise PoseRefused(name, state.pose, "its numbers must be finite")
+    for joint, position in state.joints.items():
+        if joint not in body.limits:
+            raise UnknownJoint(name, joint, tuple(body.positions))
+        if not math.isfinite(position):
+            raise JointLimitExceeded(name, joint, position, body.limits[joint])
+
+
+def set_state(body: Body, state: ObjectState) -> StateChange:
+    """Set pose and joint positions of a body, and return what has changed."""
+    before = body.pose
+    joints = {joint: value for joint, value in state.joints.items() if body.positions[joint] != value}
+    if joints:
+        body.turn(joints)
+    if body.pose != state.pose:
+        body.place(state.pose)
+    return StateChange(joints, body.pose != before)

@@ -1,4 +1,6 @@
-"""A pose is a frozen value: a position in metres and a unit quaternion xyzw, the frame of both, and a time.
+"""Define poses, the enumerations of the world, and its errors.
+
+**Pose.** A pose is a frozen value: a position in metres and a unit quaternion xyzw, the frame of both, and a time.
 
 >>> Pose([1.3, 0.7, 0.95]).position.z
 0.95
@@ -10,12 +12,14 @@ from __future__ import annotations
 
 import math
 import operator
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from enum import Enum, IntEnum
+from typing import Any, NamedTuple, cast
 
 from pycrorm_async.clock import SYSTEM_CLOCK
-from pycrorm_async.errors import CallerError
+from pycrorm_async.errors import CallerError, MissingExtra
 
 
 class Vector(NamedTuple):
@@ -171,3 +175,208 @@ def _nanoseconds(time: object) -> int:
 
 
 _NS_END = 2**63
+
+
+# === enums ====================================================================================================
+#
+# Enumerations of the world and of plans. Members are recorded by name; their values are those of PyCRAM.
+
+
+class Arms(IntEnum):
+    """An arm of the robot; BOTH for actions that move the left and the right one.
+
+    A robot's description lists which of these it has; the only arm of a robot may be LEFT or RIGHT. Further arms have a
+    name of their own (`named`), with which they are recorded.
+    """
+
+    LEFT = 1
+    RIGHT = 2
+    BOTH = 3
+
+    @classmethod
+    def named(cls, name: str) -> Arms:
+        """Return the arm of that name, the same object at each call. The class need not have a member of that name.
+
+        >>> Arms.named("CENTRE").name, Arms.named("LEFT") is Arms.LEFT
+        ('CENTRE', True)
+
+        Raises `ValueError` for a text that is not an identifier.
+        """
+        if name in cls.__members__:
+            return cls.__members__[name]
+        if not name.isidentifier():
+            raise ValueError(f"the name of an arm must be an identifier, got {name!r:.100}")
+        number = int.from_bytes(name.encode(), "big")  # the same in every process, and of no other name
+        arm = int.__new__(cls, number)
+        arm._name_, arm._value_ = name, number
+        # `setdefault` on the enum's own table keeps one object for each name, whichever thread makes it first.
+        members: Any = cls._value2member_map_
+        return cast("Arms", members.setdefault(number, arm))
+
+    def __reduce_ex__(self, protocol: Any) -> tuple[Any, ...]:
+        return Arms.named, (self._name_,)
+
+
+class Grasp(IntEnum):
+    """The side of the object from which the gripper approaches."""
+
+    FRONT = 0
+    LEFT = 1
+    RIGHT = 2
+    TOP = 3
+
+
+class GripperState(IntEnum):
+    """The goal of a gripper motion."""
+
+    OPEN = 1
+    CLOSE = 2
+
+
+class ObjectType(IntEnum):
+    """The kind of an object."""
+
+    METALMUG = 1
+    PRINGLES = 2
+    MILK = 3
+    SPOON = 4
+    BOWL = 5
+    BREAKFAST_CEREAL = 6
+    JEROEN_CUP = 7
+    ROBOT = 8
+    ENVIRONMENT = 9
+    GENERIC_OBJECT = 10
+    HUMAN = 11
+
+
+class JointType(IntEnum):
+    """The kind of a joint's motion."""
+
+    REVOLUTE = 0
+    PRISMATIC = 1
+    SPHERICAL = 2
+    PLANAR = 3
+    FIXED = 4
+    UNKNOWN = 5
+    CONTINUOUS = 6
+    FLOATING = 7
+
+
+class WorldMode(Enum):
+    """The mode of Bullet: GUI opens a window, DIRECT does not."""
+
+    GUI = "GUI"
+    DIRECT = "DIRECT"
+
+
+# === errors ===================================================================================================
+#
+# Errors of calls on the world. All are `CallerError`: each message names what to change.
+
+
+class WorldError(CallerError):
+    """Root of the errors of this package."""
+
+
+class WorldUnavailable(WorldError):
+    """Bullet cannot open a world: a window without a display, or too many worlds at once."""
+
+
+class BulletMissing(WorldUnavailable, MissingExtra):
+    """No Bullet is installed; the message names the command that installs it on this Python."""
+
+    def __init__(self) -> None:
+        message = "no world can be opened, because no Bullet is installed: pip install 'pycrorm-async[world]'"
+        if sys.version_info >= (3, 13):
+            message += " pybullet (no wheel for this Python: compiles for about 8 minutes with a C++ compiler)"
+        super().__init__(message)
+
+
+class WorldClosed(WorldError):
+    """The world is not entered yet or is closed; names, types, last poses and joints can still be read."""
+
+
+class NoWorld(WorldError):
+    """No world is entered in this context, and the call has no world argument."""
+
+    def __init__(self, wanted_for: str) -> None:
+        super().__init__(f"no world is entered for {wanted_for}: call it inside `with BulletWorld() as world:`")
+
+
+class ObjectRefused(WorldError):
+    """An object cannot have this name, type, mass or base link."""
+
+
+class ObjectNotInWorld(WorldError):
+    """No object of that name is in the world, or it was removed."""
+
+    def __init__(self, name: str, present: tuple[str, ...]) -> None:
+        super().__init__(f"{name!r} is not in the world; its objects are: {', '.join(present) or 'none'}")
+        self.name = name
+        self.present = present
+
+
+class DuplicateName(WorldError):
+    """The world already contains an object of that name."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(f"the world already contains an object named {name!r}; choose another name or remove it")
+        self.name = name
+
+
+class DescriptionNotLoadable(WorldError):
+    """Bullet cannot load a description; `reason` names the fault."""
+
+    def __init__(self, name: str, reason: str) -> None:
+        super().__init__(f"the description of {name!r} cannot be loaded: {reason}")
+        self.name = name
+        self.reason = reason
+
+
+class UnknownJoint(WorldError):
+    """The object has no movable joint of that name."""
+
+    def __init__(self, object_name: str, joint: str, present: tuple[str, ...]) -> None:
+        joints = ", ".join(present) or "none"
+        super().__init__(f"{object_name!r} has no movable joint {joint!r}; its joints are: {joints}")
+        self.object_name = object_name
+        self.joint = joint
+
+
+class UnknownLink(WorldError):
+    """The object has no link of that name."""
+
+    def __init__(self, object_name: str, link: str, present: tuple[str, ...]) -> None:
+        super().__init__(f"{object_name!r} has no link {link!r}; its links are: {', '.join(present)}")
+        self.object_name = object_name
+        self.link = link
+
+
+class JointLimitExceeded(WorldError):
+    """A joint position is outside the joint's hard limits (rad or m), or not finite; no joint was moved."""
+
+    def __init__(self, object_name: str, joint: str, value: float, limits: tuple[float, float]) -> None:
+        lower, upper = max(limits[0], -COORDINATE_MAX), min(limits[1], COORDINATE_MAX)
+        super().__init__(f"{object_name!r}: {joint} cannot be set to {value:g}; its limits are {lower:g} to {upper:g}")
+        self.object_name = object_name
+        self.joint = joint
+        self.value = value
+        self.limits = limits
+
+
+class PoseRefused(WorldError):
+    """An object's new pose is not a `Pose`, is not in the frame "map", or has a number that is NaN or too large."""
+
+    def __init__(self, object_name: str, pose: Pose, reason: str) -> None:
+        super().__init__(f"{object_name!r} cannot be moved to {pose!r}: {reason}")
+        self.object_name = object_name
+        self.pose = pose
+        self.reason = reason
+
+
+class AttachmentRefused(WorldError):
+    """Two objects cannot be attached to or detached from each other."""
+
+
+class CostmapMismatch(WorldError):
+    """Two costmaps of different origin, size or resolution cannot be multiplied."""

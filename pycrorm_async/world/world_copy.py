@@ -6,17 +6,31 @@
 ...         counterpart(milk, copy).set_pose(Pose([1, 2, 3]))
 ...     milk.pose.position
 Vector(x=0.0, y=0.0, z=0.0)
+
+**Acting robot.** Set the robot that acts in a context: `with robot_acting(robot):`. Without it the world's first robot
+acts.
+
+Choices nest, end with their block, and are inherited by tasks that start inside, so that each of several tasks can
+move a robot of its own.
+
+>>> async def tidy(robot: Object, place: Pose) -> None:
+...     with robot_acting(robot):
+...         await NavigateAction([place]).resolve().perform()
+>>> with BulletWorld(), simulated_robot:
+...     ada, bob = (Object(name, ObjectType.ROBOT, robot=PR2) for name in ("ada", "bob"))
+...     await asyncio.gather(tidy(ada, Pose([1, 0, 0])), tidy(bob, Pose([-1, 0, 0])))
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
+from contextvars import ContextVar
 
-from pycrorm_async.world.attachments import Attachment
-from pycrorm_async.world.bullet import BulletWorld
-from pycrorm_async.world.enums import WorldMode
-from pycrorm_async.world.objects import Object
+from pycrorm_async.connected_var import set_inside
+from pycrorm_async.errors import CallerError
+from pycrorm_async.world.bullet import Attachment, BulletWorld, Object
+from pycrorm_async.world.pose import ObjectType, WorldMode
 
 
 @contextmanager
@@ -85,3 +99,27 @@ def _first(obj: Object) -> Object:
     while obj.copy_of is not None:
         obj = obj.copy_of
     return obj
+
+
+# === acting robot =============================================================================================
+
+_chosen: ContextVar[Object | None] = ContextVar("_chosen", default=None)
+
+
+def robot_acting(robot: Object) -> AbstractContextManager[None]:
+    """Let this robot act inside the `with` block; in a copy of its world, its copy acts.
+
+    Raises `CallerError` if the object is not of type ROBOT.
+    """
+    if getattr(robot, "object_type", None) is not ObjectType.ROBOT:
+        raise CallerError(f"only an Object of type ROBOT can act, got {robot!r:.200}")
+    return set_inside(_chosen, robot)
+
+
+def acting_robot(world: BulletWorld) -> Object | None:
+    """Return the robot that acts in this context: the chosen one, else the world's first robot.
+
+    None if the world has no robot, or does not have the chosen one.
+    """
+    chosen = _chosen.get()
+    return world.robot if chosen is None else counterpart(chosen, world)

@@ -24,19 +24,27 @@ from __future__ import annotations
 import asyncio
 import math
 import random
-from collections.abc import Callable, Mapping, Sequence
+from collections import deque
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from contextlib import suppress
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, TypeVar
 
 from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable, FilesError, PycrormError, SpoolForeign
-from pycrorm_async.events.envelope import Record
-from pycrorm_async.events.ids import EpisodeId
+from pycrorm_async.events.codec import Record
+from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.settings import Settings
-from pycrorm_async.writer.availability import Availability
-from pycrorm_async.writer.drain import run_to_completion
-from pycrorm_async.writer.ports import ClaimedSource, Log, ScanResult, SourceScanner, Tables
-from pycrorm_async.writer.retry import PATIENT, Backoff
-from pycrorm_async.writer.visibility import VisibilityTracker
+from pycrorm_async.writer.drain import (
+    PATIENT,
+    Append,
+    Backoff,
+    ClaimedSource,
+    Drain,
+    Log,
+    ScanResult,
+    SourceScanner,
+    Tables,
+    run_to_completion,
+)
 
 STOP_S: Final = 10.0
 """Bounds the time of stopping. Records not stored by then stay in their folders for the next daemon."""
@@ -287,3 +295,131 @@ async def _wait(event: asyncio.Event, seconds: float) -> None:
 def _one_line(error: Exception) -> str:
     text = " ".join(str(error).split())
     return text if isinstance(error, PycrormError) else f"{type(error).__name__}: {text}"
+
+
+# === availability =============================================================================================
+#
+# Report when a database becomes unavailable and available again.
+
+_T = TypeVar("_T")
+_NOTABLE_S = 1.0
+"""A database that has not answered for less than this is not reported: a deadlock or a quick restart."""
+
+
+class Availability:
+    """Calls `on_lost` with the reason when the database is unavailable, `on_back` with the seconds when it is back."""
+
+    def __init__(
+        self, *, now_s: Callable[[], float], on_lost: Callable[[str], None], on_back: Callable[[float], None]
+    ) -> None:
+        self._now_s = now_s
+        self._on_lost = on_lost
+        self._on_back = on_back
+        self._unanswered_since_s: float | None = None
+        self._reported = False
+
+    async def observe(self, call: Awaitable[_T]) -> _T:
+        """Await a call of the database, and note whether it answered."""
+        called_s = self._now_s()
+        try:
+            result = await call
+        except DatabaseUnavailable as error:
+            self._note_failure(called_s, str(error))
+            raise
+        self._note_success(called_s)
+        return result
+
+    def _note_failure(self, called_s: float, reason: str) -> None:
+        if self._unanswered_since_s is None:
+            self._unanswered_since_s = called_s
+        if not self._reported and self._now_s() - self._unanswered_since_s >= _NOTABLE_S:
+            self._reported = True
+            self._on_lost(reason)
+
+    def _note_success(self, called_s: float) -> None:
+        since_s = self._unanswered_since_s
+        if since_s is None or called_s < since_s:  # the call began before the database became unavailable
+            return
+        self._unanswered_since_s = None
+        if self._reported:
+            self._reported = False
+            self._on_back(self._now_s() - since_s)
+
+
+# === visibility ===============================================================================================
+#
+# Drain one recorder for a daemon, and track which of its records are visible in the tables.
+
+_BATCHES_MAX = 256
+"""Bounds the batches tracked separately, so that memory stays flat while the tables lag; later ones are merged."""
+
+
+class VisibilityTracker:
+    """Drains a claimed source and notes the batches, so that it can publish their visibility.
+
+    Visibility comes from the log, per episode, so it does not matter which process folded.
+    """
+
+    def __init__(
+        self,
+        source: ClaimedSource,
+        append: Append,
+        *,
+        settings: Settings,
+        on_append: Callable[[], None],
+        report: Callable[[str], None],
+    ) -> None:
+        self.source = source
+        self.drain = Drain(source, append, settings=settings, on_append=self._track, report=report)
+        self._on_append = on_append
+        self._stored_before = source.stored if source.invisible else 0
+        # Of each batch its last position, and each episode's last sequence up to it; first those stored before.
+        self._invisible: deque[tuple[int, dict[str, int]]] = deque()
+        if source.invisible:
+            self._invisible.append((source.stored, _by_text(source.invisible)))
+        self._stopped: dict[str, str] = {}
+        self._updated = asyncio.Event()
+
+    async def run(self) -> None:
+        """Run until the folder is drained and all its records are visible. Raises as `Drain.run` does."""
+        await self.drain.run()
+        while self._invisible:
+            self._updated.clear()
+            await self._updated.wait()
+
+    @property
+    def appended(self) -> int:
+        """Position of the last appended record, by this process or an earlier one."""
+        return max(self.drain.state.appended, self._stored_before)
+
+    def note(self, appended: int, behind: Mapping[str, int], stopped: Mapping[str, str]) -> None:
+        """Publish to the recorder which records are visible.
+
+        Args:
+            appended: this tracker's `appended` before `behind` and `stopped` were read.
+            behind: by id, the folded sequence of each episode with events that are not visible yet.
+            stopped: by id, the reason why an episode is refused or parked.
+        """
+        visible_to, stopped = 0, {**self.drain.state.refused, **stopped}
+        while self._invisible and self._invisible[0][0] <= appended:
+            position, lasts = self._invisible[0]
+            if any(behind.get(episode, last) < last for episode, last in lasts.items()):
+                break
+            self._stopped |= {episode: stopped[episode] for episode in lasts if episode in stopped}
+            self._invisible.popleft()
+            visible_to = position
+        if visible_to:
+            self.source.mark_visible(visible_to, self._stopped)
+            self._updated.set()
+
+    def _track(self, batch: Sequence[Record]) -> None:
+        lasts = _by_text({each.episode: each.sequence for each in batch if each.episode is not None})
+        if len(self._invisible) >= _BATCHES_MAX:
+            _, before = self._invisible.pop()
+            lasts = before | lasts
+        self._invisible.append((batch[-1].position, lasts))
+        self._on_append()
+
+
+def _by_text(lasts: Mapping[EpisodeId, int]) -> dict[str, int]:
+    return {episode_text(episode): last for episode, last in lasts.items()}

@@ -7,6 +7,16 @@ The source keeps refused records as dead letters before the drain acknowledges t
 If the source cannot keep them, the drain acknowledges no position from the first such record on, because a source
 deletes by position. From then on the source can only fill up, so the drain calls `fail`, which makes waiting producers
 raise; it does the same when it ends with an error.
+
+**Retry.** Retry a database operation while the database is unavailable, with the pauses of a `Backoff`.
+
+>>> folded = await retry(destination.fold, backoff=BRIEF)
+
+**Patience.** Wait for work as long as it makes progress: bound the time without progress, not the work.
+
+>>> patience = Patience(15.0, progress=lambda: writer.progress)
+>>> if not await patience.wait(closing):
+...     raise FlushTimeout(15.0, TOO_MANY_EVENTS)
 """
 
 from __future__ import annotations
@@ -14,16 +24,75 @@ from __future__ import annotations
 import asyncio
 import logging
 import random
-from collections.abc import Awaitable, Callable, Coroutine, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Collection, Coroutine, Iterable, Mapping, Sequence
 from contextlib import suppress
-from typing import Any, NamedTuple, TypeAlias, TypeVar
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Final, NamedTuple, Protocol, TypeAlias, TypeVar
 
-from pycrorm_async.errors import DamageError, DatabaseUnavailable, FilesError
-from pycrorm_async.events.envelope import Record
+from pycrorm_async.errors import (
+    DamageError,
+    DatabaseError,
+    DatabaseUnavailable,
+    FilesError,
+    InternalError,
+    PycrormError,
+)
+from pycrorm_async.events.codec import Record
 from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.settings import Settings
-from pycrorm_async.writer.ports import Source
-from pycrorm_async.writer.retry import PATIENT, Backoff, retry
+
+# === retry ====================================================================================================
+
+
+async def retry(
+    operation: Callable[[], Awaitable[_T]],
+    *,
+    backoff: Backoff,
+    on_unavailable: Callable[[DatabaseUnavailable], None] = lambda _: None,
+    randomness: Callable[[], float] = random.random,
+    sleep: Callable[[float], Awaitable[None]] = asyncio.sleep,
+) -> _T:
+    """Return the operation's result. Calls `on_unavailable` after each failed attempt; raises the last one's error."""
+    attempt = 0
+    while True:
+        try:
+            return await operation()
+        except DatabaseUnavailable as error:
+            attempt += 1
+            on_unavailable(error)
+            pause_s = backoff.pause_s(attempt, randomness())
+            if pause_s is None:
+                raise
+        await sleep(pause_s)
+
+
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Backoff:
+    """A policy for retries; with `attempts_max` None they never end."""
+
+    first_s: float
+    longest_s: float
+    attempts_max: int | None = None
+
+    def pause_s(self, attempt: int, randomness: float) -> float | None:
+        """Return the pause after failed attempt 1, 2, 3 …; None to stop. `randomness`, 0 to 1, gives half to full."""
+        if self.attempts_max is not None and attempt >= self.attempts_max:
+            return None
+        doublings = min(attempt - 1, 30)  # bounded, because the power would overflow after some days
+        pause_s: float = min(self.longest_s, self.first_s * 2**doublings)
+        return pause_s * (1 + randomness) / 2
+
+
+PATIENT = Backoff(first_s=0.1, longest_s=10.0)
+"""The backoff of writers: retries never end, because the queue keeps recording events on disk."""
+
+BRIEF = Backoff(first_s=0.1, longest_s=1.0, attempts_max=5)
+"""The backoff of commands that a user waits for: five attempts."""
+
+
+# === drain ====================================================================================================
 
 _log = logging.getLogger("pycrorm_async")
 _T = TypeVar("_T")
@@ -195,3 +264,307 @@ async def run_to_completion(work: Coroutine[Any, Any, _T]) -> _T:
         if not task.cancelled():
             task.exception()  # retrieved, so that asyncio does not log it; the cancellation wins
         raise
+
+
+# === ports ====================================================================================================
+#
+# Define the writer's two ends: a source of synced records, and a log that stores them with the tables behind it.
+#
+# A writer beside a plan needs `Source` and `Destination`; a daemon needs `ClaimedSource`, `Log` and `Tables`; a plan
+# that waits for a daemon needs `OfferedQueue`.
+
+
+class Source(Protocol):
+    """The consumer's side of a queue, live or recovered."""
+
+    @property
+    def name(self) -> str:
+        """The recorder's name, for status and messages."""
+        ...
+
+    async def get_batch(self, *, events_max: int, bytes_max: int, age_s_max: float) -> Sequence[Record]:
+        """Return the next synced records in order, at least one, within the limits (a larger record comes alone).
+
+        Waits for the first record, then at most `age_s_max` for more. Returns an empty sequence once the queue is
+        closed and drained. A source supplies each record once; the next source supplies unacknowledged records again.
+        """
+        ...
+
+    async def acknowledge(self, position: int) -> None:
+        """Note that records up to this position are durable in the database: their segments may be deleted."""
+        ...
+
+    def dead_letter(self, records: Sequence[Record]) -> bool:
+        """Keep records that the log refused, durable on return, so that they can be acknowledged. Blocks.
+
+        Keeps each record once. Returns False if the source itself consists of dead letters, which must stay where they
+        are. Raises `FilesError` or `DamageError` if the records cannot be kept.
+        """
+        ...
+
+    def fail(self, reason: str) -> None:
+        """Note that no more records will be acknowledged, so that waiting producers fail. The first reason stays."""
+        ...
+
+
+class Log(Protocol):
+    """The log in a database."""
+
+    async def append(self, records: Sequence[Record]) -> Mapping[EpisodeId, str]:
+        """Append records, durable on return. Records stored before with the same bytes are stored once.
+
+        Returns the episodes with refused records (behind a gap, or with content no database can hold) and the reasons:
+        the caller must keep these records; other episodes are not affected. Raises `DatabaseUnavailable`; then the same
+        call may be repeated. Raises `LogDamaged` if another event is stored under a record's key.
+        """
+        ...
+
+    async def confirm(self) -> None:
+        """Check that the log still holds the events it confirmed; append lost ones again. Raises as `append` does."""
+        ...
+
+    @property
+    def writes(self) -> int:
+        """Number of committed writing transactions; grows while the database makes progress."""
+        return 0
+
+
+class Destination(Log, Protocol):
+    """A log and the tables behind it, for a writer that folds to the end."""
+
+    async def fold(self) -> int:
+        """Fold all events of the log that are not folded yet; return their number.
+
+        Parks an episode that it cannot fold. May be cancelled: committed folds stay, the next call folds the rest.
+        """
+        ...
+
+    async def stopped(self) -> Mapping[str, str]:
+        """Return the refused and parked episodes by id, with reasons, at a cost independent of the others."""
+        ...
+
+
+class Tables(Protocol):
+    """The tables behind a log, for a daemon that folds in steps while it appends."""
+
+    async def fold_next_batch(self) -> bool:
+        """Fold one batch of events that are not visible yet; False if there was none.
+
+        Parks an episode that it cannot fold. Raises `DatabaseUnavailable`; then the same call may be repeated.
+        """
+        ...
+
+    async def behind(self) -> Mapping[str, int]:
+        """Return the folded sequence, by id, of each episode with events that are not visible yet."""
+        ...
+
+    async def stopped(self) -> Mapping[str, str]:
+        """Return the refused and parked episodes, as `Destination.stopped` does."""
+        ...
+
+
+class ClaimedSource(Source, Protocol):
+    """One recorder's folder, claimed by a daemon: no other process drains it meanwhile."""
+
+    @property
+    def is_alive(self) -> bool:
+        """True if the recorder lives in another process and may record more."""
+        ...
+
+    @property
+    def stored(self) -> int:
+        """Position last acknowledged, by this source or an earlier one."""
+        ...
+
+    @property
+    def invisible(self) -> Mapping[EpisodeId, int]:
+        """The last sequence, by episode, that earlier sources stored and that was not visible when this one began."""
+        ...
+
+    @property
+    def holds_dead_letters(self) -> bool:
+        """True for a folder of records that a database refused: only the next writer should offer them again."""
+        ...
+
+    def finish(self) -> None:
+        """End this source behind the records that are synced now."""
+        ...
+
+    def mark_visible(self, position: int, stopped: Mapping[str, str]) -> None:
+        """Publish that records up to this position are visible, except those of `stopped` episodes, by id."""
+        ...
+
+    def mark_unavailable(self, reason: str | None) -> None:
+        """Publish the reason why the database is unavailable; None when it is available again."""
+        ...
+
+    def release(self) -> str | None:
+        """Release the folder; delete a dead recorder's folder if all its records are stored. Blocks.
+
+        Returns the outcome for a report; None if not all records could be stored. Raises `SpoolUnavailable`.
+        """
+        ...
+
+
+class DrainReasons(Protocol):
+    """The reasons that a drainer in another process gives: why it stopped, why it waits, which episodes stopped."""
+
+    @property
+    def failure(self) -> str | None: ...
+    @property
+    def unavailable(self) -> str | None: ...
+    @property
+    def stopped(self) -> Mapping[str, str]: ...
+
+
+class ExternalDrain(Protocol):
+    """The progress of a drainer in another process: its stored and visible positions, and its reasons."""
+
+    @property
+    def stored(self) -> int: ...
+    @property
+    def folded(self) -> int: ...
+    @property
+    def note(self) -> DrainReasons: ...
+
+
+class OfferedQueue(Protocol):
+    """The recorder's side of a queue that another process drains."""
+
+    @property
+    def folder(self) -> Path:
+        """The folder of the queue, in its spool."""
+        ...
+
+    @property
+    def written(self) -> int:
+        """Position of the last record put."""
+        ...
+
+    @property
+    def is_drained(self) -> bool:
+        """True while a process drains the queue. Raises `FilesError`."""
+        ...
+
+    @property
+    def external_drain_status(self) -> ExternalDrain | None:
+        """The status that the drainer published last; None if this process drains the queue itself."""
+        ...
+
+    async def synced_to(self, position: int | None = None) -> None:
+        """Wait until the records up to this position, by default all, are on the disk. Raises `SpoolUnavailable`."""
+        ...
+
+
+class ScanResult(NamedTuple):
+    """The result of a scan: claimed folders to drain (`held`), and by name the errors of folders that cannot be."""
+
+    held: Sequence[ClaimedSource]
+    failed: Mapping[str, Exception]
+
+
+SourceScanner: TypeAlias = Callable[[Collection[str]], ScanResult]
+"""Claims every recorder's folder that can be drained, except those of these names. Reads files: blocks."""
+
+
+# === drain once ===============================================================================================
+#
+# Drain every source to its end, then fold once, for `pycrorm writer --once`.
+
+
+@dataclass(frozen=True, kw_only=True)
+class DrainSummary:
+    """The result of `drain_once`.
+
+    Attributes:
+        drained: one state per source, in the order of draining.
+        failed: by source name, the reason why it could not be drained to its end, or its refused records not be kept.
+        folded: number of folded events.
+        stopped: by episode id, the reason why it is refused or parked; includes episodes refused whole, without a row.
+    """
+
+    drained: tuple[DrainState, ...]
+    failed: Mapping[str, PycrormError]
+    folded: int
+    stopped: Mapping[str, str]
+
+
+async def drain_once(
+    sources: Iterable[Source],
+    destination: Destination,
+    *,
+    settings: Settings,
+    on_append: Callable[[Source, Sequence[Record]], None] = lambda _source, _batch: None,
+) -> DrainSummary:
+    """Drain each source to its end, then fold. A damaged source does not prevent draining the others.
+
+    Calls `on_append` with each acknowledged batch. Raises `DatabaseUnavailable` if the database stays unavailable for
+    five attempts; stored events stay stored.
+    """
+    drained: list[DrainState] = []
+    failed: dict[str, PycrormError] = {}
+    for source in sources:
+        drain = Drain(
+            source, destination.append, settings=settings, backoff=BRIEF, on_append=partial(on_append, source)
+        )
+        try:
+            await drain.run()
+        except DatabaseError:
+            raise
+        except PycrormError as error:
+            failed[source.name] = error
+        except Exception as error:  # noqa: BLE001 - reported for this source; must not stop the next
+            failed[source.name] = InternalError(f"recorder {source.name} cannot be drained: {error!r}")
+        if drain.stuck is not None:
+            failed[source.name] = drain.stuck
+        drained.append(drain.state)
+    await retry(destination.confirm, backoff=BRIEF)
+    folded = await retry(destination.fold, backoff=BRIEF)
+    stopped = await retry(destination.stopped, backoff=BRIEF)
+    refused = {episode: reason for each in drained for episode, reason in each.refused.items()}
+    return DrainSummary(drained=tuple(drained), failed=failed, folded=folded, stopped={**refused, **stopped})
+
+
+# === patience =================================================================================================
+
+_CHECK_S: Final = 0.25
+"""Interval at which the progress is read, and the precision of the bound."""
+TOO_MANY_EVENTS: Final = "more events than could be stored and folded in that time"
+"""The reason of a `FlushTimeout` when nothing else is known to hold the writer up."""
+
+
+class PatienceEnded(Exception):
+    """The work made no progress for too long, and was cancelled."""
+
+
+class Patience:
+    """Ends a wait when `progress` has returned the same value for `limit_s`."""
+
+    def __init__(self, limit_s: float, *, progress: Callable[[], object]) -> None:
+        self.limit_s = limit_s
+        self._progress = progress
+
+    async def wait(self, work: asyncio.Future[Any]) -> bool:
+        """Wait for the work; True when it is done, False after `limit_s` without progress. Cancels nothing."""
+        loop = asyncio.get_running_loop()
+        last, since_s = self._progress(), loop.time()
+        while not work.done():
+            left_s = since_s + self.limit_s - loop.time()
+            if left_s <= 0:
+                return False
+            await asyncio.wait([work], timeout=min(left_s, _CHECK_S))
+            if (current := self._progress()) != last:
+                last, since_s = current, loop.time()
+        return True
+
+    async def run(self, work: Coroutine[Any, Any, _T], *, name: str) -> _T:
+        """Run the work in a task of this name, which ends with this call; raises `PatienceEnded`."""
+        task = asyncio.create_task(work, name=name)
+        try:
+            if not await self.wait(task):
+                raise PatienceEnded
+            return task.result()
+        finally:
+            if not task.done():
+                task.cancel()
+                await asyncio.wait([task])

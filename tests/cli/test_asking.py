@@ -13,9 +13,9 @@ import pytest
 
 from pycrorm_async import Memory
 from pycrorm_async.cli.main import app
-from pycrorm_async.cli.since import parse_since
+from pycrorm_async.cli.output import parse_since
 from pycrorm_async.errors import CallerError
-from pycrorm_async.query.asking.ask import QUESTIONS
+from pycrorm_async.query.questions import QUESTIONS
 from pycrorm_async.world import Pose
 from tests.commands import COMMAND, answer, environment, one_line_of, pycrorm
 from tests.databases import Server, run_in_own_loop

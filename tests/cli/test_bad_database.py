@@ -63,7 +63,7 @@ def without_rights(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[st
 
 def test_a_file_that_may_only_be_read_is_not_opened_for_recording(tmp_path: Path) -> None:
     (tmp_path / "memory.db").touch(0o444)
-    opening = "from pycrorm_async.store.schema import make_file; make_file(Path('memory.db'), 'memory.db', 'owner')"
+    opening = "from pycrorm_async.store.log import make_file; make_file(Path('memory.db'), 'memory.db', 'owner')"
     command = [*bound(), sys.executable, "-c", f"from pathlib import Path; {opening}"]
     done = subprocess.run(command, cwd=tmp_path, env=environment(), capture_output=True, text=True, check=False)
     reason = "this user may only read it: record with a user who may write it, or name another file"

@@ -36,7 +36,7 @@ async def plan():
 '''
 LAB = """
 from pycrorm_async.events.types import NodeEnded
-from pycrorm_async.projections.custom.projection import Projection
+from pycrorm_async.projections.custom import Projection
 
 class Weighed(Projection):
     name = "weighed"

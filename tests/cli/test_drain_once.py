@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.codec import Record
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, parse_episode_id
-from pycrorm_async.queue.files.recorder_folder import make_folder
-from pycrorm_async.queue.sources.dead_letters import DeadLetters
+from pycrorm_async.queue.sources import DeadLetters
+from pycrorm_async.queue.spool import make_folder
 from tests.cli.note_plan import NOTES_PLAN
 from tests.commands import answer, one_line_of, pycrorm
 from tests.databases import ask, ask_to_change

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.codec import Record
 from tests.commands import COMMAND, environment, one_line_of, pycrorm
 from tests.databases import ask_to_change
 from tests.projections.event_script import Script

@@ -16,9 +16,8 @@ import pytest
 
 from pycrorm_async.cli import learn as learn_command
 from pycrorm_async.learning import default_policy, load_policy, name_of
-from pycrorm_async.learning.experiment import ExperimentResult, Phase
-from pycrorm_async.learning.rollouts.kitchen_trial import KitchenResult
-from pycrorm_async.learning.rollouts.rollouts import Tally
+from pycrorm_async.learning.experiment import ExperimentResult, KitchenResult, Phase
+from pycrorm_async.learning.rollouts import Tally
 from tests.commands import COMMAND, Started, answer, environment, one_line_of, pycrorm
 from tests.databases import ask, await_events
 from tests.shared_folders import made_once

@@ -12,9 +12,9 @@ from typing import Any
 
 import pytest
 
-from pycrorm_async.cli import plan_source as reader
-from pycrorm_async.cli.plan_source import plan_source
-from pycrorm_async.recording.writing.provenance import PlanSource
+from pycrorm_async.cli import run as reader
+from pycrorm_async.cli.run import plan_source
+from pycrorm_async.record.episode_writer import PlanSource
 from tests.bullet import INSTALLED_BULLETS
 from tests.commands import pycrorm
 

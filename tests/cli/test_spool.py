@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.codec import Record
 from pycrorm_async.events.ids import parse_episode_id
-from pycrorm_async.queue.sources.dead_letters import DeadLetters
+from pycrorm_async.queue.sources import DeadLetters
 from tests.commands import Started, answer, one_line_of, pycrorm
 from tests.queue.factories import FolderWriter, overwrite, started
 

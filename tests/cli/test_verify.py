@@ -11,12 +11,12 @@ from urllib.parse import urlsplit
 import pytest
 from sqlalchemy import BigInteger, column, select, table
 
-from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.codec import Record
+from pycrorm_async.projections.mapped_tables import UserView
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.projections.schema.user_views import UserView
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.postgresql.roles import GRANTS
+from pycrorm_async.store.postgresql import GRANTS
 from tests.commands import answer, one_line_of, pycrorm
 from tests.databases import Server, ask, ask_to_change, change_each
 from tests.projections.event_script import declarations, declared

@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable, Iterable
 
 from pycrorm_async import Memory
-from pycrorm_async.events.envelope import LOST, Record
+from pycrorm_async.events.codec import LOST, Record
 from pycrorm_async.events.types import EpisodeEnded
 from pycrorm_async.plan import NavigateAction, ParkArmsAction, SimulatedTaskTree
 from pycrorm_async.settings import Settings

@@ -13,12 +13,12 @@ import pytest
 
 from pycrorm_async import Memory, Reading
 from pycrorm_async.errors import CallerError, DatabaseUnavailable, UnknownEpisode
-from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.codec import Record
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.operations.copy import CopySummary, copy_episodes
 from pycrorm_async.operations.destination import LogAndTables
 from pycrorm_async.settings import Settings
-from pycrorm_async.writer.retry import Backoff
+from pycrorm_async.writer.drain import Backoff
 from tests.copying.memories import (
     PATIENT,
     New,

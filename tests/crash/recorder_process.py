@@ -16,7 +16,7 @@ import time
 from pathlib import Path
 
 from pycrorm_async.clock import SYSTEM_CLOCK
-from pycrorm_async.events.envelope import Heading
+from pycrorm_async.events.codec import Heading
 from pycrorm_async.events.ids import episode_id, episode_text
 from pycrorm_async.queue import RecorderQueue
 from pycrorm_async.settings import Settings

@@ -20,11 +20,11 @@ import pytest
 
 from bench.breaking import databases, files, restores
 from bench.breaking.outcome import Outcome, Step
-from pycrorm_async.events.envelope import LOST, Record
+from pycrorm_async.events.codec import LOST, Record
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.operations.destination import LogAndTables
-from pycrorm_async.projections.verify.findings import VerifyResult
-from pycrorm_async.projections.verify.verify import verify
+from pycrorm_async.projections.findings import VerifyResult
+from pycrorm_async.projections.verify import verify
 from pycrorm_async.queue import DeadSource, RecorderQueue
 from pycrorm_async.store.log import EventLog
 from tests.backups import Backup

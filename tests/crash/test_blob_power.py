@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from pycrorm_async.events.blobs import references_in
-from pycrorm_async.queue.blobs import live_blobs
-from pycrorm_async.queue.blobs.blob_files import is_whole
+from pycrorm_async.events.types import references_in
+from pycrorm_async.queue import blobs
+from pycrorm_async.queue.blobs import is_whole
 from tests.crash.test_queue_power import Machine, machine_on
 from tests.queue.factories import ended, node, recover, started
 from tests.queue.test_blobs import OBSERVED, referring
@@ -29,7 +29,7 @@ class BlobMachine:
         self.machine = machine
         self._rng = rng
         self._synced: set[str] = set()
-        sync_file, cut = live_blobs._sync_file, machine.cut
+        sync_file, cut = blobs._sync_file, machine.cut
 
         def sync(path: Path) -> None:
             machine.cut()
@@ -41,7 +41,7 @@ class BlobMachine:
             cut()
             self._keep_some(machine.cuts[-1][0] / "blobs")
 
-        patch.setattr(live_blobs, "_sync_file", sync)
+        patch.setattr(blobs, "_sync_file", sync)
         patch.setattr(machine, "cut", cut_with_blobs)
 
     def put_referring(self) -> None:

@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 
 from pycrorm_async.clock import SYSTEM_CLOCK
-from pycrorm_async.events.envelope import Heading
+from pycrorm_async.events.codec import Heading
 from pycrorm_async.events.ids import episode_text
 from pycrorm_async.events.types import EpisodeEnded, EpisodeStarted, NodeEnded, NodeStarted
 from pycrorm_async.operations.daemon import _Folders
@@ -27,9 +27,9 @@ from pycrorm_async.operations.recovery import recover
 from pycrorm_async.queue import Spool
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
-from pycrorm_async.writer.background_writer import BackgroundWriter
 from pycrorm_async.writer.daemon import Daemon
-from pycrorm_async.writer.ports import ClaimedSource, ScanResult
+from pycrorm_async.writer.drain import ClaimedSource, ScanResult
+from pycrorm_async.writer.plan_writer import BackgroundWriter
 from tests.databases import ask
 from tests.projections.event_script import SAYING, Script, declarations, name_of
 from tests.queue.factories import make

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from pycrorm_async.errors import DatabaseError
-from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.codec import Record
 from pycrorm_async.queue import RecorderQueue, Spool, open_dead
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.codec import Record
 from pycrorm_async.events.ids import episode_text
 from pycrorm_async.queue import Spool, open_dead
 from tests.crash.forked_processes import ForkedProcess

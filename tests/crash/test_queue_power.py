@@ -16,13 +16,12 @@ from pathlib import Path
 import pytest
 
 from pycrorm_async.errors import SpoolDamaged
-from pycrorm_async.events.envelope import Heading, Record, is_computed_end
+from pycrorm_async.events.codec import Heading, Record, is_computed_end
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.queue import RecorderQueue, open_dead
-from pycrorm_async.queue.files.frame import EVENT
-from pycrorm_async.queue.files.segment import Segment, salt_of
-from pycrorm_async.queue.live.sync_thread import SyncThread
-from pycrorm_async.queue.live.syncable_appender import Span, SyncableAppender
+from pycrorm_async.queue.appender import Span, SyncableAppender
+from pycrorm_async.queue.format import EVENT, Segment, salt_of
+from pycrorm_async.queue.sync_thread import SyncThread
 from tests.queue.factories import RECORDER, SMALL, ended, episode, lost, make, node, overwrite, record, recover, started
 
 pytestmark = pytest.mark.slow

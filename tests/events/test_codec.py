@@ -9,8 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pycrorm_async.events.codec import NotEncodable, UnknownShape, declared_dtype, decode, encode, fingerprint
-from pycrorm_async.events.types import EVENT_TYPES, NodeEnded, NodeStarted, ObjectAdded
-from pycrorm_async.events.values import PoseValue, RobotValue
+from pycrorm_async.events.types import EVENT_TYPES, NodeEnded, NodeStarted, ObjectAdded, PoseValue, RobotValue
 
 POSE = PoseValue((0.1, 0.2, 0.3), (0.0, 0.0, 0.0, 1.0), "map", 1)
 

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pycrorm_async.events.fields import AcceptedFields, column_name, fault_in_fields, fault_in_table, table_name
-from pycrorm_async.events.values import FieldDeclared, FieldType
+from pycrorm_async.events.types import FieldDeclared, FieldType
 
 
 @pytest.mark.parametrize(

@@ -10,21 +10,19 @@ import pytest
 from pycrorm_async.events.codec import decode, encode
 from pycrorm_async.events.types import (
     EVENT_TYPES,
+    BoxValue,
     DescriptionDeclared,
     DesignatorTypeDeclared,
     EpisodeEnded,
+    FailureValue,
+    FieldDeclared,
     Happening,
+    MeshValue,
+    MissingValue,
     NodeEnded,
     NodeStarted,
     ObjectAdded,
     ObjectDetected,
-)
-from pycrorm_async.events.values import (
-    BoxValue,
-    FailureValue,
-    FieldDeclared,
-    MeshValue,
-    MissingValue,
     ObjectReference,
     PoseValue,
     RobotValue,

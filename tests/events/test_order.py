@@ -12,8 +12,8 @@ from pycrorm_async.events.types import (
     NodeStarted,
     ObjectAdded,
     ObjectMoved,
+    PoseValue,
 )
-from pycrorm_async.events.values import PoseValue
 
 START = EpisodeStarted("d", "me", "here", "0", "3")
 POSE = PoseValue((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0), "map", 0)

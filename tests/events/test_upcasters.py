@@ -8,12 +8,16 @@ from typing import Any
 import msgspec
 import pytest
 
-from pycrorm_async.events.codec import Decoder, UnknownShape, encode, fingerprint
-from pycrorm_async.events.types import EVENT_TYPES, DesignatorTypeDeclared, Happening, ObjectAdded
-from pycrorm_async.events.upcasters import UPCASTERS
-from pycrorm_async.events.values import FieldDeclared, PoseValue
-from pycrorm_async.projections.schema.layout import Layout
-from pycrorm_async.projections.schema.union import unite
+from pycrorm_async.events.codec import UPCASTERS, Decoder, UnknownShape, encode, fingerprint
+from pycrorm_async.events.types import (
+    EVENT_TYPES,
+    DesignatorTypeDeclared,
+    FieldDeclared,
+    Happening,
+    ObjectAdded,
+    PoseValue,
+)
+from pycrorm_async.projections.columns import Layout, unite
 
 LINES = (Path(__file__).parent.parent / "golden" / "events_v1.jsonl").read_text().splitlines()
 GOLDEN = [(kind, payload.encode()) for kind, _, payload in (line.partition(" ") for line in LINES)]

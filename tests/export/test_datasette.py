@@ -12,9 +12,9 @@ import pytest
 
 from pycrorm_async import Memory, Reading
 from pycrorm_async.errors import CallerError
-from pycrorm_async.export.datasette import datasette_metadata
+from pycrorm_async.export.export import datasette_metadata
 from pycrorm_async.orm import RootFailure
-from pycrorm_async.query.asking.ask import QUESTIONS
+from pycrorm_async.query.questions import QUESTIONS
 from tests.commands import pycrorm
 from tests.databases import Server
 

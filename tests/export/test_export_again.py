@@ -15,9 +15,9 @@ from pycrorm_async import Reading
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.types import EpisodeEnded, EpisodeStarted, NodeEnded, NodeStarted
 from pycrorm_async.export.export import export, export_again
-from pycrorm_async.export.manifest import read_manifest
+from pycrorm_async.export.selection import read_manifest
 from pycrorm_async.orm import TaskTreeNode
-from pycrorm_async.world.enums import Arms
+from pycrorm_async.world.pose import Arms
 from tests.projections.event_script import NAVIGATE, PICK_UP, SAYING, Script, declarations, name_of
 from tests.projections.factories import append_and_fold
 from tests.query.test_reading import episode

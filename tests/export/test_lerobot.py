@@ -25,9 +25,9 @@ from pycrorm_async.events.types import (
     NodeStarted,
     ObjectAdded,
     ObjectMoved,
+    ObjectReference,
     ObjectRemoved,
 )
-from pycrorm_async.events.values import ObjectReference
 from pycrorm_async.export.export import export, export_again
 from pycrorm_async.report.output_files import new_folder
 from tests.full_disk import files_of_at_most

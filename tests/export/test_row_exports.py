@@ -23,10 +23,10 @@ from sqlalchemy.orm import aliased
 
 from pycrorm_async import Memory, Reading
 from pycrorm_async.errors import CallerError, MissingExtra, UnknownEpisode
-from pycrorm_async.export import row_files
+from pycrorm_async.export import export as row_files
 from pycrorm_async.export.export import export
 from pycrorm_async.orm import PickUpWithContextView, RootFailure, TaskTreeNode
-from pycrorm_async.query.asking.ask import QUESTIONS
+from pycrorm_async.query.questions import QUESTIONS
 from tests.commands import one_line_of, pycrorm
 from tests.full_disk import files_of_at_most
 from tests.projections.event_script import NAVIGATE, PICK_UP, SAYING, declarations

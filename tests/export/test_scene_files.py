@@ -15,12 +15,11 @@ from sqlalchemy import select
 
 from pycrorm_async import Memory, Reading
 from pycrorm_async.errors import CallerError, MissingExtra
-from pycrorm_async.export import episode_files
+from pycrorm_async.export import export as episode_files
 from pycrorm_async.export.export import export, export_again
 from pycrorm_async.orm import TaskTreeNode
-from pycrorm_async.query.scene.link_frames import link_frames
-from pycrorm_async.query.scene.object_model import object_model
-from pycrorm_async.world.queries.bounding_boxes import rotation_matrix
+from pycrorm_async.query.scene import link_frames, object_model
+from pycrorm_async.world.bounding_boxes import rotation_matrix
 from tests.full_disk import files_of_at_most
 
 Frames = dict[str, tuple[str, list[float], list[float]]]

@@ -19,15 +19,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pycrorm_async.clock import Clock
-from pycrorm_async.events.envelope import Heading, Record
+from pycrorm_async.events.codec import Heading, Record
 from pycrorm_async.events.ids import EpisodeId, parse_episode_id
-from pycrorm_async.hooks.declaration import declared_type
 from pycrorm_async.operations.destination import LogAndTables
 from pycrorm_async.plan import ActionAbstract, PickUpActionPerformable
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.queue.files.spool import Spool
-from pycrorm_async.queue.live.recorder_queue import RecorderQueue
-from pycrorm_async.recording.declarations.declared_type import DeclaredType
+from pycrorm_async.queue.recorder_queue import RecorderQueue
+from pycrorm_async.queue.spool import Spool
+from pycrorm_async.record.declarations import declared_type
+from pycrorm_async.record.parameters import DeclaredType
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog

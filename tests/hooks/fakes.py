@@ -10,20 +10,18 @@ from typing import Any
 
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import SpoolFull
-from pycrorm_async.events.codec import decode
-from pycrorm_async.events.envelope import Heading, Receipt
+from pycrorm_async.events.codec import Heading, Receipt, decode
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.events.order import OrderCheck
 from pycrorm_async.events.types import Happening
-from pycrorm_async.hooks.episode import Episode
-from pycrorm_async.hooks.plan_recorder import Recorder, current_episode
-from pycrorm_async.plan.designator import ActionAbstract
-from pycrorm_async.plan.execution.observer import recorder
-from pycrorm_async.plan.object_designators import ObjectDesignator, ObjectPart
-from pycrorm_async.recording.writing.emitter import Emitter
-from pycrorm_async.recording.writing.open_episodes import OpenEpisodes
+from pycrorm_async.plan.execution import recorder
+from pycrorm_async.plan.language import ActionAbstract
+from pycrorm_async.plan.objects import ObjectDesignator, ObjectPart
+from pycrorm_async.record.episode import Episode
+from pycrorm_async.record.episode_writer import Emitter, OpenEpisodes
+from pycrorm_async.record.plan_recorder import Recorder, current_episode
 from pycrorm_async.settings import Settings
-from pycrorm_async.world.observers import watcher
+from pycrorm_async.world.bullet import watcher
 
 
 class ListSink:

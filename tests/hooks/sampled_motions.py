@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from pycrorm_async.events.types import Happening, NodeEnded, NodeStarted, StateSampled
 from pycrorm_async.plan import MoveMotion
-from pycrorm_async.plan.current_robot import require_robot
+from pycrorm_async.plan.objects import require_robot
 from pycrorm_async.settings import Settings
 from pycrorm_async.world import Object, Pose
 from tests.hooks.fakes import RecorderCase, findings

@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 
 from pycrorm_async.errors import DeclarationRefused
-from pycrorm_async.events.values import FieldDeclared
-from pycrorm_async.hooks.declaration import Declarations, declared_type
-from pycrorm_async.plan.actions.basic import PickUpActionPerformable
-from pycrorm_async.plan.designator import ActionAbstract
-from pycrorm_async.plan.object_designators import ObjectDesignator
-from pycrorm_async.recording.declarations.declared_type import DeclaredType
-from pycrorm_async.world.enums import Arms
-from pycrorm_async.world.pose import Pose
+from pycrorm_async.events.types import FieldDeclared
+from pycrorm_async.plan.actions import PickUpActionPerformable
+from pycrorm_async.plan.language import ActionAbstract
+from pycrorm_async.plan.objects import ObjectDesignator
+from pycrorm_async.record.declarations import Declarations, declared_type
+from pycrorm_async.record.parameters import DeclaredType
+from pycrorm_async.world.pose import Arms, Pose
 
 
 class Colour(enum.Enum):
@@ -78,7 +77,7 @@ def test_every_kind_of_field_has_its_column() -> None:
         FieldDeclared("inner_side", "inner_side", "enum", 13, optional=True, enum=f"{module}.Colour"),
         FieldDeclared("mode", "mode", "text", 14),
         FieldDeclared("number", "number", "real", 15),
-        FieldDeclared("maybe", "maybe", "enum", 16, optional=True, enum="pycrorm_async.world.enums.Arms"),
+        FieldDeclared("maybe", "maybe", "enum", 16, optional=True, enum="pycrorm_async.world.pose.Arms"),
         FieldDeclared("poses", "poses", "list", 17, item="pose"),
         FieldDeclared("triple", "triple", "list", 18, item="real"),
     )

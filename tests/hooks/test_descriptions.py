@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 
 from pycrorm_async.events.types import DescriptionDeclared, ObjectAdded
-from pycrorm_async.recording.declarations import descriptions
+from pycrorm_async.record import geometry
 from pycrorm_async.settings import Settings
 from pycrorm_async.world import BulletWorld, Object, ObjectType
-from pycrorm_async.world.models.primitives import box_urdf
+from pycrorm_async.world.models import box_urdf
 from tests.hooks.fakes import RecorderCase, recorder_case
 
 
@@ -78,7 +78,7 @@ async def test_a_fault_is_counted_and_the_object_is_recorded(monkeypatch: pytest
     def broken(_: str) -> tuple[str, ...]:
         raise RuntimeError("no parser\x00")
 
-    monkeypatch.setattr(descriptions, "mesh_files", broken)
+    monkeypatch.setattr(geometry, "mesh_files", broken)
     with recorder_case() as case, case.episode(), BulletWorld():
         Object("box", ObjectType.GENERIC_OBJECT, box(0))
     assert [(each.name, each.description) for each in added(case)] == [("box", None)]

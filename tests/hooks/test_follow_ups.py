@@ -20,21 +20,21 @@ from pycrorm_async.events.types import (
     EpisodeStarted,
     Happening,
     NodeEnded,
+    NodeReference,
     NodeStarted,
     ObjectAdded,
     ObjectAttached,
     ObjectMoved,
+    ObjectReference,
     ObjectRemoved,
     StateSampled,
 )
-from pycrorm_async.events.values import NodeReference, ObjectReference
-from pycrorm_async.hooks.plan_recorder import current_episode
 from pycrorm_async.plan import ChosenRobot, MoveMotion, SimulatedTaskTree
-from pycrorm_async.plan.actions.basic import MoveTorsoActionPerformable, NavigateActionPerformable
-from pycrorm_async.plan.current_robot import require_robot
-from pycrorm_async.plan.designator import ActionAbstract
-from pycrorm_async.plan.motions.process_modules import simulated_robot
-from pycrorm_async.plan.object_designators import ObjectDesignator
+from pycrorm_async.plan.actions import MoveTorsoActionPerformable, NavigateActionPerformable
+from pycrorm_async.plan.language import ActionAbstract
+from pycrorm_async.plan.motions import simulated_robot
+from pycrorm_async.plan.objects import ObjectDesignator, require_robot
+from pycrorm_async.record.plan_recorder import current_episode
 from pycrorm_async.settings import Settings
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
 from tests.hooks.fakes import (

@@ -18,12 +18,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from pycrorm_async.events.types import EpisodeEnded, EpisodeStarted, Happening, NodeEnded, NodeStarted, ObjectAdded
-from pycrorm_async.plan.designator import ActionAbstract
-from pycrorm_async.plan.object_designators import ObjectDesignator
-from pycrorm_async.recording.values import missing_values
+from pycrorm_async.plan.language import ActionAbstract
+from pycrorm_async.plan.objects import ObjectDesignator
+from pycrorm_async.record import values as missing_values
 from pycrorm_async.settings import Settings
 from pycrorm_async.world import Arms, BulletWorld, Object, ObjectType, Pose
-from pycrorm_async.world.models.catalog import built_in_urdf
+from pycrorm_async.world.models import built_in_urdf
 from tests.hooks.fakes import NoteActionPerformable, findings, recorder_case
 
 

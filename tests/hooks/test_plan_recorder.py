@@ -8,6 +8,7 @@ import pytest
 
 from pycrorm_async.errors import Unrecordable
 from pycrorm_async.events.types import (
+    CellsValue,
     EpisodeEnded,
     EpisodeStarted,
     JointsMoved,
@@ -18,15 +19,16 @@ from pycrorm_async.events.types import (
     ObjectAttached,
     ObjectDetached,
     ObjectMoved,
+    ObjectReference,
     ObjectRemoved,
+    PoseValue,
 )
-from pycrorm_async.events.values import CellsValue, ObjectReference, PoseValue
-from pycrorm_async.hooks.plan_recorder import current_episode
-from pycrorm_async.plan.actions.basic import MoveTorsoActionPerformable, NavigateActionPerformable
-from pycrorm_async.plan.designator import ActionAbstract
-from pycrorm_async.plan.execution.observer import Candidate, Cells, Refusal
-from pycrorm_async.plan.motions.process_modules import simulated_robot
-from pycrorm_async.plan.object_designators import ObjectDesignator, ObjectPart
+from pycrorm_async.plan.actions import MoveTorsoActionPerformable, NavigateActionPerformable
+from pycrorm_async.plan.execution import Candidate, Cells, Refusal
+from pycrorm_async.plan.language import ActionAbstract
+from pycrorm_async.plan.motions import simulated_robot
+from pycrorm_async.plan.objects import ObjectDesignator, ObjectPart
+from pycrorm_async.record.plan_recorder import current_episode
 from pycrorm_async.settings import Settings
 from pycrorm_async.world import Arms, BulletWorld, Object, ObjectType, Pose
 from tests.hooks.fakes import CarryActionPerformable, NoteActionPerformable, findings, kinds, recorder_case

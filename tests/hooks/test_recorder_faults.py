@@ -10,10 +10,10 @@ import pytest
 
 from pycrorm_async.errors import EpisodeRefused, SpoolFull, Unrecordable
 from pycrorm_async.events.types import EpisodeEnded, NodeEnded, NodeStarted
-from pycrorm_async.hooks.episode import Episode
-from pycrorm_async.plan.designator import ActionAbstract
 from pycrorm_async.plan.failures import PlanFailure
-from pycrorm_async.plan.task_tree import current_node
+from pycrorm_async.plan.language import ActionAbstract
+from pycrorm_async.plan.task import current_node
+from pycrorm_async.record.episode import Episode
 from pycrorm_async.settings import Settings
 from pycrorm_async.world import BulletWorld, Object, ObjectType
 from tests.hooks.fakes import NoteActionPerformable, RecorderCase, findings, kinds, recorder_case

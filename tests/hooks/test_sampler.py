@@ -14,7 +14,7 @@ from pycrorm_async.plan import (
     MoveTorsoActionPerformable,
     NavigateActionPerformable,
 )
-from pycrorm_async.plan.current_robot import require_robot
+from pycrorm_async.plan.objects import require_robot
 from pycrorm_async.settings import Settings
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
 from pycrorm_async.world.pose import yaw_quaternion

@@ -15,13 +15,13 @@ from pycrorm_async.events.types import (
     EpisodeEnded,
     EpisodeStarted,
     Happening,
+    NodeReference,
     NodeStarted,
     ObjectAdded,
     ObjectAttached,
     ObjectMoved,
+    ObjectReference,
 )
-from pycrorm_async.events.values import NodeReference, ObjectReference
-from pycrorm_async.hooks.plan_recorder import current_episode
 from pycrorm_async.plan import (
     ActionAbstract,
     NavigateActionPerformable,
@@ -29,7 +29,8 @@ from pycrorm_async.plan import (
     SimulatedTaskTree,
     simulated_robot,
 )
-from pycrorm_async.plan.object_designators import ObjectDesignator, designator_of, in_world
+from pycrorm_async.plan.objects import ObjectDesignator, designator_of, in_world
+from pycrorm_async.record.plan_recorder import current_episode
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
 from tests.hooks.fakes import (
     CarryActionPerformable,

@@ -8,15 +8,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pycrorm_async.events.values import FieldDeclared, FieldType, MissingValue, ObjectReference, ObjectValue, PoseValue
+from pycrorm_async.events.types import FieldDeclared, FieldType, MissingValue, ObjectReference, ObjectValue, PoseValue
 from pycrorm_async.plan.failures import ObjectLost, PlanFailure, PlanFailures
-from pycrorm_async.plan.language.outcome import Outcome
-from pycrorm_async.plan.object_designators import BelieveObject, ObjectDesignator
-from pycrorm_async.recording.values.failure_values import failure_value
-from pycrorm_async.recording.values.texts import clean_repr
-from pycrorm_async.recording.values.value_snapshot import UnrecordableValue, encode_or_missing, encode_parameter
-from pycrorm_async.world.enums import Arms, ObjectType
-from pycrorm_async.world.pose import Pose
+from pycrorm_async.plan.language import Outcome
+from pycrorm_async.plan.objects import BelieveObject, ObjectDesignator
+from pycrorm_async.record.values import (
+    UnrecordableValue,
+    clean_repr,
+    encode_or_missing,
+    encode_parameter,
+    failure_value,
+)
+from pycrorm_async.world.pose import Arms, ObjectType, Pose
 
 
 class UnknownClass:

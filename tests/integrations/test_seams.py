@@ -7,8 +7,7 @@ from typing import Any
 import pytest
 
 from pycrorm_async.errors import MissingExtra
-from pycrorm_async.integrations.pycram import remember
-from pycrorm_async.integrations.seams import Seams, guarded
+from pycrorm_async.integrations.pycram import Seams, guarded, remember
 
 
 class Counter:

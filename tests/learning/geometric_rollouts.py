@@ -9,11 +9,11 @@ from collections.abc import Iterable
 
 import pandas as pd
 
-from pycrorm_async.learning.policies.policy import PickUpChoice
-from pycrorm_async.plan.geometry.grasp_poses import pick_up_poses
+from pycrorm_async.learning.policy import PickUpChoice
+from pycrorm_async.plan.geometry import pick_up_poses
+from pycrorm_async.world.kinematics import Unreachable, solve_from
 from pycrorm_async.world.pose import Pose, yaw_quaternion
-from pycrorm_async.world.robots.kinematics import Unreachable, solve_from
-from pycrorm_async.world.robots.robot_description import PR2
+from pycrorm_async.world.urdf import PR2
 
 MILK = Pose((1.3, 1.0, 0.9))
 

@@ -6,10 +6,16 @@ import numpy as np
 import pytest
 
 from pycrorm_async.errors import ImpossibleCondition
-from pycrorm_async.learning.policies.default_policy import AROUND_OBJECT, default_policy
-from pycrorm_async.learning.policies.evidence import Evidence, Rectangle, Region
-from pycrorm_async.learning.policies.policy import PickUpChoice, Policy
-from pycrorm_async.world.enums import Arms, Grasp
+from pycrorm_async.learning.policy import (
+    AROUND_OBJECT,
+    Evidence,
+    PickUpChoice,
+    Policy,
+    Rectangle,
+    Region,
+    default_policy,
+)
+from pycrorm_async.world.pose import Arms, Grasp
 
 RETAINED = 0.94107
 """The share of the normal distribution in the square and outside the hole: 0.9953² - 0.2227²."""

@@ -19,14 +19,19 @@ import pytest
 from pycrorm_async import Reading, recover
 from pycrorm_async.errors import CallerError, NotEnoughExperience
 from pycrorm_async.learning import Policy, Scene, default_policy, experiment, name_of
-from pycrorm_async.learning.evaluation import scene_variants, study
-from pycrorm_async.learning.experiment import Experiment, ExperimentResult, read_rollouts, run
-from pycrorm_async.learning.policies.tree import learn
-from pycrorm_async.learning.rollouts import recorded_rollouts
-from pycrorm_async.learning.rollouts.kitchen_trial import pick_up_in_kitchen
-from pycrorm_async.learning.rollouts.move_and_pick_up import MoveAndPickUp
-from pycrorm_async.learning.rollouts.rollout_pool import Job, MemoryLocation, WorkerLost, Workers
-from pycrorm_async.learning.rollouts.rollouts import Tally, batch_rollout
+from pycrorm_async.learning import rollouts as recorded_rollouts
+from pycrorm_async.learning.experiment import (
+    Experiment,
+    ExperimentResult,
+    pick_up_in_kitchen,
+    read_rollouts,
+    run,
+    scene_variants,
+    study,
+)
+from pycrorm_async.learning.pool import Job, MemoryLocation, WorkerLost, Workers
+from pycrorm_async.learning.rollouts import MoveAndPickUp, Tally, batch_rollout
+from pycrorm_async.learning.tree import learn
 from pycrorm_async.operations.daemon import serve
 from pycrorm_async.orm import MoveAndPickUpAction
 from tests.databases import ask, await_events
@@ -232,7 +237,7 @@ async def test_a_study_evaluates_the_rollouts_of_its_experiment_and_no_others(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """There are 500 rollouts here, but not all of them among the first 500."""
-    monkeypatch.setattr("pycrorm_async.learning.evaluation.scene_variants", lambda _scene: ())
+    monkeypatch.setattr("pycrorm_async.learning.experiment.scene_variants", lambda _scene: ())
     place = MemoryLocation(f"sqlite:///{tmp_path}/memory.db")
     async with Workers(1, place) as workers:
         await workers.roll_out(Job(Scene(), default_policy(), 69), [(400, 200)])

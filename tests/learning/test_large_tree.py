@@ -8,12 +8,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pycrorm_async.learning.policies.default_policy import default_policy
-from pycrorm_async.learning.policies.evidence import Evidence, Rectangle, Region
-from pycrorm_async.learning.policies.policy import PickUpChoice, Policy
-from pycrorm_async.learning.policies.policy_file import load_policy, name_of, save_policy
-from pycrorm_async.learning.policies.tree import learn
-from pycrorm_async.world.enums import Arms
+from pycrorm_async.learning.policy import (
+    Evidence,
+    PickUpChoice,
+    Policy,
+    Rectangle,
+    Region,
+    default_policy,
+    load_policy,
+    name_of,
+    save_policy,
+)
+from pycrorm_async.learning.tree import learn
+from pycrorm_async.world.pose import Arms
 from tests.learning.geometric_rollouts import frame_of
 
 pytestmark = pytest.mark.slow

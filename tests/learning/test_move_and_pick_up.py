@@ -11,17 +11,14 @@ from msgspec.structs import replace
 
 from pycrorm_async.errors import CallerError, ImpossibleCondition
 from pycrorm_async.learning import MoveAndPickUp, Policy, Rectangle, Region, Scene, default_policy
-from pycrorm_async.learning.policies.marginals import Linear
-from pycrorm_async.learning.policies.policy import GRASPS, Leaf, PickUpChoice
-from pycrorm_async.learning.rollouts.feasible_places import free_and_visible, rectangles
-from pycrorm_async.learning.rollouts.scene import Stage
+from pycrorm_async.learning.policy import GRASPS, Leaf, Linear, PickUpChoice
+from pycrorm_async.learning.rollouts import Stage, free_and_visible, rectangles
 from pycrorm_async.plan import MoveTCPMotion, Retry
-from pycrorm_async.plan.current_robot import require_robot
-from pycrorm_async.plan.errors import NoRobotHere
-from pycrorm_async.plan.failures import ManipulationGoalInCollision, ObjectUnreachable
+from pycrorm_async.plan.failures import ManipulationGoalInCollision, NoRobotHere, ObjectUnreachable
+from pycrorm_async.plan.objects import require_robot
 from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose
-from pycrorm_async.world.bullet_loader import engine
-from pycrorm_async.world.robots.robot_description import PR2
+from pycrorm_async.world.bullet_body import engine
+from pycrorm_async.world.urdf import PR2
 
 IN_KITCHEN = Scene(kitchen=True, torso_height=0.3)
 

@@ -6,11 +6,18 @@ import numpy as np
 import pytest
 
 from pycrorm_async.errors import CallerError, ImpossibleCondition
-from pycrorm_async.learning.policies.default_policy import default_policy
-from pycrorm_async.learning.policies.evidence import Evidence, Rectangle, Region
-from pycrorm_async.learning.policies.marginals import Linear, Normal
-from pycrorm_async.learning.policies.policy import Leaf, PickUpChoice, Policy
-from pycrorm_async.world.enums import Arms, Grasp
+from pycrorm_async.learning.policy import (
+    Evidence,
+    Leaf,
+    Linear,
+    Normal,
+    PickUpChoice,
+    Policy,
+    Rectangle,
+    Region,
+    default_policy,
+)
+from pycrorm_async.world.pose import Arms, Grasp
 
 LEFT, RIGHT = frozenset({Arms.LEFT}), frozenset({Arms.RIGHT})
 WEST = Leaf(

@@ -10,12 +10,19 @@ import numpy as np
 import pytest
 
 from pycrorm_async.errors import PolicyDamaged, PolicyFileRefused
-from pycrorm_async.learning.policies.default_policy import default_policy
-from pycrorm_async.learning.policies.evidence import Evidence, Rectangle, Region
-from pycrorm_async.learning.policies.marginals import Linear, Normal
-from pycrorm_async.learning.policies.policy import Leaf, Policy
-from pycrorm_async.learning.policies.policy_file import load_policy, save_policy
-from pycrorm_async.world.enums import Arms, Grasp
+from pycrorm_async.learning.policy import (
+    Evidence,
+    Leaf,
+    Linear,
+    Normal,
+    Policy,
+    Rectangle,
+    Region,
+    default_policy,
+    load_policy,
+    save_policy,
+)
+from pycrorm_async.world.pose import Arms, Grasp
 
 LEARNED = Policy(
     (
@@ -39,7 +46,7 @@ for name in ("jpt", "pandas", "scipy", "matplotlib"):
     sys.modules[name] = None
 from pathlib import Path
 import numpy as np
-from pycrorm_async.learning.policies.policy_file import load_policy
+from pycrorm_async.learning.policy import load_policy
 for path in sys.argv[1:]:
     policy = load_policy(Path(path))
     print(policy.likelihood(policy.sample(np.random.default_rng(8), 500)).tolist())

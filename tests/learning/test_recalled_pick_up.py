@@ -14,23 +14,15 @@ from sqlalchemy import select
 
 from pycrorm_async import Memory
 from pycrorm_async.errors import CallerError
-from pycrorm_async.learning import (
-    Evidence,
-    RecalledPickUp,
-    RecalledPickUpPerformable,
-    Scene,
-    default_policy,
-    name_of,
-)
-from pycrorm_async.learning.policies.marginals import Linear
-from pycrorm_async.learning.rollouts.scene import Stage
+from pycrorm_async.learning import Evidence, RecalledPickUp, RecalledPickUpPerformable, Scene, default_policy, name_of
+from pycrorm_async.learning.policy import Linear
+from pycrorm_async.learning.rollouts import Stage
 from pycrorm_async.orm import Action
 from pycrorm_async.plan import Retry, Sequential
-from pycrorm_async.plan.errors import NotResolved
-from pycrorm_async.plan.experience import PastSuccess
-from pycrorm_async.plan.failures import ObjectUnreachable, PlanFailure
+from pycrorm_async.plan.failures import NotResolved, ObjectUnreachable, PlanFailure
+from pycrorm_async.plan.task import PastSuccess
 from pycrorm_async.world import Arms, Grasp, Object, ObjectType, Pose
-from pycrorm_async.world.models.primitives import box_urdf
+from pycrorm_async.world.models import box_urdf
 
 
 def way(

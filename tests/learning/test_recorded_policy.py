@@ -24,8 +24,8 @@ from pycrorm_async.learning import (
     save_policy,
 )
 from pycrorm_async.learning.experiment import Experiment, run
-from pycrorm_async.learning.policies.tree import learn
-from pycrorm_async.learning.rollouts.rollout_pool import MemoryLocation
+from pycrorm_async.learning.pool import MemoryLocation
+from pycrorm_async.learning.tree import learn
 from pycrorm_async.orm import (
     BatchRolloutAction,
     LearnPolicyAction,

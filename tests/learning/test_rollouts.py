@@ -23,14 +23,14 @@ from pycrorm_async.learning import (
     default_policy,
     learn,
     name_of,
+    rollouts,
     rollouts_question,
 )
-from pycrorm_async.learning.rollouts import recorded_rollouts
-from pycrorm_async.learning.rollouts.rollouts import BatchRolloutActionPerformable, randomness
+from pycrorm_async.learning.rollouts import BatchRolloutActionPerformable, randomness
 from pycrorm_async.orm import BatchRolloutAction, PickUpAction, ProcessMetaData, TaskTreeNode
-from pycrorm_async.plan.task_tree import collected_tree
+from pycrorm_async.plan.task import collected_tree
 from pycrorm_async.world import Grasp, ObjectType
-from pycrorm_async.world.robots.robot_description import Limits
+from pycrorm_async.world.urdf import Limits
 from tests.learning.geometric_rollouts import succeeds
 
 pytestmark = pytest.mark.slow
@@ -127,7 +127,7 @@ async def test_records_and_counts_agree_on_the_stage_at_which_each_rollout_faile
         await rolled_out(50, first=150)  # in an episode of its own
         await rolled_out(30, seed=1)  # other ones
         frame = await frame_of(memory)
-        assert recorded_rollouts.tally_of(frame) == counted[0] + again(150, 50)
+        assert rollouts.tally_of(frame) == counted[0] + again(150, 50)
         assert frame["index"].tolist() == list(range(200))
         assert set(frame.policy) == {name_of(default_policy())}
         choices = [default_policy().sample(randomness(69, index))[0] for index in range(200)]
@@ -136,7 +136,7 @@ async def test_records_and_counts_agree_on_the_stage_at_which_each_rollout_faile
         np.testing.assert_allclose(frame.object_x, [each.relative_x for each in choices], atol=1e-9)
         np.testing.assert_allclose(frame.object_y, [each.relative_y for each in choices], atol=1e-9)
         np.testing.assert_allclose(frame.height, 0.9, atol=1e-9)
-        stages = recorded_rollouts.stages_of(frame)
+        stages = rollouts.stages_of(frame)
         assert stages == await by_node_arithmetic(memory, frame)
         assert sum(stages.values()) == sum(frame.status == "FAILED")
         async with memory.session() as session:
@@ -183,7 +183,7 @@ async def test_each_rollout_can_be_an_episode_of_its_own(tmp_path: Path) -> None
     async with Memory.open(f"sqlite:///{tmp_path}/memory.db", settings=PATIENT) as memory:
         tally = await rolled_out(12, each_in=memory)
         frame = await frame_of(memory)
-        assert recorded_rollouts.tally_of(frame) == tally
+        assert rollouts.tally_of(frame) == tally
         assert frame["index"].tolist() == list(range(12))
         episodes = await memory.reading.episodes()
         assert [each.description.split(" under")[0] for each in episodes] == [f"rollout {index}" for index in range(12)]
@@ -198,7 +198,7 @@ async def test_a_stop_request_ends_a_batch_before_the_next_rollout(tmp_path: Pat
         assert tally.rollouts == 7
         frame = await frame_of(memory)
         assert frame["index"].tolist() == list(range(7))
-        left = list(recorded_rollouts.missing_runs(frame["index"], 12, length_max=3))
+        left = list(rollouts.missing_runs(frame["index"], 12, length_max=3))
         assert left == [(7, 3), (10, 2)]
         assert (await rolled_out(5, stop=lambda: True)).rollouts == 0
 
@@ -221,7 +221,7 @@ async def test_an_interrupted_rollout_does_not_count_and_is_repeated(
                 attempts += 1
                 stage.reset()
                 if attempts == 4:
-                    monkeypatch.setattr("pycrorm_async.plan.motions.simulated_robot.solve", raising)
+                    monkeypatch.setattr("pycrorm_async.plan.motions.solve", raising)
 
             def raising(*_: object, **__: object) -> None:
                 raise Enough
@@ -242,7 +242,7 @@ async def test_rollouts_that_were_repeated_count_once(tmp_path: Path) -> None:
     async with Memory.open(f"sqlite:///{tmp_path}/memory.db", settings=PATIENT) as memory:
         for first, count in ((0, 20), (10, 20)):
             await rolled_out(count, first=first)
-        frame = recorded_rollouts.drop_repeats(await frame_of(memory))
+        frame = rollouts.drop_repeats(await frame_of(memory))
         assert frame["index"].tolist() == list(range(30))
 
 
@@ -313,7 +313,7 @@ def test_rates_come_with_an_interval() -> None:
 
 
 def test_missing_rollouts_are_listed_in_runs() -> None:
-    assert list(recorded_rollouts.missing_runs([], 5, length_max=2)) == [(0, 2), (2, 2), (4, 1)]
-    assert list(recorded_rollouts.missing_runs([0, 1, 5], 8, length_max=10)) == [(2, 3), (6, 2)]
-    assert list(recorded_rollouts.missing_runs(range(8), 8, length_max=10)) == []
-    assert list(recorded_rollouts.missing_runs([9], 3, length_max=10)) == [(0, 3)]
+    assert list(rollouts.missing_runs([], 5, length_max=2)) == [(0, 2), (2, 2), (4, 1)]
+    assert list(rollouts.missing_runs([0, 1, 5], 8, length_max=10)) == [(2, 3), (6, 2)]
+    assert list(rollouts.missing_runs(range(8), 8, length_max=10)) == []
+    assert list(rollouts.missing_runs([9], 3, length_max=10)) == [(0, 3)]

@@ -15,12 +15,9 @@ import pandas as pd
 import pytest
 
 from pycrorm_async.errors import CallerError, ImpossibleCondition, MissingExtra, NotEnoughExperience
-from pycrorm_async.learning.policies.default_policy import default_policy
-from pycrorm_async.learning.policies.evidence import Evidence, Rectangle, Region
-from pycrorm_async.learning.policies.policy import PickUpChoice, Policy
-from pycrorm_async.learning.policies.policy_file import save_policy
-from pycrorm_async.learning.policies.tree import learn
-from pycrorm_async.world.enums import Arms, Grasp
+from pycrorm_async.learning.policy import Evidence, PickUpChoice, Policy, Rectangle, Region, default_policy, save_policy
+from pycrorm_async.learning.tree import learn
+from pycrorm_async.world.pose import Arms, Grasp
 from tests.learning.geometric_rollouts import frame_of, succeeds
 
 pytestmark = pytest.mark.slow
@@ -178,7 +175,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 def state():
     generators = random.getstate(), repr(numpy.random.get_state(legacy=False))
     return generators, list(warnings.filters), signal.getsignal(signal.SIGINT), threading.enumerate(), sys.excepthook
-from pycrorm_async.learning.policies.tree import learn
+from pycrorm_async.learning.tree import learn
 assert "jpt" not in sys.modules
 before = state()
 numbers = [number / 30 for number in range(30)]

@@ -10,9 +10,9 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from pycrorm_async.events.values import NodeStatus
+from pycrorm_async.events.types import NodeStatus
 from pycrorm_async.memory import Memory
-from pycrorm_async.recording.recorded_episode import RecordedEpisode
+from pycrorm_async.record.recorded_episode import RecordedEpisode
 from pycrorm_async.world import Pose
 from tests.commands import Started
 

@@ -11,14 +11,12 @@ import msgspec
 import pytest
 
 from pycrorm_async.errors import UnknownEpisode
-from pycrorm_async.live import follower as following
-from pycrorm_async.live.follower import LogFollower
-from pycrorm_async.live.overview import LiveOverview
-from pycrorm_async.live.server import LiveServer, listen
+from pycrorm_async.live import server as following
+from pycrorm_async.live.server import LiveOverview, LiveServer, LogFollower, listen
 from pycrorm_async.memory import Memory
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.report import episode_fold
-from pycrorm_async.report.overview_data import newest_episodes, overview_document
+from pycrorm_async.report import document as episode_fold
+from pycrorm_async.report.write import newest_episodes, overview_document
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.world import Pose
 from tests.databases import put_memory

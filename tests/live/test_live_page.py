@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.report.episode_data import episode_document
+from pycrorm_async.report.document import episode_document
 from tests.commands import Started
 from tests.live.conftest import Watch, robot_in
 from tests.report.browser import Browser

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from pycrorm_async import Memory
-from pycrorm_async.recording.values.missing_values import Missing
+from pycrorm_async.record.values import Missing
 from pycrorm_async.settings import Settings
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
 

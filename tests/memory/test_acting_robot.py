@@ -34,8 +34,8 @@ from pycrorm_async.plan import (
     SimulatedTaskTree,
     simulated_robot,
 )
-from pycrorm_async.plan.current_robot import require_robot
-from pycrorm_async.query.recorded_world import world_of
+from pycrorm_async.plan.objects import require_robot
+from pycrorm_async.query.again import world_of
 from pycrorm_async.settings import Settings
 from pycrorm_async.world import (
     COURIER,
@@ -49,7 +49,7 @@ from pycrorm_async.world import (
     register_robot,
     robot_acting,
 )
-from pycrorm_async.world.models.courier import courier_urdf
+from pycrorm_async.world.models import courier_urdf
 from tests.commands import answer, pycrorm
 from tests.databases import ask
 

@@ -30,9 +30,9 @@ from pycrorm_async.plan import (
     SimulatedTaskTree,
     simulated_robot,
 )
-from pycrorm_async.plan.execution.observer import PlanObserver, recorder
-from pycrorm_async.plan.object_designators import designator_of
-from pycrorm_async.plan.task_tree import TaskTreeNode as Node
+from pycrorm_async.plan.execution import PlanObserver, recorder
+from pycrorm_async.plan.objects import designator_of
+from pycrorm_async.plan.task import TaskTreeNode as Node
 from pycrorm_async.query.snapshot import Moment, WorldThen
 from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose, WorldState, current_world
 from tests.promises.chronicle import joints_of_bullet, numbers

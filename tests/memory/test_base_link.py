@@ -22,7 +22,7 @@ from pycrorm_async.plan import (
     PlaceActionPerformable,
     simulated_robot,
 )
-from pycrorm_async.plan.designator import Designator
+from pycrorm_async.plan.language import Designator
 from pycrorm_async.world import (
     Arms,
     BulletWorld,

@@ -16,9 +16,9 @@ from sqlalchemy import select
 from pycrorm_async import Memory, Reading
 from pycrorm_async.errors import CallerError
 from pycrorm_async.orm import ProcessMetaData
-from pycrorm_async.plan.execution.observer import recorder
+from pycrorm_async.plan.execution import recorder
 from pycrorm_async.world import BulletWorld, Object, ObjectType
-from pycrorm_async.world.errors import NoWorld, WorldClosed
+from pycrorm_async.world.pose import NoWorld, WorldClosed
 from tests.commands import pycrorm
 from tests.memory.note_actions import NoteActionPerformable, texts, url_of
 

@@ -12,7 +12,7 @@ from pycrorm_async.errors import SpoolDamaged
 from pycrorm_async.events.codec import encode
 from pycrorm_async.events.types import EpisodeEnded, EpisodeStarted
 from pycrorm_async.queue import Spool
-from pycrorm_async.queue.maintenance.repair import repair_folder
+from pycrorm_async.queue.maintenance import repair_folder
 from tests.commands import pycrorm
 from tests.databases import ask
 from tests.memory.daemon_in_loop import QUICK, Daemon

@@ -17,7 +17,7 @@ from pycrorm_async.errors import CallerError, DatabaseForeign, SpoolForeign, Spo
 from pycrorm_async.operations.daemon import serve
 from pycrorm_async.orm import ProcessMetaData
 from pycrorm_async.queue import Spool
-from pycrorm_async.queue.sources.live_source import LiveSource
+from pycrorm_async.queue.sources import LiveSource
 from tests.databases import ask
 from tests.memory.daemon_in_loop import QUICK, Daemon, Start, memory_at
 from tests.memory.note_actions import NoteActionPerformable, texts

@@ -10,13 +10,11 @@ import pytest
 
 from pycrorm_async import Memory, recover
 from pycrorm_async.errors import SpoolDamaged
-from pycrorm_async.events.codec import encode
-from pycrorm_async.events.envelope import Heading
-from pycrorm_async.events.types import EpisodeStarted, ObjectAdded
-from pycrorm_async.events.values import PoseValue
+from pycrorm_async.events.codec import Heading, encode
+from pycrorm_async.events.types import EpisodeStarted, ObjectAdded, PoseValue
 from pycrorm_async.operations.daemon import _Folders
 from pycrorm_async.queue import Spool
-from pycrorm_async.queue.maintenance.repair import repair_folder
+from pycrorm_async.queue.maintenance import repair_folder
 from pycrorm_async.store.address import DatabaseAddress
 from tests.databases import ask
 from tests.memory.daemon_in_loop import QUICK, Daemon

@@ -14,7 +14,7 @@ from pycrorm_async import Memory, Reading, recover
 from pycrorm_async.errors import CallerError, DatabaseUnavailable, EpisodeParked, FlushTimeout
 from pycrorm_async.orm import ProcessMetaData
 from pycrorm_async.queue import Spool
-from pycrorm_async.queue.sources.live_source import LiveSource
+from pycrorm_async.queue.sources import LiveSource
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.databases import ask, ask_to_change

@@ -13,8 +13,7 @@ import pytest
 from pycrorm_async import Memory, Settings
 from pycrorm_async.errors import DatabaseUnavailable, FlushTimeout, SpoolForeign, SpoolTaken
 from pycrorm_async.operations.recovery import Rebinding, rebind, recover
-from pycrorm_async.queue.files.recorder_folder import make_folder
-from pycrorm_async.queue.files.spool import Spool
+from pycrorm_async.queue.spool import Spool, make_folder
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.databases import Server, ask

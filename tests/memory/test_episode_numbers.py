@@ -12,7 +12,7 @@ from pycrorm_async.errors import EpisodeParked
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX
 from pycrorm_async.operations.copy import copy_episodes
 from pycrorm_async.operations.recovery import recover
-from pycrorm_async.queue.files.spool import Spool
+from pycrorm_async.queue.spool import Spool
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.commands import answer, pycrorm

@@ -19,8 +19,8 @@ from pycrorm_async.plan import (
     NavigateActionPerformable,
     PickUpActionPerformable,
 )
-from pycrorm_async.plan.experience import experience
 from pycrorm_async.plan.failures import IKError
+from pycrorm_async.plan.task import experience
 from pycrorm_async.recall.experience import PickUpExperience
 from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose
 from tests.memory.test_database_resolver import STAND, TORSO, scene

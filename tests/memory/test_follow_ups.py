@@ -15,7 +15,7 @@ from pycrorm_async.operations.copy import copy_episodes
 from pycrorm_async.operations.rebuild import rebuild_memory
 from pycrorm_async.orm import Action, ProcessMetaData, TaskTreeNode
 from pycrorm_async.plan import ActionAbstract
-from pycrorm_async.projections.verify.verify import verify
+from pycrorm_async.projections.verify import verify
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.task_status import TaskStatus

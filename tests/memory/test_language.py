@@ -25,14 +25,7 @@ from pycrorm_async.orm import (
 )
 from pycrorm_async.plan import Code as Calling
 from pycrorm_async.plan import Monitor as Watching
-from pycrorm_async.plan import (
-    MoveTorsoAction,
-    NavigateAction,
-    PlanFailure,
-    PlanFailures,
-    TaskStatus,
-    simulated_robot,
-)
+from pycrorm_async.plan import MoveTorsoAction, NavigateAction, PlanFailure, PlanFailures, TaskStatus, simulated_robot
 from pycrorm_async.plan import Retry as Trying
 from pycrorm_async.plan.failures import ObjectLost
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose

@@ -31,7 +31,7 @@ from pycrorm_async.plan import (
     PlanFailure,
     simulated_robot,
 )
-from pycrorm_async.plan.object_designators import ObjectDesignator
+from pycrorm_async.plan.objects import ObjectDesignator
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world import Arms, BulletWorld, Grasp, GripperState, Object, ObjectType, Pose
 from pycrorm_async.world.pose import yaw_quaternion

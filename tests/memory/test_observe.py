@@ -22,9 +22,9 @@ from pycrorm_async.operations.copy import copy_episodes
 from pycrorm_async.operations.rebuild import rebuild_memory
 from pycrorm_async.orm import Observation, ObservationValue
 from pycrorm_async.plan import ActionAbstract
-from pycrorm_async.plan.task_tree import TaskTreeNode, current_node
-from pycrorm_async.projections.verify.findings import VerifyResult
-from pycrorm_async.projections.verify.verify import verify
+from pycrorm_async.plan.task import TaskTreeNode, current_node
+from pycrorm_async.projections.findings import VerifyResult
+from pycrorm_async.projections.verify import verify
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.commands import answer, pycrorm, run_script
@@ -313,7 +313,7 @@ async def test_a_process_killed_between_blob_and_record_loses_no_blob_that_an_ev
     script.write_text(f"""
 import asyncio, os, signal
 from pycrorm_async import Blob, Memory
-from pycrorm_async.recording.writing.emitter import Emitter
+from pycrorm_async.record.episode_writer import Emitter
 
 async def main():
     async with Memory.open({database_url!r}, spool={str(tmp_path / "spool")!r}, writer="daemon") as memory:

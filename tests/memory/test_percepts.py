@@ -16,9 +16,9 @@ from pycrorm_async.operations.copy import copy_episodes
 from pycrorm_async.operations.rebuild import rebuild_memory
 from pycrorm_async.orm import Detection
 from pycrorm_async.plan import BelieveObject, ChosenRobot, DetectingMotion, ObjectDesignator, SimulatedTaskTree
-from pycrorm_async.plan.execution.observer import Seen
-from pycrorm_async.plan.motions.simulated_robot import SimulatedModules
-from pycrorm_async.projections.verify.verify import verify
+from pycrorm_async.plan.execution import Seen
+from pycrorm_async.plan.motions import SimulatedModules
+from pycrorm_async.projections.verify import verify
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog

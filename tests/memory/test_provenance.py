@@ -16,7 +16,7 @@ from pycrorm_async.clock import SYSTEM_CLOCK, Clock, clock_quality
 from pycrorm_async.orm import PickUpWithContextView, ProcessMetaData
 from pycrorm_async.plan import ParkArmsActionPerformable, PickUpActionPerformable, simulated_robot
 from pycrorm_async.plan.failures import PlanFailure
-from pycrorm_async.recording.writing.provenance import PlanSource
+from pycrorm_async.record.episode_writer import PlanSource
 from pycrorm_async.settings import Settings
 from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose
 from tests.bullet import INSTALLED_BULLETS

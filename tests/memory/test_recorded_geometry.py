@@ -14,10 +14,10 @@ import pytest
 from pycrorm_async import Memory, Reading, world_of
 from pycrorm_async.operations.rebuild import rebuild_memory
 from pycrorm_async.operations.recovery import recover
-from pycrorm_async.query.recorded_world import RecordedWorld
+from pycrorm_async.query.again import RecordedWorld
 from pycrorm_async.settings import Settings
 from pycrorm_async.world import BulletWorld, Object, ObjectType, copied
-from pycrorm_async.world.robots.robot_description import PR2
+from pycrorm_async.world.urdf import PR2
 from tests.commands import run_script
 from tests.golden.unpacking import unpack_memory_v1
 from tests.memory.recorded_arm import AT, RED, made_arm, recorded, wedge

@@ -20,11 +20,10 @@ from pycrorm_async.errors import (
     SpoolStuck,
     UnknownUrl,
 )
-from pycrorm_async.events.codec import encode, fingerprint
-from pycrorm_async.events.envelope import Heading
+from pycrorm_async.events.codec import Heading, encode, fingerprint
 from pycrorm_async.events.types import NodeStarted
 from pycrorm_async.plan import ActionAbstract
-from pycrorm_async.plan.execution.observer import recorder
+from pycrorm_async.plan.execution import recorder
 from tests.commands import answer
 from tests.databases import ask
 from tests.memory.note_actions import NoteActionPerformable, texts, url_of

@@ -16,7 +16,7 @@ import pytest
 
 from pycrorm_async import Blob, Memory, Settings, recover
 from pycrorm_async.plan import ActionAbstract
-from pycrorm_async.projections.verify.verify import verify
+from pycrorm_async.projections.verify import verify
 from pycrorm_async.queue import Spool
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog

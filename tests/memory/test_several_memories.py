@@ -10,13 +10,11 @@ from typing import Any
 import pytest
 
 from pycrorm_async import Memory, Reading
-from pycrorm_async.errors import (
-    UnknownEpisode,
-)
+from pycrorm_async.errors import UnknownEpisode
 from pycrorm_async.plan import ActionAbstract
-from pycrorm_async.plan.execution.observer import recorder
+from pycrorm_async.plan.execution import recorder
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.world.observers import watcher
+from pycrorm_async.world.bullet import watcher
 from tests.commands import run_script
 from tests.memory.note_actions import NoteActionPerformable, texts, url_of
 

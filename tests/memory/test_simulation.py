@@ -32,7 +32,7 @@ from pycrorm_async.plan import (
     SimulatedTaskTree,
     simulated_robot,
 )
-from pycrorm_async.plan.object_designators import designator_of
+from pycrorm_async.plan.objects import designator_of
 from pycrorm_async.world import Arms, BulletWorld, Grasp, ObjectType, Pose
 from pycrorm_async.world import Object as WorldObject
 from pycrorm_async.world.pose import yaw_quaternion

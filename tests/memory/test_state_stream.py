@@ -22,7 +22,7 @@ from pycrorm_async.plan import (
     NavigateActionPerformable,
     simulated_robot,
 )
-from pycrorm_async.plan.current_robot import require_robot
+from pycrorm_async.plan.objects import require_robot
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
 from tests.commands import environment
 from tests.memory.note_actions import url_of
@@ -158,7 +158,7 @@ def test_a_forked_child_continues_without_sampling_and_its_parent_keeps_sampling
         "from pycrorm_async import Memory, Settings\n"
         "from pycrorm_async.orm import StateSample\n"
         "from pycrorm_async.plan import *\n"
-        "from pycrorm_async.plan.current_robot import require_robot\n"
+        "from pycrorm_async.plan.objects import require_robot\n"
         "from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose\n"
         "from tests.memory.test_state_stream import Driving\n"
         "class Forking(Driving):\n"

@@ -15,16 +15,15 @@ from sqlalchemy import select
 
 from pycrorm_async import Memory, Reading, Settings, recover
 from pycrorm_async.errors import CallerError, DatabaseUnavailable, LogDamaged, UnknownEpisode
-from pycrorm_async.operations import tag as operation
-from pycrorm_async.operations.copy import copy_episodes
+from pycrorm_async.operations import copy as operation
+from pycrorm_async.operations.copy import copy_episodes, tag_episode
 from pycrorm_async.operations.rebuild import rebuild_memory
-from pycrorm_async.operations.tag import tag_episode
 from pycrorm_async.orm import EpisodeTag, ProcessMetaData
-from pycrorm_async.projections.verify.verify import verify
+from pycrorm_async.projections.verify import verify
 from pycrorm_async.store.address import DatabaseAddress
-from pycrorm_async.store.episode_lookup import tags_of as log_tags
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.postgresql.roles import GRANTS
+from pycrorm_async.store.log import tags_of as log_tags
+from pycrorm_async.store.postgresql import GRANTS
 from tests.commands import answer, one_line_of, pycrorm
 from tests.databases import Server, ask, ask_to_change, change_each
 from tests.memory.note_actions import NoteActionPerformable

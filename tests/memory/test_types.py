@@ -11,7 +11,7 @@ from sqlalchemy.orm import Mapped, undefer
 from pycrorm_async import Memory, UserView
 from pycrorm_async.orm import Action, Designator, PickUpAction, TaskTreeNode
 from pycrorm_async.plan import ActionAbstract, PickUpActionPerformable
-from pycrorm_async.plan.object_designators import BelieveObject
+from pycrorm_async.plan.objects import BelieveObject
 from pycrorm_async.world import Arms, Grasp, ObjectType, Pose
 from tests.commands import run_script
 from tests.memory.note_actions import NoteActionPerformable, url_of

@@ -13,8 +13,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, ClassVar
 
-from pycrorm_async.projections.custom.projection import Changes, Event, Projection
-from pycrorm_async.projections.fold.row_writer import TableRows
+from pycrorm_async.projections.custom import Changes, Event, Projection
+from pycrorm_async.projections.fold import TableRows
 
 TRAP = "PYCRORM_TRAP"
 

@@ -19,11 +19,9 @@ import pytest
 
 from pycrorm_async import Memory, Settings
 from pycrorm_async.operations.daemon import serve
-from pycrorm_async.operations.fold_requests import Assignment, Failure, Write, _RequestHandler
-from pycrorm_async.operations.fold_worker import FoldWorkerState
-from pycrorm_async.operations.fold_workers import DaemonNote
+from pycrorm_async.operations.workers import Assignment, DaemonNote, Failure, FoldWorkerState, Write, _RequestHandler
 from pycrorm_async.plan import ActionAbstract
-from pycrorm_async.queue.files.spool import Spool
+from pycrorm_async.queue.spool import Spool
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.databases import ask

@@ -6,8 +6,10 @@ from datetime import UTC, datetime, timedelta
 from typing import Any
 
 from pycrorm_async.events.types import (
+    CandidateValue,
     EpisodeEnded,
     EpisodeStarted,
+    FailureValue,
     JointsMoved,
     LocationResolved,
     NodeEnded,
@@ -15,9 +17,11 @@ from pycrorm_async.events.types import (
     ObjectAdded,
     ObjectAttached,
     ObjectMoved,
+    ObjectReference,
     ObjectRemoved,
+    ObjectValue,
+    RobotValue,
 )
-from pycrorm_async.events.values import CandidateValue, FailureValue, ObjectReference, ObjectValue, RobotValue
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.projections.event_script import MOVE, NAVIGATE, PICK_UP, Script, declarations, declared, field, name_of, pose

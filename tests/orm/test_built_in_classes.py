@@ -9,15 +9,14 @@ import pytest
 from sqlalchemy import Table, inspect
 
 import pycrorm_async.orm
-from pycrorm_async.hooks.declaration import declared_type
 from pycrorm_async.orm import Action, Designator, Motion
-from pycrorm_async.plan.actions import basic, manipulation, transport
-from pycrorm_async.plan.motions import motions
-from pycrorm_async.projections.schema.layout import Layout
-from pycrorm_async.projections.schema.mapped_tables import built_in_leaves, leaves_of, mapped_leaves
+from pycrorm_async.plan import actions, motions
+from pycrorm_async.projections.columns import Layout
+from pycrorm_async.projections.mapped_tables import built_in_leaves, leaves_of, mapped_leaves
+from pycrorm_async.record.declarations import declared_type
 from tests.commands import environment
 
-MODULES = (basic, manipulation, transport, motions)
+MODULES = (actions, actions, actions, motions)
 PERFORMABLES = [getattr(module, name) for module in MODULES for name in module.__all__]
 
 

@@ -16,7 +16,7 @@ from pycrorm_async.orm import Action, Concept, ConceptAncestor, Designator, Obje
 from pycrorm_async.plan import ActionAbstract, BaseMotion
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.world.enums import ObjectType
+from pycrorm_async.world.pose import ObjectType
 from tests.projections.event_script import Script, declarations, declared, field, name_of, pose
 from tests.projections.sql_queries import stored_and_folded
 

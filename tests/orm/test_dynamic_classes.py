@@ -16,17 +16,15 @@ from sqlalchemy import ForeignKey, select
 from sqlalchemy.orm import Mapped, load_only, mapped_column, registry
 
 from pycrorm_async.errors import CallerError
-from pycrorm_async.events.types import DesignatorTypeDeclared, NodeStarted, ObjectAdded
-from pycrorm_async.events.values import ObjectReference, RobotValue
+from pycrorm_async.events.types import DesignatorTypeDeclared, NodeStarted, ObjectAdded, ObjectReference, RobotValue
 from pycrorm_async.orm import Action, Base, Designator, Motion, PickUpAction, TaskTreeNode
 from pycrorm_async.orm.dynamic import DynamicClasses
+from pycrorm_async.projections.columns import Layout, unite
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.projections.schema.layout import Layout
-from pycrorm_async.projections.schema.union import unite
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.task_status import TaskStatus
-from pycrorm_async.world.enums import Arms
+from pycrorm_async.world.pose import Arms
 from tests.commands import environment
 from tests.projections.event_script import PICK_UP, SAYING, Script, declarations, declared, field, name_of, pose, row
 from tests.projections.sql_queries import stored_and_folded

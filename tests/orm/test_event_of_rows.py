@@ -8,8 +8,18 @@ import pytest
 from sqlalchemy import func, select
 
 from pycrorm_async.events.ids import row_key
-from pycrorm_async.events.types import EpisodeStarted, LocationResolved, NodeEnded, NodeStarted, ObjectAdded
-from pycrorm_async.events.values import CandidateValue, FailureValue, ObjectReference, RefusalValue, RobotValue
+from pycrorm_async.events.types import (
+    CandidateValue,
+    EpisodeStarted,
+    FailureValue,
+    LocationResolved,
+    NodeEnded,
+    NodeStarted,
+    ObjectAdded,
+    ObjectReference,
+    RefusalValue,
+    RobotValue,
+)
 from pycrorm_async.orm import (
     Base,
     EpisodeTag,
@@ -21,7 +31,7 @@ from pycrorm_async.orm import (
     RootFailure,
     SpatialRelation,
 )
-from pycrorm_async.projections.schema.generations import current_generation
+from pycrorm_async.projections.generations import current_generation
 from pycrorm_async.store.log import EventLog
 from tests.projections.event_script import PICK_UP, Script, declarations, declared, field, name_of, pose
 from tests.projections.sql_queries import stored_and_folded

@@ -5,13 +5,22 @@ from __future__ import annotations
 import pytest
 from sqlalchemy import select
 
-from pycrorm_async.events.types import EpisodeEnded, EpisodeStarted, NodeEnded, NodeStarted, ObjectAdded, ObjectMoved
-from pycrorm_async.events.values import FailureValue, ObjectReference, ObjectValue
+from pycrorm_async.events.types import (
+    EpisodeEnded,
+    EpisodeStarted,
+    FailureValue,
+    NodeEnded,
+    NodeStarted,
+    ObjectAdded,
+    ObjectMoved,
+    ObjectReference,
+    ObjectValue,
+)
 from pycrorm_async.orm import RootFailure
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.task_status import TaskStatus
-from pycrorm_async.world.enums import Arms
+from pycrorm_async.world.pose import Arms
 from tests.orm.recorded_breakfast import OPEN, every, moment
 from tests.projections.event_script import (
     MOVE,

@@ -7,11 +7,11 @@ from sqlalchemy import Table, func, inspect, select
 from sqlalchemy.ext.asyncio import AsyncSession
 
 import pycrorm_async.orm
-from pycrorm_async.hooks.declaration import declared_type
 from pycrorm_async.orm import Action, Language, Motion
 from pycrorm_async.plan import Code, Monitor, Parallel, Repeat, Retry, Sequential, TryAll, TryInOrder
-from pycrorm_async.projections.schema.layout import Layout
-from pycrorm_async.projections.schema.mapped_tables import mapped_leaves
+from pycrorm_async.projections.columns import Layout
+from pycrorm_async.projections.mapped_tables import mapped_leaves
+from pycrorm_async.record.declarations import declared_type
 from pycrorm_async.store.log import EventLog
 from tests.projections.sql_queries import stored_and_folded
 

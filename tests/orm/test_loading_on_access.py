@@ -11,12 +11,9 @@ import pytest
 from sqlalchemy import event, select
 
 from pycrorm_async.errors import DatabaseUnavailable
-from pycrorm_async.events.types import NodeStarted
-from pycrorm_async.events.values import RobotValue
-from pycrorm_async.orm import Action, NavigateAction, TaskTreeNode
-from pycrorm_async.orm.loading import batch_loads
-from pycrorm_async.query.reading import Reading
-from pycrorm_async.query.sessions.load_on_access import LoadOnAccess
+from pycrorm_async.events.types import NodeStarted, RobotValue
+from pycrorm_async.orm import Action, NavigateAction, TaskTreeNode, base
+from pycrorm_async.query.reading import LoadOnAccess, Reading
 from pycrorm_async.store.log import EventLog
 from tests.projections.event_script import NAVIGATE, Script, declarations, name_of, pose
 from tests.projections.sql_queries import stored_and_folded
@@ -72,7 +69,7 @@ async def test_an_attribute_is_loaded_for_all_objects_of_a_query_at_once(
 
 
 async def test_a_batch_is_bounded(statements: list[str], reading: Reading, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(batch_loads, "BATCH", 2)
+    monkeypatch.setattr(base, "BATCH", 2)
     rows = await actions_of(reading)
     assert [each.pose_id is not None for each in rows] == [True] * _COUNT
     assert len([each for each in statements if "navigate_action" in each]) == 3

@@ -11,8 +11,7 @@ from sqlalchemy.orm import selectinload, undefer
 import pycrorm_async.orm
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.ids import row_key
-from pycrorm_async.events.types import NodeStarted, ObjectAdded
-from pycrorm_async.events.values import ObjectReference
+from pycrorm_async.events.types import NodeStarted, ObjectAdded, ObjectReference
 from pycrorm_async.orm import (
     Action,
     Attachment,
@@ -41,11 +40,11 @@ from pycrorm_async.orm import (
     RootFailure,
     TaskTreeNode,
 )
-from pycrorm_async.orm.types import Moment
+from pycrorm_async.orm.base import Moment
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.task_status import TaskStatus
-from pycrorm_async.world.enums import Arms, Grasp, ObjectType
+from pycrorm_async.world.pose import Arms, Grasp, ObjectType
 from tests.orm.recorded_breakfast import every, moment
 from tests.projections.event_script import PICK_UP, T0_NS, Script, declarations, name_of, pose, row
 from tests.projections.sql_queries import stored_and_folded

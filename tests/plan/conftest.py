@@ -11,7 +11,7 @@ import pytest
 
 from pycrorm_async.plan import simulated_robot
 from pycrorm_async.world import Arms, BulletWorld, Object, ObjectType, Pose, WorldMode
-from pycrorm_async.world.robots.robot_description import PR2
+from pycrorm_async.world.urdf import PR2
 
 
 class Scene(NamedTuple):

@@ -7,16 +7,8 @@ from collections.abc import Awaitable, Iterator
 from contextlib import contextmanager
 from typing import Literal
 
-from pycrorm_async.plan.execution.observer import (
-    Candidate,
-    Cells,
-    Refusal,
-    Seen,
-    Simulation,
-    current_simulation,
-    recorder,
-)
-from pycrorm_async.plan.task_tree import TaskTreeNode, current_node
+from pycrorm_async.plan.execution import Candidate, Cells, Refusal, Seen, Simulation, current_simulation, recorder
+from pycrorm_async.plan.task import TaskTreeNode, current_node
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world import ObjectType
 

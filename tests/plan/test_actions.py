@@ -32,7 +32,6 @@ from pycrorm_async.plan import (
     TransportActionPerformable,
     collected_tree,
 )
-from pycrorm_async.plan.designator import ActionAbstract
 from pycrorm_async.plan.failures import (
     EndEffectorFailure,
     IllPosedGoalFailure,
@@ -40,8 +39,9 @@ from pycrorm_async.plan.failures import (
     PerceptionObjectNotInWorld,
     TorsoGoalUnreachable,
 )
-from pycrorm_async.plan.object_designators import designator_of
-from pycrorm_async.plan.task_tree import CollectedTree
+from pycrorm_async.plan.language import ActionAbstract
+from pycrorm_async.plan.objects import designator_of
+from pycrorm_async.plan.task import CollectedTree
 from pycrorm_async.world import Arms, Grasp, GripperState, Object, ObjectType, Pose
 from pycrorm_async.world.pose import rotated, yaw_quaternion
 from tests.plan.conftest import Scene

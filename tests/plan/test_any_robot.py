@@ -29,8 +29,8 @@ from pycrorm_async.plan import (
     TransportActionPerformable,
     simulated_robot,
 )
-from pycrorm_async.plan.current_robot import require_robot
 from pycrorm_async.plan.failures import CapabilityAbsenceFailure, ReachabilityFailure
+from pycrorm_async.plan.objects import require_robot
 from pycrorm_async.world import (
     COURIER,
     Arms,
@@ -46,7 +46,7 @@ from pycrorm_async.world import (
     describe_robot,
     register_robot,
 )
-from pycrorm_async.world.models.courier import courier_urdf
+from pycrorm_async.world.models import courier_urdf
 from pycrorm_async.world.pose import rotated
 
 MODELS = Path(str(distribution("example-robot-data").locate_file("cmeel.prefix/share/example-robot-data/robots")))

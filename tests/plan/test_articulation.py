@@ -9,7 +9,7 @@ import pytest
 
 from pycrorm_async.plan import ObjectDesignator, ObjectPart
 from pycrorm_async.plan.failures import EnvironmentManipulationImpossible, PerceptionObjectNotInWorld
-from pycrorm_async.plan.geometry.articulation import (
+from pycrorm_async.plan.geometry import (
     Handle,
     closed_position,
     grasp_pose,
@@ -19,7 +19,7 @@ from pycrorm_async.plan.geometry.articulation import (
     opened_position,
 )
 from pycrorm_async.world import Object, ObjectType, Pose
-from pycrorm_async.world.errors import UnknownLink
+from pycrorm_async.world.pose import UnknownLink
 from tests.plan.conftest import Scene
 from tests.world.fakes import CRANE, Z, matrix, shifted, turned
 

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from pycrorm_async.learning.rollouts.move_and_pick_up import MoveAndPickUp
+from pycrorm_async.learning.rollouts import MoveAndPickUp
 from pycrorm_async.plan import (
     AccessingLocation,
     CostmapLocation,
@@ -22,16 +22,16 @@ from pycrorm_async.plan import (
     SemanticCostmapLocation,
     simulated_robot,
 )
-from pycrorm_async.plan.current_robot import require_robot
-from pycrorm_async.plan.execution.observer import Cells
-from pycrorm_async.plan.experience import PastSuccess
+from pycrorm_async.plan.execution import Cells
 from pycrorm_async.plan.failures import NavigationGoalInCollision, ObjectUnreachable
-from pycrorm_async.plan.locations.opening_poses import opening_poses
-from pycrorm_async.plan.motions.process_modules import simulated_robot_within
+from pycrorm_async.plan.locations import opening_poses
+from pycrorm_async.plan.motions import simulated_robot_within
+from pycrorm_async.plan.objects import require_robot
+from pycrorm_async.plan.task import PastSuccess
 from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose
-from pycrorm_async.world.models.primitives import box_urdf
+from pycrorm_async.world.models import box_urdf
 from pycrorm_async.world.pose import yaw_quaternion
-from pycrorm_async.world.robots.robot_description import Limits
+from pycrorm_async.world.urdf import Limits
 from tests import bullet
 from tests.plan.conftest import Scene
 from tests.plan.fake_observer import Recording

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import pytest
 
-from pycrorm_async.learning.rollouts.move_and_pick_up import MoveAndPickUp
+from pycrorm_async.learning.rollouts import MoveAndPickUp
 from pycrorm_async.plan import (
     AccessingLocation,
     CostmapLocation,
@@ -23,10 +23,10 @@ from pycrorm_async.plan import (
     SimulatedTaskTree,
     simulated_robot,
 )
-from pycrorm_async.plan.current_robot import require_robot
-from pycrorm_async.plan.experience import PastSuccess
 from pycrorm_async.plan.failures import NavigationGoalInCollision
-from pycrorm_async.plan.motions.process_modules import simulated_robot_within
+from pycrorm_async.plan.motions import simulated_robot_within
+from pycrorm_async.plan.objects import require_robot
+from pycrorm_async.plan.task import PastSuccess
 from pycrorm_async.world import PR2, Arms, BulletWorld, Grasp, Limits, Object, ObjectType, Pose, RobotDescription
 from pycrorm_async.world.pose import yaw_quaternion
 from tests.world.base_links import HEIGHT_M, RAILS, link_poses, rail_robot, raised_robot

@@ -38,7 +38,7 @@ from pycrorm_async.plan import (
     TransportActionPerformable,
 )
 from pycrorm_async.plan.failures import IllPosedGoalFailure, ObjectNotFound
-from pycrorm_async.plan.object_designators import designator_of
+from pycrorm_async.plan.objects import designator_of
 from pycrorm_async.world import Arms, Grasp, GripperState, ObjectType, Pose
 from tests.plan.conftest import Scene
 

@@ -12,9 +12,9 @@ from typing import Any, ClassVar
 import pytest
 
 from pycrorm_async.errors import CallerError
-from pycrorm_async.plan.designator import ActionAbstract, BaseMotion, Designator
-from pycrorm_async.plan.errors import PerformNotAsync, ResolutionError
-from pycrorm_async.plan.task_tree import collected_tree
+from pycrorm_async.plan.failures import PerformNotAsync, ResolutionError
+from pycrorm_async.plan.language import ActionAbstract, BaseMotion, Designator
+from pycrorm_async.plan.task import collected_tree
 from pycrorm_async.world.pose import Pose
 
 

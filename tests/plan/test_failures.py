@@ -8,11 +8,17 @@ import pytest
 
 from pycrorm_async.errors import PycrormError
 from pycrorm_async.plan import failures
-from pycrorm_async.plan.exceptions import describe_error, is_plan_failure
-from pycrorm_async.plan.failures import IKError, ObjectLost, PlanFailure, PlanFailures, ResourceDeadlock
-from pycrorm_async.plan.language.resources import Resource
-from pycrorm_async.world.enums import Arms
-from pycrorm_async.world.pose import Pose
+from pycrorm_async.plan.failures import (
+    IKError,
+    ObjectLost,
+    PlanFailure,
+    PlanFailures,
+    Resource,
+    ResourceDeadlock,
+    describe_error,
+    is_plan_failure,
+)
+from pycrorm_async.world.pose import Arms, Pose
 
 TREE = """
 PlanFailure

@@ -32,10 +32,9 @@ from pycrorm_async.plan import (
     collected_tree,
 )
 from pycrorm_async.plan.failures import NotALanguageExpression
-from pycrorm_async.plan.language.expressions import Expression
-from pycrorm_async.plan.language.operators import Composable
+from pycrorm_async.plan.language import Composable, Expression
 from pycrorm_async.world import Arms, Grasp, Pose
-from pycrorm_async.world.robots.robot_description import PR2
+from pycrorm_async.world.urdf import PR2
 from tests.plan.conftest import Scene
 
 OPERATORS = "__add__ __sub__ __or__ __xor__ __mul__ __rmul__ __rshift__".split()

@@ -21,8 +21,7 @@ from pycrorm_async.plan import (
     collected_tree,
 )
 from pycrorm_async.plan.failures import ObjectLost
-from pycrorm_async.plan.language.operators import Composable
-from pycrorm_async.plan.language.outcome import Attempt
+from pycrorm_async.plan.language import Attempt, Composable
 from tests.plan.step_actions import Around, Step, drawn, failing
 
 # --- exceptions that are no plan failures -----------------------------------------------------------------------------

@@ -25,7 +25,7 @@ from pycrorm_async.plan import (
 )
 from pycrorm_async.plan.failures import ResourceDeadlock
 from pycrorm_async.world import Arms, BulletWorld, Grasp, Pose, WorldMode
-from pycrorm_async.world.observers import current_world
+from pycrorm_async.world.bullet import current_world
 from tests.plan.conftest import Scene
 from tests.plan.fake_observer import Recording
 from tests.plan.step_actions import Around, Step, drawn

@@ -28,8 +28,7 @@ from pycrorm_async.plan import (
     ResolutionError,
     SemanticCostmapLocation,
 )
-from pycrorm_async.plan.current_robot import CurrentRobot
-from pycrorm_async.plan.execution.observer import Candidate, Cells
+from pycrorm_async.plan.execution import Candidate, Cells
 from pycrorm_async.plan.failures import (
     LookingHighLevelFailure,
     ObjectUnavailable,
@@ -37,14 +36,13 @@ from pycrorm_async.plan.failures import (
     PerceptionObjectNotInWorld,
     ReachabilityFailure,
 )
-from pycrorm_async.plan.locations.designators import CANDIDATES_MAX
-from pycrorm_async.plan.object_designators import designator_of
+from pycrorm_async.plan.locations import CANDIDATES_MAX
+from pycrorm_async.plan.objects import CurrentRobot, designator_of
 from pycrorm_async.world import Arms, Grasp, Object, ObjectType, Pose
-from pycrorm_async.world.errors import UnknownLink
-from pycrorm_async.world.models.primitives import box_urdf
-from pycrorm_async.world.pose import yaw_quaternion
-from pycrorm_async.world.queries.costmaps import OccupancyCostmap, VisibilityCostmap
-from pycrorm_async.world.robots.robot_description import PR2
+from pycrorm_async.world.models import box_urdf
+from pycrorm_async.world.pose import UnknownLink, yaw_quaternion
+from pycrorm_async.world.queries import OccupancyCostmap, VisibilityCostmap
+from pycrorm_async.world.urdf import PR2
 from tests.plan.conftest import Scene
 from tests.plan.fake_observer import Recording
 

@@ -39,7 +39,7 @@ from pycrorm_async.plan.failures import (
     ObjectLost,
     PerceptionObjectNotInWorld,
 )
-from pycrorm_async.plan.object_designators import designator_of
+from pycrorm_async.plan.objects import designator_of
 from pycrorm_async.world import Arms, BulletWorld, Grasp, GripperState, Limits, Object, ObjectType, Pose
 from pycrorm_async.world.pose import yaw_quaternion
 from tests.plan.bullet_frames import bullet_frame

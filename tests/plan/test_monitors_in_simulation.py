@@ -18,7 +18,7 @@ from pycrorm_async.plan import (
     TaskStatus,
     collected_tree,
 )
-from pycrorm_async.plan.execution.observer import current_simulation
+from pycrorm_async.plan.execution import current_simulation
 from pycrorm_async.plan.failures import NotALanguageExpression
 from pycrorm_async.world import Pose, current_world
 from tests.plan.conftest import Scene

@@ -20,8 +20,7 @@ from pycrorm_async.plan import (
 )
 from pycrorm_async.plan.failures import ConfigurationNotReached, TorsoGoalUnreachable
 from pycrorm_async.world import Arms, GripperState, Object, Pose
-from pycrorm_async.world.errors import UnknownJoint
-from pycrorm_async.world.pose import rotated, yaw_quaternion
+from pycrorm_async.world.pose import UnknownJoint, rotated, yaw_quaternion
 from tests.plan.conftest import Scene
 
 LEFT_TOOL = "l_gripper_tool_frame"

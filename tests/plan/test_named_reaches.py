@@ -26,11 +26,10 @@ from pycrorm_async.plan.failures import (
     ManipulationGoalNotReached,
     PlanFailure,
 )
-from pycrorm_async.plan.motions.process_modules import simulated_robot_within
-from pycrorm_async.plan.motions.simulated_robot import SimulatedModules
-from pycrorm_async.plan.task_tree import collected_tree
+from pycrorm_async.plan.motions import SimulatedModules, simulated_robot_within
+from pycrorm_async.plan.task import collected_tree
 from pycrorm_async.world import Arms, Grasp, Object, ObjectType, Pose
-from pycrorm_async.world.robots.robot_description import Limits
+from pycrorm_async.world.urdf import Limits
 from tests.plan.conftest import Scene
 
 FAR = Pose([0.0, 0.0, 3.0])

@@ -15,10 +15,10 @@ from typing import Any
 
 import pytest
 
-from pycrorm_async.plan.designator import ActionAbstract
-from pycrorm_async.plan.execution.observer import recorder
+from pycrorm_async.plan.execution import recorder
 from pycrorm_async.plan.failures import ObjectUnreachable, PlanFailure
-from pycrorm_async.plan.task_tree import TaskTreeNode, collected_tree, current_node
+from pycrorm_async.plan.language import ActionAbstract
+from pycrorm_async.plan.task import TaskTreeNode, collected_tree, current_node
 from pycrorm_async.task_status import TaskStatus
 from tests.plan.fake_observer import Recording
 

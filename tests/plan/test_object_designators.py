@@ -21,10 +21,9 @@ from pycrorm_async.plan import (
     ResolutionError,
 )
 from pycrorm_async.plan.failures import ObjectNotFound, PerceptionObjectNotInWorld
-from pycrorm_async.plan.object_designators import designator_of, in_world
+from pycrorm_async.plan.objects import designator_of, in_world
 from pycrorm_async.world import ObjectType, Pose
-from pycrorm_async.world.errors import NoWorld, UnknownLink
-from pycrorm_async.world.pose import yaw_quaternion
+from pycrorm_async.world.pose import NoWorld, UnknownLink, yaw_quaternion
 from tests.plan.conftest import Scene
 
 

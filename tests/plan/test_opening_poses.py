@@ -19,15 +19,15 @@ from pycrorm_async.plan import (
     OpenActionPerformable,
     ParkArmsActionPerformable,
 )
-from pycrorm_async.plan.execution.observer import Candidate
+from pycrorm_async.plan.execution import Candidate
 from pycrorm_async.plan.failures import (
     EnvironmentManipulationImpossible,
     EnvironmentUnreachable,
     PerceptionObjectNotInWorld,
 )
-from pycrorm_async.plan.locations.designators import REFUSALS_MAX
+from pycrorm_async.plan.locations import REFUSALS_MAX
 from pycrorm_async.world import Arms, Object, Pose
-from pycrorm_async.world.errors import UnknownLink
+from pycrorm_async.world.pose import UnknownLink
 from tests.plan.conftest import Scene
 from tests.plan.fake_observer import Recording
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from pycrorm_async.errors import CallerError
-from pycrorm_async.learning.rollouts.move_and_pick_up import MoveAndPickUp
+from pycrorm_async.learning.rollouts import MoveAndPickUp
 from pycrorm_async.plan import (
     ActionAbstract,
     BelieveObject,
@@ -27,8 +27,8 @@ from pycrorm_async.plan import (
     TransportActionPerformable,
     simulated_robot,
 )
-from pycrorm_async.plan.experience import PastSuccess
 from pycrorm_async.plan.failures import CapabilityAbsenceFailure
+from pycrorm_async.plan.task import PastSuccess
 from pycrorm_async.world import (
     COURIER,
     PR2,
@@ -43,8 +43,8 @@ from pycrorm_async.world import (
     register_robot,
     robot_description,
 )
-from pycrorm_async.world.errors import ObjectRefused
-from pycrorm_async.world.models.courier import courier_urdf
+from pycrorm_async.world.models import courier_urdf
+from pycrorm_async.world.pose import ObjectRefused
 from pycrorm_async.world.world_copy import copied, counterpart
 
 PLACE = Pose([0.65, 0, 0.9])

@@ -25,13 +25,13 @@ from pycrorm_async.plan import (
     WorldStateDetectingMotion,
     collected_tree,
 )
-from pycrorm_async.plan.execution.observer import Seen, recorder
+from pycrorm_async.plan.execution import Seen, recorder
 from pycrorm_async.plan.failures import CapabilityAbsenceFailure, PerceptionObjectNotFound
-from pycrorm_async.plan.motions.simulated_robot import SimulatedModules
-from pycrorm_async.plan.task_tree import TaskTreeNode
+from pycrorm_async.plan.motions import SimulatedModules
+from pycrorm_async.plan.task import TaskTreeNode
 from pycrorm_async.world import Arms, Grasp, Limits, Object, ObjectType, Pose
-from pycrorm_async.world.models.primitives import box_urdf
-from pycrorm_async.world.robots.robot_description import PR2
+from pycrorm_async.world.models import box_urdf
+from pycrorm_async.world.urdf import PR2
 from tests.plan.bullet_frames import bullet_frame
 from tests.plan.conftest import Scene
 from tests.plan.fake_observer import Recording

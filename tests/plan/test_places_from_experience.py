@@ -15,11 +15,11 @@ from pycrorm_async.plan import (
     NavigateActionPerformable,
     PickUpActionPerformable,
 )
-from pycrorm_async.plan.execution.observer import Candidate
-from pycrorm_async.plan.experience import PastSuccess, experience
+from pycrorm_async.plan.execution import Candidate
 from pycrorm_async.plan.failures import PerceptionObjectNotInWorld
+from pycrorm_async.plan.task import PastSuccess, experience
 from pycrorm_async.world import Arms, Grasp, Object, ObjectType, Pose
-from pycrorm_async.world.models.primitives import box_urdf
+from pycrorm_async.world.models import box_urdf
 from pycrorm_async.world.pose import yaw_quaternion
 from tests.plan.conftest import Scene
 from tests.plan.fake_observer import Recording

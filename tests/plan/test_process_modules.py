@@ -39,7 +39,7 @@ from pycrorm_async.plan.failures import (
     ReachabilityFailure,
 )
 from pycrorm_async.world import Arms, BulletWorld, GripperState, Limits, Object, ObjectType, Pose, WorldMode
-from pycrorm_async.world.errors import NoWorld
+from pycrorm_async.world.pose import NoWorld
 from tests.plan.conftest import Scene
 
 THERE = Pose([0.6, 0.4, 0])

@@ -29,8 +29,7 @@ from pycrorm_async.plan import (
     SetGripperActionPerformable,
     TransportActionPerformable,
 )
-from pycrorm_async.plan.errors import ResourcesNotAMethod
-from pycrorm_async.plan.language.resources import Resource
+from pycrorm_async.plan.failures import Resource, ResourcesNotAMethod
 from pycrorm_async.world import Arms, Grasp, GripperState, Pose
 from tests.plan.conftest import Scene
 

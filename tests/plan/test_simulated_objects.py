@@ -18,7 +18,7 @@ from pycrorm_async.plan import (
     SimulatedTaskTree,
 )
 from pycrorm_async.plan.failures import PerceptionObjectNotInWorld
-from pycrorm_async.plan.object_designators import designator_of, in_world
+from pycrorm_async.plan.objects import designator_of, in_world
 from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose, current_world
 from pycrorm_async.world.pose import yaw_quaternion
 from tests.plan.conftest import Scene

@@ -22,12 +22,12 @@ from pycrorm_async.plan import (
     collected_tree,
     simulated_robot,
 )
-from pycrorm_async.plan.execution.observer import current_simulation
-from pycrorm_async.plan.object_designators import designator_of, in_world
-from pycrorm_async.plan.task_tree import current_node
+from pycrorm_async.plan.execution import current_simulation
+from pycrorm_async.plan.objects import designator_of, in_world
+from pycrorm_async.plan.task import current_node
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world import Arms, BulletWorld, Object, ObjectType, Pose, current_world
-from pycrorm_async.world.errors import WorldClosed
+from pycrorm_async.world.pose import WorldClosed
 from tests.plan.conftest import Scene
 from tests.plan.fake_observer import Recording
 from tests.world.fakes import ChangeLog

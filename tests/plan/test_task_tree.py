@@ -8,9 +8,9 @@ from dataclasses import dataclass, field
 
 import pytest
 
-from pycrorm_async.plan.designator import ActionAbstract, BaseMotion
 from pycrorm_async.plan.failures import ObjectLost
-from pycrorm_async.plan.task_tree import TaskTreeNode, collected_tree, current_node
+from pycrorm_async.plan.language import ActionAbstract, BaseMotion
+from pycrorm_async.plan.task import TaskTreeNode, collected_tree, current_node
 from tests.plan.fake_observer import Recording
 
 

@@ -16,10 +16,10 @@ from pycrorm_async.plan import (
     collected_tree,
 )
 from pycrorm_async.plan.failures import ObjectUnfetchable, ReachabilityFailure
-from pycrorm_async.plan.object_designators import designator_of
+from pycrorm_async.plan.objects import designator_of
 from pycrorm_async.world import Arms, Grasp, Pose
 from pycrorm_async.world.pose import yaw_quaternion
-from pycrorm_async.world.robots.robot_description import PR2
+from pycrorm_async.world.urdf import PR2
 from tests.plan.conftest import Scene
 from tests.plan.fake_observer import Recording
 from tests.plan.test_actions import shape

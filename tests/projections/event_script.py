@@ -4,11 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from pycrorm_async.events.codec import encode, fingerprint
-from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.codec import Record, encode, fingerprint
 from pycrorm_async.events.ids import EpisodeId
-from pycrorm_async.events.types import DesignatorTypeDeclared, Happening
-from pycrorm_async.events.values import FieldDeclared, FieldType, ItemType, NodeKind, PoseValue
+from pycrorm_async.events.types import (
+    DesignatorTypeDeclared,
+    FieldDeclared,
+    FieldType,
+    Happening,
+    ItemType,
+    NodeKind,
+    PoseValue,
+)
 from pycrorm_async.store.stored import StoredEvent
 
 T0_NS = 1_700_000_000_000_000_000

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.codec import Record
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog

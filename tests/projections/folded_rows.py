@@ -5,10 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 from pycrorm_async.events.types import DesignatorTypeDeclared
-from pycrorm_async.projections.fold.fold import fold
-from pycrorm_async.projections.fold.parameters import Designators
-from pycrorm_async.projections.fold.row_batch import Rows
-from pycrorm_async.projections.schema.core_columns import COLUMNS
+from pycrorm_async.projections.columns import COLUMNS
+from pycrorm_async.projections.fold import fold
+from pycrorm_async.projections.row_batch import Designators, Rows
 from tests.projections.event_script import Script, name_of
 
 

@@ -8,11 +8,10 @@ from typing import Any
 from sqlalchemy import column, func, select, table
 
 from pycrorm_async.events.types import EpisodeStarted, NodeEnded, NodeStarted
-from pycrorm_async.projections.custom.projection import Changes, Event, Projection
+from pycrorm_async.projections.custom import Changes, Event, Projection
+from pycrorm_async.projections.mapped_tables import UserView
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.projections.rebuild import Rebuild, claimed
-from pycrorm_async.projections.replaced_tables import clear
-from pycrorm_async.projections.schema.user_views import UserView
+from pycrorm_async.projections.rebuild import Rebuild, claimed, clear
 from pycrorm_async.store.log import EventLog
 from tests.projections.event_script import PICK_UP, Script, name_of, row
 from tests.projections.sql_queries import ask

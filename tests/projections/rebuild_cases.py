@@ -4,10 +4,19 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pycrorm_async.events.envelope import LOST, Record
+from pycrorm_async.events.codec import LOST, Record
 from pycrorm_async.events.ids import parse_episode_id
-from pycrorm_async.events.types import EpisodeEnded, EpisodeStarted, NodeEnded, NodeStarted, ObjectAdded
-from pycrorm_async.events.values import FailureValue, NodeReference, ObjectReference, RobotValue
+from pycrorm_async.events.types import (
+    EpisodeEnded,
+    EpisodeStarted,
+    FailureValue,
+    NodeEnded,
+    NodeReference,
+    NodeStarted,
+    ObjectAdded,
+    ObjectReference,
+    RobotValue,
+)
 from tests.databases import ask
 from tests.projections.event_script import PICK_UP, SAYING, Script, declarations, declared, field, name_of, pose
 from tests.projections.factories import append_and_fold

@@ -13,14 +13,11 @@ from sqlalchemy import text
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.types import EpisodeStarted, NodeStarted
 from pycrorm_async.memory import Memory
-from pycrorm_async.projections.custom.projection import Changes, Event, Projection
-from pycrorm_async.projections.custom.projection_rows import CustomRows
-from pycrorm_async.projections.custom.projection_tables import CustomFoldDefinition, states
+from pycrorm_async.projections import pipeline
+from pycrorm_async.projections.custom import Changes, CustomFoldDefinition, CustomRows, Event, Projection, states
+from pycrorm_async.projections.generations import PROJECTION, read_generation
+from pycrorm_async.projections.pipeline import BatchFold, SideTarget
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.projections.run import batch_fold
-from pycrorm_async.projections.run.batch_fold import BatchFold
-from pycrorm_async.projections.run.targets import SideTarget
-from pycrorm_async.projections.schema.generations import PROJECTION, read_generation
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.store.log import EventLog
 from tests.projections.event_script import PICK_UP, SAYING, Script, declarations, declared, field, mixed, name_of, row
@@ -126,7 +123,7 @@ async def test_a_batch_that_another_process_has_folded_meanwhile_is_not_written(
 async def test_a_fold_that_raises_stops_its_episode_and_no_other(
     log: EventLog, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch, page_events: int
 ) -> None:
-    monkeypatch.setattr(batch_fold, "_PAGE_EVENTS", page_events)
+    monkeypatch.setattr(pipeline, "_PAGE_EVENTS", page_events)
     left = [each for each in TRIES if each[0] == "LEFT"]
     records = [*declarations(PICK_UP), *mixed(tries(1), tries(2, many=left))]
     await folded(log, records, NoLeftHand())

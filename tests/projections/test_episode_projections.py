@@ -14,15 +14,19 @@ import pytest
 from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.events.types import EpisodeEnded, EpisodeStarted, EpisodeTagged, NodeEnded, NodeStarted
-from pycrorm_async.projections.custom import episode_folds
-from pycrorm_async.projections.custom.episode_folds import EpisodeFolds
-from pycrorm_async.projections.custom.projection import Changes, EpisodeFold, EpisodeProjection, Event
-from pycrorm_async.projections.custom.projection_rows import CustomRows
-from pycrorm_async.projections.custom.projection_tables import states
+from pycrorm_async.projections import custom
+from pycrorm_async.projections.custom import (
+    Changes,
+    CustomRows,
+    EpisodeFold,
+    EpisodeFolds,
+    EpisodeProjection,
+    Event,
+    states,
+)
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.projections.rebuild import Rebuild, claimed
-from pycrorm_async.projections.replaced_tables import clear
-from pycrorm_async.projections.verify.verify import verify
+from pycrorm_async.projections.rebuild import Rebuild, claimed, clear
+from pycrorm_async.projections.verify import verify
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.commands import FORKED, fork
@@ -115,8 +119,8 @@ async def rebuilt(log: EventLog) -> None:
 async def test_rows_do_not_depend_on_batches_restarts_and_other_processes(
     log: EventLog, monkeypatch: pytest.MonkeyPatch, seed: int, *, in_turn: bool
 ) -> None:
-    monkeypatch.setattr(episode_folds, "_EPISODES_MAX", 3)
-    monkeypatch.setattr(episode_folds, "_PAGE_EVENTS", 4)
+    monkeypatch.setattr(custom, "_EPISODES_MAX", 3)
+    monkeypatch.setattr(custom, "_PAGE_EVENTS", 4)
     random = Random(seed)
     episodes = random_episodes(random, 24 if seed == 1 or in_turn else 200)
     scripts = [episode(number, tries, ends=number % 3 != 0) for number, tries in enumerate(episodes, 1)]
@@ -176,7 +180,7 @@ async def test_the_folds_that_are_kept_are_bounded_and_end_with_their_episode(
         kept.append(self)
 
     monkeypatch.setattr(EpisodeFolds, "__init__", noted)
-    monkeypatch.setattr(episode_folds, "_EPISODES_MAX", 4)
+    monkeypatch.setattr(custom, "_EPISODES_MAX", 4)
     tries = [("LEFT", "FAILED"), ("LEFT", "SUCCEEDED")]
     scripts = [episode(number, tries) for number in range(1, 8)]
     await log.append([*declarations(PICK_UP), *(each for script in scripts for each in script.records[:4])])

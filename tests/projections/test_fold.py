@@ -10,26 +10,22 @@ from pycrorm_async.events.types import (
     EpisodeEnded,
     EpisodeStarted,
     EpisodeTagged,
+    FailureValue,
     LocationResolved,
+    MissingValue,
     NodeEnded,
+    NodeReference,
     NodeStarted,
     ObjectAdded,
     ObjectDetected,
-)
-from pycrorm_async.events.values import (
-    FailureValue,
-    MissingValue,
-    NodeReference,
     ObjectReference,
     ObjectValue,
     PoseValue,
     RobotValue,
     SeenValue,
 )
-from pycrorm_async.projections.fold.column_values import CannotFold, json_text
-from pycrorm_async.projections.fold.fold import fold
-from pycrorm_async.projections.fold.parameters import Designators
-from pycrorm_async.projections.fold.row_batch import Rows
+from pycrorm_async.projections.fold import fold
+from pycrorm_async.projections.row_batch import CannotFold, Designators, Rows, json_text
 from tests.projections.event_script import (
     NAVIGATE,
     PICK_UP,

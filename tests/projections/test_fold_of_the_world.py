@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from pycrorm_async.events.types import (
+    CandidateValue,
+    CellsValue,
     JointsMoved,
     LocationResolved,
     NodeStarted,
@@ -11,11 +13,13 @@ from pycrorm_async.events.types import (
     ObjectDetached,
     ObjectDetected,
     ObjectMoved,
+    ObjectReference,
     ObjectRemoved,
     Observed,
+    RefusalValue,
+    SeenValue,
     StateSampled,
 )
-from pycrorm_async.events.values import CandidateValue, CellsValue, ObjectReference, RefusalValue, SeenValue
 from tests.projections.event_script import POSE_US, Script, pose, row, time_us
 from tests.projections.folded_rows import rows_of
 

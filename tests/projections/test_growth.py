@@ -12,18 +12,17 @@ import pytest
 from sqlalchemy import text
 
 from pycrorm_async.errors import DatabaseUnavailable
-from pycrorm_async.events.codec import fingerprint
-from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.codec import Record, fingerprint
 from pycrorm_async.events.fields import column_name, table_name
 from pycrorm_async.events.ids import SLOT_FIRST_FIELD
-from pycrorm_async.events.types import DesignatorTypeDeclared, EpisodeStarted, NodeStarted
-from pycrorm_async.events.values import FieldDeclared, FieldType
+from pycrorm_async.events.types import DesignatorTypeDeclared, EpisodeStarted, FieldDeclared, FieldType, NodeStarted
 from pycrorm_async.operations.copy import copy_episodes
+from pycrorm_async.projections import columns as layout
+from pycrorm_async.projections import generations
+from pycrorm_async.projections.columns import index_name, physical_name
+from pycrorm_async.projections.findings import VerifyResult
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.projections.schema import growth, layout
-from pycrorm_async.projections.table_names import index_name, physical_name
-from pycrorm_async.projections.verify.findings import VerifyResult
-from pycrorm_async.projections.verify.verify import verify
+from pycrorm_async.projections.verify import verify
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.databases import Server
@@ -126,7 +125,7 @@ async def test_a_type_has_any_number_of_descendants(log: EventLog) -> None:
 async def test_tables_are_altered_in_several_transactions_where_one_would_hold_too_many_locks(
     log: EventLog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(growth, "_SLICE", 3)
+    monkeypatch.setattr(generations, "_SLICE", 3)
     types = [with_fields(f"Kind{n}Action", "real", "size") for n in range(8)]
     projector = await stored_and_folded(log, [*declarations(*types), *performing(1, types[7], size=7.0)])
     assert projector._fold is not None

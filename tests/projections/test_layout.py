@@ -8,8 +8,8 @@ import pytest
 from msgspec.structs import replace
 
 from pycrorm_async.events.types import DesignatorTypeDeclared
-from pycrorm_async.projections.schema.layout import Layout, LayoutConflict, Leaf
-from pycrorm_async.projections.schema.public_views import public_views
+from pycrorm_async.projections.columns import Layout, LayoutConflict, Leaf
+from pycrorm_async.projections.views import public_views
 from tests.projections.event_script import PICK_UP, SAYING, declared, field
 
 pytestmark = pytest.mark.slow

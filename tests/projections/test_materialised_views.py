@@ -9,8 +9,8 @@ from pycrorm_async.errors import CallerError
 from pycrorm_async.events.types import EpisodeEnded, NodeEnded, NodeStarted
 from pycrorm_async.operations.rebuild import rebuild_memory
 from pycrorm_async.orm import TaskTreeNode
+from pycrorm_async.projections.mapped_tables import UserView
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.projections.schema.user_views import UserView
 from pycrorm_async.store.log import EventLog
 from tests.projections.event_script import SAYING, Script, declarations, mixed, name_of
 from tests.projections.sql_queries import ask, names

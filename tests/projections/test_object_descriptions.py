@@ -18,8 +18,8 @@ from pycrorm_async.operations.rebuild import rebuild_memory
 from pycrorm_async.orm import Object as ObjectRow
 from pycrorm_async.orm import ObjectDescription
 from pycrorm_async.plan import NavigateAction, simulated_robot
-from pycrorm_async.projections.verify.findings import VerifyResult
-from pycrorm_async.projections.verify.verify import verify
+from pycrorm_async.projections.findings import VerifyResult
+from pycrorm_async.projections.verify import verify
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog

@@ -7,16 +7,19 @@ from collections.abc import AsyncIterator, Sequence
 
 import pytest
 
-from pycrorm_async.events.codec import encode
-from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.codec import Record, encode
 from pycrorm_async.events.ids import EpisodeId
-from pycrorm_async.events.types import EpisodeEnded, EpisodeStarted, LocationResolved, NodeEnded, NodeStarted
-from pycrorm_async.events.values import FieldDeclared
+from pycrorm_async.events.types import (
+    EpisodeEnded,
+    EpisodeStarted,
+    FieldDeclared,
+    LocationResolved,
+    NodeEnded,
+    NodeStarted,
+)
+from pycrorm_async.projections import pipeline
+from pycrorm_async.projections.pipeline import BatchPreview, FoldPipeline, LiveTarget
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.projections.run import pipeline
-from pycrorm_async.projections.run.batch_fold import BatchPreview
-from pycrorm_async.projections.run.pipeline import FoldPipeline
-from pycrorm_async.projections.run.targets import LiveTarget
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import Span
 from tests.projections.event_script import SAYING, Script, declarations, declared, field, mixed, name_of, row

@@ -9,8 +9,10 @@ import pytest
 
 from pycrorm_async.errors import DatabaseForeign
 from pycrorm_async.events.types import (
+    CandidateValue,
     EpisodeEnded,
     EpisodeStarted,
+    FailureValue,
     JointsMoved,
     LocationResolved,
     NodeEnded,
@@ -18,18 +20,14 @@ from pycrorm_async.events.types import (
     ObjectAdded,
     ObjectAttached,
     ObjectMoved,
-    ObjectRemoved,
-)
-from pycrorm_async.events.values import (
-    CandidateValue,
-    FailureValue,
     ObjectReference,
+    ObjectRemoved,
     PoseValue,
     RefusalValue,
     RobotValue,
 )
+from pycrorm_async.projections.generations import PROJECTION_VERSION
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.projections.schema.generations import PROJECTION_VERSION
 from pycrorm_async.store.log import EventLog
 from tests.projections.event_script import (
     NAVIGATE,

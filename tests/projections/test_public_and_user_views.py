@@ -16,22 +16,24 @@ from pycrorm_async.errors import CallerError
 from pycrorm_async.events.types import (
     DesignatorTypeDeclared,
     EpisodeStarted,
+    FailureValue,
     NodeEnded,
     NodeStarted,
     ObjectAdded,
     ObjectMoved,
+    ObjectReference,
+    PoseValue,
+    RobotValue,
 )
-from pycrorm_async.events.values import FailureValue, ObjectReference, PoseValue, RobotValue
 from pycrorm_async.orm import ParkArmsAction, PickUpAction, PickUpWithContextView, TaskTreeNode
+from pycrorm_async.projections.columns import LayoutConflict
+from pycrorm_async.projections.generations import current_generation, failed_views
+from pycrorm_async.projections.mapped_tables import UserView, view_texts
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.projections.schema.generations import current_generation
-from pycrorm_async.projections.schema.layout import LayoutConflict
-from pycrorm_async.projections.schema.user_views import UserView, view_texts
-from pycrorm_async.projections.unmade_types import failed_views
-from pycrorm_async.projections.verify.verify import verify
+from pycrorm_async.projections.verify import verify
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.task_status import TaskStatus
-from pycrorm_async.world.enums import Arms, Grasp, ObjectType
+from pycrorm_async.world.pose import Arms, Grasp, ObjectType
 from tests.projections.event_script import (
     PICK_UP,
     SAYING,

@@ -18,14 +18,14 @@ from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async import Memory, Reading
 from pycrorm_async.operations import rebuild as rebuilding
-from pycrorm_async.operations.fold_requests import Assignment
 from pycrorm_async.operations.rebuild import rebuild_memory
+from pycrorm_async.operations.workers import Assignment
 from pycrorm_async.orm import Action, PickUpAction, TaskTreeNode
 from pycrorm_async.projections import rebuild as steps
+from pycrorm_async.projections.mapped_tables import UserView
+from pycrorm_async.projections.pipeline import _fold_all
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.rebuild import Rebuild, claimed
-from pycrorm_async.projections.run.batch_fold import _fold_all
-from pycrorm_async.projections.schema.user_views import UserView
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog

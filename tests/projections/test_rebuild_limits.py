@@ -11,7 +11,7 @@ from pycrorm_async import Reading
 from pycrorm_async.errors import CallerError, DatabaseError, DatabaseForeign, DatabaseUnavailable, LogDamaged
 from pycrorm_async.operations.rebuild import rebuild_memory
 from pycrorm_async.orm import PickUpAction
-from pycrorm_async.projections import replaced_tables
+from pycrorm_async.projections import rebuild
 from pycrorm_async.projections.rebuild import claimed
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
@@ -89,7 +89,7 @@ async def test_an_event_missing_from_the_log_is_damage_and_ends_the_rebuild(tmp_
 @pytest.fixture
 def few_attempts(monkeypatch: pytest.MonkeyPatch) -> None:
     """Let a rebuild leave tables in use after two attempts to drop them, instead of seven in 6 s."""
-    monkeypatch.setattr(replaced_tables, "_DROP_PAUSES_S", (0.0, 0.1))
+    monkeypatch.setattr(rebuild, "_DROP_PAUSES_S", (0.0, 0.1))
 
 
 @pytest.mark.usefixtures("few_attempts")
@@ -126,12 +126,12 @@ async def test_a_foreign_view_on_the_tables_keeps_them_and_is_reported(server: S
 async def test_a_foreign_view_keeps_a_replaced_view_and_its_table(
     server: Server, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(replaced_tables, "_DROP_PAUSES_S", (0.0,))
+    monkeypatch.setattr(rebuild, "_DROP_PAUSES_S", (0.0,))
     url = server.new_memory()
     views = ("CREATE VIEW public.mine AS SELECT id FROM memory.pose", "ALTER SCHEMA memory RENAME TO memory_gone_1_1")
     change_each(url, views)
     log = await EventLog.open(DatabaseAddress.parse(url), create=True)
-    assert await replaced_tables._drop_all(log, ["zz_pose__1001"]) == ["zz_pose__1001"]
+    assert await rebuild._drop_all(log, ["zz_pose__1001"]) == ["zz_pose__1001"]
     await log.close()
     assert ask(url, "SELECT count(*) FROM public.mine") == [(0,)]
 

@@ -9,11 +9,10 @@ import signal
 import pytest
 from sqlalchemy.ext.asyncio import AsyncConnection
 
-from pycrorm_async.projections.custom.projection_rows import CustomRows
-from pycrorm_async.projections.rebuild import Rebuild, claimed
-from pycrorm_async.projections.replaced_tables import clear
-from pycrorm_async.projections.verify.row_comparison import Difference
-from pycrorm_async.projections.verify.verify import verify
+from pycrorm_async.projections.custom import CustomRows
+from pycrorm_async.projections.findings import Difference
+from pycrorm_async.projections.rebuild import Rebuild, claimed, clear
+from pycrorm_async.projections.verify import verify
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.commands import FORKED, fork
@@ -88,7 +87,7 @@ async def test_an_interrupted_rebuild_is_continued(log: EventLog, monkeypatch: p
 
 
 async def test_verify_finds_every_change_and_nothing_else(log: EventLog, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pycrorm_async.projections.verify.parts._PART_EVENTS", 10)  # several parts
+    monkeypatch.setattr("pycrorm_async.projections.findings._PART_EVENTS", 10)  # several parts
     records = [*declarations(PICK_UP), *mixed(*(tries(episode) for episode in range(1, 5)))]
     await folded(log, [*records, *tries(5).records[:6]], GraspRate())
     result = await verify(log, projections=[GraspRate()])

@@ -10,28 +10,28 @@ from sqlalchemy import select
 from sqlalchemy.ext.asyncio import AsyncSession
 
 from pycrorm_async.errors import CallerError
-from pycrorm_async.events.codec import decode
-from pycrorm_async.events.envelope import Heading, Record
+from pycrorm_async.events.codec import Heading, Record, decode
 from pycrorm_async.events.types import (
+    BlobReference,
     DescriptionDeclared,
     JointsMoved,
     NodeEnded,
     NodeStarted,
     ObjectAdded,
     ObjectMoved,
+    ObjectReference,
     ObjectRemoved,
 )
-from pycrorm_async.events.values import BlobReference, ObjectReference
 from pycrorm_async.orm import SpatialRelation
-from pycrorm_async.projections.verify.verify import verify
+from pycrorm_async.projections.verify import verify
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.recording.declarations.descriptions import Descriptions
-from pycrorm_async.recording.values.missing_values import MissingValues
+from pycrorm_async.record.geometry import Descriptions
+from pycrorm_async.record.values import MissingValues
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.world import BulletWorld, Object, ObjectType
-from pycrorm_async.world.models.kitchen import kitchen_urdf
-from pycrorm_async.world.models.link_boxes import link_boxes
+from pycrorm_async.world.model_boxes import link_boxes
+from pycrorm_async.world.models import kitchen_urdf
 from tests.projections.event_script import PICK_UP, T0_NS, Script, declarations, declared, field, name_of, pose, row
 from tests.projections.sql_queries import ask, stored_and_folded
 from tests.projections.verify_cases import rebuilt

@@ -11,8 +11,8 @@ from pycrorm_async import Reading
 from pycrorm_async.operations.rebuild import rebuild_memory
 from pycrorm_async.orm import PickUpAction, TaskTreeNode
 from pycrorm_async.projections import projector
-from pycrorm_async.projections.schema.user_views import UserView
-from pycrorm_async.projections.verify.verify import verify
+from pycrorm_async.projections.mapped_tables import UserView
+from pycrorm_async.projections.verify import verify
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.databases import ask

@@ -9,8 +9,7 @@ from msgspec.structs import replace
 
 from pycrorm_async.events.codec import encode
 from pycrorm_async.events.types import DesignatorTypeDeclared
-from pycrorm_async.projections.schema.layout import Layout
-from pycrorm_async.projections.schema.union import Adjustment, unite
+from pycrorm_async.projections.columns import Adjustment, Layout, unite
 from tests.projections.event_script import declared, field, name_of
 
 pytestmark = pytest.mark.slow

@@ -13,12 +13,12 @@ import pytest
 
 from pycrorm_async import Memory
 from pycrorm_async.errors import DatabaseUnavailable
-from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.codec import Record
 from pycrorm_async.events.types import EpisodeEnded, NodeStarted
+from pycrorm_async.projections import findings as parts
+from pycrorm_async.projections.findings import Difference
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.projections.verify import parts
-from pycrorm_async.projections.verify.row_comparison import Difference
-from pycrorm_async.projections.verify.verify import verify
+from pycrorm_async.projections.verify import verify
 from pycrorm_async.store.log import EventLog
 from tests.databases import ask, ask_to_change, change_each
 from tests.projections.event_script import Script

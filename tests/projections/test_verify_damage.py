@@ -12,8 +12,8 @@ import pytest
 
 from pycrorm_async.errors import PycrormError
 from pycrorm_async.events.codec import encode
-from pycrorm_async.projections.verify.findings import VerifyResult
-from pycrorm_async.projections.verify.verify import verify
+from pycrorm_async.projections.findings import VerifyResult
+from pycrorm_async.projections.verify import verify
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.databases import ask, ask_each, ask_to_change, change_each

@@ -13,9 +13,8 @@ import pytest
 from pycrorm_async.events.codec import encode, fingerprint
 from pycrorm_async.events.types import DescriptionDeclared, EpisodeTagged, ObjectAdded
 from pycrorm_async.operations.copy import copy_episodes
-from pycrorm_async.projections.verify.digest_check import OutsideDigest
-from pycrorm_async.projections.verify.findings import VerifyResult
-from pycrorm_async.projections.verify.verify import verify
+from pycrorm_async.projections.findings import VerifyResult
+from pycrorm_async.projections.verify import OutsideDigest, verify
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.backups import Backup

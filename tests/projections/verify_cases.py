@@ -13,38 +13,35 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from pycrorm_async.events.envelope import LOST
+from pycrorm_async.events.codec import LOST
 from pycrorm_async.events.types import (
+    CandidateValue,
     EpisodeEnded,
     EpisodeStarted,
+    FailureValue,
     JointsMoved,
     LocationResolved,
     NodeEnded,
+    NodeReference,
     NodeStarted,
     ObjectAdded,
     ObjectAttached,
     ObjectDetached,
     ObjectDetected,
     ObjectMoved,
-    ObjectRemoved,
-    StateSampled,
-)
-from pycrorm_async.events.values import (
-    CandidateValue,
-    FailureValue,
-    NodeReference,
     ObjectReference,
+    ObjectRemoved,
     ObjectValue,
     RefusalValue,
     RobotValue,
     SeenValue,
+    StateSampled,
 )
+from pycrorm_async.projections import findings as parts
+from pycrorm_async.projections.findings import VerifyResult
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.projections.rebuild import Rebuild, claimed
-from pycrorm_async.projections.replaced_tables import clear
-from pycrorm_async.projections.verify import parts
-from pycrorm_async.projections.verify.findings import VerifyResult
-from pycrorm_async.projections.verify.verify import verify
+from pycrorm_async.projections.rebuild import Rebuild, claimed, clear
+from pycrorm_async.projections.verify import verify
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.databases import ask, ask_each, ask_to_change

@@ -14,7 +14,7 @@ from sqlalchemy import Select, select
 from pycrorm_async import Memory, Reading
 from pycrorm_async.orm import Attachment, JointChange, ObjectRemoval, TaskTreeNode
 from pycrorm_async.orm import Object as ObjectRow
-from pycrorm_async.plan.task_tree import current_node
+from pycrorm_async.plan.task import current_node
 from pycrorm_async.world import BulletWorld, Object, Pose
 from tests import bullet
 from tests.promises.lab import at, every, turned

@@ -34,7 +34,7 @@ from pycrorm_async.plan import (
 )
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world import Arms, BulletWorld, Grasp, GripperState, ObjectType, Pose
-from pycrorm_async.world.robots.robot_description import PR2
+from pycrorm_async.world.urdf import PR2
 from tests.memory.note_actions import NoteActionPerformable
 from tests.promises.lab import Lab, lab, nodes_of, recorded, results_of, statuses, url_of, written
 

@@ -17,22 +17,20 @@ from sqlalchemy import func, select
 
 from pycrorm_async import Memory, Reading
 from pycrorm_async.errors import DatabaseForeign, TablesOutdated
-from pycrorm_async.events.codec import Decoder
+from pycrorm_async.events.codec import Decoder, Upcaster
 from pycrorm_async.events.types import EVENT_TYPES, ObjectAdded
-from pycrorm_async.events.upcasters import Upcaster
 from pycrorm_async.operations.copy import copy_episodes
 from pycrorm_async.operations.rebuild import rebuild_memory
 from pycrorm_async.operations.recovery import recover
 from pycrorm_async.orm import Action
 from pycrorm_async.plan import ActionAbstract
-from pycrorm_async.projections.fold import fold
-from pycrorm_async.projections.schema.generations import PROJECTION_VERSION
-from pycrorm_async.projections.verify.verify import verify
+from pycrorm_async.projections import fold
+from pycrorm_async.projections.generations import PROJECTION_VERSION
+from pycrorm_async.projections.verify import verify
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.dialect import Birth
 from pycrorm_async.store.dialects import dialect_of
-from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.schema import make_or_migrate
+from pycrorm_async.store.log import EventLog, make_or_migrate
 from pycrorm_async.world import Arms
 from tests.databases import ask, ask_to_change
 from tests.golden.unpacking import unpack_memory_v1

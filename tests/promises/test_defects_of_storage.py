@@ -27,13 +27,7 @@ from sqlalchemy import func, select
 from sqlalchemy.dialects import sqlite
 
 from pycrorm_async import Memory, Reading, recover
-from pycrorm_async.orm import (
-    Action,
-    Base,
-    Object,
-    ProcessMetaData,
-    TaskTreeNode,
-)
+from pycrorm_async.orm import Action, Base, Object, ProcessMetaData, TaskTreeNode
 from pycrorm_async.plan import (
     ActionAbstract,
     NavigateActionPerformable,

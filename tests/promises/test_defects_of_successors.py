@@ -36,7 +36,7 @@ from pycrorm_async.plan import (
 )
 from pycrorm_async.plan import MoveTorsoAction as MoveTorso
 from pycrorm_async.plan import NavigateAction as Navigate
-from pycrorm_async.query.recorded_designator import NotPerformable
+from pycrorm_async.query.again import NotPerformable
 from pycrorm_async.world import Arms, BulletWorld, Grasp, Pose
 from tests.memory.note_actions import NoteActionPerformable
 from tests.promises.chronicle import joints_of_bullet, numbers

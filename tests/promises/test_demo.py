@@ -28,8 +28,8 @@ from pycrorm_async.orm import (
 )
 from pycrorm_async.orm import Pose as PoseRow
 from pycrorm_async.plan import ActionAbstract, PlaceActionPerformable
-from pycrorm_async.plan.execution.observer import PlanObserver, Simulation, recorder
-from pycrorm_async.plan.task_tree import TaskTreeNode as Node
+from pycrorm_async.plan.execution import PlanObserver, Simulation, recorder
+from pycrorm_async.plan.task import TaskTreeNode as Node
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world import Arms, BulletWorld, Grasp, ObjectType, Pose
 from pycrorm_async.world import Object as WorldObject
@@ -247,7 +247,7 @@ async def test_the_same_plan_runs_without_a_memory_and_records_nothing(tmp_path:
 
 
 async def test_the_plan_also_runs_on_the_mesh_model(tmp_path: Path) -> None:
-    from pycrorm_async.world.models.pr2 import pr2_mesh_urdf_path
+    from pycrorm_async.world.models import pr2_mesh_urdf_path
 
     async with Memory.open(f"sqlite:///{tmp_path}/demo.db") as memory:
         async with memory.episode(description="mesh") as episode:

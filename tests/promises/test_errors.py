@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from pycrorm_async.errors import EpisodeParked, FlushTimeout, PycrormError, SpoolFull, SpoolUnavailable
-from pycrorm_async.plan.errors import NotResolved, ResolutionError
+from pycrorm_async.plan.failures import NotResolved, ResolutionError
 
 
 @pytest.mark.parametrize(

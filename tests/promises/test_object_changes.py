@@ -26,7 +26,7 @@ from pycrorm_async.plan import (
     SetGripperAction,
     SimulatedTaskTree,
 )
-from pycrorm_async.plan.object_designators import designator_of
+from pycrorm_async.plan.objects import designator_of
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world import Arms, Grasp, GripperState, Object, ObjectType, Pose, current_world
 from pycrorm_async.world.pose import yaw_quaternion

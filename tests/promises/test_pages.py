@@ -307,7 +307,7 @@ RESULTS: Final[Mapping[str, Mapping[str, Callable[[PageReader], None]]]] = {
     "pycrorm_async/recall/README.md": {
         'Recall: "have I been here before, and how did it end?"': past_actions_are_recalled,
     },
-    "pycrorm_async/recording/README.md": {
+    "pycrorm_async/record/README.md": {
         "Executives that tick, and executives with run ids": the_states_that_ticked_are_counted,
         "Testing an integration": the_test_of_the_integration_passes,
     },

@@ -34,7 +34,7 @@ from pycrorm_async.orm import MoveAndPickUpAction, MoveMotion, NavigateAction, O
 from pycrorm_async.orm import PickUpAction, PlaceAction, Pose, ProcessMetaData, RootFailure, TaskTreeNode
 from pycrorm_async.plan import Designator, TaskStatus
 from pycrorm_async.plan import ActionAbstract, NavigateAction as Navigate, PlanFailure, simulated_robot
-from pycrorm_async.projections.custom.projection import Changes, Event
+from pycrorm_async.projections.custom import Changes, Event
 from pycrorm_async.testing.contracts import check_designator, check_executive, check_projection
 from pycrorm_async.testing.fake_clock import FakeClock
 from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose as WorldPose

@@ -33,19 +33,19 @@ CIRCLES = frozenset(
         # the package names the classes that it imports on first access, and the memory records the package's version
         ("pycrorm_async", "memory"),
         # a world, its objects, their attachments, and the observers that are notified of all three
-        ("world.attachments", "world.bullet", "world.objects", "world.observers"),
+        ("world.bullet", "world.bullet", "world.bullet", "world.bullet"),
         # operators make expressions, which are designators, and check that their operands have operators
         (
-            "plan.actions.action_description",
-            "plan.designator",
-            "plan.language.expressions",
-            "plan.language.monitor",
-            "plan.language.operators",
+            "plan.language",
+            "plan.language",
+            "plan.language",
+            "plan.language",
+            "plan.language",
         ),
         # rows that refer to each other: a node, its designator, and the objects that it moved
-        ("orm.designators", "orm.objects", "orm.tree"),
+        ("orm.rows", "orm.rows", "orm.rows"),
         # the world of a moment draws its own map
-        ("query.notebook.world_map", "query.scene.outlines", "query.snapshot"),
+        ("query.snapshot", "query.snapshot", "query.snapshot"),
     }
 )
 """The modules that may import each other, also inside functions or for types only: each group is one concept.

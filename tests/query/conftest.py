@@ -7,7 +7,7 @@ from collections.abc import AsyncIterator
 import pytest
 
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.store.postgresql.roles import GRANTS
+from pycrorm_async.store.postgresql import GRANTS
 from tests.databases import change_each, run_in_own_loop
 from tests.projections.factories import append_and_fold
 from tests.query.random_episodes import EPISODES

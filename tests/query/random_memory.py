@@ -12,6 +12,7 @@ import msgspec
 from pycrorm_async.events.types import (
     EpisodeEnded,
     EpisodeStarted,
+    FailureValue,
     Happening,
     JointsMoved,
     NodeEnded,
@@ -21,9 +22,12 @@ from pycrorm_async.events.types import (
     ObjectDetached,
     ObjectDetected,
     ObjectMoved,
+    ObjectReference,
     ObjectRemoved,
+    PoseValue,
+    RobotValue,
+    SeenValue,
 )
-from pycrorm_async.events.values import FailureValue, ObjectReference, PoseValue, RobotValue, SeenValue
 from tests.projections.event_script import MOVE, NAVIGATE, PICK_UP, SAYING, T0_NS, Script, declarations, name_of, pose
 
 TYPES = declarations(NAVIGATE, PICK_UP, SAYING, MOVE)

@@ -7,7 +7,7 @@ from contextlib import asynccontextmanager
 from typing import Any
 from urllib.parse import urlsplit
 
-from pycrorm_async.query.sql.read_only import DEFAULT_LIMITS, ReadOnlySql, SqlLimits
+from pycrorm_async.query.sql import DEFAULT_LIMITS, ReadOnlySql, SqlLimits
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.databases import change_each

@@ -5,8 +5,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from pycrorm_async.events.types import (
+    CandidateValue,
     EpisodeEnded,
     EpisodeStarted,
+    FailureValue,
     Happening,
     JointsMoved,
     LocationResolved,
@@ -17,10 +19,12 @@ from pycrorm_async.events.types import (
     ObjectDetached,
     ObjectDetected,
     ObjectMoved,
+    ObjectReference,
     ObjectRemoved,
+    RobotValue,
+    SeenValue,
     StateSampled,
 )
-from pycrorm_async.events.values import CandidateValue, FailureValue, ObjectReference, RobotValue, SeenValue
 from tests.projections.event_script import MOVE, NAVIGATE, PICK_UP, Script, name_of, pose
 
 TYPES = (NAVIGATE, PICK_UP, MOVE)

@@ -17,13 +17,13 @@ from pycrorm_async.errors import CallerError, DatabaseForeign, LogDamaged, Unkno
 from pycrorm_async.events.types import (
     EpisodeStarted,
     NodeEnded,
+    NodeReference,
     NodeStarted,
     ObjectAdded,
     ObjectAttached,
     ObjectMoved,
     ObjectRemoved,
 )
-from pycrorm_async.events.values import NodeReference
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.query.named_queries import NodeSummary
 from pycrorm_async.query.reading import Reading

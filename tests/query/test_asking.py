@@ -12,7 +12,7 @@ import pytest
 from pycrorm_async.events.types import EpisodeEnded, EpisodeStarted, ObjectMoved
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.task_status import TaskStatus
-from pycrorm_async.world.enums import Arms, Grasp
+from pycrorm_async.world.pose import Arms, Grasp
 from tests.projections.event_script import T0_NS
 from tests.query.random_episodes import EPISODES
 from tests.query.random_memory import NAMES, Node, course_of, nodes_of, root_failures_of

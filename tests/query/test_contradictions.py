@@ -11,7 +11,7 @@ from sqlalchemy.orm import Mapped, mapped_column
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.types import DesignatorTypeDeclared, NodeStarted
 from pycrorm_async.orm import Action, Designator, Motion, TaskTreeNode
-from pycrorm_async.projections.unmade_types import contradictions
+from pycrorm_async.projections.generations import contradictions
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.store.log import EventLog
 from tests.projections.event_script import SAYING, Script, declarations, declared, field, name_of

@@ -16,26 +16,24 @@ from sqlalchemy.orm import selectinload, undefer
 
 from pycrorm_async import Reading
 from pycrorm_async.events.types import (
+    BlobReference,
+    CandidateValue,
     EpisodeEnded,
     EpisodeStarted,
+    FailureValue,
     LocationResolved,
     NodeEnded,
     NodeStarted,
     ObjectAdded,
     ObjectMoved,
-    Observed,
-)
-from pycrorm_async.events.values import (
-    BlobReference,
-    CandidateValue,
-    FailureValue,
     ObjectReference,
     ObjectValue,
+    Observed,
     RefusalValue,
     RobotValue,
 )
-from pycrorm_async.learning.policies.recorded_policy import policy_contents
-from pycrorm_async.learning.rollouts.recorded_rollouts import episodes_question, rollouts_question
+from pycrorm_async.learning.recorded_policy import policy_contents
+from pycrorm_async.learning.rollouts import episodes_question, rollouts_question
 from pycrorm_async.orm import (
     Action,
     EpisodeRobot,
@@ -50,22 +48,12 @@ from pycrorm_async.orm import (
     SpatialRelation,
     TaskTreeNode,
 )
-from pycrorm_async.projections.schema.generations import current_generation
-from pycrorm_async.query.asking.ask import Ask
+from pycrorm_async.projections.generations import current_generation
+from pycrorm_async.query.questions import Ask
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.databases import Server, ask, run_in_own_loop
-from tests.projections.event_script import (
-    MOVE,
-    NAVIGATE,
-    PICK_UP,
-    Script,
-    declarations,
-    declared,
-    field,
-    name_of,
-    pose,
-)
+from tests.projections.event_script import MOVE, NAVIGATE, PICK_UP, Script, declarations, declared, field, name_of, pose
 from tests.projections.sql_queries import stored_and_folded
 
 pytestmark = pytest.mark.slow

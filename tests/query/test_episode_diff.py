@@ -11,14 +11,15 @@ from pycrorm_async.errors import CallerError, UnknownEpisode
 from pycrorm_async.events.types import (
     EpisodeEnded,
     EpisodeStarted,
+    FailureValue,
     NodeEnded,
     NodeStarted,
     ObjectAdded,
     ObjectMoved,
+    ObjectReference,
     ObjectRemoved,
 )
-from pycrorm_async.events.values import FailureValue, ObjectReference
-from pycrorm_async.query.asking.episode_diff import Difference
+from pycrorm_async.query.episode_diff import Difference
 from pycrorm_async.query.reading import Reading
 from tests.databases import ask, run_in_own_loop
 from tests.projections.event_script import NAVIGATE, PICK_UP, SAYING, Script, name_of, pose, row

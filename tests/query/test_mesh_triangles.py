@@ -5,8 +5,8 @@ import struct
 import numpy as np
 import pytest
 
-from pycrorm_async.query.scene import mesh_triangles
-from pycrorm_async.query.scene.mesh_triangles import triangles_of
+from pycrorm_async.query import scene
+from pycrorm_async.query.scene import triangles_of
 from tests import mesh_files
 
 
@@ -60,6 +60,6 @@ def test_a_file_without_triangles_has_a_reason(name: str, content: bytes, reason
 
 
 def test_a_file_with_too_many_triangles_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(mesh_triangles, "TRIANGLES_MAX", 5)
+    monkeypatch.setattr(scene, "TRIANGLES_MAX", 5)
     with pytest.raises(ValueError, match="it has 6 triangles, more than 5"):
         triangles_of("a.obj", mesh_files.obj())

@@ -19,24 +19,18 @@ import pytest
 
 from pycrorm_async import Memory, world_of
 from pycrorm_async.errors import CallerError
-from pycrorm_async.events.types import DescriptionDeclared
-from pycrorm_async.events.values import BlobReference, BoxValue, MeshValue
+from pycrorm_async.events.types import BlobReference, BoxValue, DescriptionDeclared, MeshValue
 from pycrorm_async.plan import NavigateAction, simulated_robot
-from pycrorm_async.query.asking.episode_diff import Difference, EpisodeDiff
-from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary
-from pycrorm_async.query.notebook.answer_view import cases_html
-from pycrorm_async.query.notebook.listings import Episodes, TaskTree
-from pycrorm_async.query.notebook.memory_view import memory_html
-from pycrorm_async.query.running_episodes import RobotSummary
-from pycrorm_async.query.scene.link_frames import link_frames
-from pycrorm_async.query.scene.object_model import object_model
-from pycrorm_async.query.scene.outlines import outlines
-from pycrorm_async.query.snapshot import Moment, ObjectThen, ObservationThen, WorldThen
-from pycrorm_async.query.sql.read_only import SqlResult
-from pycrorm_async.query.value_html import NotebookValue, value_html
+from pycrorm_async.query.episode_diff import Difference, EpisodeDiff
+from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary, RobotSummary
+from pycrorm_async.query.notebook_html import Episodes, TaskTree, cases_html, memory_html
+from pycrorm_async.query.scene import link_frames, object_model
+from pycrorm_async.query.snapshot import Moment, ObjectThen, ObservationThen, WorldThen, outlines
+from pycrorm_async.query.sql import SqlResult
+from pycrorm_async.query.text import NotebookValue, value_html
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
-from pycrorm_async.world.models.courier import courier_urdf
+from pycrorm_async.world.models import courier_urdf
 from tests.mesh_files import binary_stl
 
 START = datetime(2026, 3, 1, 12, tzinfo=UTC)

@@ -9,16 +9,19 @@ import pytest
 
 from pycrorm_async import Reading
 from pycrorm_async.events.types import (
+    CandidateValue,
     EpisodeStarted,
     LocationResolved,
     NodeEnded,
     NodeStarted,
     ObjectAdded,
     ObjectDetected,
+    ObjectReference,
+    RefusalValue,
+    SeenValue,
 )
-from pycrorm_async.events.values import CandidateValue, ObjectReference, RefusalValue, SeenValue
-from pycrorm_async.query.percepts_and_places import Percept, PlaceSearch, percepts_of, searches_of
-from pycrorm_async.query.snapshot_fold import MomentFold
+from pycrorm_async.query.named_queries import Percept, PlaceSearch, percepts_of, searches_of
+from pycrorm_async.query.snapshot import MomentFold
 from tests.commands import answer, pycrorm
 from tests.projections.event_script import NAVIGATE, Script, declarations, name_of, pose, row
 from tests.projections.factories import append_and_fold

@@ -21,7 +21,7 @@ from pycrorm_async.errors import CallerError, UnknownEpisode
 from pycrorm_async.plan import NavigateAction, simulated_robot
 from pycrorm_async.settings import Settings
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
-from pycrorm_async.world.models.primitives import box_urdf
+from pycrorm_async.world.models import box_urdf
 
 pytestmark = pytest.mark.slow
 

@@ -10,10 +10,9 @@ from typing import Any
 import pytest
 
 from pycrorm_async.errors import CallerError, UnknownEpisode
-from pycrorm_async.events.types import EpisodeEnded, EpisodeStarted, NodeEnded, NodeStarted
-from pycrorm_async.events.values import FailureValue, RobotValue
+from pycrorm_async.events.types import EpisodeEnded, EpisodeStarted, FailureValue, NodeEnded, NodeStarted, RobotValue
 from pycrorm_async.memory import Memory
-from pycrorm_async.query.asking.ask import QUESTIONS
+from pycrorm_async.query.questions import QUESTIONS
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.world import Pose
 from tests.databases import ask_each

@@ -14,15 +14,8 @@ from sqlalchemy import Engine, event, select
 from bench.material.spool_recording import spool_rollouts
 from pycrorm_async import Reading
 from pycrorm_async.operations.recovery import recover
-from pycrorm_async.orm import (
-    Object,
-    PickUpAction,
-    PickUpWithContextView,
-    Pose,
-    SpatialRelation,
-    TaskTreeNode,
-)
-from pycrorm_async.query.asking.ask import QUESTIONS
+from pycrorm_async.orm import Object, PickUpAction, PickUpWithContextView, Pose, SpatialRelation, TaskTreeNode
+from pycrorm_async.query.questions import QUESTIONS
 from pycrorm_async.recall.experience import PickUpExperience
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog

@@ -12,10 +12,10 @@ import psutil
 import pytest
 
 from pycrorm_async.errors import QueryRefused
-from pycrorm_async.query.sql.read_only import SqlLimits
+from pycrorm_async.query.sql import SqlLimits
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.postgresql.roles import GRANTS
+from pycrorm_async.store.postgresql import GRANTS
 from tests.databases import Server, change_each, open_connection
 from tests.full_disk import files_of_at_most
 from tests.projections.factories import append_and_fold

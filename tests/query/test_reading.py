@@ -16,8 +16,16 @@ from sqlalchemy.exc import DBAPIError
 from sqlalchemy.orm import Session, aliased
 
 from pycrorm_async.errors import CallerError, DatabaseUnavailable, UnknownEpisode
-from pycrorm_async.events.types import EpisodeEnded, EpisodeStarted, NodeEnded, NodeStarted, ObjectAdded
-from pycrorm_async.events.values import FailureValue, ObjectReference, RobotValue
+from pycrorm_async.events.types import (
+    EpisodeEnded,
+    EpisodeStarted,
+    FailureValue,
+    NodeEnded,
+    NodeStarted,
+    ObjectAdded,
+    ObjectReference,
+    RobotValue,
+)
 from pycrorm_async.orm import Action, NavigateAction, Object, PickUpAction, PickUpWithContextView, Pose, TaskTreeNode
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary
@@ -25,7 +33,7 @@ from pycrorm_async.query.reading import Reading
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.task_status import TaskStatus
-from pycrorm_async.world.enums import Arms, Grasp, ObjectType
+from pycrorm_async.world.pose import Arms, Grasp, ObjectType
 from tests.databases import ask, run_in_own_loop
 from tests.projections.event_script import NAVIGATE, PICK_UP, SAYING, Script, declarations, name_of, pose, row
 from tests.projections.factories import append_and_fold

@@ -26,10 +26,10 @@ from pycrorm_async.plan import (
     ObjectPart,
     ResolutionError,
 )
-from pycrorm_async.plan.object_designators import designator_of
-from pycrorm_async.query.recorded_designator import NotPerformable
+from pycrorm_async.plan.objects import designator_of
+from pycrorm_async.query.again import NotPerformable
 from pycrorm_async.world import Arms, Object, ObjectType, Pose
-from pycrorm_async.world.errors import NoWorld, ObjectNotInWorld
+from pycrorm_async.world.pose import NoWorld, ObjectNotInWorld
 from tests.memory.note_actions import NoteActionPerformable
 from tests.promises.lab import CEREAL_AT, Lab, lab, recorded, results_of, url_of
 

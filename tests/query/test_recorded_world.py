@@ -11,18 +11,9 @@ import pytest
 from pycrorm_async import world_of
 from pycrorm_async.errors import CallerError
 from pycrorm_async.query.snapshot import Moment, ObjectThen, WorldThen
-from pycrorm_async.world import (
-    COURIER,
-    BulletWorld,
-    Object,
-    ObjectType,
-    Pose,
-    WorldMode,
-    current_world,
-    register_robot,
-)
-from pycrorm_async.world.errors import DuplicateName, UnknownJoint, UnknownLink, WorldClosed
-from pycrorm_async.world.models.primitives import box_urdf
+from pycrorm_async.world import COURIER, BulletWorld, Object, ObjectType, Pose, WorldMode, current_world, register_robot
+from pycrorm_async.world.models import box_urdf
+from pycrorm_async.world.pose import DuplicateName, UnknownJoint, UnknownLink, WorldClosed
 
 AT = Pose([1, 2, 0.5], [0, 0, 0.6, 0.8])
 NARROW = box_urdf("milk", x=(0, 0.01), y=(0, 0.01), z=(0, 0.01))

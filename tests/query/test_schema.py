@@ -10,12 +10,11 @@ from pathlib import Path
 import pytest
 
 from pycrorm_async.errors import CallerError
-from pycrorm_async.orm.base import Base
+from pycrorm_async.orm.base import Base, Moment
 from pycrorm_async.orm.documentation.descriptions import comments, described
-from pycrorm_async.orm.types import Moment
-from pycrorm_async.projections.schema.views.comments import comments as stored_comments
+from pycrorm_async.projections.views import comments as stored_comments
+from pycrorm_async.query.memory_schema import CORE_VIEWS, as_text, read_schema
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.query.schema.memory_schema import CORE_VIEWS, as_text, read_schema
 from tests.commands import pycrorm
 from tests.databases import Server, ask, run_in_own_loop
 from tests.projections.event_script import NAVIGATE, PICK_UP, SAYING, declarations

@@ -11,36 +11,34 @@ from sqlalchemy.exc import DBAPIError
 from pycrorm_async.errors import UnknownEpisode
 from pycrorm_async.events.ids import episode_text
 from pycrorm_async.events.types import (
+    CandidateValue,
     EpisodeEnded,
     EpisodeStarted,
     EpisodeTagged,
+    FailureValue,
     JointsMoved,
     LocationResolved,
     NodeEnded,
+    NodeReference,
     NodeStarted,
     ObjectAdded,
     ObjectAttached,
     ObjectDetached,
     ObjectDetected,
     ObjectMoved,
+    ObjectReference,
     ObjectRemoved,
     Observed,
-    StateSampled,
-)
-from pycrorm_async.events.values import (
-    CandidateValue,
-    FailureValue,
-    NodeReference,
-    ObjectReference,
     RefusalValue,
     RobotValue,
     SeenValue,
+    StateSampled,
 )
 from pycrorm_async.orm import Action, Motion, PickUpAction, PickUpWithContextView, ProcessMetaData, TaskTreeNode
 from pycrorm_async.orm import Pose as PoseRow
+from pycrorm_async.projections.columns import COLUMNS
+from pycrorm_async.projections.mapped_tables import UserView
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.projections.schema.core_columns import COLUMNS
-from pycrorm_async.projections.schema.user_views import UserView
 from pycrorm_async.query.named_queries import SimulatingNode
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.store.log import EventLog

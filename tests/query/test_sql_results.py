@@ -14,8 +14,7 @@ import pytest
 
 from pycrorm_async.errors import DatabaseUnavailable, QueryRefused
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.query.sql.json_values import json_rows
-from pycrorm_async.query.sql.read_only import ReadOnlySql, SqlLimits
+from pycrorm_async.query.sql import ReadOnlySql, SqlLimits, json_rows
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.projections.factories import append_and_fold

@@ -21,11 +21,8 @@ from pycrorm_async.cli.main import app
 from pycrorm_async.errors import CallerError, MissingExtra
 from pycrorm_async.orm import Action, PickUpWithContextView
 from pycrorm_async.orm.documentation.descriptions import unit_of
-from pycrorm_async.query.success import figure as figures
-from pycrorm_async.query.success.figure import success_figure
-from pycrorm_async.query.success.interval import interval_95
-from pycrorm_async.query.success.samples import Samples, Values, success_samples
-from pycrorm_async.query.success.success_table import success_table
+from pycrorm_async.query import success as figures
+from pycrorm_async.query.success import Samples, Values, interval_95, success_figure, success_samples, success_table
 
 pytestmark = pytest.mark.slow
 
@@ -139,7 +136,7 @@ async def test_what_cannot_be_counted_is_one_line(url: str, arguments: tuple[str
 
 
 def test_of_many_categories_the_rare_ones_are_counted_together() -> None:
-    from pycrorm_async.query.success.samples import _categories
+    from pycrorm_async.query.success import _categories
 
     names = [f"c{number:03}" for number in range(100) for _ in range(2 if number < 19 else 1)]
     values = _categories("tool", names)

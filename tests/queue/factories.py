@@ -8,14 +8,12 @@ from pathlib import Path
 
 from pycrorm_async.clock import Clock
 from pycrorm_async.errors import SpoolFull
-from pycrorm_async.events.envelope import Heading, Record
+from pycrorm_async.events.codec import Heading, Record
 from pycrorm_async.events.ids import EpisodeId, episode_id, episode_text
 from pycrorm_async.queue import DeadSource, LiveSource, RecorderQueue, open_dead
-from pycrorm_async.queue.files.frame import EVENT, Frame, encode
-from pycrorm_async.queue.files.names import MAKING
-from pycrorm_async.queue.files.segment import salt_of
-from pycrorm_async.queue.live.capacity import Capacity
-from pycrorm_async.queue.live.syncable_appender import SyncableAppender
+from pycrorm_async.queue.appender import Capacity, SyncableAppender
+from pycrorm_async.queue.format import EVENT, Frame, encode, salt_of
+from pycrorm_async.queue.locks import MAKING
 from pycrorm_async.settings import Settings
 
 WALL_NS = 1_700_000_000_123_456_789

@@ -7,9 +7,17 @@ from pathlib import Path
 from typing import Any
 from zlib import crc32
 
-from pycrorm_async.queue.files.frame import CHECKSUM, COMMIT, Frame, encode, span_checksum
-from pycrorm_async.queue.files.scan import whole_frames
-from pycrorm_async.queue.files.segment import decode_header, header_bytes, salt_of
+from pycrorm_async.queue.format import (
+    CHECKSUM,
+    COMMIT,
+    Frame,
+    decode_header,
+    encode,
+    header_bytes,
+    salt_of,
+    span_checksum,
+)
+from pycrorm_async.queue.scan import whole_frames
 
 __all__ = ["NAMES", "change_a_frame", "change_the_header", "rewritten"]
 

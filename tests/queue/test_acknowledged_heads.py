@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from pycrorm_async.queue.retention import acknowledged_heads
-from pycrorm_async.queue.retention.acknowledged_heads import AcknowledgedHeads
+from pycrorm_async.queue import spool
+from pycrorm_async.queue.spool import AcknowledgedHeads
 from tests.queue.factories import WALL_NS, episode
 
 
@@ -70,8 +70,8 @@ def test_a_line_with_any_one_bit_flipped_is_ignored(tmp_path: Path) -> None:
 def test_compacting_a_large_file_loses_no_line_of_another_process(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(acknowledged_heads, "_FILE_BYTES_MAX", 4_000)
-    monkeypatch.setattr(acknowledged_heads, "_EPISODES_MAX", 20)
+    monkeypatch.setattr(spool, "_FILE_BYTES_MAX", 4_000)
+    monkeypatch.setattr(spool, "_EPISODES_MAX", 20)
 
     def run(first: int) -> None:
         heads = heads_in(tmp_path)
@@ -96,7 +96,7 @@ def test_a_replacement_with_the_same_inode_is_read_from_its_beginning(
     for head in range(3):
         mine.note({episode(1): (1, head)})
     mine.refresh()
-    monkeypatch.setattr(acknowledged_heads, "_FILE_BYTES_MAX", 0)  # each note compacts the file
+    monkeypatch.setattr(spool, "_FILE_BYTES_MAX", 0)  # each note compacts the file
     for number in range(2, 6):
         other.note({episode(number): (number, 1)})
     mine._inode = (tmp_path / "heads").stat().st_ino  # ext4 reuses inodes sooner or later
@@ -107,8 +107,8 @@ def test_a_replacement_with_the_same_inode_is_read_from_its_beginning(
 def test_heads_that_are_too_old_or_too_many_are_forgotten_except_for_the_highest_number(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(acknowledged_heads, "_FILE_BYTES_MAX", 1_000)
-    monkeypatch.setattr(acknowledged_heads, "_EPISODES_MAX", 5)
+    monkeypatch.setattr(spool, "_FILE_BYTES_MAX", 1_000)
+    monkeypatch.setattr(spool, "_EPISODES_MAX", 5)
     heads_in(tmp_path).note({episode(1): (4_000, 9), episode(2): (2, 9)})
     later = heads_in(tmp_path, wall_ns=WALL_NS + 3601 * 10**9)
     for number in range(3, 24):

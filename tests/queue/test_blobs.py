@@ -12,25 +12,13 @@ import msgspec
 import pytest
 
 from pycrorm_async.errors import SpoolClosed, SpoolFull, SpoolUnavailable
-from pycrorm_async.events.envelope import Heading
+from pycrorm_async.events.codec import Heading
 from pycrorm_async.queue import RecorderQueue, Spool, open_dead
-from pycrorm_async.queue.blobs.blob_files import blob_files, read_blob
-from pycrorm_async.queue.files.segment import Segment
-from pycrorm_async.queue.maintenance.inspection import inspect_spool
-from pycrorm_async.queue.maintenance.repair import repair_folder
-from pycrorm_async.queue.retention.stored_segments import kept_segments
-from tests.queue.factories import (
-    RECORDER,
-    SMALL,
-    crashed_copy,
-    drain,
-    ended,
-    episode,
-    make,
-    node,
-    overwrite,
-    started,
-)
+from pycrorm_async.queue.blobs import blob_files, read_blob
+from pycrorm_async.queue.format import Segment
+from pycrorm_async.queue.maintenance import inspect_spool, repair_folder
+from pycrorm_async.queue.stored_segments import kept_segments
+from tests.queue.factories import RECORDER, SMALL, crashed_copy, drain, ended, episode, make, node, overwrite, started
 
 OBSERVED = Heading(episode(1), "Observed", 1)
 IMAGE = b"an image"

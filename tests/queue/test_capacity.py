@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pycrorm_async.errors import CallerError
-from pycrorm_async.queue.live.capacity import Capacity
+from pycrorm_async.queue.appender import Capacity
 from pycrorm_async.settings import Settings
 
 SMALL = Capacity(segment_bytes=1000, segments_max=5, reserve_bytes=500, episodes_max=10)

@@ -8,12 +8,11 @@ from pathlib import Path
 import pytest
 
 from pycrorm_async.errors import SpoolUnavailable
-from pycrorm_async.events.envelope import Heading, Record
+from pycrorm_async.events.codec import Heading, Record
 from pycrorm_async.events.ids import episode_text
 from pycrorm_async.queue import LiveSource, Spool, open_dead
-from pycrorm_async.queue.maintenance.inspection import inspect_spool
-from pycrorm_async.queue.maintenance.repair import finish_repairs, repair_folder
-from pycrorm_async.queue.sources.dead_letters import DeadLetters
+from pycrorm_async.queue.maintenance import finish_repairs, inspect_spool, repair_folder
+from pycrorm_async.queue.sources import DeadLetters
 from tests.queue.factories import (
     DECLARED,
     RECORDER,

@@ -9,10 +9,9 @@ import pytest
 from pycrorm_async.errors import SpoolDamaged, SpoolForeign, SpoolUnavailable
 from pycrorm_async.events.ids import episode_id, episode_text
 from pycrorm_async.queue import Spool, open_dead
-from pycrorm_async.queue.files.frame import CHECKSUM
-from pycrorm_async.queue.files.locks import FileLock
-from pycrorm_async.queue.files.scan import scan, tails
-from pycrorm_async.queue.files.segment import salt_of
+from pycrorm_async.queue.format import CHECKSUM, salt_of
+from pycrorm_async.queue.locks import FileLock
+from pycrorm_async.queue.scan import scan, tails
 from tests.queue.factories import (
     DECLARED,
     RECORDER,

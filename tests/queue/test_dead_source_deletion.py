@@ -3,8 +3,8 @@
 from pathlib import Path
 
 from pycrorm_async.queue import Spool, open_dead
-from pycrorm_async.queue.files.recorder_folder import parse_folder_name
-from pycrorm_async.queue.files.scan import scan, seal, tails
+from pycrorm_async.queue.scan import scan, seal, tails
+from pycrorm_async.queue.spool import parse_folder_name
 from tests.queue.factories import RECORDER, FolderWriter, drain, lost, make, node, overwrite, recover, started
 
 # --- acknowledging and deleting ---------------------------------------------------------------------------------------

@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 from pycrorm_async.errors import SpoolDamaged
-from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.codec import Record
 from pycrorm_async.queue import open_dead
-from pycrorm_async.queue.files.segment import segment_numbers
-from pycrorm_async.queue.maintenance.repair import repair_folder
+from pycrorm_async.queue.format import segment_numbers
+from pycrorm_async.queue.maintenance import repair_folder
 from tests.queue.factories import FolderWriter, lost, node, overwrite, recover, started
 
 RECORDS, SYNCED_EVERY, SEGMENTS = 20, 3, 4

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from pycrorm_async.events.envelope import Heading
-from pycrorm_async.queue.files.frame import DECLARATION
-from pycrorm_async.queue.files.scan import survey
-from pycrorm_async.queue.live.capacity import Capacity
-from pycrorm_async.queue.live.declarations import Declarations
+from pycrorm_async.events.codec import Heading
+from pycrorm_async.queue.appender import Capacity, Declarations
+from pycrorm_async.queue.format import DECLARATION
+from pycrorm_async.queue.scan import survey
 from tests.queue.factories import DECLARED, RECORDER, SMALL, FolderWriter, node, recover, started
 
 DESCRIBED = Heading(None, "DescriptionDeclared", 1)

@@ -16,10 +16,10 @@ from pathlib import Path
 import pytest
 
 from pycrorm_async.errors import SpoolUnavailable
-from pycrorm_async.events.envelope import LOST, Record
+from pycrorm_async.events.codec import LOST, Record
 from pycrorm_async.queue import LiveSource, RecorderQueue, Spool, open_dead
-from pycrorm_async.queue.files.recorder_folder import finish_folder
-from pycrorm_async.queue.maintenance.inspection import inspect_spool
+from pycrorm_async.queue.maintenance import inspect_spool
+from pycrorm_async.queue.spool import finish_folder
 from tests.crash.test_queue_disk import SLOW
 from tests.queue.factories import SMALL, copy_beside_recording, drain, ended, make, node, recover, started
 
@@ -186,7 +186,7 @@ async def test_losses_are_reported_even_when_the_new_folder_is_deleted_before_it
             delete(unfinished)
         return finish_folder(unfinished, replaced=replaced)
 
-    monkeypatch.setattr("pycrorm_async.queue.live.relocation.finish_folder", finish)
+    monkeypatch.setattr("pycrorm_async.queue.relocation.finish_folder", finish)
     delete_the_folder(queue)
     raised: list[str] = []
     while not raised or queue.synced < queue.written or "continues in" not in (queue.setback or ""):

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from pycrorm_async.queue.files.drain_status import DrainNote, DrainStatus, Progress, RecorderStatus
+from pycrorm_async.queue.spool import DrainNote, DrainStatus, Progress, RecorderStatus
 
 SAID = DrainStatus(7, 5, DrainNote(failure="refused", unavailable="locked", stopped={"an episode": "why"}))
 

@@ -11,12 +11,12 @@ import pytest
 
 from pycrorm_async import Memory, Settings
 from pycrorm_async.clock import SYSTEM_CLOCK
-from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.codec import Record
 from pycrorm_async.events.ids import parse_episode_id
-from pycrorm_async.queue.files.file_access import open_file
-from pycrorm_async.queue.files.spool import Spool
-from pycrorm_async.queue.retention.stored_segments import StoredSegments
-from pycrorm_async.queue.sources.dead_letters import DeadLetters
+from pycrorm_async.queue.locks import open_file
+from pycrorm_async.queue.sources import DeadLetters
+from pycrorm_async.queue.spool import Spool
+from pycrorm_async.queue.stored_segments import StoredSegments
 from pycrorm_async.settings import FileAccess
 from tests.memory.note_actions import NoteActionPerformable
 

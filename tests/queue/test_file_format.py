@@ -5,7 +5,7 @@ import zlib
 from dataclasses import replace
 from pathlib import Path
 
-from pycrorm_async.events.envelope import Heading
+from pycrorm_async.events.codec import Heading
 from tests.queue.factories import DECLARED, MONOTONIC_NS, RECORDER, SMALL, WALL_NS, ended, episode, make, started
 
 SALT = zlib.crc32(RECORDER + struct.pack("<Q", 1))

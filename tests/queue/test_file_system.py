@@ -9,8 +9,8 @@ import pytest
 
 from pycrorm_async import Memory
 from pycrorm_async.errors import SpoolUnavailable
-from pycrorm_async.queue.files import file_system
-from pycrorm_async.queue.files.file_system import check_file_system, file_system_type
+from pycrorm_async.queue import locks
+from pycrorm_async.queue.locks import check_file_system, file_system_type
 from tests.memory.note_actions import NoteActionPerformable, texts
 from tests.queue.factories import make
 
@@ -34,7 +34,7 @@ def btrfs(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.Mo
     def simulated_btrfs(path: Path) -> int:
         return BTRFS if path.is_relative_to(disk) else file_system_type(path)
 
-    monkeypatch.setattr(file_system, "file_system_type", simulated_btrfs)
+    monkeypatch.setattr(locks, "file_system_type", simulated_btrfs)
     yield disk
 
 
@@ -68,6 +68,6 @@ def test_the_file_systems_of_robots_are_accepted(tmp_path: Path) -> None:
 def test_other_file_systems_are_refused_by_their_name(
     tmp_path: Path, kind: int, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(file_system, "file_system_type", lambda _: kind)
+    monkeypatch.setattr(locks, "file_system_type", lambda _: kind)
     with pytest.raises(SpoolUnavailable, match=f"lies on {name}, where"):
         check_file_system(tmp_path / "spool")

@@ -16,17 +16,15 @@ from pycrorm_async.errors import (
     SpoolForeign,
     SpoolUnavailable,
 )
-from pycrorm_async.events.envelope import LOST, Record
+from pycrorm_async.events.codec import LOST, Record
 from pycrorm_async.events.ids import episode_text
 from pycrorm_async.queue import Spool, open_dead
-from pycrorm_async.queue.files.drain_status import Progress
-from pycrorm_async.queue.files.frame import EVENT, Frame, encode
-from pycrorm_async.queue.files.names import PROGRESS
-from pycrorm_async.queue.files.scan import scan
-from pycrorm_async.queue.files.segment import SEGMENT_BYTES_MAX, read_segment, salt_of, segment_numbers
-from pycrorm_async.queue.live.capacity import Capacity
-from pycrorm_async.queue.maintenance.inspection import inspect_recorder, inspect_spool
-from pycrorm_async.queue.maintenance.repair import repair_folder
+from pycrorm_async.queue.appender import Capacity
+from pycrorm_async.queue.format import EVENT, SEGMENT_BYTES_MAX, Frame, encode, read_segment, salt_of, segment_numbers
+from pycrorm_async.queue.locks import PROGRESS
+from pycrorm_async.queue.maintenance import inspect_recorder, inspect_spool, repair_folder
+from pycrorm_async.queue.scan import scan
+from pycrorm_async.queue.spool import Progress
 from tests.queue.factories import (
     DECLARED,
     RECORDER,

@@ -12,7 +12,7 @@ import pytest
 from pycrorm_async.clock import Clock
 from pycrorm_async.errors import SpoolClosed
 from pycrorm_async.queue import RecorderQueue, Spool, open_dead
-from pycrorm_async.queue.files.locks import is_locked
+from pycrorm_async.queue.locks import is_locked
 from tests.queue.factories import drain, ended, lost, make, node, record, recover, started
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pycrorm_async.queue.files.frame import (
+from pycrorm_async.queue.format import (
     COMMIT,
     DECLARATION,
     EVENT,

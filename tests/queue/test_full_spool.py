@@ -13,8 +13,8 @@ import pytest
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import CallerError, SpoolClosed, SpoolFull, SpoolStuck
 from pycrorm_async.queue import RecorderQueue
-from pycrorm_async.queue.files.segment import Segment
-from pycrorm_async.queue.live.gc_safe_lock import GcSafeLock
+from pycrorm_async.queue.appender import GcSafeLock
+from pycrorm_async.queue.format import Segment
 from tests.queue.factories import (
     ALL,
     DECLARED,

@@ -13,8 +13,8 @@ import pytest
 from pycrorm_async.clock import Clock
 from pycrorm_async.errors import InternalError, SpoolFull
 from pycrorm_async.queue import RecorderQueue
-from pycrorm_async.queue.files.segment import Segment
-from pycrorm_async.queue.live.notifier import Notifier
+from pycrorm_async.queue.format import Segment
+from pycrorm_async.queue.sync_thread import Notifier
 from pycrorm_async.settings import Settings
 from tests.queue.factories import DECLARED, MONOTONIC_NS, WALL_NS, drain, make, node, started
 

@@ -9,8 +9,7 @@ from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import SpoolUnavailable
 from pycrorm_async.events.ids import episode_text
 from pycrorm_async.queue import RecorderQueue, Spool, open_dead
-from pycrorm_async.queue.maintenance.inspection import OpenEpisode, inspect_spool
-from pycrorm_async.queue.maintenance.repair import repair_folder
+from pycrorm_async.queue.maintenance import OpenEpisode, inspect_spool, repair_folder
 from pycrorm_async.settings import Settings
 from tests.queue.factories import DECLARED, RECORDER, WALL_NS, FolderWriter, ended, episode, node, overwrite, started
 

@@ -10,13 +10,11 @@ from pathlib import Path
 import pytest
 
 from pycrorm_async.errors import SpoolDamaged, SpoolStuck
-from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.codec import Record
 from pycrorm_async.queue import LiveSource, RecorderQueue
-from pycrorm_async.queue.files.drain_status import DrainStatus, Progress, RecorderStatus
-from pycrorm_async.queue.files.locks import FileLock
-from pycrorm_async.queue.files.names import ALIVE
-from pycrorm_async.queue.files.reader import Batch, Reader
-from pycrorm_async.queue.files.segment import segment_numbers, segment_path
+from pycrorm_async.queue.format import Batch, Reader, segment_numbers, segment_path
+from pycrorm_async.queue.locks import ALIVE, FileLock
+from pycrorm_async.queue.spool import DrainStatus, Progress, RecorderStatus
 from tests.queue.factories import (
     ALL,
     DECLARED,

@@ -9,9 +9,9 @@ import sys
 from pathlib import Path
 
 from pycrorm_async.errors import SpoolFull
-from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.codec import Record
 from pycrorm_async.queue import LiveSource, RecorderQueue, Spool, open_dead
-from pycrorm_async.queue.files.drain_status import RecorderStatus
+from pycrorm_async.queue.spool import RecorderStatus
 from tests.queue.factories import drain, ended, episode, lost, make, overwrite, record, recover, started
 from tests.queue.live_sources import eventually, next_positions, take
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from pycrorm_async.queue.files.locks import FileLock, is_locked
+from pycrorm_async.queue.locks import FileLock, is_locked
 
 
 def test_a_lock_has_one_holder_and_can_be_taken_after_its_release(tmp_path: Path) -> None:
@@ -34,7 +34,7 @@ def test_a_missing_lock_file_is_made_only_on_request(tmp_path: Path) -> None:
 def test_the_kernel_releases_the_lock_of_a_killed_holder(tmp_path: Path) -> None:
     path = tmp_path / "alive"
     program = (
-        "import sys, pathlib; from pycrorm_async.queue.files.locks import FileLock;"
+        "import sys, pathlib; from pycrorm_async.queue.locks import FileLock;"
         "lock = FileLock.take(pathlib.Path(sys.argv[1])); print('held', flush=True); sys.stdin.read()"
     )
     holder = subprocess.Popen([sys.executable, "-c", program, str(path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE)

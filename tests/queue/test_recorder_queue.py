@@ -12,12 +12,12 @@ import pytest
 
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import EpisodeRefused, InternalError
-from pycrorm_async.events.envelope import Heading
+from pycrorm_async.events.codec import Heading
 from pycrorm_async.queue import RecorderQueue
-from pycrorm_async.queue.files.segment import Segment
-from pycrorm_async.recording.writing.event_sink import EventSink
+from pycrorm_async.queue.format import Segment
+from pycrorm_async.record.episode_writer import EventSink
 from pycrorm_async.settings import Settings
-from pycrorm_async.writer.ports import Source
+from pycrorm_async.writer.drain import Source
 from tests.queue.factories import (
     DECLARED,
     LONG_S,

@@ -7,7 +7,7 @@ import pytest
 
 from pycrorm_async.errors import SpoolClosed, SpoolUnavailable
 from pycrorm_async.queue import RecorderQueue, Spool
-from pycrorm_async.queue.files.locks import FileLock
+from pycrorm_async.queue.locks import FileLock
 from pycrorm_async.settings import Settings
 from tests.queue.factories import LONG_S, batch_of, drain, ended, lost, make, node, record, recover, started
 

@@ -13,12 +13,12 @@ from typing import Any
 import pytest
 
 from pycrorm_async.errors import SpoolDamaged, SpoolForeign, SpoolUnavailable
-from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.codec import Record
 from pycrorm_async.events.ids import episode_text
 from pycrorm_async.queue import Spool, open_dead
-from pycrorm_async.queue.files.locks import FileLock
-from pycrorm_async.queue.files.scan import scan
-from pycrorm_async.queue.maintenance.repair import RepairReport, finish_repairs, repair_folder
+from pycrorm_async.queue.locks import FileLock
+from pycrorm_async.queue.maintenance import RepairReport, finish_repairs, repair_folder
+from pycrorm_async.queue.scan import scan
 from tests.queue.factories import (
     DECLARED,
     RECORDER,

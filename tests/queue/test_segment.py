@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 
 from pycrorm_async.events.ids import EpisodeId
-from pycrorm_async.queue.files.segment import (
+from pycrorm_async.queue.format import (
     LastRecord,
     Segment,
     SegmentHeader,
     decode_header,
-    encode_header,
+    encode_segment_header,
     format_of,
     header_bytes,
     segment_numbers,
@@ -49,7 +49,7 @@ def test_a_header_has_its_golden_bytes() -> None:
     salt = zlib.crc32(RECORDER + struct.pack("<Q", 5))
     fixed = b"PYCRQSEG" + struct.pack("<II", 1, salt) + RECORDER + struct.pack("<QQI", 5, 43, 2)
     by_hand = fixed + struct.pack("<I", zlib.crc32(episodes + fixed)) + episodes
-    assert encode_header(HEADER) == by_hand == SEGMENT
+    assert encode_segment_header(HEADER) == by_hand == SEGMENT
     assert len(SEGMENT) == header_bytes(2) == 136
 
 

@@ -13,13 +13,12 @@ from typing import Literal, TypeVar
 import pytest
 
 from pycrorm_async.errors import SpoolStuck
-from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.codec import Record
 from pycrorm_async.queue import DeadSource, LiveSource, RecorderQueue, Spool, open_dead
-from pycrorm_async.queue.files.drain_status import DrainNote, DrainStatus
-from pycrorm_async.queue.files.frame import EVENT
-from pycrorm_async.queue.files.scan import survey
-from pycrorm_async.queue.files.segment import read_segment, segment_path
-from pycrorm_async.writer.ports import ClaimedSource, Source
+from pycrorm_async.queue.format import EVENT, read_segment, segment_path
+from pycrorm_async.queue.scan import survey
+from pycrorm_async.queue.spool import DrainNote, DrainStatus
+from pycrorm_async.writer.drain import ClaimedSource, Source
 from tests.queue.factories import RECORDER, crashed_copy, ended, episode, fill, make, node, started
 from tests.queue.live_sources import take
 

@@ -8,8 +8,8 @@ import pytest
 from pycrorm_async.errors import SpoolForeign, SpoolUnavailable
 from pycrorm_async.events.ids import episode_text
 from pycrorm_async.queue import RecorderQueue, Spool, open_dead
-from pycrorm_async.queue.files.locks import FileLock
-from pycrorm_async.queue.files.recorder_folder import make_folder
+from pycrorm_async.queue.locks import FileLock
+from pycrorm_async.queue.spool import make_folder
 from tests.queue.factories import RECORDER, episode, make, started
 
 

@@ -11,13 +11,12 @@ import pytest
 
 from pycrorm_async.clock import Clock
 from pycrorm_async.events.ids import EpisodeId, episode_text
-from pycrorm_async.queue import RecorderQueue, Spool, open_dead
-from pycrorm_async.queue.files.scan import scan
-from pycrorm_async.queue.files.segment import Segment
-from pycrorm_async.queue.maintenance.inspection import inspect_spool
-from pycrorm_async.queue.retention import stored_segments
-from pycrorm_async.queue.retention.stored_records import stored_recorders, stored_records
-from pycrorm_async.queue.retention.stored_segments import StoredSegments, kept_segments
+from pycrorm_async.operations.destination import stored_recorders, stored_records
+from pycrorm_async.queue import RecorderQueue, Spool, open_dead, stored_segments
+from pycrorm_async.queue.format import Segment
+from pycrorm_async.queue.maintenance import inspect_spool
+from pycrorm_async.queue.scan import scan
+from pycrorm_async.queue.stored_segments import StoredSegments, kept_segments
 from pycrorm_async.settings import Settings
 from tests.queue.factories import (
     DECLARED,

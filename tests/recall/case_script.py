@@ -9,21 +9,24 @@ from typing import Any
 from pycrorm_async.events.types import (
     EpisodeEnded,
     EpisodeStarted,
+    FailureValue,
     JointsMoved,
     NodeEnded,
     NodeStarted,
+    NodeStatus,
     ObjectAdded,
     ObjectAttached,
     ObjectDetached,
     ObjectMoved,
+    ObjectReference,
+    PoseValue,
+    RobotValue,
 )
-from pycrorm_async.events.values import FailureValue, NodeStatus, ObjectReference, PoseValue, RobotValue
-from pycrorm_async.projections.custom.projection_tables import CustomFoldDefinition
-from pycrorm_async.projections.schema.layout import Layout
+from pycrorm_async.projections.columns import Layout
+from pycrorm_async.projections.custom import CustomFoldDefinition
 from pycrorm_async.recall.blocks import Block
-from pycrorm_async.recall.case import Case
-from pycrorm_async.recall.cases.case_batch import CaseBatch
-from pycrorm_async.recall.cases.case_projection import CaseProjection
+from pycrorm_async.recall.cases import CaseBatch, CaseProjection
+from pycrorm_async.recall.columns import Case
 from tests.projections.event_script import Script, declarations, declared, field, name_of, pose
 
 __all__ = ["CaseScript", "LEFT_TURN", "TYPES", "cases_of", "in_order", "random_script"]

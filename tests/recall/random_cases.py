@@ -7,7 +7,7 @@ import random
 from hypothesis import strategies as st
 
 from pycrorm_async.events.ids import row_id
-from pycrorm_async.recall.case import Case
+from pycrorm_async.recall.columns import Case
 
 __all__ = ["CASES", "random_case", "random_cases"]
 

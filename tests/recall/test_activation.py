@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from pycrorm_async.events.ids import row_id
-from pycrorm_async.recall import activation as activations
-from pycrorm_async.recall.activation import activation, forgotten
-from pycrorm_async.recall.blocks import Block
-from pycrorm_async.recall.case import Case
-from pycrorm_async.recall.library import CaseLibrary
+from pycrorm_async.recall import search as activations
+from pycrorm_async.recall.blocks import Block, CaseLibrary
+from pycrorm_async.recall.columns import Case
+from pycrorm_async.recall.search import activation, forgotten
 
 NOW_US = 10_000_000_000
 

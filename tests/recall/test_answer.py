@@ -8,10 +8,9 @@ import pytest
 
 from pycrorm_async.events.ids import row_id
 from pycrorm_async.recall.answer import Answer, answer, success_of
-from pycrorm_async.recall.blocks import Block
-from pycrorm_async.recall.case import Case
-from pycrorm_async.recall.cue import Cue, Wanted
-from pycrorm_async.recall.library import CaseLibrary
+from pycrorm_async.recall.blocks import Block, CaseLibrary
+from pycrorm_async.recall.columns import Case
+from pycrorm_async.recall.search import Cue, Wanted
 
 
 def pick_up(sequence: int, *, height: float, arm: str = "LEFT", reason: str | None = None, yaw: float = 0.0) -> Case:

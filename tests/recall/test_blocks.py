@@ -10,9 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pycrorm_async.events.ids import row_id
-from pycrorm_async.recall.block_rows import BlockRow, decode, encode
-from pycrorm_async.recall.blocks import WORDS_MAX, Block, merge
-from pycrorm_async.recall.case import FEATURES_MAX, Case, bounded_case
+from pycrorm_async.recall.blocks import WORDS_MAX, Block, BlockRow, decode, encode, merge
+from pycrorm_async.recall.columns import FEATURES_MAX, Case, bounded_case
 from tests.recall.random_cases import CASES, random_cases
 
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import random
 from collections.abc import Collection, Mapping, Sequence
 
-from pycrorm_async.recall.activation import forgotten
 from pycrorm_async.recall.blocks import Block, merge
-from pycrorm_async.recall.case import Case
-from pycrorm_async.recall.reading.case_reader import CaseReader, StoredBlocks
+from pycrorm_async.recall.columns import Case
+from pycrorm_async.recall.recall import CaseReader, StoredBlocks
+from pycrorm_async.recall.search import forgotten
 from tests.recall.random_cases import random_cases
 
 

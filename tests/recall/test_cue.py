@@ -9,12 +9,11 @@ import pytest
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.ids import row_id
 from pycrorm_async.recall.answer import answer
-from pycrorm_async.recall.blocks import WORDS_MAX, Block
-from pycrorm_async.recall.case import FEATURES_MAX, Case
-from pycrorm_async.recall.cue import K_MAX, Cue, Wanted, check_cue, numbers_of, symbols_of
-from pycrorm_async.recall.library import CaseLibrary
-from pycrorm_async.recall.reading.cue_arguments import cue_like
-from pycrorm_async.world.enums import Arms, ObjectType
+from pycrorm_async.recall.blocks import WORDS_MAX, Block, CaseLibrary
+from pycrorm_async.recall.columns import FEATURES_MAX, Case
+from pycrorm_async.recall.recall import cue_like
+from pycrorm_async.recall.search import K_MAX, Cue, Wanted, check_cue, numbers_of, symbols_of
+from pycrorm_async.world.pose import Arms, ObjectType
 from tests.recall.random_cases import random_cases
 
 LIBRARY = CaseLibrary([Block.of(random_cases(50, seed=1))])

@@ -8,8 +8,7 @@ import pytest
 from sqlalchemy import event
 
 from pycrorm_async import Reading
-from pycrorm_async.recall.reading.case_reader import CaseReader
-from pycrorm_async.recall.reading.database_source import DatabaseSource
+from pycrorm_async.recall.recall import CaseReader, DatabaseSource
 from pycrorm_async.store.log import EventLog
 from tests.recall.case_script import TYPES, cases_of, random_script
 from tests.recall.test_stored_cases import projector_of, rebuilt, small_blocks

@@ -12,10 +12,11 @@ from pycrorm_async.events.types import (
     ObjectAttached,
     ObjectDetached,
     ObjectMoved,
+    ObjectReference,
     ObjectRemoved,
+    PoseValue,
 )
-from pycrorm_async.events.values import ObjectReference, PoseValue
-from pycrorm_async.recall.case import RESERVED, Case
+from pycrorm_async.recall.columns import RESERVED, Case
 from tests.projections.event_script import T0_NS, declared, name_of, pose, row, time_us
 from tests.recall.case_script import LEFT_TURN, CaseScript, cases_of
 

@@ -7,10 +7,9 @@ import random
 import pytest
 
 from pycrorm_async.events.ids import row_id
-from pycrorm_async.recall.blocks import Block
-from pycrorm_async.recall.case import Case
-from pycrorm_async.recall.following import Relation, Sequences, relation
-from pycrorm_async.recall.library import CaseLibrary
+from pycrorm_async.recall.answer import Relation, Sequences, relation
+from pycrorm_async.recall.blocks import Block, CaseLibrary
+from pycrorm_async.recall.columns import Case
 
 
 def action(sequence: int, name: str, *, parent: int = 0, status: str = "SUCCEEDED", episode: int = 1) -> Case:

@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 
 from pycrorm_async.events.ids import row_id
-from pycrorm_async.plan.experience import PastSuccess
-from pycrorm_async.recall.blocks import Block
-from pycrorm_async.recall.case import Case
-from pycrorm_async.recall.library import CaseLibrary
-from pycrorm_async.recall.past_pick_ups import TRIES_MAX, Tries, best_first, tries_of
-from pycrorm_async.world.enums import Arms, Grasp, ObjectType
+from pycrorm_async.plan.task import PastSuccess
+from pycrorm_async.recall.blocks import Block, CaseLibrary
+from pycrorm_async.recall.columns import Case
+from pycrorm_async.recall.experience import TRIES_MAX, Tries, best_first, tries_of
+from pycrorm_async.world.pose import Arms, Grasp, ObjectType
 
 OFF = math.exp(-1 / 2)
 """The likeness of a try that is 0.1 m off."""

@@ -9,8 +9,8 @@ import pytest
 from pycrorm_async import Memory
 from pycrorm_async.errors import CallerError
 from pycrorm_async.plan import ActionAbstract, PickUpAction, PlanFailure, simulated_robot
-from pycrorm_async.plan.object_designators import ObjectDesignator, ObjectDesignatorDescription
-from pycrorm_async.recall.reading.present_situation import present_situation
+from pycrorm_async.plan.objects import ObjectDesignator, ObjectDesignatorDescription
+from pycrorm_async.recall.recall import present_situation
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
 
 pytestmark = pytest.mark.slow

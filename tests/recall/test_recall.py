@@ -15,12 +15,10 @@ import pytest_asyncio
 from pycrorm_async import Memory, Reading, Settings
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import CallerError, DatabaseUnavailable, UnknownEpisode
-from pycrorm_async.recall.answer import Answer
-from pycrorm_async.recall.case import Case
-from pycrorm_async.recall.following import Relation
-from pycrorm_async.recall.reading import running_cases
-from pycrorm_async.recall.reading.recall import Recall
-from pycrorm_async.recall.reading.running_cases import ProcessCases
+from pycrorm_async.recall import recall as running_cases
+from pycrorm_async.recall.answer import Answer, Relation
+from pycrorm_async.recall.columns import Case
+from pycrorm_async.recall.recall import ProcessCases, Recall
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world import Arms
 from tests.recall.sliding_grips import (

@@ -7,7 +7,7 @@ import pytest
 
 from pycrorm_async import Memory, Reading
 from pycrorm_async.plan import ActionAbstract
-from pycrorm_async.recall.reading.recall import Recall
+from pycrorm_async.recall.recall import Recall
 from tests.commands import pycrorm
 
 

@@ -14,9 +14,9 @@ from pycrorm_async import Memory, Reading
 from pycrorm_async.errors import DamageError, TablesOutdated
 from pycrorm_async.operations.copy import copy_episodes
 from pycrorm_async.operations.rebuild import rebuild_projection
-from pycrorm_async.projections.custom.discovery import own_projections
-from pycrorm_async.recall.cases.case_projection import CaseProjection
-from pycrorm_async.recall.reading.recall import Recall
+from pycrorm_async.projections.custom import own_projections
+from pycrorm_async.recall.cases import CaseProjection
+from pycrorm_async.recall.recall import Recall
 from tests.databases import Server
 from tests.recall.sliding_grips import FETCH, GRIP, record
 

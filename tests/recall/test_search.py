@@ -10,12 +10,9 @@ import pytest
 
 from pycrorm_async.events.ids import row_id
 from pycrorm_async.recall import search as searching
-from pycrorm_async.recall.block_rows import decode, encode
-from pycrorm_async.recall.blocks import Block, Group
-from pycrorm_async.recall.case import Case, bounded_case
-from pycrorm_async.recall.cue import Cue, Wanted
-from pycrorm_async.recall.library import CaseLibrary
-from pycrorm_async.recall.search import Match, Weights, search, weights_of
+from pycrorm_async.recall.blocks import Block, CaseLibrary, Group, decode, encode
+from pycrorm_async.recall.columns import Case, bounded_case
+from pycrorm_async.recall.search import Cue, Match, Wanted, Weights, search, weights_of
 from tests.recall.random_cases import STATUSES, TYPES, WORDS, random_cases
 
 CASES = [bounded_case(case) for case in random_cases(400, seed=1)]

@@ -18,18 +18,16 @@ from pycrorm_async.errors import DamageError
 from pycrorm_async.memory import Memory
 from pycrorm_async.operations.copy import copy_episodes
 from pycrorm_async.operations.rebuild import rebuild_memory, rebuild_projection
-from pycrorm_async.projections.custom.discovery import own_projections
-from pycrorm_async.projections.custom.projection_tables import states
+from pycrorm_async.projections import pipeline
+from pycrorm_async.projections.custom import own_projections, states
+from pycrorm_async.projections.findings import VerifyResult
+from pycrorm_async.projections.generations import PROJECTION, read_generation
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.projections.rebuild import Rebuild, claimed
-from pycrorm_async.projections.replaced_tables import clear
-from pycrorm_async.projections.run import batch_fold
-from pycrorm_async.projections.schema.generations import PROJECTION, read_generation
-from pycrorm_async.projections.verify.findings import VerifyResult
-from pycrorm_async.projections.verify.verify import verify
-from pycrorm_async.recall.case import Case
-from pycrorm_async.recall.cases import stored_blocks
-from pycrorm_async.recall.cases.stored_blocks import BlockHeading, read_blocks, read_headings
+from pycrorm_async.projections.rebuild import Rebuild, claimed, clear
+from pycrorm_async.projections.verify import verify
+from pycrorm_async.recall import cases as stored_blocks
+from pycrorm_async.recall.cases import BlockHeading, read_blocks, read_headings
+from pycrorm_async.recall.columns import Case
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
@@ -79,7 +77,7 @@ async def test_cases_do_not_depend_on_batches_restarts_processes_or_merges(
     log: EventLog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     small_blocks(monkeypatch)
-    monkeypatch.setattr(batch_fold, "_PAGE_EVENTS", 11)
+    monkeypatch.setattr(pipeline, "_PAGE_EVENTS", 11)
     random = Random(7)
     scripts = [random_script(number, random, actions=40) for number in range(1, 13)]
     records = [each for first in range(0, len(scripts), 4) for each in mixed(*scripts[first : first + 4])]
@@ -129,7 +127,7 @@ async def test_blocks_are_merged_as_they_grow(log: EventLog) -> None:
 async def test_cases_are_folded_at_intervals_unless_a_caller_waits_for_them(
     log: EventLog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("pycrorm_async.projections.custom.projection_tables._CHECK_S", 60.0)
+    monkeypatch.setattr("pycrorm_async.projections.custom._CHECK_S", 60.0)
     script = CaseScript()
     await log.append([*TYPES, *script.records])
     projector = await projector_of(log)

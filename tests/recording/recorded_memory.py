@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from pycrorm_async import Memory, Settings
-from pycrorm_async.projections.verify.verify import verify
-from pycrorm_async.recording.recorded_episode import RecordedEpisode
-from pycrorm_async.recording.recording import Recording
+from pycrorm_async.memory import SyncMemory
+from pycrorm_async.projections.verify import verify
+from pycrorm_async.record.recorded_episode import RecordedEpisode
+from pycrorm_async.record.recording import Recording
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.sync_memory import SyncMemory
 from pycrorm_async.world.pose import Pose
 from tests.databases import ask, put_memory
 

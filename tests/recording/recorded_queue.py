@@ -13,11 +13,10 @@ from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.events.codec import decode
 from pycrorm_async.events.ids import episode_id
 from pycrorm_async.events.types import Happening
-from pycrorm_async.queue.live.recorder_queue import RecorderQueue
-from pycrorm_async.recording.declarations.known_types import KnownTypes
-from pycrorm_async.recording.recording import Recording
-from pycrorm_async.recording.writing.emitter import Emitter
-from pycrorm_async.recording.writing.open_episodes import OpenEpisodes
+from pycrorm_async.queue.recorder_queue import RecorderQueue
+from pycrorm_async.record.declarations import KnownTypes
+from pycrorm_async.record.episode_writer import Emitter, OpenEpisodes
+from pycrorm_async.record.recording import Recording
 
 
 class Recorded:

@@ -16,9 +16,9 @@ from typing import Any
 import pytest
 
 from pycrorm_async import Memory, Settings, recover
-from pycrorm_async.recording import activations as module
-from pycrorm_async.recording.activations import Activations, BehaviourReader, NodeType
-from pycrorm_async.recording.declarations.recorded_type import FieldSpec
+from pycrorm_async.record import executives as module
+from pycrorm_async.record.declarations import FieldSpec
+from pycrorm_async.record.executives import Activations, BehaviourReader, NodeType
 from pycrorm_async.testing.contracts import check_executive
 from tests.commands import environment
 from tests.databases import ask
@@ -280,7 +280,7 @@ def test_the_number_of_repeats_is_written_rarely_while_they_go_on(tmp_path: Path
 _KILLED = """
 import os, signal, sys
 from pycrorm_async import Memory
-from pycrorm_async.recording.activations import Activations
+from pycrorm_async.record.executives import Activations
 from tests.recording.test_activations import READER, Machine, State
 near = State("near")
 with Memory.sync(sys.argv[1], writer="daemon") as memory:

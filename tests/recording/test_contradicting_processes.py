@@ -10,8 +10,8 @@ import pytest
 from pycrorm_async.events.codec import declaration_of
 from pycrorm_async.events.types import NodeStarted
 from pycrorm_async.operations.rebuild import rebuild_memory
-from pycrorm_async.projections.schema import union
-from pycrorm_async.projections.verify.verify import verify
+from pycrorm_async.projections import columns as union
+from pycrorm_async.projections.verify import verify
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.commands import pycrorm, run_script

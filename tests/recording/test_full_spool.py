@@ -12,7 +12,7 @@ import pytest
 
 from pycrorm_async import Settings
 from pycrorm_async.events.types import NodeEnded, NodeStarted
-from pycrorm_async.queue.live import recorder_queue
+from pycrorm_async.queue import recorder_queue
 from tests.recording.recorded_queue import Recorded
 
 

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from pycrorm_async import Memory, Settings
-from pycrorm_async.recording.recorded_episode import RecordedEpisode
-from pycrorm_async.recording.recording import Recording
+from pycrorm_async.record.recorded_episode import RecordedEpisode
+from pycrorm_async.record.recording import Recording
 from tests.databases import ask
 from tests.recording.recorded_memory import HERE, SMALL, assert_verified, nodes, record, url_of
 from tests.recording.recorded_queue import Recorded

@@ -12,8 +12,8 @@ import pytest
 
 from pycrorm_async import Memory, Settings
 from pycrorm_async.errors import CallerError
-from pycrorm_async.events.types import EpisodeEnded
-from pycrorm_async.events.values import (
+from pycrorm_async.events.types import (
+    EpisodeEnded,
     FailureValue,
     NodeReference,
     ObjectReference,
@@ -22,8 +22,8 @@ from pycrorm_async.events.values import (
     RobotValue,
     SeenValue,
 )
-from pycrorm_async.recording.recorded_episode import RecordedEpisode
-from pycrorm_async.recording.recording import Recording
+from pycrorm_async.record.recorded_episode import RecordedEpisode
+from pycrorm_async.record.recording import Recording
 from pycrorm_async.world import ObjectType
 from pycrorm_async.world.pose import Pose
 from tests.databases import ask

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from pycrorm_async.recording.recorded_episode import RecordedEpisode
+from pycrorm_async.record.recorded_episode import RecordedEpisode
 from tests.recording.recorded_memory import assert_verified
 from tests.recording.test_activations import Group, State, machine, nodes
 

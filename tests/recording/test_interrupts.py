@@ -25,14 +25,13 @@ import pycrorm_async
 from pycrorm_async import Settings
 from pycrorm_async.events.order import OrderCheck
 from pycrorm_async.events.types import EpisodeEnded, Happening, NodeEnded, NodeStarted
-from pycrorm_async.hooks import sampler
-from pycrorm_async.hooks.plan_recorder import Recorder, current_episode
-from pycrorm_async.plan.designator import ActionAbstract
-from pycrorm_async.plan.execution.observer import recorder as observing
+from pycrorm_async.plan.execution import recorder as observing
 from pycrorm_async.plan.failures import PlanFailure
-from pycrorm_async.queue.live import appender, gc_safe_lock
-from pycrorm_async.recording import ordered_calls
-from pycrorm_async.recording.writing import event_feed, open_episodes
+from pycrorm_async.plan.language import ActionAbstract
+from pycrorm_async.queue import appender
+from pycrorm_async.queue import appender as gc_safe_lock
+from pycrorm_async.record import episode_writer, event_feed, plan_recorder, recorded_episode
+from pycrorm_async.record.plan_recorder import Recorder, current_episode
 from pycrorm_async.world.pose import Pose
 from tests.hooks.fakes import NoteActionPerformable
 from tests.recording.recorded_queue import Recorded
@@ -225,7 +224,9 @@ def test_an_exit_at_any_call_leaves_the_plan(recorded: Recorded) -> None:
         assert_in_order(log)
 
 
-@pytest.mark.parametrize("module", [ordered_calls, open_episodes, event_feed, sampler, gc_safe_lock, appender])
+@pytest.mark.parametrize(
+    "module", [recorded_episode, episode_writer, event_feed, plan_recorder, gc_safe_lock, appender]
+)
 def test_no_loop_is_directly_in_a_block_that_holds_a_lock(module: ModuleType) -> None:
     """Python 3.12 and 3.13 leave the block with the lock taken if a handler raises where a loop jumps back."""
     tree = ast.parse(inspect.getsource(module))
@@ -235,7 +236,7 @@ def test_no_loop_is_directly_in_a_block_that_holds_a_lock(module: ModuleType) ->
 
 
 def test_a_loop_is_never_directly_before_the_end_of_being_busy() -> None:
-    tree = ast.parse(inspect.getsource(ordered_calls))
+    tree = ast.parse(inspect.getsource(recorded_episode))
     busy = [each for each in ast.walk(tree) if isinstance(each, ast.Try) and "is_busy" in ast.unparse(each)]
     assert len(busy) == 1
     assert [each for each in ast.walk(busy[0]) if isinstance(each, ast.For | ast.While)] == []

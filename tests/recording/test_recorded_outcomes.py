@@ -9,10 +9,10 @@ from typing import Any, cast
 import pytest
 
 from pycrorm_async.errors import CallerError
-from pycrorm_async.events.values import EpisodeStatus, FailureValue, ObjectReference, PoseValue, RobotValue
+from pycrorm_async.events.types import EpisodeStatus, FailureValue, ObjectReference, PoseValue, RobotValue
 from pycrorm_async.plan.failures import NavigationGoalInCollision
-from pycrorm_async.recording.recorded_episode import RecordedEpisode
-from pycrorm_async.recording.recording import Recording
+from pycrorm_async.record.recorded_episode import RecordedEpisode
+from pycrorm_async.record.recording import Recording
 from tests.databases import ask
 from tests.recording.recorded_memory import events, faults_of, nodes, opened
 

@@ -14,9 +14,8 @@ import pytest
 
 from pycrorm_async import Memory, Settings
 from pycrorm_async.plan import ActionAbstract
-from pycrorm_async.recording.declarations.declared_type import DeclaredType
-from pycrorm_async.recording.declarations.known_types import KnownTypes
-from pycrorm_async.recording.declarations.recorded_type import FieldSpec, declare_type
+from pycrorm_async.record.declarations import FieldSpec, KnownTypes, declare_type
+from pycrorm_async.record.parameters import DeclaredType
 from pycrorm_async.world.pose import Pose
 from tests.commands import pycrorm
 from tests.databases import ask

@@ -13,11 +13,11 @@ from typing import Any, NamedTuple
 import pytest
 
 from pycrorm_async import Memory, Settings
+from pycrorm_async.memory import SyncMemory
 from pycrorm_async.plan.failures import NavigationGoalNotReached
-from pycrorm_async.recording.recording import Recording
-from pycrorm_async.recording.runs import Runs
-from pycrorm_async.recording.values.plain_values import json_text, plain_value
-from pycrorm_async.sync_memory import SyncMemory
+from pycrorm_async.record.executives import Runs
+from pycrorm_async.record.recording import Recording
+from pycrorm_async.record.values import json_text, plain_value
 from pycrorm_async.testing.contracts import check_executive
 from pycrorm_async.world.pose import Pose
 from tests.databases import ask

@@ -14,9 +14,9 @@ from sqlalchemy import select
 
 from pycrorm_async import Memory, Settings
 from pycrorm_async.errors import CallerError, DatabaseForeign, FlushTimeout, UnknownUrl
+from pycrorm_async.memory import SyncMemory
 from pycrorm_async.orm import TaskTreeNode
-from pycrorm_async.recording.declarations.recorded_type import FieldSpec
-from pycrorm_async.sync_memory import SyncMemory
+from pycrorm_async.record.declarations import FieldSpec
 from pycrorm_async.world.pose import Pose
 from tests.commands import environment
 from tests.databases import ask, ask_to_change

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from pycrorm_async import Memory, Settings
-from pycrorm_async.recording.value_changes import ValueChanges
-from pycrorm_async.sync_memory import SyncMemory
+from pycrorm_async.memory import SyncMemory
+from pycrorm_async.record.executives import ValueChanges
 from tests.databases import ask
 from tests.recording.recorded_memory import url_of
 

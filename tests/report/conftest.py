@@ -13,7 +13,7 @@ from pycrorm_async.cli.demo import kitchen_world
 from pycrorm_async.plan import NavigateAction, ObjectDesignatorDescription, ParkArmsAction, PickUpAction, PlanFailure
 from pycrorm_async.plan import TransportAction, simulated_robot
 from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose
-from pycrorm_async.world.models.courier import courier_urdf
+from pycrorm_async.world.models import courier_urdf
 
 LINK = "forearm_link"
 

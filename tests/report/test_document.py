@@ -15,13 +15,11 @@ from pycrorm_async.memory import Memory
 from pycrorm_async.orm import LocationResolution
 from pycrorm_async.plan import CostmapLocation, simulated_robot
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.query.scene.object_model import object_model
-from pycrorm_async.recording.recorded_episode import RecordedEpisode
-from pycrorm_async.report import episode_fold
-from pycrorm_async.report.episode_data import episode_document
-from pycrorm_async.report.html_page import page_of
-from pycrorm_async.report.tracks import Texts, Track
-from pycrorm_async.report.write import Report
+from pycrorm_async.query.scene import object_model
+from pycrorm_async.record.recorded_episode import RecordedEpisode
+from pycrorm_async.report import document as episode_fold
+from pycrorm_async.report.document import Texts, Track, episode_document
+from pycrorm_async.report.write import Report, page_of
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
 
 HOSTILE = "</script><script>alert(1)</script> & \u2028\u202e]]> {title} <!--"

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from pycrorm_async.events.values import NodeStatus
+from pycrorm_async.events.types import NodeStatus
 from pycrorm_async.memory import Memory
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.report.write import report

@@ -6,8 +6,8 @@ import pytest
 
 from pycrorm_async.memory import Memory
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.report import mesh_data
-from pycrorm_async.report.episode_data import episode_document
+from pycrorm_async.report import document as mesh_data
+from pycrorm_async.report.document import episode_document
 from pycrorm_async.settings import RecordMeshes, Settings
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
 from tests import mesh_files

@@ -9,9 +9,8 @@ import msgspec
 import pytest
 
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.report.episode_data import document_behind, episode_document, read_into
-from pycrorm_async.report.episode_fold import EpisodeFold
-from pycrorm_async.store.episode_lookup import episode_named
+from pycrorm_async.report.document import EpisodeFold, document_behind, episode_document, read_into
+from pycrorm_async.store.log import episode_named
 from pycrorm_async.store.stored import StoredEvent
 from tests.report.browser import Browser
 

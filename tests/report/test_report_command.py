@@ -11,9 +11,8 @@ import pytest
 
 from pycrorm_async import Reading
 from pycrorm_async.cli import report as command
-from pycrorm_async.report import episode_fold
-from pycrorm_async.report.html_page import write_page
-from pycrorm_async.report.write import overview
+from pycrorm_async.report import document
+from pycrorm_async.report.write import overview, write_page
 from tests.commands import one_line_of, pycrorm
 from tests.full_disk import files_of_at_most
 
@@ -139,7 +138,7 @@ def test_a_full_page_names_the_next_window(
     continues: bool,
 ) -> None:
     notes: list[str] = []
-    monkeypatch.setattr(episode_fold, "_NODES_MAX", 2)
+    monkeypatch.setattr(document, "_NODES_MAX", 2)
     monkeypatch.setattr(command, "note", notes.append)
     url = f"sqlite:///{recorded / 'pycrorm.db'}"
     command.report("1", every=False, out=tmp_path / "page.html", first=first, last=last, url=url)

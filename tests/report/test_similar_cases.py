@@ -16,10 +16,9 @@ from pycrorm_async.events.ids import row_id
 from pycrorm_async.memory import Memory
 from pycrorm_async.orm import TaskTreeNode
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.recall.reading.recall import Recall
-from pycrorm_async.report import similar_cases
-from pycrorm_async.report.similar_cases import SimilarCases
-from pycrorm_async.report.write import overview, report
+from pycrorm_async.recall.recall import Recall
+from pycrorm_async.report import write as similar_cases
+from pycrorm_async.report.write import SimilarCases, overview, report
 from tests.report.browser import Browser
 
 HOSTILE = "</script><b onload=alert(1)>"

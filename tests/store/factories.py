@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.codec import Record
 from pycrorm_async.events.ids import EpisodeId
 
 __all__ = ["episode", "record", "run_of", "declaration", "name", "HEADS"]

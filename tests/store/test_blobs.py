@@ -11,15 +11,14 @@ import pytest
 from sqlalchemy import text
 from sqlalchemy.exc import DBAPIError
 
-from pycrorm_async.events.blobs import Blob
-from pycrorm_async.events.envelope import Record
-from pycrorm_async.events.values import BlobReference
+from pycrorm_async.events.codec import Record
+from pycrorm_async.events.types import Blob, BlobReference
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.store import blobs
+from pycrorm_async.store import append
 from pycrorm_async.store.address import DatabaseAddress
-from pycrorm_async.store.blobs import BlobSource
+from pycrorm_async.store.append import BlobSource
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.postgresql.roles import GRANTS
+from pycrorm_async.store.postgresql import GRANTS
 from tests.databases import Server, ask, change_each
 from tests.store.factories import episode, record
 
@@ -67,7 +66,7 @@ async def test_a_blob_is_stored_before_the_batch_and_once(log: EventLog) -> None
 async def test_a_large_blob_is_stored_in_parts_and_continued_where_a_writer_was_killed(
     log: EventLog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(blobs, "PART_BYTES", 20)
+    monkeypatch.setattr(append, "PART_BYTES", 20)
     log.blobs.source = Files(log, CONTENT)
     writes = log.writes
     await log.blobs.add(BlobReference(NAME, "a/b", 50), CONTENT[:20])  # as if killed behind the first part

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from pycrorm_async.store.sqlite.engine import USE_WAL, _connect
+from pycrorm_async.store.sqlite_engine import USE_WAL, _connect
 
 
 @pytest.fixture

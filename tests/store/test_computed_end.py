@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from pycrorm_async.errors import LogDamaged
-from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.codec import Record
 from pycrorm_async.store.log import EventLog
 from tests.databases import ask
 from tests.store.factories import episode, record, run_of

@@ -13,7 +13,7 @@ import pytest
 from sqlalchemy import text
 from sqlalchemy.ext.asyncio import AsyncConnection
 
-from pycrorm_async.store.sqlite.engine import Connection, make_engine
+from pycrorm_async.store.sqlite_engine import Connection, make_engine
 from tests.store.faults import cancel_at_await
 
 

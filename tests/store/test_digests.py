@@ -7,12 +7,12 @@ from hashlib import sha256
 import msgspec
 import pytest
 
-from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.codec import Record
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.dialects import dialect_of
-from pycrorm_async.store.digests.episode_digest import RunningDigest
 from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.stored import RunningDigest
 from tests.databases import ask, ask_to_change
 from tests.store.factories import episode, record, run_of
 

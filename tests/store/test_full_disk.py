@@ -17,9 +17,8 @@ from pycrorm_async.errors import DatabaseUnavailable
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.sqlite.errors import translate_error
-from pycrorm_async.writer.drain import Drain
-from pycrorm_async.writer.retry import Backoff
+from pycrorm_async.store.sqlite_engine import translate_error
+from pycrorm_async.writer.drain import Backoff, Drain
 from tests.databases import ask
 from tests.store.factories import episode, record
 from tests.writer.fakes import KeptSource

@@ -19,11 +19,11 @@ from pycrorm_async.errors import PycrormError, TablesUntrusted
 from pycrorm_async.operations.rebuild import rebuild_memory
 from pycrorm_async.operations.recovery import recover
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.projections.verify.verify import verify
+from pycrorm_async.projections.verify import verify
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.postgresql.roles import GRANTS
+from pycrorm_async.store.postgresql import GRANTS
 from tests.crash.step_robot import SETTINGS, StepActionPerformable
 from tests.databases import Server, ask, change_each
 

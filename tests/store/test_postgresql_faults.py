@@ -16,14 +16,13 @@ import pytest
 from sqlalchemy import text
 
 from pycrorm_async.errors import DatabaseUnavailable
-from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.codec import Record
 from pycrorm_async.settings import Settings
+from pycrorm_async.store import postgresql_engine
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.postgresql import engine
 from pycrorm_async.testing.postgresql_proxy import Proxy, proxy_before
-from pycrorm_async.writer.drain import Drain
-from pycrorm_async.writer.retry import Backoff
+from pycrorm_async.writer.drain import Backoff, Drain
 from tests.databases import Server, ask, ask_each, server_in_memory
 from tests.store.factories import declaration, episode, run_of
 from tests.store.faults import cancel_at_await
@@ -223,7 +222,7 @@ async def test_a_server_that_refuses_every_connection_is_unavailable_until_it_ac
 async def test_a_silent_connection_is_closed_and_the_batch_is_sent_through_another(
     proxy: Proxy, direct_url: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(engine, "ANSWER_S_MAX", 0.5)
+    monkeypatch.setattr(postgresql_engine, "ANSWER_S_MAX", 0.5)
     records = records_of_three_episodes(random.Random(13), 1000)
 
     async def silent(drain: Drain) -> None:

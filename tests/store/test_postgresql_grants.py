@@ -12,7 +12,7 @@ from pycrorm_async.errors import TablesUntrusted
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.postgresql.roles import GRANTS
+from pycrorm_async.store.postgresql import GRANTS
 from tests.databases import Server, ask, change_each, server_in_memory
 from tests.store.factories import episode, run_of
 

@@ -11,9 +11,9 @@ from urllib.parse import urlsplit
 import pytest
 
 from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable, PycrormError
+from pycrorm_async.store import postgresql
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.postgresql import dialect
 from tests.databases import Server, ask
 from tests.store.factories import episode, run_of
 
@@ -140,7 +140,7 @@ async def test_a_server_that_is_too_old_is_refused(
     url = server.new_database()
     [[version]] = ask(url, "SELECT current_setting('server_version_num')::int / 10000")
     # A server of today's version, checked by a program that requires the next one.
-    monkeypatch.setattr(dialect, "_SERVER_MIN", (version + 1) * 10_000)
+    monkeypatch.setattr(postgresql, "_SERVER_MIN", (version + 1) * 10_000)
     error = await refused(url, caplog)
     assert type(error) is DatabaseUnavailable
     assert str(error).endswith(f"PostgreSQL 14 or newer is needed, this is {version}")

@@ -14,12 +14,11 @@ from pycrorm_async import Memory
 from pycrorm_async.errors import DatabaseUnavailable
 from pycrorm_async.operations.recovery import recover
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.projections.verify.verify import verify
+from pycrorm_async.projections.verify import verify
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import numbers_reserved
-from pycrorm_async.writer.drain import Drain
-from pycrorm_async.writer.retry import Backoff
+from pycrorm_async.writer.drain import Backoff, Drain
 from tests.crash.step_robot import SETTINGS, StepActionPerformable
 from tests.databases import Server, ask
 from tests.store.factories import declaration, episode, run_of

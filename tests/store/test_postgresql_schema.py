@@ -9,17 +9,15 @@ import asyncpg
 import pytest
 
 from pycrorm_async.errors import DatabaseUnavailable
-from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.codec import Record
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.append import Appending
 from pycrorm_async.store.dialect import Birth
 from pycrorm_async.store.dialects import dialect_of
-from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.postgresql.roles import GRANTS
-from pycrorm_async.store.postgresql.tables import MIGRATIONS
-from pycrorm_async.store.schema import make_or_migrate
+from pycrorm_async.store.log import EventLog, make_or_migrate
+from pycrorm_async.store.postgresql import GRANTS, MIGRATIONS
 from tests.databases import Server, ask, change_each
 from tests.store.concurrent_openers import open_at_once
 from tests.store.factories import declaration, episode, record, run_of

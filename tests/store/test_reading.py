@@ -8,11 +8,11 @@ import pytest
 from sqlalchemy import text
 
 from pycrorm_async.errors import DatabaseUnavailable
+from pycrorm_async.store import sqlite
+from pycrorm_async.store.append import EPISODES_MANY, EVENTS_MANY
 from pycrorm_async.store.dialects import dialect_of
-from pycrorm_async.store.limits import EPISODES_MANY, EVENTS_MANY
 from pycrorm_async.store.log import EventLog, advance_folded, park
-from pycrorm_async.store.sqlite import statements
-from pycrorm_async.store.sqlite.engine import Connection
+from pycrorm_async.store.sqlite_engine import Connection
 from pycrorm_async.store.stored import Basis, EpisodeRow, Incarnation, Span, StoredEvent
 from tests.databases import ask, ask_to_change
 from tests.store.factories import episode, record, run_of
@@ -124,16 +124,16 @@ async def test_an_episode_row_holds_all_its_columns(log: EventLog) -> None:
 
 async def test_the_query_for_unfolded_episodes_reads_no_other_episode(file_log: EventLog) -> None:
     behind = " | ".join(
-        row[3] for row in ask(file_log.address.path, f"EXPLAIN QUERY PLAN {statements.SELECT_BEHIND}", (0, 9))
+        row[3] for row in ask(file_log.address.path, f"EXPLAIN QUERY PLAN {sqlite.SELECT_BEHIND}", (0, 9))
     )
     assert "episode_behind" in behind
     assert "TEMP B-TREE" not in behind
     spans = " | ".join(
-        row[3] for row in ask(file_log.address.path, f"EXPLAIN QUERY PLAN {statements.SELECT_SPAN}", (1, 0, 9))
+        row[3] for row in ask(file_log.address.path, f"EXPLAIN QUERY PLAN {sqlite.SELECT_SPAN}", (1, 0, 9))
     )
     assert "SEARCH event USING INDEX" in spans
     assert "SCAN event" not in spans
-    stopped = ask(file_log.address.path, f"EXPLAIN QUERY PLAN {statements.SELECT_STOPPED}")
+    stopped = ask(file_log.address.path, f"EXPLAIN QUERY PLAN {sqlite.SELECT_STOPPED}")
     assert "episode_stopped" in stopped[0][3]
 
 

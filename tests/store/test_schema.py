@@ -12,9 +12,8 @@ from pycrorm_async.clock import Clock
 from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.dialect import Birth
-from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.schema import make_or_migrate, recognise
-from pycrorm_async.store.sqlite.tables import MIGRATIONS
+from pycrorm_async.store.log import EventLog, make_or_migrate, recognise
+from pycrorm_async.store.sqlite import MIGRATIONS
 from tests.databases import ask
 from tests.store.concurrent_openers import open_at_once
 from tests.store.factories import declaration, episode, run_of

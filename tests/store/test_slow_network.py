@@ -7,8 +7,8 @@ from sqlalchemy import select
 
 from pycrorm_async.errors import DatabaseUnavailable
 from pycrorm_async.orm import Pose
+from pycrorm_async.projections.mapped_tables import UserView
 from pycrorm_async.projections.projector import Projector
-from pycrorm_async.projections.schema.user_views import UserView
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.testing.postgresql_proxy import Proxy, proxy_before

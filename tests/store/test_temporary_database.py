@@ -10,13 +10,12 @@ from pathlib import Path
 import pytest
 
 from pycrorm_async.errors import DatabaseUnavailable
-from pycrorm_async.store.address import DatabaseAddress
-from pycrorm_async.store.temporary_database import private_folder
+from pycrorm_async.store.address import DatabaseAddress, private_folder
 
 HOLD_ONE = """
 import sys
 from pathlib import Path
-from pycrorm_async.store.temporary_database import private_folder
+from pycrorm_async.store.address import private_folder
 with private_folder(Path(sys.argv[1])) as folder:
     print(folder, flush=True)
     sys.stdin.read()
@@ -108,7 +107,7 @@ def test_many_processes_that_make_and_delete_concurrently_each_have_a_folder(tmp
     script = """
 import sys
 from pathlib import Path
-from pycrorm_async.store.temporary_database import private_folder
+from pycrorm_async.store.address import private_folder
 for _ in range(200):
     with private_folder(Path(sys.argv[1])) as folder:
         (folder / "memory.db").touch(exist_ok=False)
@@ -124,7 +123,7 @@ def test_a_forked_child_that_leaves_the_context_keeps_its_parents_folder(tmp_pat
     script = """
 import os, sys
 from pathlib import Path
-from pycrorm_async.store.temporary_database import private_folder
+from pycrorm_async.store.address import private_folder
 with private_folder(Path(sys.argv[1])) as folder:
     child = os.fork()
     if child:

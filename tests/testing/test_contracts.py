@@ -18,8 +18,8 @@ from pycrorm_async import Memory, Projection
 from pycrorm_async.errors import CallerError, Unrecordable
 from pycrorm_async.orm import TaskTreeNode
 from pycrorm_async.plan import ActionAbstract
-from pycrorm_async.projections.custom.projection import Changes, Event
-from pycrorm_async.recording.recording import Recording
+from pycrorm_async.projections.custom import Changes, Event
+from pycrorm_async.record.recording import Recording
 from pycrorm_async.testing.contracts import check_designator, check_executive, check_projection
 from pycrorm_async.testing.fake_clock import FakeClock
 from pycrorm_async.world import Arms

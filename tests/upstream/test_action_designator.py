@@ -33,7 +33,7 @@ from pycrorm_async.plan import (
 )
 from pycrorm_async.world import Arms, Grasp, GripperState, ObjectType, Pose
 from pycrorm_async.world.pose import yaw_quaternion
-from pycrorm_async.world.robots.robot_description import PR2
+from pycrorm_async.world.urdf import PR2
 from tests.plan.conftest import Scene
 
 pytestmark = pytest.mark.slow

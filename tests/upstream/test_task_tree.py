@@ -11,7 +11,7 @@ from sqlalchemy import select
 from pycrorm_async import Memory
 from pycrorm_async.orm import TaskTreeNode
 from pycrorm_async.plan import ActionAbstract, PlanFailure, SimulatedTaskTree, TaskStatus, collected_tree
-from pycrorm_async.plan.task_tree import CollectedTree
+from pycrorm_async.plan.task import CollectedTree
 from pycrorm_async.world import Pose
 from tests.plan.conftest import Scene, kitchen
 from tests.promises.lab import url_of

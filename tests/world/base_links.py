@@ -6,9 +6,8 @@ from dataclasses import replace
 from xml.etree.ElementTree import fromstring, indent, tostring
 
 from pycrorm_async.world import COURIER, Object, Pose, RobotDescription
-from pycrorm_async.world.models.courier import courier_urdf
-from pycrorm_async.world.models.urdf_elements import link, moving
-from pycrorm_async.world.robots.robot_description import Bounds
+from pycrorm_async.world.models import courier_urdf, link, moving
+from pycrorm_async.world.urdf import Bounds
 
 HEIGHT_M = 0.2
 RAILS = {"rail_x": 0.4, "rail_y": -0.3, "rail_turn": 0.9}

@@ -7,9 +7,8 @@ import random
 from collections.abc import Mapping
 from pathlib import Path
 
-from pycrorm_async.world.enums import Arms
-from pycrorm_async.world.pose import Pose, Quaternion, Vector, product
-from pycrorm_async.world.robots.robot_description import PR2, Limits
+from pycrorm_async.world.pose import Arms, Pose, Quaternion, Vector, product
+from pycrorm_async.world.urdf import PR2, Limits
 from tests import bullet
 
 LINK_WORLD_POSITION, LINK_WORLD_ORIENTATION = 4, 5

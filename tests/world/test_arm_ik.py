@@ -16,11 +16,10 @@ import pytest
 import pycrorm_async
 from pycrorm_async.errors import CallerError, PycrormError
 from pycrorm_async.world import BulletWorld, Object, ObjectType
-from pycrorm_async.world.enums import Arms, Grasp
-from pycrorm_async.world.models.pr2 import pr2_urdf
-from pycrorm_async.world.pose import Pose, Quaternion, Vector, product, rotated, yaw_quaternion
-from pycrorm_async.world.robots.kinematics import Unreachable, forward, solve, solve_from
-from pycrorm_async.world.robots.robot_description import GRASP_ORIENTATIONS, PR2, Limits
+from pycrorm_async.world.kinematics import Unreachable, forward, solve, solve_from
+from pycrorm_async.world.models import pr2_urdf
+from pycrorm_async.world.pose import Arms, Grasp, Pose, Quaternion, Vector, product, rotated, yaw_quaternion
+from pycrorm_async.world.urdf import GRASP_ORIENTATIONS, PR2, Limits
 from tests.world.loaded_model import LoadedModel, angle_between, random_arm, random_base_pose
 
 ARMS = (Arms.LEFT, Arms.RIGHT)
@@ -202,10 +201,10 @@ def test_an_invalid_request_is_the_callers_error(arm: Arms, target: Pose, says: 
 
 FINGERPRINT = """
 import hashlib, random
-from pycrorm_async.world.robots.kinematics import Unreachable, solve_from
-from pycrorm_async.world.enums import Arms
+from pycrorm_async.world.kinematics import Unreachable, solve_from
+from pycrorm_async.world.pose import Arms
 from pycrorm_async.world.pose import Pose
-from pycrorm_async.world.robots.robot_description import PR2
+from pycrorm_async.world.urdf import PR2
 rng, seen = random.Random(36), hashlib.sha256()
 for _ in range(400):
     target = Pose([rng.uniform(0, 0.9), rng.uniform(-0.3, 0.8), rng.uniform(0.3, 1.2)],

@@ -11,13 +11,13 @@ import optik
 import pytest
 
 from pycrorm_async.learning import PickUpChoice, default_policy
-from pycrorm_async.learning.rollouts.rollouts import randomness
-from pycrorm_async.plan.geometry.grasp_poses import PickUpPoses, pick_up_poses
+from pycrorm_async.learning.rollouts import randomness
+from pycrorm_async.plan.geometry import PickUpPoses, pick_up_poses
 from pycrorm_async.world import Arms, Pose
-from pycrorm_async.world.models.pr2 import pr2_urdf
+from pycrorm_async.world.kinematics import Unreachable, solve_from
+from pycrorm_async.world.models import pr2_urdf
 from pycrorm_async.world.pose import yaw_quaternion
-from pycrorm_async.world.robots.kinematics import Unreachable, solve_from
-from pycrorm_async.world.robots.robot_description import PR2
+from pycrorm_async.world.urdf import PR2
 
 pytestmark = pytest.mark.slow
 

@@ -19,13 +19,11 @@ from pycrorm_async.world import (
     RobotDescription,
     describe_robot,
 )
-from pycrorm_async.world.bullet_loader import engine
-from pycrorm_async.world.errors import ObjectRefused, UnknownLink
-from pycrorm_async.world.pose import yaw_quaternion
-from pycrorm_async.world.queries.collision_queries import collisions_at
-from pycrorm_async.world.queries.footprints import footprint_of
-from pycrorm_async.world.robots.kinematics import solve
-from pycrorm_async.world.robots.robot_description import Limits
+from pycrorm_async.world.bullet_body import engine
+from pycrorm_async.world.kinematics import solve
+from pycrorm_async.world.pose import ObjectRefused, UnknownLink, yaw_quaternion
+from pycrorm_async.world.queries import collisions_at, footprint_of
+from pycrorm_async.world.urdf import Limits
 from pycrorm_async.world.world_copy import copied, counterpart
 from tests.world.base_links import HEIGHT_M, RAILS, link_poses, rail_robot, raised_robot
 from tests.world.fakes import ChangeLog

@@ -13,7 +13,8 @@ import pytest
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose, WorldMode, current_world, watcher
-from pycrorm_async.world.errors import (
+from pycrorm_async.world.bullet_body import WorldState
+from pycrorm_async.world.pose import (
     JointLimitExceeded,
     ObjectNotInWorld,
     PoseRefused,
@@ -22,7 +23,6 @@ from pycrorm_async.world.errors import (
     WorldError,
     WorldUnavailable,
 )
-from pycrorm_async.world.state import WorldState
 from tests.world.fakes import CRANE, ChangeLog
 
 # --- entering and leaving -------------------------------------------------------------------------------------

@@ -41,7 +41,7 @@ def test_nothing_of_bullet_reaches_stdout_or_stderr() -> None:
     done = run(
         "import tempfile\n"
         "from pycrorm_async.world import *\n"
-        "from pycrorm_async.world.errors import DescriptionNotLoadable\n"
+        "from pycrorm_async.world.pose import DescriptionNotLoadable\n"
         "print('before')\n"
         'link = \'<robot name="a"><link name="l"><collision><geometry>{}</geometry></collision></link></robot>\'\n'
         "with BulletWorld(), tempfile.NamedTemporaryFile(suffix='.stl') as empty:\n"

@@ -23,8 +23,8 @@ from pycrorm_async.world import (
     RobotDescription,
     copied,
 )
-from pycrorm_async.world.models.courier import courier_urdf
-from pycrorm_async.world.robots.kinematics import Unreachable, chain_of, solve
+from pycrorm_async.world.kinematics import Unreachable, chain_of, solve
+from pycrorm_async.world.models import courier_urdf
 from pycrorm_async.world.world_copy import counterpart
 
 SLIDER = """<robot name="slider">

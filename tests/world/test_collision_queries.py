@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
-from pycrorm_async.world.queries.collision_queries import collisions_at
+from pycrorm_async.world.queries import collisions_at
 from tests.world.fakes import ChangeLog
 
 BOX = """<robot name="box"><link name="box">

@@ -18,9 +18,8 @@ from pycrorm_async.world import (
     SemanticCostmap,
     VisibilityCostmap,
 )
-from pycrorm_async.world.errors import CostmapMismatch, UnknownLink
-from pycrorm_async.world.pose import Vector, yaw_quaternion
-from pycrorm_async.world.queries.bounding_boxes import BoundingBox
+from pycrorm_async.world.bounding_boxes import BoundingBox
+from pycrorm_async.world.pose import CostmapMismatch, UnknownLink, Vector, yaw_quaternion
 
 
 def block(name: str, size: tuple[float, float, float], at: tuple[float, float, float], yaw: float = 0.0) -> Object:

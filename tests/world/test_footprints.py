@@ -10,10 +10,9 @@ import random
 import pytest
 
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
-from pycrorm_async.world.models.pr2 import pr2_mesh_urdf_path
-from pycrorm_async.world.models.primitives import box_urdf
+from pycrorm_async.world.models import box_urdf, pr2_mesh_urdf_path
 from pycrorm_async.world.pose import yaw_quaternion
-from pycrorm_async.world.queries.footprints import Footprint, Obstacles, footprint_of
+from pycrorm_async.world.queries import Footprint, Obstacles, footprint_of
 from tests import bullet
 
 SQUARE = Footprint((-0.3, 0.3), (-0.3, 0.3))

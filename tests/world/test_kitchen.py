@@ -12,10 +12,9 @@ import numpy as np
 import pytest
 
 from pycrorm_async.world import Arms, BulletWorld, JointType, Object, ObjectType, OccupancyCostmap, Pose
-from pycrorm_async.world.errors import JointLimitExceeded
-from pycrorm_async.world.models.kitchen import kitchen_urdf
-from pycrorm_async.world.pose import rotated, yaw_quaternion
-from pycrorm_async.world.robots.kinematics import Unreachable, solve
+from pycrorm_async.world.kinematics import Unreachable, solve
+from pycrorm_async.world.models import kitchen_urdf
+from pycrorm_async.world.pose import JointLimitExceeded, rotated, yaw_quaternion
 
 
 @pytest.fixture
@@ -32,7 +31,7 @@ def cereal_and_milk() -> tuple[Object, Object]:
 
 @pytest.mark.parametrize("seed", ["1", "2"])
 def test_the_description_is_the_same_text_in_every_process(seed: str) -> None:
-    code = "from pycrorm_async.world.models.kitchen import kitchen_urdf; print(kitchen_urdf(), end='')"
+    code = "from pycrorm_async.world.models import kitchen_urdf; print(kitchen_urdf(), end='')"
     done = subprocess.run(
         [sys.executable, "-c", code],
         capture_output=True,

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pycrorm_async.world import BulletWorld, JointType, Object, ObjectType, Pose
-from pycrorm_async.world.errors import (
+from pycrorm_async.world.pose import (
     DuplicateName,
     JointLimitExceeded,
     NoWorld,
@@ -288,7 +288,7 @@ def test_a_removed_object_can_be_read_but_not_moved(world: BulletWorld, change_l
 
 
 def test_a_colour_is_applied_to_every_link(world: BulletWorld) -> None:
-    from pycrorm_async.world.bullet_loader import engine
+    from pycrorm_async.world.bullet_body import engine
 
     milk = Object("milk", ObjectType.MILK, color=(1.0, 0.0, 0.5, 1.0))
     shapes = engine().getVisualShapeData(milk.body.number, physicsClientId=world.client)

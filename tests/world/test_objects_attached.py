@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
-from pycrorm_async.world.errors import AttachmentRefused, ObjectNotInWorld, UnknownLink
-from pycrorm_async.world.pose import yaw_quaternion
+from pycrorm_async.world.pose import AttachmentRefused, ObjectNotInWorld, UnknownLink, yaw_quaternion
 from tests.world.fakes import CRANE, ChangeLog, crane_links, matrix
 
 BASE = Pose([0.5, 1.0, 0.2], [0.1, 0.2, -0.3, 0.9])

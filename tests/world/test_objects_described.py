@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
-from pycrorm_async.world.errors import DescriptionNotLoadable
-from pycrorm_async.world.models.pr2 import pr2_mesh_urdf_path, pr2_urdf
-from pycrorm_async.world.robots.robot_description import PR2
+from pycrorm_async.world.models import pr2_mesh_urdf_path, pr2_urdf
+from pycrorm_async.world.pose import DescriptionNotLoadable
+from pycrorm_async.world.urdf import PR2
 from tests.world.fakes import CRANE
 
 WEDGE = """v 0 0 0

@@ -12,11 +12,10 @@ from pathlib import Path
 import pytest
 
 import pycrorm_async
-from pycrorm_async.world.enums import Arms, Grasp, GripperState
-from pycrorm_async.world.models.pr2 import pr2_mesh_urdf_path, pr2_urdf
-from pycrorm_async.world.pose import Pose, product, rotated, yaw_quaternion
-from pycrorm_async.world.robots.kinematics import forward
-from pycrorm_async.world.robots.robot_description import GRASP_ORIENTATIONS, PR2, Limits, robot_description
+from pycrorm_async.world.kinematics import forward
+from pycrorm_async.world.models import pr2_mesh_urdf_path, pr2_urdf
+from pycrorm_async.world.pose import Arms, Grasp, GripperState, Pose, product, rotated, yaw_quaternion
+from pycrorm_async.world.urdf import GRASP_ORIENTATIONS, PR2, Limits, robot_description
 from tests.world.loaded_model import LoadedModel, angle_between, random_arm, random_base_pose
 
 BULLET_EXACT = 1e-6
@@ -198,7 +197,7 @@ def test_without_the_mesh_package_the_error_names_the_extra_to_install() -> None
 import sys
 sys.path.insert(0, {root!r})
 from pycrorm_async.errors import MissingExtra
-from pycrorm_async.world.models.pr2 import pr2_mesh_urdf_path
+from pycrorm_async.world.models import pr2_mesh_urdf_path
 try:
     pr2_mesh_urdf_path()
 except MissingExtra as missing:

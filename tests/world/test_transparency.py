@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pycrorm_async.world import Arms, BulletWorld, Object, ObjectType, Pose
-from pycrorm_async.world.robots.kinematics import solve
+from pycrorm_async.world.kinematics import solve
 
 
 def test_a_transparent_hand_in_front_of_an_object_does_not_hide_it(world: BulletWorld) -> None:

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose, current_world, watcher
-from pycrorm_async.world.errors import WorldClosed
-from pycrorm_async.world.pose import yaw_quaternion
+from pycrorm_async.world.pose import WorldClosed, yaw_quaternion
 from pycrorm_async.world.world_copy import copied, counterpart, original, related
 from tests.world.fakes import CRANE, ChangeLog, crane_links, matrix
 

@@ -9,11 +9,11 @@ from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from functools import partial
 
 from pycrorm_async.errors import DatabaseUnavailable
-from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.codec import Record
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog, advance_folded
-from pycrorm_async.writer.ports import Destination, Source
+from pycrorm_async.writer.drain import Destination, Source
 
 __all__ = ["KeptSource", "CountingFold", "ForwardingDestination", "LosesReplies", "opener"]
 

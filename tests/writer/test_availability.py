@@ -5,7 +5,7 @@ import asyncio
 import pytest
 
 from pycrorm_async.errors import DatabaseUnavailable
-from pycrorm_async.writer.availability import Availability
+from pycrorm_async.writer.daemon import Availability
 
 
 class Observed:

@@ -11,12 +11,11 @@ from pathlib import Path
 import pytest
 
 from pycrorm_async.errors import DatabaseUnavailable, LogDamaged, SpoolUnavailable
-from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.codec import Record
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.writer.drain import Drain, run_to_completion
-from pycrorm_async.writer.retry import Backoff
+from pycrorm_async.writer.drain import Backoff, Drain, run_to_completion
 from tests.databases import ask
 from tests.store.factories import episode, record, run_of
 from tests.writer.fakes import CountingFold, ForwardingDestination, KeptSource, LosesReplies

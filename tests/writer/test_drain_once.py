@@ -7,10 +7,10 @@ from pathlib import Path
 import pytest
 
 from pycrorm_async.errors import DatabaseUnavailable, SpoolDamaged, SpoolUnavailable
-from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.codec import Record
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.writer.drain_once import drain_once
+from pycrorm_async.writer.drain import drain_once
 from tests.databases import ask
 from tests.store.factories import episode, run_of
 from tests.writer.fakes import CountingFold, ForwardingDestination, KeptSource

@@ -12,7 +12,7 @@ import pytest
 from pycrorm_async.errors import FlushTimeout
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
-from pycrorm_async.writer.writer_thread import WriterThread
+from pycrorm_async.writer.plan_writer import WriterThread
 from tests.databases import ask
 from tests.store.factories import episode, run_of
 from tests.writer.fakes import ForwardingDestination, KeptSource, opener

@@ -11,17 +11,17 @@ import pytest
 
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import EpisodeParked, PycrormError, SpoolFull, SpoolStuck
-from pycrorm_async.events.envelope import Heading
+from pycrorm_async.events.codec import Heading
 from pycrorm_async.events.ids import EpisodeId, episode_id, episode_text
 from pycrorm_async.operations.recovery import dead_queues
-from pycrorm_async.queue.files.spool import Spool
-from pycrorm_async.queue.live.recorder_queue import RecorderQueue
-from pycrorm_async.queue.sources.dead_source import open_dead
+from pycrorm_async.queue.recorder_queue import RecorderQueue
+from pycrorm_async.queue.sources import open_dead
+from pycrorm_async.queue.spool import Spool
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.writer.drain_once import drain_once
-from pycrorm_async.writer.writer_thread import WriterThread
+from pycrorm_async.writer.drain import drain_once
+from pycrorm_async.writer.plan_writer import WriterThread
 from tests.databases import ask, ask_to_change
 from tests.store.factories import episode
 from tests.writer.fakes import CountingFold, opener

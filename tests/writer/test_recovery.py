@@ -7,14 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from pycrorm_async.errors import (
-    EpisodeParked,
-    SpoolDamaged,
-)
-from pycrorm_async.events.envelope import Record
+from pycrorm_async.errors import EpisodeParked, SpoolDamaged
+from pycrorm_async.events.codec import Record
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.writer.ports import Source
+from pycrorm_async.writer.drain import Source
 from tests.databases import ask
 from tests.store.factories import episode, name, record, run_of
 from tests.writer.fakes import KeptSource

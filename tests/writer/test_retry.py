@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from pycrorm_async.writer.retry import Backoff
+from pycrorm_async.writer.drain import Backoff
 
 
 def test_each_pause_is_twice_the_previous_one_up_to_the_longest() -> None:

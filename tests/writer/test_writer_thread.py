@@ -11,13 +11,13 @@ from collections.abc import Mapping, Sequence
 import pytest
 
 from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable, EpisodeParked, LogDamaged
-from pycrorm_async.events.envelope import Record
+from pycrorm_async.events.codec import Record
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog, park
-from pycrorm_async.writer.ports import Destination
-from pycrorm_async.writer.writer_thread import WriterThread
+from pycrorm_async.writer.drain import Destination
+from pycrorm_async.writer.plan_writer import WriterThread
 from tests.databases import ask
 from tests.store.factories import declaration, episode, name, record, run_of
 from tests.writer.fakes import ForwardingDestination, KeptSource, LosesReplies, opener

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
-from pycrorm_async.writer.ports import Source
-from pycrorm_async.writer.writer_thread import WriterThread
+from pycrorm_async.writer.drain import Source
+from pycrorm_async.writer.plan_writer import WriterThread
 from tests.databases import ask
 from tests.writer.fakes import opener
 

@@ -18,11 +18,8 @@ from typing import Any
 
 from sqlalchemy import Table
 
-from pycrorm_async.orm.base import EPISODE, Base
-from pycrorm_async.orm.designators import Action, Designator, Language, Motion
-from pycrorm_async.orm.types import JsonText, Moment
-
-__all__ = ["ViewDescription", "comments", "describe", "described", "unit_of"]
+from pycrorm_async.orm.base import EPISODE, Base, JsonText, Moment
+from pycrorm_async.orm.rows import Action, Designator, Language, Motion
 
 _TIME = "µs since 1970-01-01 00:00 UTC"
 _UNIT = re.compile(r"(?:^|, | in )(m|rad|s|kg|ns)(?=[,;:]|$)")

@@ -23,7 +23,7 @@ from pycrorm_async import Memory, Settings
 from pycrorm_async.integrations import callbacks
 from pycrorm_async.integrations.callbacks import RememberedRuns
 from pycrorm_async.plan.failures import NavigationGoalNotReached
-from pycrorm_async.recording.recording import Recording
+from pycrorm_async.record.recording import Recording
 from pycrorm_async.testing.contracts import check_executive
 from tests.databases import ask
 from tests.integrations.callbacks.agents import agent, call, pick_up, request

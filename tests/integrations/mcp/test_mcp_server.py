@@ -14,7 +14,7 @@ import pytest
 
 from pycrorm_async import Memory
 from pycrorm_async.store.address import DatabaseAddress
-from pycrorm_async.store.postgresql.roles import GRANTS
+from pycrorm_async.store.postgresql import GRANTS
 from tests.commands import COMMAND, environment
 from tests.databases import change_each, run_in_own_loop
 from tests.projections.event_script import NAVIGATE, PICK_UP, SAYING, declarations

@@ -17,7 +17,7 @@ from pycrorm_async import Memory, Settings, recover
 from pycrorm_async.errors import CallerError
 from pycrorm_async.integrations import py_trees as integration
 from pycrorm_async.integrations.py_trees import RememberedTree
-from pycrorm_async.recording import activations
+from pycrorm_async.record import executives
 from tests.commands import environment
 from tests.databases import ask
 from tests.integrations.py_trees.behaviours import Broken, Condition, Scripted, named, parallel, sequence, tick, tree
@@ -172,7 +172,7 @@ def test_an_unknown_version_of_py_trees_is_refused_by_name(tmp_path: Path, monke
 def test_replaced_subtrees_do_not_fill_the_memory_of_the_process(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(activations, "_KNOWN_MAX", 10)
+    monkeypatch.setattr(executives, "_KNOWN_MAX", 10)
     root = sequence("job", Condition("is near", named("S")), Scripted("drive", named("R")))
     kept: list[int] = []
 

@@ -14,7 +14,7 @@ import pytest
 
 from pycrorm_async import Memory, Settings
 from pycrorm_async.integrations.py_trees import RememberedTree
-from pycrorm_async.recording import activations
+from pycrorm_async.record import executives
 from tests.databases import ask
 from tests.integrations.py_trees.behaviours import FAILURE, RUNNING, SUCCESS, Visits, parallel, selector, sequence, tree
 from tests.recording.recorded_memory import assert_verified, url_of
@@ -96,7 +96,7 @@ def misplaced(folder: Path) -> list[Any]:
 def test_a_random_tree_is_remembered_as_it_was_visited(
     seed: int, instant_s: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(activations, "_UNWRITTEN_TICKS", 5 + seed)
+    monkeypatch.setattr(executives, "_UNWRITTEN_TICKS", 5 + seed)
     _compare(random.Random(seed), instant_s, tmp_path)
 
 

@@ -11,8 +11,7 @@ from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element, fromstring, indent, tostring
 
-from pycrorm_async.world.models.pr2 import pr2_urdf
-from pycrorm_async.world.models.urdf_elements import fixed, link
+from pycrorm_async.world.models import fixed, link, pr2_urdf
 
 _BOXES = {"plane": (10.0, 10.0, 0.001), "milk": (0.06, 0.06, 0.2), "cereal": (0.06, 0.16, 0.25)}
 

@@ -1,0 +1,792 @@
+"""Write episodes as motion over time: states and scene frames of robots, MCAP and rerun."""
+
+from __future__ import annotations
+
+import heapq
+import math
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from itertools import groupby
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pycrorm_async.errors import CallerError, MissingExtra
+from pycrorm_async.events.codec import description_of
+from pycrorm_async.events.types import (
+    EpisodeEnded,
+    EpisodeStarted,
+    JointsMoved,
+    NodeEnded,
+    NodeStarted,
+    ObjectAdded,
+    ObjectMoved,
+    ObjectRemoved,
+    StateSampled,
+)
+from pycrorm_async.export.selection import CoveredEpisode
+from pycrorm_async.projections.fold import happening_of
+from pycrorm_async.projections.row_batch import CannotFold
+from pycrorm_async.query.reading import Reading
+from pycrorm_async.query.scene import Frame, assumed_model, joint_frame, link_frames, object_model, placed, point_model
+from pycrorm_async.query.snapshot import unreadable
+from pycrorm_async.query.text import parameters_text, with_object_names
+from pycrorm_async.store.stored import StoredEvent
+from pycrorm_async.world.pose import Pose
+
+#
+# Read an episode's events into objects, their changes, and nodes of the plan, which all formats of robots share.
+
+_BASE = ("base.x", "base.y", "base.z", "base.qx", "base.qy", "base.qz", "base.qw")
+
+
+class EventTime(NamedTuple):
+    """An event: its sequence, the ns since the episode's first event, and the wall time in ns."""
+
+    sequence: int
+    since_ns: int
+    wall_ns: int
+
+
+class Change(NamedTuple):
+    """A change of an object of the world: its new pose (position, orientation), new joint positions, or its removal."""
+
+    when: EventTime
+    object: int
+    pose: tuple[float, ...] | None
+    joints: Mapping[str, float]
+    removed: bool = False
+    sampled: bool = False
+
+
+@dataclass(slots=True)
+class ExportedNode:
+    """A node of the plan. `label` is its type with the names of its objects; `parameters` all of them as text."""
+
+    sequence: int
+    parent: int | None
+    kind: str
+    dtype: str
+    label: str
+    parameters: str
+    start: EventTime
+    end: EventTime | None = None
+    status: str = "RUNNING"
+    reason: str | None = None
+    message: str | None = None
+
+
+@dataclass
+class RecordedEpisode:
+    """The events of an episode up to its head when it was chosen.
+
+    Attributes:
+        events: all of them, in order.
+        objects: each object's `ObjectAdded`, by identity, the sequence of that event.
+        changes: of the world, in order; an object's first one adds it.
+        nodes: in the order in which they started.
+    """
+
+    number: int
+    id: str
+    description: str = ""
+    status: str = "RUNNING"
+    started_wall_ns: int = 0
+    events: list[EventTime] = field(default_factory=list)
+    objects: dict[int, ObjectAdded] = field(default_factory=dict)
+    changes: list[Change] = field(default_factory=list)
+    nodes: list[ExportedNode] = field(default_factory=list)
+
+
+async def read_episode(
+    reading: Reading, covered: CoveredEpisode, report_events: Callable[[int], object]
+) -> RecordedEpisode:
+    """Read an episode up to the event `covered.events`. `report_events` gets the number of events read so far.
+
+    Raises `CallerError` for one without an event; `LogDamaged` or `DatabaseForeign` for an event that cannot be read.
+    """
+    log = await reading.log()
+    row = next(each for each in await log.episodes() if each.number == covered.number)
+    if covered.events == 0:
+        raise CallerError(f"the log has no event of episode {covered.number}")
+    fold = _EpisodeFold(RecordedEpisode(row.number, row.id), await log.dtypes())
+    async for page in log.pages(row._replace(head=covered.events)):
+        for event in page:
+            try:
+                fold.read(event)
+            except CannotFold as reason:
+                raise unreadable(row.id, event, str(reason), log) from None
+        report_events(page[-1].sequence)
+    return fold.episode
+
+
+class _EpisodeFold:
+    def __init__(self, episode: RecordedEpisode, dtypes: Mapping[str, str]) -> None:
+        self.episode = episode
+        self._dtypes = dtypes
+        self._begin_ns = 0
+        self._nodes: dict[int, ExportedNode] = {}
+        self._poses: dict[int, tuple[float, ...]] = {}
+
+    def read(self, event: StoredEvent) -> None:
+        happening = happening_of(event)
+        if event.sequence == 1:
+            self._begin_ns, self.episode.started_wall_ns = event.monotonic_ns, event.wall_ns
+        when = EventTime(event.sequence, event.monotonic_ns - self._begin_ns, event.wall_ns)
+        self.episode.events.append(when)
+        match happening:
+            case EpisodeStarted():
+                self.episode.description = happening.description
+            case EpisodeEnded():
+                self.episode.status = happening.status
+            case ObjectAdded():
+                self.episode.objects[event.sequence] = happening
+                pose = (*happening.pose.position, *happening.pose.orientation)
+                self._change(when, event.sequence, pose, happening.joints)
+            case ObjectMoved():
+                self._change(when, happening.object, (*happening.pose.position, *happening.pose.orientation), {})
+            case JointsMoved():
+                self._change(when, happening.object.object, None, happening.joints)
+            case StateSampled():
+                self._sampled(when, happening)
+            case ObjectRemoved():
+                self._change(when, happening.object.object, None, {}, removed=True)
+            case NodeStarted():
+                self._started(when, happening)
+            case NodeEnded():
+                self._ended(when, happening)
+
+    def _change(
+        self,
+        when: EventTime,
+        identity: int,
+        pose: tuple[float, ...] | None,
+        joints: Mapping[str, float],
+        *,
+        removed: bool = False,
+        sampled: bool = False,
+    ) -> None:
+        if identity not in self.episode.objects:
+            return
+        if pose is not None:
+            self._poses[identity] = pose
+        self.episode.changes.append(Change(when, identity, pose, joints, removed, sampled))
+
+    def _sampled(self, when: EventTime, sample: StateSampled) -> None:
+        """Apply a sample of the robot's state, which holds the channels that have changed."""
+        identity, channels = sample.object.object, sample.channels
+        before = self._poses.get(identity)
+        pose = None
+        if before is not None and not channels.keys().isdisjoint(_BASE):
+            pose = tuple(channels.get(name, value) for name, value in zip(_BASE, before, strict=True))
+        joints = {name: value for name, value in channels.items() if name not in _BASE}
+        self._change(when, identity, pose, joints, sampled=True)
+
+    def _started(self, when: EventTime, started: NodeStarted) -> None:
+        dtype = self._dtypes.get(started.designator or "", "") or started.kind
+        named = with_object_names(started.parameters, self._name_of)
+        names = [each["name"] for key, each in named.items() if each is not started.parameters[key]]
+        node = ExportedNode(
+            when.sequence,
+            started.parent,
+            started.kind,
+            dtype,
+            " ".join([dtype, *names]),
+            parameters_text(named),
+            when,
+        )
+        self._nodes[when.sequence] = node
+        self.episode.nodes.append(node)
+
+    def _name_of(self, reference: Mapping[str, int]) -> str | None:
+        added = self.episode.objects.get(reference["object"])
+        return added.name if added is not None else None
+
+    def _ended(self, when: EventTime, ended: NodeEnded) -> None:
+        if (node := self._nodes.get(ended.node)) is None:
+            raise CannotFold(f"node {ended.node} ends and never started")
+        node.status = ended.status
+        node.end = when if ended.status != "LOST" else None
+        if ended.failure is not None:
+            node.reason, node.message = ended.failure.type.rpartition(".")[2], ended.failure.message
+
+
+# === states ===================================================================================================
+#
+# Make the frames of an episode: the robot's base and joints, by event or at a fixed rate, and the running action.
+#
+# By event there is a frame for each event that changed the robot's state, because a plan whose motions are jumps takes
+# a third of a second for 70 nodes. By time there is a frame at a fixed rate, with the latest state, samples included.
+
+Clock: TypeAlias = Literal["event", "time"]
+"""The axis of the frames."""
+
+BASE = ("base.x", "base.y", "base.z", "base.qx", "base.qy", "base.qz", "base.qw")
+IDLE = "idle"
+"""The subtask while no action runs."""
+_FRAMES_MAX = 10_000_000
+"""Bounds the frames of an episode by time, because a wrong rate could fill the disk."""
+_SECOND_NS = 10**9
+
+
+class Frames(NamedTuple):
+    """The frames of an episode.
+
+    Attributes:
+        robot: the model of the robot, or its name.
+        channels: names of the numbers of a state: 7 of the base (m, quaternion), then the joints (rad, m) by name.
+        states: one row for each frame.
+        at: the last event of each frame; by time at the time of the frame.
+        subtasks: the innermost running action of each frame, with the names of its objects.
+    """
+
+    robot: str
+    channels: tuple[str, ...]
+    states: NDArray[np.float32]
+    at: list[EventTime]
+    subtasks: list[str]
+
+
+def frames_of(episode: RecordedEpisode, clock: Clock, fps: int) -> Frames:
+    """Return the frames of the robot that was added first, while it was in the world.
+
+    Raises `CallerError` for an episode without a robot, or with fewer than two frames.
+    """
+    robots = [identity for identity, each in episode.objects.items() if each.object_type == "ROBOT"]
+    if not robots:
+        raise CallerError(f"episode {episode.number} has no robot, whose states LeRobot's frames are: leave it out")
+    robot = episode.objects[robots[0]]
+    channels = (*BASE, *sorted(robot.joints))
+    changed = list(_states(episode, robots[0], channels))
+    while_there = _events_with(episode, robots[0])
+    chosen = changed if clock == "event" else list(_resampled(episode.number, while_there, changed, fps))
+    if len(chosen) < 2:
+        stay_ns = while_there[-1].since_ns - while_there[0].since_ns
+        time_remedy = f"give a higher --fps, because the robot was there for {stay_ns / 1e9:.3f} s, or --clock event"
+        remedy = time_remedy if clock == "time" else "leave it out"
+        count = f"{len(chosen)} frame{'' if len(chosen) == 1 else 's'}"
+        raise CallerError(f"episode {episode.number} has {count} by {clock}, and LeRobot needs two: {remedy}")
+    at = [when for when, _ in chosen]
+    states = np.array([state for _, state in chosen], dtype=np.float32)
+    return Frames(robot.model or robot.name, channels, states, at, list(_subtasks(episode.nodes, at)))
+
+
+def _states(
+    episode: RecordedEpisode, identity: int, channels: Sequence[str]
+) -> Iterator[tuple[EventTime, tuple[float, ...]]]:
+    """Yield each event that changed the robot's state, and the state after it."""
+    index = {name: position for position, name in enumerate(channels)}
+    state = [0.0] * len(channels)
+    before: tuple[float, ...] | None = None
+    for change in episode.changes:
+        if change.object != identity:
+            continue
+        if change.removed:
+            return
+        if change.pose is not None:
+            state[: len(BASE)] = change.pose
+        for name, position in change.joints.items():
+            if name in index:
+                state[index[name]] = position
+        now = tuple(state)
+        if now != before:
+            before = now
+            yield change.when, now
+
+
+def _events_with(episode: RecordedEpisode, identity: int) -> list[EventTime]:
+    """Return the events from the one that added the robot to the last one before its removal."""
+    removals = (each.when.sequence for each in episode.changes if each.removed and each.object == identity)
+    removal = next(removals, None)
+    return [each for each in episode.events if identity <= each.sequence and (not removal or each.sequence < removal)]
+
+
+def _resampled(
+    episode: int, events: Sequence[EventTime], changed: Sequence[tuple[EventTime, tuple[float, ...]]], fps: int
+) -> Iterator[tuple[EventTime, tuple[float, ...]]]:
+    """Yield the last event and the state in force at each multiple of 1 / fps, from the first event to the last."""
+    begin_ns, end_ns = events[0].since_ns, events[-1].since_ns
+    count = (end_ns - begin_ns) * fps // _SECOND_NS + 1
+    if count > _FRAMES_MAX:
+        raise CallerError(f"episode {episode} would have {count:,} frames at {fps} per second: give a lower --fps")
+    event = state = 0
+    for frame in range(count):
+        since_ns = begin_ns + frame * _SECOND_NS // fps
+        while event + 1 < len(events) and events[event + 1].since_ns <= since_ns:
+            event += 1
+        while state + 1 < len(changed) and changed[state + 1][0].sequence <= events[event].sequence:
+            state += 1
+        yield events[event]._replace(since_ns=since_ns), changed[state][1]
+
+
+def _subtasks(nodes: Sequence[ExportedNode], at: Sequence[EventTime]) -> Iterator[str]:
+    """Yield the label of the action that was running last at each of these events."""
+    actions = [each for each in nodes if each.kind == "action"]
+    running: list[tuple[int, ExportedNode]] = []  # the one that started last comes first
+    started = 0
+    for when in at:
+        while started < len(actions) and actions[started].sequence <= when.sequence:
+            heapq.heappush(running, (-actions[started].sequence, actions[started]))
+            started += 1
+        while running and (end := running[0][1].end) is not None and end.sequence <= when.sequence:
+            heapq.heappop(running)
+        yield running[0][1].label if running else IDLE
+
+
+# === mcap file ================================================================================================
+#
+# Write an episode as MCAP with Foxglove's schemas: `/tf`, `/scene`, `/plan`.
+#
+# `/tf` has a `FrameTransforms` for each event that moved objects or joints, `/scene` a `SceneUpdate` with the shapes of
+# each object, in the frames of its links, and the deletion when it is removed, and `/plan` a `Log` for the start and
+# the end of each node. The time of a message is the wall time of its event, or, by event, `fps` events in a second; its
+# sequence is that of the event.
+
+_TOPICS = {"/tf": "FrameTransforms", "/scene": "SceneUpdate", "/plan": "Log"}
+
+
+class _Message(NamedTuple):
+    """A message of a topic. `content` makes the message from its time stamp, which depends on the clock."""
+
+    when: EventTime
+    topic: str
+    content: Callable[[Any], Any]
+
+
+def write_mcap(
+    episode: RecordedEpisode,
+    objects: dict[int, SceneObject],
+    path: Path,
+    report_events: Callable[[int], object],
+    *,
+    clock: Clock,
+    fps: int,
+) -> int:
+    """Write the file and return the number of messages.
+
+    Args:
+        report_events: gets the event up to which the messages are written.
+        clock: the axis of the messages: `time`, the wall time of each event, or `event`, `fps` events in a second.
+
+    Raises `MissingExtra`.
+    """
+    try:
+        from foxglove import messages
+        from mcap.writer import Writer
+    except ImportError:
+        raise MissingExtra("MCAP files need mcap and foxglove-sdk: pip install 'pycrorm-async[mcap]'") from None
+
+    count = 0
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile="", library="pycrorm-async")
+        writer.add_metadata("episode", _metadata(episode))
+        channels = {topic: _channel(writer, topic, getattr(messages, name)) for topic, name in _TOPICS.items()}
+        for each in sorted(_messages(episode, objects, messages), key=lambda message: message.when.sequence):
+            since_ns = each.when.sequence * _SECOND_NS // fps
+            time_ns = each.when.wall_ns if clock == "time" else episode.started_wall_ns + since_ns
+            stamped = each.content(messages.Timestamp(sec=time_ns // _SECOND_NS, nsec=time_ns % _SECOND_NS))
+            writer.add_message(channels[each.topic], time_ns, stamped.encode(), time_ns, each.when.sequence)
+            count += 1
+            if count % REPORTED_CHANGES == 0:
+                report_events(each.when.sequence)
+        writer.finish()
+    return count
+
+
+def _metadata(episode: RecordedEpisode) -> dict[str, str]:
+    return {
+        "number": str(episode.number),
+        "id": episode.id,
+        "description": episode.description,
+        "status": episode.status,
+    }
+
+
+def _channel(writer: Any, topic: str, kind: Any) -> int:
+    schema = kind.get_schema()
+    registered = writer.register_schema(schema.name, schema.encoding, schema.data)
+    channel: int = writer.register_channel(topic, "protobuf", registered)
+    return channel
+
+
+def _messages(episode: RecordedEpisode, objects: dict[int, SceneObject], kinds: Any) -> Iterator[_Message]:
+    for when, changes in groupby(frame_changes(episode, objects), key=lambda each: each.when):
+        yield _Message(when, "/tf", partial(_transforms, kinds, list(changes)))
+    yield from _scene(episode, objects, kinds)
+    yield from _plan(episode, kinds)
+
+
+def _transforms(kinds: Any, changes: list[FrameChange], stamp: Any) -> Any:
+    return kinds.FrameTransforms(
+        transforms=[
+            kinds.FrameTransform(
+                timestamp=stamp,
+                parent_frame_id=each.parent,
+                child_frame_id=each.child,
+                translation=_vector(kinds, each.translation),
+                rotation=_rotation(kinds, each.rotation),
+            )
+            for each in changes
+        ]
+    )
+
+
+def _scene(episode: RecordedEpisode, objects: dict[int, SceneObject], kinds: Any) -> Iterator[_Message]:
+    seen: set[int] = set()
+    for change in episode.changes:
+        shapes = {frame: each for frame, each in objects[change.object].shapes.items() if each}
+        if change.removed:
+            yield _Message(change.when, "/scene", partial(_deletion, kinds, list(shapes)))
+        elif change.object not in seen:
+            seen.add(change.object)
+            yield _Message(change.when, "/scene", partial(_entities, kinds, shapes))
+
+
+def _deletion(kinds: Any, names: list[str], stamp: Any) -> Any:
+    return kinds.SceneUpdate(deletions=[kinds.SceneEntityDeletion(timestamp=stamp, id=name) for name in names])
+
+
+def _entities(kinds: Any, shapes: dict[str, list[Shape]], stamp: Any) -> Any:
+    return kinds.SceneUpdate(entities=[_entity(kinds, stamp, frame, each) for frame, each in shapes.items()])
+
+
+def _entity(kinds: Any, stamp: Any, frame: str, shapes: list[Shape]) -> Any:
+    cubes, cylinders, spheres = [], [], []
+    for each in shapes:
+        pose = kinds.Pose(position=_vector(kinds, each.translation), orientation=_rotation(kinds, each.rotation))
+        color = kinds.Color(**dict(zip("rgba", each.color, strict=True)))
+        match each.kind, each.sizes:
+            case "box", edges:
+                cubes.append(kinds.CubePrimitive(pose=pose, size=_vector(kinds, edges), color=color))
+            case "sphere", (radius,):
+                size = _vector(kinds, (2 * radius,) * 3)
+                spheres.append(kinds.SpherePrimitive(pose=pose, size=size, color=color))
+            case _, (radius, length):  # a capsule is shown as the cylinder between its ends
+                size = _vector(kinds, (2 * radius, 2 * radius, length))
+                cylinders.append(
+                    kinds.CylinderPrimitive(pose=pose, size=size, bottom_scale=1, top_scale=1, color=color)
+                )
+    return kinds.SceneEntity(
+        timestamp=stamp,
+        frame_id=frame,
+        id=frame,
+        frame_locked=True,
+        cubes=cubes,
+        cylinders=cylinders,
+        spheres=spheres,
+    )
+
+
+def _plan(episode: RecordedEpisode, kinds: Any) -> Iterator[_Message]:
+    for node in episode.nodes:
+        line, level = partial(_line, kinds, node.label), kinds.LogLevel.Info
+        yield _Message(node.start, "/plan", partial(line, level, f"{node.dtype} started {node.parameters}".rstrip()))
+        if node.end is not None:
+            level = kinds.LogLevel.Error if node.status in ("FAILED", "ERROR") else level
+            reason = f" {node.reason}: {node.message}" if node.reason else ""
+            yield _Message(node.end, "/plan", partial(line, level, f"{node.dtype} {node.status}{reason}"))
+
+
+def _line(kinds: Any, name: str, level: Any, text: str, stamp: Any) -> Any:
+    return kinds.Log(timestamp=stamp, level=level, message=text, name=name)
+
+
+def _vector(kinds: Any, values: tuple[float, ...]) -> Any:
+    x, y, z = values
+    return kinds.Vector3(x=x, y=y, z=z)
+
+
+def _rotation(kinds: Any, values: tuple[float, ...]) -> Any:
+    x, y, z, w = values
+    return kinds.Quaternion(x=x, y=y, z=z, w=w)
+
+
+# === rerun file ===============================================================================================
+#
+# Write an episode as a rerun recording: boxes, cylinders and spheres in a tree of frames, and the plan as a log.
+#
+# The timelines are `event`, the sequence of the event, and `time`, since the episode's start. All changes of one frame
+# are one column (`send_columns`), so that a recording is small and opens at once.
+
+_APPLICATION = "pycrorm"
+
+
+def write_rerun(
+    episode: RecordedEpisode, objects: dict[int, SceneObject], path: Path, report_events: Callable[[int], object]
+) -> int:
+    """Write the file and return the number of changes in it. `report_events` gets the event of the latest change.
+
+    Raises `MissingExtra`; `OSError` if the disk is full.
+    """
+    os.environ.setdefault("RERUN_ANALYTICS", "0")  # its first start would print a notice and ask a server
+    try:
+        import rerun as rr
+    except ImportError:
+        raise MissingExtra("rerun recordings need rerun-sdk: pip install 'pycrorm-async[rerun]'") from None
+
+    recording = rr.RecordingStream(_APPLICATION, recording_id=episode.id)
+    # Not `save`, whose thread only logs that the disk is full. The changes below take more memory than the file.
+    encoded = recording.memory_recording()
+    recording.send_recording_name(f"episode {episode.number}: {episode.description}")
+    recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    entities: dict[str, str] = {MAP: "world"}
+    changes: dict[str, list[FrameChange]] = {}
+    count = 0
+    for each in frame_changes(episode, objects):
+        entities.setdefault(each.child, f"{entities[each.parent]}/{_part(each.child)}")
+        changes.setdefault(each.child, []).append(each)
+        count += 1
+        if count % REPORTED_CHANGES == 0:
+            report_events(each.when.sequence)
+    for frame, moved in changes.items():
+        recording.send_columns(
+            entities[frame],
+            indexes=_indexes(rr, [each.when for each in moved]),
+            columns=rr.Transform3D.columns(
+                translation=[each.translation for each in moved], quaternion=[each.rotation for each in moved]
+            ),
+        )
+    for identity, when in _added(episode).items():
+        recording.set_time("event", sequence=when.sequence)
+        recording.set_time("time", duration=when.since_ns / 1e9)
+        for frame, shapes in objects[identity].shapes.items():
+            _log_shapes(rr, recording, entities[frame], shapes)
+    recording.reset_time()
+    count += _send_removals(rr, recording, episode, objects, entities)
+    count += _send_plan(rr, recording, episode)
+    recording.flush()
+    path.write_bytes(encoded.drain_as_bytes())
+    recording.disconnect()
+    return count
+
+
+def _part(frame: str) -> str:
+    """Return the last part of an entity path, without the characters that have a meaning in rerun."""
+    return "".join(each if each.isalnum() or each in "_-." else "_" for each in frame.rpartition("/")[2])
+
+
+def _indexes(rr: Any, whens: Sequence[EventTime]) -> list[Any]:
+    return [
+        rr.TimeColumn("event", sequence=[each.sequence for each in whens]),
+        rr.TimeColumn("time", duration=[each.since_ns / 1e9 for each in whens]),
+    ]
+
+
+def _added(episode: RecordedEpisode) -> dict[int, EventTime]:
+    """Return the event that added each object."""
+    added: dict[int, EventTime] = {}
+    for each in episode.changes:
+        added.setdefault(each.object, each.when)
+    return added
+
+
+def _log_shapes(rr: Any, recording: Any, entity: str, shapes: Sequence[Shape]) -> None:
+    """Log the shapes of a frame at the set time, and not as static, because static ones cannot be cleared."""
+    by_kind: dict[str, list[Shape]] = {}
+    for each in shapes:
+        by_kind.setdefault(each.kind, []).append(each)
+    for kind, members in by_kind.items():
+        placed: Mapping[str, Any] = {
+            "centers": [each.translation for each in members],
+            "quaternions": [each.rotation for each in members],
+            "colors": [each.color for each in members],
+            "fill_mode": "solid",
+        }
+        sizes = [each.sizes for each in members]
+        match kind:
+            case "box":
+                shown = rr.Boxes3D(half_sizes=[[edge / 2 for edge in each] for each in sizes], **placed)
+            case "sphere":
+                shown = rr.Ellipsoids3D(half_sizes=[[each[0]] * 3 for each in sizes], **placed)
+            case _:  # a capsule is shown as the cylinder between its ends
+                shown = rr.Cylinders3D(radii=[each[0] for each in sizes], lengths=[each[1] for each in sizes], **placed)
+        recording.log(f"{entity}/shape_{kind}", shown)
+
+
+def _send_removals(
+    rr: Any, recording: Any, episode: RecordedEpisode, objects: Mapping[int, SceneObject], entities: Mapping[str, str]
+) -> int:
+    """Make an object vanish at the event that removed it, and count the removals; not at the end of the episode.
+
+    Leaving a world removes all its objects, and a recording that ends with an empty scene shows nothing when opened.
+    """
+    last = max((each.when.sequence for each in episode.changes if not each.removed), default=0)
+    removals = [each for each in episode.changes if each.removed and each.when.sequence < last]
+    for each in removals:
+        entity = entities[objects[each.object].name]
+        recording.send_columns(entity, indexes=_indexes(rr, [each.when]), columns=rr.Clear.columns(is_recursive=[True]))
+    return len(removals)
+
+
+def _send_plan(rr: Any, recording: Any, episode: RecordedEpisode) -> int:
+    """Send a line for each start and end of a node; return their number."""
+    lines: list[tuple[EventTime, str, str]] = []
+    for node in episode.nodes:
+        lines.append((node.start, "INFO", f"{node.dtype} started {node.parameters}".rstrip()))
+        if node.end is not None:
+            failed = node.status in ("FAILED", "ERROR")
+            text = f"{node.dtype} {node.status}" + (f" {node.reason}: {node.message}" if node.reason else "")
+            lines.append((node.end, "ERROR" if failed else "INFO", text))
+    lines.sort(key=lambda each: each[0].sequence)
+    if lines:
+        recording.send_columns(
+            "plan",
+            indexes=_indexes(rr, [when for when, _, _ in lines]),
+            columns=rr.TextLog.columns(text=[text for _, _, text in lines], level=[level for _, level, _ in lines]),
+        )
+    return len(lines)
+
+
+# === scene frames =============================================================================================
+#
+# Turn the changes of an episode's world into frames: one for each object and link, each in that of its parent.
+#
+# `map` is the frame of the world, `milk` that of the object, `pr2/torso_lift_link` that of a link. A second object of
+# the same name is `milk#51`, with the event that added it. A joint that moves changes the frame of its child link
+# alone.
+
+MAP = "map"
+REPORTED_CHANGES = 100
+"""A writer reports its progress after so many changes or messages: to draw a bar takes longer than to write one."""
+_GREY = (0.6, 0.6, 0.6, 1.0)
+"""The colour of a shape without one."""
+
+
+class FrameChange(NamedTuple):
+    """A frame has a new pose in its parent: translation (m) and quaternion xyzw."""
+
+    when: EventTime
+    parent: str
+    child: str
+    translation: tuple[float, float, float]
+    rotation: tuple[float, float, float, float]
+
+
+class Shape(NamedTuple):
+    """A shape in the frame of a link: kind (box, cylinder, capsule, sphere), sizes (m), pose and colour.
+
+    The sizes of a box are its three edges, of a cylinder and a capsule radius and length, of a sphere the radius.
+    """
+
+    kind: str
+    sizes: tuple[float, ...]
+    translation: tuple[float, float, float]
+    rotation: tuple[float, float, float, float]
+    color: tuple[float, float, float, float]
+
+
+class SceneObject:
+    """An object of the world with its model.
+
+    Args:
+        model: root link, shapes by link, and joints, as `query.scene.object_model.object_model` returns them.
+        base_link: the link whose pose is recorded; None means the root link.
+        color: of all its shapes; None means each shape's own.
+
+    Attributes:
+        name: of its frame.
+        parents: the frame that each of its links' frames is in, by link; that of the root link is in the object's own.
+        shapes: by frame.
+    """
+
+    def __init__(self, name: str, model: Mapping[str, Any], base_link: str | None, color: Any) -> None:
+        self.name = name
+        self._model = model
+        self._base_link = base_link
+        self._joints: dict[str, float] = {}
+        self._pose = Pose([0, 0, 0])
+        self.shapes = {
+            self.frame(link): [_shape(each, color) for each in shapes] for link, shapes in model["shapes"].items()
+        }
+
+    def frame(self, link: str) -> str:
+        """Return the name of the frame of a link; the root link has that of the object."""
+        return self.name if link == self._model["root"] else f"{self.name}/{link}"
+
+    def changes(self, change: Change, *, is_first: bool) -> Iterator[FrameChange]:
+        """Yield the frames that a change of this object gives new poses, and for its first one those of all links.
+
+        Where the recorded pose is that of another link than the root, a joint between the two also moves the root.
+        """
+        self._joints.update(change.joints)
+        if change.pose is not None:
+            self._pose = Pose(change.pose[:3], change.pose[3:])
+        if change.pose is not None or (self._base_link is not None and change.joints):
+            root = link_frames(self._model, self._pose, self._joints, self._base_link)[self._model["root"]]
+            yield FrameChange(change.when, MAP, self.name, *_parts(root))
+        for joint in self._model["joints"]:
+            name, _, parent, child, *_, mimic = joint
+            moves = name in change.joints or (mimic is not None and mimic[0] in change.joints)
+            if is_first or moves:
+                frame = joint_frame(joint, self._joints)
+                yield FrameChange(change.when, self.frame(parent), self.frame(child), *_parts(frame))
+
+
+async def scene_objects(reading: Reading, episode: RecordedEpisode) -> dict[int, SceneObject]:
+    """Return the objects of an episode by identity, with their recorded, assumed or missing shapes."""
+    log = await reading.log()
+    fingerprints = {each.description for each in episode.objects.values() if each.description is not None}
+    models: dict[str, Mapping[str, Any]] = {}
+    for name, payload in (await log.descriptions(fingerprints)).items():
+        try:
+            models[name] = object_model(description_of(payload))
+        except ValueError as error:
+            models[name] = point_model(f"its description cannot be read: {error}")
+    objects: dict[int, SceneObject] = {}
+    names: set[str] = set()
+    for identity, added in episode.objects.items():
+        if added.description is None:
+            model: Mapping[str, Any] = assumed_model(added.name, added.object_type, set(added.joints))
+        else:
+            model = models.get(added.description) or point_model("its description is not in the log")
+        name = added.name.replace("/", "_")
+        name = f"{name}#{identity}" if name in names else name
+        names.add(name)
+        objects[identity] = SceneObject(name, model, added.base_link, added.color)
+    return objects
+
+
+def frame_changes(episode: RecordedEpisode, objects: Mapping[int, SceneObject]) -> Iterator[FrameChange]:
+    """Yield every change of a frame, in the order of the events."""
+    seen: set[int] = set()
+    for change in episode.changes:
+        if not change.removed:
+            yield from objects[change.object].changes(change, is_first=change.object not in seen)
+            seen.add(change.object)
+
+
+def _shape(shape: Sequence[Any], color: Sequence[float] | None) -> Shape:
+    kind, sizes, xyz, rpy, own = shape
+    translation, rotation = _parts(placed(xyz, rpy))
+    red, green, blue, opacity = color or own or _GREY
+    return Shape(kind, tuple(sizes), translation, rotation, (red, green, blue, opacity))
+
+
+def _parts(frame: Frame) -> tuple[tuple[float, float, float], tuple[float, float, float, float]]:
+    """Return translation and quaternion xyzw of a frame."""
+    x, y, z = (float(each) for each in frame[:3, 3])
+    return (x, y, z), _quaternion(frame)
+
+
+def _quaternion(frame: Frame) -> tuple[float, float, float, float]:
+    turn = frame[:3, :3]
+    # The largest of the four is computed first, because dividing by a small one would lose digits.
+    squares = [1 + np.trace(turn), *(1 + 2 * turn[each, each] - np.trace(turn) for each in range(3))]
+    largest = int(np.argmax(squares))
+    twice = math.sqrt(squares[largest])
+    if largest == 0:
+        parts = [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
+        x, y, z = (float(each) / twice / 2 for each in parts)
+        return x, y, z, twice / 2
+    first = largest - 1
+    second, third = (first + 1) % 3, (first + 2) % 3
+    vector = [0.0, 0.0, 0.0]
+    vector[first] = twice / 2
+    vector[second] = float(turn[second, first] + turn[first, second]) / twice / 2
+    vector[third] = float(turn[third, first] + turn[first, third]) / twice / 2
+    return vector[0], vector[1], vector[2], float(turn[third, second] - turn[second, third]) / twice / 2

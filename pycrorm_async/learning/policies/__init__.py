@@ -1,1 +1,0 @@
-"""Fit, sample, store and draw policies for move-and-pick-up."""

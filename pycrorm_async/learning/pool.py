@@ -1,0 +1,339 @@
+"""Perform rollouts in several worker processes, each with its own world and recorder, and drain their recorders.
+
+Theory of operation
+-------------------
+
+The caller's process holds a `Workers` object, one `_Worker` per worker process, and one task that runs the daemon. Each
+worker process is forked from a fork server (`processes`) and connected by one pipe. With a `MemoryLocation` each worker
+opens a memory with ``writer="daemon"``: it writes to its own folder in the spool, and the daemon task drains all of
+them into the database. Without one nothing is recorded, and no daemon runs; the rollouts are the same. Seed and index
+alone determine a rollout, so it does not matter which worker performs it.
+
+The parent sends ``job`` (scene, policy, seed), ``run`` (first index, length), ``flush`` and ``stop``. A worker answers
+a run with ``so far`` messages, at most one per 0.2 s, and one ``done``; it answers a flush with ``flushed``; an
+exception ends the worker with ``failed``. A worker has at most one run at a time, and while it has one the parent
+sends it nothing but ``stop``. Therefore the worker does not read the pipe during a run: any pending message, and also
+the end of file after the parent has closed the pipe or died, makes ``poll`` true and ends the run after the current
+rollout.
+
+A `Workers` object performs one job at a time (`_is_free`). After an interrupted or failed job it accepts no other,
+because answers to the old job may still be in the pipes.
+
+A worker that dies closes its end of the pipe; the parent reads the end of file and raises `WorkerLost`. Its finished
+rollouts survive in its spool folder, which the daemon adopts and drains. If the parent dies, every worker reads the end
+of file, ends its run and closes its memory; the next `recover` or daemon drains the folders. Workers ignore the signals
+of a terminal (`processes`): the parent alone handles them and stops the workers.
+
+At exit the parent closes the pipes, waits for the processes in a thread so that the daemon keeps draining meanwhile,
+and stops the daemon last. Only one daemon drains a spool: while another holds it (`SpoolTaken`), the task retries every
+second and takes over when that one ends, so that a flush always has a daemon to wait for.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextvars
+import logging
+import signal
+import time
+from collections.abc import AsyncIterator, Callable, Iterable
+from contextlib import AsyncExitStack, asynccontextmanager, suppress
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, Self
+
+from pycrorm_async.errors import CallerError, DatabaseUnavailable, PycrormError, SpoolTaken
+from pycrorm_async.learning.policy import Policy, name_of
+from pycrorm_async.learning.rollouts import MoveAndPickUp, Scene, Tally, batch_rollout
+from pycrorm_async.memory import Memory
+from pycrorm_async.operations.daemon import serve
+from pycrorm_async.operations.workers import ChildProcess
+from pycrorm_async.settings import Settings
+
+ROLLOUTS_PER_RUN = 500
+"""Rollouts in one run of a worker, which is one episode: enough to make the cost of building the world negligible."""
+_PROGRESS_INTERVAL_S = 0.2
+"""The shortest time in s between two reports of progress."""
+_POLL_INTERVAL_S = 0.02
+"""The pause in s between two looks at the results of the workers."""
+_TAKEOVER_INTERVAL_S = 1.0
+"""Time between attempts to drain the spool while another daemon drains it."""
+SETTINGS = Settings(flush_timeout_s=120)
+"""Workers wait longer than usual in `flush`, because one daemon drains and folds the records of all of them."""
+_log = logging.getLogger(__name__)
+
+
+class WorkerLost(PycrormError):
+    """A worker process died or raised; its finished rollouts are recorded."""
+
+
+@dataclass(frozen=True)
+class MemoryLocation:
+    """The database URL and the spool that rollouts are recorded to; without a spool, the URL's default one."""
+
+    url: str
+    spool: Path | None = None
+
+
+@dataclass(frozen=True)
+class Job:
+    """The parameters that the rollouts of one `roll_out` share.
+
+    Attributes:
+        recorded: whether rollouts are recorded.
+        episode_each: whether each rollout is an episode; otherwise each run is one.
+    """
+
+    scene: Scene
+    policy: Policy
+    seed: int
+    recorded: bool = True
+    episode_each: bool = False
+
+
+class Workers:
+    """A pool of worker processes that perform rollouts.
+
+    The processes import the main module, so a script must use the pool below `if __name__ == "__main__":`.
+
+    >>> async with Workers(2, MemoryLocation("sqlite:///learn.db")) as workers:
+    ...     tally = await workers.roll_out(Job(Scene(), default_policy(), seed=69), [(0, 500), (500, 500)])
+    """
+
+    def __init__(self, count: int, place: MemoryLocation | None) -> None:
+        """Raise `CallerError` if count < 1."""
+        if count < 1:
+            raise CallerError(f"worker count must be >= 1, got {count}")
+        self._count = count
+        self._place = place
+        self._workers: list[_Worker] = []
+        self._is_free = False
+        self._stack = AsyncExitStack()
+        self._check_daemon: Callable[[], None] = lambda: None
+
+    async def __aenter__(self) -> Self:
+        try:
+            if self._place is not None:
+                self._check_daemon = await self._stack.enter_async_context(_run_daemon(self._place))
+            for _ in range(self._count):
+                process = ChildProcess.start(_run_worker, "pycrorm rollouts", self._place, dies_with_parent=False)
+                self._workers.append(_Worker(process))
+            self._is_free = True
+        except BaseException:
+            await self._close()
+            raise
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self._close()
+
+    async def _close(self) -> None:
+        """Close the pipes, wait until the workers have closed their memories and exited, then stop the daemon."""
+        self._is_free = False
+        for worker in self._workers:
+            worker.close()
+        for worker in self._workers:
+            await asyncio.to_thread(worker.join)
+        await self._stack.aclose()
+
+    async def roll_out(
+        self, job: Job, runs: Iterable[tuple[int, int]], report: Callable[[Tally], None] = lambda _: None
+    ) -> Tally:
+        """Perform the runs of indexes (first, length); return when all are performed and, if recorded, visible.
+
+        On cancellation the workers stop after their current rollout; finished rollouts are recorded.
+
+        Raises:
+            WorkerLost: a worker died or raised; finished rollouts are recorded.
+            CallerError: the workers are not started, perform another job, or were interrupted in one.
+        """
+        if not self._is_free:
+            raise CallerError("workers do one job at a time, and none after an interrupted job: start new workers")
+        self._is_free = False
+        pending_runs = iter(runs)
+        tallies = {worker: Tally() for worker in self._workers}
+        ended = Tally()
+        for worker in self._workers:
+            worker.send(("job", job))
+        busy = {worker for worker in self._workers if worker.send_run(next(pending_runs, None))}
+        try:
+            while busy:
+                for worker in [each for each in busy if each.has_message]:
+                    kind, tally = worker.receive()
+                    tallies[worker] = tally
+                    if kind == "done":
+                        ended, tallies[worker] = ended + tally, Tally()
+                        if not worker.send_run(next(pending_runs, None)):
+                            busy.discard(worker)
+                    report(sum(tallies.values(), ended))
+                self._check_daemon()
+                await asyncio.sleep(_POLL_INTERVAL_S)
+        except BaseException:
+            for worker in busy:
+                worker.send(("stop", None))
+            raise
+        if job.recorded:
+            await self._flush()
+        self._is_free = True
+        return ended
+
+    async def _flush(self) -> None:
+        for worker in self._workers:
+            worker.send(("flush", None))
+        for worker in self._workers:
+            while not worker.has_message:
+                self._check_daemon()
+                await asyncio.sleep(_POLL_INTERVAL_S)
+            worker.receive()
+
+
+class _Worker:
+    """One worker process and the parent's end of its pipe."""
+
+    def __init__(self, process: ChildProcess) -> None:
+        self._process = process
+        self._pipe = process.connection
+        self.close = self._pipe.close
+        self.join = process.process.join
+
+    @property
+    def has_message(self) -> bool:
+        return self._pipe.poll()
+
+    def send(self, message: tuple[str, Any]) -> None:
+        with suppress(OSError):  # a dead worker: the next `receive` raises WorkerLost
+            self._pipe.send(message)
+
+    def send_run(self, run: tuple[int, int] | None) -> bool:
+        """Send the run, if there is one, and return whether there was one."""
+        if run is not None:
+            self.send(("run", run))
+        return run is not None
+
+    def receive(self) -> tuple[str, Tally]:
+        try:
+            kind, answer = self._pipe.recv()
+        except (EOFError, OSError):
+            self.join()
+            ending = _describe_exit(self._process.process.exitcode)
+            raise WorkerLost(f"a rollout worker {ending}; its finished rollouts are recorded") from None
+        if kind == "failed":
+            raise WorkerLost(f"a rollout worker failed: {answer}; its finished rollouts are recorded")
+        return kind, answer
+
+
+def _describe_exit(code: int | None) -> str:
+    if code is None or code >= 0:
+        return f"ended with exit code {code}"
+    return f"was killed by {signal.Signals(-code).name}"
+
+
+@asynccontextmanager
+async def _run_daemon(place: MemoryLocation) -> AsyncIterator[Callable[[], None]]:
+    """Drain the workers' recorders until the context ends, except while another daemon drains the spool.
+
+    Yields a function that raises the exception that ended the daemon, if one did. Raises as `serve` does.
+    """
+    stop, ready = asyncio.Event(), asyncio.Event()
+
+    def check() -> None:
+        if task.done():
+            task.result()
+
+    task = asyncio.create_task(_drain(place, stop, ready), name="pycrorm daemon")
+    task.add_done_callback(lambda _: ready.set())
+    try:
+        await ready.wait()
+        check()
+        yield check
+    finally:
+        stop.set()
+        await asyncio.wait([task])
+        check()
+
+
+async def _drain(place: MemoryLocation, stop: asyncio.Event, ready: asyncio.Event) -> None:
+    """Drain until `stop` is set; set `ready` when this or another daemon drains.
+
+    Raises as `serve` does, except that it retries after `SpoolTaken` and, once ready, after `DatabaseUnavailable`.
+    """
+
+    def log(line: str) -> None:
+        _log.info(line)
+        ready.set()
+
+    while not stop.is_set():
+        try:
+            await serve(place.url, spool=place.spool, stop=stop, report=log)
+        except SpoolTaken:
+            ready.set()
+        except DatabaseUnavailable:
+            if not ready.is_set():
+                raise
+        with suppress(TimeoutError):
+            await asyncio.wait_for(stop.wait(), _TAKEOVER_INTERVAL_S)
+
+
+# --- in the worker --------------------------------------------------------------------------------------------
+
+
+def _run_worker(pipe: Connection, place: MemoryLocation | None) -> None:
+    """Serve jobs until the pipe is closed, by the parent or because the parent died."""
+    logging.disable(logging.WARNING)
+    try:
+        asyncio.run(_serve_jobs(pipe, place))
+    except Exception as error:  # noqa: BLE001  reported to the parent in one line, if the parent is alive
+        with suppress(OSError):
+            pipe.send(("failed", f"{type(error).__name__}: {error}"))
+
+
+async def _serve_jobs(pipe: Connection, place: MemoryLocation | None) -> None:
+    context_without_memory = contextvars.copy_context()  # copied before a memory is open: hooks record nothing in it
+    async with AsyncExitStack() as stack:
+        memory = None
+        if place is not None:
+            opened = Memory.open(place.url, spool=place.spool, writer="daemon", settings=SETTINGS)
+            memory = await stack.enter_async_context(opened)
+        job: Job | None = None
+        with suppress(EOFError):
+            while True:
+                kind, content = await asyncio.to_thread(pipe.recv)
+                if kind == "job":
+                    job = content
+                elif kind == "flush" and memory is not None:
+                    await memory.flush()
+                    pipe.send(("flushed", Tally()))
+                elif kind == "run" and job is not None:
+                    first, count = content
+                    run = _run(pipe, job, first, count, memory if job.recorded else None)
+                    context = contextvars.copy_context() if job.recorded else context_without_memory
+                    pipe.send(("done", await asyncio.create_task(run, context=context)))
+
+
+async def _run(pipe: Connection, job: Job, first: int, count: int, memory: Memory | None) -> Tally:
+    reported_s = time.monotonic()
+
+    def report(tally: Tally) -> None:
+        nonlocal reported_s
+        if time.monotonic() > reported_s + _PROGRESS_INTERVAL_S:
+            reported_s = time.monotonic()
+            with suppress(OSError):  # the parent is dead: `stop` sees the end of file too
+                pipe.send(("so far", tally))
+
+    async with AsyncExitStack() as stack:
+        if memory is not None and not job.episode_each:
+            description = f"rollouts {first} to {first + count - 1} under policy {name_of(job.policy)}"
+            await stack.enter_async_context(memory.episode(description=description, plan="learn", seed=job.seed))
+        stage = stack.enter_context(job.scene.entered())
+        return await batch_rollout(
+            MoveAndPickUp(stage.target, policy=job.policy),
+            count,
+            seed=job.seed,
+            first=first,
+            scene=str(job.scene),
+            reset=stage.reset,
+            each_in=memory if job.episode_each else None,
+            stop=pipe.poll,  # during a run the parent sends nothing but `stop`
+            report_progress=report,
+        )

@@ -1,1 +1,0 @@
-"""Find the class of a row, and load attributes of many objects at once."""

@@ -1,1 +1,0 @@
-"""Execute designators: create nodes, enter execution contexts, notify the observer, simulate plans."""

@@ -1,1 +1,0 @@
-"""Compute poses for grasping, opening and holding, and check whether a gripper can take an object."""

@@ -1,0 +1,881 @@
+"""Combine designators to plans: expressions, outcomes, monitors, retries and resources.
+
+**Action description.** Descriptions of actions hold alternatives for each property; `resolve()` uses the first
+alternative of each.
+
+A property with one value needs no list: `ParkArmsAction(Arms.LEFT)`. Iterating a description yields every combination,
+the last property varying fastest; those in which the arm is too weak for the object come last:
+
+>>> [each.motion.name for each in SetGripperAction([Arms.LEFT], [GripperState.OPEN, GripperState.CLOSE])]
+['OPEN', 'CLOSE']
+
+**Designator.** Designators are the performable parts of a plan: dataclasses with parameters as fields and an async
+`perform`.
+
+A user's own designator needs nothing else; every call of its `perform` creates a node of the task tree:
+
+>>> @dataclass
+... class SayingActionPerformable(ActionAbstract):
+...     text: str
+...     async def perform(self) -> None:
+...         print(self.text)
+>>> SayingActionPerformable.dtype
+'SayingAction'
+
+**Expressions.** Expressions combine actions and motions to plans: in sequence, as alternatives, in parallel,
+repeatedly.
+
+    plan = NavigateAction([place]) + (PickUpAction(milk, [Arms.LEFT], [Grasp.FRONT]) - call_operator)
+    outcome = await plan.perform()
+
+An expression is performed like an action: it is a node of the task tree, and its operands' nodes are its children. It
+returns an `Outcome`, or raises when it fails, so that a failure is visible at every level. Only plan failures count as
+outcomes; any other exception ends the whole expression. A description is resolved immediately before it is performed.
+Parallel branches that need the same part of the robot (`Designator.resources`) take turns. `Monitor` is in
+`language`, `Retry` in `retry`.
+
+**Monitor.** Monitors interrupt a plan as soon as a condition holds: `plan >> Monitor(condition)`.
+
+>>> outcome = await (NavigateAction([place]) + look >> Monitor(milk_is_visible)).perform()
+>>> outcome.interrupted
+True
+"""
+
+from __future__ import annotations
+
+import asyncio
+import copy
+import functools
+import inspect
+import itertools
+import math
+import operator
+from abc import ABC, abstractmethod
+from collections.abc import Awaitable, Callable, Generator, Iterable, Iterator, Mapping
+from contextvars import Context, copy_context
+from dataclasses import dataclass, fields
+from numbers import Real
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, NamedTuple, NoReturn, Self, TypeAlias, TypeVar
+
+from pycrorm_async.plan.execution import Arbiter, is_wrapped, wrap_perform
+from pycrorm_async.plan.failures import (
+    NOTHING,
+    IllPosedGoalFailure,
+    NoRobotHere,
+    NotALanguageExpression,
+    NotResolved,
+    PerformNotAsync,
+    PlanFailures,
+    Resource,
+    ResourcesNotAMethod,
+    describe_error,
+    is_plan_failure,
+)
+from pycrorm_async.plan.field_types import check_properties, record_arguments
+from pycrorm_async.plan.geometry import lifting_arms
+from pycrorm_async.plan.objects import ObjectDesignatorDescription, ObjectLike, require_robot
+from pycrorm_async.plan.task import (
+    ExecutionContext,
+    NodeKind,
+    current_node,
+    execution_context,
+    join_tasks,
+    raise_errors,
+)
+from pycrorm_async.task_status import TaskStatus
+from pycrorm_async.world.pose import Arms, NoWorld
+
+# === operators ================================================================================================
+#
+# Operators that combine plans: `a + b`, `a - b`, `a | b`, `a ^ b`, `a * 3`, `a >> Monitor(…)`.
+#
+# Designators and descriptions have them. Each operator creates an expression of `plan.language`, which refuses an
+# operand that is not performable immediately and names it.
+
+
+class Composable:
+    """Base of everything that can be an operand.
+
+    At run time the other operand may be any object; one that is not performable raises `NotALanguageExpression`.
+    """
+
+    __slots__ = ()
+    __array_ufunc__ = None  # numpy would otherwise turn an array times a plan into an array of plans
+
+    def __add__(self, other: Composable) -> Sequential:
+        """Perform this one, then the other."""
+        return _expressions().sequential(self, other)
+
+    def __sub__(self, other: Composable) -> TryInOrder:
+        """Perform this one, and the other only if it fails."""
+        return _expressions().try_in_order(self, other)
+
+    def __or__(self, other: Composable) -> Parallel:
+        """Perform both in parallel; both must succeed."""
+        return _expressions().parallel(self, other)
+
+    def __xor__(self, other: Composable) -> TryAll:
+        """Perform both in parallel; one must succeed."""
+        return _expressions().try_all(self, other)
+
+    def __mul__(self, times: int) -> Repeat:
+        """Perform this one `times` times."""
+        return _expressions().repeat(self, times)
+
+    __rmul__ = __mul__
+
+    def __rshift__(self, monitor: Monitor) -> Monitor:
+        """Perform this one until it ends or the monitor's condition holds."""
+        return _expressions().watch_operand(self, monitor)
+
+    # Python calls these only if the left operand lacks the operator, so it is not performable: the constructors raise.
+
+    def __radd__(self, other: Composable) -> Sequential:
+        return Composable.__add__(other, self)
+
+    def __rsub__(self, other: Composable) -> TryInOrder:
+        return Composable.__sub__(other, self)
+
+    def __ror__(self, other: Composable) -> Parallel:
+        return Composable.__or__(other, self)
+
+    def __rxor__(self, other: Composable) -> TryAll:
+        return Composable.__xor__(other, self)
+
+    def __rrshift__(self, other: Composable) -> Monitor:
+        return _expressions().watch_operand(other, self)
+
+
+class _Expressions(NamedTuple):
+    sequential: type[Sequential]
+    try_in_order: type[TryInOrder]
+    parallel: type[Parallel]
+    try_all: type[TryAll]
+    repeat: type[Repeat]
+    watch_operand: Callable[[Composable, Composable], Monitor]
+
+
+def _expressions() -> _Expressions:
+    """Import the expressions when an operator is used: they are designators, whose base class is `Composable`."""
+
+    return _Expressions(Sequential, TryInOrder, Parallel, TryAll, Repeat, watch_operand)
+
+
+# === action description =======================================================================================
+
+P = TypeVar("P")
+
+
+class ActionDescription(Composable, Generic[P]):
+    """Base of descriptions; takes the alternatives by name, in the order of the performable's fields.
+
+    Object descriptions among the alternatives are matched against the world at each resolution or iteration.
+    """
+
+    _lifting: ClassVar[tuple[str, str] | None] = None
+    """The properties that name the arm and the object that it lifts."""
+
+    def __init__(self, performable: Callable[..., P], **alternatives: Any) -> None:
+        self._performable = performable
+        self._alternatives = {name: _as_alternatives(each) for name, each in alternatives.items()}
+
+    if not TYPE_CHECKING:  # hidden from type checkers, which report the fault themselves
+
+        def __getattr__(self, name: str) -> NoReturn:
+            if name == "perform" or name in self.__dict__.get("_alternatives", ()):
+                raise NotResolved(type(self).__name__, name)
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+
+    def resolve(self) -> P:
+        """Return the performable with the first alternative of each property.
+
+        Of several arms it is the first one that lifts the object (`ArmDescription.payload_kg`), if one does.
+
+        Raises:
+            IllPosedGoalFailure: a property has no alternative.
+            ObjectNotFound: no object in the world matches the description.
+        """
+        return next(iter(self))
+
+    def __iter__(self) -> Iterator[P]:
+        """Yield every combination, the last property varying fastest. Raises as `resolve` does."""
+        choices = [self._choices(name, among) for name, among in self._alternatives.items()]
+        too_weak: list[dict[str, Any]] = []
+        for combination in itertools.product(*choices):
+            properties = dict(zip(self._alternatives, combination, strict=True))
+            if self._is_too_weak(properties):
+                too_weak.append(properties)
+            else:
+                yield self._performable(**properties)
+        for properties in too_weak:
+            yield self._performable(**properties)
+
+    def _is_too_weak(self, properties: Mapping[str, Any]) -> bool:
+        """Return whether another arm of the alternatives lifts the object and this one does not."""
+        if self._lifting is None:
+            return False
+        arm, load = self._lifting
+        arms = self._alternatives[arm]
+        return isinstance(arms, tuple) and len(arms) > 1 and properties[arm] not in _arms_for(properties[load], arms)
+
+    def _choices(self, name: str, among: ObjectDesignatorDescription | tuple[Any, ...]) -> tuple[Any, ...]:
+        if isinstance(among, ObjectDesignatorDescription):
+            return tuple(among) or (among.resolve(),)
+        if not among:
+            raise IllPosedGoalFailure(f"{type(self).__name__} has no alternative for {name}", name)
+        return among
+
+
+def _arms_for(load: ObjectLike, arms: tuple[Arms, ...]) -> tuple[Arms, ...]:
+    """Return the arms that lift the object; all of them outside a world with a robot."""
+    try:
+        return lifting_arms(require_robot(), arms, load)
+    except (NoWorld, NoRobotHere):
+        return arms
+
+
+def _as_alternatives(value: Any) -> ObjectDesignatorDescription | tuple[Any, ...]:
+    """Return the alternatives; a value that is not iterable is the only one, and so is a str."""
+    if isinstance(value, ObjectDesignatorDescription):
+        return value
+    if isinstance(value, str):
+        return (value,)
+    try:
+        alternatives = iter(value)
+    except TypeError:
+        return (value,)
+    return tuple(alternatives)
+
+
+# === designator ===============================================================================================
+
+
+class Designator(Composable, ABC):
+    """Base of everything performable; derive from `ActionAbstract` or `BaseMotion`.
+
+    Class attributes:
+        kind: the kind of its nodes.
+        dtype: its name in a memory, by default derived from the class name, also for a subclass of a class that sets
+            it, so that two types never share a name by accident. Set it to keep the name when the class is renamed.
+        aliases: a tuple of former names; queries for this type include records under them. Not inherited.
+        concept: the SOMA concept it corresponds to, if there is one.
+        orm_class: a mapped class of the user's own for queries.
+
+    Raises:
+        PerformNotAsync: at class definition, if `perform` is not a coroutine function.
+        ResourcesNotAMethod: at class definition, if `resources` is a field or a value.
+    """
+
+    kind: ClassVar[NodeKind]
+    dtype: ClassVar[str]
+    concept: ClassVar[str | None] = None
+    orm_class: ClassVar[type | None] = None
+
+    def __init_subclass__(cls, **arguments: Any) -> None:
+        super().__init_subclass__(**arguments)
+        own = vars(cls)
+        if not isinstance(own.get("dtype"), str):
+            cls.dtype = cls._name_in_memory()
+        if "resources" in own.get("__annotations__", ()) or not callable(own.get("resources", len)):
+            raise ResourcesNotAMethod(cls.__qualname__)
+        initialise = own.get("__init__")
+        if inspect.isfunction(initialise) and "__dataclass_fields__" not in own and not _is_built_in(cls):
+            cls.__init__ = record_arguments(initialise)  # type: ignore[method-assign]  # as `perform` below
+        perform = own.get("perform")
+        if perform is None or is_wrapped(perform):  # dataclass(slots=True) copies a class whose `perform` is wrapped
+            return
+        if not inspect.iscoroutinefunction(perform):
+            raise PerformNotAsync(cls.__qualname__)
+        cls.perform = wrap_perform(perform)  # type: ignore[assignment]  # the wrapper replaces the method
+
+    @classmethod
+    def _name_in_memory(cls) -> str:
+        return cls.__name__
+
+    @abstractmethod
+    async def perform(self) -> Any:
+        """Perform the designator and return when it has ended. Raises a `PlanFailure` if it fails."""
+
+    def resources(self) -> frozenset[Resource]:
+        """Return the parts of the robot it uses exclusively from start to end; nested designators declare their own."""
+        return NOTHING
+
+
+def _is_built_in(designator: type) -> bool:
+    return designator.__module__.startswith("pycrorm_async.")
+
+
+class ActionAbstract(Designator):
+    """A goal of a plan, achieved by performing motions and other actions."""
+
+    kind: ClassVar[NodeKind] = "action"
+
+    @classmethod
+    def _name_in_memory(cls) -> str:
+        """Derive the name: both `FaceAtPerformable` and `FaceAtActionPerformable` give `FaceAtAction`."""
+        stem = cls.__name__.removesuffix("Performable")
+        return stem if stem.endswith("Action") else f"{stem}Action"
+
+
+class BaseMotion(Designator):
+    """A single command to a robot's controllers. Its fields are checked when it is built.
+
+    Raises:
+        ResolutionError: names the fields that are missing or have another type than declared.
+    """
+
+    kind: ClassVar[NodeKind] = "motion"
+
+    def __post_init__(self) -> None:
+        check_properties(self)
+
+
+# === expressions ==============================================================================================
+
+Operand: TypeAlias = Designator | ActionDescription[Any]
+
+
+class Expression(Designator):
+    """Base of expressions. Operands are never modified, so one operand may occur in several places.
+
+    Attributes:
+        operands: in the order in which they were written; descriptions stay unresolved until they are performed.
+
+    Raises:
+        NotALanguageExpression: an operand is not performable, or there is no operand.
+    """
+
+    kind: ClassVar[NodeKind] = "language"
+    operands: tuple[Operand, ...] = ()
+
+    def __init__(self, *operands: Composable) -> None:
+        self.hold(self._flat(operands))
+
+    def hold(self, operands: Iterable[Composable]) -> None:
+        """Check the operands and store them."""
+        self.operands = tuple(_check_operand(each, type(self).__name__) for each in operands)
+        if not self.operands:
+            raise NotALanguageExpression(f"{type(self).__name__} needs something to perform")
+
+    @property
+    def is_complete(self) -> bool:
+        """True if it can be an operand; False for a `Monitor` without an operand."""
+        return True
+
+    def simplify(self) -> Self:
+        """Return the expression itself, for plans written for PyCRAM, which call it.
+
+        Nested expressions such as `a + (b + c)` are flattened when they are built.
+        """
+        return self
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({', '.join(name_of(each) for each in self.operands)})"
+
+    def _flat(self, operands: Iterable[Composable]) -> Iterable[Composable]:
+        for each in operands:
+            if isinstance(each, Expression) and type(each) is type(self):
+                yield from each.operands
+            else:
+                yield each
+
+
+class Sequential(Expression):
+    """`a + b`: performs the operands in sequence. Raises the first failure and skips the operands after it."""
+
+    async def perform(self) -> Outcome:
+        results = [await perform_operand(operand) for operand in self.operands]
+        return Outcome(tuple(results), tuple(range(len(results))))
+
+
+class TryInOrder(Expression):
+    """`a - b`: performs the operands in sequence until one succeeds. If none does, raises all failures as a group."""
+
+    async def perform(self) -> Outcome:
+        failures: list[Exception] = []
+        for position, operand in enumerate(self.operands):
+            result, failure = await attempt(functools.partial(perform_operand, operand))
+            if failure is None:
+                before, after = (None,) * position, (None,) * (len(self.operands) - position - 1)
+                return Outcome((*before, result, *after), (position,), tuple(failures))
+            failures.append(failure)
+            del failure
+        raise combine_failures(failures, f"none of {len(failures)} alternatives succeeded")
+
+
+class Parallel(Expression):
+    """`a | b`: performs the operands in parallel tasks and waits for all. Raises the failures, if any, as a group."""
+
+    async def perform(self) -> Outcome:
+        attempts = await _run_branches(self)
+        failures = [each.failure for each in attempts if each.failure is not None]
+        if failures:
+            count = len(attempts)
+            del attempts
+            raise combine_failures(failures, f"{len(failures)} of {count} branches failed")
+        return Outcome(tuple(each.result for each in attempts), tuple(range(len(attempts))))
+
+
+class TryAll(Expression):
+    """`a ^ b`: performs the operands in parallel, waits for all. If none succeeds, raises all failures as a group."""
+
+    async def perform(self) -> Outcome:
+        attempts = await _run_branches(self)
+        succeeded = tuple(position for position, each in enumerate(attempts) if each.failure is None)
+        failures = [each.failure for each in attempts if each.failure is not None]
+        if not succeeded:
+            del attempts
+            raise combine_failures(failures, f"none of {len(failures)} branches succeeded")
+        return Outcome(tuple(each.result for each in attempts), succeeded, tuple(failures))
+
+
+@dataclass(init=False, repr=False, eq=False)
+class Repeat(Expression):
+    """`a * 3`: performs the operand `times` times, also after a round that failed.
+
+    Raises the failures, if any, as a group after the last round. The message names the failed rounds; a single failure
+    is raised itself, with its round as a note.
+
+    Raises:
+        NotALanguageExpression: `times` is not an integer >= 0.
+    """
+
+    times: int
+
+    def __init__(self, operand: Composable, times: int) -> None:
+        try:
+            self.times = operator.index(times)
+        except TypeError:
+            self.times = -1
+        if isinstance(times, bool) or self.times < 0:
+            raise NotALanguageExpression(f"Repeat needs an integer times >= 0, got {times!r}", repr(times))
+        self.hold([operand])
+
+    async def perform(self) -> Outcome:
+        (operand,) = self.operands
+        results: list[Any] = []
+        failures: list[Exception] = []
+        failed: list[int] = []
+        for number in range(1, self.times + 1):
+            result, failure = await attempt(functools.partial(perform_operand, operand))
+            results.append(result)
+            if failure is not None:
+                failures.append(failure)
+                failed.append(number)
+            del failure
+        if failures:
+            raise self._failed(failures, failed)
+        return Outcome(tuple(results), tuple(range(self.times)), rounds=self.times)
+
+    def _failed(self, failures: list[Exception], failed: list[int]) -> Exception:
+        if len(failures) == 1:
+            failures[0].add_note(f"this was round {failed[0]} of {self.times}; the others succeeded")
+        rounds = f"{', '.join(map(str, failed[:10]))}{', …' if len(failed) > 10 else ''}"
+        return combine_failures(failures, f"{len(failed)} of {self.times} rounds failed ({rounds})")
+
+
+@dataclass(init=False, repr=False, eq=False)
+class Code(Designator):
+    """Calls a sync or async function as a node of its own and returns its result.
+
+    A sync function runs in the plan's event loop, so it must be quick.
+
+    Attributes:
+        function: the function's qualified name.
+        arguments: its arguments, each as a short repr of the moment when the `Code` was built.
+
+    Raises:
+        NotALanguageExpression: the function is not callable.
+    """
+
+    kind: ClassVar[NodeKind] = "language"
+
+    function: str
+    arguments: dict[str, str]
+
+    def __init__(self, function: Callable[..., Any], /, **arguments: Any) -> None:
+        if not callable(function):
+            raise NotALanguageExpression(f"Code needs a function, got {_short(function)}", _short(function))
+        self.function = name_of(function)
+        self.arguments = {name: _short(value) for name, value in arguments.items()}
+        self._call = functools.partial(function, **arguments)
+
+    def __repr__(self) -> str:
+        return f"Code({self.function})"
+
+    async def perform(self) -> Any:
+        result = self._call()
+        return await result if inspect.isawaitable(result) else result
+
+
+async def perform_operand(operand: Operand) -> Any:
+    """Perform an operand; resolve it first if it is a description."""
+    designator = operand if isinstance(operand, Designator) else operand.resolve()
+    if inspect.isawaitable(designator):
+        designator = await designator
+    return await _check_operand(designator, "an expression").perform()
+
+
+def name_of(value: Any) -> str:
+    """Return the name of an operand, a function or a condition."""
+    if isinstance(value, functools.partial):
+        return name_of(value.func)
+    if isinstance(value, Designator):
+        return value.dtype
+    if isinstance(value, ActionDescription):
+        return type(value).__name__
+    named = value if hasattr(value, "__qualname__") else type(value)
+    module = getattr(named, "__module__", None)
+    return f"{module}.{named.__qualname__}" if module not in (None, "builtins") else str(named.__qualname__)
+
+
+async def _run_branches(expression: Expression) -> list[Attempt]:
+    """Perform all operands in tasks of their own and return the attempts in the order of the operands.
+
+    Nested parallel expressions share the arbiter of the outermost one, so that all branches take turns with each other.
+    """
+    context = execution_context.get() or ExecutionContext()
+    if context.arbiter is None or context.arbiter.loop is not asyncio.get_running_loop():
+        context = ExecutionContext(context.watches, Arbiter())
+
+    async def branch(operand: Operand) -> Attempt:
+        execution_context.set(context)
+        return await attempt(functools.partial(perform_operand, operand))
+
+    tasks = [
+        asyncio.create_task(branch(operand), name=f"{expression.dtype} {number}: {name_of(operand)}")
+        for number, operand in enumerate(expression.operands)
+    ]
+    outside = await join_tasks(tasks)
+    try:
+        raise_errors(tasks, outside)
+        return [task.result() for task in tasks]
+    finally:
+        # The traceback of a raised exception holds this frame: break the reference cycle.
+        del tasks, outside
+
+
+def _check_operand(operand: Any, where: str) -> Any:
+    """Return the operand. Raises `NotALanguageExpression` if it is not performable."""
+    if isinstance(operand, Expression) and not operand.is_complete:
+        raise NotALanguageExpression(
+            f"this Monitor has no operand, so {where} cannot perform it: write plan >> Monitor(condition)"
+        )
+    if isinstance(operand, Designator | ActionDescription):
+        return operand
+    advice = ""
+    if callable(operand):
+        advice = ": make an instance" if isinstance(operand, type) else ": wrap it in Code(…)"
+    raise NotALanguageExpression(
+        f"{where} needs designators or descriptions of actions, got {_short(operand)}{advice}", _short(operand)
+    )
+
+
+def _short(value: Any) -> str:
+    """Return a repr of at most 100 characters. Never raises."""
+    try:
+        text = repr(value)
+    except Exception as error:  # noqa: BLE001  a user's __repr__ may raise anything
+        text = f"<{type(value).__name__}: {describe_error(error)}>"
+    return text if len(text) <= 100 else f"{text[:99]}…"
+
+
+# === outcome ==================================================================================================
+#
+# The result of an expression of the plan language, and functions that try operands and combine their failures.
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class Outcome:
+    """The outcome of an expression; a memory records `in_brief()` as the result of its node.
+
+    Attributes:
+        results: the operands' results in the order of the operands, for `Repeat` the rounds' results. None for one that
+            failed, was not tried, or was interrupted.
+        succeeded: positions, from 0, of the operands or rounds that succeeded.
+        failures: failures of the others, in the order in which they occurred.
+        rounds: number of rounds of a `Repeat`.
+        interrupted: for a `Monitor`, whether its condition held before the operand ended.
+    """
+
+    results: tuple[Any, ...] = ()
+    succeeded: tuple[int, ...] = ()
+    failures: tuple[Exception, ...] = ()
+    rounds: int | None = None
+    interrupted: bool | None = None
+
+    def __repr__(self) -> str:
+        values = ((each.name, getattr(self, each.name)) for each in fields(self))
+        return f"Outcome({', '.join(f'{name}={value!r}' for name, value in values if value not in ((), None))})"
+
+    def in_brief(self) -> dict[str, Any]:
+        """Return the outcome as plain values, without the operands' results, which are at their own nodes.
+
+        >>> Outcome(results=(None, 3), succeeded=(1,), failures=(ObjectLost("gone"),)).in_brief()
+        {'succeeded': [1], 'failures': ['ObjectLost: gone']}
+        """
+        if self.interrupted is not None:
+            return {"interrupted": self.interrupted}
+        if self.rounds is not None:
+            return {"rounds": self.rounds}
+        brief: dict[str, Any] = {"succeeded": list(self.succeeded)}
+        if self.failures:
+            brief["failures"] = [describe_error(each) for each in self.failures]
+        return brief
+
+
+class Attempt(NamedTuple):
+    """A result, or the plan failure that was raised instead."""
+
+    result: Any = None
+    failure: Exception | None = None
+
+
+async def attempt(perform: Callable[[], Any]) -> Attempt:
+    """Perform and return the result or the plan failure; any other exception propagates."""
+    try:
+        return Attempt(await perform())
+    except Exception as error:
+        if not is_plan_failure(error):
+            raise
+        return Attempt(failure=error)
+
+
+def combine_failures(failures: list[Exception], summary: str) -> Exception:
+    """Return a single failure itself, or several as `PlanFailures`, for the caller to raise.
+
+    Empties the list, because the failure's traceback holds the caller's frame and its variables: this breaks the
+    reference cycle.
+    """
+    error = (
+        failures[0] if len(failures) == 1 else PlanFailures(f"{summary}: {_list_failures(failures)}", tuple(failures))
+    )
+    failures.clear()
+    return error
+
+
+def _list_failures(failures: list[Exception]) -> str:
+    named = [describe_error(each) for each in failures[:_NAMED_MAX]]
+    more = len(failures) - len(named)
+    return "; ".join([*named, f"and {more} more"] if more else named)
+
+
+_NAMED_MAX = 10
+"""Bounds the failures that a message describes."""
+
+
+# === monitor ==================================================================================================
+
+
+@dataclass(init=False, repr=False, eq=False)
+class Monitor(Expression):
+    """Performs its operand until that ends, or interrupts it as soon as the condition holds.
+
+    Interrupted nodes and the monitor's own node end with the status INTERRUPTED. An interruption is not a failure: the
+    plan continues after the monitor. The operand's `finally` blocks run.
+
+    Args:
+        condition: evaluated in the plan's event loop, so it must be quick; an async one is awaited before each node, so
+            it must be quick too. An exception of the condition interrupts the operand, and the monitor raises it. An
+            `asyncio.Event` interrupts when it is set.
+        interval_s: time between evaluations, s; the condition is also evaluated before each node inside starts.
+
+    Attributes:
+        condition: the condition's name.
+
+    Raises:
+        NotALanguageExpression: the condition is neither callable nor an Event, or the interval is not finite and > 0.
+    """
+
+    condition: str
+    interval_s: float
+
+    def __init__(self, condition: Condition, interval_s: float = 0.1) -> None:
+        checked: object = condition
+        if not (callable(checked) or isinstance(checked, asyncio.Event)):
+            raise NotALanguageExpression(
+                f"Monitor needs a callable or an asyncio.Event, got {type(checked).__name__}: write a function that"
+                " returns whether to interrupt",
+                repr(checked),
+            )
+        if isinstance(getattr(checked, "__self__", None), asyncio.Event) and name_of(checked).endswith("Event.wait"):
+            raise NotALanguageExpression(
+                "Monitor evaluates its condition before each node, so one that waits keeps the plan from starting: pass"
+                " the Event itself, not its wait",
+                repr(checked),
+            )
+        if isinstance(interval_s, bool) or not isinstance(interval_s, Real) or not 0 < interval_s < math.inf:
+            raise NotALanguageExpression(f"Monitor needs a finite interval_s > 0, got {interval_s!r}", interval_s)
+        self.condition = name_of(condition)
+        self.interval_s = float(interval_s)
+        self._condition: Condition = condition
+
+    @property
+    def is_complete(self) -> bool:
+        return bool(self.operands)
+
+    async def perform(self) -> Outcome:
+        """Return an `Outcome` with one result, or one with `interrupted` set. Raises the operand's exceptions."""
+        if not self.operands:
+            raise NotALanguageExpression("this Monitor has no operand: write plan >> Monitor(condition)")
+        watch = Watch(self._condition)
+        task = asyncio.create_task(self._perform_watched(watch), name=f"watched by {self.condition}")
+        watch.set_task(task)
+        polling = asyncio.create_task(watch.poll(self.interval_s), name=f"asks {self.condition}")
+        try:
+            outside = await join_tasks([task])
+        finally:
+            polling.cancel()
+        outside = await join_tasks([polling]) or outside
+        try:
+            if outside is None and watch.error is not None:
+                raise watch.error
+            if outside is not None or not watch.fired or not (task.cancelled() or task.exception() is None):
+                raise_errors([task], outside)
+            if not watch.fired:
+                return Outcome(results=(task.result(),), succeeded=(0,), interrupted=False)
+            node = current_node.get()
+            assert node is not None
+            node.status = TaskStatus.INTERRUPTED
+            return Outcome(results=(None,), interrupted=True)
+        finally:
+            # The traceback of a raised exception holds this frame: break the reference cycle.
+            del outside, task, watch, polling
+
+    async def _perform_watched(self, watch: Watch) -> Any:
+        execution_context.set(watch.inner_context())
+        return await perform_operand(self.operands[0])
+
+
+def watch_operand(operand: Composable, monitor: Composable) -> Monitor:
+    """Implement `operand >> monitor`: copy the monitor and give it this operand. Raises `NotALanguageExpression`."""
+    if not isinstance(monitor, Monitor):
+        raise NotALanguageExpression(
+            f"the right operand of >> must be a Monitor, got {name_of(monitor)}", name_of(monitor)
+        )
+    if monitor.operands:
+        raise NotALanguageExpression("this Monitor has an operand already: create another Monitor for this plan")
+    monitor_copy = copy.copy(monitor)
+    monitor_copy.hold([operand])
+    return monitor_copy
+
+
+# === monitor watch ============================================================================================
+#
+# A watch evaluates a monitor's condition at intervals and before every node inside, and interrupts the monitored task.
+#
+# The evaluation before each node is necessary for plans that never suspend, because no other task could interrupt them.
+# A watch fires once, so that the cleanup of the interrupted plan is not interrupted again.
+
+Condition: TypeAlias = Callable[[], bool | Awaitable[bool]] | asyncio.Event
+
+
+class Watch:
+    """The watch of one running monitor; create it while the monitor's own node is current.
+
+    Attributes:
+        fired: whether it has interrupted the task that performs the monitor's operand.
+        error: the exception of the condition, if that caused the interruption.
+    """
+
+    def __init__(self, condition: Condition) -> None:
+        self.fired = False
+        self.error: BaseException | None = None
+        self._condition = condition
+        self._context = copy_context()
+        self._task: asyncio.Task[Any] | None = None
+
+    def set_task(self, task: asyncio.Task[Any]) -> None:
+        """Set the task to interrupt."""
+        self._task = task
+
+    def inner_context(self) -> ExecutionContext:
+        """Return the execution context for the monitor's operand."""
+        outside = self._context.get(execution_context) or ExecutionContext()
+        return ExecutionContext((*outside.watches, self), outside.arbiter, outside.claim)
+
+    async def check(self) -> None:
+        """Interrupt the task and raise `CancelledError` if the condition holds."""
+        holds, error = await self._evaluate()
+        if holds and self._fire(error):
+            raise asyncio.CancelledError("interrupted by a monitor")
+
+    async def poll(self, interval_s: float) -> None:
+        """Evaluate the condition at intervals and interrupt the task when it holds; ends then or with the task."""
+        assert self._task is not None
+        if isinstance(self._condition, asyncio.Event):
+            await self._condition.wait()
+        # A condition may swallow the cancellation with which the monitor ends this task: check the task as well.
+        while not (self.fired or self._task.done()):
+            holds, error = await self._evaluate()
+            if holds:
+                self._fire(error)
+            else:
+                await asyncio.sleep(interval_s)
+
+    async def _evaluate(self) -> tuple[bool, BaseException | None]:
+        """Return whether to interrupt, and the condition's exception if that is the cause; the monitor raises it."""
+        try:
+            return await self._holds(), None
+        except asyncio.CancelledError as raised:
+            task = asyncio.current_task()
+            if task is None or task.cancelling():
+                raise
+            return True, raised
+        except Exception as raised:  # noqa: BLE001  the monitor raises it
+            return True, raised
+
+    async def _holds(self) -> bool:
+        """Evaluate the condition in the monitor's own context.
+
+        Nodes that the condition performs belong to the monitor's node and are not watched by it. A monitor outside a
+        simulation evaluates its condition outside it too, also when a node inside the simulation starts.
+        """
+        if isinstance(self._condition, asyncio.Event):
+            return self._condition.is_set()
+        context = self._context.copy()
+        answer = context.run(self._condition)
+        if not inspect.isawaitable(answer):
+            return bool(answer)
+        return bool(await _InContext(context, answer))
+
+    def _fire(self, error: BaseException | None) -> bool:
+        """Interrupt the task and return True; return False if the watch has fired or the task has ended."""
+        task = self._task
+        if self.fired or task is None or task.done():
+            return False
+        self.fired, self.error = True, error
+        if asyncio.get_running_loop() is not task.get_loop():  # called from another thread's loop
+            task.get_loop().call_soon_threadsafe(task.cancel)
+        elif asyncio.current_task() is not task:
+            task.cancel()
+        return True
+
+
+class _InContext:
+    """Awaits an awaitable in the same task, but in another context."""
+
+    def __init__(self, context: Context, awaitable: Awaitable[Any]) -> None:
+        self._context = context
+        self._awaitable = awaitable
+
+    def __await__(self) -> Generator[Any, Any, Any]:
+        steps = self._context.run(self._awaitable.__await__)
+        step: Callable[[], Any] = functools.partial(next, steps)
+        try:
+            while True:
+                future = self._context.run(step)
+                try:
+                    yield future
+                    step = functools.partial(next, steps)
+                except BaseException as raised:  # noqa: BLE001  passed to the awaitable, for example a cancellation
+                    step = functools.partial(_throw, steps, raised)
+        except StopIteration as done:
+            return done.value
+        finally:
+            # The traceback of a thrown exception holds this frame: break the reference cycle.
+            del step
+
+
+def _throw(steps: Generator[Any, Any, Any], raised: BaseException) -> Any:
+    return steps.throw(raised)

@@ -1,1 +1,0 @@
-"""Combine designators to plans: expressions, outcomes, monitors, retries and resources."""

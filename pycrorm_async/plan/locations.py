@@ -1,0 +1,892 @@
+"""Location designators: search poses for the robot's base and for placing objects.
+
+**Designators.** Location designators search places for the robot's base or for objects, and report the search to the
+observer.
+
+`resolve()` returns the best place; iterating yields one after another. Both search in the current state of the world.
+Each resolution or iteration is reported once: the first places offered and the number of further ones, the one taken,
+the number considered, the first refused ones with the reason for each, and how many a costmap excludes.
+
+>>> stand = CostmapLocation(target=cereal, reachable_for=robot).resolve()
+>>> stand.reachable_arms
+(<Arms.LEFT: 1>,)
+
+**From experience.** Find places to pick an object up from past successes in the memory instead of by search.
+
+>>> stand = await DatabaseCostmapLocation(target=milk, reachable_for=robot).resolve()
+>>> if stand is not None:
+...     await NavigateActionPerformable(stand.pose).perform()
+...     await MoveTorsoActionPerformable(stand.torso_height).perform()
+...     await PickUpActionPerformable(milk, stand.reachable_arms[0], stand.grasp).perform()
+"""
+
+from __future__ import annotations
+
+import math
+import random
+from abc import ABC, abstractmethod
+from collections.abc import AsyncIterator, Callable, Collection, Generator, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from itertools import islice
+from typing import TYPE_CHECKING, NamedTuple, NoReturn
+
+import numpy as np
+
+from pycrorm_async.errors import CallerError
+from pycrorm_async.plan.execution import Candidate, Cells, Refusal, recorder
+from pycrorm_async.plan.failures import (
+    EnvironmentUnreachable,
+    LookingHighLevelFailure,
+    NoRobotHere,
+    NotResolved,
+    ObjectUnavailable,
+    ObjectUnreachable,
+    PlanFailure,
+    ReachabilityFailure,
+)
+from pycrorm_async.plan.field_types import check_properties
+from pycrorm_async.plan.geometry import (
+    Handle,
+    approach,
+    closed_position,
+    hand_poses,
+    handle_of,
+    lifting_arms,
+    opened_position,
+    pick_up_poses,
+    place_pose,
+    retract,
+)
+from pycrorm_async.plan.motions import chosen_limits, collisions_count
+from pycrorm_async.plan.objects import (
+    CurrentRobot,
+    ObjectDesignator,
+    ObjectLike,
+    ObjectPart,
+    check_in_map,
+    designator_of,
+    in_world,
+    pose_of,
+    require_robot,
+    require_world,
+)
+from pycrorm_async.plan.task import Experience, PastSuccess, current_node, experience
+from pycrorm_async.world.bounding_boxes import BoundingBox, box_around
+from pycrorm_async.world.bullet import Object, current_world
+from pycrorm_async.world.kinematics import Unreachable, solve
+from pycrorm_async.world.pose import Arms, Grasp, Pose, Quaternion, Vector, rotated, yaw_quaternion
+from pycrorm_async.world.queries import (
+    Costmap,
+    GaussianCostmap,
+    Obstacles,
+    OccupancyCostmap,
+    VisibilityCostmap,
+    footprint_of,
+)
+from pycrorm_async.world.urdf import Drive, PR2Description
+from pycrorm_async.world.world_copy import acting_robot
+
+# === base clearance ===========================================================================================
+#
+# Check whether a robot's base, with its heading, is clear of obstacles at a pose.
+
+
+class BaseClearance:
+    """The footprints of one or more robots, and the obstacles around them as they are now."""
+
+    def __init__(self, robots: Collection[CurrentRobot]) -> None:
+        self._footprints = [footprint_of(each.body, each.base_links()) for each in robots]
+        self._obstacles = Obstacles(require_world(), ignore={part for each in robots for part in each.with_load()})
+
+    def refusal(self, base: Pose) -> str | None:
+        """Return the reason why a base cannot be at this pose; None if it is clear of obstacles there."""
+        for footprint in self._footprints:
+            if (obstacle := self._obstacles.overlapping(footprint, base)) is not None:
+                return "base in collision with {} ({})".format(*obstacle)
+        return None
+
+    def costmap(self, origin: Pose, *, size_cells: int = 200, resolution_m: float = 0.02) -> Costmap:
+        """Return the places that a base may have with some heading: 1 where nothing is within its inner radius."""
+        distance_m = max(each.inner_radius_m for each in self._footprints)
+        return self._obstacles.costmap(origin, distance_m=distance_m, size_cells=size_cells, resolution_m=resolution_m)
+
+
+def base_clearance(robots: Collection[CurrentRobot] = ()) -> BaseClearance | None:
+    """Return the clearance of these robots, of the current one without any; None where collisions do not count.
+
+    Raises `NoRobotHere` if collisions count and there is no robot.
+    """
+    return BaseClearance(robots or (require_robot(),)) if collisions_count() else None
+
+
+# === base poses ===============================================================================================
+#
+# Search base poses from which a robot reaches or sees a target: the best cells of a costmap, checked by kinematics.
+#
+# Each check uses the goals that the actions will use (`geometry`), with the robot's torso and arms as they are now,
+# within the limits of the chosen robot. Nothing is moved.
+
+CELLS_MAX = 600
+"""Bounds the cells per search at which kinematics is checked, so that a search without a solution ends."""
+VISIBLE_SHARE_MIN = 0.5
+"""Minimum visible share of an object that counts as seen from a place."""
+
+
+class Reach(NamedTuple):
+    """The arms that reach the target from a place; or, for an unsuitable place, none and the reason."""
+
+    arms: tuple[Arms, ...] = ()
+    refusal: str | None = None
+
+
+def base_poses(
+    target: Pose | ObjectLike,
+    *,
+    reachable_for: ObjectLike | None,
+    visible_for: ObjectLike | None,
+    reachable_arm: Arms | None,
+) -> Iterator[tuple[Pose, Reach] | Cells]:
+    """Yield the cells of the costmaps, then base poses that face the target, best first, suitable or not.
+
+    For a fixed base yield only its own pose.
+    """
+    reacher = resolve_robot(reachable_for) if reachable_for is not None else None
+    viewer = resolve_robot(visible_for) if visible_for is not None else None
+    goal = target if isinstance(target, Pose) else pose_of(target)
+    check_in_map(goal)
+    arms = _arms(reacher, reachable_arm, target) if reacher is not None else reachable_arm
+    if reacher is not None and reacher.description.drive is Drive.FIXED:
+        yield _checked(reacher.body.pose, target, goal, reacher, viewer, arms)
+        return
+    robots = [each for each in (reacher, viewer) if each is not None]
+    clearance = base_clearance(robots)
+    costmap, cells = _costmap(target, goal, robots, viewer, clearance)
+    yield cells
+    clear, height_m = 0, base_height_m(reacher or viewer)
+    for cell in _cells(costmap, robots, every=clearance is not None):
+        base_pose = face(cell, goal, height_m=height_m)
+        if clearance is not None and (collision := clearance.refusal(base_pose)) is not None:
+            yield base_pose, Reach(refusal=collision)
+            continue
+        if (clear := clear + 1) > CELLS_MAX:
+            return
+        yield _checked(base_pose, target, goal, reacher, viewer, arms)
+
+
+def _arms(robot: CurrentRobot, arm: Arms | None, target: Pose | ObjectLike) -> Arms | tuple[Arms, ...]:
+    """Return the required arm; without one those that lift the target, or reach it if it is a pose."""
+    if arm is not None:
+        return arm
+    candidates = tuple(robot.description.arms)
+    return candidates if isinstance(target, Pose) else lifting_arms(robot, candidates, target)
+
+
+def _cells(costmap: Costmap, robots: list[CurrentRobot], *, every: bool) -> Iterator[Pose]:
+    """Yield the middles of the cells to search: the best ones, or with `every` all of them.
+
+    The best cells are as near to the target as is usual for a PR2. For other robots, whose arms reach from other
+    distances, the cells are spread over the whole map, best first.
+    """
+    if all(isinstance(robot.description, PR2Description) for robot in robots):
+        return islice(costmap.ranked(), None if every else CELLS_MAX)
+    return costmap.ranked(every=max(1, int(np.count_nonzero(costmap.map)) // CELLS_MAX))
+
+
+def _checked(
+    base_pose: Pose,
+    target: Pose | ObjectLike,
+    goal: Pose,
+    reacher: CurrentRobot | None,
+    viewer: CurrentRobot | None,
+    arms: Arms | tuple[Arms, ...] | None,
+) -> tuple[Pose, Reach]:
+    """Return the base pose with the arms that reach the target from there, or with the reason why none does."""
+    if viewer is not None and not _sees(viewer, base_pose, target, goal):
+        return base_pose, Reach(refusal="the target is not visible from here")
+    if reacher is None:
+        return base_pose, Reach()
+    return base_pose, reaching_arms(reacher, arms, base_pose, partial(_goals, reacher, base_pose, target, goal))
+
+
+def resolve_robot(meant: ObjectLike) -> CurrentRobot:
+    """Return the robot that the argument refers to. Raises `NoRobotHere` if it has no robot description."""
+    body = in_world(meant)
+    if body.robot_description is None:
+        raise NoRobotHere(f"{body.name!r} is not a robot with a robot description")
+    return CurrentRobot(body, body.robot_description)
+
+
+def base_height_m(robot: CurrentRobot | None = None) -> float:
+    """Return the height of a robot's base link, which driving keeps: of this robot, else of the acting one, else 0."""
+    if robot is not None:
+        return robot.body.pose.position.z
+    world = current_world.get()
+    acting = acting_robot(world) if world is not None else None
+    return acting.pose.position.z if acting is not None else 0.0
+
+
+def face(place: Pose, goal: Pose, *, height_m: float, turned: float = 0.0) -> Pose:
+    """Return the upright pose at the place that faces the goal, rotated by `turned` (rad) to the left."""
+    x, y, _ = place.position
+    heading = math.atan2(goal.position.y - y, goal.position.x - x) + turned
+    return Pose((x, y, height_m), yaw_quaternion(heading))
+
+
+def reaching_arms(
+    robot: CurrentRobot,
+    arm: Arms | tuple[Arms, ...] | None,
+    base_pose: Pose,
+    goals: Callable[[Arms], Iterable[Pose]],
+    *,
+    torso_height: float | None = None,
+) -> Reach:
+    """Return the arms that reach all their goals from this base pose, or a refusal if the required ones do not.
+
+    Args:
+        arm: the required arm; BOTH requires both, several any of these, None any.
+        torso_height: m; None means the current height.
+
+    Raises `CapabilityAbsenceFailure` for an arm that the robot lacks.
+    """
+    limits = chosen_limits()
+    if isinstance(arm, tuple):
+        candidates = arm
+    else:
+        candidates = tuple(robot.description.arms if arm is None else robot.each_arm(arm))
+    reaching: list[Arms] = []
+    refusals: list[str] = []
+    for candidate in candidates:
+        try:
+            for each in goals(candidate):
+                solve(robot.body, candidate, each, base=base_pose, torso_height=torso_height, limits=limits)
+        except Unreachable as unreachable:
+            refusals.append(f"{candidate.name}: {unreachable.reason}")
+        else:
+            reaching.append(candidate)
+    enough = not refusals if arm is Arms.BOTH else bool(reaching)
+    return Reach(tuple(reaching)) if enough else Reach(refusal="; ".join(refusals))
+
+
+def _costmap(
+    target: Pose | ObjectLike,
+    goal: Pose,
+    robots: list[CurrentRobot],
+    viewer: CurrentRobot | None,
+    clearance: BaseClearance | None,
+) -> tuple[Costmap, Cells]:
+    """Return the costmap of the search, and how many cells the maps in it exclude."""
+    world = require_world()
+    origin = Pose((goal.position.x, goal.position.y, 0.0))
+    ignored = {part for robot in robots for part in robot.with_load()}
+    free = OccupancyCostmap(world, origin, ignore=ignored) if clearance is None else clearance.costmap(origin)
+    costmap = free * GaussianCostmap(origin)
+    if viewer is None:
+        return costmap, cells_of(free)
+    low, high = viewer.camera_heights_m()
+    viewed = goal if isinstance(target, Pose) else in_world(target)
+    visible = VisibilityCostmap(world, viewed, min_height_m=low, max_height_m=high, origin=origin, ignore=ignored)
+    return costmap * visible, cells_of(free, free * visible)
+
+
+def cells_of(free: Costmap, seeing: Costmap | None = None) -> Cells:
+    """Count the cells of a map of free places; `seeing` leaves those from which the target is visible."""
+    clear = int(np.count_nonzero(free.map))
+    left = clear if seeing is None else int(np.count_nonzero(seeing.map))
+    return Cells(free.map.size - clear, clear - left, left)
+
+
+def _goals(robot: CurrentRobot, base_pose: Pose, target: Pose | ObjectLike, goal: Pose, arm: Arms) -> tuple[Pose, ...]:
+    body, description = robot
+    tool_frame = description.arms[arm].tool_frame
+    tool = robot.tool_pose(arm)
+    if not isinstance(target, Pose):
+        return pick_up_poses(goal, Grasp.FRONT, base_pose @ tool.relative_to(body.pose))
+    held = next((each for each, link in body.attachments.items() if link == tool_frame), None)
+    tool_goal = place_pose(goal, held.pose, tool) if held is not None else goal
+    return tool_goal, retract(tool_goal)
+
+
+def _sees(robot: CurrentRobot, base_pose: Pose, target: Pose | ObjectLike, goal: Pose) -> bool:
+    """Return whether the target is visible from the camera's position at this base pose."""
+    eye = (base_pose @ robot.camera_pose().relative_to(robot.body.pose)).position
+    if isinstance(target, Pose):
+        return require_world().ray_test([eye], [goal.position], ignore=robot.with_load()) == [None]
+    return require_world().visible(in_world(target), eye, ignore=robot.with_load()) >= VISIBLE_SHARE_MIN
+
+
+# === designators ==============================================================================================
+
+CANDIDATES_MAX = 1_000
+"""Bounds the offered places that are reported of one search: the first ones, and the last, which may be the one taken.
+A loop over the places of a large surface may ask for thousands."""
+REFUSALS_MAX = 1_000
+"""Bounds the refused places that are reported of one search. A search for a pick-up tries at most 600 places, one for
+opening 9,600, whose record would be larger than a record may be."""
+
+
+class LocationDesignator(ABC):
+    """Base of location designators; a subclass defines the candidates.
+
+    Fields are checked when it is built, as an action's are: `ResolutionError` names those that do not fit.
+    """
+
+    def __post_init__(self) -> None:
+        check_properties(self)
+
+    if not TYPE_CHECKING:  # hidden from type checkers, which report the fault themselves
+
+        def __getattr__(self, name: str) -> NoReturn:
+            if name in ("pose", "reachable_arms"):
+                raise NotResolved(type(self).__name__, name)
+            raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+
+    @abstractmethod
+    def _candidates(self) -> Iterator[Location | Refusal | Cells | None]:
+        """Yield every candidate in order; a refusal, or None, for one that is unsuitable; once `Cells` of costmaps."""
+
+    @abstractmethod
+    def _no_place_failure(self) -> PlanFailure:
+        """Return the plan failure for a search without a suitable place."""
+
+    def _name(self) -> str:
+        """Return the name reported to the observer."""
+        return type(self).__name__
+
+    def resolve(self) -> Location:
+        """Return the first suitable place. Raises a plan failure, documented by each designator, if there is none."""
+        places = iter(self)
+        try:
+            place = next(places, None)
+        finally:
+            places.close()
+        if place is None:
+            raise self._no_place_failure()
+        return place
+
+    def __iter__(self) -> Generator[Location, None, None]:
+        """Yield suitable places; the last one yielded counts as taken, or none if the iteration is exhausted."""
+        observer, node = recorder.get(), current_node.get()
+        offered: list[Candidate] = []
+        offered_beyond = 0
+        refused: list[Refusal] = []
+        cells: Cells | None = None
+        taken: int | None = None
+        considered = 0
+        try:
+            for place in self._candidates():
+                if isinstance(place, Cells):
+                    cells = place
+                    continue
+                considered += 1
+                if isinstance(place, Refusal):
+                    if len(refused) < REFUSALS_MAX:
+                        refused.append(place)
+                elif place is not None:
+                    if len(offered) == CANDIDATES_MAX:
+                        offered.pop()
+                        offered_beyond += 1
+                    taken = len(offered)
+                    offered.append(Candidate(place.pose, place.reachable_arms, place.grasp, place.torso_height))
+                    yield place
+                    taken = None
+        finally:
+            if observer is not None:
+                observer.location_resolved(
+                    location=self._name(),
+                    offered=tuple(offered),
+                    taken=taken,
+                    considered=considered,
+                    refused=tuple(refused),
+                    offered_beyond=offered_beyond,
+                    cells=cells,
+                    node=node,
+                )
+
+
+@dataclass(frozen=True)
+class Location(LocationDesignator):
+    """A place: a pose in the map, and the arms that reach the target of the search. Resolves to itself.
+
+    A place from experience also has the grasp and the torso height (m) of the past success.
+    """
+
+    pose: Pose
+    reachable_arms: tuple[Arms, ...] = ()
+    grasp: Grasp | None = None
+    torso_height: float | None = None
+
+    def _candidates(self) -> Iterator[Location | Refusal]:
+        yield self
+
+    def _no_place_failure(self) -> PlanFailure:
+        raise AssertionError("a location always yields itself")
+
+
+@dataclass(frozen=True)
+class ObjectRelativeLocation(LocationDesignator):
+    """The place at `relative_pose` relative to an object. Raises `PerceptionObjectNotInWorld`."""
+
+    relative_pose: Pose
+    reference_object: ObjectLike
+
+    def _candidates(self) -> Iterator[Location | Refusal]:
+        yield Location(pose_of(self.reference_object) @ self.relative_pose)
+
+    def _no_place_failure(self) -> PlanFailure:
+        raise AssertionError("a relative location always yields one place")
+
+
+@dataclass(frozen=True)
+class CostmapLocation(LocationDesignator):
+    """Base poses near the target and clear of obstacles from which a robot, facing the target, reaches or sees it.
+
+    Args:
+        target: an object to pick up, or a pose to which the tool frame or a held object is brought.
+        reachable_for: the robot that must reach the target. For an object that means all three goals of a pick-up
+            from the front (`Grasp.FRONT`), for a pose those of placing the held object, with the torso and the arms
+            as they are now, within the limits of the chosen robot (`simulated_robot_within`).
+        visible_for: the robot that must see the target.
+        reachable_arm: the arm that must reach the target; BOTH requires each of the two. None means any arm that lifts
+            the object (`ArmDescription.payload_kg`), if one does.
+
+    Where collisions count, the base with its heading is clear of obstacles; elsewhere its middle is 0.32 m away from
+    them. The search considers up to 600 such places, best first. Resolving raises `ObjectUnreachable` (for an object),
+    `ReachabilityFailure` (for a pose), `LookingHighLevelFailure` (if only visibility is required) or
+    `PerceptionObjectNotInWorld`.
+    """
+
+    target: Pose | ObjectLike
+    reachable_for: ObjectLike | None = None
+    visible_for: ObjectLike | None = None
+    reachable_arm: Arms | None = None
+
+    def _candidates(self) -> Iterator[Location | Refusal | Cells]:
+        return map(
+            _candidate,
+            base_poses(
+                self.target,
+                reachable_for=self.reachable_for,
+                visible_for=self.visible_for,
+                reachable_arm=self.reachable_arm,
+            ),
+        )
+
+    def _no_place_failure(self) -> PlanFailure:
+        if self.reachable_for is None:
+            return LookingHighLevelFailure("there is no place to stand from which the target is visible")
+        if isinstance(self.target, Pose):
+            return ReachabilityFailure(f"there is no place to stand and reach {self.target}", self.target)
+        name = self.target.name
+        return ObjectUnreachable(f"there is no place to stand and pick up {name}", name)
+
+
+@dataclass(frozen=True)
+class AccessingLocation(LocationDesignator):
+    """Base poses from which a robot can open a drawer or a door by its handle and close it again.
+
+    >>> handle = ObjectPart("sink_area_drawer_handle", kitchen)
+    >>> stand = AccessingLocation(handle, robot).resolve()
+    >>> await NavigateActionPerformable(stand.pose).perform()
+    >>> await OpenActionPerformable(handle, stand.reachable_arms[0]).perform()
+
+    Args:
+        handle: the part that the gripper grasps.
+        robot: the robot, with its torso as it is now, within the limits of the chosen robot
+            (`simulated_robot_within`).
+        arm: the arm that must reach; BOTH requires each of the two.
+
+    Places are 0.4 m clear of obstacles, and where collisions count the base with its heading is clear of them; places
+    that the drawer or door sweeps come last. Resolving raises
+    `EnvironmentUnreachable`, `EnvironmentManipulationImpossible` (no joint moves the handle),
+    `PerceptionObjectNotInWorld`, `CapabilityAbsenceFailure` and `UnknownLink`.
+    """
+
+    handle: ObjectPart
+    robot: ObjectLike
+    arm: Arms | None = None
+
+    def _candidates(self) -> Iterator[Location | Refusal | Cells]:
+        return map(_candidate, opening_poses(self.handle, self.robot, self.arm))
+
+    def _no_place_failure(self) -> PlanFailure:
+        name = self.handle.name
+        return EnvironmentUnreachable(f"there is no place to stand and open and close {name}", name)
+
+
+@dataclass(frozen=True)
+class SemanticCostmapLocation(LocationDesignator):
+    """Poses for an object on a link of another object, for example on the surface of a table.
+
+    Args:
+        urdf_link_name: the link; the top of its bounding box is the surface.
+        part_of: the object that has the link.
+        for_object: the object to place: at these poses its bottom is on the surface and it collides with no other
+            object. Without it, the poses are on the surface itself.
+
+    The middle comes first, then places all over the surface in a fixed order. Resolving raises `ObjectUnavailable` if
+    there is no room, `PerceptionObjectNotInWorld` and `UnknownLink`.
+    """
+
+    urdf_link_name: str
+    part_of: ObjectLike
+    for_object: ObjectLike | None = None
+
+    def _candidates(self) -> Iterator[Location | Refusal]:
+        for place in surface_poses(self.urdf_link_name, self.part_of, self.for_object):
+            yield place if isinstance(place, Refusal) else Location(place)
+
+    def _no_place_failure(self) -> PlanFailure:
+        name = self.for_object.name if self.for_object is not None else "anything"
+        return ObjectUnavailable(f"there is no room for {name} on {self.urdf_link_name}", self.urdf_link_name, name)
+
+
+def _candidate(searched: tuple[Pose, Reach] | Cells) -> Location | Refusal | Cells:
+    if isinstance(searched, Cells):
+        return searched
+    pose, reach = searched
+    return Location(pose, reach.arms) if reach.refusal is None else Refusal(pose, reach.refusal)
+
+
+# === opening poses ============================================================================================
+#
+# Search base poses from which a robot can open a drawer or a door by its handle and close it again.
+#
+# Each check uses the goals of `OpenAction` and `CloseAction` (`geometry`): grasping the handle in its closed, open and
+# current position, and following its whole path, with the torso as it is now and within the limits of the chosen robot.
+# Nothing is moved.
+
+OPENING_CLEARANCE_M = 0.4
+"""The distance in m of the base from obstacles."""
+HEADINGS = 8
+"""The headings that are tried at each cell, in equal steps from that which faces the handle."""
+CELL_M = 0.05
+"""The side of a cell in m."""
+_OPENING_CELLS = 80
+"""The cells along each axis of the costmap: 4 m around the handle."""
+_SIGMA_CELLS = 6.0  # 0.3 m, as for picking up
+_SWEEP_STEPS = 10
+"""The steps of the joint at which the space that the drawer or door sweeps is computed."""
+
+
+def opening_poses(part: ObjectLike, robot: ObjectLike, arm: Arms | None) -> Iterator[tuple[Pose, Reach] | Cells]:
+    """Yield the cells of the costmaps, then base poses, best first, each with the arms that reach every goal or none.
+
+    Places that the opening part does not sweep come first, facing the handle and then rotated by each multiple of 45
+    degrees; the places that it sweeps follow in the same order.
+    """
+    handle, reacher = handle_of(part), resolve_robot(robot)
+    handle_pose = handle.whole.link_pose_at(handle.link, {handle.joint: closed_position(handle)})
+    goals = _handle_goals(handle)
+    clearance, height_m = base_clearance([reacher]), base_height_m(reacher)
+    free, *costmaps = _costmaps(handle, handle_pose, reacher)
+    yield cells_of(free)
+    for costmap in costmaps:
+        cells = costmap.best(CELLS_MAX)
+        for number in range(HEADINGS):
+            for cell in cells:
+                base_pose = face(cell, handle_pose, height_m=height_m, turned=number * math.tau / HEADINGS)
+                collision = clearance.refusal(base_pose) if clearance is not None else None
+                if collision is not None:
+                    yield base_pose, Reach(refusal=collision)
+                else:
+                    yield base_pose, reaching_arms(reacher, arm, base_pose, lambda _: goals)
+
+
+def _handle_goals(handle: Handle) -> list[Pose]:
+    """Return all goals of the tool frame; the ends of the path first, because most places fail at them."""
+    opened, closed, current = opened_position(handle), closed_position(handle), handle.position
+    path = hand_poses(handle, opened, closed)
+    between = [*path[1:-1]]
+    ends = [path[0], path[-1]]
+    if current not in (opened, closed):
+        from_current = hand_poses(handle, opened)
+        ends.append(from_current[0])
+        between += [*from_current[1:], *hand_poses(handle, closed)[1:]]
+    return [*ends, *(approach(each) for each in ends), *between]
+
+
+def _costmaps(handle: Handle, handle_pose: Pose, robot: CurrentRobot) -> tuple[Costmap, ...]:
+    """Return a map of free places, and two of those near the handle: the moving part does not sweep them, or does."""
+    world, origin = handle.whole.world, Pose((handle_pose.position.x, handle_pose.position.y, 0.0))
+    near = GaussianCostmap(origin, sigma_cells=_SIGMA_CELLS, size_cells=_OPENING_CELLS, resolution_m=CELL_M)
+    free, unswept = (
+        OccupancyCostmap(
+            world,
+            origin,
+            distance_to_obstacle_m=OPENING_CLEARANCE_M,
+            size_cells=_OPENING_CELLS,
+            resolution_m=CELL_M,
+            ignore=robot.with_load(),
+            also=boxes,
+        )
+        for boxes in ((), list(_swept(handle)))
+    )
+    return free, unswept * near, Costmap(free.map - unswept.map, origin, resolution_m=CELL_M) * near
+
+
+def _swept(handle: Handle) -> Iterator[BoundingBox]:
+    """Yield the boxes that the links moved by the handle's joint occupy along its path."""
+    whole, opened, closed = handle.whole, opened_position(handle), closed_position(handle)
+    moving = [link for link in whole.links if handle.joint in whole.joints_above(link)]
+    for number in range(_SWEEP_STEPS + 1):
+        at = {handle.joint: closed + (opened - closed) * number / _SWEEP_STEPS}
+        for link in moving:
+            frame = whole.link_pose_at(link, at)
+            box = box_around([((frame.position, frame.orientation), whole.body.solids[link])])
+            if box is not None:
+                yield box
+
+
+# === surfaces =================================================================================================
+#
+# Find poses for an object on a surface: the middle first, then all over the surface in a fixed random order.
+
+STEP_M = 0.02
+"""The distance in m between two candidates along each axis."""
+_POINT = BoundingBox(Vector(0.0, 0.0, 0.0), Vector(0.0, 0.0, 0.0))
+
+
+def surface_poses(link: str, whole: ObjectLike, obj: ObjectLike | None) -> Iterator[Pose | Refusal]:
+    """Yield poses for `obj` on top of the link, with the link's heading, and refusals of occupied places."""
+    support = in_world(whole)
+    obj_to_put = in_world(obj) if obj is not None else None
+    heading = yaw_quaternion(support.link_pose(link).yaw)
+    extent = _extent(obj_to_put, heading) if obj_to_put is not None else _POINT
+    surface = support.bounding_box(link)
+    z = surface.max.z - extent.min.z
+    occupied = [
+        (each.name, each.bounding_box())
+        for each in support.world.objects
+        if each is not support and not _moves_along(each, obj_to_put)
+    ]
+    if collisions_count():
+        others = (each for each in support.links if each != link and support.body.solids[each])
+        occupied += [(each, support.bounding_box(each)) for each in others]
+    for x, y in _grid_points(surface, extent):
+        placed_box = _translate(extent, x, y, z)
+        pose = Pose((x, y, z), heading)
+        obstacles = (name for name, box in occupied if obj_to_put is not None and _overlap(placed_box, box))
+        obstacle = next(obstacles, None)
+        yield pose if obstacle is None else Refusal(pose, f"{obstacle} is in the way")
+
+
+def _grid_points(surface: BoundingBox, extent: BoundingBox) -> Iterator[tuple[float, float]]:
+    """Yield the points at which a box of that extent stays on the surface; only the middle if it is too large."""
+    ranges = []
+    for low, high, below, above in zip(surface.min[:2], surface.max[:2], extent.min[:2], extent.max[:2], strict=True):
+        middle = (low - below + high - above) / 2
+        steps = int(max(0.0, (high - above) - (low - below)) / 2 / STEP_M)
+        ranges.append([middle + STEP_M * step for step in range(-steps, steps + 1)])
+    middle_point = (ranges[0][len(ranges[0]) // 2], ranges[1][len(ranges[1]) // 2])
+    yield middle_point
+    points = [(x, y) for x in ranges[0] for y in ranges[1] if (x, y) != middle_point]
+    random.Random(0).shuffle(points)  # noqa: S311  a fixed seed: the order is random but reproducible
+    yield from points
+
+
+def _extent(obj: Object, turn: Quaternion) -> BoundingBox:
+    """Return the object's box at the origin with this rotation, independent of its current pose."""
+    pose = obj.pose
+    placed = []
+    for link in obj.links:
+        frame = Pose((0.0, 0.0, 0.0), turn) @ obj.link_pose(link).relative_to(pose)
+        placed.append(((frame.position, frame.orientation), obj.body.solids[link]))
+    return box_around(placed) or _POINT
+
+
+def _translate(box: BoundingBox, x: float, y: float, z: float) -> BoundingBox:
+    return BoundingBox(
+        Vector(box.min.x + x, box.min.y + y, box.min.z + z), Vector(box.max.x + x, box.max.y + y, box.max.z + z)
+    )
+
+
+def _overlap(a: BoundingBox, b: BoundingBox) -> bool:
+    """Return whether the boxes share more than a face."""
+    return all(
+        low + 1e-6 < high and other + 1e-6 < over
+        for low, high, other, over in zip(a.min, b.max, b.min, a.max, strict=True)
+    )
+
+
+def _moves_along(each: Object, obj_to_put: Object | None) -> bool:
+    """Return whether `each` is the object to place, carries it, or is carried by it, and so is no obstacle."""
+    if obj_to_put is None:
+        return False
+    chain = {obj_to_put}
+    above = obj_to_put.attached_to
+    while above is not None:
+        chain.add(above)
+        above = above.attached_to
+    below: Object | None = each
+    while below is not None:
+        if below in chain:
+            return True
+        below = below.attached_to
+    return False
+
+
+# === from experience ==========================================================================================
+
+POLICY_CLEARANCE_M = 0.3
+"""Minimum distance between the middle of the robot's base and any obstacle, the thesis' value."""
+_POLICY_CELLS = 300  # 6 m across: the range of the policies' base poses, with a margin
+_UPRIGHT_MIN = 0.99  # the cosine of 8 degrees: a base that leans more is not on the floor
+
+
+@dataclass(frozen=True)
+class DatabaseCostmapLocation:
+    """Base poses of past successful pick-ups of the target's type, transferred to the target's current pose.
+
+    Args:
+        target: the object to pick up.
+        reachable_for: the robot. Restricts the result to places from which it reaches all three goals of the pick-up
+            with the arm, grasp and torso height of the past success, with its arms as they are now, within the limits
+            of the chosen robot.
+        reachable_arm: use only successes with this arm, LEFT or RIGHT; None means any arm that lifts the object, if one
+            does.
+        experience: the source of past successes; None means the open memory.
+
+    Each place has the arm, the grasp and the torso height of the past success, and is 0.3 m clear of obstacles; where
+    collisions count, the base with its heading is clear of them instead. The best place is the one with the highest
+    share of successes among the tries like it, for the target's height; failures count. A pick-up of this process
+    counts as soon as it has ended, one of another process once it is visible in the memory's tables.
+
+    Raises `CallerError` without a memory or for `Arms.BOTH`; `NoWorld`, `NoRobotHere` and
+    `PerceptionObjectNotInWorld`.
+    """
+
+    target: ObjectLike
+    reachable_for: ObjectLike | None = None
+    reachable_arm: Arms | None = None
+    experience: Experience | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.target, Object | ObjectDesignator):
+            raise CallerError("experience is recorded by the type of an object: pass an object as target, not a place")
+        check_properties(self)
+        if self.reachable_arm is Arms.BOTH:
+            raise CallerError("a pick-up uses one arm: reachable_arm must be LEFT, RIGHT, or None for either of them")
+
+    async def resolve(self) -> Location | None:
+        """Return the place with the best experience; None if no past success is usable in the current scene."""
+        places = iter(await self.remembered())
+        try:
+            return next(places, None)
+        finally:
+            places.close()
+
+    def __aiter__(self) -> AsyncIterator[Location]:
+        """Iterate over the places, best first; the last one yielded counts as taken, or none if all were yielded."""
+        return _PlaceIterator(self)
+
+    async def remembered(self) -> LocationDesignator:
+        """Query the experience once, and return its places as an ordinary location designator."""
+        source = self.experience if self.experience is not None else experience.get()
+        if source is None:
+            raise CallerError(
+                "past successes are queried from a memory, and none is open: resolve inside"
+                " `async with Memory.open(url)`, or pass one as `experience`"
+            )
+        robot = resolve_robot(self.reachable_for) if self.reachable_for is not None else None
+        height = pose_of(self.target).position.z - base_height_m(robot)
+        past = await source.successes(designator_of(self.target).object_type, arm=self.reachable_arm, height=height)
+        return _ExperienceLocation(self.target, self.reachable_for, self.reachable_arm, past)
+
+
+class _PlaceIterator:
+    """An asynchronous iterator; a dropped one is closed at once, an async generator only later by the event loop."""
+
+    def __init__(self, designator: DatabaseCostmapLocation) -> None:
+        self._designator = designator
+        self._places: Iterator[Location] | None = None
+
+    def __aiter__(self) -> _PlaceIterator:
+        return self
+
+    async def __anext__(self) -> Location:
+        if self._places is None:
+            self._places = iter(await self._designator.remembered())
+        for place in self._places:
+            return place
+        raise StopAsyncIteration
+
+
+@dataclass(frozen=True)
+class _ExperienceLocation(LocationDesignator):
+    """The places of a `DatabaseCostmapLocation` after its experience has been queried."""
+
+    target: ObjectLike
+    reachable_for: ObjectLike | None
+    reachable_arm: Arms | None
+    past: Sequence[PastSuccess]
+
+    def _name(self) -> str:
+        return DatabaseCostmapLocation.__name__
+
+    def _candidates(self) -> Iterator[Location | Refusal]:
+        target_pose = pose_of(self.target)
+        robot = resolve_robot(self.reachable_for) if self.reachable_for is not None else None
+        origin = Pose((target_pose.position.x, target_pose.position.y, 0.0))
+        ignored = robot.with_load() if robot is not None else None
+        clearance = base_clearance([robot] if robot is not None else [])
+        free = OccupancyCostmap(
+            require_world(), origin, distance_to_obstacle_m=POLICY_CLEARANCE_M, size_cells=_POLICY_CELLS, ignore=ignored
+        )
+        height_m, lifting = base_height_m(robot), self._lifting(robot)
+        for each in self.past:
+            pose = target_pose @ each.stand
+            base_pose = _upright_pose(pose, height_m)
+            if base_pose is None:
+                yield Refusal(pose, "the base would lean")
+                continue
+            if clearance is not None:
+                refusal = clearance.refusal(base_pose)
+            else:
+                is_free = free.value_at(*base_pose.position[:2])
+                refusal = None if is_free else f"an obstacle is nearer than {POLICY_CLEARANCE_M} m"
+            if refusal is None and each.arm not in lifting:
+                refusal = f"the {each.arm.name} arm does not lift the object, another one does"
+            if refusal is None and robot is not None:
+                refusal = _reach(robot, base_pose, target_pose, each).refusal
+            if refusal is not None:
+                yield Refusal(base_pose, refusal)
+            else:
+                yield Location(base_pose, (each.arm,), each.grasp, each.torso_height)
+
+    def _lifting(self, robot: CurrentRobot | None) -> tuple[Arms, ...]:
+        """Return the arms of past successes to repeat: where the arm is open, those that lift the target."""
+        used = dict.fromkeys(each.arm for each in self.past)
+        if robot is None or self.reachable_arm is not None:
+            return tuple(used)
+        return lifting_arms(robot, [*robot.description.arms, *used], self.target)
+
+    def _no_place_failure(self) -> PlanFailure:
+        name = self.target.name
+        return ObjectUnreachable(f"no past success is usable for {name} in this scene", name)
+
+
+def _upright_pose(base: Pose, height_m: float) -> Pose | None:
+    """Move the base pose to this height; None if it leans, because the object lies and recorded ones were upright."""
+    if rotated(base.orientation, (0.0, 0.0, 1.0)).z < _UPRIGHT_MIN:
+        return None
+    return Pose((base.position.x, base.position.y, height_m), yaw_quaternion(base.yaw), base.frame)
+
+
+def _reach(robot: CurrentRobot, base_pose: Pose, target_pose: Pose, past: PastSuccess) -> Reach:
+    """Return the arm if it reaches all three goals of the grasp from the base pose at the past torso height."""
+    body, description = robot
+    if past.arm not in description.arms:
+        return Reach(refusal=f"the robot has no {past.arm.name} arm")
+    if past.torso_height is not None:
+        if description.torso_joint is None:
+            return Reach(refusal="the robot has no torso to lift")
+        lower, upper = body.joint_limits(description.torso_joint)
+        if not lower <= past.torso_height <= upper:
+            return Reach(refusal=f"the torso cannot be lifted to {past.torso_height:g} m")
+
+    def goals(arm: Arms) -> tuple[Pose, ...]:
+        tool = robot.tool_pose(arm)
+        return pick_up_poses(target_pose, past.grasp, base_pose @ tool.relative_to(body.pose))
+
+    return reaching_arms(robot, past.arm, base_pose, goals, torso_height=past.torso_height)

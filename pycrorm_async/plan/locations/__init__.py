@@ -1,1 +1,0 @@
-"""Location designators: search poses for the robot's base and for placing objects."""

@@ -1,1 +1,0 @@
-"""Define motions, and the process modules that execute them."""

@@ -1,0 +1,930 @@
+"""Fold the log into tables of the user's own.
+
+**Discovery.** Discover custom projections: those given by the caller, those installed as entry points, and those of
+this package.
+
+A package declares a projection in its `pyproject.toml`:
+
+    [project.entry-points."pycrorm.projections"]
+    grasp_rate = "lab.projections:GraspRate"
+
+**Projection.** Define custom projections: tables that a pure fold makes from the log, kept live, rebuilt and verified
+like built-in ones.
+
+>>> class GraspRate(Projection):
+...     name, version = "grasp_rate", 1
+...     tables = {"grasp_try": {"arm": "text", "grasp": "text", "status": "text"}}
+...
+...     def fold(self, event, rows):
+...         match event.happening:
+...             case NodeStarted(parameters=values) if event.dtype == "PickUpAction":
+...                 rows.insert("grasp_try", event.id, arm=values["arm"], grasp=values["grasp"], status="RUNNING")
+...             case NodeEnded(node=node, status=status):
+...                 rows.update("grasp_try", event.row(node), status=status)
+"""
+
+from __future__ import annotations
+
+import asyncio
+import importlib
+import logging
+import re
+import sys
+from abc import ABC, abstractmethod
+from collections import OrderedDict
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, partial
+from importlib.metadata import EntryPoint, entry_points
+from operator import attrgetter
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, NamedTuple, Protocol, TypeAlias, final, get_args
+
+import msgspec
+from sqlalchemy import Dialect
+from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
+
+from pycrorm_async.bulk_records import make
+from pycrorm_async.errors import CallerError, DatabaseForeign, DatabaseUnavailable, PycrormError
+from pycrorm_async.events.codec import declaration_of, fingerprint, unwritable
+from pycrorm_async.events.fields import is_reserved
+from pycrorm_async.events.ids import row_key
+from pycrorm_async.events.types import DesignatorTypeDeclared, EpisodeEnded, Happening, NodeStarted
+from pycrorm_async.projections import pipeline as checkpoints
+from pycrorm_async.projections.columns import OWN, Layout, Storage, column_type, next_number, physical_name
+from pycrorm_async.projections.fold import happening_of, stored_rows
+from pycrorm_async.projections.generations import (
+    PROJECTION,
+    Generation,
+    grow_tables,
+    make_empty,
+    projections_in,
+    read_generation,
+    read_generations,
+    write_generation,
+)
+from pycrorm_async.projections.mapped_tables import UserView, with_user_views
+from pycrorm_async.projections.pipeline import LOOKAHEAD_EVENTS_MIN, Batch, BatchFold, FoldPipeline, SideTarget
+from pycrorm_async.projections.row_batch import CannotFold, Row, in_slot, is_missing, json_text, microseconds, row_of
+from pycrorm_async.store.dialect import Insertion
+from pycrorm_async.store.dialects import dialect_of
+from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.stored import Span, StoredEvent, consecutive
+
+if TYPE_CHECKING:
+    from pycrorm_async.projections.findings import PartCheck, VerifyResult
+
+
+# === discovery ================================================================================================
+
+GROUP = "pycrorm.projections"
+_OF_THIS_PACKAGE = ("pycrorm_async.recall.cases:CaseProjection",)
+"""The projections of every memory. They are loaded by name, because their folders are above this one."""
+
+_log = logging.getLogger("pycrorm_async.projections")
+
+
+def validate_projections(projections: Sequence[Projection]) -> tuple[Projection, ...]:
+    """Validate projections and return them. Raises `CallerError` for an invalid one, and for two of one name."""
+    names: set[str] = set()
+    for each in projections:
+        if not isinstance(each, Projection):
+            raise CallerError(f"{each!r} is not a projection: pass an instance of a class that derives from Projection")
+        columns_of(each)
+        if each.name in names:
+            raise CallerError(f"two projections have the name {each.name!r}: rename one")
+        names.add(each.name)
+    return tuple(projections)
+
+
+def load_projections(references: Sequence[str]) -> tuple[Projection, ...]:
+    """Import projections by `module:Class`, also from the working directory. Raises `CallerError`."""
+    if references and str(Path.cwd()) not in sys.path:
+        sys.path.insert(0, str(Path.cwd()))
+    return validate_projections([_load_projection(each) for each in references])
+
+
+def _load_projection(reference: str) -> Projection:
+    module_name, _, class_name = reference.partition(":")
+    if not module_name or not class_name:
+        raise CallerError(f"{reference!r} does not name a projection: write module:Class")
+    try:
+        module = importlib.import_module(module_name)
+    except Exception as error:
+        raise CallerError(f"{module_name} cannot be imported: {type(error).__name__}: {error}") from error
+    if not hasattr(module, class_name):
+        raise CallerError(f"{module_name} has no {class_name!r}")
+    return _instance(getattr(module, class_name), reference)
+
+
+def _instance(kind: Any, reference: str) -> Projection:
+    """Create and validate an instance of this class. Raises `CallerError`."""
+    if not isinstance(kind, type) or not issubclass(kind, Projection):
+        raise CallerError(f"{reference} is not a projection: derive from pycrorm_async.Projection")
+    try:
+        projection = kind()
+    except Exception as error:
+        raise CallerError(f"{reference} cannot be instantiated: {type(error).__name__}: {error}") from error
+    columns_of(projection)
+    return projection
+
+
+def installed_projections(projections: Sequence[Projection], *, own: bool = True) -> tuple[Projection, ...]:
+    """Return the installed projections whose names these do not have, with those of this package if `own` is true.
+
+    A faulty one is logged and left out. A package that is installed while the process runs is not found.
+    """
+    names = {each.name for each in projections}
+    installed = [each for each in own_projections() if own and each.name not in names]
+    names.update(each.name for each in installed)
+    for entry in _entries():
+        try:
+            projection = _instance(entry.load(), entry.value)
+        except Exception as error:  # noqa: BLE001 - a fault in one package must not disable the others
+            reason = error if isinstance(error, CallerError) else f"{type(error).__name__}: {error}"
+            _log.warning("the projection %s of an installed package is left out: %s", entry.name, reason)
+            continue
+        if projection.name not in names:
+            names.add(projection.name)
+            installed.append(projection)
+    return tuple(installed)
+
+
+@cache
+def own_projections() -> tuple[Projection, ...]:
+    """Return the projections of this package, which every memory has."""
+    return tuple(map(_load_projection, _OF_THIS_PACKAGE))
+
+
+@cache
+def _entries() -> tuple[EntryPoint, ...]:
+    """Return the entry points. Each memory that is opened needs them; those of a hundred packages take 3 ms to read."""
+    return tuple(sorted(entry_points(group=GROUP), key=lambda each: (each.name, each.value)))
+
+
+# === projection ===============================================================================================
+
+_NAME = re.compile(r"[a-z][a-z0-9_]{0,39}")
+Column: TypeAlias = Literal["row", "integer", "real", "text", "boolean", "time", "json"]
+"""The storage of a column: the id of a row, a scalar, µs since 1970, JSON."""
+OF_EVERY_TABLE: dict[str, Storage] = {"id": "key", "process_metadata_id": "row"}
+
+
+class Event(NamedTuple):
+    """One event of the log, as a fold receives it.
+
+    Attributes:
+        number: of its episode, in this database.
+        sequence: of the event in its episode.
+        time: µs since 1970.
+        monotonic_ns: reading of the monotonic clock.
+        happening: the payload, one of `pycrorm_async.events.types`.
+        dtype: of a NodeStarted, its designator's type; None for others.
+        parameters: of a NodeStarted, by field, as `NodeStarted.parameters`; None for one that could not be recorded.
+        declaration: of a NodeStarted, that of its designator's type; None for others.
+    """
+
+    number: int
+    sequence: int
+    time: int
+    monotonic_ns: int
+    happening: Happening
+    dtype: str | None
+    parameters: Mapping[str, Any]
+    declaration: DesignatorTypeDeclared | None = None
+
+    @property
+    def id(self) -> int:
+        """The id of this event's row, in any table: for a NodeStarted that of its node and designator."""
+        return row_of(self.number, self.sequence)
+
+    def row(self, sequence: int, slot: int = 0) -> int:
+        """Return the id of a row of another event in the same episode; each event may have 32, by slot."""
+        return in_slot(row_of(self.number, sequence), slot)
+
+
+Changed: TypeAlias = list[tuple[bool, str, int, dict[str, Any]]]
+"""Changes of rows: whether one is inserted, table, id, columns."""
+
+
+class Changes:
+    """The row changes of one event. An event may change rows of its own episode only."""
+
+    def __init__(self) -> None:
+        self.all: Changed = []
+
+    def insert(self, table: str, id: int, /, **columns: Any) -> None:  # noqa: A002
+        """Insert a new row; omitted columns are null."""
+        self.all.append((True, table, id, columns))
+
+    def update(self, table: str, id: int, /, **columns: Any) -> None:  # noqa: A002
+        """Set columns of a row; no effect if no row has this id."""
+        self.all.append((False, table, id, columns))
+
+
+class Projection(ABC):
+    """The base class of custom projections: subclasses define tables and a fold.
+
+    Attributes:
+        name: in the database: lower-case letters, digits and underscores.
+        version: of the fold. After a change of it, `pycrorm rebuild NAME` rebuilds the tables.
+        tables: columns and their storage (`row` for the id of one, `integer`, `real`, `text`, `boolean`, `time` in µs
+            since 1970, `json`). Every table also has `id`, and `process_metadata_id` for its episode.
+        views: named queries over these tables, created beside them.
+        reads: the types of events that the fold gets. Events of other types cost it nothing; None: all types.
+        is_packed: whether it is a `PackedProjection`, whose columns and names are checked less strictly.
+    """
+
+    name: ClassVar[str]
+    version: ClassVar[int] = 1
+    tables: ClassVar[Mapping[str, Mapping[str, Column]]]
+    views: ClassVar[Sequence[UserView]] = ()
+    reads: ClassVar[Collection[type[Happening]] | None] = None
+    is_packed: ClassVar[bool] = False
+
+    @abstractmethod
+    def fold(self, event: Event, rows: Changes) -> None:
+        """Add the changes of this event to `rows`. Must be pure: no lookups, no state, the same event gives the same.
+
+        An exception parks the episode in this projection until a rebuild; `pycrorm status` shows the reason.
+        """
+
+
+EpisodeFold: TypeAlias = Callable[[Event, Changes], None]
+"""Folds the events of one episode, in order. It may have state."""
+
+
+class EpisodeProjection(Projection):
+    """The base class of custom projections whose fold has a state, that of the event's own episode.
+
+    >>> class Attempts(EpisodeProjection):
+    ...     name, version = "attempts", 1
+    ...     tables = {"attempt": {"dtype": "text", "number": "integer"}}
+    ...
+    ...     def episode(self):
+    ...         counts = Counter()
+    ...
+    ...         def fold(event, rows):
+    ...             if event.dtype is not None:
+    ...                 counts[event.dtype] += 1
+    ...                 rows.insert("attempt", event.id, dtype=event.dtype, number=counts[event.dtype])
+    ...
+    ...         return fold
+    """
+
+    @abstractmethod
+    def episode(self) -> EpisodeFold:
+        """Return a function that folds the events of one episode from its first, as `Projection.fold` folds an event.
+
+        It gets every event once and in order. After a restart, and where a batch could not be written, a new function
+        gets the episode's events from the first again, and the rows of those that are in the tables are discarded. So
+        its state must depend on the events alone. It is dropped at the end of the episode.
+        """
+
+    @final
+    def fold(self, event: Event, rows: Changes) -> None:  # noqa: ARG002 - of the base class
+        raise TypeError(f"{self.name} folds events with what `episode()` returns")
+
+
+def columns_of(projection: Projection) -> dict[str, dict[str, Storage]]:
+    """Return the projection's tables with all their columns. Raises `CallerError` for an invalid projection."""
+    fault = _fault_in(projection)
+    if fault is not None:
+        raise CallerError(f"the projection {type(projection).__qualname__}: {fault}")
+    return {name: {**OF_EVERY_TABLE, **columns} for name, columns in projection.tables.items()}
+
+
+def _fault_in(projection: Projection) -> str | None:
+    name: Any = getattr(projection, "name", None)
+    version: Any = projection.version
+    if not isinstance(name, str) or not _NAME.fullmatch(name) or name == "tables":
+        return f"its name is {name!r}, and must be lower-case letters, digits and underscores, 40 at most, not 'tables'"
+    if not isinstance(version, int) or not 0 < version < 2**31:
+        return f"its version is {version!r}, and must be an integer > 0"
+    if not getattr(projection, "tables", None):
+        return "it has no tables: set `tables`"
+    storages = get_args(Storage if projection.is_packed else Column)
+    for table, columns in projection.tables.items():
+        if not _NAME.fullmatch(table):
+            return f"the table name {table!r} must be lower-case letters, digits and underscores, 40 at most"
+        if is_reserved(table) and not projection.is_packed:
+            return f"the table name {table!r} is used by the memory itself"
+        for column, storage in columns.items():
+            if not _NAME.fullmatch(column) or column in OF_EVERY_TABLE:
+                return f"the column name {table}.{column} is reserved, or has other characters than a-z, 0-9 and _"
+            if storage not in storages:
+                return f"the column {table}.{column} is {storage!r}, and must be one of {', '.join(storages)}"
+    if any(each.materialised for each in projection.views):
+        return "a view of a projection cannot be materialised: its tables are stored already"
+    names = [*projection.tables, *(each.name for each in projection.views)]
+    duplicate = next((each for each in names if [*map(str.lower, names)].count(each.lower()) > 1), None)
+    return f"two of its tables and views have the name {duplicate!r}" if duplicate else None
+
+
+# === episode folds ============================================================================================
+#
+# Keep the folds of open episodes between batches, so that each event of an episode is folded with its state.
+#
+# Theory of operation. An `EpisodeProjection` has one fold for each episode, and its state is a function of the
+# episode's events up to one sequence. That sequence is kept beside it. A batch takes the folds of its episodes out of
+# the cache and gives them back when it is folded, before it is written. If the batch is then not written, because
+# another process folded its events first or the database refused a row, the kept sequence is ahead of the checkpoint,
+# and if another process folded events in the meantime it is behind. So nothing relies on the cache: a batch compares
+# the sequence with the checkpoint that it continues. A fold that is behind reads the events in between, and one that is
+# ahead or missing, as after a restart, is replaced by a new one that reads the episode from its start. The rows of
+# events that are read in this way are discarded, because the transaction that moved the checkpoint wrote them.
+#
+# Two batches may be folded at a time, one while the other is written in parts. They never share a fold, because a fold
+# is in the cache or in one batch.
+
+_EPISODES_MAX: Final = 1_000
+"""Bounds the folds of open episodes that are kept, and with it the memory. It is above the episodes of one batch (400).
+With more open episodes than this, those that were not folded for the longest time are read from their start again."""
+_PAGE_EVENTS: Final = 2_000
+"""Bounds the events that are read at once to restore a fold."""
+_ENDED: Final = EpisodeEnded.__name__
+_TYPE: Final = attrgetter("type")
+Refused: TypeAlias = tuple[int, Exception]
+"""The first event that a fold cannot read, by its sequence, with the exception."""
+
+
+class _Read(Protocol):
+    """Gives events of one episode to a fold; discards the results if `kept` is False."""
+
+    def __call__(self, fold: EpisodeFold, events: Sequence[StoredEvent], *, kept: bool = True) -> Refused | None: ...
+
+
+@dataclass(slots=True)
+class _OpenFold:
+    """The fold of one episode after its event `reached`; `fault` is the reason why it could not be restored."""
+
+    fold: EpisodeFold
+    reached: int = 0
+    has_ended: bool = False
+    fault: str | None = None
+
+    def advance(self, events: Sequence[StoredEvent]) -> None:
+        """Note that the fold has read these events."""
+        self.reached = events[-1].sequence
+        self.has_ended = self.has_ended or _ENDED in map(_TYPE, events)
+
+
+class EpisodeFolds:
+    """The folds of the open episodes of one projection in this process."""
+
+    def __init__(self, projection: EpisodeProjection) -> None:
+        self.projection = projection
+        self._open: OrderedDict[int, _OpenFold] = OrderedDict()
+
+    def take(self, number: int) -> _OpenFold | None:
+        """Return the fold of this episode and remove it; None if there is none."""
+        return self._open.pop(number, None)
+
+    def keep(self, number: int, fold: _OpenFold) -> None:
+        """Keep the fold of an episode that has not ended, and drop the one that was not folded for the longest time.
+
+        After its end an episode can only be tagged, for which its fold is restored.
+        """
+        if fold.has_ended or fold.fault is not None:
+            return
+        self._open[number] = fold
+        self._open.move_to_end(number)
+        if len(self._open) > _EPISODES_MAX:
+            self._open.popitem(last=False)
+
+    def __len__(self) -> int:
+        return len(self._open)
+
+
+class BatchOfFolds:
+    """The folds of the episodes of one batch.
+
+    Args:
+        folds: those that earlier batches left.
+        read: gives events to a fold.
+    """
+
+    def __init__(self, folds: EpisodeFolds, read: _Read) -> None:
+        self._folds = folds
+        self._read = read
+        self._taken: dict[int, _OpenFold] = {}
+
+    async def restore(self, log: EventLog, spans: Sequence[Span]) -> None:
+        """Bring the fold of each episode to the event before its span."""
+        for span in spans:
+            fold = self._folds.take(span.number)
+            if fold is None or fold.reached > span.after:
+                fold = _OpenFold(self._folds.projection.episode())
+            self._taken[span.number] = fold
+            while fold.reached < span.after and fold.fault is None:
+                page = Span(span.number, fold.reached, min(fold.reached + _PAGE_EVENTS, span.after))
+                fold.fault = self._read_again(fold, await log.spans([page]), page.last)
+
+    def fold(self, events: Sequence[StoredEvent]) -> Refused | None:
+        """Give the next events of an episode to its fold, which is dropped if it cannot fold one of them."""
+        first = events[0]
+        taken = self._taken.get(first.number)
+        if taken is None:
+            assert first.sequence == 1, "a batch that continues an episode restores its fold first"
+            taken = self._taken[first.number] = _OpenFold(self._folds.projection.episode())
+        if taken.fault is not None:
+            refused: Refused | None = (first.sequence, CannotFold(taken.fault))
+        else:
+            refused = self._read(taken.fold, events)
+        if refused is None:
+            taken.advance(events)
+        else:
+            del self._taken[first.number]
+        return refused
+
+    def give_back(self) -> None:
+        """Keep the folds for the next batch."""
+        while self._taken:
+            self._folds.keep(*self._taken.popitem())
+
+    def _read_again(self, fold: _OpenFold, events: Sequence[StoredEvent], last: int) -> str | None:
+        """Fold events up to `last` whose rows are written already; return the reason if that is not possible."""
+        whole = consecutive(events, fold.reached)
+        if whole and (refused := self._read(fold.fold, whole, kept=False)) is not None:
+            sequence, fault = refused
+            raised = "" if isinstance(fault, CannotFold) else f"{type(fault).__name__}: "
+            return f"event {sequence}, read again: {raised}{fault}"
+        if whole:
+            fold.advance(whole)
+        return None if fold.reached == last else f"event {fold.reached + 1} is missing in the log"
+
+
+# === packed projection ========================================================================================
+#
+# Define projections that pack many rows of a fold into one row of a table.
+
+
+class PackedProjection(EpisodeProjection):
+    """The base class of projections of this package that pack rows into other rows, as cases into blocks.
+
+    Its tables may have columns of every storage, and names that are reserved for it. Its batch reads the stored events,
+    collects the results of the fold, and packs them.
+    """
+
+    is_packed: ClassVar[bool] = True
+
+    @abstractmethod
+    def episode(self) -> Any:
+        """Return the fold of one episode, as the batch needs it."""
+
+    @abstractmethod
+    def batch(self, declared: Mapping[str, DesignatorTypeDeclared], folds: EpisodeFolds) -> ProjectedBatch:
+        """Return an empty batch."""
+
+    @abstractmethod
+    def check(self, result: VerifyResult) -> PartCheck:
+        """Return the check that compares the tables with the log."""
+
+
+# === projected batch ==========================================================================================
+#
+# Fold a batch of events with a custom projection; subclasses collect the results of the fold, and store them.
+
+
+class ProjectedBatch(ABC):
+    """A batch of a custom projection. Implements `Batch`.
+
+    Args:
+        projection: to fold with.
+        declared: designator types by fingerprint.
+        folds: of an `EpisodeProjection`, those of the episodes that earlier batches began.
+    """
+
+    def __init__(
+        self,
+        projection: Projection,
+        declared: Mapping[str, DesignatorTypeDeclared],
+        folds: EpisodeFolds | None = None,
+    ) -> None:
+        self._projection = projection
+        self._declared = declared
+        reads = projection.reads
+        self._reads = None if reads is None else frozenset(each.__name__ for each in reads)
+        self._folds: BatchOfFolds | None = None
+        if isinstance(projection, EpisodeProjection):
+            self._folds = BatchOfFolds(EpisodeFolds(projection) if folds is None else folds, self._read)
+
+    async def restore(self, log: EventLog, spans: Sequence[Span]) -> None:
+        """Restore the folds of the episodes that this batch continues."""
+        if self._folds is not None:
+            await self._folds.restore(log, spans)
+
+    def fold(self, events: Sequence[StoredEvent]) -> tuple[int, str] | None:
+        """Fold consecutive events of an episode, and add the results to the batch; implements `Batch.fold`."""
+        refused = self._read(self._projection.fold, events) if self._folds is None else self._folds.fold(events)
+        if refused is None:
+            return None
+        sequence, fault = refused
+        raised = "" if isinstance(fault, CannotFold) else f"{self._projection.name} raised {type(fault).__name__}: "
+        return sequence, f"{raised}{fault}"
+
+    def _read(self, fold: Any, events: Sequence[StoredEvent], *, kept: bool = True) -> Refused | None:
+        reads = self._reads
+        return self.add(fold, events if reads is None else [each for each in events if each.type in reads], kept=kept)
+
+    @abstractmethod
+    def add(self, fold: Any, events: Sequence[StoredEvent], *, kept: bool) -> Refused | None:
+        """Fold events of an episode, and add the results to the batch, or discard them if `kept` is False.
+
+        Returns the sequence of the first event that cannot be folded, with the exception; its results are not added.
+        """
+
+    async def ready(self, engine: AsyncEngine, generation: int) -> None:  # noqa: ARG002 - for subclasses
+        """Leave the folds of the episodes to the next batch. Subclasses prepare their statements, too."""
+        if self._folds is not None:
+            self._folds.give_back()
+
+    @abstractmethod
+    async def write(self, connection: AsyncConnection, generation: int) -> None:
+        """Write all rows in the caller's transaction. Raises `RowRefused`."""
+
+
+# === projection rows ==========================================================================================
+#
+# Collect the rows of a custom projection for one batch, checked so that every database stores the same values.
+#
+# `ProjectedBatch`, the base class, gives the events of each episode to the right fold and adds the projection's name to
+# its faults. `CustomRows` executes the fold of one event at a time, checks the changes of rows, and writes them.
+
+_INTEGER_MAX = 2**63 - 1
+"""The largest integer that both databases store."""
+
+
+class CustomRows(ProjectedBatch):
+    """Rows to insert, and changes of rows that an earlier batch inserted, by table and id. Implements `Batch`."""
+
+    def __init__(
+        self,
+        projection: Projection,
+        declared: Mapping[str, DesignatorTypeDeclared],
+        folds: EpisodeFolds | None = None,
+    ) -> None:
+        super().__init__(projection, declared, folds)
+        self._columns = columns_of(projection)
+        self._inserts: dict[str, dict[int, dict[str, Any]]] = {name: {} for name in self._columns}
+        self._updates: dict[str, dict[int, dict[str, Any]]] = {name: {} for name in self._columns}
+        self._insertion: Insertion = None
+
+    def add(self, fold: EpisodeFold, events: Sequence[StoredEvent], *, kept: bool) -> Refused | None:
+        """Add the changes of rows that a fold makes of events, if both databases store their values alike.
+
+        With `kept` False the fold only reads the events, to restore its state: their rows are in the tables already.
+        Returns None, or the sequence of the first event that could not be folded, with the exception; none of the
+        changes of that event are added then, and its episode is parked.
+        """
+        for event in events:
+            changes = Changes()
+            try:
+                fold(self._event(event), changes)
+                if kept and changes.all:
+                    self._add(event.number, changes.all)
+            except Exception as fault:  # noqa: BLE001 - user code; the reason parks the episode
+                return event.sequence, fault
+        return None
+
+    def _add(self, number: int, changes: Changed) -> None:
+        """Add the changes of one event to the rows of the batch. Raises `CannotFold`, and then has added none."""
+        new: set[tuple[str, int]] = set()
+        checked = []
+        for inserts, table, id_, columns in changes:
+            checked.append((inserts, table, id_, self._checked(number, table, id_, columns)))
+            if inserts and ((table, id_) in new or id_ in self._inserts[table]):
+                raise CannotFold(f"{table} has a row {id_} already")
+            if inserts:
+                new.add((table, id_))
+        for inserts, table, id_, values in checked:
+            if inserts:
+                self._inserts[table][id_] = {"id": id_, "process_metadata_id": number, **values}
+                self._updates[table].pop(id_, None)  # an update before the insert had no row, so it has no effect
+            elif id_ in self._inserts[table]:
+                self._inserts[table][id_] |= values
+            elif values:
+                self._updates[table].setdefault(id_, {}).update(values)
+
+    def to_insert(self) -> dict[tuple[str, tuple[str, ...]], list[Row]]:
+        """Return all rows to insert, by (table, columns)."""
+        rows_by_table: dict[tuple[str, tuple[str, ...]], list[Row]] = {}
+        for table, rows in self._inserts.items():
+            columns = tuple(self._columns[table])
+            if rows:
+                rows_by_table[f"{OWN}{table}", columns] = [tuple(map(each.get, columns)) for each in rows.values()]
+        return rows_by_table
+
+    async def ready(self, engine: AsyncEngine, generation: int) -> None:
+        """Prepare the statements that insert the rows, and leave the folds of the episodes to the next batch."""
+        await super().ready(engine, generation)
+        self._insertion = await dialect_of(engine).insertion(stored_rows(engine, self.to_insert(), generation))
+
+    async def write(self, connection: AsyncConnection, generation: int) -> None:
+        """Write all rows in the caller's transaction. Raises `RowRefused`."""
+        dialect, quote = dialect_of(connection), connection.dialect.identifier_preparer.quote
+        await dialect.insert(connection, self._insertion)
+        for table, rows in self._updates.items():
+            updates: dict[tuple[str, ...], list[Row]] = {}
+            for id_, values in rows.items():
+                updates.setdefault(tuple(sorted(values)), []).append((id_, *(values[name] for name in sorted(values))))
+            for columns, changed in updates.items():
+                kinds = {
+                    quote(dialect.stored_column(name)): column_type(self._columns[table][name]).compile(
+                        dialect=connection.dialect
+                    )
+                    for name in ("id", *columns)
+                }
+                await dialect.update_rows(connection, physical_name(f"{OWN}{table}", generation), kinds, changed)
+
+    def _event(self, stored: StoredEvent) -> Event:
+        number, sequence, _, _, wall_ns, monotonic_ns, payload = stored
+        happening = happening_of(stored)
+        parameters: Mapping[str, Any] = {}
+        dtype = declaration = None
+        if isinstance(happening, NodeStarted) and happening.designator is not None:
+            declaration = self._declared.get(happening.designator)
+            if declaration is None:
+                raise CannotFold(f"the designator type {happening.designator} was never declared")
+            dtype, parameters = declaration.dtype, happening.parameters
+            if b'"missing"' in payload:  # only then can a parameter be a `MissingValue`, so most events skip the copy
+                parameters = {name: None if is_missing(each) else each for name, each in parameters.items()}
+        time_us = microseconds(wall_ns)
+        return make(Event, (number, sequence, time_us, monotonic_ns, happening, dtype, parameters, declaration))
+
+    def _checked(self, number: int, table: str, id_: Any, values: Mapping[str, Any]) -> dict[str, Any]:
+        columns = self._columns.get(table)
+        if columns is None:
+            raise CannotFold(f"{self._projection.name} has no table {table!r}")
+        if not isinstance(id_, int) or row_key(id_).number != number:
+            raise CannotFold(f"{table}: {id_!r} is not a row of this episode: use event.id or event.row(sequence)")
+        for name in values:
+            if name not in columns or name in OF_EVERY_TABLE:
+                raise CannotFold(f"{table} has no column {name!r} to fill")
+        return {name: _value(table, name, columns[name], each) for name, each in values.items()}
+
+
+def _value(table: str, name: str, storage: Storage, value: Any) -> Any:
+    """Return the value as the column stores it. Raises `CannotFold` where SQLite would accept it and change it."""
+    if value is None:
+        return None
+    match storage:
+        case "json":
+            try:
+                return json_text(value)
+            except (TypeError, ValueError) as error:
+                raise CannotFold(f"{table}.{name}: {error}") from None
+        case "text":
+            fits = isinstance(value, str)
+        case "boolean":
+            fits = isinstance(value, bool)
+        case "real":
+            fits = isinstance(value, int | float) and not isinstance(value, bool)
+        case _:
+            fits = isinstance(value, int) and not isinstance(value, bool) and abs(value) <= _INTEGER_MAX
+    if not fits:
+        raise CannotFold(f"{table}.{name}: {repr(value)[:80]} is not of the declared type {storage}")
+    if storage == "real":
+        value = float(value)
+    fault = unwritable(value)
+    if fault is not None:
+        raise CannotFold(f"{table}.{name}: {fault}")
+    return value
+
+
+# === projection tables ========================================================================================
+#
+# Create the tables of custom projections and keep them up to date, after the built-in tables.
+#
+# `pycrorm_generation` lists them under `projection/NAME`. A process without the projection's code leaves its tables as
+# they are; a process that has it catches up. A fault in one projection is logged, and the others continue.
+
+_CHECK_S = 1.0
+"""The interval between checks for events from other processes, because a check costs a scan of all episodes."""
+
+
+class CustomFoldDefinition:
+    """The fold of a custom projection. Implements `FoldDefinition`."""
+
+    def __init__(self, projection: Projection) -> None:
+        self._projection = projection
+        self._folds = EpisodeFolds(projection) if isinstance(projection, EpisodeProjection) else None
+
+    def learn(self, layout: Layout, payloads: Sequence[bytes]) -> tuple[Layout, Callable[[], Batch]]:
+        declared = {}
+        for payload in payloads:
+            try:
+                declared[fingerprint(payload)] = declaration_of(payload)
+            except ValueError:  # from a newer version: its nodes cannot be folded
+                continue
+        projection, folds = self._projection, self._folds
+        if isinstance(projection, PackedProjection):
+            assert folds is not None, "it is an EpisodeProjection"
+            return layout, partial(projection.batch, declared, folds)
+        return layout, partial(CustomRows, projection, declared, folds)
+
+
+def layout_of(projection: Projection, dialect: Dialect) -> Layout:
+    """Return the projection's tables and views. Raises `CallerError`."""
+    tables = columns_of(projection)
+    leaves: dict[str, dict[str, Storage]] = {
+        f"{OWN}{name}": {each: storage for each, storage in columns.items() if each != "id"}
+        for name, columns in tables.items()
+    }
+    layout = Layout(leaves=leaves)
+    return with_user_views(layout, projection.views, dialect)
+
+
+def events_of_batch(projection: Projection, batch_events: int) -> int:
+    """Return the most events in one transaction of a projection, where one of the tables has `batch_events`.
+
+    A packed projection writes a few rows only, so that most of a transaction's cost does not depend on its events.
+    """
+    return 4 * batch_events if isinstance(projection, PackedProjection) else batch_events
+
+
+async def make_projection_tables(connection: AsyncConnection, projection: Projection, key: str) -> Generation:
+    """Create the projection's tables and checkpoints, empty, as a new generation under this key."""
+    generations = await read_generations(connection)
+    own = f"{PROJECTION}{projection.name}"
+    numbers = [each.number for name, each in generations.items() if name == own or name.startswith(f"{own}/")]
+    empty = Generation(next_number(numbers), 0, Layout(), {}, projection.version)
+    generation = await grow_tables(connection, empty, layout_of(projection, connection.dialect))
+    await make_empty(connection, {f"{checkpoints.TABLE}_{projection.name}": checkpoints.COLUMNS}, generation.number)
+    await write_generation(connection, key, generation)
+    return generation
+
+
+def refuse_taken(name: str, layout: Layout, tables: Layout, projections: Mapping[str, Generation]) -> None:
+    """Raise `CallerError` if the memory or another projection has a name of this projection's tables and views."""
+    others = {other: generation for other, generation in projections.items() if other != name}
+    owners = {
+        each: f"the projection {other}" for other, generation in others.items() for each in _names(generation.layout)
+    }
+    owners |= dict.fromkeys(_names(tables), "the memory")
+    for each in _names(layout):
+        if each in owners:
+            raise CallerError(f"the projection {name} needs the name {each!r}, which {owners[each]} has: rename it")
+
+
+async def _set_up(connection: AsyncConnection, projection: Projection, tables: Layout) -> tuple[Generation, bool]:
+    """Create the projection's missing tables; return its generation, and whether the views must be created again.
+
+    Args:
+        connection: in a transaction that excludes all other writers of the memory.
+        projection: to set up.
+        tables: the layout of the built-in tables.
+
+    Raises `CallerError` for a name that is taken, `DatabaseForeign` for tables of another version.
+    """
+    layout = layout_of(projection, connection.dialect)
+    generations = projections_in(await read_generations(connection))
+    refuse_taken(projection.name, layout, tables, generations)
+    generation = generations.get(projection.name)
+    key = f"{PROJECTION}{projection.name}"
+    if generation is None:
+        return await make_projection_tables(connection, projection, key), True
+    fault = fault_in_version(projection, generation, layout)
+    if fault is not None:
+        raise DatabaseForeign(fault)
+    if generation.layout == layout:
+        return generation, False
+    generation = replace(generation, revision=generation.revision + 1, layout=layout)
+    await write_generation(connection, key, generation)
+    return generation, True
+
+
+def fault_in_version(projection: Projection, generation: Generation, layout: Layout) -> str | None:
+    """Return the reason why this projection cannot be folded into these tables; None if it can."""
+    name = projection.name
+    if generation.version != projection.version:
+        return (
+            f"the tables of the projection {name} have version {generation.version}, its code has version"
+            f" {projection.version}: run `pycrorm rebuild {name}`"
+        )
+    if generation.layout.leaves != layout.leaves:
+        return (
+            f"the projection {name} defines other tables than its stored version {generation.version}:"
+            f" raise its version, then run `pycrorm rebuild {name}`"
+        )
+    return None
+
+
+class CustomTables:
+    """Folds the custom projections of a process. A fault in one is logged once, and then it is left out."""
+
+    def __init__(
+        self, log: EventLog, named: Sequence[Projection], installed: Sequence[Projection], *, batch_events: int
+    ) -> None:
+        self._log = log
+        self._named = named
+        self._installed = installed
+        self._batch_events = batch_events
+        self._folded: dict[str, tuple[BatchFold, FoldPipeline]] = {}
+        self._packed: set[str] = set()
+        self._checked_s = self._packed_s = 0.0
+
+    async def set_up(self, connection: AsyncConnection, tables: Layout) -> bool:
+        """Create missing tables; return whether the views must be created again.
+
+        Raises `CallerError` for a taken name of a projection that the caller gave; an installed one is left out.
+        """
+        changed = False
+        for each in (*self._named, *self._installed):
+            try:
+                generation, is_new = await _set_up(connection, each, tables)
+            except (DatabaseForeign, CallerError) as fault:
+                if isinstance(fault, CallerError) and each in self._named:
+                    raise
+                _log.warning("%s", fault)
+                continue
+            changed = changed or is_new
+            target = SideTarget(self._log, f"{PROJECTION}{each.name}", each.name, each.version)
+            fold = BatchFold(self._log, target, generation, CustomFoldDefinition(each))
+            local = None if self._log.address.is_sqlite else fold
+            if isinstance(each, PackedProjection):
+                self._packed.add(each.name)
+            self._folded[each.name] = (
+                fold,
+                FoldPipeline(target, batch_events=events_of_batch(each, self._batch_events), local=local),
+            )
+        return changed
+
+    async def fold_next_batch(self, *, now: bool, until_visible: bool = False) -> bool:
+        """Fold a batch of each projection; return False if none was behind.
+
+        Checks only every `_CHECK_S` unless `now` is True. The package's own projections are folded every `_CHECK_S`
+        unless `until_visible` is True, because a batch of a few events costs as much as one of a thousand.
+        """
+        time_s = asyncio.get_running_loop().time()
+        if not self._folded or (not now and time_s < self._checked_s + _CHECK_S):
+            return False
+        packed = until_visible or time_s >= self._packed_s + _CHECK_S
+        count = 0
+        for name, (fold, pipeline) in [*self._folded.items()]:
+            if name in self._packed and not packed:
+                continue
+            try:
+                events = await pipeline.fold_next([fold])
+                count += events is not None
+                if name in self._packed and (events is None or events < LOOKAHEAD_EVENTS_MIN):
+                    self._packed_s = time_s
+            except DatabaseUnavailable:
+                raise
+            except PycrormError as fault:
+                _log.warning("this process stops folding the projection %s: %s", name, fault)
+                await self._note_fault(name, fold.generation, str(fault))
+                del self._folded[name]
+        if not count:
+            self._checked_s = time_s
+        return count > 0
+
+    async def _note_fault(self, name: str, folded: Generation, reason: str) -> None:
+        """Write the reason into the projection's generation, where `pycrorm status` reads it until it is set up again.
+
+        Tables that another process has rebuilt in the meantime get no note.
+        """
+        key = f"{PROJECTION}{name}"
+        async with self._log.engine.begin() as connection:
+            generation = await read_generation(connection, key, hold="change")
+            if generation is not None and generation.number == folded.number:
+                layout = msgspec.structs.replace(generation.layout, fault=reason)
+                await write_generation(connection, key, replace(generation, layout=layout))
+
+
+class ProjectionState(NamedTuple):
+    """The state of a projection that has tables in a memory.
+
+    Attributes:
+        name, version: of its tables.
+        behind: the number of events that its tables lack.
+        parked: the parked episodes by number, with the reasons.
+        fault: the reason why this process cannot fold it, or another one stopped; None if it can, or has not its code.
+    """
+
+    name: str
+    version: int
+    behind: int
+    parked: Mapping[int, str]
+    fault: str | None
+
+
+async def states(log: EventLog, projections: Sequence[Projection]) -> list[ProjectionState]:
+    """Return the state of every projection in this memory. `projections` are those whose code this process has."""
+    by_name = {each.name: each for each in projections}
+    result: list[ProjectionState] = []
+    async with log.reading() as connection:
+        for name, each in projections_in(await read_generations(connection)).items():
+            place = checkpoints.place_of(each.number, name)
+            fault = each.layout.fault
+            if fault is not None:
+                fault = f"a process stopped folding the projection {name}, start it again to try again: {fault}"
+            if name in by_name:
+                fault = fault_in_version(by_name[name], each, layout_of(by_name[name], connection.dialect)) or fault
+            left, parked = await checkpoints.left(connection, place), await checkpoints.parked(connection, place)
+            result.append(ProjectionState(name, each.version, left, parked, fault))
+    return result
+
+
+def _names(layout: Layout) -> list[str]:
+    return [name.removeprefix(OWN).lower() for name in (*layout.leaves, *layout.user_views)]

@@ -1,1 +1,0 @@
-"""Fold the log into tables of the user's own."""

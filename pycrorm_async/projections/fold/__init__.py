@@ -1,1 +1,0 @@
-"""Turn events into rows, without reading a table."""

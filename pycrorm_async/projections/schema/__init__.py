@@ -1,1 +1,0 @@
-"""Define the tables and views of a generation, and create them."""

@@ -1,1 +1,0 @@
-"""Verify the log and compare the tables with it."""

@@ -1,0 +1,412 @@
+"""Define the public views: the selects over a generation's tables that queries and mapped classes read.
+
+Most views select their table unchanged. `designator`, `action`, `motion`, `language` and `robot_state` select from
+`task_tree_node`, `position` and `quaternion` from `pose`; a leaf's view unites the tables of its descendants.
+
+The views exclude simulations, so that every reader sees only real episodes. `session_views` replaces them, for
+one connection, by views of the same names that include simulations.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple, TypeAlias
+
+import msgspec
+from sqlalchemy import (
+    Column,
+    ColumnElement,
+    Double,
+    Select,
+    Table,
+    TextualSelect,
+    and_,
+    case,
+    cast,
+    column,
+    func,
+    not_,
+    null,
+    or_,
+    select,
+    table,
+    union_all,
+)
+from sqlalchemy.sql.selectable import CompoundSelect
+
+from pycrorm_async.events.codec import DESCRIPTION_PREFIX
+from pycrorm_async.events.fields import table_name
+from pycrorm_async.projections.columns import (
+    CORE,
+    EPISODE,
+    LINK_BOX,
+    OF_NO_EPISODE,
+    OWN,
+    Layout,
+    Storage,
+    column_type,
+    columns_in_order,
+    leaf_columns,
+    make_table,
+)
+from pycrorm_async.projections.derived_views import (
+    CONCEPT_VIEWS,
+    SpatialTables,
+    absent,
+    event_of,
+    member,
+    pick_ups_with_context,
+    root_failures,
+    spatial_relations,
+    world_line,
+)
+from pycrorm_async.world.pose import ObjectType
+
+View: TypeAlias = Select[Any] | CompoundSelect[Any] | TextualSelect
+_Columns: TypeAlias = tuple[tuple[str, Storage], ...]
+
+_UNITED_MAX = 400
+"""Bounds the selects in one UNION, because SQLite allows 500. More are united in groups."""
+
+_PICKED = "pick_up_action"
+_PLACED = "place_action"
+_OF_PICK_UPS = ("task_tree_node", "object", "object_removal", "pose", "process_metadata")
+_OF_RELATIONS = ("task_tree_node", "object", "object_removal", "pose", "joint_change")
+"""The tables of `PickUpWithContextView` and of `spatial_relation`."""
+
+_declaration = table("pycrorm_declaration", column("fingerprint"), column("payload"))
+_is_description = func.substr(_declaration.c.fingerprint, 1, len(DESCRIPTION_PREFIX)) == DESCRIPTION_PREFIX
+
+
+@dataclass(frozen=True)
+class Tables:
+    """The tables behind the views.
+
+    Attributes:
+        generation: their number.
+        stored: maps a column to its name in this database.
+        simulated: the views include simulations.
+    """
+
+    generation: int
+    stored: Callable[[str], str]
+    simulated: bool = False
+
+    def __getitem__(self, name: str) -> Table:
+        """Return a table that every memory has."""
+        return make_table(name, CORE.get(name) or OF_NO_EPISODE[name], self.generation, self.stored)
+
+    def leaf(self, name: str, columns: _Columns) -> Table:
+        return make_table(name, leaf_columns(dict(columns)), self.generation, self.stored)
+
+    def shown(self, view: Select[Any], rows: Table) -> Select[Any]:
+        """Return the view without the rows of simulations, unless these views include them."""
+        return view if self.simulated else view.where(_happened(rows, self["simulated_episode"]))
+
+
+class _Leaf(NamedTuple):
+    """The facts of a layout that a leaf's view depends on: its columns, and the tables it unites with theirs."""
+
+    columns: _Columns
+    members: tuple[tuple[str, _Columns], ...]
+
+    @classmethod
+    def of(cls, name: str, layout: Layout) -> _Leaf:
+        members = ((each, tuple(layout.leaves[each].items())) for each in layout.members(name))
+        return cls(tuple(layout.columns(name).items()), tuple(members))
+
+
+class ViewDefinition(NamedTuple):
+    """The function that makes a view's select, and all the facts of a layout that it depends on.
+
+    Two layouts with the same facts have the same view, so its text is compiled once (`generations`).
+    """
+
+    function: Callable[..., View]
+    facts: tuple[Hashable, ...] = ()
+
+    def select(self, tables: Tables) -> View:
+        return self.function(tables, *self.facts)
+
+
+def public_views(layout: Layout) -> dict[str, ViewDefinition]:
+    """Return name and definition of every view of this layout, except users' views."""
+    views = {name: ViewDefinition(_whole, (name,)) for name in CORE if name != "simulated_episode"}
+    views |= {name: ViewDefinition(_cut, (name,)) for name in _CUT}
+    views["designator"] = ViewDefinition(_designator, (_unusual_lineages(layout),))
+    leaves = {name: _Leaf.of(name, layout) for name in layout.leaves}
+    views |= {name: ViewDefinition(_united_rows, (leaf,)) for name, leaf in leaves.items()}
+    if _PICKED in leaves:
+        dtypes = layout.dtypes(_PICKED)
+        views["PickUpWithContextView"] = ViewDefinition(_pick_ups_with_context, (leaves[_PICKED], dtypes))
+        if _PLACED in leaves:
+            views["spatial_relation"] = ViewDefinition(_spatial_relations, (leaves[_PICKED], leaves[_PLACED]))
+    views["designator_type"] = ViewDefinition(_designator_type, (layout.unreadable,))
+    views["object_description"] = ViewDefinition(_object_description)
+    return {**views, **{name: ViewDefinition(_of_concepts, (name,)) for name in CONCEPT_VIEWS}}
+
+
+def projection_views(layout: Layout, number: int, tables: Tables) -> dict[str, View]:
+    """Return the views of a custom projection. `number` is the generation of its tables, `tables` are the built-in."""
+    views: dict[str, View] = {}
+    for name, columns in layout.leaves.items():
+        rows = make_table(name, leaf_columns(columns), number, tables.stored)
+        views[name.removeprefix(OWN)] = tables.shown(select(*map(_labelled, columns_in_order(rows))), rows)
+    return views
+
+
+def _whole(tables: Tables, name: str) -> View:
+    """Return the view that shows a table unchanged."""
+    rows = tables[name]
+    return tables.shown(select(*columns_in_order(rows), *_sequence(rows)), rows)
+
+
+def _cut(tables: Tables, name: str) -> View:
+    home, function = _CUT[name]
+    return tables.shown(function(tables), tables[home])
+
+
+def _pick_ups_with_context(tables: Tables, picked: _Leaf, dtypes: tuple[str, ...]) -> View:
+    node, object_, removal, pose, episode = (tables[name] for name in _OF_PICK_UPS)
+    rows = _with_simulations(tables, picked).subquery("picked")
+    return tables.shown(pick_ups_with_context(rows, node, object_, removal, pose, episode, dtypes), node)
+
+
+def _spatial_relations(tables: Tables, picked: _Leaf, placed: _Leaf) -> View:
+    rows = [_with_simulations(tables, each).subquery(name) for each, name in ((picked, "picked"), (placed, "placed"))]
+    read = SpatialTables(*(tables[name] for name in _OF_RELATIONS))
+    return spatial_relations(read, tables[LINK_BOX], *rows, simulated=tables.simulated)
+
+
+def _with_simulations(tables: Tables, leaf: _Leaf) -> View:
+    return _united_rows(replace(tables, simulated=True), leaf)
+
+
+def _object_description(_tables: Tables) -> View:
+    return select(_declaration).where(_is_description)
+
+
+def _of_concepts(_tables: Tables, name: str) -> View:
+    return CONCEPT_VIEWS[name]()
+
+
+def _happened(rows: Table, simulations: Table) -> ColumnElement[bool]:
+    """Return the condition that a row does not belong to a simulation."""
+    if "simulated" in rows.c:
+        return ~rows.c.simulated
+    return absent(rows.c[EPISODE], simulations.c.id)
+
+
+def _process_metadata(tables: Tables) -> Select[Any]:
+    episodes = tables["process_metadata"]
+    line = world_line(tables["object"], tables["object_removal"], episodes.c.id)
+    world = func.coalesce(episodes.c.world, episodes.c.entered_world, line).label("world")
+    columns = columns_in_order(episodes)
+    first, *others = (world if each.name == "world" else each for each in columns if each.name != "entered_world")
+    return select(first, *others)
+
+
+def _episode_tag(tables: Tables) -> Select[Any]:
+    """Return the tags that episodes have now: those whose last change added them."""
+    changes = tables["episode_tagging"]
+    later = changes.alias("later")
+    is_later = and_(
+        later.c.process_metadata_id == changes.c.process_metadata_id,
+        later.c.tag == changes.c.tag,
+        or_(later.c.id > changes.c.id, and_(later.c.id == changes.c.id, later.c.position > changes.c.position)),
+    )
+    columns = changes.c.id, changes.c.process_metadata_id, changes.c.tag, changes.c.time
+    return select(*columns, *_sequence(changes)).where(
+        changes.c.added, not_(select(later.c.id).where(is_later).exists())
+    )
+
+
+def _episode_robot(tables: Tables) -> Select[Any]:
+    """Return the robots of episodes, each once, however often it was added: with the row of the first time."""
+    rows = tables["object"]
+    robot = rows.c.process_metadata_id, rows.c.name, rows.c.model, rows.c.serial, rows.c.description_fingerprint
+    first = func.min(rows.c.id)
+    robots = select(first.label("id"), *robot, event_of(first).label("sequence")).group_by(*robot)
+    return robots.where(rows.c.obj_type == ObjectType.ROBOT.name, rows.c.id == rows.c.identity_id)
+
+
+def _designator_type(_tables: Tables, unreadable_declarations: tuple[str, ...]) -> View:
+    """Return the view of declarations. It never parses one that is not JSON, whichever column a query reads."""
+    payload: ColumnElement[Any] = _declaration.c.payload
+    if unreadable_declarations:
+        unreadable = _declaration.c.fingerprint.in_(unreadable_declarations)
+        payload = case((unreadable, "{}"), else_=payload)
+
+    def of_payload(name: str) -> ColumnElement[Any]:
+        return member(payload, name)
+
+    view = select(
+        _declaration.c.fingerprint,
+        of_payload("dtype").label("dtype"),
+        of_payload("kind").label("kind"),
+        of_payload("table").label("leaf"),
+        of_payload("concept").label("concept"),
+        func.coalesce(of_payload("fields"), "[]").label("fields"),
+    )
+    view = view.where(~_is_description)
+    return view.where(~unreadable) if unreadable_declarations else view
+
+
+def _task_tree_node(tables: Tables) -> Select[Any]:
+    nodes = tables["task_tree_node"]
+    action_id = case((nodes.c.dtype.is_not(None), nodes.c.id), else_=null())
+    columns = (each for each in columns_in_order(nodes) if each.key != "parameters")
+    return select(*columns, *_sequence(nodes), action_id.label("action_id"), _duration(nodes))
+
+
+def _sequence(rows: Table) -> tuple[ColumnElement[Any], ...]:
+    """Return the column `sequence` of rows: the sequence of the event in the id that their key begins with."""
+    first, *_ = rows.primary_key.columns
+    return (event_of(first).label("sequence"),)
+
+
+def _duration(nodes: Table) -> ColumnElement[Any]:
+    """Return the column `duration` (s); null while the node runs, and if it is LOST."""
+    return (cast(nodes.c.end_ns - nodes.c.start_ns, Double()) / 1e9).label("duration")
+
+
+def _course(nodes: Table) -> tuple[ColumnElement[Any], ...]:
+    """Return the columns of a node's course: start and end by time and by event, robot, parent, and outcome."""
+    times = nodes.c.start_time, nodes.c.end_time, _duration(nodes)
+    ended = nodes.c.reason, nodes.c.failure_message, nodes.c.result
+    return nodes.c.status, *times, *ended, *_sequence(nodes), nodes.c.end_sequence, nodes.c.robot, nodes.c.parent_id
+
+
+def _designator(tables: Tables, unusual_lineages: tuple[tuple[str, str], ...]) -> View:
+    nodes = tables["task_tree_node"]
+    robot_state_id = case((nodes.c.robot_pose_id.is_not(None), nodes.c.id), else_=null())
+    kind = case({"action": " Action", "motion": " Motion", "language": " Language"}, value=nodes.c.kind)
+    lineage: ColumnElement[str] = nodes.c.dtype.concat(kind)
+    if unusual_lineages:
+        lineage = case(dict(unusual_lineages), value=nodes.c.dtype, else_=lineage)
+    view = select(
+        nodes.c.id,
+        nodes.c.process_metadata_id,
+        nodes.c.dtype,
+        nodes.c.kind,
+        robot_state_id.label("robot_state_id"),
+        func.coalesce(nodes.c.parameters, "{}").label("parameters"),
+        lineage.label("lineage"),
+        *_course(nodes),
+    ).where(nodes.c.dtype.is_not(None))
+    return tables.shown(view, nodes)
+
+
+def _unusual_lineages(layout: Layout) -> tuple[tuple[str, str], ...]:
+    """Return the lineages of the types with bases or with another table name, and of former names."""
+    unusual = (dtype for dtype, each in layout.types.items() if each.bases or each.tables != (table_name(dtype),))
+    return tuple((dtype, layout.lineage(dtype)) for dtype in dict.fromkeys((*unusual, *layout.renamed)))
+
+
+def _of_kind(kind: str) -> Callable[[Tables], Select[Any]]:
+    def view(tables: Tables) -> Select[Any]:
+        nodes = tables["task_tree_node"]
+        parameters = func.coalesce(nodes.c.parameters, "{}").label("parameters")
+        columns = nodes.c.id, nodes.c.process_metadata_id, nodes.c.dtype, *_course(nodes), parameters
+        return select(*columns).where(nodes.c.kind == kind, nodes.c.dtype.is_not(None))
+
+    return view
+
+
+def _robot_state(tables: Tables) -> Select[Any]:
+    nodes = tables["task_tree_node"]
+    return select(
+        nodes.c.id,
+        nodes.c.process_metadata_id,
+        nodes.c.torso_height,
+        nodes.c.robot_type.label("type"),
+        nodes.c.robot_pose_id.label("pose_id"),
+        *_sequence(nodes),
+    ).where(nodes.c.robot_pose_id.is_not(None))
+
+
+def _root_failure(tables: Tables) -> Select[Any]:
+    return root_failures(tables["task_tree_node"], tables["object"])
+
+
+def _pose(tables: Tables) -> Select[Any]:
+    poses = tables["pose"]
+    return select(
+        *columns_in_order(poses), *_sequence(poses), poses.c.id.label("position_id"), poses.c.id.label("orientation_id")
+    )
+
+
+def _position(tables: Tables) -> Select[Any]:
+    poses = tables["pose"]
+    return select(poses.c.id, poses.c.process_metadata_id, poses.c.x, poses.c.y, poses.c.z)
+
+
+def _quaternion(tables: Tables) -> Select[Any]:
+    poses = tables["pose"]
+    parts = (poses.c[f"q{axis}"].label(axis) for axis in "xyzw")
+    return select(poses.c.id, poses.c.process_metadata_id, *parts)
+
+
+_CUT: dict[str, tuple[str, Callable[[Tables], Select[Any]]]] = {
+    "process_metadata": ("process_metadata", _process_metadata),
+    "episode_tag": ("episode_tagging", _episode_tag),
+    "episode_robot": ("object", _episode_robot),
+    "task_tree_node": ("task_tree_node", _task_tree_node),
+    "action": ("task_tree_node", _of_kind("action")),
+    "motion": ("task_tree_node", _of_kind("motion")),
+    "language": ("task_tree_node", _of_kind("language")),
+    "robot_state": ("task_tree_node", _robot_state),
+    "root_failure": ("task_tree_node", _root_failure),
+    "pose": ("pose", _pose),
+    "position": ("pose", _position),
+    "quaternion": ("pose", _quaternion),
+}
+"""Views that differ from their table: by name, the table their rows come from and the function that selects them."""
+
+
+def _united_rows(tables: Tables, leaf: _Leaf) -> View:
+    """Return the rows of a leaf table and of its members; a column that a member lacks is null."""
+    parts = []
+    for member_name, member_columns in leaf.members:
+        rows, own = tables.leaf(member_name, member_columns), dict(member_columns)
+        columns: list[ColumnElement[Any]] = [rows.c.id]
+        for each, storage in leaf.columns:
+            same = own.get(each) == storage
+            columns.append(_labelled(rows.c[each]) if same else cast(null(), column_type(storage)).label(each))
+        columns += [rows.c[EPISODE]]
+        if all(name != "sequence" for name, _ in leaf.columns):
+            columns += _sequence(rows)
+        parts.append(tables.shown(select(*columns), rows))
+    return _united(parts)
+
+
+def _united(parts: Sequence[Select[Any]]) -> View:
+    """Return the union of these selects, which have the same columns."""
+    while len(parts) > _UNITED_MAX:
+        groups = [parts[first : first + _UNITED_MAX] for first in range(0, len(parts), _UNITED_MAX)]
+        parts = [select(union_all(*each).subquery()) for each in groups]
+    return parts[0] if len(parts) == 1 else union_all(*parts)
+
+
+def _labelled(column: Column[Any]) -> ColumnElement[Any]:
+    """Return the column under its name in the view."""
+    return column if column.name == column.key else column.label(column.key)
+
+
+# === comments =================================================================================================
+#
+# Load the comments on views and columns, which PostgreSQL keeps.
+#
+# `python -m pycrorm_async.orm.documentation` writes the file from the docstrings of the mapped classes. It exists
+# because a process that makes tables, such as a daemon, does not load these classes.
+
+FILE = Path(__file__).with_name("comments.json")
+
+
+@cache
+def comments() -> dict[str, dict[str, str]]:
+    """Return the texts by view and column; the text under the empty name is the view's own."""
+    return msgspec.json.decode(FILE.read_bytes(), type=dict[str, dict[str, str]])

@@ -1,0 +1,710 @@
+"""Draw episodes, task trees, charts, moments and answers as HTML and SVG for notebooks.
+
+HTML and SVG are without scripts, styles of their own or requests. Text takes the colour of the notebook, signs and bars
+have colours that contrast with light and dark pages, and every status has a sign. Everything recorded is escaped and
+isolated from the direction of the text around it.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import html
+import math
+import threading
+from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Set as AbstractSet
+from itertools import islice
+from random import Random
+from typing import (
+    Generic,
+    Literal,
+    NamedTuple,
+    Self,
+    SupportsIndex,
+    TypeAlias,
+    TypeVar,
+    get_args,
+    overload,
+)
+
+import msgspec
+from sqlalchemy import func, select
+
+from pycrorm_async.errors import CallerError, PycrormError
+from pycrorm_async.orm import ProcessMetaData
+from pycrorm_async.query.episode_diff import EpisodeDiff
+from pycrorm_async.query.named_queries import EpisodeChoice, EpisodeSummary, NodeSummary, counts_text, episodes
+from pycrorm_async.query.question import Question, SyncQuestion
+from pycrorm_async.query.snapshot import Moment, ObjectThen, WorldThen, world_map
+from pycrorm_async.query.sql import SqlResult
+from pycrorm_async.query.text import (
+    FAILED,
+    Drawing,
+    color_of,
+    duration,
+    facts,
+    left_out,
+    moment,
+    one_line,
+    parameters_text,
+    quiet,
+    recorded,
+    sign_of,
+    status,
+    table,
+    value_html,
+    view,
+)
+from pycrorm_async.store.address import DatabaseAddress
+
+#
+# Draw episodes: a table of many, the facts of one, and its task tree with a chart.
+
+EPISODES_MAX = 100
+"""Bounds the rows of a table of episodes."""
+_COLUMNS = ("episode", "started, UTC", "took", "status", "nodes", "failed", "description", "robots", "tags")
+
+
+def episodes_html(episodes: Sequence[EpisodeSummary], total: int | None = None) -> str:
+    """Return a table of the newest episodes, the oldest of them first; `total` is the number of all in the memory."""
+    if not episodes:
+        return view("No episodes")
+    count, shown = len(episodes) if total is None else total, episodes[-EPISODES_MAX:]
+    more = f"<div>{left_out(count - len(shown), 'before these')}</div>" if len(shown) < count else ""
+    return view(f"<b>{count:,} episode{'s' * (count > 1)}</b>", more, table(_COLUMNS, map(_row, shown)))
+
+
+def _row(each: EpisodeSummary) -> tuple[str, ...]:
+    return (
+        str(each.number),
+        moment(each.started_at),
+        duration(each.duration_ns),
+        status(each.status),
+        f"{each.nodes:,}",
+        f"{each.failed:,}" if each.failed else "",
+        recorded(each.description, 100),
+        recorded(", ".join(map(str, each.robots)), 60),
+        recorded(", ".join(each.tags), 60),
+    )
+
+
+def episode_html(each: EpisodeSummary) -> str:
+    """Return the facts of an episode."""
+    commit = f"{each.git_commit}{' and changes' if each.git_dirty else ''}" if each.git_commit else ""
+    return view(
+        _title(each),
+        facts(
+            {
+                "started": f"{moment(each.started_at)} UTC by {recorded(each.created_by)}",
+                "took": duration(each.duration_ns),
+                "nodes": f"{each.nodes:,}, {each.failed:,} failed",
+                "robots": recorded(", ".join(map(str, each.robots))) if each.robots else "",
+                "tags": recorded(", ".join(each.tags)) if each.tags else "",
+                "metadata": recorded(each.metadata) if each.metadata else "",
+                "plan": recorded(each.plan) if each.plan else "",
+                "commit": recorded(commit) if commit else "",
+                "world": recorded(each.world) if each.world else "",
+                "simulated by": f"a node of episode {each.thought_by.episode}" if each.thought_by else "",
+                "id": each.id,
+            }
+        ),
+    )
+
+
+def _title(each: EpisodeSummary) -> str:
+    simulated = f" {quiet('simulated')}" if each.simulated else ""
+    return f"<b>Episode {each.number} · {recorded(each.description)}</b> · {status(each.status)}{simulated}"
+
+
+def task_tree_html(nodes: Sequence[NodeSummary], episode: EpisodeSummary | None) -> str:
+    """Return the title of the episode, a chart of its nodes over events, and the nodes as nested lists."""
+    count = f"{len(nodes):,} node{'s' * (len(nodes) != 1)}"
+    if episode is None:
+        title = f"<b>{count}</b>"
+    else:
+        took = f" {duration(episode.duration_ns)}" if episode.duration_ns is not None else ""
+        title = f"{_title(episode)}{took} · {count}"
+    if not nodes:
+        return view(title)
+    more = f"<div>{left_out(len(nodes) - NODES_MAX, 'nodes than drawn')}</div>" if len(nodes) > NODES_MAX else ""
+    chart = f'<div style="max-height:340px;overflow:auto;margin:6px 0">{gantt(nodes).svg}</div>'
+    return view(title, more, chart, tree_html(nodes))
+
+
+# === tree view ================================================================================================
+#
+# Draw a task tree as nested lists that are opened at its failures.
+
+NODES_MAX = 500
+"""Bounds the nodes of a view, so that a notebook with many of them stays small."""
+_NODES_OPEN = 100
+"""Opens the first two levels of a tree of up to this many nodes, and the first one of a larger tree."""
+_FAILURES_OPEN = 20
+"""Bounds the failures at which a tree is opened, so that a view of hundreds of them is not long."""
+_PARAMETERS_MAX = 160
+"""Bounds the characters of a node's parameters."""
+
+
+def shown_nodes(nodes: Sequence[NodeSummary]) -> list[NodeSummary]:
+    """Return the nodes that a view shows: at most half of them lead to failures, the others are nearest to the root."""
+    if len(nodes) <= NODES_MAX:
+        return list(nodes)
+    by_id = {each.id: each for each in nodes}
+    depths: dict[int, int] = {}
+    for each in nodes:
+        depths[each.id] = depths.get(each.parent_id, -1) + 1 if each.parent_id is not None else 0
+    kept: set[int] = set()
+    for each in root_failures(nodes):
+        path = {each.id}
+        while (parent := each.parent_id) in by_id and parent is not None:
+            path.add(parent)
+            each = by_id[parent]
+        if len(kept | path) > NODES_MAX // 2:
+            break
+        kept |= path
+    nearest = sorted((each.id for each in nodes if each.id not in kept), key=lambda number: depths[number])
+    kept.update(nearest[: NODES_MAX - len(kept)])
+    return [each for each in nodes if each.id in kept]
+
+
+def root_failures(nodes: Sequence[NodeSummary]) -> list[NodeSummary]:
+    """Return the failed nodes without a failed child."""
+    caused = {each.parent_id for each in nodes if each.status in FAILED}
+    return [each for each in nodes if each.status in FAILED and each.id not in caused]
+
+
+def tree_html(nodes: Sequence[NodeSummary]) -> str:
+    """Return the nodes as nested lists; `nodes` lists each parent before its children, as `TaskTree` does."""
+    shown = shown_nodes(nodes)
+    parents = _parents(nodes, {each.id for each in shown})
+    shown_ids = {each.id for each in shown}
+    hidden: dict[int | None, int] = {}
+    for each in nodes:
+        if each.id not in shown_ids:
+            hidden[parents[each.id]] = hidden.get(parents[each.id], 0) + 1
+    with_children = {parents[each.id] for each in nodes}
+    from_below = {(each.parent_id, each.failure_message) for each in nodes}
+    opened = _opened(shown, parents)
+    parts: list[str] = []
+    path: list[int] = []
+
+    def close(parent: int | None) -> None:
+        while path and path[-1] != parent:
+            parts.append(f"{_more_nodes(hidden.get(path.pop(), 0))}</details>")
+
+    for each in shown:
+        close(parents[each.id])
+        if each.id in with_children:
+            is_open = " open" if each.id in opened else ""
+            parts.append(f'<details{is_open} style="margin-left:16px"><summary>{_line(each, from_below)}</summary>')
+            path.append(each.id)
+        else:
+            parts.append(f'<div style="margin-left:30px">{_line(each, from_below)}</div>')
+    close(None)
+    return f'<div style="margin-left:-16px">{"".join(parts)}{_more_nodes(hidden.get(None, 0))}</div>'
+
+
+def _parents(nodes: Sequence[NodeSummary], shown: set[int]) -> dict[int, int | None]:
+    """Return for each node its nearest shown ancestor; None if no ancestor is shown."""
+    parents: dict[int, int | None] = {}
+    for each in nodes:
+        parent = each.parent_id
+        parents[each.id] = parent if parent in shown else parents.get(parent) if parent is not None else None
+    return parents
+
+
+def _opened(shown: Sequence[NodeSummary], parents: Mapping[int, int | None]) -> set[int]:
+    """Return the nodes to open: the first levels, and those with one of the first failed or running nodes below."""
+    opened: set[int] = set()
+    levels = 2 if len(shown) <= _NODES_OPEN else 1
+    leading = root_failures(shown)[:_FAILURES_OPEN]
+    ends = {each.id for each in (*leading, *(each for each in shown if each.status == "RUNNING"))}
+    depths: dict[int | None, int] = {None: -1}
+    for each in shown:
+        depths[each.id] = depths[parents[each.id]] + 1
+        if depths[each.id] < levels:
+            opened.add(each.id)
+        if each.id in ends:
+            above = parents[each.id]
+            while above is not None and above not in opened:
+                opened.add(above)
+                above = parents[above]
+    return opened
+
+
+def _line(node: NodeSummary, from_below: AbstractSet[tuple[int | None, str | None]]) -> str:
+    """Return the text of a node; a failure that came from a child has its message there."""
+    end = node.end_sequence if node.end_sequence is not None else ""
+    name = f'<b title="events {node.sequence} to {end}">{recorded(node.dtype or node.kind)}</b>'
+    parts = [status(node.status, with_name=False), name]
+    if node.parameters:
+        parts.append(quiet(recorded(parameters_text(node.parameters), _PARAMETERS_MAX)))
+    if node.status not in ("SUCCEEDED", "FAILED"):
+        parts.append(recorded(node.status))
+    if node.duration_ns is not None:
+        parts.append(quiet(duration(node.duration_ns)))
+    if node.reason:
+        has_message = node.failure_message and (node.id, node.failure_message) not in from_below
+        message = f": {recorded(node.failure_message)}" if has_message else ""
+        parts.append(f"<b>{recorded(node.reason)}</b>{message}")
+    if node.observations:
+        parts.append(quiet(f"{node.observations} observation{'s' * (node.observations > 1)}"))
+    if counts := counts_text(node):
+        parts.append(quiet(counts))
+    if node.thoughts:
+        parts.append(quiet(f"{len(node.thoughts)} simulation{'s' * (len(node.thoughts) > 1)}"))
+    return " ".join(parts)
+
+
+def _more_nodes(count: int) -> str:
+    return f'<div style="margin-left:30px">{left_out(count)}</div>' if count else ""
+
+
+# === gantt ====================================================================================================
+#
+# Draw nodes as bars over events or over time, as SVG.
+
+Axis: TypeAlias = Literal["events", "time"]
+
+_WIDTH, _PAD, _LANE, _BAR, _AXIS = 900.0, 8.0, 20.0, 16.0, 18.0
+_CHARACTER = 6.8
+"""Width of a character of a bar's name, so that a name is cut where its bar ends."""
+_TICKS = 6
+"""The labels along the axis."""
+_DRAWS_MAX = 4 * NODES_MAX
+"""Bounds the nodes drawn by lot for a chart of a part, because those whose ancestors do not fit are left out."""
+
+
+class _Bar(NamedTuple):
+    node: NodeSummary
+    start: float
+    end: float
+    lane: int
+
+
+def gantt(nodes: Sequence[NodeSummary], axis: Axis = "events") -> Drawing:
+    """Return a chart of the nodes over their events, or over time in s. Raises `CallerError` for another axis.
+
+    Robots of a kinematic world jump, so that many nodes take no time; over events each is as wide as its number of
+    events. A node that has not ended extends to the end of the chart. Of more nodes than 500 the chart has failures, up
+    to half of it, and others by lot from the whole episode, each with its ancestors; a line below the axis counts them.
+    """
+    if axis not in get_args(Axis):
+        raise CallerError(f"axis must be 'events' or 'time', got {axis!r}")
+    drawn = _sample(nodes)
+    bars = _bars(drawn, by_time=axis == "time")
+    first = min((each.start for each in bars), default=0.0)
+    last = max((each.end for each in bars), default=0.0)
+    scale = (_WIDTH - 2 * _PAD) / ((last - first) or 1.0)
+    height = (max((each.lane for each in bars), default=-1) + 1) * _LANE + _AXIS
+    parts = [_drawn(each, _PAD + (each.start - first) * scale, _PAD + (each.end - first) * scale) for each in bars]
+    labels: set[str] = set()
+    for index in range(_TICKS):
+        x = _PAD + (_WIDTH - 2 * _PAD) * index / (_TICKS - 1)
+        value = first + (last - first) * index / (_TICKS - 1)
+        label = duration(round(value * 1e9)) if axis == "time" else f"e{value:.0f}"
+        if label in labels:  # a chart of few events
+            continue
+        labels.add(label)
+        anchor = "start" if index == 0 else "end" if index == _TICKS - 1 else "middle"
+        parts.append(f'<text x="{x:.1f}" y="{height - 4:.0f}" text-anchor="{anchor}" opacity=".7">{label}</text>')
+    if note := _note(drawn, nodes):
+        height += _AXIS
+        parts.append(f'<text x="{_PAD:.1f}" y="{height - 4:.0f}" opacity=".7">{note}</text>')
+    return Drawing(
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {_WIDTH:.0f} {height:.0f}" role="img"'
+        f' aria-label="chart of {len(bars)} nodes over {axis}" font-family="system-ui,sans-serif" font-size="11"'
+        f' fill="currentColor" style="width:100%;max-width:{_WIDTH:.0f}px">{"".join(parts)}</svg>'
+    )
+
+
+def _sample(nodes: Sequence[NodeSummary]) -> list[NodeSummary]:
+    """Return all nodes, or of many some that are spread over the whole episode, always the same ones."""
+    if len(nodes) <= NODES_MAX:
+        return list(nodes)
+    lot = Random(0)  # noqa: S311  no secret: a seed draws the same chart again
+    by_id = {each.id: each for each in nodes}
+    kept: set[int] = set()
+    failures = root_failures(nodes)
+    _keep(kept, lot.sample(failures, min(len(failures), _DRAWS_MAX)), by_id, NODES_MAX // 2)
+    _keep(kept, lot.sample(nodes, min(len(nodes), _DRAWS_MAX)), by_id, NODES_MAX)
+    return [each for each in nodes if each.id in kept]
+
+
+def _keep(kept: set[int], chosen: Sequence[NodeSummary], by_id: Mapping[int, NodeSummary], nodes_max: int) -> None:
+    """Add the chosen nodes, each with its ancestors, as far as they fit."""
+    for each in chosen:
+        path: set[int] = set()
+        node: NodeSummary | None = each
+        while node is not None and node.id not in kept and len(kept) + len(path) <= nodes_max:
+            path.add(node.id)
+            node = by_id.get(node.parent_id) if node.parent_id is not None else None
+        if len(kept) + len(path) <= nodes_max:
+            kept |= path
+
+
+def _note(drawn: Sequence[NodeSummary], nodes: Sequence[NodeSummary]) -> str:
+    """Return the line that counts what a chart of a part of the nodes draws; empty for a chart of all."""
+    if len(drawn) == len(nodes):
+        return ""
+    failed, all_failed = (sum(each.status in FAILED for each in some) for some in (drawn, nodes))
+    failures = f"all {failed:,}" if failed == all_failed else f"{failed:,} of {all_failed:,}"
+    others = f"{len(drawn) - failed:,} of {len(nodes) - all_failed:,}"
+    return (
+        f"{failures} failed nodes and {others} others, chosen at random from the whole episode; gaps are not idle time"
+    )
+
+
+def _bars(nodes: Sequence[NodeSummary], *, by_time: bool) -> list[_Bar]:
+    """Give each node the first free lane below its parent's, so that concurrent branches do not cover each other."""
+    ordered = sorted(nodes, key=lambda each: each.sequence)
+    begin = min((each.started_at for each in nodes), default=None)
+    spans: list[tuple[float, float | None]] = []
+    for each in ordered:
+        if by_time and begin is not None:
+            start = (each.started_at - begin).total_seconds()
+            spans.append((start, None if each.duration_ns is None else start + each.duration_ns / 1e9))
+        else:
+            spans.append((each.sequence, each.end_sequence))
+    last = max((start if end is None else end for start, end in spans), default=0.0)
+    lanes: dict[int | None, int] = {}
+    busy_until: list[int] = []
+    bars = []
+    for node, (start, end) in zip(ordered, spans, strict=True):
+        lane = lanes.get(node.parent_id, -1) + 1
+        while lane < len(busy_until) and busy_until[lane] > node.sequence:
+            lane += 1
+        busy_until += [0] * (lane + 1 - len(busy_until))
+        busy_until[lane] = node.end_sequence or ordered[-1].sequence + 1
+        lanes[node.id] = lane
+        bars.append(_Bar(node, start, max(last if end is None else end, start), lane))
+    return bars
+
+
+def _drawn(bar: _Bar, left: float, right: float) -> str:
+    node, top = bar.node, bar.lane * _LANE + 1
+    width, color = max(right - left - 1, 1.5), color_of(node.status)
+    dash = ' stroke-dasharray="4 2"' if node.end_sequence is None else ""
+    shape = (
+        f'<rect x="{left:.1f}" y="{top:.0f}" width="{width:.1f}" height="{_BAR:.0f}" rx="2" fill="{color}"'
+        f' fill-opacity=".25" stroke="{color}"{dash}/>'
+    )
+    if node.status in FAILED:
+        shape += f'<path d="{_hatch(left, top, width)}" stroke="{color}" stroke-opacity=".7"/>'
+    name = node.dtype or node.kind
+    label = name if node.status == "SUCCEEDED" else f"{sign_of(node.status)} {name}"
+    room = int((width - 6) / _CHARACTER)
+    if room >= 3:
+        shown = label if len(label) <= room else f"{label[: room - 1]}…"
+        shape += f'<text x="{left + 4:.1f}" y="{top + 12:.0f}">{html.escape(shown)}</text>'
+    hint = one_line(f"{label} {node.status} {duration(node.duration_ns)} {parameters_text(node.parameters)}", 200)
+    return f"<g><title>{html.escape(hint)}</title>{shape}</g>"
+
+
+def _hatch(left: float, top: float, width: float) -> str:
+    """Return diagonal lines across a bar, so that a failure is visible without colour."""
+    lines = []
+    foot = left - _BAR + 4
+    while foot < left + width:
+        begin, end = max(foot, left), min(foot + _BAR, left + width)
+        lines.append(f"M{begin:.1f} {top + _BAR - (begin - foot):.1f}L{end:.1f} {top + _BAR - (end - foot):.1f}")
+        foot += 6
+    return "".join(lines)
+
+
+# === answer view ==============================================================================================
+#
+# Draw results: rows of SQL, a question that is not awaited yet, differences of two episodes, recalled cases.
+
+_ROWS_MAX = 100
+"""Bounds the rows that a notebook shows."""
+_SQL_MAX = 5_000
+"""Bounds the characters of SQL that a notebook shows."""
+
+
+def sql_result_html(result: SqlResult) -> str:
+    """Return the first rows as a table; a missing value is an empty cell."""
+    rows = ["" if value is None else recorded(value) for row in result.rows[:_ROWS_MAX] for value in row]
+    width = len(result.columns)
+    cells = [rows[start : start + width] for start in range(0, len(rows), width)] if width else []
+    count = f"<b>{len(result.rows):,} row{'s' * (len(result.rows) != 1)}</b>"
+    limited = f" {quiet('and more, which a limit left out')}" if result.more else ""
+    return view(count + limited, table([recorded(each) for each in result.columns], cells), _omitted(len(result.rows)))
+
+
+def question_html(name: str, sql: str, request: str) -> str:
+    """Return the name of a question, the code that awaits it, and its SQL."""
+    shown = html.escape(sql if len(sql) <= _SQL_MAX else f"{sql[:_SQL_MAX]}…")
+    text = f'<div style="font-family:monospace;white-space:pre-wrap;margin:4px 0">{shown}</div>'
+    return view(f"<b>Question {html.escape(name)}</b> {quiet(html.escape(request))}", text)
+
+
+def diff_html(compared: EpisodeDiff) -> str:
+    """Return the first differences as a table; A and B are the episodes."""
+    title = " and ".join(
+        f"<b>{letter}: episode {each.number} · {recorded(each.description)}</b>"
+        for letter, each in (("A", compared.first), ("B", compared.second))
+    )
+    rows = [
+        [
+            recorded(each.of),
+            recorded(each.where),
+            recorded(f"{each.what}, with {each.below} below" if each.below else each.what),
+            *("" if value is None else recorded(value) for value in (each.first, each.second)),
+        ]
+        for each in compared.differences[:_ROWS_MAX]
+    ]
+    count = len(compared.differences)
+    same = quiet(f"{count:,} difference{'s' * (count != 1)}; {compared.same_nodes:,} nodes are the same")
+    return view(title, same, table(("of", "where", "what", "A", "B"), rows) if rows else "", _omitted(count))
+
+
+def cases_html(summary: Sequence[str], columns: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
+    """Return the lines of a summary, and the first cases as a table; the column `status` has signs."""
+    title, *lines = (recorded(each) for each in summary)
+    cells = [
+        [
+            status(str(value)) if name == "status" else f"{value:.3f}" if isinstance(value, float) else recorded(value)
+            for name, value in zip(columns, ("" if each is None else each for each in row), strict=True)
+        ]
+        for row in rows[:_ROWS_MAX]
+    ]
+    facts = [f"<div>{each}</div>" for each in lines]
+    return view(f"<b>{title}</b>", *facts, table(columns, cells) if cells else "", _omitted(len(rows)))
+
+
+def _omitted(count: int) -> str:
+    return f"<div>{left_out(count - _ROWS_MAX)}</div>" if count > _ROWS_MAX else ""
+
+
+# === listings =================================================================================================
+#
+# Define the lists of episodes and of nodes that queries return: ordinary lists that a notebook draws.
+#
+# The views are imported when a notebook draws one, because every command imports this module.
+
+Item = TypeVar("Item")
+
+_LINES_MAX = 200
+"""Bounds the lines of a list as text."""
+_LINE_MAX = 160
+"""Bounds the characters of a line."""
+
+
+class _Listing(list[Item], Generic[Item]):
+    """A list whose slices are of its own type."""
+
+    @overload
+    def __getitem__(self, index: SupportsIndex, /) -> Item: ...
+    @overload
+    def __getitem__(self, index: slice, /) -> Self: ...
+    def __getitem__(self, index: SupportsIndex | slice, /) -> Item | Self:
+        return self._part(super().__getitem__(index)) if isinstance(index, slice) else super().__getitem__(index)
+
+    def _part(self, items: Iterable[Item]) -> Self:
+        return type(self)(items)
+
+
+def _text(lines: Iterable[str], count: int) -> str:
+    """Return the first lines of a list of this many items, each cut, with its indentation."""
+    cut = [
+        f"{' ' * (len(each) - len(each.lstrip(' ')))}{one_line(each, _LINE_MAX)}" for each in islice(lines, _LINES_MAX)
+    ]
+    return "\n".join([*cut, f"… {count - _LINES_MAX:,} more"] if count > _LINES_MAX else cut) or "[]"
+
+
+class Episodes(_Listing[EpisodeSummary]):
+    """The episodes of a memory, the oldest first. A list that a notebook draws as a table."""
+
+    def __repr__(self) -> str:
+        lines = (
+            f"{each.number} {each.started_at:%Y-%m-%d %H:%M:%S} {each.status} {each.description}"
+            f" ({each.nodes} nodes, {each.failed} failed)"
+            for each in self
+        )
+        return _text(lines, len(self))
+
+    def _repr_html_(self) -> str:
+
+        return episodes_html(self)
+
+
+class TaskTree(_Listing[NodeSummary]):
+    """The nodes of an episode, each before its children. A list that a notebook draws as a chart and nested lists.
+
+    Attributes:
+        episode: to which they belong; None in a list that was not read from a memory.
+    """
+
+    def __init__(self, nodes: Iterable[NodeSummary] = (), episode: EpisodeSummary | None = None) -> None:
+        super().__init__(nodes)
+        self.episode = episode
+
+    def gantt(self, axis: Axis = "events") -> Drawing:
+        """Return the nodes as bars over events, or over time: `tree.gantt("time")`."""
+
+        return gantt(self, axis)
+
+    def _part(self, items: Iterable[NodeSummary]) -> TaskTree:
+        return type(self)(items, self.episode)
+
+    def __repr__(self) -> str:
+        lines = (
+            f"{'  ' * each.depth}{each.dtype or each.kind} {parameters_text(each.parameters)} {each.status}"
+            f" {duration(each.duration_ns)} {f'{each.reason}: {each.failure_message}' if each.reason else ''}"
+            for each in self
+        )
+        return _text(lines, len(self))
+
+    def _repr_html_(self) -> str:
+
+        return task_tree_html(self, self.episode)
+
+
+# === memory view ==============================================================================================
+#
+# Draw a memory: its address and the table of its newest episodes.
+#
+# A notebook asks for a view while its event loop waits for the answer, so a thread with a loop of its own reads.
+
+_ANSWER_S_MAX = 10.0
+"""Bounds the wait for a database, so that a cell ends although the server does not answer."""
+
+
+def memory_html(address: DatabaseAddress, located: DatabaseAddress | None) -> str:
+    """Return the view of the memory at an address; it is not open if it is not `located`."""
+    title = f"<b>Memory {html.escape(str(address))}</b>"
+    if located is None:
+        return view(f"{title} · not open", quiet("it is closed, or was never entered: await Memory.connect(url)"))
+    return view(f"{title} · open", _episodes(located))
+
+
+def _episodes(address: DatabaseAddress) -> str:
+    answers: list[str] = []
+    reader = threading.Thread(target=lambda: answers.append(asyncio.run(_read(address))), daemon=True)
+    reader.start()
+    reader.join(_ANSWER_S_MAX)
+    return answers[0] if answers else quiet(f"the database did not answer within {_ANSWER_S_MAX:g} s")
+
+
+async def _read(address: DatabaseAddress) -> str:
+    from pycrorm_async.query.reading import Reading  # imports this package
+
+    try:
+        async with Reading.open_address(address) as reading, reading.session() as session:
+            total = await session.scalar(select(func.count()).select_from(ProcessMetaData))
+            newest = await episodes(await session.connection(), EpisodeChoice(limit=EPISODES_MAX))
+            return episodes_html(newest, total or 0)
+    except PycrormError as error:
+        return html.escape(str(error))
+
+
+# === moment view ==============================================================================================
+#
+# Draw the state of an episode at a moment: running nodes, the world from above, objects, observations and the tree.
+
+
+def moment_html(then: Moment) -> str:
+    """Return the views of a moment below each other; the tree is closed."""
+    simulated = f" {quiet('simulated')}" if then.simulated else ""
+    title = (
+        f"<b>Episode {then.number} · {recorded(then.description)}</b> at {then.time_s:.3f} s, event {then.sequence}"
+        f" {quiet(f'({moment(then.at)} UTC)')} · {status(then.status)}{simulated}"
+    )
+    running = " → ".join(
+        f"<b>{recorded(each.dtype or each.kind)}</b> {quiet(recorded(parameters_text(each.parameters), 80))}"
+        for each in then.running
+    )
+    seen = list(then.observations.items())
+    rows = [(recorded(name), recorded(_json(each.values)), f"e{each.sequence}") for name, each in seen[:_ROWS_MAX]]
+    observed = [table(("observation", "values", "event"), rows), _and_others(len(seen), "observations")] if seen else []
+    tree = f"<details><summary>{len(then.tree):,} nodes had started</summary>{tree_html(then.tree)}</details>"
+    doing = f"<div>{running or quiet('nothing was running')}</div>"
+    return view(title, doing, _world(then.world), *observed, tree)
+
+
+def world_html(world: WorldThen) -> str:
+    """Return the map of a world and the table of its objects."""
+    return view(f"<b>{len(world.objects):,} object{'s' * (len(world.objects) != 1)}</b>", _world(world))
+
+
+def _world(world: WorldThen) -> str:
+    if not world.objects:
+        return f"<div>{quiet('the world was empty at this moment')}</div>"
+    columns = ("object", "type", "x, m", "y, m", "z, m", "heading", "attached to")
+    rows = table(columns, map(_object_row, world.objects[:_ROWS_MAX]))
+    return (
+        '<div style="display:flex;flex-wrap:wrap;gap:16px;align-items:flex-start">'
+        f'<div style="flex:1 1 300px;max-width:420px">{world_map(world).svg}</div>'
+        f'<div style="flex:1 1 560px;min-width:0">{rows}{_and_others(len(world.objects), "objects")}</div></div>'
+    )
+
+
+def _object_row(each: ObjectThen) -> Sequence[str]:
+    attached = ""
+    if each.attached_to is not None:
+        name, link = each.attached_to
+        attached = recorded(name if link is None else f"{name}, {link}")
+    position = (f"{value:.3f}" for value in each.pose.position)
+    return recorded(each.name, 40), recorded(each.object_type), *position, _degrees(each.pose.yaw), attached
+
+
+def _degrees(radians: float) -> str:
+    return f"{round(math.degrees(radians)) + 0}°"
+
+
+def _json(values: object) -> str:
+    return msgspec.json.encode(values).decode()
+
+
+def _and_others(count: int, noun: str) -> str:
+    return f"<div>{left_out(count - _ROWS_MAX, noun)}</div>" if count > _ROWS_MAX else ""
+
+
+# === views ====================================================================================================
+#
+# Register the view of each value that a memory returns.
+#
+# The views are imported when a notebook draws one, because every command imports this module.
+
+
+@value_html.register(EpisodeSummary)
+def _(episode: EpisodeSummary) -> str:
+
+    return episode_html(episode)
+
+
+@value_html.register(Moment)
+def _(moment: Moment) -> str:
+
+    return moment_html(moment)
+
+
+@value_html.register(WorldThen)
+def _(world: WorldThen) -> str:
+
+    return world_html(world)
+
+
+@value_html.register(Question)
+def _(question: Question) -> str:
+
+    return question_html(question.name, question.sql, "await it for a frame")
+
+
+@value_html.register(SyncQuestion)
+def _(question: SyncQuestion) -> str:
+
+    return question_html(question.name, question.sql, "call frame() or rows()")
+
+
+@value_html.register(EpisodeDiff)
+def _(diff: EpisodeDiff) -> str:
+
+    return diff_html(diff)
+
+
+@value_html.register(SqlResult)
+def _(result: SqlResult) -> str:
+
+    return sql_result_html(result)

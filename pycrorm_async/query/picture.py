@@ -1,0 +1,178 @@
+"""Draw the scene of an episode at a moment as PNG: a world made from the recorded geometry, photographed by Bullet.
+
+The world is made in a thread with an empty context, so that it belongs to no open episode and is not recorded.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import struct
+import zlib
+from collections.abc import Collection, Sequence
+from contextvars import Context
+from datetime import datetime
+from typing import Any, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy import Select, func, select
+
+from pycrorm_async.errors import CallerError
+from pycrorm_async.events.ids import row_key
+from pycrorm_async.orm import Object as ObjectRow
+from pycrorm_async.orm import ObjectRemoval
+from pycrorm_async.query.again import RecordedWorld, world_of
+from pycrorm_async.query.reading import Reading
+from pycrorm_async.query.snapshot import AnyEpisode, Moment, parse_moment
+from pycrorm_async.world.bullet import Object
+from pycrorm_async.world.pose import Vector
+from pycrorm_async.world.queries import Camera, photograph
+
+MomentReference: TypeAlias = float | str | datetime | None
+"""Seconds since the start, `e115` for an event, a wall clock's time; None: the moment before the world is emptied."""
+
+_PIXELS_MAX = 4_000_000
+"""Bounds a picture, which then takes about 15 s."""
+_PIXELS_LEAST = 16
+"""The least width and height of a picture, in pixels."""
+_LAST = 1 << 40
+_RADIUS_LEAST_M = 0.3
+"""The least radius in m of the sphere that the camera frames, so that one small object has surroundings."""
+_YAWS = range(0, 360, 30)
+
+
+async def picture(
+    reading: Reading,
+    episode: AnyEpisode,
+    *,
+    at: MomentReference = None,
+    width: int = 640,
+    height: int = 480,
+    yaw_deg: float | None = None,
+    pitch_deg: float = 32.0,
+    focus: str | None = None,
+) -> bytes:
+    """Return the scene at a moment as PNG. It needs the extra `world`, and no display.
+
+    The camera frames the objects that move in the episode, where they are at that moment, and looks from the side from
+    which most of them is visible.
+
+    Args:
+        episode: its number, its id or the first digits of it, `last`, or an object of the episode.
+        at: seconds since the episode's start, `"e115"` for an event, or an aware datetime; by default the last moment
+            before the world was emptied.
+        width, height: in pixels. 640 x 480 takes about 1 s.
+        yaw_deg: direction from the scene to the camera, 0 along +x, 90 along +y; give it for pictures of a series.
+        pitch_deg: of the camera above the scene.
+        focus: name of the object to frame instead.
+
+    Raises `UnknownEpisode`; `CallerError` for a moment without objects or without recorded shapes, an unknown `focus`,
+    an angle that is none, or a size that is too small or too large; `BulletMissing`.
+    """
+    if min(width, height) < _PIXELS_LEAST or width * height > _PIXELS_MAX:
+        raise CallerError(
+            f"a picture has at least {_PIXELS_LEAST} x {_PIXELS_LEAST} and at most {_PIXELS_MAX:,} pixels,"
+            f" not {width} x {height}"
+        )
+    if not (math.isfinite(pitch_deg) and -89 <= pitch_deg <= 89):
+        raise CallerError(f"pitch_deg must be -89 to 89, got {pitch_deg}")
+    if yaw_deg is not None and not math.isfinite(yaw_deg):
+        raise CallerError(f"yaw_deg must be a finite number, got {yaw_deg}")
+    then = await _moment(reading, episode, at)
+    if not then.world.objects:
+        raise CallerError(await _emptiness(reading, then))
+    if focus is not None:
+        then.world.object(focus)
+    async with reading.session() as session:
+        moved = {focus} if focus is not None else set((await session.scalars(_moving(then.number))).all())
+    return await asyncio.to_thread(Context().run, _drawn, then, moved, (width, height), yaw_deg, pitch_deg)
+
+
+async def _moment(reading: Reading, episode: AnyEpisode, at: MomentReference) -> Moment:
+    if isinstance(at, str):
+        time, sequence = parse_moment(at)
+        return await reading.as_of(episode, time=time, sequence=sequence, meshes=True)
+    if at is not None:
+        return await reading.as_of(episode, time=at, meshes=True)
+    then = await reading.as_of(episode, sequence=_LAST, meshes=True)
+    if then.world.objects:
+        return then
+    async with reading.session() as session:
+        of_episode = ObjectRow.process_metadata_id == then.number
+        changed = select(func.max(ObjectRow.id)).where(of_episode).scalar_subquery()
+        removed = ObjectRemoval.process_metadata_id == then.number, ObjectRemoval.id > changed
+        removal = await session.scalar(select(func.min(ObjectRemoval.id)).where(*removed))
+    return then if removal is None else await _moment(reading, episode, f"e{row_key(removal).sequence - 1}")
+
+
+async def _emptiness(reading: Reading, then: Moment) -> str:
+    async with reading.session() as session:
+        added = await session.scalar(select(func.min(ObjectRow.id)).where(ObjectRow.process_metadata_id == then.number))
+    if added is None:
+        return f"episode {then.number} has no objects to draw: no world was recorded"
+    begin = f"its first object was added at event {row_key(added).sequence}"
+    return f"the world of episode {then.number} was empty at event {then.sequence}, so nothing is drawn; {begin}"
+
+
+def _moving(number: int) -> Select[Any]:
+    """Select the names of the objects with more than one pose in the episode."""
+    of_world = ObjectRow.process_metadata_id == number, ObjectRow.identity_id.is_not(None)
+    return (
+        select(ObjectRow.name).where(*of_world).group_by(ObjectRow.name, ObjectRow.identity_id).having(func.count() > 1)
+    )
+
+
+def _drawn(
+    then: Moment, moved: Collection[str], size: tuple[int, int], yaw_deg: float | None, pitch_deg: float
+) -> bytes:
+    with world_of(then) as world:
+        points = [name for name, shape in world.assumed.items() if shape.startswith("a point")]
+        if len(points) == len(world.objects):
+            reason = world.assumed[points[0]].removeprefix("a point, because ")
+            raise CallerError(f"episode {then.number} has no shapes to draw: of {points[0]}, {reason}")
+        camera = _camera(world, moved, size, yaw_deg, pitch_deg)
+        return png(photograph(world, camera, *size).pixels)
+
+
+def _camera(
+    world: RecordedWorld, moved: Collection[str], size: tuple[int, int], yaw_deg: float | None, pitch_deg: float
+) -> Camera:
+    """Return the camera that frames the moved objects; without one, all but the environment; without these, all."""
+    actors = [each for each in world.objects if each.name in moved]
+    actors = actors or [each for each in world.objects if each.object_type.name != "ENVIRONMENT"] or list(world.objects)
+    low = np.min([each.bounding_box().min for each in actors], axis=0)
+    high = np.max([each.bounding_box().max for each in actors], axis=0)
+    radius = max(float(np.linalg.norm(high - low)) / 2, _RADIUS_LEAST_M)
+    target = Vector(*((low + high) / 2).tolist())
+    view = 40.0
+    aspect = size[0] / size[1]
+    narrow = math.atan(math.tan(math.radians(view / 2)) * min(1.0, aspect))
+    cameras = [
+        Camera(target, radius / math.sin(narrow), yaw, pitch_deg, view)
+        for yaw in (_YAWS if yaw_deg is None else (yaw_deg,))
+    ]
+    return cameras[0] if len(cameras) == 1 else max(cameras, key=lambda each: _visible(world, each, radius, actors))
+
+
+def _visible(world: RecordedWorld, camera: Camera, radius: float, actors: Sequence[Object]) -> float:
+    """Rate the visibility of the actors by the sum of the logarithms, so that small ones count as much as robots.
+
+    An object between the camera and the framed objects, such as a wall, costs as much as it covers.
+    """
+    picture = photograph(world, camera, 80, 60, smooth=False)
+    covered = float((picture.depths < camera.distance_m - 1.2 * radius).mean())
+    return sum(math.log1p(int((picture.bodies == each.body.number).sum())) for each in actors) * (1 - covered)
+
+
+def png(pixels: NDArray[np.uint8]) -> bytes:
+    """Encode pixels of shape (height, width, 3)."""
+    height, width, _ = pixels.shape
+
+    def chunk(name: bytes, content: bytes) -> bytes:
+        return struct.pack(">I", len(content)) + name + content + struct.pack(">I", zlib.crc32(name + content))
+
+    rows = np.concatenate([np.zeros((height, 1), np.uint8), pixels.reshape(height, width * 3)], axis=1)
+    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    content = zlib.compress(rows.tobytes(), 9)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", content) + chunk(b"IEND", b"")

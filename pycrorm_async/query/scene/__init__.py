@@ -1,1 +1,0 @@
-"""Read the recorded geometry of a moment without Bullet: shapes of objects, poses of links, outlines from above."""

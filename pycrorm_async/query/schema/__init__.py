@@ -1,1 +1,0 @@
-"""Describe the views of a memory, for users and programs that write SQL."""

@@ -1,1 +1,0 @@
-"""Run SQL that a user or a program wrote, on connections that can only read."""

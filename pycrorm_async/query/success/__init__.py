@@ -1,1 +1,0 @@
-"""Count and draw how often actions succeeded, over any two columns of a view."""

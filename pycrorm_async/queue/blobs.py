@@ -1,0 +1,308 @@
+"""Keep the blobs of a recorder beside its segments until the database has them.
+
+**Blob files.** Keep blobs as files beside a recorder's segments: contents too large for an event, named by their
+SHA-256.
+
+    spool/<recorder>/blobs/<sha256>                                    records of this recorder refer to it
+    spool/stored/<log id>/<recorder>/00000001.segment.blobs/<sha256>   kept as long as this segment or an earlier one
+
+A file gets its name when its content is complete, and is never changed. A kill therefore leaves whole blobs, but a
+power cut may leave a file whose content is not on the disk: readers compare the content with the name.
+"""
+
+from __future__ import annotations
+
+import itertools
+import os
+import shutil
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+from hashlib import sha256
+from pathlib import Path
+from typing import Final
+
+from pycrorm_async.errors import SpoolFull
+from pycrorm_async.queue.appender import FULL, GcSafeLock
+from pycrorm_async.queue.format import sync_folder
+from pycrorm_async.queue.locks import BLOBS, KEPT_BLOBS, MAKING, STORED, create_folder, create_folders, open_file
+
+# === blob files ===============================================================================================
+
+
+def blob_files(folder: Path) -> list[Path]:
+    """List the blobs in a recorder's folder. Raises `OSError`, but not for a missing folder."""
+    try:
+        return sorted(each for each in (folder / BLOBS).iterdir() if each.suffix != MAKING)
+    except (FileNotFoundError, NotADirectoryError):
+        return []
+
+
+def blob_bytes(blobs: Iterable[Path]) -> int:
+    """Return the size of these files, without those deleted meanwhile."""
+    size = 0
+    for each in blobs:
+        with suppress(FileNotFoundError):
+            size += each.stat().st_size
+    return size
+
+
+def read_blob(spool: Path, name: str) -> bytes | None:
+    """Read a blob from any folder of a spool; None if none holds it whole. Raises `OSError`."""
+    for path in _places(spool, name):
+        with suppress(FileNotFoundError, NotADirectoryError):
+            content = path.read_bytes()
+            if sha256(content).hexdigest() == name:
+                return content
+    return None
+
+
+def is_whole(folder: Path, name: str) -> bool:
+    """Return whether a recorder's folder holds this blob with the content of its name. Raises `OSError`."""
+    try:
+        with (folder / BLOBS / name).open("rb") as file:
+            digest = sha256()
+            while part := file.read(2**20):
+                digest.update(part)
+    except FileNotFoundError:
+        return False
+    return digest.hexdigest() == name
+
+
+def carry_blobs(source: Path, target: Path) -> None:
+    """Link the blobs of a recorder's folder into another one, or copy them. Durable on return. Raises `OSError`."""
+    blobs = blob_files(source)
+    if not blobs:
+        return
+    with suppress(FileExistsError):
+        create_folder(target / BLOBS)
+    for blob in blobs:
+        with suppress(FileExistsError, FileNotFoundError):
+            try:
+                (target / BLOBS / blob.name).hardlink_to(blob)
+            except PermissionError:  # the file system has no hard links
+                shutil.copyfile(blob, target / BLOBS / blob.name)
+    sync_folder(target / BLOBS)
+
+
+def kept_with(segment: Path) -> Path:
+    """Return the folder with the blobs that are kept as long as this segment."""
+    return segment.with_name(f"{segment.name}{KEPT_BLOBS}")
+
+
+def keep_blobs(spool: Path, blobs: Iterable[Path], segment: Path) -> None:
+    """Move blobs to those kept with this segment. Raises `OSError`."""
+    target = kept_with(segment)
+    for blob in blobs:
+        create_folders(spool, target)
+        with suppress(FileNotFoundError):
+            blob.replace(target / blob.name)
+
+
+def _places(spool: Path, name: str) -> Iterator[Path]:
+    """Yield the paths at which a blob of this name may be: first those of recorders, then the kept ones."""
+    for recorder in _folders(spool):
+        yield recorder / BLOBS / name
+    for log in _folders(spool / STORED):
+        for recorder in _folders(log):
+            for segment in _folders(recorder):
+                if segment.suffix == KEPT_BLOBS:
+                    yield segment / name
+
+
+def _folders(folder: Path) -> list[Path]:
+    try:
+        with os.scandir(folder) as entries:
+            return [Path(entry.path) for entry in entries if entry.is_dir(follow_symlinks=False)]
+    except (FileNotFoundError, NotADirectoryError):
+        return []
+
+
+# === live blobs ===============================================================================================
+#
+# Keep the blobs of a living recorder: any thread puts them, the sync thread makes them durable and deletes them.
+#
+# **Theory of operation.** `put` writes the file in the caller's thread, without a sync, gives it its name and only then
+# registers it. A record that refers to the blob is put later, so a sync that covers this record finds the blob
+# registered: the sync thread calls `sync` before it appends the commit frame. A kill between the two leaves a blob
+# without a record, which is deleted with the folder.
+#
+# Each put holds the blob until `release`, which the caller calls when no further record will refer to it; a
+# declaration, which every segment repeats, is never released. A released blob is taken away when all segments up to the
+# last record at its release are taken away. So a blob stays as long as any segment that refers to it.
+#
+# One lock protects the registry; no file is read or written under it, except while the queue moves to another folder. A
+# put that meets such a move finds another folder when it registers, and puts again.
+
+_BLOCK_BYTES: Final = 4_096
+_FULL_REASON: Final = "spool_bytes_max is reached"
+
+
+@dataclass(slots=True)
+class _Blob:
+    """A blob in the folder. `released` is the position behind which no record refers to it, once `holders` is 0."""
+
+    size: int
+    holders: int = 1
+    released: int = 0
+    synced: bool = False
+
+
+class LiveBlobs:
+    """The blobs of one recorder. `reserve` takes a number of bytes of the spool, or returns them if negative."""
+
+    def __init__(self, folder: Path, *, reserve: Callable[[int], bool], make_room: Callable[[int], bool]) -> None:
+        self._folder = folder
+        self._reserve = reserve
+        self._make_room = make_room
+        self._lock = GcSafeLock()
+        self._blobs: dict[str, _Blob] = {}
+        self._names = itertools.count(1)
+
+    # --- any thread -------------------------------------------------------------------------------------------
+
+    def put(self, content: bytes) -> str:
+        """Write a blob unless it is here; hold it until `release`; return its name. Raises `SpoolFull`, `OSError`."""
+        name = sha256(content).hexdigest()
+        while not self._lock.run(partial(self._hold, name)):
+            folder = self._folder
+            size = _rounded(len(content))
+            if not self._reserve(size):
+                raise SpoolFull(f"spool {folder.parent} is full: {_FULL_REASON}")
+            registered = False
+            try:
+                self._write(folder / BLOBS, name, content)
+                registered = self._lock.run(partial(self._register, folder, name, size))
+            finally:
+                if not registered:
+                    self._reserve(-size)
+            if registered:
+                break
+        return name
+
+    def release(self, name: str, position: int) -> None:
+        """State that no record behind this position will refer to the blob because of one put. Ignores other names."""
+        self._lock.run(partial(self._release, name, position))
+
+    @property
+    def size(self) -> int:
+        """The bytes that all blobs take on the disk."""
+        return self._lock.run(lambda: sum(each.size for each in self._blobs.values()))
+
+    def abandon(self) -> None:
+        """Detach in a forked child."""
+        self._lock.abandon()
+        self._lock, self._blobs = GcSafeLock(), {}
+
+    def _hold(self, name: str) -> bool:
+        blob = self._blobs.get(name)
+        if blob is not None:
+            blob.holders += 1
+        return blob is not None
+
+    def _register(self, folder: Path, name: str, size: int) -> bool:
+        if folder != self._folder or name in self._blobs:
+            return False
+        self._blobs[name] = _Blob(size)
+        return True
+
+    def _release(self, name: str, position: int) -> None:
+        blob = self._blobs.get(name)
+        if blob is not None and blob.holders:
+            blob.holders -= 1
+            blob.released = max(blob.released, position)
+
+    def _write(self, folder: Path, name: str, content: bytes) -> None:
+        with suppress(FileExistsError):
+            create_folder(folder)
+        unfinished = folder / f"{name}.{next(self._names)}{MAKING}"
+        try:
+            while True:
+                try:
+                    _fill(unfinished, content)
+                    break
+                except OSError as error:
+                    if error.errno not in FULL or not self._make_room(len(content)):
+                        raise
+            unfinished.replace(folder / name)
+        except BaseException:
+            with suppress(OSError):
+                unfinished.unlink()
+            raise
+
+    # --- the sync thread ----------------------------------------------------------------------------------------
+
+    def sync(self) -> list[str]:
+        """Write the new blobs to the disk; return the names of those whose file is missing. Raises `OSError`."""
+        new = self._lock.run(lambda: [name for name, blob in self._blobs.items() if not blob.synced])
+        if not new:
+            return []
+        missing = []
+        for name in new:
+            try:
+                _sync_file(self._folder / BLOBS / name)
+            except FileNotFoundError:
+                missing.append(name)
+        with suppress(FileNotFoundError):
+            sync_folder(self._folder / BLOBS)
+        sync_folder(self._folder)
+        self._lock.run(partial(self._note_synced, new, missing))
+        return missing
+
+    def take(self, *, before: int) -> list[Path]:
+        """Forget the blobs to which no record from this position on refers, and return their files."""
+        return self._lock.run(partial(self._take, before))
+
+    def take_all(self) -> list[Path]:
+        """Forget all blobs and return their files; call it when no more records are put."""
+        return self._lock.run(lambda: [self._forget(name) for name in list(self._blobs)])
+
+    def move_to(self, folder: Path) -> None:
+        """Continue in another folder. Carries the blobs there unless the folder was only renamed. Raises `OSError`."""
+        self._lock.run(partial(self._move_to, folder))
+
+    def _note_synced(self, names: list[str], missing: list[str]) -> None:
+        for name in missing:
+            self._forget(name)  # so that a later put writes it again
+        for name in names:
+            if name in self._blobs:
+                self._blobs[name].synced = True
+
+    def _take(self, before: int) -> list[Path]:
+        free = [name for name, blob in self._blobs.items() if not blob.holders and blob.released < before]
+        return [self._forget(name) for name in free]
+
+    def _forget(self, name: str) -> Path:
+        self._reserve(-self._blobs.pop(name).size)
+        return self._folder / BLOBS / name
+
+    def _move_to(self, folder: Path) -> None:
+        if self._folder.exists():
+            carry_blobs(self._folder, folder)
+        self._folder = folder
+        for blob in self._blobs.values():
+            blob.synced = False
+
+
+def _fill(path: Path, content: bytes) -> None:
+    descriptor = open_file(path, os.O_WRONLY | os.O_TRUNC)
+    try:
+        if content:
+            os.posix_fallocate(descriptor, 0, len(content))  # a full disk refuses here, not when the file is synced
+        with os.fdopen(os.dup(descriptor), "wb") as file:
+            file.write(content)
+    finally:
+        os.close(descriptor)
+
+
+def _sync_file(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _rounded(size: int) -> int:
+    return max(_BLOCK_BYTES, -(-size // _BLOCK_BYTES) * _BLOCK_BYTES)

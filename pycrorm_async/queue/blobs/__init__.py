@@ -1,1 +1,0 @@
-"""Keep the blobs of a recorder beside its segments until the database has them."""

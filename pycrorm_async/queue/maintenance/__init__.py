@@ -1,1 +1,0 @@
-"""Inspect a spool, and repair a damaged recorder's folder."""

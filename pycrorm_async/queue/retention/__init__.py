@@ -1,1 +1,0 @@
-"""Keep stored segments and acknowledged heads, to refill a log that went back."""

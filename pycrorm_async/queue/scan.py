@@ -1,0 +1,428 @@
+"""Scan a dead recorder's segments: keep every record up to the first hole, and distinguish a torn tail from damage.
+
+**Theory of operation.** The scanning process holds `alive` and `drain`, so no segment changes during a scan, except
+where a report examines a living recorder. `SegmentScanner` reads one segment per step, the oldest first, and checks
+every frame: salt and checksum (`decode_each`), the next position, the next sequence of its episode, and for a commit
+frame the checksum of the records it covers. The scanner stops at the first byte where no next record decodes, the
+*cut*. The records before the cut are the `ValidPrefix`.
+
+A sync appends its commit frame only after its records are on the disk. So a commit frame behind the cut that covers a
+position behind the cut proves that a synced record is missing: the folder is damaged and the scanner raises
+`SpoolDamaged`. Ordinary records behind the cut prove nothing, because pages reach the disk in any order: they belong to
+a torn tail that no sync covered. Therefore the last step searches the rest of the files for commit frames.
+
+Until the scan has finished, only the records that a commit frame covers are certain to be kept (`confirmed`): if damage
+follows, a repair decides about the others. A caller that passes records on during the scan must stop at `confirmed`.
+
+Scanning changes no file. `seal` truncates the files at the cut and first copies the tail to `<segment>.tail`;
+`sync_segments` makes the kept segments durable before their records are passed on.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+from pycrorm_async.bulk_records import make
+from pycrorm_async.errors import PycrormError, SpoolDamaged, SpoolForeign
+from pycrorm_async.events.codec import DECLARATION_TYPES, Record
+from pycrorm_async.events.ids import EpisodeId, episode_text
+from pycrorm_async.events.types import references_in
+from pycrorm_async.queue.blobs import is_whole
+from pycrorm_async.queue.format import (
+    CHECKSUM,
+    COMMIT,
+    EPISODE_ENDED,
+    EVENT,
+    FORMAT,
+    HEADER_BYTES,
+    Buffer,
+    Cursor,
+    Frame,
+    LastRecord,
+    SegmentHeader,
+    check_type,
+    decode,
+    decode_each,
+    decode_header,
+    format_of,
+    header_bytes,
+    read_segment,
+    salt_of,
+    segment_numbers,
+    segment_path,
+    span_checksum,
+    sync_folder,
+)
+from pycrorm_async.queue.locks import BLOBS, TAIL
+from pycrorm_async.queue.spool import write_durably
+
+_SALT_OFFSET = HEADER_BYTES - 8
+_EPISODE_ENDED = EPISODE_ENDED.encode()
+
+
+class ValidPrefix(NamedTuple):
+    """The records of a folder up to the first hole.
+
+    Attributes:
+        start: before the first record.
+        cut: behind the last record; the files' content from here on is not kept. Number 0 if there is no segment.
+        bases: position of the first record of each kept segment, by segment number.
+        open: the episodes without an end, and the last record of each.
+        numbers: numbers of all segment files, including those behind the cut.
+    """
+
+    start: Cursor
+    cut: Cursor
+    bases: dict[int, int]
+    open: dict[EpisodeId, LastRecord]
+    numbers: list[int]
+
+
+class Survey(NamedTuple):
+    """The result of a scan that returns damage instead of raising it.
+
+    Attributes:
+        prefix: the records before the damage.
+        damage: file, offset and reason of the damage, or None.
+        uncommitted: checksums of the last records of the prefix, which no commit frame covers.
+    """
+
+    prefix: ValidPrefix
+    damage: SpoolDamaged | None
+    uncommitted: tuple[int, ...]
+
+
+def scan(folder: Path, recorder: bytes) -> ValidPrefix:
+    """Scan the segments of a folder, each byte once.
+
+    Raises `SpoolDamaged` with file and offset, `SpoolForeign` for a segment of a newer format or another recorder, and
+    `OSError`.
+    """
+    prefix, damage, _ = survey(folder, recorder)
+    if damage is not None:
+        raise damage
+    return prefix
+
+
+def survey(folder: Path, recorder: bytes, *, on_frame: Callable[[int, Frame], None] | None = None) -> Survey:
+    """Scan as `scan` does, and return damage. Calls `on_frame` with the segment number and each kept frame."""
+    scanner = SegmentScanner(folder, recorder, on_frame=on_frame)
+    damage: SpoolDamaged | None = None
+    try:
+        while scanner.step():
+            pass
+    except SpoolDamaged as error:
+        damage = error
+    return Survey(scanner.prefix, damage, scanner.uncommitted)
+
+
+class SegmentScanner:
+    """Scan from the oldest segment to the first hole, one segment per step.
+
+    Calls `on_frame` with the segment number and each kept frame, and `on_record` with each kept record. With
+    `segments`, paths by number in any folders, the scan ends at the first hole without searching for commit frames.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        recorder: bytes,
+        *,
+        on_frame: Callable[[int, Frame], None] | None = None,
+        on_record: Callable[[Record], None] | None = None,
+        segments: Mapping[int, Path] | None = None,
+    ) -> None:
+        self._folder = folder
+        self._recorder = recorder
+        self._on_frame = on_frame
+        self._on_record = on_record
+        self._types: dict[bytes, str] = {}
+        self._paths = segments
+        self._numbers = segment_numbers(folder) if segments is None else sorted(segments)
+        self._steps = 0
+        self._start = self._cut = Cursor(0, 0, 0)
+        self._bases: dict[int, int] = {}
+        self._open: dict[bytes, tuple[int, int, int]] = {}
+        self._uncommitted: list[int] = []  # checksums of the records that no commit frame has covered yet
+        self.damage: SpoolDamaged | None = None
+        self.finished = False
+
+    def step(self) -> bool:
+        """Scan one more segment; False when the scan has finished and no synced record is missing.
+
+        Raises as `scan` does.
+        """
+        if self.damage is not None:
+            raise self.damage
+        if self.finished:
+            return False
+        try:
+            if self._steps < len(self._numbers) and self._scan_segment(self._numbers[self._steps]):
+                self._steps += 1
+                return True
+            if self._paths is None:
+                _refuse_damage(self._folder, self._recorder, self.prefix)
+        except SpoolDamaged as damage:
+            self.damage = damage
+            raise
+        except (PycrormError, OSError):
+            raise
+        except Exception as error:  # an unforeseen content must fail this folder alone, as damage
+            path = segment_path(self._folder, self._cut.number)
+            self.damage = SpoolDamaged(path, self._cut.offset, f"{type(error).__name__}: {error}")
+            raise self.damage from error
+        self.finished = True
+        return False
+
+    @property
+    def prefix(self) -> ValidPrefix:
+        """The records scanned so far."""
+        opened = {EpisodeId(episode): LastRecord(*last) for episode, last in self._open.items()}
+        return ValidPrefix(self._start, self._cut, self._bases, opened, self._numbers)
+
+    @property
+    def confirmed(self) -> int:
+        """The position up to which records are kept even if damage follows, because a commit frame covers them."""
+        return self._cut.position - (0 if self.finished else len(self._uncommitted))
+
+    @property
+    def uncommitted(self) -> tuple[int, ...]:
+        return tuple(self._uncommitted)
+
+    def _scan_segment(self, number: int) -> bool:
+        """Scan one segment; False if it does not continue the one before."""
+        path = segment_path(self._folder, number) if self._paths is None else self._paths[number]
+        buffer = read_segment(path)
+        header = read_header(path, buffer, recorder=self._recorder, number=number)
+        if not self._bases:
+            if header is None and number > 1:
+                raise SpoolDamaged(path, 0, "its header is unreadable, and the segments before it are deleted")
+            base = 1 if header is None else header.base
+            self._start = self._cut = Cursor(number, header_bytes(0), base - 1)
+        if header is None or number != self._cut.number + bool(self._bases) or header.base != self._cut.position + 1:
+            return False
+        first = header_bytes(len(header.open))
+        if not self._bases:
+            self._start = Cursor(number, first, header.base - 1)
+            self._open = dict(header.open.items())
+        self._bases[number] = header.base
+        self._cut = Cursor(number, first, header.base - 1)
+        self._scan_records(path, buffer, number)
+        return True
+
+    def _scan_records(self, path: Path, buffer: Buffer, number: int) -> None:
+        """Keep a segment's records from the cut to the first hole or damage, and move the cut there."""
+        opened, uncommitted, on_frame, on_record, types = (
+            self._open,
+            self._uncommitted,
+            self._on_frame,
+            self._on_record,
+            self._types,
+        )
+        _, offset, position = self._cut
+        try:
+            for frame in decode_each(buffer, offset, salt_of(self._recorder, number)):
+                kind, version, at, sequence, wall_ns, monotonic_ns, episode, name, payload, checksum, size = frame
+                if kind == COMMIT:
+                    self._cut = Cursor(number, offset, position)
+                    self._check_commit(path, make(Frame, frame))
+                elif at == position + 1:
+                    type_name = types.get(name)
+                    if type_name is None:
+                        type_name = types[name] = check_type(path, offset, name)
+                    if kind == EVENT:
+                        before = opened.get(episode)
+                        if sequence != (before[0] if before else 0) + 1:
+                            raise _not_next(path, offset, episode, sequence, before)
+                        opened[episode] = (sequence, wall_ns, monotonic_ns)
+                        if name == _EPISODE_ENDED:
+                            del opened[episode]
+                    else:
+                        _check_declaration(path, offset, type_name, payload)
+                    uncommitted.append(checksum)
+                    position = at
+                    if on_record is not None:
+                        owner = episode if kind == EVENT else None
+                        values = (at, owner, sequence, type_name, version, wall_ns, monotonic_ns, payload)
+                        on_record(make(Record, values))
+                else:
+                    break
+                offset += size
+                if on_frame is not None:
+                    on_frame(number, make(Frame, frame))
+        finally:
+            self._cut = Cursor(number, offset, position)
+
+    def _check_commit(self, path: Path, frame: Frame) -> None:
+        """Check that the records a commit frame covers are present and unchanged."""
+        later = self._cut.position - frame.position
+        if later < 0:
+            raise SpoolDamaged(path, self._cut.offset, f"position {self._cut.position + 1} was synced and is missing")
+        covered = self._uncommitted[: max(0, len(self._uncommitted) - later)]
+        deleted = frame.sequence - len(covered)  # records it covers in segments that are stored and deleted
+        if deleted < 0 or (deleted == 0 and frame.payload != CHECKSUM.pack(span_checksum(covered))):
+            raise SpoolDamaged(path, self._cut.offset, "the records before it differ from those that were synced")
+        del self._uncommitted[: len(covered)]
+
+
+def _not_next(
+    path: Path, offset: int, episode: bytes, sequence: int, before: tuple[int, int, int] | None
+) -> SpoolDamaged:
+    name = episode_text(EpisodeId(episode))
+    return SpoolDamaged(path, offset, f"event {sequence} of episode {name} follows {before and before[0]}")
+
+
+def check_record(path: Path, offset: int, frame: Frame) -> None:
+    """Raise `SpoolDamaged` for a frame that no recorder writes although its checksum is right."""
+    type_name = check_type(path, offset, frame.type)
+    if frame.kind != EVENT:
+        _check_declaration(path, offset, type_name, frame.payload)
+
+
+def _check_declaration(path: Path, offset: int, type_name: str, payload: bytes) -> None:
+    """Check a record without an episode: dead-lettering cannot skip it, so a bad one would block the whole folder."""
+    if type_name not in DECLARATION_TYPES:
+        raise SpoolDamaged(path, offset, f"holds a {type_name} that belongs to no episode")
+    try:
+        is_text = "\0" not in payload.decode()
+    except UnicodeDecodeError:
+        is_text = False
+    if not is_text:
+        raise SpoolDamaged(path, offset, "the declaration is not valid UTF-8 without NUL, so no database can store it")
+
+
+def read_header(path: Path, buffer: Buffer, *, recorder: bytes, number: int) -> SegmentHeader | None:
+    """Decode a segment's header; None if it is preallocated or torn. Raises `SpoolForeign` for another recorder's."""
+    format_number = format_of(buffer)
+    if format_number is not None and format_number > FORMAT:
+        raise SpoolForeign(f"{path} is in format {format_number} of a newer program; this one reads format {FORMAT}")
+    header = decode_header(buffer)
+    if header is not None and (header.recorder, header.number) != (recorder, number):
+        raise SpoolForeign(f"{path} is segment {header.number} of recorder {episode_text(EpisodeId(header.recorder))}")
+    return header
+
+
+def whole_frames(buffer: Buffer, start: int, salt: int) -> Iterator[tuple[int, Frame]]:
+    """Find every frame from `start` on, with its offset, whatever bytes lie between them."""
+    salted = CHECKSUM.pack(salt)
+    end = start
+    index = buffer.find(salted, start)
+    while index >= 0:
+        offset = index - _SALT_OFFSET
+        if offset >= end and offset % 8 == 0 and (frame := decode(buffer, offset, salt)) is not None:
+            yield offset, frame
+            end = offset + frame.size
+        index = buffer.find(salted, max(index + 1, end))
+
+
+def _refuse_damage(folder: Path, recorder: bytes, prefix: ValidPrefix) -> None:
+    """Raise `SpoolDamaged` if a commit frame behind the cut covers a record that is missing."""
+    for number in prefix.numbers:
+        if number < prefix.cut.number:
+            continue
+        path = segment_path(folder, number)
+        start = prefix.cut.offset if number == prefix.cut.number else 0
+        for offset, frame in whole_frames(read_segment(path), start, salt_of(recorder, number)):
+            if frame.kind == COMMIT and frame.position > prefix.cut.position:
+                raise SpoolDamaged(
+                    segment_path(folder, prefix.cut.number),
+                    prefix.cut.offset,
+                    f"position {prefix.cut.position + 1} is missing, although the commit frame at byte {offset} of"
+                    f" {path.name} covers all records up to position {frame.position}",
+                )
+
+
+def seal(folder: Path, prefix: ValidPrefix) -> None:
+    """Truncate the files at the cut; first copy the bytes behind it to `<segment>.tail`.
+
+    Idempotent, and can be repeated after a kill at any point. Raises `OSError`.
+    """
+    for path, tail in tails(folder, prefix):
+        if tail:
+            write_durably(path.with_name(f"{path.name}{TAIL}"), tail)
+    for number in prefix.numbers:
+        path = segment_path(folder, number)
+        if number > prefix.cut.number:
+            path.unlink(missing_ok=True)
+        elif number == prefix.cut.number:
+            with path.open("rb+") as file:
+                file.truncate(prefix.cut.offset)
+                os.fsync(file.fileno())
+    sync_folder(folder)
+
+
+def sync_segments(folder: Path, numbers: Iterable[int]) -> None:
+    """Sync these segments to the disk, in this order. Raises `OSError`.
+
+    The last records of a killed process are readable but may exist only in the page cache. If such records were stored
+    and then lost in a power cut, the next recovery would compute ends with the sequences of events in the log.
+    """
+    for number in numbers:
+        descriptor = os.open(segment_path(folder, number), os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            os.fdatasync(descriptor)
+        finally:
+            os.close(descriptor)
+    sync_folder(folder)
+
+
+def tails(folder: Path, prefix: ValidPrefix) -> list[tuple[Path, bytes]]:
+    """Return each file that extends behind the cut and its bytes there, without trailing zeros. Raises `OSError`."""
+    cut = prefix.cut
+    return [
+        (path, read_segment(path)[cut.offset if number == cut.number else 0 :].rstrip(b"\0"))
+        for number in prefix.numbers
+        if number >= cut.number and (path := segment_path(folder, number)).exists()
+    ]
+
+
+# === lost blobs ===============================================================================================
+#
+# Truncate a dead recorder's folder before the first unsynced record whose blob a power cut took.
+#
+# A sync makes blobs durable before it appends the commit frame of the records that refer to them. So only a record that
+# no commit frame covers can be on the disk without its blob. Such a record counts as a hole, like one whose bytes are
+# missing: it and all later records belong to the torn tail.
+
+
+class _Referring(NamedTuple):
+    """A record with the blobs it refers to; `offset` is the sum of the frames before it in its segment."""
+
+    segment: int
+    offset: int
+    position: int
+    names: tuple[str, ...]
+
+
+def truncate_at_lost_blob(folder: Path, recorder: bytes) -> None:
+    """Truncate the segments of a locked folder; copies the tail aside first. Raises `OSError` and `SpoolForeign`.
+
+    Leaves a damaged folder as it is, because a repair decides about its records.
+    """
+    if not (folder / BLOBS).is_dir():
+        return
+    unsynced: list[_Referring] = []
+    sizes: dict[int, int] = {}
+
+    def note(segment: int, frame: Frame) -> None:
+        if frame.kind == COMMIT:
+            unsynced[:] = [each for each in unsynced if each.position > frame.position]
+        elif references := references_in(frame.type.decode(), frame.payload):
+            names = tuple(each.hash for each in references)
+            unsynced.append(_Referring(segment, sizes.get(segment, 0), frame.position, names))
+        sizes[segment] = sizes.get(segment, 0) + frame.size
+
+    prefix, damage, _ = survey(folder, recorder, on_frame=note)
+    if damage is not None:
+        return
+    for each in unsynced:
+        if not all(is_whole(folder, name) for name in each.names):
+            path = segment_path(folder, each.segment)
+            header = read_header(path, read_segment(path), recorder=recorder, number=each.segment)
+            assert header is not None, "the segment was scanned"
+            offset = header_bytes(len(header.open)) + each.offset
+            seal(folder, prefix._replace(cut=Cursor(each.segment, offset, each.position - 1)))
+            return

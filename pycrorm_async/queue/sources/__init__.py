@@ -1,1 +1,0 @@
-"""Supply a drain with records, and keep the dead letters it leaves."""

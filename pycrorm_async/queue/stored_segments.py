@@ -1,0 +1,185 @@
+"""Keep segments after all their records are stored, to refill a log that went back.
+
+    spool/stored/<log id>/<recorder>/00000001.segment
+    spool/stored/<log id>/<recorder>/00000001.segment.blobs/<sha256>
+
+One rename moves a segment here instead of deleting it; it is not written again. Its blobs are deleted with it. Segments
+stored in another log, before an empty spool was bound to this one, are in that log's folder.
+
+Kept segments duplicate records of the database, so they must not compete with records still to be stored. They are
+deleted, oldest first, after `keep_stored_s`, above `keep_stored_bytes`, above `FILES_MAX`, and when the disk is full.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Final, NamedTuple
+
+from pycrorm_async.errors import SpoolUnavailable
+from pycrorm_async.queue.blobs import blob_bytes, keep_blobs, kept_with
+from pycrorm_async.queue.format import segment_numbers, segment_path
+from pycrorm_async.queue.locks import STORED, create_folders
+from pycrorm_async.queue.spool import Spool
+from pycrorm_async.settings import Settings
+
+FILES_MAX: Final = 4_096
+"""Bounds the number of kept segments: every recorder that ends lists them, which takes some 20 ms for this many."""
+
+_PRUNE_INTERVAL_NS: Final = 60 * 10**9
+"""Interval at which a process that keeps segments deletes those that are too old."""
+_BLOCK_BYTES: Final = 4_096
+_ATTEMPTS: Final = 5
+
+_log = logging.getLogger("pycrorm_async")
+
+
+class KeptSegment(NamedTuple):
+    """A kept segment with its blobs. `stored_ns` is the wall time at which its records were all stored, or later."""
+
+    stored_ns: int
+    bytes: int
+    path: Path
+
+
+def stored_in(spool: Path, log_id: str | None) -> Path | None:
+    """Return the folder for segments stored in this log; None for an id that cannot name a folder."""
+    if not log_id or "/" in log_id or log_id.startswith("."):
+        return None
+    return spool / STORED / log_id
+
+
+def kept_segments(spool: Path) -> list[KeptSegment]:
+    """List all kept segments in the order of deletion; of one recorder the lowest number comes first.
+
+    Leaves out files deleted or moved during the listing. Raises other `OSError`.
+    """
+    folders = [folder for log in _children(spool / STORED) for folder in _children(log)]
+    return sorted(segment for folder in folders for segment in _segments(folder))
+
+
+def _children(folder: Path) -> list[Path]:
+    try:
+        with os.scandir(folder) as entries:
+            return [Path(entry.path) for entry in entries if entry.is_dir(follow_symlinks=False)]
+    except FileNotFoundError:
+        return []
+
+
+def _segments(folder: Path) -> Iterator[KeptSegment]:
+    after_ns = 0
+    with suppress(FileNotFoundError):
+        for number in segment_numbers(folder):
+            path = segment_path(folder, number)
+            with suppress(FileNotFoundError):
+                status = path.stat()
+                after_ns = max(after_ns, status.st_mtime_ns)  # keeps the order by number if the clock was set back
+                yield KeptSegment(after_ns, _rounded(status.st_size) + _blob_bytes(path), path)
+
+
+def _blob_bytes(segment: Path) -> int:
+    blobs = kept_with(segment)
+    return sum(_rounded(blob_bytes([each])) for each in blobs.iterdir()) if blobs.is_dir() else 0
+
+
+def _rounded(size: int) -> int:
+    return -(-size // _BLOCK_BYTES) * _BLOCK_BYTES
+
+
+class StoredSegments:
+    """One process' access to the kept segments of a spool. Any number of processes may use it at once."""
+
+    def __init__(self, spool: Path, settings: Settings, *, wall_ns: Callable[[], int]) -> None:
+        self._spool = spool
+        self._keep_ns = round(settings.keep_stored_s * 1e9)
+        self._keep_bytes = settings.keep_stored_bytes
+        self._wall_ns = wall_ns
+        self._pruned_ns: int | None = None
+        self._bytes = 0
+
+    def keep(self, segment: Path, *, length: int | None = None, blobs: Sequence[Path] = ()) -> None:
+        """Move a segment and these blobs here; delete them if they cannot be kept. Raises `OSError`.
+
+        Truncates the segment to `length`. No process may have the truncated part mapped, because reading it would raise
+        SIGBUS.
+        """
+        kept_bytes = self._move(segment, length, blobs) if self._keep_ns and self._keep_bytes else 0
+        if not kept_bytes:
+            for path in (*blobs, segment):
+                path.unlink(missing_ok=True)
+            return
+        self._bytes += kept_bytes
+        now_ns = self._wall_ns()
+        if (
+            self._pruned_ns is None
+            or self._bytes > self._keep_bytes
+            or abs(now_ns - self._pruned_ns) > _PRUNE_INTERVAL_NS
+        ):
+            try:
+                self.prune()
+            except OSError as error:
+                _log.warning("kept segments cannot be listed, so old ones are not deleted: %s", error)
+
+    def prune(self) -> None:
+        """Delete the segments beyond the limits of age, bytes and number. Raises `OSError`."""
+        now_ns = self._pruned_ns = self._wall_ns()
+        segments = kept_segments(self._spool)
+        self._bytes = sum(each.bytes for each in segments)
+        for index, each in enumerate(segments):
+            if (
+                each.stored_ns > now_ns - self._keep_ns
+                and self._bytes <= self._keep_bytes
+                and len(segments) - index <= FILES_MAX
+            ):
+                break
+            self._bytes -= each.bytes
+            _delete(each.path)
+
+    def make_room(self, size: int) -> bool:
+        """Delete the oldest kept segments, at least `size` bytes; False if there is none to delete."""
+        freed = 0
+        with suppress(OSError):  # the caller reports the full disk
+            for each in kept_segments(self._spool):
+                if freed >= size:
+                    break
+                _delete(each.path)
+                freed += each.bytes
+        return freed > 0
+
+    def _move(self, segment: Path, length: int | None, blobs: Sequence[Path]) -> int:
+        """Move a segment and its blobs; return their size in bytes, or 0 if they cannot be kept."""
+        try:
+            folder = stored_in(self._spool, Spool(self._spool).log_id())
+            if folder is None:
+                return 0
+            if length is not None:
+                os.truncate(segment, length)
+            now_ns = self._wall_ns()
+            os.utime(segment, ns=(now_ns, now_ns))
+            target = folder / segment.parent.name / segment.name
+            for _ in range(_ATTEMPTS):
+                create_folders(self._spool, target.parent)
+                with suppress(FileNotFoundError):  # another process deleted the folder, which was empty
+                    keep_blobs(self._spool, blobs, target)
+                    segment.rename(target)
+                    return target.stat().st_size + _blob_bytes(target)
+        except FileNotFoundError:  # a process that was then killed has moved it already
+            return 0
+        except (OSError, SpoolUnavailable) as error:
+            _log.warning(
+                "stored segment %s cannot be kept, so it is deleted: %s",
+                segment,
+                getattr(error, "strerror", None) or error,
+            )
+        return 0
+
+
+def _delete(segment: Path) -> None:
+    shutil.rmtree(kept_with(segment), ignore_errors=True)
+    segment.unlink(missing_ok=True)
+    with suppress(OSError):  # it contains more segments
+        segment.parent.rmdir()

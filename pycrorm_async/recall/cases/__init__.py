@@ -1,1 +1,0 @@
-"""Make cases from the events of episodes, and store them as blocks beside the memory's tables."""

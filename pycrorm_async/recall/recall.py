@@ -1,0 +1,952 @@
+"""Recall past actions: `memory.recall(...)` takes a cue and returns the cases most like it.
+
+>>> answer = await memory.recall(type=PickUpAction, has={"object_type": ObjectType.MILK}, near={"height": 0.93})
+>>> answer.success, answer.reasons, answer.never_seen
+>>> await answer[0].moment()                                             # the world as it was then
+>>> await memory.recall.similar_to_now(milk, PickUpAction)               # cue: the world as it is
+>>> await memory.recall.follows(PickUpAction, reason=IKError)            # what came next, and how that ended
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime, timedelta
+from importlib import import_module
+from numbers import Real
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, Protocol, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+from sqlalchemy import Select, select
+
+from pycrorm_async.clock import SYSTEM_CLOCK, Clock
+from pycrorm_async.errors import (
+    CallerError,
+    DatabaseUnavailable,
+    EpisodeParked,
+    MissingExtra,
+    PycrormError,
+    TablesOutdated,
+)
+from pycrorm_async.events.codec import encode
+from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, EpisodeId, episode_text, parse_episode_id, row_id, row_key
+from pycrorm_async.events.types import DesignatorTypeDeclared, EpisodeEnded, ObjectReference, RobotValue
+from pycrorm_async.orm import EpisodeRobot, EpisodeTag
+from pycrorm_async.plan.language import Designator
+from pycrorm_async.plan.objects import ObjectDesignator
+from pycrorm_async.projections.fold import WorldFold, WorldObject
+from pycrorm_async.projections.generations import PROJECTION, read_generation
+from pycrorm_async.query.frames import member_of
+from pycrorm_async.query.named_queries import EpisodeSummary
+from pycrorm_async.query.reading import Reading
+from pycrorm_async.query.snapshot import AnyEpisode, Moment
+from pycrorm_async.recall.answer import Answer, Following, RecalledCase, Relation, Sequences, answer
+from pycrorm_async.recall.blocks import Block, CaseLibrary, merge
+from pycrorm_async.recall.cases import (
+    READS,
+    CaseProjection,
+    EpisodeCases,
+    FeatureFields,
+    Numbers,
+    Symbols,
+    read_blocks,
+    read_headings,
+    select_numbers,
+    situation,
+)
+from pycrorm_async.recall.columns import FEATURES_MAX, RESERVED, Case
+from pycrorm_async.recall.search import (
+    Cue,
+    Forgotten,
+    Wanted,
+    check_cue,
+    closest,
+    forgotten,
+    numbers_of,
+    shortened,
+    symbols_of,
+    weights_of,
+    word,
+)
+from pycrorm_async.record.declarations import built_in_declaration, declared_type
+from pycrorm_async.record.episode_writer import Emitter
+from pycrorm_async.record.event_feed import EventBuffer
+from pycrorm_async.record.values import pose_value
+from pycrorm_async.store.log import EventLog, episode_named
+from pycrorm_async.store.stored import StoredEvent
+from pycrorm_async.task_status import TaskStatus
+from pycrorm_async.world.bullet import BulletWorld, Object
+from pycrorm_async.world.world_copy import acting_robot
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+_NOTHING: Mapping[str, Any] = MappingProxyType({})
+
+
+class Recall:
+    """The recall of one memory, for one event loop.
+
+    Args:
+        reader: of the cases.
+        reading: of the same memory, for episodes and past moments.
+    """
+
+    def __init__(self, reader: CaseReader, reading: Reading, clock: Clock = SYSTEM_CLOCK) -> None:
+        self._reader = reader
+        self._reading = reading
+        self._clock = clock
+
+    @property
+    def reader(self) -> CaseReader:
+        """The cases that are searched."""
+        return self._reader
+
+    @classmethod
+    def of(cls, reading: Reading) -> Recall:
+        """Return the recall of a memory that is open for reading."""
+        return cls(CaseReader(DatabaseSource(reading)), reading)
+
+    async def __call__(
+        self,
+        type: str | type | None = None,  # noqa: A002  the feature's name
+        *,
+        has: Mapping[str, Any] = _NOTHING,
+        near: Mapping[str, Any] = _NOTHING,
+        lacks: Mapping[str, Any] = _NOTHING,
+        only: Mapping[str, Any] = _NOTHING,
+        before: TimeReference | None = None,
+        after: TimeReference | None = None,
+        during: AnyCase | tuple[TimeReference, TimeReference] | None = None,
+        as_of: TimeReference | None = None,
+        prohibit: Iterable[AnyCase] = (),
+        episode: AnyEpisode | Iterable[AnyEpisode] | None = None,
+        robot: str | None = None,
+        tag: str | None = None,
+        simulated: bool = False,
+        k: int = 20,
+        minimum: float = 0.0,
+    ) -> Answer:
+        """Return the past actions most like a cue, the best first and among equals the newest.
+
+        `has` and `near` make actions similar. The others are conditions, which every action of the answer fulfils. An
+        action of this process is included as soon as it has ended, one of another process once it is in the tables.
+
+        Args:
+            type: a designator class or its dtype; subclasses are types of their own. One that was renamed is found by
+                each name, with the cases of all. A type that never occurred gives an empty answer.
+            has: values by feature, as `{"arm": Arms.LEFT, "near": ["BOWL", "CUP"]}`: enums, texts, booleans, classes.
+                `status`, `reason` and `duration` of the outcome are compared only if they are given.
+            near: numbers by feature: the wanted one, or a pair of it and the tolerance, from which on nothing is alike.
+                Without one it is the number's standard deviation among the actions of the type, 0.5 rad for angles.
+            lacks, only: values that the action must not have, and that it must have.
+            before, after: it started before this moment, or before this case; at or after it, or after its end.
+            during: it started and ended in this interval, or during this case in the same episode.
+            as_of: the answer at this moment: it had ended by then.
+            prohibit: cases that are left out, such as the one that the cue describes.
+            episode, robot, tag: it belongs to this episode or one of these; the robot's name; the episode has the tag.
+                A robot without a case gives an empty answer, because a plan may ask before its robot has ever acted.
+            simulated: simulations are included.
+            k: the number of actions, 1 to 10,000.
+            minimum: the lowest score, 0 to 1.
+
+        Raises:
+            CallerError: for a cue that cannot be answered, in one line with the nearest name. `UnknownEpisode`.
+        """
+        conditions = Conditions(
+            before, after, during, as_of, prohibit, only, episode, robot, tag, simulated=simulated, k=k, minimum=minimum
+        )
+        library = await self._reader.library(dtype_of(type), aliases_of(type))
+        words = symbols_of(has), numbers_of(near), symbols_of(lacks)
+        cue = await make_cue(library, EpisodeNames(self._reading), dtype_of(type), *words, conditions)
+        return self._answer(cue, library)
+
+    async def like(self, case: AnyCase, *, k: int = 20, simulated: bool = False) -> Answer:
+        """Return the actions whose situation was most like that of a case, which is left out itself.
+
+        The name of its object is not compared. Of more than 256 words and numbers, those that weigh least are left out,
+        and the answer has their number. Raises `CallerError` for a node without a case.
+        """
+        library = await self._reader.library()
+        original = case_of(case, library)
+        cue = cue_like(original, library)
+        cue = replace(cue, prohibit=frozenset({original.node}), k=k, simulated=simulated or original.simulated)
+        return self._answer(cue, library)
+
+    async def similar_to_now(
+        self,
+        target: Object | ObjectDesignator,
+        action: str | type,
+        *,
+        has: Mapping[str, Any] = _NOTHING,
+        near: Mapping[str, Any] = _NOTHING,
+        k: int = 50,
+        **conditions: Any,
+    ) -> Answer:
+        """Return the actions of a class whose situation was most like the present one of an object.
+
+        Compares the object's type, neighbourhood and height, and the base pose and torso of the acting robot.
+
+        Args:
+            target: an object in a world, or its designator.
+            action: a designator class, or a built-in type as `PickUpAction`, also by its name.
+            has, near: further features, and others than the present ones, as the arm that is to be used.
+            conditions: those of the call, as `only` and `episode`.
+        """
+        dtype = dtype_of(action)
+        library = await self._reader.library(dtype, aliases_of(action))
+        symbols, numbers = present_situation(target, action)
+        features = library.texts(dtype) | library.numbers(dtype)
+        symbols = {name: each for name, each in symbols.items() if name in features and name != "object_name"}
+        wanted = {name: each for name, each in numbers.items() if name in features}
+        words = symbols_of({**symbols, **has}), numbers_of({**wanted, **near})
+        cue = await make_cue(library, EpisodeNames(self._reading), dtype, *words, (), Conditions(k=k, **conditions))
+        return self._answer(cue, library)
+
+    def _answer(self, cue: Cue, library: CaseLibrary) -> Answer:
+        check_cue(cue, library)
+        return answer(cue, library, self)
+
+    async def frame(self, type: str | type | None = None, **cue: Any) -> pd.DataFrame:  # noqa: A002
+        """Return an answer as a data frame: a row for each action, with its score and a column for each feature.
+
+        The arguments are those of the call. Raises `MissingExtra` without pandas.
+        """
+        return frame_of(await self(type, **cue))
+
+    async def forget(self, activation: float, *, dry_run: bool = False) -> Forgotten:
+        """Hide the actions in ways that were not used enough lately, from this object only; nothing is deleted.
+
+        A way is a type with all its texts, as the same object, arm and grasp. Each call replaces the one before it:
+        `forget(float("-inf"))` hides nothing.
+
+        Args:
+            activation: the lowest base-level activation in the sense of ACT-R; that of one use is 0 after 1 s, -2.3
+                after 100 s, -5.7 after a day.
+            dry_run: only count.
+        """
+        if isinstance(activation, bool) or not isinstance(activation, Real) or activation != activation:
+            raise CallerError(f"activation must be a number, got {shortened(activation)}")
+        return await self._reader.forget(activation, self._clock.wall_ns() // 1_000, dry_run=dry_run)
+
+    async def types(self) -> tuple[str, ...]:
+        """Return the types of the actions that have ended, those that were renamed by each name."""
+        library = await self._reader.library()
+        return tuple(sorted({*library.types, *library.recorded_types}))
+
+    async def reasons(self, type: str | type) -> tuple[str, ...]:  # noqa: A002
+        """Return the classes of the failures with which actions of a type have ended, in alphabetical order."""
+        dtype = dtype_of(type)
+        library = await self._reader.library(dtype, aliases_of(type))
+        return tuple(sorted(each for each in library.words("reason") if library.seen(dtype, "reason", each)))
+
+    # --- around a case ----------------------------------------------------------------------------------------
+
+    async def case(self, case: AnyCase) -> Case:
+        """Return the case of a node. Raises `CallerError` if it has none."""
+        return case_of(case, await self._reader.library())
+
+    async def next(self, case: AnyCase) -> Case | None:
+        """Return the action that started next under the same parent."""
+        return (await self._reader.sequences()).next(await self.case(case))
+
+    async def previous(self, case: AnyCase) -> Case | None:
+        """Return the action that started before it under the same parent."""
+        return (await self._reader.sequences()).previous(await self.case(case))
+
+    async def parent(self, case: AnyCase) -> Case | None:
+        """Return the nearest action around it; None outside any, and while that runs."""
+        return (await self._reader.sequences()).parent(await self.case(case))
+
+    async def related(self, case: AnyCase, relation: Relation | str) -> list[Case]:
+        """Return the actions of the case's episode that have this relation of Allen to it, ordered by their start."""
+        try:
+            wanted = Relation(relation)
+        except ValueError:
+            names = ", ".join(each.value for each in Relation)
+            raise CallerError(f"{relation!r} is not a relation: give one of {names}") from None
+        return (await self._reader.sequences()).related(await self.case(case), wanted)
+
+    async def moment(self, case: AnyCase) -> Moment:
+        """Return the task tree and the world as they were when an action started; see `Reading.as_of`."""
+        action = await self.case(case)
+        return await self._reading.as_of(action.episode, sequence=action.sequence)
+
+    async def follows(
+        self,
+        type: str | type,  # noqa: A002
+        *,
+        status: object = None,
+        reason: str | type | None = None,
+    ) -> Following:
+        """Count the actions that came next after the actions of a type, with their success rates.
+
+        Args:
+            type: a designator class or its dtype.
+            status, reason: how they ended, and the class of the failure or its name; by default any.
+
+        Raises `CallerError` for a status that is none.
+        """
+        dtype = dtype_of(type)
+        if dtype is None:
+            raise CallerError("give the type of the actions, as in `follows(PickUpAction)`")
+        if status is not None:
+            status = member_of(TaskStatus, word(status), "status")
+        wanted = {name: word(each) for name, each in (("status", status), ("reason", reason)) if each is not None}
+        sequences = await self._reader.sequences(dtype, aliases_of(type))
+        return sequences.follows(dtype, **wanted)
+
+
+def frame_of(recalled: Answer) -> pd.DataFrame:
+    """Return an answer as a data frame. Raises `MissingExtra` without pandas."""
+    try:
+        pandas = import_module("pandas")
+    except ImportError:
+        raise MissingExtra("frames need pandas: pip install 'pycrorm-async[frames]'") from None
+    rows = []
+    for each in recalled:
+        case = each.case
+        outcome = {"status": case.status, "reason": case.reason, "duration": case.duration_s}
+        place: dict[str, Any] = {
+            "node": case.node,
+            "episode": case.episode,
+            "sequence": case.sequence,
+            "type": case.type,
+        }
+        rows.append(
+            {"score": each.score, **place, "started": case.started_at, **outcome, **case.symbols, **case.numbers}
+        )
+    columns = ["score", "node", "episode", "sequence", "type", "started", "status", "reason", "duration"]
+    frame: pd.DataFrame = pandas.DataFrame(rows) if rows else pandas.DataFrame(columns=columns)
+    return frame
+
+
+# === case reader ==============================================================================================
+#
+# Keep the cases of a memory in this process: the stored blocks, and its own cases that are not stored yet.
+#
+# Theory of operation. Before each recall the reader asks the source for the numbers of the blocks, and reads those that
+# it does not have. A merge replaces blocks by one with a new number; the source returns both in one snapshot, so that
+# no case is missing or doubled. In another generation, which a rebuild has made, all blocks are new. A case of this
+# process is included as soon as its action has ended; once a stored block has it too, that of the block is used.
+
+_UNSTORED_BLOCKS = 16
+"""Bounds the blocks of cases of this process, each of one recall; more of them are merged."""
+
+
+class StoredBlocks(NamedTuple):
+    """The blocks that a memory has at one moment.
+
+    Attributes:
+        generation: of the tables; a block's number means another block in another generation.
+        numbers: of all blocks.
+        added: those that the reader did not have, by number.
+    """
+
+    generation: int
+    numbers: frozenset[int]
+    added: Mapping[int, Block]
+
+
+class BlockSource(Protocol):
+    """The blocks of a memory."""
+
+    async def read(self, generation: int, block_numbers: Collection[int]) -> StoredBlocks:
+        """Return the numbers of all blocks, and the blocks that a reader lacks.
+
+        The reader has the blocks with these numbers of this generation; of another generation it gets all blocks.
+        """
+        ...
+
+    async def present_names(self) -> Mapping[str, str]:
+        """Return the present name of each type that the memory knows, by all the names that it had."""
+        ...
+
+
+class RunningCases(Protocol):
+    """The cases of this process, stored or not."""
+
+    async def new(self) -> tuple[Sequence[Case], Sequence[Case]]:
+        """Return the new cases of actions that have ended, and all cases whose episodes have no number yet."""
+        ...
+
+
+class NoRunningCases:
+    """The cases of a process that records nothing."""
+
+    async def new(self) -> tuple[Sequence[Case], Sequence[Case]]:
+        """Return nothing."""
+        return (), ()
+
+
+class CaseReader:
+    """The cases of one memory, for one event loop."""
+
+    def __init__(self, source: BlockSource, running: RunningCases | None = None) -> None:
+        self._source = source
+        self._running = running if running is not None else NoRunningCases()
+        self._generation = -1
+        self._blocks: dict[int, Block] = {}
+        self._unstored: list[Block] = []
+        self._unnumbered: Sequence[Case] = ()
+        self._hidden: NDArray[np.int64] = np.zeros(0, np.int64)
+        self._library = CaseLibrary()
+        self._names: Mapping[str, str] = {}
+        self._aliases: dict[str, str] = {}
+        self._sequences: tuple[CaseLibrary, Sequences] | None = None
+        self._reading = asyncio.Lock()
+
+    async def library(self, type: str | None = None, aliases: Collection[str] = ()) -> CaseLibrary:  # noqa: A002
+        """Return all cases that are not hidden, under the present names of their types.
+
+        Args:
+            type: the type of the next cue, because the memory may know it by another name.
+            aliases: former names of this type, also if the memory does not know them yet.
+        """
+        async with self._reading:
+            library = await self._read()
+            unknown = {*library.recorded_types, *([] if type is None else [type])} - self._names.keys()
+            if unknown or not self._aliases.keys() >= {*aliases}:
+                self._aliases |= {alias: type for alias in aliases if type is not None}
+                names = dict(await self._source.present_names())
+                names |= {alias: each for alias, each in self._aliases.items() if names.get(alias, alias) == alias}
+                if library.joins(names):
+                    self._library = CaseLibrary(library.blocks, names)
+                self._names = names
+            return self._library
+
+    async def sequences(self, type: str | None = None, aliases: Collection[str] = ()) -> Sequences:  # noqa: A002
+        """Return these cases in the order in which they happened."""
+        library = await self.library(type, aliases)
+        if self._sequences is None or self._sequences[0] is not library:
+            self._sequences = library, Sequences(library)
+        return self._sequences[1]
+
+    async def forget(self, threshold: float, now_us: int, *, dry_run: bool) -> Forgotten:
+        """Hide the cases whose ways have an activation below the threshold now, and no others, from this reader."""
+        async with self._reading:
+            hidden, self._hidden = self._hidden, np.zeros(0, np.int64)
+            cases = forgotten(await self._read(changed=hidden.size > 0), threshold=threshold, now_us=now_us)
+            self._hidden = hidden if dry_run else cases.nodes
+            if self._hidden.size:
+                await self._read(changed=True)
+            return cases
+
+    async def _read(self, *, changed: bool = False) -> CaseLibrary:
+        running, unnumbered = await self._running.new()
+        stored = await self._source.read(self._generation, self._blocks.keys())
+        self._generation = stored.generation  # of another generation the source has returned all blocks
+        gone = self._blocks.keys() - stored.numbers
+        for number in gone:
+            del self._blocks[number]
+        self._blocks.update(stored.added)
+        unstored = self._unstored
+        if stored.added:
+            unstored = _without(unstored, stored.added.values())
+        if running:
+            unstored = [*unstored, *_without([Block.of(running)], self._blocks.values())]
+        if changed or gone or stored.added or unstored != self._unstored or [*unnumbered] != [*self._unnumbered]:
+            self._unstored = unstored if len(unstored) <= _UNSTORED_BLOCKS else [merge(unstored)]
+            self._unnumbered = unnumbered
+            self._library = CaseLibrary(self._visible(), self._names)
+        return self._library
+
+    def _visible(self) -> list[Block]:
+        blocks = [*self._blocks.values(), *self._unstored, *([Block.of(self._unnumbered)] if self._unnumbered else [])]
+        if not self._hidden.size:
+            return blocks
+        kept = [(block, ~np.isin(block.nodes, self._hidden)) for block in blocks]
+        return [block if each.all() else block.where(each) for block, each in kept if each.any()]
+
+
+def _without(blocks: Sequence[Block], stored: Collection[Block]) -> list[Block]:
+    """Return the blocks without the cases that a stored block has; a block of which none are left is left out."""
+    left: list[Block] = []
+    for block in blocks:
+        first, last = block.nodes.min(), block.nodes.max()
+        both = [np.isin(block.nodes, each.nodes[(each.nodes >= first) & (each.nodes <= last)]) for each in stored]
+        kept = ~np.logical_or.reduce(both) if both else np.ones(len(block), np.bool_)
+        if kept.any():
+            left.append(block if kept.all() else block.where(kept))
+    return left
+
+
+# === cue arguments ============================================================================================
+#
+# Make a cue from a caller's arguments: designator classes, enums, datetimes, cases, names of episodes and tags.
+
+AnyCase: TypeAlias = "Case | RecalledCase | int"
+"""A case, or the id of its task-tree node."""
+TimeReference: TypeAlias = "datetime | str | AnyCase"
+"""A moment: an aware datetime, or a text in ISO 8601, UTC where it has no zone; or a case, for its start or its end."""
+_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
+_OF_EACH_CASE = frozenset({"object_name"})
+"""The texts of a case that `cue_like` leaves out: they name one object of many alike."""
+
+
+class Conditions(NamedTuple):
+    """The conditions of a cue, as `Recall` takes them."""
+
+    before: TimeReference | None = None
+    after: TimeReference | None = None
+    during: AnyCase | tuple[TimeReference, TimeReference] | None = None
+    as_of: TimeReference | None = None
+    prohibit: Iterable[AnyCase] = ()
+    only: Mapping[str, Any] | None = None
+    episode: AnyEpisode | Iterable[AnyEpisode] | None = None
+    robot: str | None = None
+    tag: str | None = None
+    simulated: bool = False
+    k: int = 20
+    minimum: float = 0.0
+
+
+class EpisodeNames:
+    """The episodes of a memory by name and by tag, and the robots that took part in them."""
+
+    def __init__(self, reading: Reading) -> None:
+        self._reading = reading
+
+    async def numbers_of(self, episode: AnyEpisode | Iterable[AnyEpisode]) -> frozenset[int]:
+        """Return the numbers of one episode or several. Raises `UnknownEpisode`."""
+        several = [episode] if isinstance(episode, int | str | EpisodeSummary) or not _is_iterable(episode) else episode
+        log = await self._reading.log()
+        names = [str(each.number if isinstance(each, EpisodeSummary) else each) for each in several]  # type: ignore[union-attr]
+        return frozenset([(await episode_named(log, name)).number for name in names])
+
+    async def tagged(self, tag: str) -> frozenset[int]:
+        """Return the numbers of the episodes with a tag. Raises `CallerError` if no episode has it."""
+        async with self._reading.session(simulated=True) as session:
+            rows = (await session.execute(select(EpisodeTag.process_metadata_id, EpisodeTag.tag))).all()
+        numbers = frozenset(number for number, each in rows if each == tag)
+        if not numbers:
+            raise CallerError(f"no episode has the tag {tag!r}{closest(tag, {each for _, each in rows})}")
+        return numbers
+
+    async def check_robot(self, robot: str) -> None:
+        """Raise `CallerError` if no robot of this name took part in any episode."""
+        async with self._reading.session(simulated=True) as session:
+            names = set((await session.scalars(select(EpisodeRobot.name).distinct())).all())
+        if robot not in names:
+            raise CallerError(f"no episode has the robot {robot!r}{closest(robot, names)}")
+
+
+async def make_cue(
+    library: CaseLibrary,
+    episodes: EpisodeNames,
+    dtype: str | None,
+    has: tuple[tuple[str, str], ...],
+    near: tuple[Wanted, ...],
+    lacks: tuple[tuple[str, str], ...],
+    conditions: Conditions,
+) -> Cue:
+    """Return the cue. Raises `CallerError` for a moment without a zone or an unknown node, `UnknownEpisode`."""
+    numbers = await _numbers(episodes, conditions)
+    during = None
+    if isinstance(conditions.during, tuple) and not isinstance(conditions.during, Case):
+        if len(conditions.during) != 2:
+            raise CallerError(f"`during` takes a case, or two moments, got {len(conditions.during)}")
+        first, last = conditions.during
+        during = _start(first, library), _end(last, library)
+    elif conditions.during is not None:
+        case = case_of(conditions.during, library)
+        if case.duration_s is None:
+            raise CallerError(f"{case.type} in episode {case.episode} has no end, so nothing happened during it")
+        during = case.started_us, _end(case, library)
+        numbers = frozenset({case.episode}) & (numbers if numbers is not None else {case.episode})
+    only = dict(conditions.only or {})
+    if conditions.robot is not None:
+        only["robot"] = conditions.robot
+    return Cue(
+        type=dtype,
+        has=has,
+        near=near,
+        lacks=lacks,
+        requires=symbols_of(only),
+        before_us=None if conditions.before is None else _start(conditions.before, library),
+        after_us=None if conditions.after is None else _end(conditions.after, library),
+        during_us=during,
+        as_of_us=None if conditions.as_of is None else _start(conditions.as_of, library),
+        episodes=numbers,
+        prohibit=_nodes(conditions.prohibit),
+        simulated=conditions.simulated,
+        k=conditions.k,
+        minimum=conditions.minimum,
+    )
+
+
+def cue_like(case: Case, library: CaseLibrary) -> Cue:
+    """Return the situation of a case as a cue, without its outcome and without the name of its object.
+
+    If there are more features than a cue can have, those with the lowest weights are left out, and counted.
+    """
+    unused = RESERVED | _OF_EACH_CASE | library.left_out
+    has = symbols_of({name: value for name, value in case.symbols.items() if name not in unused})
+    near = tuple(Wanted(name, value) for name, value in sorted(case.numbers.items()))
+    cue = Cue(type=case.type, has=has, near=near, simulated=case.simulated)
+    features = [*has, *near]
+    if len(features) <= FEATURES_MAX:
+        return cue
+    weights = [*weights_of(cue, library).words, *(1.0 for _ in near)]
+    heaviest = sorted(range(len(features)), key=lambda index: -weights[index])[:FEATURES_MAX]
+    kept = {features[index] for index in heaviest}
+    return replace(
+        cue,
+        has=tuple(each for each in has if each in kept),
+        near=tuple(each for each in near if each in kept),
+        left_out=len(features) - FEATURES_MAX,
+    )
+
+
+def dtype_of(designator: str | type | None) -> str | None:
+    """Return the type of a designator class, of a mapped class, or by its name.
+
+    >>> dtype_of(PickUpAction), dtype_of("PickUpAction")
+    ('PickUpAction', 'PickUpAction')
+    """
+    if designator is None or isinstance(designator, str):
+        return designator
+    dtype = getattr(designator, "dtype", None)
+    if isinstance(dtype, str):
+        return dtype
+    if not isinstance(designator, type):
+        raise CallerError(f"{shortened(designator)} is not a type: give a designator class, or the name of one")
+    return word(designator).removeprefix("ORM")
+
+
+def aliases_of(designator: str | type | None) -> tuple[str, ...]:
+    """Return the former names that a designator class declares."""
+    aliases = vars(designator).get("aliases", ()) if isinstance(designator, type) else ()
+    return tuple(aliases) if isinstance(aliases, tuple | list) else ()
+
+
+def node_of(case: AnyCase) -> int:
+    """Return the id of the node of a case. Raises `CallerError` for anything else."""
+    if not isinstance(case, int | Case | RecalledCase):
+        raise CallerError(f"{shortened(case)} is not a case: give one of an answer, or the id of its node")
+    return case if isinstance(case, int) else case.node
+
+
+def _nodes(cases: object) -> frozenset[int]:
+    if not isinstance(cases, Iterable) or isinstance(cases, Case | str):
+        raise CallerError("`prohibit` takes a list of cases")
+    return frozenset(map(node_of, cases))
+
+
+async def _numbers(episodes: EpisodeNames, conditions: Conditions) -> frozenset[int] | None:
+    numbers = None if conditions.episode is None else await episodes.numbers_of(conditions.episode)
+    if conditions.tag is None:
+        return numbers
+    tagged = await episodes.tagged(conditions.tag)
+    return tagged if numbers is None else numbers & tagged
+
+
+def _is_iterable(value: object) -> bool:
+    return isinstance(value, list | tuple | set | frozenset)
+
+
+def case_of(case: AnyCase, library: CaseLibrary) -> Case:
+    """Return a case, by its node too. Raises `CallerError` for a node without one."""
+    if isinstance(case, Case):
+        return case
+    if isinstance(case, RecalledCase):
+        return case.case
+    case = node_of(case)
+    stored = library.find(case)
+    if stored is None:
+        key = row_key(case) if 0 < case < 2**53 else None
+        place = f"event {key.sequence} of episode {key.number}" if key is not None else f"{case}"
+        raise CallerError(f"there is no case of {place}: it does not exist, is not an action, or has not ended")
+    return stored
+
+
+def _start(when: TimeReference, library: CaseLibrary) -> int:
+    return _moment_us(when) if isinstance(when, datetime | str) else case_of(when, library).started_us
+
+
+def _end(when: TimeReference, library: CaseLibrary) -> int:
+    """Return the end of a case, rounded up; of a lost one, which has none, its start."""
+    if isinstance(when, datetime | str):
+        return _moment_us(when)
+    case = case_of(when, library)
+    return case.started_us + int(-(-(case.duration_s or 0.0) * 1e6 // 1))
+
+
+def _moment_us(when: datetime | str) -> int:
+    if isinstance(when, str):
+        try:
+            moment = datetime.fromisoformat(when)
+        except ValueError:
+            raise CallerError(
+                f"{when[:40]!r} is not a moment: give one as in 2026-11-20 or 2026-11-20T14:30+01:00"
+            ) from None
+        when = moment if moment.utcoffset() is not None else moment.replace(tzinfo=UTC)
+    if when.utcoffset() is None:
+        raise CallerError(f"{when!r} has no time zone: add one, for example .replace(tzinfo=UTC)")
+    return (when - _EPOCH) // timedelta(microseconds=1)
+
+
+# === database source ==========================================================================================
+#
+# Read the stored blocks of a memory; one statement finds out whether any has changed.
+
+_KEY: Final = f"{PROJECTION}{CaseProjection.name}"
+
+
+class DatabaseSource:
+    """The blocks in the tables of a memory. Implements `BlockSource`."""
+
+    def __init__(self, reading: Reading) -> None:
+        self._reading = reading
+        self._numbers: tuple[int, Select[Any]] | None = None
+
+    async def read(self, generation: int, block_numbers: Collection[int]) -> StoredBlocks:
+        """Return the blocks in one snapshot.
+
+        Raises `DatabaseUnavailable` for a memory without a table of cases, `TablesOutdated` for one of another version,
+        `DamageError` for a block whose bytes were changed.
+        """
+        log = await self._reading.log()
+        if await self._is_unchanged(log, generation, block_numbers):
+            return StoredBlocks(generation, frozenset(block_numbers), {})
+        async with log.snapshot() as connection:
+            tables = await read_generation(connection, _KEY)
+            if tables is None:
+                raise DatabaseUnavailable(
+                    f"{log.address} has no cases to recall yet (with Settings(recall=False) none are made): run"
+                    " `pycrorm writer --once`"
+                )
+            if tables.version != CaseProjection.version:
+                raise TablesOutdated(
+                    f"{log.address}: its cases have version {tables.version} instead of {CaseProjection.version}: run"
+                    f" `pycrorm rebuild {CaseProjection.name}`"
+                )
+            numbers = frozenset(each.number for each in await read_headings(connection, tables.number))
+            wanted = numbers.difference(block_numbers if tables.number == generation else ())
+            added = await read_blocks(connection, tables.number, sorted(wanted)) if wanted else {}
+        return StoredBlocks(tables.number, numbers, added)
+
+    async def _is_unchanged(self, log: EventLog, generation: int, block_numbers: Collection[int]) -> bool:
+        """Return whether this generation has exactly these blocks; False also if it was dropped."""
+        if not block_numbers:
+            return False
+        if self._numbers is None or self._numbers[0] != generation:
+            self._numbers = generation, select_numbers(_KEY, generation)
+        with suppress(PycrormError):  # where a rebuild has dropped the table; another fault is met again
+            async with log.reading() as connection:
+                rows = (await connection.execute(self._numbers[1])).all()
+            generations = {(number, version) for number, version, _ in rows}
+            return generations == {(generation, CaseProjection.version)} and {block for _, _, block in rows} == {
+                *block_numbers
+            }
+        return False
+
+    async def present_names(self) -> Mapping[str, str]:
+        """Return the present name of each declared type, by all its names."""
+        return await self._reading.present_names()
+
+
+# === present situation ========================================================================================
+#
+# Describe the world as it is, as if an action with an object began now: the features that its case would have.
+
+
+def present_situation(target: Object | ObjectDesignator, action: str | type) -> tuple[Symbols, Numbers]:
+    """Return the features of an action that would start now, without those of parameters other than the object.
+
+    `action` is a designator class, or a built-in type by its description or its dtype.
+
+    Raises `CallerError` for an object that is in no world, and for another class.
+    """
+    body = target.world_object if isinstance(target, ObjectDesignator) else target
+    if not isinstance(body, Object) or body not in body.world.objects:
+        raise CallerError(f"{target!r} is not an object in a world, so it has no situation: add it to a world first")
+    fields = FeatureFields.of(_declaration(action))
+    # Events refer to objects by the sequence that added them: number the objects as an episode that began now would.
+    sequences = {each: number for number, each in enumerate(body.world.objects, 1)}
+    parameters: dict[str, Any] = {}
+    if fields.objects:
+        parameters[fields.objects[0]] = {"object": sequences[body], "row": sequences[body]}
+    return situation(fields, parameters, _robot(body.world, sequences), _world(body.world, sequences))
+
+
+def _declaration(action: str | type) -> DesignatorTypeDeclared:
+    if isinstance(action, type) and issubclass(action, Designator):
+        return declared_type(action, strict=False).declaration
+    declaration = built_in_declaration(dtype_of(action) or "")
+    if declaration is None:
+        raise CallerError(f"{action!r} is not a designator class: give one, such as PickUpAction")
+    return declaration
+
+
+def _robot(world: BulletWorld, sequences: Mapping[Object, int]) -> RobotValue | None:
+    robot = acting_robot(world)
+    if robot is None or robot not in sequences:
+        return None
+    torso = robot.robot_description.torso_joint if robot.robot_description is not None else None
+    reference = ObjectReference(sequences[robot], sequences[robot])
+    height = robot.joint_position(torso) if torso is not None else None
+    return RobotValue(pose_value(robot.pose), robot.object_type.name, height, reference, robot.name)
+
+
+def _world(world: BulletWorld, sequences: Mapping[Object, int]) -> WorldFold:
+    fold = WorldFold()
+    for each, sequence in sequences.items():
+        attachment = world.attachments.of(each)
+        present = WorldObject(each.name, each.object_type.name, pose_value(each.pose), sequence)
+        if attachment is not None:
+            present.attached_to = sequences[attachment.parent], attachment.link
+        fold.objects[sequence], fold.names[sequence] = present, each.name
+    return fold
+
+
+# === running cases ============================================================================================
+#
+# Make the cases of the episodes that this process records, before their events are in the tables.
+#
+# Theory of operation. From the first recall on, a buffer of the event feed keeps the events of this process until the
+# next recall, which folds them as those of the log are folded. The first recall flushes, and reads the earlier events
+# of the open episodes from the log; so does one that finds events left out because the buffer was full. An episode to
+# which the database has not given a number yet has one from the end of the numbers, and its cases get the right one as
+# soon as it is known. Start and duration of such a case are those at which its events were published, some microseconds
+# later than those in the log; the reader takes the stored case as soon as there is one.
+
+_READS: Final = frozenset(each.__name__ for each in READS)
+_EVENTS_MAX: Final = 100_000
+"""Bounds the events between two recalls. Beyond it the open episodes are read from the log again."""
+
+
+@dataclass(slots=True)
+class _Running:
+    """An episode that this process records.
+
+    Attributes:
+        number: that of the database, or while that is not known one from the end of the numbers.
+        reached: the sequence of the last event that was folded.
+        unnumbered: its cases that `ProcessCases.new` has not returned under the database's number yet.
+    """
+
+    id: str
+    number: int
+    is_numbered: bool
+    fold: EpisodeCases = field(default_factory=EpisodeCases)
+    reached: int = 0
+    unnumbered: list[Case] = field(default_factory=list)
+    has_ended: bool = False
+
+
+class ProcessCases:
+    """The cases of the episodes that one memory records. Implements `RunningCases`.
+
+    Args:
+        emitter: of the memory.
+        open_episodes: returns the ids of the open episodes.
+        flush: makes all events visible in the tables.
+        log: returns the memory's log.
+        clock: gives the times of published events.
+    """
+
+    def __init__(
+        self,
+        emitter: Emitter,
+        *,
+        open_episodes: Callable[[], Iterable[EpisodeId]],
+        flush: Callable[[], Awaitable[None]],
+        log: Callable[[], Awaitable[EventLog]],
+        clock: Clock,
+    ) -> None:
+        self._emitter = emitter
+        self._feed = emitter.feed
+        self._open_episodes = open_episodes
+        self._flush = flush
+        self._log = log
+        self._clock = clock
+        self._buffer: EventBuffer | None = None
+        self._left_out = 0
+        self._episodes: dict[str, _Running] = {}
+        self._own_numbers = 0
+
+    async def new(self) -> tuple[Sequence[Case], Sequence[Case]]:
+        """Return the new cases of episodes with a number, and all cases of those that have none yet.
+
+        Raises `CallerError` once the memory is closed.
+        """
+        if self._emitter.is_closed:
+            raise CallerError("the memory is closed, so nothing can be recalled from it: ask while it is open")
+        cases: list[Case] = []
+        if self._buffer is None:
+            self._buffer = self._feed.keep(READS, _EVENTS_MAX, self._clock)
+            cases += await self._read_open()
+        elif self._buffer.left_out > self._left_out:
+            self._left_out = self._buffer.left_out
+            self._buffer.take()
+            self._episodes.clear()
+            cases += await self._read_open()
+        for event, wall_ns, monotonic_ns in sorted(self._buffer.take(), key=lambda each: each.event[:2]):
+            episode, sequence, happening, _ = event
+            running = self._episodes.get(episode)
+            if running is None and sequence == 1:
+                running = self._begin(episode)
+            if running is not None and sequence > running.reached:
+                kind, payload = type(happening), encode(happening)
+                identity = running.number, sequence, kind.__name__, kind.version
+                running.unnumbered += self._read(running, StoredEvent(*identity, wall_ns, monotonic_ns, payload))
+        cases += await self._numbered()
+        return cases, [case for each in self._episodes.values() for case in each.unnumbered]
+
+    def _begin(self, episode: str) -> _Running:
+        self._own_numbers += 1
+        running = _Running(episode, EPISODE_NUMBER_MAX + 1 - self._own_numbers, is_numbered=False)
+        self._episodes[episode] = running
+        return running
+
+    async def _read_open(self) -> list[Case]:
+        """Fold the earlier events of the open episodes; cases that are in the tables too are returned again."""
+        with suppress(EpisodeParked):  # `flush` and `status` report it; what is stored is folded here
+            await self._flush()
+        log = await self._log()
+        cases: list[Case] = []
+        for episode in self._open_episodes():
+            if await log.episode_number(episode) is None:
+                continue
+            row = await episode_named(log, episode_text(episode))
+            running = self._episodes[row.id] = _Running(row.id, row.number, is_numbered=True)
+            async for page in log.pages(row):
+                for stored in page:
+                    cases += self._read(running, stored)
+        return cases
+
+    def _read(self, running: _Running, stored: StoredEvent) -> Sequence[Case]:
+        running.reached = stored.sequence
+        running.has_ended = running.has_ended or stored.type == EpisodeEnded.__name__
+        if stored.type not in _READS:
+            return ()
+        cases: list[Case] = []
+        if running.fold.read([stored], self._feed.declaration, cases) is not None:
+            running.has_ended = True  # the fold of the tables parks the episode, with the reason
+        return cases
+
+    async def _numbered(self) -> list[Case]:
+        """Return the cases of the episodes that have a number by now, and drop those episodes that have ended."""
+        cases: list[Case] = []
+        for episode, running in list(self._episodes.items()):
+            if not running.is_numbered:
+                number = await (await self._log()).episode_number(parse_episode_id(episode))
+                if number is not None:
+                    running.number, running.is_numbered = number, True
+            if running.is_numbered:
+                cases += [_renumbered(case, running.number) for case in running.unnumbered]
+                running.unnumbered = []
+                if running.has_ended:
+                    del self._episodes[episode]
+        return cases
+
+
+def _renumbered(case: Case, number: int) -> Case:
+    parent = None if case.parent is None else row_id(number, row_key(case.parent).sequence, 0)
+    return case._replace(node=row_id(number, case.sequence, 0), parent=parent)

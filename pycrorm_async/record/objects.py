@@ -1,0 +1,259 @@
+"""`ObjectRows` writes the events of an episode's objects and keeps each object's current row.
+
+Theory of operation. The sequence of an object's `ObjectAdded` identifies the object; the sequence of its latest
+`ObjectAdded` or `ObjectMoved` is its current row. `K` is whatever the executive identifies an object by.
+
+A change of the world must not fail because of a memory, so `_put` catches and counts every exception; the object then
+keeps its former row. An object whose `ObjectAdded` failed has no row, and its later changes are not recorded, because
+an event that names an object without a row would be damage.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Collection, Hashable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Generic, NamedTuple, TypeVar
+
+from pycrorm_async.events.codec import NotEncodable
+from pycrorm_async.events.ids import EpisodeId
+from pycrorm_async.events.types import (
+    Happening,
+    JointsMoved,
+    ObjectAdded,
+    ObjectAttached,
+    ObjectDetached,
+    ObjectMoved,
+    ObjectReference,
+    ObjectRemoved,
+    PoseValue,
+    RobotValue,
+)
+from pycrorm_async.record.episode_writer import Emitter
+from pycrorm_async.record.parameters import clean_texts
+from pycrorm_async.world.bounding_boxes import BoundingBox
+from pycrorm_async.world.pose import Pose
+
+K = TypeVar("K", bound=Hashable)
+
+
+class ObjectRows(Generic[K]):
+    """The rows of one episode's objects.
+
+    Attributes:
+        last: sequence of the last event it recorded; 0 before the first.
+        continue_at: the first sequence at which a change calls `continue_`.
+        continue_: moves the episode to a follow-up.
+    """
+
+    def __init__(self, emitter: Emitter, episode: EpisodeId, continue_: Callable[[], None] = lambda: None) -> None:
+        self.last = 0
+        self.continue_at = sys.maxsize  # no follow-up before the present state is recorded
+        self.continue_ = continue_
+        self._emitter = emitter
+        self._episode = episode
+        self._references: dict[K, ObjectReference] = {}
+
+    def _put_removed(self, key: K, node: Callable[[], int | None]) -> int:
+        reference = self._references.pop(key, None)
+        return self._put(lambda: ObjectRemoved(reference, node())) if reference is not None else 0
+
+    def _put_joints(self, key: K, positions: Mapping[str, float], node: Callable[[], int | None]) -> int:
+        reference = self._references.get(key)
+        return self._put(lambda: JointsMoved(reference, dict(positions), node())) if reference is not None else 0
+
+    def _put_attachment(
+        self,
+        kind: type[ObjectAttached | ObjectDetached],
+        parent: K,
+        child: K,
+        link: str | None,
+        node: Callable[[], int | None],
+    ) -> int:
+        first, second = self._references.get(parent), self._references.get(child)
+        if first is None or second is None:
+            return 0
+        return self._put(lambda: kind(first, second, link, node()))
+
+    def _put(self, build: Callable[[], Happening], *, row_of: K | None = None, identity: int | None = None) -> int:
+        """Build and record an event; return its sequence. Exceptions are counted, so that the change succeeds; 0 then.
+
+        The event becomes the current row of the object `row_of`, and its identity too if `identity` is None.
+        """
+        if self._emitter.is_closed:
+            return 0
+        try:
+            event = build()
+            try:
+                sequence = self._emitter.put(self._episode, event)
+            except NotEncodable as unencodable:
+                self._emitter.missing.note(type(event).__name__, "value", str(unencodable))
+                sequence = self._emitter.put(self._episode, clean_texts(event))
+            self.last = sequence
+        except Exception as error:  # noqa: BLE001  a change of the world must not fail because of a memory
+            self._emitter.note_fault("a change of the world", error)
+            return 0
+        if row_of is not None:
+            self._references[row_of] = ObjectReference(sequence if identity is None else identity, sequence)
+        if sequence >= self.continue_at:
+            self.continue_()
+        return sequence
+
+
+# === recorded objects =========================================================================================
+#
+# `RecordedObjects` writes the objects of an episode whose executive reports them by keys of its own.
+#
+# It keeps the last reported state of each object, because a follow-up episode begins with it.
+
+
+@dataclass(slots=True)
+class RecordedObject:
+    """An object as it was last reported: pose and joints as they are now, the rest as it was added.
+
+    `torso_joint` is the joint whose position is the torso height, of a robot.
+    """
+
+    name: str
+    object_type: str
+    pose: PoseValue
+    joints: dict[str, float] = field(default_factory=dict)
+    urdf: str | None = None
+    color: tuple[float, float, float, float] | None = None
+    model: str | None = None
+    serial: str | None = None
+    mass_kg: float | None = None
+    base_link: str | None = None
+    torso_joint: str | None = None
+
+
+class _Described(NamedTuple):
+    """A description without the shapes that Bullet would compute."""
+
+    description_text: str
+    links: tuple[str, ...] = ()
+
+    def box_in_link(self, link: str) -> BoundingBox | None:  # noqa: ARG002  the port's signature
+        return None
+
+    def visual_boxes(self, links: Collection[str]) -> dict[str, BoundingBox]:  # noqa: ARG002  as above
+        return {}
+
+
+class RecordedObjects(ObjectRows[Hashable]):
+    """The objects of one episode; begins with those of the episode that it continues."""
+
+    def __init__(self, emitter: Emitter, episode: EpisodeId, former: RecordedObjects | None = None) -> None:
+        super().__init__(emitter, episode)
+        self._objects: dict[Hashable, RecordedObject] = {}
+        self._attached: dict[tuple[Hashable, Hashable], str | None] = {}
+        self._identities: set[int] = set()
+        self._renewed: dict[int, ObjectReference] = {}
+        if former is None:
+            return
+        for key, each in former._objects.items():  # noqa: SLF001  of the same class
+            self.add(key, each, None)
+        for (parent, child), link in former._attached.items():  # noqa: SLF001  of the same class
+            self.attach(parent, child, link, None)
+        for key, before in former._references.items():  # noqa: SLF001  of the same class
+            if (now := self._references.get(key)) is not None:
+                self._renewed[before.object] = now
+
+    def holds(self, reference: ObjectReference | None) -> bool:
+        """Return whether this episode has such a row; True for None."""
+        if reference is None:
+            return True
+        return reference.object in self._identities and reference.object <= reference.row <= self.last
+
+    def renewed(self, value: Any) -> Any:
+        """Return a value of the former episode with references to rows of this one; None for an object that left."""
+        if isinstance(value, ObjectReference):
+            return self._renewed.get(value.object)
+        if isinstance(value, dict):
+            return {key: self.renewed(each) for key, each in value.items()}
+        return [self.renewed(each) for each in value] if isinstance(value, list) else value
+
+    def reference(self, key: Hashable) -> ObjectReference | None:
+        """Return the current row of an object; None if there is none of this key."""
+        return self._references.get(key)
+
+    def robot(self, key: Hashable) -> RobotValue | None:
+        """Return the state of the object as that of the acting robot; None if there is none of this key."""
+        state = self._objects.get(key)
+        if state is None:
+            return None
+        torso = state.joints.get(state.torso_joint) if state.torso_joint is not None else None
+        return RobotValue(state.pose, state.object_type, torso, self._references.get(key), state.name)
+
+    def is_at(self, key: Hashable, pose: object) -> bool:
+        """Return whether the last pose of an object is this one; False if no object has this key."""
+        state = self._objects.get(key)
+        return state is not None and isinstance(pose, (Pose, PoseValue)) and _are_at_one_place(state.pose, pose)
+
+    def add(self, key: Hashable, added: RecordedObject, node: int | None) -> int:
+        """Write that an object entered the world; for a known key, write its new pose and joints."""
+        if key in self._references:
+            return max(self.move(key, added.pose, node), self.turn(key, added.joints, node))
+        sequence = self._put(
+            lambda: ObjectAdded(
+                added.name,
+                added.object_type,
+                added.pose,
+                dict(added.joints),
+                node,
+                self._emitter.descriptions.declare(_Described(added.urdf)) if added.urdf is not None else None,
+                added.color,
+                added.model,
+                added.serial,
+                added.mass_kg,
+                added.base_link,
+            ),
+            row_of=key,
+        )
+        if sequence:
+            self._objects[key] = added
+            self._identities.add(sequence)
+        return sequence
+
+    def move(self, key: Hashable, pose: PoseValue, node: int | None) -> int:
+        """Write a new pose of an object, if it has changed."""
+        state, reference = self._objects[key], self._references[key]
+        last = state.pose
+        if _are_at_one_place(pose, last):
+            return 0
+        sequence = self._put(
+            lambda: ObjectMoved(reference.object, state.name, state.object_type, pose, node),
+            row_of=key,
+            identity=reference.object,
+        )
+        state.pose = pose if sequence else last
+        return sequence
+
+    def turn(self, key: Hashable, positions: Mapping[str, float], node: int | None) -> int:
+        """Write those joint positions of an object that have changed."""
+        joints = self._objects[key].joints
+        changed = {name: each for name, each in positions.items() if joints.get(name) != each}
+        sequence = self._put_joints(key, changed, lambda: node) if changed else 0
+        if sequence:
+            joints.update(changed)
+        return sequence
+
+    def attach(self, parent: Hashable, child: Hashable, link: str | None, node: int | None) -> int:
+        """Write that `child` moves with `parent`."""
+        self._attached[parent, child] = link
+        return self._put_attachment(ObjectAttached, parent, child, link, lambda: node)
+
+    def detach(self, parent: Hashable, child: Hashable, node: int | None) -> int:
+        """Write that `child` no longer moves with `parent`."""
+        link = self._attached.pop((parent, child), None)
+        return self._put_attachment(ObjectDetached, parent, child, link, lambda: node)
+
+    def remove(self, key: Hashable, node: int | None) -> int:
+        """Write that an object left the world."""
+        self._objects.pop(key, None)
+        self._attached = {pair: link for pair, link in self._attached.items() if key not in pair}
+        return self._put_removed(key, lambda: node)
+
+
+def _are_at_one_place(pose: Pose | PoseValue, other: Pose | PoseValue) -> bool:
+    return pose.position == other.position and pose.orientation == other.orientation and pose.frame == other.frame

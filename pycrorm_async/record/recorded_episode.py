@@ -1,0 +1,900 @@
+"""A `RecordedEpisode` is an episode of an executive that is not ours: any thread writes nodes, objects and values."""
+
+from __future__ import annotations
+
+import functools
+import math
+import threading
+from collections import OrderedDict, deque
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from enum import Enum
+from functools import partial
+from types import TracebackType
+from typing import Any, Concatenate, Literal, ParamSpec, Protocol, Self, TypeVar, get_args
+
+import msgspec
+from msgspec.structs import replace
+
+from pycrorm_async.errors import CallerError
+from pycrorm_async.events.fields import checked_tags
+from pycrorm_async.events.ids import EpisodeId
+from pycrorm_async.events.types import (
+    EpisodeStatus,
+    FailureValue,
+    NodeEnded,
+    NodeReference,
+    NodeStatus,
+    ObjectDetected,
+    ObjectReference,
+    ObjectValue,
+    PoseValue,
+    RobotValue,
+    SeenValue,
+)
+from pycrorm_async.record.episode_writer import (
+    THREAD_NAME_PREFIX,
+    Emitter,
+    EpisodeOpening,
+    EpisodeWriter,
+    Failures,
+    OpenEpisodes,
+    end_statuses,
+    put_observation,
+)
+from pycrorm_async.record.objects import RecordedObject, RecordedObjects
+from pycrorm_async.record.parameters import DeclaredType
+from pycrorm_async.record.values import (
+    MissingValues,
+    References,
+    RefusedValue,
+    UnrecordableValue,
+    clean,
+    clean_repr,
+    encode_or_missing,
+    encode_parameter,
+    failure_value,
+    message_of,
+    missing_value,
+    reading_fault,
+)
+from pycrorm_async.world.pose import Pose
+
+# === ordered calls ============================================================================================
+#
+# `OrderedCalls` runs the calls of one episode one after the other, whichever threads make them.
+#
+# Theory of operation. A thread runs its call under the lock of the episode, so its call has run when it returns. It
+# must not wait for a lock if it runs a call of any episode already, because the garbage collector, or a method of a
+# key, may have made the call in the middle of another one, and two episodes could wait for each other: such a call is
+# left in `_this_thread.left`, and the thread runs it after that other one. A thread of the memory must not wait either,
+# because the holder of the lock may wait for the room in the spool that this thread makes: it takes the lock only if it
+# is free, and otherwise leaves the call in `_left` to the holder.
+#
+# A signal handler may raise KeyboardInterrupt in the main thread when any call returns. `with` on the lock itself
+# cannot be interrupted between taking the lock and entering the block, nor before the lock is released; `acquire` and
+# `release` in a `try` can. Only threads of the memory, which run no signal handlers, use these. A handler may also run
+# where a loop begins its next round, and there Python 3.12 and 3.13 leave the block without releasing the lock, because
+# they take the jump back for one that cannot raise. So no loop, and no comprehension, is directly in such a block.
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+class _ThreadState(threading.local):
+    """The state of one thread: busy with a call, the calls left to run after it, and if it is one of the memory."""
+
+    def __init__(self) -> None:
+        self.is_busy = False
+        self.left: deque[tuple[OrderedCalls, Callable[[], object]]] = deque()
+        self.is_of_memory = threading.current_thread().name.startswith(THREAD_NAME_PREFIX)
+
+
+_this_thread = _ThreadState()
+
+
+def may_wait() -> bool:
+    """Return whether this thread may wait for room in the spool: it runs no call, and does not make room itself."""
+    return not _this_thread.is_busy and not _this_thread.is_of_memory
+
+
+class OrderedCalls:
+    """The calls of one episode."""
+
+    def __init__(self) -> None:
+        self._left: deque[Callable[[], object]] = deque()
+        self._lock = threading.Lock()
+
+    def run(self, call: Callable[[], object]) -> None:
+        """Run a call, which must not raise, after all earlier ones."""
+        thread = _this_thread
+        if thread.is_of_memory:
+            self._left.append(call)
+            self._run_if_free()
+            return
+        if thread.is_busy:
+            thread.left.append((self, call))
+            return
+        thread.is_busy = True  # followed by `try` without a call, so that Ctrl-C cannot separate the two
+        try:
+            self._run(call)
+            _run_left(thread)
+        finally:
+            thread.is_busy = False
+
+    def _run(self, call: Callable[[], object]) -> None:
+        with self._lock:
+            if self._left:
+                self._drain()
+            call()
+        while self._left:  # a thread of the memory came before the lock was released
+            with self._lock:
+                self._drain()
+
+    def _run_if_free(self) -> None:
+        while self._left and self._lock.acquire(blocking=False):
+            try:
+                self._drain()
+            finally:
+                self._lock.release()
+
+    def _drain(self) -> None:
+        while self._left:
+            self._left.popleft()()
+
+
+def _run_left(thread: _ThreadState) -> None:
+    while thread.left:
+        calls, each = thread.left.popleft()
+        calls._run(each)  # noqa: SLF001  of this module
+
+
+class CountingEpisode(Protocol):
+    """An episode whose methods never raise."""
+
+    @property
+    def emitter(self) -> Emitter:
+        """Counts the faults."""
+        ...
+
+
+E = TypeVar("E", bound=CountingEpisode)
+
+
+def counted(event_type: str) -> Callable[[Callable[Concatenate[E, P], R]], Callable[Concatenate[E, P], R | None]]:
+    """Count the exceptions of a method; do nothing if the memory is closed or belongs to a parent process."""
+
+    def wrap(method: Callable[Concatenate[E, P], R]) -> Callable[Concatenate[E, P], R | None]:
+        @functools.wraps(method)
+        def run(self: E, /, *args: P.args, **kwargs: P.kwargs) -> R | None:
+            emitter = self.emitter
+            if emitter.is_closed:
+                return None
+            try:
+                return method(self, *args, **kwargs)
+            except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
+                emitter.note_fault(event_type, error)
+                return None
+
+        return run
+
+    return wrap
+
+
+def noted(emitter: Any, event_type: str, read: Callable[P, R], /, *args: P.args, **kwargs: P.kwargs) -> R | None:
+    """Call `read` with these arguments and return its result; if it raises, count the exception and return None."""
+    try:
+        return read(*args, **kwargs)
+    except Exception as error:  # noqa: BLE001  the code of an executive's values may raise anything
+        emitter.note_fault(event_type, error)
+        return None
+
+
+# === recorded nodes ===========================================================================================
+#
+# `RecordedNodes` writes the nodes of an episode of any executive, its beginning, its end and its follow-ups.
+#
+# Theory of operation. Each method first copies its arguments, which may run any code of the caller, and then has
+# `OrderedCalls` write them; so no other call comes between the events of one, and a node's parent has started before
+# it, whichever threads start them. If the episode is continued after the copy, `_now` replaces references to rows of
+# the former episode. No method raises into the caller: faults, and calls after the end of the episode, are counted in
+# `Memory.status`. `_nodes` holds the open nodes by key, `_ended` the last ones that ended, because a child may start
+# after the end of its parent.
+
+FOREVER_S = 1e8
+"""The seconds that a start waits for room: three years, because a wait takes a number."""
+_ENDED_MAX = 1_000
+"""Bounds the keys of ended nodes that a child can still name as its parent."""
+
+
+class _Node:
+    """A node that an executive started, as it is written again when the episode is continued.
+
+    `sequence` counts in the episode with the id `episode_id`. `parent` is the parent, or, when this node has ended, the
+    nearest node above it that was open then.
+    """
+
+    __slots__ = ("declared", "episode_id", "key", "parameters", "parent", "robot", "sequence")
+
+    def __init__(self, key: Hashable, declared: DeclaredType, parameters: dict[str, Any]) -> None:
+        self.key = key
+        self.declared = declared
+        self.parameters = parameters
+        self.parent: _Node | None = None
+        self.robot: RobotValue | None = None
+        self.sequence = 0
+        self.episode_id: EpisodeId | None = None
+
+
+class RecordedNodes(EpisodeWriter[_Node]):
+    """The nodes of a `RecordedEpisode`, and its beginning, end and follow-ups."""
+
+    def __init__(
+        self,
+        emitter: Emitter,
+        episodes: OpenEpisodes,
+        opening: EpisodeOpening,
+        convert: Convert | None,
+        failures: Failures = (),
+    ) -> None:
+        super().__init__(emitter, episodes.new_id(), opening)
+        self._episodes = episodes
+        self._failures = failures
+        self._calls = OrderedCalls()
+        self._end_status: EpisodeStatus | None = None
+        self._nodes: dict[Hashable, _Node] = {}
+        self._ended: OrderedDict[Hashable, _Node] = OrderedDict()
+        self._objects = RecordedObjects(emitter, self.id)
+        self._values = RecordedValues(convert, lambda: self._objects, self)
+        self._arguments = ArgumentReader(emitter.missing)
+
+    def close(self, failure: BaseException | None = None, status: EpisodeStatus | None = None) -> None:
+        """End the episode. Without a failure it SUCCEEDED, and nodes that are still open are counted.
+
+        They end LOST, or CANCELLED in an episode that was INTERRUPTED.
+        `status` is FAILED, ERROR or INTERRUPTED, by default as for `end`.
+        """
+        if isinstance(status, str) and status in get_args(EpisodeStatus):
+            self._end_status = status
+        self._episodes.close(self, failure)
+
+    def _write(self, event_type: str, write: Callable[P, int], *args: P.args, **kwargs: P.kwargs) -> None:
+        """Call `write` after all earlier calls; it returns the sequence of the event that it wrote, 0 for none."""
+        self._calls.run(partial(self._written, event_type, write, *args, **kwargs))
+
+    def _written(self, event_type: str, write: Callable[P, int], *args: P.args, **kwargs: P.kwargs) -> None:
+        if self.closed:
+            self._note(event_type, f"episode {self} has ended")
+            return
+        try:  # not `noted`, because this is called for each event
+            sequence = write(*args, **kwargs)
+        except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
+            self.emitter.note_fault(event_type, error)
+            return
+        if sequence >= self.continue_at:
+            self._episodes.continue_episode(self)
+
+    def _now(self, value: Any, prepared: EpisodeId) -> Any:
+        """Return a value that was copied when the episode had the id `prepared`, with references to current rows."""
+        return value if prepared == self.id else self._objects.renewed(value)
+
+    # --- nodes ------------------------------------------------------------------------------------------------
+
+    @counted("NodeStarted")
+    def start(
+        self,
+        key: Hashable,
+        type: DeclaredType,  # noqa: A002  the field's word
+        parameters: Mapping[str, Any] = {},
+        *,
+        parent: Hashable | None = None,
+        robot: RobotValue | Hashable | None = None,
+    ) -> Hashable:
+        """Record that a node started; return it.
+
+        Waits while the spool is full. With `on_full="fail"`, the node is counted as a fault then, and not recorded.
+
+        The returned value can be passed as `parent` and `node` in place of the key, also long after the node has ended
+        and its key names another one.
+
+        Args:
+            key: names the node from now on. If an open node has it, that one ends LOST, and is counted.
+            type: from `Recording.type`.
+            parameters: by field name, copied now.
+            parent: key of the node it runs inside. One that never started is counted, and the root takes its place.
+            robot: the state of the robot that acts, or the key of its object.
+        """
+        hash(key)
+        if self.emitter.must_wait() and may_wait():
+            self.emitter.sink.block_until_room(FOREVER_S, reserved=False)
+        missing: dict[str, str] = {}
+        prepared = self.id
+        values = noted(self.emitter, "NodeStarted", self._values.parameters, type, parameters, missing) or {}
+        node = _Node(key, type, values)
+        self._write("NodeStarted", self._start_node, node, parent, robot, missing, prepared)
+        return node
+
+    def _start_node(
+        self, node: _Node, parent: Hashable | None, robot: object, missing: dict[str, str], prepared: EpisodeId
+    ) -> int:
+        key = node.key
+        if key in self._nodes:
+            self._note("NodeStarted", f"the key {clean_repr(key)} starts a second node before the first has ended")
+            self._end_node(self._nodes[key], NodeEnded(self._nodes[key].sequence, "LOST"))
+        node.parent = self._find(parent, "NodeStarted")
+        node.robot = noted(self.emitter, "NodeStarted", self._robot, robot)
+        node.parameters = self._now(node.parameters, prepared)
+        self._write_start(node, missing, continues=None)
+        self._nodes[key] = node
+        self._ended.pop(key, None)
+        return node.sequence
+
+    def _robot(self, robot: Any) -> RobotValue | None:
+        if robot is None:
+            return None
+        if isinstance(robot, RobotValue):
+            state = struct_of(robot, RobotValue)
+            return state if self._objects.holds(state.object) else replace(state, object=None)
+        if (acting := self._objects.robot(robot)) is None:
+            raise CallerError(f"no object has the key {clean_repr(robot)}, so the robot's state is not recorded")
+        return acting
+
+    def _write_start(self, node: _Node, missing: Mapping[str, str], continues: int | None) -> None:
+        declared, parent = node.declared, self.node_or_root(node.parent)
+        node.sequence = self._put_start(
+            node, declared, declared.declaration.kind, parent, node.parameters, node.robot,
+            missing=missing, continues=continues, may_refuse=False,
+        )  # fmt: skip
+        node.episode_id = self.id
+
+    @counted("NodeEnded")
+    def end(
+        self,
+        key: Hashable,
+        status: NodeStatus | None = None,
+        failure: BaseException | FailureValue | str | None = None,
+        result: Any = None,
+        *,
+        below: NodeStatus | None = None,
+    ) -> None:
+        """Record that a node ended. A key that no open node has is counted, and so is an unknown status, as ERROR.
+
+        Args:
+            status: by default SUCCEEDED without a failure, FAILED for a plan failure or a text, CANCELLED for a
+                cancellation, Ctrl-C or an exit, and ERROR for any other exception.
+            failure, result: why it failed; what it returned.
+            below: first end the nodes that are open below this one, the innermost first, with this status.
+        """
+        key = key.key if isinstance(key, _Node) and self._nodes.get(key.key) is key else key
+        hash(key)
+        if status is None:
+            status = "FAILED" if isinstance(failure, str | FailureValue) else end_statuses(failure, self._failures)[1]
+        status, below = self._checked_status(status), self._checked_status(below) if below is not None else None
+        prepared = self.id
+        value = noted(self.emitter, "NodeEnded", self._values.failure, failure) if failure is not None else None
+        encoded = self._values.any(result) if result is not None else None
+        self._write("NodeEnded", self._end_open, key, status, value, encoded, below, prepared)
+
+    def _checked_status(self, status: NodeStatus) -> NodeStatus:
+        if status in END_STATUSES:
+            return status
+        self._note("NodeEnded", f"{clean_repr(status)} is not a status ({', '.join(END_STATUSES)})")
+        return "ERROR"
+
+    def _end_open(
+        self, key: Hashable, status: NodeStatus, failure: FailureValue | None, result: Any, below: NodeStatus | None,
+        prepared: EpisodeId,
+    ) -> int:  # fmt: skip
+        node = self._nodes.get(key)
+        if node is None:
+            raise CallerError(f"no open node has the key {clean_repr(key)}")
+        if below is not None:
+            for each in [each for each in reversed(self._nodes.values()) if _is_below(each, node)]:
+                self._end_node(each, NodeEnded(each.sequence, below))
+        self._end_node(node, NodeEnded(node.sequence, status, failure, self._now(result, prepared)))
+        return 0  # an end continues no episode
+
+    def _end_node(self, node: _Node, event: NodeEnded) -> None:
+        self._close_node(event, node.declared.dtype)
+        self._nodes.pop(node.key, None)
+        node.parameters, node.robot = {}, None
+        while node.parent is not None and self._nodes.get(node.parent.key) is not node.parent:
+            node.parent = node.parent.parent
+        self._ended[node.key] = node
+        while len(self._ended) > _ENDED_MAX:
+            self._ended.popitem(last=False)
+
+    def is_open(self, key: Hashable) -> bool:
+        """Return whether a node with this key has started and not ended."""
+        return bool(noted(self.emitter, "NodeStarted", lambda: key in self._nodes))
+
+    def node_reference(self, key: Hashable | None = None) -> NodeReference:
+        """Return a reference to a node for `Recording.episode(thought_by=…)`; without a known key, to the root."""
+        return NodeReference(str(self), self.node_or_root(self._find(key, "EpisodeStarted")))
+
+    def node_or_root(self, node: Any) -> int:
+        """Return the sequence of this node, or of the nearest above it that is in this episode; None gives the root."""
+        while isinstance(node, _Node):
+            if node.episode_id == self.id:
+                return node.sequence
+            node = node.parent
+        return self._root
+
+    def open(self) -> None:
+        """Write the start of the episode; if that fails, count the fault, and record nothing."""
+        self._calls.run(self._open_now)
+
+    def _open_now(self) -> None:
+        try:
+            self._episodes.add(self)
+            super().open()
+        except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
+            self.emitter.note_fault("EpisodeStarted", error)
+            self._episodes.by_id.pop(self.id, None)
+            self.closed = True
+
+    def end_episode(self, failure: BaseException | None) -> None:
+        """Write the end of the episode."""
+        self._calls.run(lambda: noted(self.emitter, "EpisodeEnded", self._end_now, failure))
+
+    def _end_now(self, failure: BaseException | None) -> None:
+        if (left := len(self._open_nodes)) and failure is None and not self.closed:
+            self._note("EpisodeEnded", f"nodes open at the end of episode {self}, which end LOST: {left}")
+        super().end_episode(failure)
+        self._nodes.clear()
+        self._ended.clear()
+
+    def change_tags(self, added: Sequence[str], removed: Sequence[str]) -> None:
+        """Write a change of the episode's tags, for `Memory.tag`. Raises what `EpisodeWriter.change_tags` raises."""
+        raised: list[BaseException] = []
+
+        def change() -> None:
+            try:
+                super(RecordedNodes, self).change_tags(added, removed)
+            except Exception as error:  # noqa: BLE001  raised to the caller below
+                raised.append(error)
+
+        self._calls.run(change)
+        for each in raised:
+            raise each
+
+    def _end_statuses(self, failure: BaseException | None) -> tuple[EpisodeStatus, NodeStatus]:
+        status = self._end_status
+        if status is None:
+            return end_statuses(failure, self._failures)
+        return status, ("CANCELLED" if status == "INTERRUPTED" else status)
+
+    def _has_ended(self, node: _Node) -> bool:
+        return self._nodes.get(node.key) is not node
+
+    def _restart_node(self, node: _Node, sequence: int) -> int:
+        node.parameters = self._objects.renewed(node.parameters)
+        if node.robot is not None:
+            node.robot = replace(node.robot, object=self._objects.renewed(node.robot.object))
+        self._write_start(node, {}, continues=sequence)
+        return node.sequence
+
+    def _restart_world(self) -> int:
+        self._objects = RecordedObjects(self.emitter, self.id, self._objects)
+        return self._objects.last
+
+    def _leave_world(self) -> None:
+        """Do nothing: the executive reports the objects, so no observer has to stop."""
+
+    def _described_world(self) -> str | None:
+        return None
+
+    def _find(self, key: Hashable | None, event_type: str) -> _Node | None:
+        """Return the node of a key, or of a value that `start` returned; count a key that no node has."""
+        if key is None or isinstance(key, _Node):
+            return key
+        node = noted(self.emitter, event_type, lambda: self._nodes.get(key) or self._ended.get(key))
+        if node is None:
+            self._note(event_type, f"no node has the key {clean_repr(key)}; the root of the episode takes its place")
+        return node
+
+    def _known(self, key: Hashable) -> Hashable:
+        if self._objects.reference(key) is None:
+            raise CallerError(f"no object has the key {clean_repr(key)}: add it with `object_added` first")
+        return key
+
+    def _cause(self, key: Hashable | None) -> int | None:
+        """Return the sequence of the node that changes the world; None for one of a former episode."""
+        node = self._find(key, "a change of the world")
+        return node.sequence if node is not None and node.episode_id == self.id else None
+
+    def _note(self, event_type: str, reason: str) -> None:
+        self.emitter.note_fault(event_type, CallerError(reason))
+
+
+def _is_below(node: _Node, ancestor: _Node) -> bool:
+    above = node.parent
+    while above is not None and above is not ancestor:
+        above = above.parent
+    return above is not None
+
+
+# === checked arguments ========================================================================================
+#
+# Copy the arguments of an executive, because a value of a wrong type in the log would stop the fold of its episode.
+#
+# A wrong value raises `CallerError` if it is required (a pose); an optional one (a colour, one joint) is counted as
+# missing.
+
+END_STATUSES = tuple(each for each in get_args(NodeStatus) if each != "RUNNING")
+_INTEGERS = range(-(2**63), 2**63)
+
+S = TypeVar("S", bound=msgspec.Struct)
+
+
+def struct_of(value: object, kind: type[S]) -> S:
+    """Return a value of this class whose parts have the declared types. Raises `CallerError`."""
+    if not isinstance(value, kind):
+        raise CallerError(f"expected a {kind.__name__}, got {clean_repr(value)}")
+    try:
+        return msgspec.convert(msgspec.to_builtins(value), kind)
+    except Exception as error:
+        raise CallerError(f"not a whole {kind.__name__}: {message_of(error)}") from error
+
+
+def pose_of(pose: Pose | PoseValue) -> PoseValue:
+    """Copy a pose. Raises `CallerError`, also for a number that is not finite."""
+    if isinstance(pose, Pose):
+        value = PoseValue(pose.position, pose.orientation, pose.frame, pose.time_ns)
+    else:
+        value = struct_of(pose, PoseValue)
+    if not math.isfinite(sum(value.position) + sum(value.orientation)):
+        raise CallerError(f"the pose holds a number that is not finite: {clean_repr(pose)}")
+    if value.time_ns not in _INTEGERS:
+        raise CallerError(f"the time of the pose does not fit into 64 bits: {clean_repr(pose)}")
+    return value
+
+
+def _are_plain(joints: dict[Any, Any]) -> bool:
+    """Return whether all names are ASCII texts and all positions finite floats, so that none of them must change."""
+    if set(map(type, joints)) != {str} or set(map(type, joints.values())) != {float}:
+        return False
+    names = "".join(joints)
+    return names.isascii() and "\0" not in names and all(map(math.isfinite, joints.values()))
+
+
+class ArgumentReader:
+    """Copies the arguments that describe an object; counts the ones that it has to leave out in `missing`."""
+
+    def __init__(self, missing: MissingValues) -> None:
+        self._missing = missing
+
+    def object_of(
+        self, name: str, object_type: str | Enum, pose: Pose | PoseValue, joints: Mapping[str, float], **others: Any
+    ) -> RecordedObject:
+        """Copy the description of an object; `others` are the further attributes of `RecordedObject`."""
+        urdf = others["urdf"]
+        if urdf is not None and not isinstance(urdf, str):
+            self._missing.note("ObjectAdded", "urdf", f"it must be a text, not {clean_repr(urdf)}")
+            urdf = None
+        texts = {each: self.text_of(each, others[each]) for each in ("model", "serial", "base_link", "torso_joint")}
+        return RecordedObject(
+            self.text_of("name", name) or "an object",
+            self.text_of("object_type", object_type) or "UNKNOWN",
+            pose_of(pose),
+            self.joints_of(joints),
+            urdf=urdf,
+            color=self._color_of(others["color"]),
+            mass_kg=self._number_of("mass_kg", others["mass_kg"]),
+            **texts,
+        )
+
+    def text_of(self, argument: str, text: object) -> str | None:
+        """Copy a text; of an enum its member's name, of another value its shortened repr."""
+        if text is None:
+            return None
+        if isinstance(text, Enum):
+            return clean(str(text.name))
+        if isinstance(text, str):
+            return clean(str.__str__(text))
+        self._missing.note("ObjectAdded", argument, f"it must be a text, not {clean_repr(text)}")
+        return clean_repr(text)
+
+    def joints_of(self, joints: Mapping[str, float]) -> dict[str, float]:
+        """Copy joint positions; those that are not finite numbers are counted as missing."""
+        if not isinstance(joints, Mapping):
+            self._missing.note("JointsMoved", "joints", f"they must be positions by name, not {clean_repr(joints)}")
+            return {}
+        copied = dict(joints)
+        if _are_plain(copied):  # as nearly all are; the checks below take twenty times as long
+            return copied
+        positions: dict[str, float] = {}
+        for name, position in copied.items():
+            text = self.text_of("joint", name)
+            number = self._number_of("joints", position)
+            if text is not None and number is not None:
+                positions[text] = number
+        return positions
+
+    def _number_of(self, argument: str, number: Any) -> float | None:
+        if number is None:
+            return None
+        try:
+            if isinstance(number, str | bytes | bool) or not math.isfinite(number):
+                raise ValueError("it must be a finite number")  # noqa: TRY301  counted below
+            return float(number)
+        except Exception as error:  # noqa: BLE001  a __float__ of the user's may raise anything
+            self._missing.note("ObjectAdded", argument, f"{clean_repr(number)}: {message_of(error)}")
+            return None
+
+    def _color_of(self, color: Any) -> tuple[float, float, float, float] | None:
+        if color is None:
+            return None
+        parts = [self._number_of("color", each) for each in color] if isinstance(color, list | tuple) else []
+        red, green, blue, opacity, *_ = (*parts, None, None, None, None)
+        if len(parts) != 4 or red is None or green is None or blue is None or opacity is None:
+            self._missing.note("ObjectAdded", "color", f"it must be red, green, blue and opacity: {clean_repr(color)}")
+            return None
+        return red, green, blue, opacity
+
+
+# === recorded values ==========================================================================================
+#
+# Copy the values of an executive, through its own conversion, into values of events.
+
+Convert = Callable[[Any], Any]
+
+
+class _Objects(Protocol):
+    def reference(self, key: Hashable) -> ObjectReference | None: ...
+
+    def holds(self, reference: ObjectReference | None) -> bool: ...
+
+
+class RecordedValues:
+    """Converts values for one episode. `convert` is the executive's; it is called with each value and each item."""
+
+    def __init__(self, convert: Convert | None, objects: Callable[[], _Objects], references: References) -> None:
+        self._convert = convert
+        self._objects = objects
+        self._references = references
+
+    def parameters(self, declared: DeclaredType, values: Mapping[Any, Any], missing: dict[str, str]) -> dict[str, Any]:
+        """Return the parameters by field name; add to `missing` the reason for each that becomes a `MissingValue`."""
+        parameters: dict[str, Any] = {}
+        undeclared = dict(values)
+        for field, path, enum in declared.fields:
+            value = undeclared.pop(path[0], None)
+            if value is None:
+                continue
+            try:
+                converted = self.converted(value, as_object="object" in (field.type, field.item))
+                if converted is not None:
+                    parameters[field.name] = encode_parameter(field, enum, converted, self._references)
+            except UnrecordableValue as refusal:
+                missing[field.name] = str(refusal)
+                parameters[field.name] = missing_value(str(refusal), value)
+            except Exception as error:  # noqa: BLE001  a __float__ of the user's may raise anything
+                missing[field.name] = fault = reading_fault(error)
+                parameters[field.name] = missing_value(fault, value)
+        for name, value in undeclared.items():
+            if value is not None:
+                reasons = {each.path[0]: each.reason for each in declared.undeclared}
+                text = clean(name) if isinstance(name, str) else clean_repr(name)
+                missing[text] = reason = reasons.get(name, f"{declared.dtype} was declared without this field")
+                parameters[text] = missing_value(reason, value)
+        return parameters
+
+    def any(self, value: Any) -> Any:
+        """Return a JSON value, or a `MissingValue`. Never raises."""
+        return encode_or_missing(self.converted(value), self._references)
+
+    def converted(self, value: Any, *, as_object: bool = False) -> Any:
+        """Return the value as the executive converts it; a `RefusedValue` with the reason if it cannot convert it.
+
+        With `as_object` the key of an object becomes a reference to its row.
+        """
+        value = self._item(value, as_object)
+        kind = type(value)
+        if kind is list or kind is tuple:
+            return [self._item(each, as_object) for each in value]
+        if kind is dict:
+            return {key: self._item(each, as_object) for key, each in value.items()}
+        return value
+
+    def _item(self, value: Any, as_object: bool) -> Any:  # noqa: FBT001  a keyword would cost each item of a list
+        """Convert a value, but not the items inside it."""
+        if as_object and (reference := self._known_object(value)) is not None:
+            return reference
+        if self._convert is not None:
+            try:
+                value = self._convert(value)
+            except Exception as error:  # noqa: BLE001  an executive's conversion may raise anything
+                return RefusedValue(message_of(error) if isinstance(error, ValueError) else reading_fault(error))
+            if as_object and (reference := self._known_object(value)) is not None:
+                return reference
+        return self._checked(value) if isinstance(value, msgspec.Struct) else value
+
+    def failure(self, failure: object) -> FailureValue:
+        """Copy a failure: an exception, a `FailureValue`, or a text. Raises `CallerError` for anything else."""
+        if isinstance(failure, BaseException):
+            return failure_value(failure, self._references)
+        return FailureValue("Failure", clean(failure)) if isinstance(failure, str) else struct_of(failure, FailureValue)
+
+    def _checked(self, value: msgspec.Struct) -> Any:
+        """Return a value of an event if it is whole, and its rows are those of this episode."""
+        try:
+            if isinstance(value, PoseValue):
+                return pose_of(value)
+            whole = struct_of(value, type(value))
+        except CallerError as error:
+            return RefusedValue(message_of(error))
+        reference = whole.part_of if isinstance(whole, ObjectValue) else whole
+        if isinstance(reference, ObjectReference) and not self._objects().holds(reference):
+            return RefusedValue("it refers to a row that this episode does not have")
+        if isinstance(whole, ObjectValue) and whole.pose is not None:
+            return self._checked(whole.pose) if isinstance(self._checked(whole.pose), RefusedValue) else whole
+        return whole
+
+    def _known_object(self, value: Any) -> ObjectReference | None:
+        try:
+            return self._objects().reference(value)
+        except TypeError:  # it is not hashable, so it is no key
+            return None
+
+
+# === recorded episode =========================================================================================
+
+
+class RecordedEpisode(RecordedNodes):
+    """An episode of any executive, from any thread; `Recording.episode` makes it.
+
+    >>> with recording.episode(description="Tutorial") as episode:
+    ...     episode.start("a", navigate, {"target_location": Pose([1, 0, 0])})
+    ...     episode.end("a")
+
+    Keys are any hashable values, `id(node)` for example; a key can be used again after its node has ended. No method
+    raises: values that cannot be recorded are counted in `Memory.status` and logged. `node` is always the key of the
+    acting node; None means the root of the episode.
+    """
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close(error)
+
+    # --- objects ----------------------------------------------------------------------------------------------
+
+    @counted("ObjectAdded")
+    def object_added(
+        self,
+        key: Hashable,
+        name: str,
+        object_type: str | Enum,
+        pose: Pose | PoseValue,
+        joints: Mapping[str, float] = {},
+        *,
+        urdf: str | None = None,
+        color: tuple[float, float, float, float] | None = None,
+        model: str | None = None,
+        serial: str | None = None,
+        mass_kg: float | None = None,
+        base_link: str | None = None,
+        torso_joint: str | None = None,
+        node: Hashable | None = None,
+    ) -> None:
+        """Record that an object entered the world; for a known key, record its new pose and joints.
+
+        Args:
+            key: names the object from now on.
+            object_type: `ROBOT`, `MILK`, …; a type of `world.ObjectType` where one fits.
+            joints: positions by name, rad or m.
+            urdf: the text of its description, which is recorded once.
+            color, model, serial, mass_kg, base_link: see `events.types.ObjectAdded`.
+            torso_joint: of a robot with a torso that is lifted, the joint that does it.
+        """
+        added = self._arguments.object_of(
+            name, object_type, pose, joints, urdf=urdf, color=color, model=model, serial=serial, mass_kg=mass_kg,
+            base_link=base_link, torso_joint=torso_joint,
+        )  # fmt: skip
+        self._write("ObjectAdded", lambda: self._objects.add(key, added, self._cause(node)))
+
+    @counted("ObjectMoved")
+    def object_moved(self, key: Hashable, pose: Pose | PoseValue, *, node: Hashable | None = None) -> None:
+        """Record the new pose of an object, unless it is the same."""
+        if not self.closed and self._objects.is_at(key, pose):
+            return  # before the pose is copied, which takes longer
+        copied = pose_of(pose)
+        self._write("ObjectMoved", lambda: self._objects.move(self._known(key), copied, self._cause(node)))
+
+    @counted("JointsMoved")
+    def joints_moved(self, key: Hashable, joints: Mapping[str, float], *, node: Hashable | None = None) -> None:
+        """Record new joint positions (rad or m); only those that changed."""
+        copied = self._arguments.joints_of(joints)
+        self._write("JointsMoved", lambda: self._objects.turn(self._known(key), copied, self._cause(node)))
+
+    @counted("ObjectAttached")
+    def object_attached(
+        self, parent: Hashable, child: Hashable, link: str | None = None, *, node: Hashable | None = None
+    ) -> None:
+        """Record that `child` moves with `link` of `parent` from now on."""
+        name = self._arguments.text_of("link", link)
+
+        def write() -> int:
+            return self._objects.attach(self._known(parent), self._known(child), name, self._cause(node))
+
+        self._write("ObjectAttached", write)
+
+    @counted("ObjectDetached")
+    def object_detached(self, parent: Hashable, child: Hashable, *, node: Hashable | None = None) -> None:
+        """Record that `child` no longer moves with `parent`."""
+
+        def write() -> int:
+            return self._objects.detach(self._known(parent), self._known(child), self._cause(node))
+
+        self._write("ObjectDetached", write)
+
+    @counted("ObjectRemoved")
+    def object_removed(self, key: Hashable, *, node: Hashable | None = None) -> None:
+        """Record that an object left the world."""
+        self._write("ObjectRemoved", lambda: self._objects.remove(self._known(key), self._cause(node)))
+
+    def reference(self, key: Hashable) -> ObjectReference | None:
+        """Return the current row of an object, for values that name it; None if there is none of this key.
+
+        Call it again for each value: the row changes when the object moves and when the episode is continued.
+        """
+        return noted(self.emitter, "ObjectAdded", self._objects.reference, key)
+
+    # --- observations -----------------------------------------------------------------------------------------
+
+    @counted("Observed")
+    def observe(self, name: str, values: object, *, node: Hashable | None = None) -> None:
+        """Record an observation, as `Memory.observe` does."""
+        copied = self._values.converted(values)
+
+        def write() -> int:
+            observer = self.node_or_root(self._find(node, "Observed"))
+            return put_observation(self.emitter, self, name, copied, observer, may_refuse=False)
+
+        self._write("Observed", write)
+
+    @counted("ObjectDetected")
+    def detected(
+        self,
+        seen: Sequence[SeenValue],
+        *,
+        source: Literal["camera", "world_state"] = "camera",
+        object_type: str | None = None,
+        node: Hashable | None = None,
+    ) -> None:
+        """Record a result of perception; `object_type` is the type searched for."""
+        copied = (noted(self.emitter, "ObjectDetected", struct_of, each, SeenValue) for each in seen)
+        percepts = [each for each in copied if each is not None]
+        event = struct_of(ObjectDetected(source, object_type), ObjectDetected)
+
+        def write() -> int:
+            acting = self._find(node, "ObjectDetected")
+            number = self.node_or_root(acting) if acting is not None else None
+            held = (each if self._objects.holds(each.object) else replace(each, object=None) for each in percepts)
+            return self._put_detection(replace(event, seen=tuple(held), node=number))
+
+        self._write("ObjectDetected", write)
+
+    @counted("EpisodeTagged")
+    def tag(self, *tags: str, remove: Sequence[str] = ()) -> None:
+        """Add and remove tags."""
+        added, removed = checked_tags(tags), checked_tags(remove)
+
+        def write() -> int:
+            super(RecordedNodes, self).change_tags(added, removed)
+            return 0
+
+        self._write("EpisodeTagged", write)
+
+    @counted("EpisodeStarted")
+    def wait_for_room(self, timeout_s: float | None = None) -> bool:
+        """Block while the spool is full, for a limited time; return whether it has room now.
+
+        `start` waits by itself, without a limit; so this is for an executive that has something else to do then.
+        """
+        sink = self.emitter.sink
+        has_room = not sink.full or sink.block_until_room(FOREVER_S if timeout_s is None else timeout_s, reserved=False)
+        return has_room and not self.emitter.is_closed

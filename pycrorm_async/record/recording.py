@@ -1,0 +1,284 @@
+"""`Recording` writes the episodes of any executive into a memory, from any thread and without asyncio."""
+
+from __future__ import annotations
+
+import builtins
+import threading
+from collections.abc import Iterable, Mapping, Sequence
+from types import MappingProxyType
+from typing import Any, Self, TypeAlias, cast, get_args
+
+from pycrorm_async.errors import CallerError
+from pycrorm_async.events.ids import SEQUENCE_MAX, parse_episode_id
+from pycrorm_async.events.types import DesignatorTypeDeclared, NodeReference
+from pycrorm_async.record.declarations import (
+    FieldSpec,
+    KnownTypes,
+    PreparedType,
+    RecordedKind,
+    declare_prepared,
+    declare_type,
+    prepare_type,
+)
+from pycrorm_async.record.episode_writer import (
+    Emitter,
+    EpisodeOpening,
+    Failures,
+    OpenEpisodes,
+    Provenance,
+    check_arguments,
+    read_labels,
+)
+from pycrorm_async.record.parameters import DeclaredType
+from pycrorm_async.record.recorded_episode import Convert, RecordedEpisode
+from pycrorm_async.record.values import clean_repr
+
+_TYPES_MAX = 10_000
+"""Bounds the types kept for reuse; when it is reached all are dropped."""
+
+
+_Arguments: TypeAlias = tuple[
+    RecordedKind, str, tuple[tuple[str, FieldSpec], ...], tuple[str, ...], str | None, tuple[str, ...]
+]
+"""The arguments of `Recording.type`, in its order."""
+
+
+class Recording:
+    """Writes the episodes of an executive that is not ours; `Memory.recording` and `SyncMemory.recording`.
+
+    >>> navigate = recording.type("action", "NavigateAction", {"target_location": "pose"})
+    >>> with recording.episode(description="Tutorial") as episode:
+    ...     episode.start(id(task), navigate, {"target_location": Pose([1, 0, 0])})
+    ...     episode.end(id(task), "FAILED", NavigationGoalNotReached())
+
+    Args:
+        known_types: the types that this memory has declared so far, shared with the recorder of our own plans.
+        stored: the declarations that the database holds already, also from other processes.
+        software, provenance: recorded with each episode.
+    """
+
+    def __init__(
+        self,
+        emitter: Emitter,
+        episodes: OpenEpisodes,
+        known_types: KnownTypes,
+        stored: Iterable[DesignatorTypeDeclared],
+        *,
+        software: str,
+        provenance: Provenance | None = None,
+    ) -> None:
+        self._emitter = emitter
+        self._episodes = episodes
+        self._known_types = known_types
+        self._software = software
+        self._provenance = provenance
+        self._types: dict[_Arguments, DeclaredType] = {}
+        self._prepared: dict[_Arguments, PreparedType] = {}
+        self._lock = threading.RLock()
+        for each in stored:
+            known_types.note_stored(each)
+
+    def type(
+        self,
+        kind: RecordedKind,
+        dtype: str,
+        fields: Mapping[str, FieldSpec] = MappingProxyType({}),
+        *,
+        bases: Sequence[str] = (),
+        concept: str | None = None,
+        aliases: Sequence[str] = (),
+    ) -> DeclaredType:
+        """Declare a type of node once, and return it; the same arguments return the same type.
+
+        A part that cannot be declared is counted as missing, with the reason, and never raises. A field that
+        contradicts a built-in type or an earlier declaration of this dtype is kept under `<field>_<type>`. A type whose
+        name cannot be a table's gets a similar one; the nodes of a type that still cannot have a table are recorded
+        without a type.
+
+        Args:
+            kind: an `action`; a `motion`, which moves the robot itself; `language`, which controls other nodes.
+            dtype: a name as of a class. With the dtype of a built-in type (`PickUpAction`), nodes are in its table.
+            fields: their types by name: `integer`, `real`, `text`, `boolean`, `datetime`, `enum`, `pose`, `object`,
+                `("list", "real")`, `("dict", "text")`, or a Python type of these (`float`, `list[str]`, `Pose`).
+            bases: dtypes of more general types, nearest first.
+            concept: the SOMA concept.
+            aliases: dtypes the type had before it was renamed.
+        """
+        try:
+            cached = _arguments(kind, dtype, fields, bases, concept, aliases)
+            declared = self._types.get(cached)
+            if declared is None and not self._emitter.is_closed:  # before the lock, which may be held since a fork
+                with self._lock:
+                    if len(self._types) >= _TYPES_MAX:
+                        self._types.clear()
+                    declared = self._types.get(cached) or self._declare(*cached)
+                    self._types[cached] = declared
+        except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
+            declared = None
+            self._emitter.note_fault("DesignatorTypeDeclared", error)
+        return declared or _undeclared(kind, dtype)
+
+    def prepare(
+        self, kind: RecordedKind, dtype: str, fields: Mapping[str, FieldSpec], *, bases: Sequence[str] = ()
+    ) -> None:
+        """Derive a type ahead, so that `type` with the same arguments only has to write it, in a third of the time.
+
+        Nothing is declared, so a type that is never asked for has no table and reserves no name. Raises nothing.
+        """
+        try:
+            prepared = prepare_type(kind, dtype, fields, self._known_types, bases=bases)
+            if prepared is not None and len(self._prepared) < _TYPES_MAX:
+                self._prepared[_arguments(kind, dtype, fields, bases)] = prepared
+        except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
+            self._emitter.note_fault("DesignatorTypeDeclared", error)
+
+    def _declare(
+        self,
+        kind: RecordedKind,
+        dtype: str,
+        fields: tuple[tuple[str, FieldSpec], ...],
+        bases: tuple[str, ...],
+        concept: str | None,
+        aliases: tuple[str, ...],
+    ) -> DeclaredType:
+        if not all(isinstance(each, str) for each in (kind, dtype, *bases, *aliases, concept or "")):
+            raise CallerError("the kind, the dtype, the concept, the bases and the aliases of a type must be texts")
+        prepared = self._prepared.pop((kind, dtype, fields, bases, concept, aliases), None)
+        recorded = declare_prepared(prepared, self._known_types) if prepared is not None else None
+        if recorded is None:
+            recorded = declare_type(
+                kind, dtype, dict(fields), self._known_types, bases=bases, concept=concept, aliases=aliases
+            )
+        declared, missing = recorded.type, self._emitter.missing
+        for name, renamed in recorded.fields.items():
+            missing.note_renamed(declared.dtype, name, *renamed)
+        for each in declared.undeclared:
+            missing.note(declared.dtype, each.name, each.reason)
+        if recorded.dtype is not None:
+            missing.note_renamed(declared.dtype, "type", *recorded.dtype)
+        if declared.fault is not None:
+            missing.note(declared.dtype, "type", declared.fault)
+        if declared.payload:
+            self._emitter.put_declaration(declared)
+        return declared
+
+    def episode(
+        self,
+        *,
+        description: str | None = None,
+        plan: str | None = None,
+        seed: int | None = None,
+        tags: Sequence[str] = (),
+        metadata: Mapping[str, Any] = MappingProxyType({}),
+        world: str | None = None,
+        simulated: bool = False,
+        thought_by: NodeReference | None = None,
+        convert: Convert | None = None,
+        failures: Failures = (),
+    ) -> RecordedEpisode:
+        """Start an episode; use it with `with`, or call its `close`. Any number may be open at a time.
+
+        Args:
+            description, plan, seed, tags, metadata: as for `Memory.episode`.
+            world: the description of the world in one line.
+            simulated: True for a simulation, which no robot performs; ordinary queries leave it out.
+            thought_by: the node that performs the simulation, from `RecordedEpisode.node_reference`.
+            convert: converts each parameter, result and observed value, and each item of one, to a scalar, a text, a
+                list or dict, a `PoseValue`, an `ObjectReference`, or, for a field of the type `object`, the key of an
+                object. An exception that it raises is recorded as the reason why the value is missing.
+            failures: the classes of the executive's own plan failures: nodes and episodes that one left are FAILED, and
+                those that another exception left are CANCELLED or ERROR.
+
+        Raises:
+            CallerError: an argument has the wrong type. Any other fault is counted, and the episode stays empty.
+        """
+        text = description or plan or "an episode"
+        check_arguments(description=text, plan=plan, seed=seed, strict=False)
+        check_arguments(description=world, plan=None, seed=None, strict=False)
+        if thought_by is not None and not _is_whole(thought_by):
+            raise CallerError(f"thought_by must be from `node_reference` of an episode, not {thought_by!r:.100}")
+        unchecked: tuple[object, object, object] = (simulated, seed, failures)  # as the caller passed them
+        if not isinstance(unchecked[0], bool) or isinstance(unchecked[1], bool):
+            raise CallerError("simulated must be a bool, and seed an int")
+        if convert is not None and not callable(convert):
+            raise CallerError(f"convert must be a function, not {convert!r:.100}")
+        if not isinstance(unchecked[2], tuple) or not all(isinstance(each, builtins.type) for each in unchecked[2]):
+            raise CallerError(f"failures must be a tuple of classes of exceptions, not {failures!r:.100}")
+        opening = EpisodeOpening(
+            text,
+            self._software,
+            plan,
+            seed,
+            world,
+            simulated=simulated,
+            thought_by=thought_by,
+            provenance=self._provenance,
+            labels=read_labels(tags, metadata, self._emitter),
+        )
+        episode = RecordedEpisode(self._emitter, self._episodes, opening, convert, failures)
+        if not self._emitter.is_closed:
+            episode.open()
+        return episode
+
+    def note_fault(self, where: str, error: BaseException) -> None:
+        """Count a fault of an integration in `Memory.status`, and log it now and then. Raises nothing."""
+        self._emitter.note_fault(where, error)
+
+
+def _arguments(
+    kind: RecordedKind,
+    dtype: str,
+    fields: Mapping[str, FieldSpec],
+    bases: Sequence[str],
+    concept: str | None = None,
+    aliases: Sequence[str] = (),
+) -> _Arguments:
+    return kind, dtype, tuple(fields.items()), tuple(bases), concept, tuple(aliases)
+
+
+def _is_whole(reference: Any) -> bool:
+    try:
+        parse_episode_id(reference.episode)
+        return isinstance(reference, NodeReference) and 0 < reference.node <= SEQUENCE_MAX
+    except (AttributeError, TypeError, ValueError):
+        return False
+
+
+def _undeclared(kind: object, dtype: object) -> DeclaredType:
+    """Return the type of nodes whose type cannot be declared."""
+    valid: RecordedKind = "action"
+    if isinstance(kind, str) and kind in get_args(RecordedKind):
+        valid = cast("RecordedKind", kind)
+    name = clean_repr(dtype)
+    reason = "its type could not be declared"
+    return DeclaredType(name, b"", "", (), DesignatorTypeDeclared(kind=valid, dtype=name, table=""), (), reason)
+
+
+# === episode block ============================================================================================
+#
+# An `EpisodeBlock` is an object that an executive reports to, whose `with` block is one episode.
+
+
+class EpisodeBlock:
+    """Opens an episode when its block begins, and closes it when the block ends; it can be entered again after that.
+
+    Args:
+        executive: name and version of the executive, which are in the metadata of the episode.
+        episode: the arguments of `Recording.episode`. A `metadata` takes the place of the executive.
+
+    Attributes:
+        episode: the episode of the block, for all that the object does not record itself.
+    """
+
+    episode: RecordedEpisode
+
+    def __init__(self, recording: Recording, executive: str, **episode: Any) -> None:
+        self._recording, self._executive = recording, executive
+        self._arguments: dict[str, Any] = {"metadata": {"executive": executive}, **episode}
+
+    def __enter__(self) -> Self:
+        self.episode = self._recording.episode(**self._arguments)
+        return self
+
+    def __exit__(self, kind: object, error: BaseException | None, frames: object) -> None:
+        self.episode.close(error)

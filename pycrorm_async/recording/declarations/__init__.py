@@ -1,1 +1,0 @@
-"""Declare the types of designators and the descriptions of objects."""

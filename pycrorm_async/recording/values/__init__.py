@@ -1,1 +1,0 @@
-"""Convert parameter values to event values: shorten long ones and mark missing ones."""

@@ -1,1 +1,0 @@
-"""Write the events of episodes into the queue."""

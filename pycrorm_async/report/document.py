@@ -1,0 +1,675 @@
+"""Fold the events of an episode into the document that the page shows, as a whole or the part behind an event.
+
+The document holds columns and numbers of texts instead of one object per node, so that 100,000 nodes stay below 20 MB.
+`web/episode.js` reads it. Sequences of events are the axis of everything; `times` maps them to seconds.
+
+A part holds the additions and changes of the events behind `after`; a whole document is the part behind event 0. Each
+entry is found by the sequence of its event, so one fold serves any number of pages, wherever each of them has stopped.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from base64 import b64encode
+from bisect import bisect_right
+from collections.abc import AsyncIterable, Iterable, Mapping, Reversible, Sequence
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from itertools import islice, takewhile
+from typing import Any
+
+import msgspec
+
+from pycrorm_async.errors import CallerError, UnknownEpisode
+from pycrorm_async.events.codec import description_of
+from pycrorm_async.events.fields import retagged
+from pycrorm_async.events.types import (
+    DescriptionDeclared,
+    EpisodeEnded,
+    EpisodeStarted,
+    EpisodeTagged,
+    Happening,
+    JointsMoved,
+    LocationResolved,
+    MeshValue,
+    NodeEnded,
+    NodeStarted,
+    ObjectAdded,
+    ObjectAttached,
+    ObjectDetached,
+    ObjectDetected,
+    ObjectMoved,
+    ObjectRemoved,
+    Observed,
+    PoseValue,
+    StateSampled,
+)
+from pycrorm_async.projections.fold import happening_of
+from pycrorm_async.projections.row_batch import CannotFold
+from pycrorm_async.query.reading import Reading
+from pycrorm_async.query.scene import Triangles, assumed_model, object_model, point_model, triangles_of
+from pycrorm_async.query.snapshot import unreadable
+from pycrorm_async.query.text import parameters_text, with_object_names
+from pycrorm_async.store.log import EventLog, episode_named
+from pycrorm_async.store.stored import EpisodeRow, StoredEvent
+
+_TEXTS_CHARACTERS = 6_000_000
+"""Bounds the characters of all texts of a page together, so that it stays below 20 MB."""
+_TEXT_SHORTEST, _TEXT_LONGEST = 80, 20_000
+"""Bounds the characters of one text on the page, when there are many long ones and when there are few."""
+_NODES_MAX = 100_000
+"""Bounds the nodes of a page: it then has about 10 MB and opens in less than 3 s."""
+_NUMBERS_MAX = 1_400_000
+"""Bounds the numbers of poses and joints of a page, of which each takes about 7 bytes: 200,000 moves of an object."""
+_CURVE_POINTS_MAX = 2_000
+"""Bounds the values of a curve, which is a few hundred pixels wide."""
+_LISTS = "detections", "observations", "locations"
+_LISTED_MAX = 20_000
+"""Bounds the percepts, observations and location resolutions of a page, each; the page counts the others."""
+_ITEMS_MAX = 8
+"""Bounds the numbers of a list that have curves: as many as a wrench, a quaternion or the joints of an arm have."""
+_VALUES_MAX = 2_000
+"""Bounds the characters of an observation's values in the page."""
+
+
+class EpisodeFold:
+    """The document of an episode as far as its events were read, from event `first` on."""
+
+    def __init__(self, row: EpisodeRow, first: int = 1) -> None:
+        self.row = row
+        self.world = ObjectTracks(first)
+        self._first = first
+        self._texts = Texts()
+        self._started: EpisodeStarted | None = None
+        self._first_event: StoredEvent | None = None
+        self.last = 0
+        """The sequence of the last event that was read."""
+        self._status = "RUNNING"
+        self._tags: tuple[str, ...] = ()
+        self._failure: dict[str, str] | None = None
+        self._times: list[int] = []
+        self._nodes: dict[int, list[Any]] = {}
+        self._ended_nodes: list[tuple[int, int]] = []
+        """The event that ended a node, and the node's start; both also of a node that is LOST."""
+        self._listed: dict[str, list[dict[str, Any]]] = {name: [] for name in _LISTS}
+        self._unlisted = dict.fromkeys(_LISTS, 0)
+        self._series: dict[str, Track] = {}
+
+    def read(self, event: StoredEvent, designators: Mapping[str, str]) -> None:
+        """Apply the next event. Raises `CannotFold`."""
+        happening = happening_of(event)
+        if self._first_event is None:
+            self._first_event = event
+        self.last = self._texts.sequence = event.sequence
+        if event.sequence >= self._first:
+            self._times.append((event.monotonic_ns - self._first_event.monotonic_ns) // 1000)
+        self._happened(event.sequence, happening, designators)
+
+    def _happened(self, sequence: int, happening: Happening, designators: Mapping[str, str]) -> None:
+        match happening:
+            case NodeStarted():
+                dtype = designators.get(happening.designator or "", "")
+                number = self._texts.number
+                parameters = parameters_text(with_object_names(happening.parameters, self._name_of))
+                self._nodes[sequence] = [
+                    *(sequence, 0, happening.parent or 0),
+                    *(number(happening.kind), number(dtype), number(parameters), number("RUNNING"), 0, 0),
+                ]
+            case NodeEnded():
+                self._node_ended(sequence, happening)
+            case EpisodeStarted():
+                self._started = happening
+                self._tags = retagged((), happening.tags, ())
+            case EpisodeTagged():
+                self._tags = retagged(self._tags, happening.added, happening.removed)
+            case EpisodeEnded():
+                self._ended(sequence, happening)
+            case ObjectDetected() if sequence >= self._first:
+                self._list("detections", _detection(sequence, happening))
+            case Observed() if sequence >= self._first:
+                self._observed(sequence, happening)
+            case LocationResolved() if sequence >= self._first:
+                self._list("locations", _location(sequence, happening))
+            case _:
+                self.world.read(sequence, happening)
+
+    @property
+    def is_full(self) -> bool:
+        """True if a page can hold no further node, or no further move."""
+        return len(self._nodes) >= _NODES_MAX or self.world.numbers >= _NUMBERS_MAX
+
+    def _list(self, name: str, entry: dict[str, Any]) -> None:
+        if len(self._listed[name]) < _LISTED_MAX:
+            self._listed[name].append(entry)
+        else:
+            self._unlisted[name] += 1
+
+    def _name_of(self, reference: Mapping[str, int]) -> str | None:
+        referred = self.world.objects.get(reference["object"])
+        return referred.added.name if referred is not None else None
+
+    def _node_ended(self, sequence: int, ended: NodeEnded) -> None:
+        if (node := self._nodes.get(ended.node)) is None:
+            raise CannotFold(f"node {ended.node} ends and never started")
+        if sequence < self._first:
+            del self._nodes[ended.node]
+            return
+        node[6] = self._texts.number(ended.status)
+        self._ended_nodes.append((sequence, ended.node))
+        if ended.status != "LOST":
+            node[1] = sequence
+        if ended.failure is not None:
+            node[7] = self._texts.number(ended.failure.type.rpartition(".")[2])
+            node[8] = self._texts.number(ended.failure.message)
+
+    def _ended(self, sequence: int, ended: EpisodeEnded) -> None:
+        self._status = ended.status
+        if ended.failure is not None:
+            reason = ended.failure.type.rpartition(".")[2]
+            self._failure = {"reason": reason, "message": ended.failure.message[:_TEXT_LONGEST]}
+        if ended.status == "LOST":
+            running, lost = self._texts.number("RUNNING"), self._texts.number("LOST")
+            for start, node in self._nodes.items():
+                if node[6] == running:
+                    node[6] = lost
+                    self._ended_nodes.append((sequence, start))
+
+    def _observed(self, sequence: int, observed: Observed) -> None:
+        text = msgspec.json.encode(observed.values).decode()
+        if len(text) > _VALUES_MAX:
+            text = f"{text[:_VALUES_MAX]}… ({len(text) - _VALUES_MAX:,} more characters)"
+        entry = {"at": sequence, "node": observed.node or 0, "name": observed.name, "values": text}
+        self._list("observations", entry)
+        for path, number in _numbers_in(observed.name, observed.values):
+            self._series.setdefault(path, Track(self._first)).set(sequence, number)
+
+    def document(self, models: Mapping[str, Any], *, after: int = 0) -> dict[str, Any]:
+        """Return the document of the events read so far, or the part of those behind event `after`.
+
+        `models` are those of the objects added behind `after`, by `model_name`.
+        """
+        begin = max(after + 1 - self._first, 0)
+        return {
+            "format": 1,
+            "after": after,
+            "episode": self._header(),
+            "times": differences(self._times[begin:]),
+            "texts": self._texts.cut(
+                _TEXTS_CHARACTERS, shortest=_TEXT_SHORTEST, longest=_TEXT_LONGEST, after=after or -1
+            ),
+            "nodes": _columns(_newest(self._nodes.values(), after), 9),
+            "ended": _columns([self._end_of(start) for start in self._ended_since(after)], 5),
+            "models": dict(models),
+            "objects": [
+                each for each in (self._object(identity, models, after) for identity in self.world.objects) if each
+            ],
+            "attachments": [each for each in self.world.attachments if max(each[3:]) > after],
+            **{name: _behind(entries, after) for name, entries in self._listed.items()},
+            "series": _tracks(self._series, after),
+            "samples": {
+                str(identity): tracks
+                for identity, channels in self.world.samples.items()
+                if (tracks := _tracks(channels, after))
+            },
+        }
+
+    def _header(self) -> dict[str, Any]:
+        started, first = self._started, self._first_event
+        assert started is not None, "an event was read before"
+        assert first is not None, "an event was read before"
+        opens = self.world.full_until if self.world.full_until is not None else self.last
+        return {
+            "number": self.row.number,
+            "id": self.row.id,
+            "description": started.description,
+            "created_by": started.created_by,
+            "host": started.host,
+            "software": started.software,
+            "plan": started.plan,
+            "simulated": started.simulated,
+            "started": f"{datetime.fromtimestamp(first.wall_ns // 10**9, UTC):%Y-%m-%d %H:%M:%S} UTC",
+            "status": self._status,
+            "failure": self._failure,
+            "tags": list(self._tags),
+            "metadata": {name: _short(each) for name, each in started.metadata.items()},
+            "first": self._first,
+            "last": self.last,
+            "head": max(self.row.head, self.last),
+            "full": self.is_full,
+            "unlisted": dict(self._unlisted),
+            "opens": min(max(opens, self._first), self.last),
+        }
+
+    def _ended_since(self, after: int) -> list[int]:
+        """Return the starts of the nodes that started up to event `after` and ended behind it."""
+        begin = bisect_right(self._ended_nodes, after, key=lambda each: each[0])
+        return [start for _, start in self._ended_nodes[begin:] if start <= after]
+
+    def _end_of(self, start: int) -> tuple[Any, ...]:
+        _, end, _, _, _, _, status, reason, message = self._nodes[start]
+        return start, end, status, reason, message
+
+    def _object(self, identity: int, models: Mapping[str, Any], after: int) -> dict[str, Any] | None:
+        """Return an object, or its identity with what changed behind event `after`; None if nothing did."""
+        each = self.world.objects[identity]
+        poses, joints = each.poses.columns(after=after), _tracks(each.joints, after, points_max=None)
+        if identity <= after:
+            if not poses[0] and not joints and (each.removed or 0) <= after:
+                return None
+            return {"id": identity, "removed": each.removed or 0, "poses": poses, "joints": joints}
+        name = model_name(each.added)
+        return {
+            "id": identity,
+            "name": each.added.name,
+            "type": each.added.object_type,
+            "model": name if name in models else "",
+            "color": each.added.color,
+            "base_link": each.added.base_link,
+            "removed": each.removed or 0,
+            "poses": poses,
+            "joints": joints,
+        }
+
+
+def model_name(added: ObjectAdded) -> str:
+    """Return the name of an object's model: its fingerprint, or for an assumed one what the assumption rests on."""
+    return added.description or f"{added.object_type} {added.name}"
+
+
+def _newest(nodes: Reversible[list[Any]], after: int) -> list[list[Any]]:
+    """Return the nodes that started behind event `after`, in their order."""
+    newest = list(takewhile(lambda each: each[0] > after, reversed(nodes)))
+    return newest[::-1]
+
+
+def _columns(rows: Sequence[Sequence[Any]], width: int) -> list[list[Any]]:
+    return [list(column) for column in zip(*rows, strict=True)] if rows else [[] for _ in range(width)]
+
+
+def _behind(entries: Sequence[dict[str, Any]], after: int) -> list[dict[str, Any]]:
+    return list(entries[bisect_right(entries, after, key=lambda each: each["at"]) :])
+
+
+def _tracks(
+    tracks: Mapping[str, Track], after: int, *, points_max: int | None = _CURVE_POINTS_MAX
+) -> dict[str, list[Any]]:
+    """Return the columns of these tracks behind event `after`; in a part, without those that have none."""
+    columns = {name: track.columns(points_max, after=after) for name, track in tracks.items()}
+    return {name: each for name, each in columns.items() if each[0]}
+
+
+def _detection(sequence: int, detected: ObjectDetected) -> dict[str, Any]:
+    seen = [
+        [each.name, each.object_type, rounded(each.pose.position), each.visible, each.confidence]
+        for each in detected.seen
+    ]
+    wanted = detected.object_type or ""
+    return {"at": sequence, "node": detected.node or 0, "source": detected.source, "type": wanted, "seen": seen}
+
+
+def _location(sequence: int, resolved: LocationResolved) -> dict[str, Any]:
+    refused: dict[str, int] = {}
+    for each in resolved.refused:
+        refused[each.reason] = refused.get(each.reason, 0) + 1
+    cells = resolved.cells
+    excluded = {} if cells is None else {"occupied": cells.occupied, "hidden": cells.hidden}
+    return {
+        "at": sequence,
+        "node": resolved.node or 0,
+        "location": resolved.location,
+        "offered": len(resolved.offered) + resolved.offered_beyond,
+        "considered": resolved.considered,
+        "taken": -1 if resolved.taken is None else resolved.taken,
+        "places": [rounded(each.pose.position) for each in resolved.offered[:200]],
+        "refused_places": [rounded(each.pose.position) for each in resolved.refused[:200]],
+        "refused": refused,
+        "excluded": {name: count for name, count in excluded.items() if count},
+    }
+
+
+def _numbers_in(name: str, values: Any) -> list[tuple[str, float]]:
+    """Return the numbers of an observation, two levels deep, by name."""
+    if isinstance(values, bool):
+        return []
+    if isinstance(values, int | float):
+        return [(name, float(values))]
+    if isinstance(values, dict) and name.count(".") < 2:
+        return [pair for key, each in values.items() for pair in _numbers_in(f"{name}.{key}", each)]
+    if isinstance(values, list) and len(values) <= _ITEMS_MAX and name.count(".") < 2:
+        return [pair for index, each in enumerate(values) for pair in _numbers_in(f"{name}.{index}", each)]
+    return []
+
+
+def _short(value: Any) -> str:
+    text = value if isinstance(value, str) else msgspec.json.encode(value).decode()
+    return text if len(text) <= _VALUES_MAX else f"{text[:_VALUES_MAX]}…"
+
+
+# === tracks ===================================================================================================
+#
+# Keep the changes of a value over the events of an episode, in columns that are compact as JSON.
+
+_DIGITS = 4
+"""Rounds lengths to 0.1 mm and angles to 0.006 degrees, which the page cannot show finer."""
+
+
+def rounded(values: Iterable[float]) -> list[float]:
+    """Round numbers for the page."""
+    return [round(each, _DIGITS) + 0.0 for each in values]
+
+
+class Track:
+    """The values of one quantity, each with the sequence of the event that set it.
+
+    Only the last value before the event `first` is kept.
+    """
+
+    __slots__ = ("_first", "at", "values")
+
+    def __init__(self, first: int) -> None:
+        self._first = first
+        self.at: list[int] = []
+        self.values: list[Any] = []
+
+    def set(self, sequence: int, value: Any) -> None:
+        """Append a value; leave out one that equals the last, and replace the last if it is of the same event."""
+        if self.values and self.values[-1] == value:
+            return
+        if self.at and (self.at[-1] == sequence or sequence <= self._first):
+            self.at[-1], self.values[-1] = sequence, value
+            return
+        self.at.append(sequence)
+        self.values.append(value)
+
+    def columns(self, points_max: int | None = None, *, after: int = 0) -> list[Any]:
+        """Return the differences of the sequences, and the values, of the entries behind event `after`.
+
+        Of more than `points_max` entries, which must be numbers, it returns the least and the greatest of each group of
+        neighbours, so that the range of a curve stays that of all values.
+        """
+        begin = bisect_right(self.at, after)
+        at, values = self.at[begin:], self.values[begin:]
+        if points_max is not None and len(at) > points_max:
+            kept = _extremes(values, points_max)
+            at, values = [at[each] for each in kept], [values[each] for each in kept]
+        return [differences(at), values]
+
+
+def _extremes(values: list[Any], points_max: int) -> list[int]:
+    """Return the indices of the least and the greatest value in each bucket of neighbours, and that of the last."""
+    size = -(-2 * len(values) // points_max)
+    kept = {len(values) - 1}
+    for begin in range(0, len(values), size):
+        bucket = range(begin, min(begin + size, len(values)))
+        kept |= {min(bucket, key=values.__getitem__), max(bucket, key=values.__getitem__)}
+    return sorted(kept)
+
+
+def differences(values: Iterable[int]) -> list[int]:
+    """Return the first value and the difference of each other one to the value before it."""
+    before, result = 0, []
+    for each in values:
+        result.append(each - before)
+        before = each
+    return result
+
+
+class Texts:
+    """Texts by number, each once: most nodes of a long episode share theirs with others."""
+
+    def __init__(self) -> None:
+        self.sequence = 0
+        """The sequence of the event that is being read."""
+        self._numbers: dict[str, int] = {"": 0}
+        self._first_used: list[int] = [0]
+
+    def number(self, text: str) -> int:
+        """Return the number of a text; that of the empty text is 0."""
+        number = self._numbers.setdefault(text, len(self._numbers))
+        if number == len(self._first_used):
+            self._first_used.append(self.sequence)
+        return number
+
+    def cut(self, total_characters: int, *, shortest: int, longest: int, after: int = -1) -> list[str]:
+        """Return the texts that events behind `after` were the first to use, by number, each cut to an equal share.
+
+        All texts share `total_characters`, within the bounds. A cut text ends with the number of characters left out.
+        """
+        limit = max(shortest, min(longest, total_characters // len(self._numbers)))
+        begin = bisect_right(self._first_used, after)
+        return [
+            each if len(each) <= limit else f"{each[:limit]}… ({len(each) - limit:,} more characters)"
+            for each in islice(self._numbers, begin, None)
+        ]
+
+
+# === recorded objects =========================================================================================
+#
+# Fold the objects of an episode's world into tracks: poses, joint positions, attachments, samples of the state.
+
+
+@dataclass(slots=True)
+class RecordedObject:
+    """An object from its `ObjectAdded` to its `ObjectRemoved` (`removed` is None if it stayed)."""
+
+    added: ObjectAdded
+    poses: Track
+    joints: dict[str, Track] = field(default_factory=dict)
+    removed: int | None = None
+
+
+class ObjectTracks:
+    """The objects of a world with their tracks, as far as the events were read.
+
+    Args:
+        first: the first event that the page shows; a track has one value for all that came before it.
+
+    Attributes:
+        objects: by identity, the sequence of their `ObjectAdded`; removed ones too.
+        attachments: `[parent, child, link, from, to]`, the objects by identity, `to` 0 while attached.
+        samples: by object and channel.
+        full_until: the last event before the world was emptied; None while it has objects.
+        numbers: the number of values in the tracks of poses and joints, which bounds the size of the page.
+    """
+
+    def __init__(self, first: int) -> None:
+        self._first = first
+        self.objects: dict[int, RecordedObject] = {}
+        self.attachments: list[list[Any]] = []
+        self.samples: dict[int, dict[str, Track]] = {}
+        self.full_until: int | None = None
+        self.numbers = 0
+        self._present = 0
+        self._removals_from: int | None = None
+
+    def read(self, sequence: int, happening: Happening) -> None:
+        """Apply an event of the world; events of unknown objects have no effect."""
+        match happening:
+            case ObjectAdded():
+                self._add(sequence, happening)
+            case ObjectMoved():
+                self._move(happening.object, sequence, happening.pose)
+            case JointsMoved():
+                self._set_joints(happening.object.object, sequence, happening.joints)
+            case ObjectAttached():
+                pair = [happening.parent.object, happening.child.object, happening.link or "", sequence, 0]
+                self.attachments.append(pair)
+            case ObjectDetached():
+                self._detach(sequence, parent=happening.parent.object, child=happening.child.object)
+            case ObjectRemoved():
+                self._remove(happening.object.object, sequence)
+                return
+            case StateSampled():
+                channels = self.samples.setdefault(happening.object.object, {})
+                for name, value in happening.channels.items():
+                    channels.setdefault(name, Track(self._first)).set(sequence, round(value, 4))
+                return
+            case _:
+                return
+        self._removals_from = None
+
+    def _add(self, sequence: int, added: ObjectAdded) -> None:
+        self.objects[sequence] = RecordedObject(added, Track(self._first))
+        self._move(sequence, sequence, added.pose)
+        self._set_joints(sequence, sequence, added.joints)
+        self._present += 1
+        self.full_until = None
+
+    def _move(self, identity: int, sequence: int, pose: PoseValue) -> None:
+        if (moved := self.objects.get(identity)) is not None:
+            moved.poses.set(sequence, rounded((*pose.position, *pose.orientation)))
+            self.numbers += 7
+
+    def _set_joints(self, identity: int, sequence: int, joints: dict[str, float]) -> None:
+        if (moved := self.objects.get(identity)) is not None:
+            self.numbers += len(joints)
+            for name, position in joints.items():
+                moved.joints.setdefault(name, Track(self._first)).set(sequence, round(position, 4))
+
+    def _detach(self, sequence: int, *, parent: int, child: int) -> None:
+        for pair in reversed(self.attachments):
+            if pair[0] == parent and pair[1] == child and not pair[4]:
+                pair[4] = sequence
+                return
+
+    def _remove(self, identity: int, sequence: int) -> None:
+        removed = self.objects.get(identity)
+        if removed is None or removed.removed is not None:
+            return
+        removed.removed = sequence
+        self._present -= 1
+        if self._removals_from is None:
+            self._removals_from = sequence
+        if self._present == 0:
+            self.full_until = self._removals_from - 1
+        for pair in self.attachments:
+            if identity in pair[:2] and not pair[4]:
+                pair[4] = sequence
+
+
+# === episode data =============================================================================================
+#
+# Read the events of an episode from the log and return the document that its page shows.
+
+
+async def episode_document(
+    reading: Reading, episode: str | int, *, first: int | None = None, last: int | None = None
+) -> dict[str, Any]:
+    """Return the document of an episode, of all its events or of those from `first` to `last`.
+
+    It ends with the 100,000th node, or after 200,000 moves, if there are more; `document["episode"]` has its `last`.
+
+    Raises `UnknownEpisode`; `CallerError` for a window that holds no event; `LogDamaged` or `DatabaseForeign` for an
+    event that cannot be read.
+    """
+    log = await reading.log()
+    row = await episode_named(log, str(episode))
+    if row.head == 0:
+        raise UnknownEpisode(f"the log has no event of episode {row.number}")
+    begin, end = first or 1, min(last or row.head, row.head)
+    if begin > end:
+        raise CallerError(f"episode {row.number} has {row.head} events, and none from event {begin} to {last or end}")
+    fold = EpisodeFold(row, begin)
+    await read_into(fold, log, log.pages(row._replace(head=end)))
+    return await document_behind(fold, log)
+
+
+async def read_into(fold: EpisodeFold, log: EventLog, pages: AsyncIterable[Sequence[StoredEvent]]) -> None:
+    """Fold these events, up to the one at which the page is full.
+
+    Raises `LogDamaged` or `DatabaseForeign` for an event that cannot be read.
+    """
+    designators = await log.dtypes()
+    async for page in pages:
+        for event in page:
+            if fold.is_full:
+                return
+            try:
+                fold.read(event, designators)
+            except CannotFold as reason:
+                raise unreadable(fold.row.id, event, str(reason), log) from None
+
+
+async def document_behind(fold: EpisodeFold, log: EventLog, after: int = 0) -> dict[str, Any]:
+    """Return the document of the events that were folded, or the part of those behind event `after`."""
+    return fold.document(await _models(log, fold, after), after=after)
+
+
+async def _models(log: EventLog, fold: EpisodeFold, after: int) -> Mapping[str, Any]:
+    """Return the models of the objects that were added behind event `after`."""
+    added = [each for identity, each in fold.world.objects.items() if identity > after]
+    names = {each.added.description for each in added} - {None}
+    payloads = await log.descriptions([name for name in names if name is not None])
+    meshes = Meshes(log)
+    models: dict[str, Any] = {"": point_model("its description is not in the log")} if added or not after else {}
+    for name, payload in payloads.items():
+        try:
+            models[name] = await meshes.model(description_of(payload))
+        except ValueError as error:
+            models[name] = point_model(f"its description cannot be read: {error}")
+    for each in added:
+        name = model_name(each.added)
+        if each.added.description is None and name not in models:
+            models[name] = assumed_model(each.added.name, each.added.object_type, set(each.joints))
+    return models
+
+
+# === mesh data ================================================================================================
+#
+# Read the recorded mesh files of a description into the triangles that the page draws.
+
+_TRIANGLES_MAX = 200_000
+"""Bounds the triangles of a page: they take about 5 MB."""
+_NAMED_MAX = 5
+"""Bounds the names of files that a note lists."""
+
+
+class Meshes:
+    """The meshes of one page, up to its bound."""
+
+    def __init__(self, log: EventLog) -> None:
+        self._log = log
+        self._left = _TRIANGLES_MAX
+
+    async def model(self, description: DescriptionDeclared) -> dict[str, Any]:
+        """Return the model of a description: `meshes` has its triangles, `boxes` why others are drawn as boxes."""
+        meshes: dict[str, Any] = {}
+        refused: list[str] = []
+        for mesh in description.meshes:
+            try:
+                triangles = await self._triangles(mesh)
+            except ValueError as reason:
+                refused.append(f"{mesh.name} ({reason})")
+            else:
+                self._left -= len(triangles.faces)
+                meshes[mesh.reference] = _encoded(triangles)
+        model = object_model(description, drawn=frozenset(meshes))
+        if not description.meshes or "assumed" in model:
+            return model
+        return {**model, "meshes": meshes, "boxes": _note(refused)}
+
+    async def _triangles(self, mesh: MeshValue) -> Triangles:
+        """Return the triangles of a mesh file. Raises `ValueError` with the reason why it has a box instead."""
+        if mesh.content is None:
+            raise ValueError(mesh.missing or "its content was not recorded")
+        with self._log.translated():
+            content = await self._log.blobs.read_blob(mesh.content.hash)
+        if content is None:
+            raise ValueError("its content is not in the log")
+        triangles = await asyncio.to_thread(triangles_of, mesh.name, content)
+        if len(triangles.faces) > self._left:
+            raise ValueError("the page has too many triangles already")
+        return triangles
+
+
+def _encoded(triangles: Triangles) -> dict[str, str]:
+    """Return the arrays as base64 of little-endian numbers, which take half the space of digits."""
+    vertices, faces = triangles.vertices.astype("<f4"), triangles.faces.astype("<u4")
+    return {"vertices": b64encode(vertices.tobytes()).decode(), "faces": b64encode(faces.tobytes()).decode()}
+
+
+def _note(refused: list[str]) -> str:
+    if not refused:
+        return ""
+    others = f" and {len(refused) - _NAMED_MAX} more" if len(refused) > _NAMED_MAX else ""
+    return f"{len(refused)} mesh file{'s' * (len(refused) > 1)}: {', '.join(refused[:_NAMED_MAX])}{others}"

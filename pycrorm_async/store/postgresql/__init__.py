@@ -1,1 +1,0 @@
-"""Implement the log on PostgreSQL: connections, roles, tables, statements and errors."""

@@ -1,0 +1,303 @@
+"""Create an engine for a PostgreSQL server: durable at COMMIT, with a pinned search path and bounded waits."""
+
+# ruff: noqa: S608 - the SQL is composed of our own schema names only
+
+from __future__ import annotations
+
+import errno
+import os
+import re
+import ssl
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import asyncpg
+from sqlalchemy import URL, event
+from sqlalchemy.exc import DataError, DBAPIError, IntegrityError, InterfaceError
+from sqlalchemy.ext.asyncio import AsyncEngine, create_async_engine
+from sqlalchemy.pool import ConnectionPoolEntry
+
+from pycrorm_async.errors import DamageError, DatabaseUnavailable, InternalError, PycrormError
+from pycrorm_async.store.dialect import RowRefused
+
+ANSWER_S_MAX = 60.0
+"""Bounds a statement; a server that takes longer counts as unavailable."""
+
+WARNING = "pycrorm_warning"
+"""Key in a connection's `info` for the server's latest warning."""
+
+_VANISHED = {
+    "tcp_keepalives_idle": "10",
+    "tcp_keepalives_interval": "5",
+    "tcp_keepalives_count": "3",
+    "tcp_user_timeout": "25000",
+}
+"""A machine that loses power during a statement does not close its connection. With these settings the server detects
+that and releases its locks after half a minute; the default is two hours, in which its episodes stay locked."""
+
+WHERE = ("host", "port")
+"""URL parameters that locate the server, and so may be shown."""
+
+TLS = ("sslmode", "sslrootcert", "sslcert", "sslkey")
+"""URL parameters for the encryption of the connection, as in libpq. Their paths are not secret."""
+
+_TLS_FILES = {"sslrootcert", "sslcert", "sslkey"}
+
+_PARAMETERS = (*WHERE, *TLS, "password", "passfile", "target_session_attrs", "krbsrvname")
+_SSL_MODES = ("disable", "allow", "prefer", "require", "verify-ca", "verify-full")
+
+
+def refusal_of_url(url: URL) -> str | None:
+    """Return the fault of a PostgreSQL URL, or None. Quotes no part of it, which may belong to a password."""
+    if "@" in (url.host or ""):
+        return "an @ in a password is written %40"
+    if not url.database:
+        return "a PostgreSQL URL names its database"
+    ports = [url.port, *(_number(each) for each in url.normalized_query.get("port", ()))]
+    if any(port is not None and not 0 < port < 2**16 for port in ports):
+        return "a port is a number from 1 to 65535"
+    if not set(url.query) <= set(_PARAMETERS):
+        return f"a PostgreSQL URL takes the parameters {', '.join(_PARAMETERS)} and no other"
+    if not set(url.normalized_query.get("sslmode", ())) <= set(_SSL_MODES):
+        return f"sslmode is one of {', '.join(_SSL_MODES)}"
+    return None
+
+
+def _number(text: str) -> int:
+    return int(text) if text.isascii() and text.isdigit() else 0
+
+
+def make_engine(url: URL, *, read_only: bool, busy_timeout_s: float) -> AsyncEngine:
+    """Create an engine for the server and database of this URL.
+
+    Connecting, and waiting for another session's lock, take at most `busy_timeout_s`; then the database counts as
+    unavailable. A read-only engine refuses writes.
+    """
+    settings = {
+        "application_name": "pycrorm",
+        "search_path": "pg_catalog",  # until `PIN` sets it
+        "synchronous_commit": "on",  # a segment of the spool is deleted after COMMIT, so COMMIT must mean the disk
+        "lock_timeout": f"{int(busy_timeout_s * 1000)}",
+        "idle_in_transaction_session_timeout": "60000",
+        **_VANISHED,
+        "default_transaction_read_only": "on" if read_only else "off",
+        "timezone": "UTC",
+    }
+    # The driver reads these only from a URL; other parts of the URL are passed as arguments, which take precedence.
+    tls = {name: value for name, value in url.query.items() if name in TLS}
+    for name in sorted(_TLS_FILES & tls.keys()):
+        if not os.access(str(tls[name]), os.R_OK):
+            raise DatabaseUnavailable(f"{name} of the database's URL cannot be read: {tls[name]}")
+    dsn = {"dsn": URL.create("postgresql", query=tls).render_as_string()} if tls else {}
+    engine = create_async_engine(
+        url.set(drivername="postgresql+asyncpg").difference_update_query(TLS),
+        connect_args={
+            **dsn,
+            "timeout": busy_timeout_s,
+            "command_timeout": ANSWER_S_MAX,
+            "server_settings": settings,
+            # A cached plan fails once after its view gets a column, which happens with every new type.
+            "prepared_statement_cache_size": 0,
+        },
+        pool_size=2,
+        pool_pre_ping=True,
+        hide_parameters=True,
+    )
+    event.listen(engine.sync_engine, "connect", _set_up)
+    return engine
+
+
+def _set_up(connection: Any, record: ConnectionPoolEntry) -> None:
+    """Pin the search path of a new connection, and keep the server's latest warning in its `info`."""
+
+    def keep(_: Any, message: Any) -> None:
+        if getattr(message, "severity_en", None) == "WARNING":
+            record.info[WARNING] = " ".join(str(message).split())
+
+    connection.driver_connection.add_log_listener(keep)
+    connection.run_async(lambda driver: driver.execute(PIN))
+
+
+# === search path ==============================================================================================
+#
+# Pin the search path of each connection, and keep untrusted schemas out of it.
+#
+# **Theory of operation.** Schema `pycrorm` holds the log and belongs to the memory's owner, the only role that can
+# create objects in it. `memory_tables` and `memory` hold the tables and views made from the log, and belong to the role
+# that folds: after `roles.GRANTS`, `pycrorm_folder`. A member of that role can put code there: a function that
+# PostgreSQL prefers to the one of pg_catalog because its arguments match better, an operator, a trigger, a default
+# value, a view that calls a function. Such code runs with the rights of any session that evaluates it.
+#
+# So a session with all rights on the log must not evaluate it. SET ROLE pycrorm_folder would not help, because the code
+# can run RESET ROLE. Therefore each new connection first asks, with only pg_catalog in its path, whether the schemas of
+# tables and views belong to a stranger: a role that is not a member of the log's owner, while this session's login is.
+# Then these schemas stay out of its path, `HAS_TABLE` detects the stranger again whenever tables are about to be read
+# or written, and the dialect refuses. Appending continues, because the log is in the owner's schema.
+#
+# The owner folds and reads with a separate login that is a member of `pycrorm_folder` or `pycrorm_reader`.
+
+LOG_SCHEMA = "pycrorm"
+"""Schema of the log."""
+TABLES_SCHEMA = "memory_tables"
+"""Schema of the tables made from the log, all generations."""
+VIEWS_SCHEMA = "memory"
+"""Schema of the public views on the tables. Replaced as a whole."""
+
+PATH = f"{TABLES_SCHEMA}, {VIEWS_SCHEMA}, {LOG_SCHEMA}"
+"""The search path. The schema of tables comes first, so that objects created without a schema go there."""
+
+STRANGER = f"""
+SELECT pg_catalog.min(pg_catalog.pg_get_userbyid(derived.nspowner)::text)
+FROM pg_catalog.pg_namespace AS log CROSS JOIN pg_catalog.pg_namespace AS derived
+WHERE log.nspname = '{LOG_SCHEMA}' AND derived.nspname IN ('{TABLES_SCHEMA}', '{VIEWS_SCHEMA}')
+AND pg_catalog.pg_has_role(session_user, log.nspowner, 'MEMBER')
+AND NOT pg_catalog.pg_has_role(derived.nspowner, log.nspowner, 'MEMBER')"""
+"""Selects the role whose code this session must not evaluate; null if there is none."""
+
+PIN = f"""
+SELECT pg_catalog.set_config(
+    'search_path', CASE WHEN ({STRANGER}) IS NULL THEN '{PATH}' ELSE '{LOG_SCHEMA}' END, false
+)"""
+"""The first statement of each connection; sets its search path."""
+
+
+# === errors ===================================================================================================
+#
+# Translate errors of PostgreSQL: a connection problem, a server state, a missing right, damage, or our defect.
+
+FAULTS: tuple[type[Exception], ...] = (
+    DBAPIError,
+    asyncpg.PostgresError,
+    asyncpg.InterfaceError,
+    asyncpg.InternalClientError,
+    OSError,
+    TimeoutError,
+)
+
+_ROW_FAULTS: tuple[type[Exception], ...] = (
+    asyncpg.DataError,
+    asyncpg.IntegrityConstraintViolationError,
+    asyncpg.exceptions._base.DataError,  # noqa: SLF001  raised by the driver before sending; the public name is another class
+    OverflowError,
+)
+"""The errors of a row that the database cannot store."""
+
+_NO_RIGHT = "42501"
+_UNAVAILABLE = (
+    "08",  # connection
+    "25",  # invalid transaction state, such as a read-only one
+    "28",  # authentication failed
+    "3D",  # no such database
+    "40",  # rolled back: deadlock, serialisation
+    _NO_RIGHT,
+    "53",  # out of memory, disk or connections
+    "55",  # lock not available in time
+    "57",  # shutting down, cancelled
+    "58",  # error of the server's operating system
+    "23505",  # another connection inserted the same episode at the same time
+)
+_DEFINITIONS = ("22", "42", "54")
+"""Errors of an impossible definition: a value, syntax, a name or a server limit. `_UNAVAILABLE` takes precedence."""
+_DAMAGED = ("XX001", "XX002")
+_MISSING = ("42P01", "3F000", "42P10")
+"""A table, a schema, or the key of a table is missing."""
+_OF_THE_MEMORY = re.compile(
+    r"""["'«„](?:(?:pycrorm|memory_tables|memory)\b|(?:pycrorm_log|pycrorm_declaration|episode|event|episode_number)\b"""
+    r"""|pycrorm_\w+|\w+__\d+\b)"""
+)
+"""Names of the log's schemas and tables and of derived tables, in the quotes of the server's language."""
+_NO_TLS = re.compile("rejected SSL upgrade|unexpected connection_lost")
+"""The driver's messages about a first answer that is not PostgreSQL's consent to encrypt."""
+_DROPPED_MEANWHILE = re.compile("could not open relation with OID|cache lookup failed for relation")
+"""Messages of a statement that looked up a table just before it was dropped."""
+
+
+class CommitInDoubt(ConnectionError):
+    """The server committed, but warns that a synchronous standby may not have the commit."""
+
+
+@contextmanager
+def rows_refused() -> Iterator[None]:
+    """Raise `RowRefused` for an error of a row that the database cannot store."""
+    try:
+        yield
+    except DBAPIError as error:
+        if isinstance(error, DataError | IntegrityError):
+            raise RowRefused(str(error.orig)) from error
+        raise
+    except _ROW_FAULTS as error:
+        raise RowRefused(" ".join(str(error).split())) from error
+
+
+def translate_error(error: Exception, database: str) -> PycrormError:
+    """Return the error of this package to raise instead. Its text never quotes the URL, which may hold a password."""
+    fault = error.orig if isinstance(error, DBAPIError) and error.orig is not None else error
+    code = _code(fault)
+    text = _text(fault)
+    if code.startswith(_DAMAGED):
+        return DamageError(f"{database} is damaged: {text}")
+    if _is_missing(code, text):
+        return DatabaseUnavailable(f"{database}: {text}: a part of the memory is missing; restore it from a backup")
+    if code == _NO_RIGHT:
+        return DatabaseUnavailable(
+            f"{database}: {text}: use a login with this right (operations/README.md, PostgreSQL)"
+        )
+    if code.startswith(_UNAVAILABLE):
+        return DatabaseUnavailable(f"{database}: {text}")
+    if not code or isinstance(error, InterfaceError):  # the connection was refused, reset, closed or timed out
+        return DatabaseUnavailable(f"{database}: {text}")
+    return InternalError(f"{database}: {text}")
+
+
+def _is_missing(code: str, text: str) -> bool:
+    """Return whether a part of the memory is missing, as during a restore; names in user queries do not count."""
+    if code == "42P10":  # ON CONFLICT needs keys, which a restore creates last
+        return True
+    if code == "XX000":
+        return _DROPPED_MEANWHILE.search(text) is not None
+    return code in _MISSING and _OF_THE_MEMORY.search(text) is not None
+
+
+def refusal(error: Exception) -> str | None:
+    """Return the reason why the server can never create a table or view of this definition; None for other errors."""
+    fault = error.orig if isinstance(error, DBAPIError) and error.orig is not None else error
+    code = _code(fault)
+    text = _text(fault)
+    is_refused = code.startswith(_DEFINITIONS) and not code.startswith(_UNAVAILABLE) and not _is_missing(code, text)
+    return text if is_refused else None
+
+
+def is_missing_table(error: DBAPIError) -> bool:
+    """Return whether a named table is missing."""
+    return error.orig is not None and _code(error.orig) == "42P01"
+
+
+def _code(fault: BaseException) -> str:
+    """Return the SQLSTATE; empty if the error has none."""
+    return getattr(fault, "sqlstate", None) or getattr(fault.__cause__, "sqlstate", None) or ""
+
+
+_HINTS = {
+    "28000": ": correct the user in the URL, or let the server's administrator create or admit it",
+    "28P01": ": put the right password into PYCRORM_URL or ~/.pgpass",
+    "3D000": ": create it with `createdb`, or correct the URL",
+}
+"""The next step by SQLSTATE."""
+
+
+def _text(fault: BaseException) -> str:
+    """Return the driver's message in one line, without class names."""
+    cause = fault.__cause__ if isinstance(fault.__cause__, asyncpg.PostgresError | OSError) else fault
+    if isinstance(cause, ssl.SSLCertVerificationError):
+        return f"the server's certificate is not accepted: {cause.verify_message}"
+    if isinstance(cause, OSError) and not isinstance(cause, ssl.SSLError) and cause.strerror is not None:
+        number = cause.errno or 0  # errors of name look-ups have negative numbers
+        hint = ": start the server, or correct the URL" if number == errno.ECONNREFUSED else ""
+        return f"cannot be reached: {os.strerror(number) if number > 0 else cause.strerror}{hint}"
+    message = " ".join(str(cause).split())
+    if isinstance(cause, TimeoutError):
+        return message or "no answer in time"
+    if isinstance(cause, ConnectionError) and _NO_TLS.search(message):
+        return "another program answers at this address, or a PostgreSQL server that does not encrypt: correct the URL"
+    return f"{message or type(cause).__name__}{_HINTS.get(_code(fault), '')}"

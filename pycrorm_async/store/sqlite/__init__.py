@@ -1,1 +1,0 @@
-"""Implement the log on SQLite: connections, locks, tables, statements and errors."""

@@ -1,1 +1,0 @@
-"""Built-in models as URDF text: primitive shapes, a kitchen, a PR2."""

@@ -1,1 +1,0 @@
-"""Query a world without changing it: bounding boxes, collisions, visibility, free space."""

@@ -1,1 +1,0 @@
-"""Describe robots and solve their inverse kinematics."""
