@@ -94,12 +94,21 @@ __all__ = [
 
 _NAMES_BY_MODULE = {
     "bounding_boxes": ("BoundingBox",),
-    "bullet": ("BulletWorld",),
-    "world_copy": ("copied",),
-    "queries": ("Costmap", "OccupancyCostmap", "GaussianCostmap", "VisibilityCostmap", "SemanticCostmap"),
-    "enums": ("Arms", "Grasp", "GripperState", "JointType", "ObjectType", "WorldMode"),
-    "objects": ("Object",),
-    "pose": ("Pose", "Quaternion", "Vector"),
+    "pose": (
+        "Arms",
+        "Grasp",
+        "GripperState",
+        "JointType",
+        "ObjectType",
+        "Pose",
+        "Quaternion",
+        "Vector",
+        "WorldMode",
+    ),
+    "bullet": ("BulletWorld", "Object", "WorldObserver", "WorldWatcher", "current_world", "watcher"),
+    "bullet_body": ("WorldState",),
+    "world_copy": ("acting_robot", "copied", "robot_acting"),
+    "queries": ("Costmap", "GaussianCostmap", "OccupancyCostmap", "SemanticCostmap", "VisibilityCostmap"),
     "urdf": (
         "COURIER",
         "PR2",
@@ -109,13 +118,11 @@ _NAMES_BY_MODULE = {
         "FieldOfView",
         "Limits",
         "RobotDescription",
+        "describe_arm",
+        "describe_robot",
         "register_robot",
         "robot_description",
     ),
-    "urdf": ("describe_arm", "describe_robot"),
-    "world_copy": ("acting_robot", "robot_acting"),
-    "state": ("WorldState",),
-    "observers": ("WorldObserver", "WorldWatcher", "current_world", "watcher"),
 }
 
 

@@ -210,9 +210,7 @@ def test_a_class_with_the_name_of_a_built_in_one_is_refused() -> None:
         async def perform(self) -> None:
             """Succeed without doing anything."""
 
-    with pytest.raises(
-        DeclarationRefused, match=r"plan\.actions\.basic\.NavigateActionPerformable already has the dtype"
-    ):
+    with pytest.raises(DeclarationRefused, match=r"plan\.actions\.NavigateActionPerformable already has the dtype"):
         Declarations().of(NavigateAction, lambda _: None)
 
 
@@ -260,7 +258,7 @@ def test_a_field_may_be_called_aliases() -> None:
         (("WelcomeAction",), r"its alias 'WelcomeAction' is its current dtype"),
         (
             ("PickUpAction",),
-            r"its alias 'PickUpAction' is the dtype of pycrorm_async\.plan\.actions\.basic\.PickUpActionPerformable",
+            r"its alias 'PickUpAction' is the dtype of pycrorm_async\.plan\.actions\.PickUpActionPerformable",
         ),
         (("EverythingAction",), r"its alias 'EverythingAction' is the dtype of one of its base classes"),
     ],

@@ -16,7 +16,7 @@ from pycrorm_async.projections.mapped_tables import built_in_leaves, leaves_of, 
 from pycrorm_async.record.declarations import declared_type
 from tests.commands import environment
 
-MODULES = (actions, actions, actions, motions)
+MODULES = (actions, motions)
 PERFORMABLES = [getattr(module, name) for module in MODULES for name in module.__all__]
 
 

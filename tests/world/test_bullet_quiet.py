@@ -16,7 +16,7 @@ def test_importing_the_package_does_not_import_bullet_or_numpy() -> None:
     done = run(
         "import sys, pycrorm_async.world as world\n"
         "bullets = {'pybullet', 'pycram_bullet', 'optik'}\n"
-        "world.Pose, world.ObjectType, world.current_world\n"
+        "world.Pose, world.ObjectType\n"
         "print(bullets & set(sys.modules), 'numpy' in sys.modules)\n"
         "world.BulletWorld, world.Object, world.OccupancyCostmap\n"
         "print(bullets & set(sys.modules))\n"
