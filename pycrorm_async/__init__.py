@@ -8,12 +8,14 @@
 ...         actions = (await session.scalars(select(Action))).all()
 
 Users also import from `pycrorm_async.plan` (designators), `pycrorm_async.world` (the simulated world) and
-`pycrorm_async.orm` (the mapped classes to query). Importing this package loads no other module; each public name loads
-its module on first use.
+`pycrorm_async.orm` (the mapped classes to query). Importing this package loads none of its parts; each public name
+loads its module on first use.
 """
 
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
+
+from pycrorm_async.moved_modules import keep_former_paths
 
 if TYPE_CHECKING:
     from pycrorm_async.errors import PycrormError
@@ -60,6 +62,9 @@ _MODULES = {
     "recover": "operations.recovery",
     "world_of": "query.again",
 }
+
+
+keep_former_paths()
 
 
 def __getattr__(name: str) -> Any:

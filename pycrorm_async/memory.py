@@ -21,6 +21,7 @@ of that database stores them.
 from __future__ import annotations
 
 import asyncio
+import html
 import logging
 import os
 import threading
@@ -44,7 +45,7 @@ from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self, TypeVar, overload
 
-from sqlalchemy import Select
+from sqlalchemy import Select, func, select
 from sqlalchemy.ext.asyncio import AsyncSession
 
 from pycrorm_async import __version__
@@ -64,13 +65,14 @@ from pycrorm_async.projections.custom import Projection, validate_projections
 from pycrorm_async.projections.mapped_tables import UserView
 from pycrorm_async.query.episode_diff import EpisodeDiff
 from pycrorm_async.query.frames import BATCH_ROWS, Library
-from pycrorm_async.query.named_queries import EpisodeSummary
-from pycrorm_async.query.notebook_html import Episodes, TaskTree
+from pycrorm_async.query.named_queries import EpisodeChoice, EpisodeSummary, episodes
+from pycrorm_async.query.notebook import Episodes, TaskTree
 from pycrorm_async.query.question import AskedEpisode, FrameQuery, Question, SyncQuestion
 from pycrorm_async.query.questions import Ask
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.snapshot import AnyEpisode, Moment
 from pycrorm_async.query.sql import DEFAULT_LIMITS, SqlLimits, SqlResult
+from pycrorm_async.query.text import quiet, view
 from pycrorm_async.queue.locks import call_in_forked_child
 from pycrorm_async.queue.recorder_queue import RecorderQueue
 from pycrorm_async.queue.spool import Spool
@@ -254,8 +256,6 @@ class ReadableMemory(PartsHolder):
         return f"<Memory {self._address}, {'open' if self._parts is not None else 'not open'}>"
 
     def _repr_html_(self) -> str:
-        from pycrorm_async.query.notebook_html import memory_html
-
         return memory_html(self._address, self._located if self._parts is not None else None)
 
     @property
@@ -908,6 +908,45 @@ class Memory(RecordingMemory):
         if self._parts is not None:
             self._parts.emitter.is_closed = self._parts.experience.is_closed = True
             self._parts = None
+
+
+# === memory view ==============================================================================================
+#
+# Draw a memory: its address and the table of its newest episodes.
+#
+# A notebook asks for a view while its event loop waits for the answer, so a thread with a loop of its own reads.
+
+_ANSWER_S_MAX = 10.0
+"""Bounds the wait for a database, so that a cell ends although the server does not answer."""
+
+
+def memory_html(address: DatabaseAddress, located: DatabaseAddress | None) -> str:
+    """Return the view of the memory at an address; it is not open if it is not `located`."""
+    title = f"<b>Memory {html.escape(str(address))}</b>"
+    if located is None:
+        return view(f"{title} · not open", quiet("it is closed, or was never entered: await Memory.connect(url)"))
+    return view(f"{title} · open", _episodes(located))
+
+
+def _episodes(address: DatabaseAddress) -> str:
+    answers: list[str] = []
+    reader = threading.Thread(target=lambda: answers.append(asyncio.run(_read(address))), daemon=True)
+    reader.start()
+    reader.join(_ANSWER_S_MAX)
+    return answers[0] if answers else quiet(f"the database did not answer within {_ANSWER_S_MAX:g} s")
+
+
+async def _read(address: DatabaseAddress) -> str:
+    from pycrorm_async.orm import ProcessMetaData
+    from pycrorm_async.query.notebook_html import EPISODES_MAX, episodes_html
+
+    try:
+        async with Reading.open_address(address) as reading, reading.session() as session:
+            total = await session.scalar(select(func.count()).select_from(ProcessMetaData))
+            newest = await episodes(await session.connection(), EpisodeChoice(limit=EPISODES_MAX))
+            return episodes_html(newest, total or 0)
+    except PycrormError as error:
+        return html.escape(str(error))
 
 
 # === sync memory ==============================================================================================

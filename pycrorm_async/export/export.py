@@ -47,7 +47,7 @@ from pycrorm_async.export.selection import (
     select_rows,
     versions_of,
 )
-from pycrorm_async.orm.documentation.descriptions import ViewDescription, described
+from pycrorm_async.orm.documentation import ViewDescription, described
 from pycrorm_async.projections.generations import PROJECTION_VERSION
 from pycrorm_async.query.frames import columns_of, needed_pyarrow
 from pycrorm_async.query.question import Question

@@ -403,10 +403,10 @@ def _labelled(column: Column[Any]) -> ColumnElement[Any]:
 # `python -m pycrorm_async.orm.documentation` writes the file from the docstrings of the mapped classes. It exists
 # because a process that makes tables, such as a daemon, does not load these classes.
 
-FILE = Path(__file__).with_name("comments.json")
+COMMENTS_FILE = Path(__file__).with_name("comments.json")
 
 
 @cache
 def comments() -> dict[str, dict[str, str]]:
     """Return the texts by view and column; the text under the empty name is the view's own."""
-    return msgspec.json.decode(FILE.read_bytes(), type=dict[str, dict[str, str]])
+    return msgspec.json.decode(COMMENTS_FILE.read_bytes(), type=dict[str, dict[str, str]])

@@ -16,7 +16,7 @@ from sqlalchemy.engine.reflection import ObjectKind
 
 from pycrorm_async.errors import CallerError, DatabaseUnavailable
 from pycrorm_async.orm import DesignatorType
-from pycrorm_async.orm.documentation.descriptions import ViewDescription, described
+from pycrorm_async.orm.documentation import ViewDescription, described
 from pycrorm_async.projections.generations import current_generation
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.text import nearest

@@ -7,34 +7,18 @@ isolated from the direction of the text around it.
 
 from __future__ import annotations
 
-import asyncio
 import html
 import math
-import threading
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from collections.abc import Set as AbstractSet
-from itertools import islice
 from random import Random
-from typing import (
-    Generic,
-    Literal,
-    NamedTuple,
-    Self,
-    SupportsIndex,
-    TypeAlias,
-    TypeVar,
-    get_args,
-    overload,
-)
+from typing import Literal, NamedTuple, TypeAlias, get_args
 
 import msgspec
-from sqlalchemy import func, select
 
-from pycrorm_async.errors import CallerError, PycrormError
-from pycrorm_async.orm import ProcessMetaData
+from pycrorm_async.errors import CallerError
 from pycrorm_async.query.episode_diff import EpisodeDiff
-from pycrorm_async.query.named_queries import EpisodeChoice, EpisodeSummary, NodeSummary, counts_text, episodes
-from pycrorm_async.query.question import Question, SyncQuestion
+from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary, counts_text
 from pycrorm_async.query.snapshot import Moment, ObjectThen, WorldThen, world_map
 from pycrorm_async.query.sql import SqlResult
 from pycrorm_async.query.text import (
@@ -52,13 +36,8 @@ from pycrorm_async.query.text import (
     sign_of,
     status,
     table,
-    value_html,
     view,
 )
-from pycrorm_async.store.address import DatabaseAddress
-
-#
-# Draw episodes: a table of many, the facts of one, and its task tree with a chart.
 
 EPISODES_MAX = 100
 """Bounds the rows of a table of episodes."""
@@ -477,128 +456,6 @@ def _omitted(count: int) -> str:
     return f"<div>{left_out(count - _ROWS_MAX)}</div>" if count > _ROWS_MAX else ""
 
 
-# === listings =================================================================================================
-#
-# Define the lists of episodes and of nodes that queries return: ordinary lists that a notebook draws.
-#
-# The views are imported when a notebook draws one, because every command imports this module.
-
-Item = TypeVar("Item")
-
-_LINES_MAX = 200
-"""Bounds the lines of a list as text."""
-_LINE_MAX = 160
-"""Bounds the characters of a line."""
-
-
-class _Listing(list[Item], Generic[Item]):
-    """A list whose slices are of its own type."""
-
-    @overload
-    def __getitem__(self, index: SupportsIndex, /) -> Item: ...
-    @overload
-    def __getitem__(self, index: slice, /) -> Self: ...
-    def __getitem__(self, index: SupportsIndex | slice, /) -> Item | Self:
-        return self._part(super().__getitem__(index)) if isinstance(index, slice) else super().__getitem__(index)
-
-    def _part(self, items: Iterable[Item]) -> Self:
-        return type(self)(items)
-
-
-def _text(lines: Iterable[str], count: int) -> str:
-    """Return the first lines of a list of this many items, each cut, with its indentation."""
-    cut = [
-        f"{' ' * (len(each) - len(each.lstrip(' ')))}{one_line(each, _LINE_MAX)}" for each in islice(lines, _LINES_MAX)
-    ]
-    return "\n".join([*cut, f"… {count - _LINES_MAX:,} more"] if count > _LINES_MAX else cut) or "[]"
-
-
-class Episodes(_Listing[EpisodeSummary]):
-    """The episodes of a memory, the oldest first. A list that a notebook draws as a table."""
-
-    def __repr__(self) -> str:
-        lines = (
-            f"{each.number} {each.started_at:%Y-%m-%d %H:%M:%S} {each.status} {each.description}"
-            f" ({each.nodes} nodes, {each.failed} failed)"
-            for each in self
-        )
-        return _text(lines, len(self))
-
-    def _repr_html_(self) -> str:
-
-        return episodes_html(self)
-
-
-class TaskTree(_Listing[NodeSummary]):
-    """The nodes of an episode, each before its children. A list that a notebook draws as a chart and nested lists.
-
-    Attributes:
-        episode: to which they belong; None in a list that was not read from a memory.
-    """
-
-    def __init__(self, nodes: Iterable[NodeSummary] = (), episode: EpisodeSummary | None = None) -> None:
-        super().__init__(nodes)
-        self.episode = episode
-
-    def gantt(self, axis: Axis = "events") -> Drawing:
-        """Return the nodes as bars over events, or over time: `tree.gantt("time")`."""
-
-        return gantt(self, axis)
-
-    def _part(self, items: Iterable[NodeSummary]) -> TaskTree:
-        return type(self)(items, self.episode)
-
-    def __repr__(self) -> str:
-        lines = (
-            f"{'  ' * each.depth}{each.dtype or each.kind} {parameters_text(each.parameters)} {each.status}"
-            f" {duration(each.duration_ns)} {f'{each.reason}: {each.failure_message}' if each.reason else ''}"
-            for each in self
-        )
-        return _text(lines, len(self))
-
-    def _repr_html_(self) -> str:
-
-        return task_tree_html(self, self.episode)
-
-
-# === memory view ==============================================================================================
-#
-# Draw a memory: its address and the table of its newest episodes.
-#
-# A notebook asks for a view while its event loop waits for the answer, so a thread with a loop of its own reads.
-
-_ANSWER_S_MAX = 10.0
-"""Bounds the wait for a database, so that a cell ends although the server does not answer."""
-
-
-def memory_html(address: DatabaseAddress, located: DatabaseAddress | None) -> str:
-    """Return the view of the memory at an address; it is not open if it is not `located`."""
-    title = f"<b>Memory {html.escape(str(address))}</b>"
-    if located is None:
-        return view(f"{title} · not open", quiet("it is closed, or was never entered: await Memory.connect(url)"))
-    return view(f"{title} · open", _episodes(located))
-
-
-def _episodes(address: DatabaseAddress) -> str:
-    answers: list[str] = []
-    reader = threading.Thread(target=lambda: answers.append(asyncio.run(_read(address))), daemon=True)
-    reader.start()
-    reader.join(_ANSWER_S_MAX)
-    return answers[0] if answers else quiet(f"the database did not answer within {_ANSWER_S_MAX:g} s")
-
-
-async def _read(address: DatabaseAddress) -> str:
-    from pycrorm_async.query.reading import Reading  # imports this package
-
-    try:
-        async with Reading.open_address(address) as reading, reading.session() as session:
-            total = await session.scalar(select(func.count()).select_from(ProcessMetaData))
-            newest = await episodes(await session.connection(), EpisodeChoice(limit=EPISODES_MAX))
-            return episodes_html(newest, total or 0)
-    except PycrormError as error:
-        return html.escape(str(error))
-
-
 # === moment view ==============================================================================================
 #
 # Draw the state of an episode at a moment: running nodes, the world from above, objects, observations and the tree.
@@ -659,52 +516,3 @@ def _json(values: object) -> str:
 
 def _and_others(count: int, noun: str) -> str:
     return f"<div>{left_out(count - _ROWS_MAX, noun)}</div>" if count > _ROWS_MAX else ""
-
-
-# === views ====================================================================================================
-#
-# Register the view of each value that a memory returns.
-#
-# The views are imported when a notebook draws one, because every command imports this module.
-
-
-@value_html.register(EpisodeSummary)
-def _(episode: EpisodeSummary) -> str:
-
-    return episode_html(episode)
-
-
-@value_html.register(Moment)
-def _(moment: Moment) -> str:
-
-    return moment_html(moment)
-
-
-@value_html.register(WorldThen)
-def _(world: WorldThen) -> str:
-
-    return world_html(world)
-
-
-@value_html.register(Question)
-def _(question: Question) -> str:
-
-    return question_html(question.name, question.sql, "await it for a frame")
-
-
-@value_html.register(SyncQuestion)
-def _(question: SyncQuestion) -> str:
-
-    return question_html(question.name, question.sql, "call frame() or rows()")
-
-
-@value_html.register(EpisodeDiff)
-def _(diff: EpisodeDiff) -> str:
-
-    return diff_html(diff)
-
-
-@value_html.register(SqlResult)
-def _(result: SqlResult) -> str:
-
-    return sql_result_html(result)

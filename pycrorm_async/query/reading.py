@@ -29,7 +29,6 @@ from sqlalchemy.sql import visitors
 from sqlalchemy.sql.operators import in_op
 from sqlalchemy.util.concurrency import in_greenlet
 
-import pycrorm_async.query.notebook_html  # noqa: F401  registers the views of values
 from pycrorm_async.bulk_records import collecting_seldom
 from pycrorm_async.errors import CallerError, DatabaseUnavailable, UnknownEpisode
 from pycrorm_async.events.ids import parse_episode_id, row_key
@@ -43,7 +42,7 @@ from pycrorm_async.query import named_queries
 from pycrorm_async.query.episode_diff import EpisodeDiff, diff_episodes
 from pycrorm_async.query.frames import BATCH_ROWS, Library, arrow_batches, columns_of, dataframe, select_of
 from pycrorm_async.query.named_queries import EpisodeChoice, EpisodeSummary
-from pycrorm_async.query.notebook_html import Episodes, TaskTree
+from pycrorm_async.query.notebook import Episodes, TaskTree  # and registers the views of values
 from pycrorm_async.query.question import AskedEpisode, FrameQuery, Question, translated_errors
 from pycrorm_async.query.questions import Ask
 from pycrorm_async.query.snapshot import AnyEpisode, Moment, as_of

@@ -19,7 +19,7 @@ from sqlalchemy.orm import DeclarativeBase
 from pycrorm_async import orm
 from pycrorm_async.errors import CallerError, MissingExtra
 from pycrorm_async.orm.base import EPISODE
-from pycrorm_async.orm.documentation.descriptions import unit_of
+from pycrorm_async.orm.documentation import unit_of
 from pycrorm_async.query.frames import FrameColumn, columns_of
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.text import nearest, one_line

@@ -49,6 +49,7 @@ from pycrorm_async.record.parameters import (
     undecorated_fields,
 )
 from pycrorm_async.record.values import clean, clean_repr, cut, message_of
+from pycrorm_async.recorded_names import recorded_name
 
 #
 # Declare a designator type from the names and types of its fields, for an executive that has no class for it.
@@ -236,7 +237,7 @@ def _named(name: str, spec: FieldSpec, known_types: KnownTypes, table: str, acce
             type=shape.kind,
             slot=SLOT_FIRST_FIELD + accepted.count,
             optional=True,
-            enum=f"{shape.enum.__module__}.{shape.enum.__qualname__}" if shape.enum is not None else None,
+            enum=recorded_name(shape.enum) if shape.enum is not None else None,
             item=shape.item,
         )
         reason = _fault_in_field(declared, accepted) or known_types.fault_in_field(declared, table)
@@ -618,7 +619,7 @@ def _fields(designator: type, leave_out: Callable[[str, tuple[str, ...], str], N
                 type=shape.kind,
                 slot=SLOT_FIRST_FIELD,
                 optional=shape.optional,
-                enum=_path(shape.enum) if shape.enum is not None else None,
+                enum=recorded_name(shape.enum) if shape.enum is not None else None,
                 item=shape.item,
             ),
             path,

@@ -38,6 +38,7 @@ from pycrorm_async.events.types import (
 )
 from pycrorm_async.plan.language import Outcome
 from pycrorm_async.plan.objects import BelieveObject, LocatedObject, ObjectDesignator, ObjectPart
+from pycrorm_async.recorded_names import recorded_name
 from pycrorm_async.world.bullet import Object
 from pycrorm_async.world.pose import Pose
 
@@ -469,7 +470,7 @@ def failure_value(failure: BaseException, references: References) -> FailureValu
 
 def _path_of(kind: type) -> str:
     try:
-        return clean(f"{kind.__module__}.{kind.__qualname__}")
+        return clean(recorded_name(kind))
     except Exception as error:  # noqa: BLE001  a metaclass may raise anything
         return f"<an exception whose class has no name: {type(error).__name__}>"
 

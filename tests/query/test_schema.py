@@ -11,7 +11,7 @@ import pytest
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.orm.base import Base, Moment
-from pycrorm_async.orm.documentation.descriptions import comments, described
+from pycrorm_async.orm.documentation import comments, described
 from pycrorm_async.projections.views import comments as stored_comments
 from pycrorm_async.query.memory_schema import CORE_VIEWS, as_text, read_schema
 from pycrorm_async.query.reading import Reading

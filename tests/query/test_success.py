@@ -20,7 +20,7 @@ from pycrorm_async import Memory, UserView
 from pycrorm_async.cli.main import app
 from pycrorm_async.errors import CallerError, MissingExtra
 from pycrorm_async.orm import Action, PickUpWithContextView
-from pycrorm_async.orm.documentation.descriptions import unit_of
+from pycrorm_async.orm.documentation import unit_of
 from pycrorm_async.query import success as figures
 from pycrorm_async.query.success import Samples, Values, interval_95, success_figure, success_samples, success_table
 

@@ -1,7 +1,8 @@
 """Describe the views of the mapped classes and their columns, in words and with their units.
 
 A column's text comes from the docstring behind its attribute, from the section `Attributes` of its class or of a base,
-and from its type: times are integers in SQL, so their text has their unit.
+and from its type: times are integers in SQL, so their text has their unit. Run as a program, it writes the comments on
+views and columns of PostgreSQL, `projections/comments.json`, from these docstrings.
 """
 
 from __future__ import annotations
@@ -16,10 +17,12 @@ from functools import cache
 from itertools import pairwise
 from typing import Any
 
+import msgspec
 from sqlalchemy import Table
 
 from pycrorm_async.orm.base import EPISODE, Base, JsonText, Moment
 from pycrorm_async.orm.rows import Action, Designator, Language, Motion
+from pycrorm_async.projections.views import COMMENTS_FILE
 
 _TIME = "µs since 1970-01-01 00:00 UTC"
 _UNIT = re.compile(r"(?:^|, | in )(m|rad|s|kg|ns)(?=[,;:]|$)")
@@ -177,3 +180,7 @@ def comments() -> dict[str, dict[str, str]]:
     """Return the texts of the built-in views and their columns; the view's own text has the empty name."""
     views = (each for each in described().values() if each.built_in)
     return {each.name: {"": each.text, **each.columns} for each in views}
+
+
+if __name__ == "__main__":  # `python -m pycrorm_async.orm.documentation`, after a docstring or a column has changed
+    COMMENTS_FILE.write_bytes(msgspec.json.format(msgspec.json.encode(comments()), indent=1) + b"\n")

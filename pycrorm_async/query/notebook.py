@@ -1,0 +1,153 @@
+"""Give what a memory returns its views in notebooks: lists of episodes and of nodes, moments, questions, differences.
+
+`notebook_html` draws the views. It is imported when a notebook draws one, because every command imports this module.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from itertools import islice
+from typing import TYPE_CHECKING, Generic, Self, SupportsIndex, TypeVar, overload
+
+from pycrorm_async.query.episode_diff import EpisodeDiff
+from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary
+from pycrorm_async.query.question import Question, SyncQuestion
+from pycrorm_async.query.snapshot import Moment, WorldThen
+from pycrorm_async.query.sql import SqlResult
+from pycrorm_async.query.text import duration, one_line, parameters_text, value_html
+
+if TYPE_CHECKING:
+    from pycrorm_async.query.notebook_html import Axis
+    from pycrorm_async.query.text import Drawing
+
+Item = TypeVar("Item")
+
+_LINES_MAX = 200
+"""Bounds the lines of a list as text."""
+_LINE_MAX = 160
+"""Bounds the characters of a line."""
+
+
+class _Listing(list[Item], Generic[Item]):
+    """A list whose slices are of its own type."""
+
+    @overload
+    def __getitem__(self, index: SupportsIndex, /) -> Item: ...
+    @overload
+    def __getitem__(self, index: slice, /) -> Self: ...
+    def __getitem__(self, index: SupportsIndex | slice, /) -> Item | Self:
+        return self._part(super().__getitem__(index)) if isinstance(index, slice) else super().__getitem__(index)
+
+    def _part(self, items: Iterable[Item]) -> Self:
+        return type(self)(items)
+
+
+def _text(lines: Iterable[str], count: int) -> str:
+    """Return the first lines of a list of this many items, each cut, with its indentation."""
+    cut = [
+        f"{' ' * (len(each) - len(each.lstrip(' ')))}{one_line(each, _LINE_MAX)}" for each in islice(lines, _LINES_MAX)
+    ]
+    return "\n".join([*cut, f"… {count - _LINES_MAX:,} more"] if count > _LINES_MAX else cut) or "[]"
+
+
+class Episodes(_Listing[EpisodeSummary]):
+    """The episodes of a memory, the oldest first. A list that a notebook draws as a table."""
+
+    def __repr__(self) -> str:
+        lines = (
+            f"{each.number} {each.started_at:%Y-%m-%d %H:%M:%S} {each.status} {each.description}"
+            f" ({each.nodes} nodes, {each.failed} failed)"
+            for each in self
+        )
+        return _text(lines, len(self))
+
+    def _repr_html_(self) -> str:
+        from pycrorm_async.query.notebook_html import episodes_html
+
+        return episodes_html(self)
+
+
+class TaskTree(_Listing[NodeSummary]):
+    """The nodes of an episode, each before its children. A list that a notebook draws as a chart and nested lists.
+
+    Attributes:
+        episode: to which they belong; None in a list that was not read from a memory.
+    """
+
+    def __init__(self, nodes: Iterable[NodeSummary] = (), episode: EpisodeSummary | None = None) -> None:
+        super().__init__(nodes)
+        self.episode = episode
+
+    def gantt(self, axis: Axis = "events") -> Drawing:
+        """Return the nodes as bars over events, or over time: `tree.gantt("time")`."""
+        from pycrorm_async.query.notebook_html import gantt
+
+        return gantt(self, axis)
+
+    def _part(self, items: Iterable[NodeSummary]) -> TaskTree:
+        return type(self)(items, self.episode)
+
+    def __repr__(self) -> str:
+        lines = (
+            f"{'  ' * each.depth}{each.dtype or each.kind} {parameters_text(each.parameters)} {each.status}"
+            f" {duration(each.duration_ns)} {f'{each.reason}: {each.failure_message}' if each.reason else ''}"
+            for each in self
+        )
+        return _text(lines, len(self))
+
+    def _repr_html_(self) -> str:
+        from pycrorm_async.query.notebook_html import task_tree_html
+
+        return task_tree_html(self, self.episode)
+
+
+# === the views of values ======================================================================================
+
+
+@value_html.register(EpisodeSummary)
+def _(episode: EpisodeSummary) -> str:
+    from pycrorm_async.query.notebook_html import episode_html
+
+    return episode_html(episode)
+
+
+@value_html.register(Moment)
+def _(moment: Moment) -> str:
+    from pycrorm_async.query.notebook_html import moment_html
+
+    return moment_html(moment)
+
+
+@value_html.register(WorldThen)
+def _(world: WorldThen) -> str:
+    from pycrorm_async.query.notebook_html import world_html
+
+    return world_html(world)
+
+
+@value_html.register(Question)
+def _(question: Question) -> str:
+    from pycrorm_async.query.notebook_html import question_html
+
+    return question_html(question.name, question.sql, "await it for a frame")
+
+
+@value_html.register(SyncQuestion)
+def _(question: SyncQuestion) -> str:
+    from pycrorm_async.query.notebook_html import question_html
+
+    return question_html(question.name, question.sql, "call frame() or rows()")
+
+
+@value_html.register(EpisodeDiff)
+def _(diff: EpisodeDiff) -> str:
+    from pycrorm_async.query.notebook_html import diff_html
+
+    return diff_html(diff)
+
+
+@value_html.register(SqlResult)
+def _(result: SqlResult) -> str:
+    from pycrorm_async.query.notebook_html import sql_result_html
+
+    return sql_result_html(result)
