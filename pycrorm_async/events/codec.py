@@ -4,7 +4,7 @@ The payload bytes are the same in the queue, in the log and in an export. `encod
 hold without changing its meaning, and names the path to it: NaN and infinities (msgspec alone would write null), lone
 surrogates and U+0000 (PostgreSQL text refuses it). It also refuses a payload above the limit. Bytes and sets must not
 occur in an event, because msgspec writes them as a text and a list. `decode` reads the payloads of this and all earlier
-versions (see `upcasters`).
+versions (see the section "upcasters").
 
 **Upcasters.** Upcasters convert the JSON of an event of an older version to that of the next version.
 

@@ -684,7 +684,7 @@ class SceneObject:
     """An object of the world with its model.
 
     Args:
-        model: root link, shapes by link, and joints, as `query.scene.object_model.object_model` returns them.
+        model: root link, shapes by link, and joints, as `query.scene.object_model` returns them.
         base_link: the link whose pose is recorded; None means the root link.
         color: of all its shapes; None means each shape's own.
 

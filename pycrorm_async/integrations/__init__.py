@@ -1,1 +1,1 @@
-"""Record the plans of other executives through the package `recording`, and answer the questions of agents."""
+"""Record the plans of other executives through the package `record`, and answer the questions of agents."""

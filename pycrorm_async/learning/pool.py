@@ -4,10 +4,10 @@ Theory of operation
 -------------------
 
 The caller's process holds a `Workers` object, one `_Worker` per worker process, and one task that runs the daemon. Each
-worker process is forked from a fork server (`processes`) and connected by one pipe. With a `MemoryLocation` each worker
-opens a memory with ``writer="daemon"``: it writes to its own folder in the spool, and the daemon task drains all of
-them into the database. Without one nothing is recorded, and no daemon runs; the rollouts are the same. Seed and index
-alone determine a rollout, so it does not matter which worker performs it.
+worker process is forked from a fork server (`operations.workers`) and connected by one pipe. With a `MemoryLocation`
+each worker opens a memory with ``writer="daemon"``: it writes to its own folder in the spool, and the daemon task
+drains all of them into the database. Without one nothing is recorded, and no daemon runs; the rollouts are the same.
+Seed and index alone determine a rollout, so it does not matter which worker performs it.
 
 The parent sends ``job`` (scene, policy, seed), ``run`` (first index, length), ``flush`` and ``stop``. A worker answers
 a run with ``so far`` messages, at most one per 0.2 s, and one ``done``; it answers a flush with ``flushed``; an
@@ -22,7 +22,7 @@ because answers to the old job may still be in the pipes.
 A worker that dies closes its end of the pipe; the parent reads the end of file and raises `WorkerLost`. Its finished
 rollouts survive in its spool folder, which the daemon adopts and drains. If the parent dies, every worker reads the end
 of file, ends its run and closes its memory; the next `recover` or daemon drains the folders. Workers ignore the signals
-of a terminal (`processes`): the parent alone handles them and stops the workers.
+of a terminal (`operations.workers`): the parent alone handles them and stops the workers.
 
 At exit the parent closes the pipes, waits for the processes in a thread so that the daemon keeps draining meanwhile,
 and stops the daemon last. Only one daemon drains a spool: while another holds it (`SpoolTaken`), the task retries every

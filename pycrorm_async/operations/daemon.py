@@ -1,9 +1,9 @@
 """`pycrorm writer`: wire the daemon between a spool and its database.
 
-Theory of operation. The actors are the daemon process, its fold workers (`fold_workers`), and the recorders, which are
-other processes with a folder each in the spool. One daemon drains a spool: it takes the spool's `writer` lock file,
-whose note also publishes the states of the fold workers to `pycrorm status`. `_Folders` finds the folders and claims
-each by its `drain` lock. The folder of a living recorder (`LiveSource`) is drained as far as it is synced, and
+Theory of operation. The actors are the daemon process, its fold workers (`operations.workers`), and the recorders,
+which are other processes with a folder each in the spool. One daemon drains a spool: it takes the spool's `writer` lock
+file, whose note also publishes the states of the fold workers to `pycrorm status`. `_Folders` finds the folders and
+claims each by its `drain` lock. The folder of a living recorder (`LiveSource`) is drained as far as it is synced, and
 released when the recorder ends; that of a dead one (`DeadSource`) is read to its end, completed with LOST ends, and
 deleted once everything in it is stored. A folder that cannot be claimed is reported and does not delay the others.
 

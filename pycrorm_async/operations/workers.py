@@ -26,7 +26,7 @@ this process. The fork server reaps its children itself, so `kill` first looks w
     async with FoldWorkers(2, assignment, settings=settings, report=report, note=note) as workers:
         tables = FoldWorkerTables(destination, workers)
 
-Theory of operation. A worker is a process (`fold_worker`) with one connection to its parent, a daemon or a rebuild. The
+Theory of operation. A worker is a process with one connection to its parent, a daemon or a rebuild. The
 parent sends a request and waits for the answer; between requests a worker has no lock and no transaction. Checkpoints
 are in the tables, so the events that a dead worker had not committed are folded again by another worker or by the
 parent. Therefore the parent may kill a worker at any moment, and does so when it exits. There are two strategies: the
@@ -320,8 +320,8 @@ class FoldWorker:
 # share of the episodes. The process opens the database at the first request, has at most one open transaction, and none
 # between requests. An exception in a request becomes a `Failure`, and the process continues.
 #
-# Its parent alone ends it (`processes`), and the kernel kills it when the parent dies, so that no worker outlives the
-# daemon, not even a stopped one.
+# Its parent alone ends it (section "processes"), and the kernel kills it when the parent dies, so that no worker
+# outlives the daemon, not even a stopped one.
 
 READY: Final = "ready"
 

@@ -397,7 +397,7 @@ Empty after the start, and after `close` has reported the coroutine.
 class CalledPerforms:
     """The performs of one context that were called and have not started.
 
-    `node_execution` updates the count itself, because it does so at every call.
+    The execution of a node updates the count itself, because it does so at every call.
 
     Attributes:
         waiting: number of calls that have not started, including those closed before their start.

@@ -467,7 +467,7 @@ def moving(joints: Iterable[str], robot: RobotDescription) -> frozenset[Resource
 #
 # Three modules share the exceptions of plans. `errors` has the mistakes of a plan's author, which are a `CallerError`
 # and need a change of code. `failures` has the outcomes of actions, such as an unreachable object, which a plan catches
-# to try an alternative. `exceptions` defines no class; its functions classify and describe any exception.
+# to try an alternative. The section "exceptions" defines no class; its functions classify and describe any exception.
 #
 # A *description*, such as `NavigateAction([pose_1, pose_2])`, lists alternatives. `resolve()` chooses one and returns a
 # *designator*, such as `NavigateActionPerformable(pose_1)`, which can be performed.

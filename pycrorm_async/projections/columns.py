@@ -572,7 +572,7 @@ def _refuse_different(dtype: str, present: Mapping[str, Storage], columns: Mappi
 
 # === tables ===================================================================================================
 #
-# Make the tables of a generation, those that every memory has (`core_columns`) and those of types (`layout`).
+# Make the tables of a generation, those that every memory has, and those of types.
 #
 # Every row names its episode (`process_metadata_id`). Row ids are computed from (episode number, sequence, slot), see
 # `pycrorm_async.events.ids`: a node, its designator and its leaf row have one id, and so have an object's row and its

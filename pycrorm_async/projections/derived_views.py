@@ -64,7 +64,7 @@ from pycrorm_async.world.pose import ObjectType
 # here the node is checked once. PostgreSQL cannot estimate how many rows such a check leaves, and with one for each
 # table it read all pick-ups where the latest 2,000 were wanted.
 #
-# Poses and objects are joined as outer joins (see `joins`).
+# Poses and objects are joined as outer joins (see the section "joins").
 
 _POSE = "x y z qx qy qz qw"
 

@@ -137,13 +137,13 @@ class FoldPipeline:
 # of processes may fold one memory: every event is folded exactly once, and rows and checkpoints never disagree.
 #
 # A declaration that the generation has no tables for makes the write transaction exclusive and grows the tables first
-# (`growth`). If the database creates only some of them, the growth is committed, the batch is not, and it is folded
-# again for the tables that exist now. An event that cannot be folded parks its episode at this event: the events before
-# it are written, later ones are not folded, and all other episodes continue. If the database refuses a row, the batch
-# is written again episode by episode, and then in halves, until the refused event is alone; it parks its episode.
+# (`generations`). If the database creates only some of them, the growth is committed, the batch is not, and it is
+# folded again for the tables that exist now. An event that cannot be folded parks its episode at this event: the events
+# before it are written, later ones are not folded, and all other episodes continue. If the database refuses a row, the
+# batch is written again episode by episode, and then in halves, until the refused event is alone; it parks its episode.
 #
-# `FoldTarget` is the generation and its checkpoints, of which there are two kinds (`targets`). `FoldDefinition` turns
-# events into rows: those of the built-in tables, here, or those of a custom projection.
+# `FoldTarget` is the generation and its checkpoints, of which there are two kinds (section "targets"). `FoldDefinition`
+# turns events into rows: those of the built-in tables, here, or those of a custom projection.
 
 _REASON_LENGTH_MAX = 2_000
 """Bounds the characters of the reason for parking an episode: `status` shows it, and a value may have megabytes."""
@@ -461,7 +461,7 @@ def _by_span(spans: Sequence[Span], events: Sequence[StoredEvent]) -> Iterator[t
 # Read and write the checkpoint table of a generation: one row for each episode.
 #
 # Generations that a rebuild fills and those of custom projections have such a table, named after the generation
-# (`targets`).
+# (section "targets").
 
 TABLE = "pycrorm_progress"
 COLUMNS: dict[str, Storage] = {"id": "key", "folded": "integer", "parked": "text"}
@@ -658,8 +658,9 @@ async def _retry_unmade(
 #
 # Theory of operation. There are two stores of checkpoints. Those of the visible built-in tables are `episode.folded`,
 # whose index makes a poll for new events take 0.03 ms, however many episodes there are. Every other generation, one
-# that a rebuild fills or that of a custom projection, has a table with one row for each episode (`checkpoints`), which
-# is dropped together with it. A rebuild copies its checkpoints into `episode.folded` when it switches.
+# that a rebuild fills or that of a custom projection, has a table with one row for each episode (section
+# "checkpoints"), which is dropped together with it. A rebuild copies its checkpoints into `episode.folded` when it
+# switches.
 #
 # `SideTarget` reads the generation under its key in every transaction. For a rebuild another number is an error. For a
 # projection it means that another process has rebuilt it: a batch folded for the old tables is folded again for the new

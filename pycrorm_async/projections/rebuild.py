@@ -20,7 +20,7 @@ see fewer events after the switch than before. The new revision is above both ol
 tables fails its check and is folded again (`generations`).
 
 Queries that began before the switch may still read the replaced tables. The switch never drops them: `clear` in
-`replaced_tables` waits some seconds for such queries, and reports tables that are still in use.
+the section "replaced tables" waits some seconds for such queries, and reports tables that are still in use.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Collect the rows of one batch of events: those to insert, and changes to rows that the tables contain already.
 
-A node that starts and ends in one batch is one row to insert. Rows are tuples in the order of `core_columns`. Until
+A node that starts and ends in one batch is one row to insert. Rows are tuples in the order of `columns`. Until
 the batch is complete later events change the rows of nodes and episodes, which are lists (`node_row`) and dicts.
 """
 

@@ -3,7 +3,7 @@
 Most views select their table unchanged. `designator`, `action`, `motion`, `language` and `robot_state` select from
 `task_tree_node`, `position` and `quaternion` from `pose`; a leaf's view unites the tables of its descendants.
 
-The views exclude simulations, so that every reader sees only real episodes. `session_views` replaces them, for
+The views exclude simulations, so that every reader sees only real episodes. `generations.with_views` replaces them, for
 one connection, by views of the same names that include simulations.
 """
 

@@ -25,11 +25,12 @@ result = await sql.query("SELECT dtype, count(*) AS nodes FROM task_tree_node GR
 async with sql.stream("SELECT * FROM event", SqlLimits(rows=None)) as rows:
     async for row in rows: ...
 
-**Theory of operation.** The text of a query is untrusted: a user or a language model wrote it. Each query
-has a connection of its own, which is closed after it, so that no setting, lock or temporary table outlives a query.
-The database refuses everything but reading: SQLite through an authorizer, in a process with limits (`sqlite_reader`),
-PostgreSQL through a login without other rights, a read-only transaction and a cursor (`postgresql_reader`). Parsing the
-text here would not do, because a parser that differs from the database's in one detail would let a statement through.
+**Theory of operation.** The text of a query is untrusted: a user or a language model wrote it. Each query has a
+connection of its own, which is closed after it, so that no setting, lock or temporary table outlives a query. The
+database refuses everything but reading: SQLite through an authorizer, in a process with limits (section "sqlite
+reader"), PostgreSQL through a login without other rights, a read-only transaction and a cursor (section "postgresql
+reader"). Parsing the text here would not do, because a parser that differs from the database's in one detail would let
+a statement through.
 
 A query that reaches a bound on time is stopped: SQLite's process is killed, a server cancels it. One that reaches a
 bound on rows or bytes ends early, and `more` is True.

@@ -1,4 +1,4 @@
-"""Run one query on a SQLite file in this process, which `sqlite_reader` starts with this file as its program.
+"""Run one query on a SQLite file in this process, which `query.sql` starts with this file as its program.
 
 The parent writes one request to stdin, (URI of the file, SQL, bytes of rows, seconds), and reads an answer from stdout:
 "open", then the columns, and for each number of rows that it writes these rows. A fault ends the process after its

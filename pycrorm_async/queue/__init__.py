@@ -3,7 +3,7 @@
     spool/                     one folder, bound to one database
       log                      id of that database's log, one line; fixed while the spool holds a recorder's folder
       writer                   locked by the daemon that drains the spool
-      stored/<log id>/         segments whose records are all stored, and the stored heads (`retention/`)
+      stored/<log id>/         segments whose records are all stored, and the stored heads (`stored_segments.py`)
       <recorder>/              one recorder, one life of a process; the name is its UUID, so names sort by time
         alive                  locked (flock) by the recorder as long as it lives
         drain                  locked by the process that drains the folder

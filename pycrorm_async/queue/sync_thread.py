@@ -1,4 +1,4 @@
-"""Run the background thread of a live queue: decide when a turn begins; `queue_files` has its steps.
+"""Run the background thread of a live queue: decide when a turn begins; `QueueFiles` has its steps.
 
 **Theory of operation.** The thread sleeps in `_calls.get` while it has no work. A call puts a delay in seconds into
 `_calls`: `wake` the sync interval, so that further records gather and share one sync; `hurry` zero, for a waiter;

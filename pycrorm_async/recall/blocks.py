@@ -1,4 +1,4 @@
-"""A block holds many cases as columns; `block_rows` encodes it as rows of a table.
+"""A block holds many cases as columns; the section "block rows" encodes it as rows of a table.
 
 The cases of one type form a group, the newest first: by the time of their start, then by their node. Groups follow each
 other in the alphabetical order of their types. A column has the cases of those types that have its feature, so types

@@ -554,10 +554,10 @@ BLOCK_COLUMNS: Final = {
 }
 """The columns of `recall_block`. Its `id` is the block's number. The episodes and times are those of its cases."""
 COLUMN_COLUMNS: Final = {"feature": "key", "kind": "key", "words": "text", "data": "bytes", "checksum": "integer"}
-"""The columns of `recall_column`. Its `id` is the block's number; see `block_rows` for the others. The checksum is the
-CRC-32 of feature, kind, words and data."""
+"""The columns of `recall_column`. Its `id` is the block's number; see `recall.blocks` for the others. The checksum is
+the CRC-32 of feature, kind, words and data."""
 _FORMAT: Final = 1
-"""The format of the rows of a block (`block_rows`)."""
+"""The format of the rows of a block (`recall.blocks`)."""
 _MERGED: Final = 16
 """The number of blocks of one level that are merged into one of the next level."""
 _FULL_LEVEL: Final = 4

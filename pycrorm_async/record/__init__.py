@@ -5,10 +5,11 @@ nodes, its percepts and tags (`EpisodeWriter`), the rows of its objects, their j
 observations (`put_observation`), the values inside these (`values`), the checks of declared types (`KnownTypes`), and
 the queue (`Emitter`, `OpenEpisodes`).
 
-What comes before that differs, because the sources do. The hooks (`hooks`) read live designators and a world that
-reports its changes in the plan's own thread and context, so they build ObjectAdded and ObjectMoved from its objects and
-a declaration from the annotations of a class, copy nothing twice and take no lock. `Recording` and `RecordedEpisode`
-get keys and values from any thread: they copy and convert these first, keep the last state of each object, because they
-cannot ask for it again, build a declaration from the names of fields, and run the calls of an episode one after the
-other. One function for both would make a hook pay for the copies and the lock.
+What comes before that differs, because the sources do. The hooks of our own plan layer (`plan_recorder`, `episode`)
+read live designators and a world that reports its changes in the plan's own thread and context, so they build
+ObjectAdded and ObjectMoved from its objects and a declaration from the annotations of a class, copy nothing twice and
+take no lock. `Recording` and `RecordedEpisode` get keys and values from any thread: they copy and convert these first,
+keep the last state of each object, because they cannot ask for it again, build a declaration from the names of fields,
+and run the calls of an episode one after the other. One function for both would make a hook pay for the copies and the
+lock.
 """

@@ -362,7 +362,7 @@ def type_text(field: FieldDeclared) -> str:
 #
 # Derive the declaration of a designator class: its fields with their types, slots and columns.
 #
-# Each parameter of the class (see `parameter_types`) becomes a field. A parameter that cannot be a column is omitted
+# Each parameter of the class (see `record.parameters`) becomes a field. A parameter that cannot be a column is omitted
 # from the declaration, and its values are recorded as missing. If the whole class cannot be declared, its nodes are
 # recorded without a type. In strict mode both cases raise `DeclarationRefused` the first time the class is performed.
 

@@ -19,8 +19,8 @@ The second line makes the objects that one robot creates belong to all robots, s
 tables.
 
 From then on the owner's own login can append and migrate the log, but is refused at tables and views: members of
-`pycrorm_folder` could plant code there that would run with the owner's rights (see `search_path`). The owner folds and
-reads with logins that have no other rights:
+`pycrorm_folder` could plant code there that would run with the owner's rights (see `postgresql_engine`). The owner
+folds and reads with logins that have no other rights:
 
     CREATE ROLE lab LOGIN IN ROLE pycrorm_folder; ALTER ROLE lab IN DATABASE memory SET role = 'pycrorm_folder';
 
@@ -405,7 +405,7 @@ PARK = "UPDATE pycrorm.episode SET parked = $1 WHERE number = $2"
 
 # === dialect ==================================================================================================
 #
-# Implement `Dialect` for PostgreSQL; the SQL is in `statements` and `tables`.
+# Implement `Dialect` for PostgreSQL; the SQL is in the sections before.
 
 _SERVER_MIN = 140_000
 """The lowest supported `server_version_num`: PostgreSQL 14."""

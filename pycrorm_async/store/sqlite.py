@@ -250,7 +250,7 @@ INSERT INTO sqlite_stat1 (tbl, idx, stat) SELECT value->>0, value->>1, value->>2
 
 # === dialect ==================================================================================================
 #
-# Implement `Dialect` for SQLite; the SQL is in `statements` and `tables`.
+# Implement `Dialect` for SQLite; the SQL is in the sections before.
 
 
 class SQLite:

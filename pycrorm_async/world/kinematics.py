@@ -1,10 +1,10 @@
 """Compute an arm's tool frame from joint angles (`forward`), and joint angles for a pose of the tool frame (`solve`).
 
 For an arm of the PR2's build there is a closed form: a reachable pose has a curve of postures over the shoulder pan
-(`arm_ik`), which is sampled, both ends included, in steps of at most 0.01 rad, finer where it misses narrowly; the
+(`world.arms`), which is sampled, both ends included, in steps of at most 0.01 rad, finer where it misses narrowly; the
 result is the posture that stays farthest from every limit. Continuous joints have no limits. A refused target is out of
 reach, except for rare ones at the rim of the workspace (about 1 in 10,000 of the reachable ones there) whose only
-postures lie in a narrow range between limits. Any other arm is solved numerically (`chain_ik`).
+postures lie in a narrow range between limits. Any other arm is solved numerically (`world.arms`).
 
 The result is deterministic: on one machine the same arguments yield the same result, to the bit. `solve` verifies it by
 forward kinematics to 1e-6 m and 1e-6 rad. Collisions, with the robot itself or with objects, are not checked.

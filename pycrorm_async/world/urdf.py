@@ -246,7 +246,7 @@ class PR2Arm(ArmDescription):
     """An arm of the PR2's build: pan, lift, roll at the shoulder, flex, roll at the elbow, flex, roll at the wrist.
 
     Pan rotates about z, lift and both flexes about y, the rolls about x; with all joints 0 the arm points along x. Its
-    inverse kinematics has a closed form (`arm_ik`).
+    inverse kinematics has a closed form (`world.arms`).
     """
 
     shoulder: Vector
