@@ -5,13 +5,15 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Awaitable, Callable
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from pycrorm_async.cli.output import note
 from pycrorm_async.operations.destination import shared_address
-from pycrorm_async.query.reading import Reading
 from pycrorm_async.queue.spool import Spool
 from pycrorm_async.store.address import DatabaseAddress
+
+if TYPE_CHECKING:
+    from pycrorm_async.query.reading import Reading
 
 T = TypeVar("T")
 
@@ -21,6 +23,8 @@ def read_memory(url: str, spool: Path | None, read: Callable[[Reading], Awaitabl
 
     Raises `CallerError` for `sqlite://`, as every verb that opens the memory of another process.
     """
+    from pycrorm_async.query.reading import Reading  # loads the mapped classes, which not every verb needs
+
     shared_address(url)
 
     async def run() -> T:
