@@ -37,7 +37,7 @@ from pycrorm_async.projections.generations import (
     read_generation,
     unmade_types,
 )
-from pycrorm_async.query.named_queries import RunningEpisode, running_episodes
+from pycrorm_async.query.running_episodes import RunningEpisode, running_episodes
 from pycrorm_async.queue.maintenance import inspect_folder
 from pycrorm_async.queue.spool import RecorderFolder, Spool, wrap_os_errors
 from pycrorm_async.queue.stored_segments import kept_segments
