@@ -59,6 +59,7 @@ from pycrorm_async.events.types import Blob
 from pycrorm_async.operations.copy import tag_episode
 from pycrorm_async.operations.destination import expected_log, open_destination
 from pycrorm_async.operations.recovery import dead_queues
+from pycrorm_async.orm import ProcessMetaData
 from pycrorm_async.plan.execution import called_performs, recorder
 from pycrorm_async.plan.task import TaskTreeNode, experience
 from pycrorm_async.projections.custom import Projection, validate_projections
@@ -67,11 +68,13 @@ from pycrorm_async.query.episode_diff import EpisodeDiff
 from pycrorm_async.query.frames import BATCH_ROWS, Library
 from pycrorm_async.query.named_queries import EpisodeChoice, EpisodeSummary, episodes
 from pycrorm_async.query.notebook import Episodes, TaskTree
+from pycrorm_async.query.notebook_html import EPISODES_MAX, episodes_html
 from pycrorm_async.query.question import AskedEpisode, FrameQuery, Question, SyncQuestion
 from pycrorm_async.query.questions import Ask
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.snapshot import AnyEpisode, Moment
 from pycrorm_async.query.sql import DEFAULT_LIMITS, SqlLimits, SqlResult
+from pycrorm_async.query.success import Kind, Source, success_figure, success_samples
 from pycrorm_async.query.text import quiet, view
 from pycrorm_async.queue.locks import call_in_forked_child
 from pycrorm_async.queue.recorder_queue import RecorderQueue
@@ -104,7 +107,6 @@ if TYPE_CHECKING:
     from pycrorm_async.export.scenes import Clock as StateClock
     from pycrorm_async.export.selection import Exportable
     from pycrorm_async.query.picture import MomentReference
-    from pycrorm_async.query.success import Kind, Source
 
 
 # === memory parts =============================================================================================
@@ -479,8 +481,6 @@ class ReadableMemory(PartsHolder):
 
         It needs the extra `pictures`. Raises `CallerError` for an unknown view or column, and if no row is left.
         """
-        from pycrorm_async.query.success import success_figure, success_samples
-
         samples = await success_samples(self._open_parts.reading, x, y, of)
         return success_figure(samples, kind=kind, bins=bins, axes=axes)
 
@@ -937,9 +937,6 @@ def _episodes(address: DatabaseAddress) -> str:
 
 
 async def _read(address: DatabaseAddress) -> str:
-    from pycrorm_async.orm import ProcessMetaData
-    from pycrorm_async.query.notebook_html import EPISODES_MAX, episodes_html
-
     try:
         async with Reading.open_address(address) as reading, reading.session() as session:
             total = await session.scalar(select(func.count()).select_from(ProcessMetaData))

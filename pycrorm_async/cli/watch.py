@@ -32,7 +32,8 @@ from pycrorm_async.cli.reading import note_pending_events
 from pycrorm_async.cli.show import tree_of
 from pycrorm_async.errors import CallerError, DatabaseUnavailable, UnknownEpisode
 from pycrorm_async.events.ids import parse_episode_id
-from pycrorm_async.live.server import LogFollower, kept_token
+from pycrorm_async.live.access import kept_token
+from pycrorm_async.live.follower import LogFollower
 from pycrorm_async.operations.destination import shared_address
 from pycrorm_async.projections.row_batch import CannotFold
 from pycrorm_async.query.snapshot import Moment, MomentFold, NodeThen, unreadable

@@ -17,6 +17,7 @@ import msgspec
 from sqlalchemy import Select, func, select
 
 from pycrorm_async.orm import Object, Pose, ProcessMetaData
+from pycrorm_async.query.frames import imported
 from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary, nodes_of
 from pycrorm_async.query.question import AskedEpisode, EpisodeReader, episode_name
 from pycrorm_async.query.text import NotebookValue, parameters_text
@@ -82,8 +83,6 @@ class EpisodeDiff(NotebookValue):
 
     def frame(self) -> Any:
         """Return the differences as a pandas DataFrame. Raises `MissingExtra` where pandas is not installed."""
-        from pycrorm_async.query.frames import imported
-
         columns = list(Difference.__annotations__)
         rows = [[getattr(each, name) for name in columns] for each in self.differences]
         return imported("pandas").DataFrame(rows, columns=columns)

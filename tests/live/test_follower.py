@@ -11,8 +11,9 @@ import msgspec
 import pytest
 
 from pycrorm_async.errors import UnknownEpisode
-from pycrorm_async.live import server as following
-from pycrorm_async.live.server import LiveOverview, LiveServer, LogFollower, listen
+from pycrorm_async.live import follower as following
+from pycrorm_async.live.follower import LiveOverview, LogFollower
+from pycrorm_async.live.server import LiveServer, listen
 from pycrorm_async.memory import Memory
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.report import document as episode_fold

@@ -20,7 +20,9 @@ import pytest
 from pycrorm_async.cli.watch import draw_episode
 from pycrorm_async.errors import CallerError, DatabaseUnavailable, MissingExtra
 from pycrorm_async.events.ids import EpisodeId
-from pycrorm_async.live.server import PORT, LogFollower, kept_token, listen, refusal
+from pycrorm_async.live.access import kept_token, refusal
+from pycrorm_async.live.follower import LogFollower
+from pycrorm_async.live.server import PORT, listen
 from pycrorm_async.memory import Memory
 from pycrorm_async.operations.destination import shared_address
 from pycrorm_async.store.log import EventLog

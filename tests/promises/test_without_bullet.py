@@ -184,3 +184,31 @@ def test_an_integration_without_its_package_names_the_extra(module: str, absent:
     )
     assert done.stderr.splitlines()[-1].startswith("pycrorm_async.errors.MissingExtra: ")
     assert f"pip install 'pycrorm-async[{extra}]'" in done.stderr
+
+
+IMPORTS = """
+import importlib, json, pkgutil
+import pycrorm_async.errors
+
+EXTRAS |= set("foxglove langchain_core langgraph mcap mcp polars pyarrow py_trees rerun starlette uvicorn".split())
+needing = []
+for module in pkgutil.walk_packages(pycrorm_async.__path__, "pycrorm_async."):
+    if module.name.endswith("__main__") or module.name == "pycrorm_async.testing.fixtures":
+        continue
+    try:
+        importlib.import_module(module.name)
+    except pycrorm_async.errors.MissingExtra:
+        needing.append(module.name.removeprefix("pycrorm_async."))
+print(json.dumps(needing))
+"""
+
+
+def test_only_what_serves_an_extra_needs_it_to_be_imported(tmp_path: Path) -> None:
+    done = run(WITHOUT_EXTRAS + IMPORTS, tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout) == [
+        "integrations.callbacks",
+        "integrations.mcp_server",
+        "integrations.py_trees",
+        "live.server",
+    ]

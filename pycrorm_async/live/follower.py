@@ -1,0 +1,463 @@
+"""Read new events of the log as they are stored, for any number of pages that follow one episode or all of them.
+
+Theory of operation. One task, `LogFollower.run`, asks the log every 50 ms (150 ms if nothing happens) which episodes
+have grown, as long as a page listens, and folds the new events of those that are followed: each `EpisodeFeed` once,
+however many pages show it. After each turn it wakes the listeners, and each takes the part of the document behind the
+event that it has sent last. A feed has a lock, because a part must not be taken while events are folded. The log is
+only read. If the database does not exist yet or does not answer, `fault` has the reason and the task tries again; if
+it was replaced, the feeds are thrown away and `epoch` counts it, and the pages load again.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Iterable, Mapping
+from contextlib import asynccontextmanager
+from datetime import UTC, datetime
+from typing import Any
+
+from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable, LogDamaged
+from pycrorm_async.events.ids import EPISODE_NUMBER_MAX
+from pycrorm_async.events.types import EpisodeEnded, EpisodeStarted, NodeEnded, NodeStarted, ObjectAdded
+from pycrorm_async.projections.fold import happening_of
+from pycrorm_async.projections.row_batch import CannotFold
+from pycrorm_async.query.reading import Reading
+from pycrorm_async.query.text import parameters_text, with_object_names
+from pycrorm_async.report.document import EpisodeFold, document_behind, read_into
+from pycrorm_async.report.write import newest_episodes, overview_document
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.log import EventLog, episode_named, grown_episodes, is_simulated
+from pycrorm_async.store.stored import EpisodeRow, StoredEvent
+
+_INTERVAL_S = 0.05
+"""The pause in s between two reads of the log."""
+_IDLE_INTERVAL_S = 0.15
+"""The pause in s between two reads of a log that did not change for `_IDLE_TURNS` reads."""
+_IDLE_TURNS = 40
+"""The turns without a change after which the log is queried less often, to spare the robot's processor."""
+_RETRY_S = 0.5
+"""Delays the next attempt if the database does not answer."""
+_FEEDS_MAX = 8
+"""Bounds the folded episodes that are kept for pages without a listener, which load again or come back."""
+
+
+class EpisodeFeed:
+    """An episode, folded as far as it was read, from event `first` on.
+
+    Attributes:
+        listeners: number of pages that follow it.
+        fault: why its events cannot be read any further, or None.
+    """
+
+    def __init__(self, row: EpisodeRow, first: int) -> None:
+        self._fold = EpisodeFold(row, first)
+        self._reading = asyncio.Lock()
+        self.listeners = 0
+        self.fault: str | None = row.refused
+
+    @property
+    def id(self) -> str:
+        return self._fold.row.id
+
+    @property
+    def number(self) -> int:
+        return self._fold.row.number
+
+    @property
+    def last(self) -> int:
+        """The sequence of the last event that was folded."""
+        return self._fold.last
+
+    async def catch_up(self, log: EventLog, row: EpisodeRow) -> None:
+        """Fold the events that were stored since the last call."""
+        async with self._reading:
+            fold = self._fold
+            fold.row = row
+            self.fault = row.refused or self.fault
+            if fold.is_full or row.head <= fold.last or self.fault is not None:
+                return
+            try:
+                await read_into(fold, log, log.pages(row, after=fold.last))
+            except (LogDamaged, DatabaseForeign) as error:
+                self.fault = str(error)
+
+    async def document(self, log: EventLog, after: int = 0) -> dict[str, Any]:
+        """Return the document, or the part of it behind event `after`."""
+        async with self._reading:
+            return await document_behind(self._fold, log, after)
+
+
+class LogFollower:
+    """Follows the log at an address.
+
+    Attributes:
+        fault: why the log cannot be read at the moment, or None.
+        turn: counts the turns in which something changed.
+        epoch: counts how often the database was replaced.
+        began: number of the newest episode, except simulations, that began while the log was followed; 0 without one.
+        overview: the present activity of each episode.
+    """
+
+    def __init__(self, address: DatabaseAddress) -> None:
+        self.address = address
+        self.fault: str | None = None
+        self.turn = 0
+        self.epoch = 0
+        self.began = 0
+        self.overview = LiveOverview(address)
+        self._log: EventLog | None = None
+        self._file: tuple[int, int] | None = None
+        self._newest: int | None = None
+        """Number of the newest episode, simulations included; None before the first turn."""
+        self._feeds: dict[tuple[int, int], EpisodeFeed] = {}
+        self._growing: set[int] = set()
+        self._listeners = 0
+        self._wanted = asyncio.Event()
+        self._changed = asyncio.Condition()
+        self._opening = asyncio.Lock()
+
+    async def run(self) -> None:
+        """Follow the log until cancelled; rest while nothing listens."""
+        unchanged = 0
+        try:
+            while True:
+                await self._wanted.wait()
+                fault = self.fault
+                try:
+                    changed = await self._take_turn()
+                    self.fault = None
+                except (DatabaseUnavailable, DatabaseForeign) as error:
+                    changed, self.fault = False, str(error)
+                unchanged = 0 if changed else unchanged + 1
+                if changed or fault != self.fault:
+                    await self._wake()
+                interval_s = _INTERVAL_S if unchanged < _IDLE_TURNS else _IDLE_INTERVAL_S
+                await asyncio.sleep(interval_s if self.fault is None else _RETRY_S)
+        finally:
+            await self.close()
+
+    async def close(self) -> None:
+        """Close the connections to the database."""
+        log, self._log = self._log, None
+        await _close(self.overview, log)
+
+    async def log(self) -> EventLog:
+        """Return the open log. Raises `DatabaseUnavailable`, `DatabaseForeign`."""
+        async with self._opening:
+            file = self._identity()
+            if self._log is not None and file == self._file:
+                return self._log
+            opened = await EventLog.open(self.address, create=False)  # fails as long as there is none
+            former, self._log, self._file = self._log, opened, file  # before a wait, which may be cancelled
+            if former is not None:
+                overview, self.overview = self.overview, LiveOverview(self.address)
+                self._feeds.clear()
+                self._growing.clear()
+                self.began, self._newest = 0, None
+                self.epoch += 1
+                await _close(overview, former)
+            return opened
+
+    def _identity(self) -> tuple[int, int] | None:
+        """Return device and inode of a SQLite file, by which a file that replaces it differs."""
+        if not self.address.is_sqlite:
+            return None
+        try:
+            status = self.address.path.stat()
+        except OSError:
+            return None
+        return status.st_dev, status.st_ino
+
+    async def feed(self, name: str, first: int = 1) -> EpisodeFeed:
+        """Return the feed of an episode, folded up to its last stored event. Raises `UnknownEpisode`."""
+        log = await self.log()
+        row = await episode_named(log, name)
+        key = (row.number, first)
+        feed = self._feeds.pop(key, None)
+        if feed is None or feed.id != row.id or row.head < feed.last:
+            feed = EpisodeFeed(row, first)
+        self._feeds[key] = feed
+        for idle in [each for each, other in self._feeds.items() if not other.listeners][:-_FEEDS_MAX]:
+            del self._feeds[idle]
+        await feed.catch_up(log, row)
+        return feed
+
+    @asynccontextmanager
+    async def listening(self, followed: EpisodeFeed | LiveOverview) -> AsyncIterator[None]:
+        """Keep the feed or the overview up to date inside the context."""
+        followed.listeners += 1
+        self._listeners += 1
+        self._wanted.set()
+        try:
+            yield
+        finally:
+            followed.listeners -= 1
+            self._listeners -= 1
+            if self._listeners == 0:
+                self._wanted.clear()
+
+    async def changed_since(self, turn: int, timeout_s: float) -> bool:
+        """Wait until a turn behind this one has changed something; return False after the timeout."""
+        try:
+            async with asyncio.timeout(timeout_s), self._changed:
+                await self._changed.wait_for(lambda: self.turn > turn)
+        except TimeoutError:
+            return False
+        return True
+
+    async def _wake(self) -> None:
+        async with self._changed:
+            self.turn += 1
+            self._changed.notify_all()
+
+    async def _take_turn(self) -> bool:
+        """Fold the events stored since the last turn; return whether there were any."""
+        epoch, log = self.epoch, await self.log()
+        if self._newest is None:
+            self._newest = max([each.number for each in await log.episodes()], default=0)
+        rows = {each.number: each for each in await grown_episodes(log, above=self._newest, numbers=self._growing)}
+        self._growing = {each.number for each in rows.values() if each.ended_wall_ns is None}
+        added = [each for each in rows.values() if each.number > self._newest]
+        for row in added:
+            self._newest = row.number
+            if not await is_simulated(log, row):
+                self.began = row.number
+        changed = epoch != self.epoch or bool(added)
+        for feed in [each for each in self._feeds.values() if each.listeners]:
+            if (grown := rows.get(feed.number)) is not None:
+                before = feed.last, feed.fault
+                await feed.catch_up(log, grown)
+                changed = changed or before != (feed.last, feed.fault)
+        if self.overview.listeners:
+            changed = await self.overview.catch_up(log, rows.values()) or changed
+        return changed
+
+
+async def _close(overview: LiveOverview, log: EventLog | None) -> None:
+    try:
+        await overview.close()
+    finally:
+        if log is not None:
+            await log.close()
+
+
+# === overview =================================================================================================
+#
+# Keep the list of episodes up to date: those that had ended from the tables, the others from their events.
+
+_LISTED_MAX = 2_000
+"""Bounds the episodes of the list that are read from the tables."""
+_ENDED_MAX = 500
+"""Bounds the activities that are kept of episodes that have ended meanwhile."""
+_PAGE_EVENTS = 2_000
+"""Bounds the events that are read at once."""
+
+
+class LiveOverview:
+    """The present activity of each running episode.
+
+    Attributes:
+        listeners: number of pages that follow it.
+    """
+
+    def __init__(self, address: DatabaseAddress) -> None:
+        self.listeners = 0
+        self._reading = Reading(address)
+        self._activities: dict[int, Activity] = {}
+        self._changed_at: dict[int, int] = {}
+        """The turn in which an episode's entry changed last, by its number."""
+        self._turn = 0
+        self._folding = asyncio.Lock()
+
+    async def close(self) -> None:
+        await self._reading.close()
+
+    @property
+    def turn(self) -> int:
+        """Counts the turns in which an entry changed."""
+        return self._turn
+
+    async def catch_up(self, log: EventLog, rows: Iterable[EpisodeRow]) -> bool:
+        """Fold the new events of these episodes; return whether any entry changed."""
+        async with self._folding:
+            grown = [each for each in rows if self._is_behind(each)]
+            if not grown:
+                return False
+            self._turn += 1
+            designators = await log.dtypes()
+            for row in grown:
+                activity = self._activities.setdefault(row.number, Activity(row))
+                activity.row = row
+                await self._read(activity, log, designators)
+                self._changed_at[row.number] = self._turn
+            self._forget()
+            return True
+
+    def _is_behind(self, row: EpisodeRow) -> bool:
+        activity = self._activities.get(row.number)
+        if activity is None:
+            return row.head > 0
+        return activity.fault is None and (row.head > activity.last or row.refused != activity.row.refused)
+
+    async def _read(self, activity: Activity, log: EventLog, designators: dict[str, str]) -> None:
+        while activity.last < activity.row.head:
+            page = await log.events(activity.row.number, after=activity.last, limit=_PAGE_EVENTS)
+            if not page:
+                return
+            for event in page:
+                try:
+                    activity.read(event, designators)
+                except CannotFold as reason:
+                    activity.fault = f"event {event.sequence}: {reason}"
+                    return
+
+    def _forget(self) -> None:
+        ended = [number for number, each in self._activities.items() if each.has_ended]
+        for number in ended[:-_ENDED_MAX]:
+            del self._activities[number], self._changed_at[number]
+
+    def entries(self, since: int) -> list[dict[str, Any]]:
+        """Return the entries that changed behind a turn, without those of simulations."""
+        numbers = sorted(number for number, turn in self._changed_at.items() if turn > since)
+        return [self._activities[each].entry() for each in numbers if not self._activities[each].simulated]
+
+    async def document(self, log: EventLog) -> dict[str, Any]:
+        """Return the document of the list: the newest episodes of the tables, running ones, and those not folded."""
+        unended = [number for number, each in self._activities.items() if not each.has_ended]
+        running = await grown_episodes(log, above=EPISODE_NUMBER_MAX, numbers=unended)
+        await self.catch_up(log, {each.number: each for each in [*await log.behind(), *running]}.values())
+        try:
+            episodes, total = await newest_episodes(self._reading)
+            episodes = episodes[-_LISTED_MAX:]
+            pages = {each.number: f"episode/{each.number}" for each in episodes}
+            document = await overview_document(self._reading, "Episodes", episodes, total, pages, {})
+        except DatabaseUnavailable:  # it has no tables yet
+            document = {"title": "Episodes", "total": 0, "episodes": []}
+        entries = {each["number"]: each for each in document["episodes"]}
+        entries |= {each["number"]: each for each in self.entries(0)}
+        total = max(document["total"], len(entries))
+        return {**document, "total": total, "episodes": [entries[each] for each in sorted(entries)]}
+
+
+# === activity =================================================================================================
+#
+# Fold the events of an episode into the present activity of its robot, and into its row in the list of episodes.
+#
+# Events of motion are skipped undecoded, so that an episode of a million events is read in seconds.
+
+_READ = frozenset({"EpisodeStarted", "EpisodeEnded", "NodeStarted", "NodeEnded", "ObjectAdded"})
+_FAILED = frozenset({"FAILED", "ERROR"})
+_TEXT_MAX = 200
+"""Bounds the characters of a description, and of the text of the running nodes."""
+_NODES_IN_FULL = 2
+"""Bounds the innermost nodes that are shown with parameters."""
+
+
+class Activity:
+    """The present activity of an episode, up to the last event that was read.
+
+    Attributes:
+        last: sequence of the last event that was read.
+        simulated: True for a simulation, performed in a copy of the world.
+        fault: the reason for which its events cannot be read any further, or None.
+    """
+
+    def __init__(self, row: EpisodeRow) -> None:
+        self.row = row
+        self.last = 0
+        self.simulated = False
+        self.fault: str | None = None
+        self._description = ""
+        self._status = "RUNNING"
+        self._nodes = self._failed = 0
+        self._parents: dict[int, int | None] = {}
+        self._running: dict[int, str] = {}
+        self._actions: set[int] = set()
+        """The running nodes that are actions."""
+        self._latest = ""
+        """The action that ended last."""
+        self._causes: set[int] = set()
+        """The running nodes below which a node failed."""
+        self._reasons: dict[str, int] = {}
+        self._robots: dict[str, None] = {}
+        self._names: dict[int, str] = {}
+        self._ended_wall_ns: int | None = None
+
+    @property
+    def has_ended(self) -> bool:
+        return self._status != "RUNNING"
+
+    def read(self, event: StoredEvent, designators: Mapping[str, str]) -> None:
+        """Apply the next event. Raises `CannotFold`."""
+        self.last = event.sequence
+        if event.type not in _READ:
+            return
+        match happening_of(event):
+            case EpisodeStarted() as started:
+                self._description, self.simulated = started.description[:_TEXT_MAX], started.simulated
+            case NodeStarted() as started:
+                self._nodes += 1
+                dtype = designators.get(started.designator or "", "")
+                parameters = with_object_names(started.parameters, lambda each: self._names.get(each["object"]))
+                self._parents[event.sequence] = started.parent
+                if started.kind == "action":
+                    self._actions.add(event.sequence)
+                self._running[event.sequence] = f"{dtype or started.kind} {parameters_text(parameters)}".strip()
+            case NodeEnded() as ended:
+                self._node_ended(ended)
+            case ObjectAdded() as added:
+                self._names[event.sequence] = added.name
+                if added.object_type == "ROBOT":
+                    self._robots[added.name] = None
+            case EpisodeEnded() as ended_episode:
+                self._status, self._ended_wall_ns = ended_episode.status, event.wall_ns
+                if ended_episode.status == "LOST":
+                    self._failed += len(self._running)
+                self._running.clear()
+            case _:
+                pass
+
+    def _node_ended(self, ended: NodeEnded) -> None:
+        text = self._running.pop(ended.node, "")
+        self._latest = text if ended.node in self._actions else self._latest
+        self._actions.discard(ended.node)
+        parent = self._parents.pop(ended.node, None)
+        if ended.status not in _FAILED:
+            return
+        self._failed += 1
+        if ended.node not in self._causes:
+            reason = ended.failure.type.rpartition(".")[2] if ended.failure is not None else "no reason"
+            self._reasons[reason] = self._reasons.get(reason, 0) + 1
+        self._causes.discard(ended.node)
+        if parent is not None:
+            self._causes.add(parent)
+
+    @property
+    def now(self) -> list[str]:
+        """The nodes from the root's child down to the one that started last, the innermost ones with parameters."""
+        path: list[str] = []
+        node: int | None = max(self._running, default=None)
+        while node is not None and (parent := self._parents.get(node)) is not None:
+            text = self._running.get(node, "")
+            path.append(text if len(path) < _NODES_IN_FULL else text.partition(" ")[0])
+            node = parent
+        return [each[:_TEXT_MAX] for each in reversed(path) if each]
+
+    def entry(self) -> dict[str, Any]:
+        """Return its row, with the keys of `report.write`; its times are those of the tables, in µs."""
+        ended = self._ended_wall_ns
+        return {
+            "number": self.row.number,
+            "started": f"{datetime.fromtimestamp(self.row.started_wall_ns // 10**9, UTC):%Y-%m-%d %H:%M:%S}",
+            "description": self._description,
+            "status": self._status,
+            "seconds": None if ended is None else (ended // 1000 - self.row.started_wall_ns // 1000) / 1e6,
+            "nodes": self._nodes,
+            "failed": self._failed,
+            "reasons": dict(self._reasons),
+            "page": f"episode/{self.row.number}",
+            "unreadable": self.row.refused or self.fault or "",
+            "robots": list(self._robots),
+            "now": self.now,
+            "after": "" if self.now else self._latest[:_TEXT_MAX],
+        }
