@@ -29,7 +29,7 @@ _MOVED: Final = {
     ("recording.values.value_snapshot", "record.values"): "UnrecordableValue",
     ("recording.writing.emitter", "record.episode_writer"): "BlobRefused",
     ("store.append_rules", "store.append"): "NumbersExhausted",
-    ("store.postgresql.errors", "store.postgresql_engine"): "CommitInDoubt",
+    ("store.postgresql.errors", "store.postgresql_errors"): "CommitInDoubt",
     ("world.enums", "world.pose"): "Arms Grasp GripperState JointType ObjectType WorldMode",
     ("world.errors", "world.pose"): """
         AttachmentRefused BulletMissing CostmapMismatch DescriptionNotLoadable DuplicateName

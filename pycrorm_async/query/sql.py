@@ -53,7 +53,6 @@ from decimal import Decimal
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
-import asyncpg
 from sqlalchemy.ext.asyncio import AsyncEngine
 
 from pycrorm_async.errors import QueryRefused
@@ -62,6 +61,7 @@ from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.postgresql_engine import LOG_SCHEMA, TABLES_SCHEMA, VIEWS_SCHEMA
 
 if TYPE_CHECKING:
+    import asyncpg
     import pandas as pd
 
 
@@ -225,6 +225,8 @@ class _Cursor:
         """
         if ";" not in query:
             return query
+        import asyncpg  # takes a tenth of a second to load, which readers of SQLite need not wait for
+
         text = f"({query}\n)"
         await self._connection.execute("SAVEPOINT pycrorm_end")  # an error would end the transaction
         try:
@@ -256,6 +258,8 @@ class _Cursor:
     @asynccontextmanager
     async def _bounded(self, seconds: float) -> AsyncIterator[None]:
         """Stop the statement inside after this time, and raise its own errors as `QueryRefused`."""
+        import asyncpg
+
         try:
             async with asyncio.timeout(seconds):  # cancels it on the server, too
                 yield
@@ -310,8 +314,7 @@ async def postgresql_cursor(engine: AsyncEngine, sql: str, *, bytes_max: int, se
     """Run one query on a connection of its own, which is closed at the end."""
     async with engine.connect() as connection:
         try:
-            driver = (await connection.get_raw_connection()).driver_connection
-            assert isinstance(driver, asyncpg.Connection)
+            driver: Any = (await connection.get_raw_connection()).driver_connection
             cursor = _Cursor(driver, bytes_max)
             await cursor.start(sql, seconds)
             yield cursor

@@ -45,7 +45,7 @@ from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 from pycrorm_async.bulk_records import make
 from pycrorm_async.errors import DatabaseError, DatabaseForeign, DatabaseUnavailable, PycrormError, TablesUntrusted
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX
-from pycrorm_async.store import postgresql_engine
+from pycrorm_async.store import postgresql_errors
 from pycrorm_async.store.dialect import (
     Birth,
     DigestStatements,
@@ -418,7 +418,7 @@ class PostgreSQL:
     migrations: Migrations = MIGRATIONS
     digest_statements = DIGEST_STATEMENTS
     blob_table: Sequence[str] = BLOB
-    faults: tuple[type[Exception], ...] = postgresql_engine.FAULTS
+    faults: tuple[type[Exception], ...] = postgresql_errors.FAULTS
 
     # --- finding and creating a log ---------------------------------------------------------------------------------
 
@@ -535,7 +535,7 @@ class PostgreSQL:
         connected.pop(WARNING, None)
         await connection.commit()
         if WARNING in connected:
-            raise postgresql_engine.CommitInDoubt(connected[WARNING])
+            raise postgresql_errors.CommitInDoubt(connected[WARNING])
 
     async def events_by_key(self, connection: AsyncConnection, keys: Sequence[tuple[int, int]]) -> list[StoredEvent]:
         return await _rows(StoredEvent, connection, SELECT_STORED_AGAIN, *_arrays(keys, 2))
@@ -584,7 +584,7 @@ class PostgreSQL:
         try:
             await connection.exec_driver_sql(f"LOCK TABLE {named} IN ACCESS SHARE MODE")
         except DBAPIError as error:
-            if postgresql_engine.is_missing_table(error):
+            if postgresql_errors.is_missing_table(error):
                 return False
             raise
         return True
@@ -711,7 +711,7 @@ class PostgreSQL:
     ) -> None:
         arrays = ", ".join(f"${index}::{kind}[]" for index, kind in enumerate(columns.values(), 1))
         changes = ", ".join(f"{column} = change.{column}" for column in list(columns)[1:])
-        with postgresql_engine.rows_refused():
+        with postgresql_errors.rows_refused():
             await connection.exec_driver_sql(
                 f"UPDATE {table} SET {changes}"
                 f" FROM unnest({arrays}) AS change ({', '.join(columns)}) WHERE {table}.id = change.id",
@@ -721,10 +721,10 @@ class PostgreSQL:
     # --- faults -------------------------------------------------------------------------------------------------
 
     def refusal(self, error: Exception) -> str | None:
-        return postgresql_engine.refusal(error)
+        return postgresql_errors.refusal(error)
 
     def translate_error(self, error: Exception, name: str) -> PycrormError:
-        return postgresql_engine.translate_error(error, name)
+        return postgresql_errors.translate_error(error, name)
 
 
 def _confirming(configured: str) -> int:
@@ -749,7 +749,7 @@ async def _copy(
 ) -> None:
     """Insert rows by COPY, in the transaction that an earlier statement through SQLAlchemy began."""
     driver = await _driver(connection)
-    with postgresql_engine.rows_refused():
+    with postgresql_errors.rows_refused():
         await driver.copy_records_to_table(table, schema_name=schema, columns=columns, records=rows)
 
 
