@@ -15,7 +15,8 @@ from contextlib import contextmanager
 import asyncpg
 from sqlalchemy.exc import DataError, DBAPIError, IntegrityError, InterfaceError
 
-from pycrorm_async.errors import DamageError, DatabaseUnavailable, InternalError, PycrormError, RowRefused
+from pycrorm_async.errors import DamageError, DatabaseUnavailable, InternalError, PycrormError
+from pycrorm_async.store.dialect import RowRefused
 
 FAULTS: tuple[type[Exception], ...] = (
     DBAPIError,
