@@ -25,10 +25,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from bench.reporting.budgets import BUDGETS, verdict_on
-from bench.reporting.figures import console
-from bench.reporting.machine import hardware, versions
-from bench.reporting.page import page
-from bench.reporting.plots import draw
+from bench.reporting.figures import console, hardware, versions
+from bench.reporting.page import draw, page
 
 
 class Run(NamedTuple):

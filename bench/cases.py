@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.material.actions import Actions
-from bench.material.spool_recording import spool_rollouts
+from bench.material.rollouts import spool_rollouts
 from bench.reporting.figures import console, cpu_s_of, percentiles, spread, with_children
 from pycrorm_async import Reading
 from pycrorm_async.bulk_records import collect_seldom

@@ -32,22 +32,15 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from bench.breaking import (
-    crafted_frames,
-    databases,
-    declarations,
-    deletions,
-    disks,
-    files,
-    machine,
-    processes,
-    restores,
-    robots,
-    simulation,
-    workers,
-)
-from bench.breaking.outcome import Outcome, Step
-from bench.breaking.report import Report, Slice, summed
+from bench.breaking import databases, disks, files, processes, restores
+from bench.breaking import databases as declarations
+from bench.breaking import disks as machine
+from bench.breaking import files as crafted_frames
+from bench.breaking import files as simulation
+from bench.breaking import processes as robots
+from bench.breaking import processes as workers
+from bench.breaking import restores as deletions
+from bench.breaking.outcome import Outcome, Report, Slice, Step, summed
 from pycrorm_async.store.address import usual_place
 from tests.databases import Server, server_in
 

@@ -31,8 +31,7 @@ from typing import Any, NamedTuple
 from rich.table import Table
 
 from bench.daemon import start_daemon, stop
-from bench.material.fold_progress import progress, until_folded
-from bench.material.spool_recording import spool_rollouts
+from bench.material.rollouts import progress, spool_rollouts, until_folded
 from bench.reporting.figures import console, held_mb, spread
 from pycrorm_async import Memory
 from pycrorm_async.plan import ActionAbstract

@@ -35,7 +35,7 @@ from urllib.parse import urlsplit
 from rich.console import Console
 from rich.table import Table
 
-from bench.breaking.child_process import ChildProcess
+from bench.breaking.processes import ChildProcess
 from bench.daemon import start_daemon, stop
 from bench.material.turns import NothingActionPerformable, TurnTaker, nothing_action
 from pycrorm_async import Memory, Settings

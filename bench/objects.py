@@ -29,10 +29,8 @@ from rich.table import Table
 from sqlalchemy import Engine, select
 from sqlalchemy.orm import Session
 
-from bench.baseline.store import engine_of, store
-from bench.baseline.tables import LEAVES, ActionRow, TaskTreeNodeRow
-from bench.material.rollouts import tree
-from bench.material.spool_recording import spool_tree
+from bench.material.baseline import LEAVES, ActionRow, TaskTreeNodeRow, engine_of, store
+from bench.material.rollouts import spool_tree, tree
 from bench.reporting.figures import MISSING, console, spread
 from pycrorm_async import Reading
 from pycrorm_async.operations.recovery import recover

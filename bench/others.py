@@ -19,28 +19,327 @@ from __future__ import annotations
 
 import argparse
 import asyncio
+import importlib
 import itertools
 import json
+import mmap
+import os
 import shutil
 import signal
+import sqlite3
 import tempfile
-from collections.abc import Callable, Iterator
+import time
+import uuid
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, suppress
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import asyncpg
+import msgspec
 from rich.table import Table
+from sqlalchemy.engine import make_url
+from sqlalchemy.ext.asyncio import create_async_engine
 
-from bench.material.contenders import CONTENDERS, Contender, Material
-from bench.material.rollouts import tree
-from bench.material.spool_recording import spool_tree
+from bench.material.rollouts import Recording, spool_tree, tree
 from bench.reporting.figures import MISSING, console, spread
 from pycrorm_async.bulk_records import collect_seldom
-from pycrorm_async.events.codec import Record
+from pycrorm_async.clock import SYSTEM_CLOCK
+from pycrorm_async.events.codec import Heading, Record, decode, encode
+from pycrorm_async.events.types import Happening
+from pycrorm_async.operations.destination import open_destination
 from pycrorm_async.queue import Spool, open_dead
+from pycrorm_async.settings import Settings
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.log import EventLog
+from pycrorm_async.writer.drain import Drain
 from tests.databases import Server, server_in
+
+# === contenders ===============================================================================================
+#
+# Store the same events with this package, with other libraries, and with plain SQL: one function for each way.
+
+_RAW_BATCH = 10_000
+_INSERT = "INSERT INTO event (episode, sequence, type, version, wall_ns, monotonic_ns, payload) VALUES (?,?,?,?,?,?,?)"
+_INSERT_AS_JSON = """
+INSERT INTO event (episode, sequence, type, version, wall_ns, monotonic_ns, payload)
+SELECT value->>0, value->>1, value->>2, value->>3, value->>4, value->>5, value->>6 FROM json_each(?)"""
+_COLUMNS = ("episode", "sequence", "type", "version", "wall_ns", "monotonic_ns", "payload")
+
+
+class Material(NamedTuple):
+    """The events, the spool that contains them, and a folder for the files of the contenders."""
+
+    records: list[Record]
+    spool: Path
+    folder: Path
+
+    @property
+    def rows(self) -> list[tuple[Any, ...]]:
+        return [(1, *each[2:7], each.payload.decode()) for each in self.records]
+
+
+Contender = Callable[[Material, str], float]
+"""Store all events at this URL, and return the seconds this took."""
+
+
+def _batches(values: Sequence[Any], size: int) -> Iterator[Sequence[Any]]:
+    return (values[first : first + size] for first in range(0, len(values), size))
+
+
+# --- into the database ----------------------------------------------------------------------------------------------
+
+
+def ours(material: Material, url: str) -> float:
+    spool = Path(tempfile.mkdtemp(dir=material.folder)) / "spool"
+    shutil.copytree(material.spool, spool)
+    return asyncio.run(_drain_spool(spool, url))
+
+
+async def _drain_spool(spool: Path, url: str) -> float:
+    spool_folder, settings = Spool(spool), Settings()
+    async with open_destination(DatabaseAddress.parse(url), spool_folder, clock=SYSTEM_CLOCK) as destination:
+        [folder] = spool_folder.recorders()
+        began = time.perf_counter()
+        queue = open_dead(folder.path)
+        assert queue is not None
+        await Drain(queue, destination.append, settings=settings).run()
+        took = time.perf_counter() - began
+        queue.release()
+    return took
+
+
+def eventsource_py(material: Material, url: str) -> float:
+    eventsource = importlib.import_module("eventsource")
+
+    class Happened(eventsource.DomainEvent):  # type: ignore[misc, name-defined]
+        aggregate_type: str = "Episode"
+        body: str
+
+    aggregate = uuid.uuid4()
+    events = [Happened(aggregate_id=aggregate, body=each.payload.decode()) for each in material.records]
+
+    async def append_all() -> float:
+        if url.startswith("postgresql:"):
+            engine = create_async_engine(url.replace("postgresql:", "postgresql+asyncpg:"))
+            store = eventsource.PostgreSQLEventStore(engine, create_schema=True, owns_engine=True)
+        else:
+            store = eventsource.SQLiteEventStore(url.removeprefix("sqlite:///"))
+        stream, any_version = eventsource.StreamId(aggregate, "Episode"), eventsource.ExpectedVersion.any_()
+        await store.append(eventsource.StreamId(uuid.uuid4(), "Warm"), [_warm_up_event(Happened)], any_version)
+        began = time.perf_counter()
+        for batch in _batches(events, 1_000):
+            await store.append(stream, batch, any_version)
+        took = time.perf_counter() - began
+        await store.close()
+        return took
+
+    return asyncio.run(append_all())
+
+
+def _warm_up_event(kind: Any) -> Any:
+    """Return an event to store first, so that connecting and creating tables is not measured."""
+    return kind(aggregate_id=uuid.uuid4(), body="{}")
+
+
+def eventsourcing(material: Material, url: str) -> float:
+    persistence = importlib.import_module("eventsourcing.persistence")
+    if url.startswith("postgresql:"):
+        importlib.import_module("eventsourcing.postgres")
+        address = make_url(url)
+        environment = {
+            "PERSISTENCE_MODULE": "eventsourcing.postgres",
+            "POSTGRES_DBNAME": str(address.database),
+            "POSTGRES_HOST": str(address.query["host"]),
+            "POSTGRES_PORT": "5432",
+            "POSTGRES_USER": "postgres",
+            "POSTGRES_PASSWORD": "none",
+        }
+    else:
+        path = url.removeprefix("sqlite:///")
+        environment = {"PERSISTENCE_MODULE": "eventsourcing.sqlite", "SQLITE_DBNAME": path}
+    factory = persistence.InfrastructureFactory.construct(persistence.Environment("bench", environment))
+    recorder = factory.application_recorder()
+    name, warm_up = uuid.uuid4(), persistence.StoredEvent(uuid.uuid4(), 1, "warm", b"{}")
+    events = [
+        persistence.StoredEvent(name, number, each.type, each.payload)
+        for number, each in enumerate(material.records, 1)
+    ]
+    recorder.insert_events([warm_up])
+    began = time.perf_counter()
+    # With 5,000 a call psycopg and the server deadlock.
+    for batch in _batches(events, 1_000 if url.startswith("postgresql:") else 5_000):
+        recorder.insert_events(batch)
+    took = time.perf_counter() - began
+    factory.close()
+    return took
+
+
+def raw_executemany(material: Material, url: str) -> float:
+    def insert(connection: sqlite3.Connection, batch: Sequence[tuple[Any, ...]]) -> None:
+        connection.executemany(_INSERT, batch)
+
+    return _raw_sqlite(material, url, insert)
+
+
+def raw_json_each(material: Material, url: str) -> float:
+    def insert(connection: sqlite3.Connection, batch: Sequence[tuple[Any, ...]]) -> None:
+        connection.execute(_INSERT_AS_JSON, (msgspec.json.encode(batch).decode(),))
+
+    return _raw_sqlite(material, url, insert)
+
+
+def _raw_sqlite(material: Material, url: str, insert: Callable[[sqlite3.Connection, Any], None]) -> float:
+    rows = material.rows
+    _create_log(url)
+    connection = sqlite3.connect(url.removeprefix("sqlite:///"), isolation_level=None)
+    connection.execute("PRAGMA synchronous = FULL")
+    connection.execute("PRAGMA wal_autocheckpoint = 4000")
+    began = time.perf_counter()
+    for batch in _batches(rows, _RAW_BATCH):
+        connection.execute("BEGIN IMMEDIATE")
+        insert(connection, batch)
+        connection.execute("COMMIT")
+    took = time.perf_counter() - began
+    connection.close()
+    return took
+
+
+def raw_copy(material: Material, url: str) -> float:
+    async def copy_all() -> float:
+        connection = await asyncpg.connect(url)
+        began = time.perf_counter()
+        for batch in _batches(rows, _RAW_BATCH):
+            await connection.copy_records_to_table("event", schema_name="pycrorm", columns=_COLUMNS, records=batch)
+        took = time.perf_counter() - began
+        await connection.close()
+        return took
+
+    rows = material.rows
+    _create_log(url)
+    return asyncio.run(copy_all())
+
+
+def raw_executemany_postgresql(material: Material, url: str) -> float:
+    async def insert_all() -> float:
+        connection = await asyncpg.connect(url)
+        statement = f"INSERT INTO pycrorm.event ({', '.join(_COLUMNS)}) VALUES ($1, $2, $3, $4, $5, $6, $7)"
+        began = time.perf_counter()
+        for batch in _batches(rows, _RAW_BATCH):
+            await connection.executemany(statement, batch)
+        took = time.perf_counter() - began
+        await connection.close()
+        return took
+
+    rows = material.rows
+    _create_log(url)
+    return asyncio.run(insert_all())
+
+
+def _create_log(url: str) -> None:
+    """Create the table of our log, with its key and its triggers."""
+
+    async def create() -> None:
+        await (await EventLog.open(DatabaseAddress.parse(url), create=True)).close()
+
+    asyncio.run(create())
+
+
+# --- into a durable queue -------------------------------------------------------------------------------------------
+
+
+def our_queue(material: Material, _url: str) -> float:
+    recording = Recording(Path(tempfile.mkdtemp(dir=material.folder)) / "spool", live=True)
+    began = time.perf_counter()
+    put = recording.queue.put_nowait
+    for each in material.records:
+        put(Heading(each.episode, each.type, each.version), each.payload)
+    took = time.perf_counter() - began
+    recording.leave()
+    return took
+
+
+def encode_checksum_and_copy(material: Material, _url: str) -> float:
+    """Encode each event, compute its checksum and copy both into a mapped file; every queue on disk must do this."""
+    events: list[Happening] = [decode(each.type, each.payload, each.version) for each in material.records]
+    size = sum(len(each.payload) + 8 for each in material.records)
+    with (material.folder / "raw").open("w+b") as file:
+        os.posix_fallocate(file.fileno(), 0, size)
+        with mmap.mmap(file.fileno(), size) as memory:
+            began = time.perf_counter()
+            start = 0
+            for event in events:
+                payload = encode(event)
+                end = start + 8 + len(payload)
+                memory[start:end] = zlib.crc32(payload).to_bytes(8, "little") + payload
+                start = end
+            return time.perf_counter() - began
+
+
+def persist_queue_sqlite(material: Material, _url: str) -> float:
+    persistqueue = importlib.import_module("persistqueue")
+    queue = persistqueue.SQLiteQueue(tempfile.mkdtemp(dir=material.folder), auto_commit=True)
+    return _put_all(queue.put, material.records)
+
+
+def persist_queue_file(material: Material, _url: str) -> float:
+    persistqueue = importlib.import_module("persistqueue")
+    queue = persistqueue.Queue(tempfile.mkdtemp(dir=material.folder))
+    return _put_all(queue.put, material.records)
+
+
+def sqlite_autocommit(material: Material, _url: str) -> float:
+    """Commit each event; with WAL and synchronous=NORMAL it survives power loss only after a checkpoint."""
+    connection = sqlite3.connect(f"{tempfile.mkdtemp(dir=material.folder)}/queue.db", isolation_level=None)
+    connection.execute("PRAGMA journal_mode = WAL")
+    connection.execute("PRAGMA synchronous = NORMAL")
+    connection.execute("CREATE TABLE queue (id INTEGER PRIMARY KEY, type TEXT, payload BLOB)")
+
+    def put(record: tuple[str, bytes]) -> None:
+        connection.execute("INSERT INTO queue (type, payload) VALUES (?, ?)", record)
+
+    return _put_all(put, material.records)
+
+
+def _put_all(put: Callable[[tuple[str, bytes]], Any], records: Iterable[Record]) -> float:
+    values = [(each.type, each.payload) for each in records]
+    began = time.perf_counter()
+    for value in values:
+        put(value)
+    return time.perf_counter() - began
+
+
+# --- all contenders -------------------------------------------------------------------------------------------------
+
+CONTENDERS: dict[str, dict[str, Contender]] = {
+    "sqlite": {
+        "ours": ours,
+        "executemany": raw_executemany,
+        "json_each": raw_json_each,
+        "eventsource-py": eventsource_py,
+        "eventsourcing": eventsourcing,
+    },
+    "postgresql": {
+        "ours": ours,
+        "COPY": raw_copy,
+        "executemany": raw_executemany_postgresql,
+        "eventsource-py": eventsource_py,
+        "eventsourcing": eventsourcing,
+    },
+    "queue": {
+        "ours": our_queue,
+        "encode + checksum + copy": encode_checksum_and_copy,
+        "persist-queue, SQLite": persist_queue_sqlite,
+        "persist-queue, file": persist_queue_file,
+        "sqlite3 autocommit": sqlite_autocommit,
+    },
+}
+
+
+# === others ===================================================================================================
 
 _SECONDS_MAX = 600
 

@@ -27,7 +27,7 @@ from typing import Any
 from rich.table import Table
 from sqlalchemy import func, select
 
-from bench.material.spool_recording import spool_rollouts
+from bench.material.rollouts import spool_rollouts
 from bench.reporting.figures import console, spread
 from pycrorm_async import Memory, Reading, UserView
 from pycrorm_async.operations.recovery import recover

@@ -31,7 +31,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from bench.concurrent_processes import ConcurrentProcesses
+from bench.material.concurrent_processes import ConcurrentProcesses
 from pycrorm_async.bulk_records import collect_seldom
 from pycrorm_async.events.codec import Record
 from pycrorm_async.events.ids import EpisodeId

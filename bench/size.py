@@ -23,8 +23,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from bench.material.rollouts import Tree, tree
-from bench.material.spool_recording import spool_tree
+from bench.material.rollouts import Tree, spool_tree, tree
 from bench.reporting.figures import MISSING
 from bench.thesis import run_baseline, store_by_us
 from tests.databases import ask, server_in

@@ -31,12 +31,9 @@ from typing import Any
 
 from rich.table import Table
 
-from bench.baseline.store import Statements, engine_of, store
-from bench.baseline.tables import BaselineBase
 from bench.daemon import start_daemon, stop
-from bench.material.fold_progress import until_folded
-from bench.material.rollouts import Tree, tree
-from bench.material.spool_recording import spool_tree
+from bench.material.baseline import BaselineBase, Statements, engine_of, store
+from bench.material.rollouts import Tree, spool_tree, tree, until_folded
 from bench.reporting.figures import MISSING, console, cpu_s_of, held_mb, memory_free_gb, peak_mb, spread, with_children
 from tests.databases import Server, ask, server_in
 

@@ -242,3 +242,23 @@ def one_line_of(done: subprocess.CompletedProcess[str]) -> str:
     lines = [line for line in done.stderr.splitlines() if line.strip()]
     assert len(lines) == 1, done.stderr
     return lines[0]
+
+
+# === note plan ================================================================================================
+#
+# A plan that takes three notes, for tests of the command.
+
+NOTES_PLAN = """
+from dataclasses import dataclass
+from pycrorm_async.plan import ActionAbstract
+
+@dataclass
+class NoteActionPerformable(ActionAbstract):
+    text: str
+    async def perform(self): ...
+
+async def plan():
+    '''Take three notes.'''
+    for text in "abc":
+        await NoteActionPerformable(text).perform()
+"""

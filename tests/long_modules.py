@@ -14,11 +14,11 @@ import pytest
 
 LONGEST: Final = """
     integrations/pycram/test_unusual_plans integrations/pycram/test_plans crash/test_crash_points
-    crash/test_stopped_daemon learning/test_experiment crash/test_cancelled cli/test_learn
-    learning/test_recorded_policy promises/test_defects_of_storage crash/test_many_machines
-    operations/test_faulty_workers crash/test_rebuild_kill projections/test_rebuild promises/test_public_types
-    operations/test_daemonic_process plan/test_base_clearance plan/test_opening_poses memory/test_restored_database
-    store/test_postgresql_faults crash/test_queue_kill crash/test_daemon_kill bench/test_quick copying/test_copy
+    crash/test_daemon learning/test_experiment crash/test_cancelled cli/test_learn
+    learning/test_policy promises/test_defects_of_storage crash/test_many_machines
+    operations/test_workers crash/test_rebuild_kill projections/test_rebuild promises/test_public_types
+    plan/test_locations plan/test_doors memory/test_lost_storage
+    store/test_postgresql_faults crash/test_killed bench/test_figures operations/test_copy
     promises/test_pages
 """.split()
 """The modules with a test of 5 s or more, the longest first. Most tests of a run take less than 0.1 s."""

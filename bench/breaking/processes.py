@@ -1,36 +1,154 @@
-"""Faults of processes: killed recorders and appenders, forks, exits with a full queue, several drains of one folder."""
+"""Faults of processes: killed recorders, plans, daemons and fold workers, forks, exits, several drains."""
 
 from __future__ import annotations
 
 import asyncio
+import atexit
 import contextlib
+import ctypes
+import itertools
+import multiprocessing
 import os
 import random
 import shutil
 import signal
+import struct
 import sys
 import tempfile
+import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
 from itertools import count
+from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import NamedTuple
 
-from bench.breaking.child_process import SPAWN, ChildProcess, kill_me_after
+import msgspec
+
+from bench.breaking.databases import start_again
 from bench.breaking.files import ROOMY, events_of, put
-from bench.breaking.outcome import Outcome, Step
+from bench.breaking.outcome import Event, Outcome, Step
+from pycrorm_async import Memory
 from pycrorm_async.errors import SpoolClosed, SpoolFull
 from pycrorm_async.events.codec import LOST
 from pycrorm_async.events.ids import episode_text
+from pycrorm_async.operations.daemon import serve
+from pycrorm_async.operations.recovery import recover as recover_spool
+from pycrorm_async.operations.workers import DaemonNote
+from pycrorm_async.projections.verify import verify
 from pycrorm_async.queue import Spool, open_dead
+from pycrorm_async.settings import Writer
 from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.log import EventLog
 from tests.crash import recorder_process
-from tests.databases import ask
+from tests.crash.step_robot import SETTINGS, StepActionPerformable, report
+from tests.databases import Server, ask
 from tests.queue.factories import SMALL, episode, make, node, recover
 from tests.store.test_crash import PER_BATCH, append_all, batch
 
-__all__ = ["killed_recorders", "killed_appenders", "forks", "exits_with_a_full_queue", "second_openers"]
+# === child process ============================================================================================
+#
+# Run a function in a child process that prints its progress; the parent keeps the output when the child is killed.
+
+SPAWN = multiprocessing.get_context("forkserver")
+# The fork server imports these once, so that a child starts by a fork instead of a new interpreter with its imports.
+SPAWN.set_forkserver_preload(["bench.breaking.disks", "bench.breaking.files", "rich.progress", "rich.table"])
+_PATIENCE_S = 3600.0
+"""Bounds the wait for output. On a busy machine a process may start for minutes; an exit is noticed at once."""
+
+
+class ChildProcess:
+    """Run `target(*arguments)` in a process; a thread reads its output all the time, so that the child never blocks.
+
+    Start all children from one thread, because starting one reaps the others.
+    """
+
+    def __init__(self, target: Callable[..., None], *arguments: object) -> None:
+        reader, writer = SPAWN.Pipe(duplex=False)
+        self._process = SPAWN.Process(target=_run, args=(writer, target, *arguments))
+        self._process.start()
+        atexit.register(self._process.kill)  # not daemonic, because a daemonic process must not start fold workers
+        writer.close()
+        self._output = bytearray()
+        self._reader = threading.Thread(target=self._read, args=(reader,), daemon=True)
+        self._reader.start()
+
+    @property
+    def is_running(self) -> bool:
+        return self._process.is_alive()
+
+    def wait_for(self, text: str) -> None:
+        """Wait until the output contains this text; raise `RuntimeError` if the child ends before."""
+        deadline = time.monotonic() + _PATIENCE_S
+        while text.encode() not in self._output:
+            if not self.is_running or time.monotonic() > deadline:
+                raise RuntimeError(
+                    f"the child did not print {text!r}; its last output is {bytes(self._output[-200:])!r}"
+                )
+            time.sleep(0.001)
+
+    def kill(self) -> list[list[str]]:
+        """Send SIGKILL and return the lines, split into words. Raise `RuntimeError` if the child had already ended."""
+        self._process.kill()
+        return self.wait_until_killed()
+
+    def wait_until_killed(self) -> list[list[str]]:
+        """Wait until another process, or the child itself, sends SIGKILL; return its lines."""
+        lines = self.wait()
+        if self._process.exitcode != -9:
+            raise RuntimeError(f"the child was not killed but ended with exit code {self._process.exitcode}")
+        return lines
+
+    def stop(self) -> list[list[str]]:
+        """Kill it if it still runs, and return its lines."""
+        self._process.kill()
+        return self.wait()
+
+    def wait(self) -> list[list[str]]:
+        """Wait until it has ended, and return its lines."""
+        self._process.join()
+        self._reader.join()
+        return self.lines
+
+    @property
+    def lines(self) -> list[list[str]]:
+        """The words of every complete line so far."""
+        output = bytes(self._output)
+        return [line.split() for line in output[: output.rfind(b"\n") + 1].decode().splitlines()]
+
+    def _read(self, reader: Connection) -> None:
+        while chunk := os.read(reader.fileno(), 1 << 20):
+            self._output += chunk
+        reader.close()
+
+
+def _run(out: Connection, target: Callable[..., None], *arguments: object) -> None:
+    """Run the target in the child, with stdout connected to `out`."""
+    os.dup2(out.fileno(), 1)
+    out.close()
+    sys.stdout = os.fdopen(1, "w", buffering=1, closefd=False)
+    target(*arguments)
+
+
+def kill_me_after(cpu_s: float) -> None:
+    """Let the kernel send SIGKILL to this process after `cpu_s` more seconds of CPU time.
+
+    CPU time makes the life of the process equally long on a busy and on an idle machine.
+    """
+    event, timer = struct.pack("Pii48x", 0, signal.SIGKILL, 0), ctypes.c_void_p()
+    assert _C.timer_create(time.CLOCK_PROCESS_CPUTIME_ID, event, ctypes.byref(timer)) == 0
+    assert _C.timer_settime(timer, 0, struct.pack("4l", 0, 0, 0, max(1, round(cpu_s * 1e9))), None) == 0
+
+
+_C = ctypes.CDLL(None)
+
+
+# === processes ================================================================================================
+#
+# Faults of processes: killed recorders and appenders, forks, exits with a full queue, several drains of one folder.
 
 _LONGEST_LIFE_S = 0.1
 _AT_ONCE = 4
@@ -244,3 +362,208 @@ def second_openers(rounds: int, rng: random.Random, folder: Path, step: Step) ->
         shutil.rmtree(queue.folder.parent)
         step()
     return outcome
+
+
+# === robots ===================================================================================================
+#
+# Kill plans that record with a writer thread or through the daemon, kill the daemon, and kill its server.
+#
+# The lines that a plan printed before its death are compared with the rows of its steps. The comparison therefore
+# covers everything between `perform` and the tables.
+
+_LONGEST_ROBOT_S = 0.2
+_SETTINGS = replace(SETTINGS, connect_timeout_s=3600.0, flush_timeout_s=3600.0)
+"""Timeouts that no busy machine reaches: opening a database may take a minute there."""
+_STEPS = (
+    "SELECT place, step, status FROM step_action JOIN task_tree_node ON step_action.id = task_tree_node.id"
+    " ORDER BY step_action.id"
+)
+_INCOMPLETE = (
+    "SELECT count(*) FROM episode WHERE refused IS NOT NULL OR parked IS NOT NULL OR head <> folded OR head <>"
+    " (SELECT count(*) FROM event WHERE event.episode = episode.number)"
+)
+
+
+def walk(url: str, spool: str, writer: Writer, name: str, seed: int) -> None:
+    """Run an endless plan; print `did PLACE STEP` after each `perform`, and `synced` after a sync of all of them."""
+    asyncio.run(_walk(url, Path(spool), writer, name, random.Random(seed)))
+
+
+async def _walk(url: str, spool: Path, writer: Writer, name: str, rng: random.Random) -> None:
+    async with Memory.open(url, spool=spool, writer=writer, settings=_SETTINGS) as memory:
+        for number in itertools.count():
+            place = f"{name}.{number}"
+            async with memory.episode(description=place):
+                for step in range(1, rng.randrange(2, 60)):
+                    await StepActionPerformable(place, step).perform()
+                    report("did", place, step)
+                    chance = rng.random()
+                    if chance < 0.5:
+                        await asyncio.sleep(rng.random() * 0.005)
+                    elif chance < 0.55:
+                        await memory.synced()
+                        report("synced")
+
+
+class RecordedSteps:
+    """Collect the lines of killed plans: `certain` steps must exist, `possible` steps may exist."""
+
+    def __init__(self) -> None:
+        self.certain: list[Event] = []
+        self.possible: list[Event] = []
+
+    def add(self, lines: list[list[str]], *, when_synced: bool = False) -> None:
+        """Add the lines of one plan. With `when_synced` only the steps before the last `synced` are certain."""
+        returned = [(index, line[1], int(line[2])) for index, line in enumerate(lines) if line[0] == "did"]
+        end = max([-1, *(index for index, line in enumerate(lines) if line[0] == "synced")])
+        done = [(index, (place, step, "SUCCEEDED")) for index, place, step in returned]
+        self.certain += [each for index, each in done if index < end or not when_synced]
+        uncertain = [each for index, each in done if index > end and when_synced]
+        # The plan died in the next step of the episode or in the first of the next one: LOST unless it had ended.
+        last, sequence = (returned[-1][1], returned[-1][2]) if returned else ("", 0)
+        name, _, number = last.rpartition(".")
+        following = [(last, sequence + 1), (f"{name}.{int(number) + 1}", 1)] if returned else []
+        self.possible += uncertain + [(place, step, "LOST") for place, step, _ in uncertain]
+        self.possible += [(place, step, status) for place, step in following for status in ("SUCCEEDED", "LOST")]
+
+
+def compare_steps(outcome: Outcome, steps: RecordedSteps, url: str) -> None:
+    """Count one round: compare the rows of the steps, and count incomplete episodes. No process may still write."""
+    rows = [(place, step, status) for place, step, status in ask(url, _STEPS)]
+    outcome.compare(steps.certain, rows, put=steps.possible)
+    outcome.corrupted += ask(url, _INCOMPLETE)[0][0]
+
+
+def killed_plans(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:
+    """Kill a plan with its writer thread; the next plan recovers its folder and is killed too."""
+    outcome = Outcome(note="SQLite; each plan recovers the folder of the killed one; the tables are compared")
+    url, spool, steps = f"sqlite:///{folder}/memory.db", folder / "spool", RecordedSteps()
+    for number in range(rounds):
+        plan = ChildProcess(walk, url, str(spool), "thread", f"plan{number}", rng.randrange(2**31))
+        plan.wait_for("did")
+        time.sleep(rng.random() * _LONGEST_ROBOT_S)
+        steps.add(plan.kill())
+        step()
+    asyncio.run(recover_spool(url, spool=spool))
+    compare_steps(outcome, steps, url)
+    outcome.rounds = rounds
+    return outcome
+
+
+def _serve(url: str, spool: str) -> None:
+    asyncio.run(serve(url, spool=Path(spool), stop=asyncio.Event(), report=report))
+
+
+def killed_daemons(server: Server | None) -> Callable[[int, random.Random, Path, Step], Outcome]:
+    """Kill the daemon while three plans record; at random also kill a plan, and the server if there is one."""
+
+    def killed(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:
+        outcome = Outcome(
+            note="SQLite; plans are killed too" if server is None else "PostgreSQL; plans and the server are killed too"
+        )
+        place = Path(tempfile.mkdtemp(dir=folder))
+        url = f"sqlite:///{place}/memory.db" if server is None else server.new_database()
+        spool, steps, names = place / "spool", RecordedSteps(), itertools.count()
+
+        def start() -> ChildProcess:
+            return ChildProcess(walk, url, str(spool), "daemon", f"plan{next(names)}", rng.randrange(2**31))
+
+        plans = [start() for _ in range(3)]
+        for _ in range(rounds):
+            daemon = ChildProcess(_serve, url, str(spool))
+            daemon.wait_for("draining")
+            time.sleep(rng.random() ** 2 * 0.5)
+            if rng.random() < 0.3:
+                steps.add(plans.pop(rng.randrange(len(plans))).kill())
+                plans.append(start())
+            if server is not None and rng.random() < 0.1:
+                server.kill()
+                time.sleep(rng.random() * 0.1)
+                start_again(server)
+            daemon.kill()
+            step()
+        for each in plans:
+            each.wait_for("did")
+            steps.add(each.kill())
+        asyncio.run(recover_spool(url, spool=spool))
+        compare_steps(outcome, steps, url)
+        outcome.rounds = rounds
+        return outcome
+
+    return killed
+
+
+# === workers ==================================================================================================
+#
+# Kill or stop fold workers of a daemon at random moments while a plan records.
+
+_WORKER_SETTINGS = replace(
+    SETTINGS,
+    fold_worker_restart_s=0.02,
+    fold_worker_healthy_s=0.01,
+    fold_worker_report_s=0.05,
+    fold_worker_stopped_s=0.2,
+)
+_REPLACED_S_MAX = 120.0
+
+
+def _serve_with_workers(url: str, spool: str) -> None:
+    """Run a daemon with one fold worker, so that the daemon must use the worker that is stopped."""
+    leave = asyncio.Event()
+    asyncio.run(serve(url, spool=Path(spool), stop=leave, report=report, settings=_WORKER_SETTINGS, fold_workers=1))
+
+
+def faulty_workers(
+    server: Server | None, end_signal: signal.Signals
+) -> Callable[[int, random.Random, Path, Step], Outcome]:
+    """Send a signal to the fold worker, and wait for its replacement; at the end verify log and tables."""
+
+    def run(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:
+        outcome, steps = Outcome(note="each worker was replaced; the tables are compared and verified"), RecordedSteps()
+        place = Path(tempfile.mkdtemp(dir=folder))
+        url = f"sqlite:///{place}/memory.db" if server is None else server.new_database()
+        spool = place / "spool"
+        daemon = ChildProcess(_serve_with_workers, url, str(spool))
+        daemon.wait_for("draining")
+        plan = ChildProcess(walk, url, str(spool), "daemon", "plan", rng.randrange(2**31))
+        try:
+            for _ in range(rounds):
+                worker = _worker(Spool(spool), other_than=None)
+                time.sleep(rng.random() * _LONGEST_ROBOT_S)
+                with suppress(ProcessLookupError):  # the daemon has just replaced it
+                    os.kill(worker, end_signal)
+                _worker(Spool(spool), other_than=worker)
+                step()
+        finally:
+            steps.add(plan.kill())
+            daemon.kill()
+        asyncio.run(recover_spool(url, spool=spool))
+        compare_steps(outcome, steps, url)
+        outcome.corrupted += asyncio.run(_differences(url))
+        outcome.rounds = rounds
+        return outcome
+
+    return run
+
+
+def _worker(spool: Spool, *, other_than: int | None) -> int:
+    """Wait for a running fold worker with another pid than `other_than`; return its pid."""
+    deadline_s = time.monotonic() + _REPLACED_S_MAX
+    while time.monotonic() < deadline_s:
+        note = spool.writer_note()
+        if note is not None:
+            for each in msgspec.json.decode(note, type=DaemonNote).fold_workers:
+                if each.state == "running" and each.pid is not None and each.pid != other_than:
+                    return each.pid
+        time.sleep(0.01)
+    raise TimeoutError(
+        f"no fold worker replaced pid {other_than} within {_REPLACED_S_MAX:g} s; the daemon's note is {note!r}"
+    )
+
+
+async def _differences(url: str) -> int:
+    log = await EventLog.open(DatabaseAddress.parse(url), create=False)
+    try:
+        return len((await verify(log)).differences)
+    finally:
+        await log.close()

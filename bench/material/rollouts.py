@@ -1,19 +1,56 @@
-"""Generate task trees of pick-up rollouts as plain values; the thesis has 50,000 of them below one root (section 5.2).
-
-A rollout navigates, faces the milk and picks it up. It has 9 nodes if the arm cannot reach the place in front of the
-milk, 11 if it cannot reach the milk, and 13 otherwise. The shares are those of the thesis, so 50,000 rollouts have its
-488,043 nodes.
-"""
+"""Generate task trees of pick-up rollouts, and record them in a spool; the thesis has 50,000 (section 5.2)."""
 
 from __future__ import annotations
 
+import asyncio
 import math
+import os
 import random
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Final, NamedTuple
+from pathlib import Path
+from typing import Any, Final, NamedTuple
 
-__all__ = ["Place", "Robot", "WorldObject", "Node", "Tree", "tree", "tree_of", "THESIS_NODES", "SHARES", "MILK"]
+from pycrorm_async import __version__
+from pycrorm_async.clock import SYSTEM_CLOCK, Clock
+from pycrorm_async.events.codec import Heading
+from pycrorm_async.events.ids import EpisodeId, episode_id
+from pycrorm_async.events.types import (
+    DesignatorTypeDeclared,
+    EpisodeEnded,
+    EpisodeStarted,
+    FailureValue,
+    Happening,
+    NodeEnded,
+    NodeStarted,
+    ObjectAdded,
+    ObjectReference,
+    PoseValue,
+    RobotValue,
+)
+from pycrorm_async.plan.actions import (
+    FaceAtPerformable,
+    LookAtActionPerformable,
+    NavigateActionPerformable,
+    PickUpActionPerformable,
+)
+from pycrorm_async.plan.language import Designator
+from pycrorm_async.plan.motions import LookingMotion, MoveGripperMotion, MoveMotion, MoveTCPMotion
+from pycrorm_async.queue import RecorderQueue
+from pycrorm_async.record.declarations import declared_type
+from pycrorm_async.record.episode_writer import Emitter
+from pycrorm_async.record.parameters import DeclaredType
+from pycrorm_async.settings import Settings
+from tests.databases import ask
+
+# === rollouts =================================================================================================
+#
+# Generate task trees of pick-up rollouts as plain values; the thesis has 50,000 of them below one root (section 5.2).
+#
+# A rollout navigates, faces the milk and picks it up. It has 9 nodes if the arm cannot reach the place in front of the
+# milk, 11 if it cannot reach the milk, and 13 otherwise. The shares are those of the thesis, so 50,000 rollouts have
+# its 488,043 nodes.
 
 THESIS_NODES: Final = 488_043
 _THESIS_ROLLOUTS, _SUCCEEDED, _STUCK_LATER = 50_000, 7_886, 3_249
@@ -158,3 +195,183 @@ def _motion(dtype: str, values: dict[str, object], clock: _Clock) -> Node:
 def _end(node: Node, clock: _Clock) -> Node:
     node.end_ns = clock.read()
     return node
+
+
+# === fold progress ============================================================================================
+#
+# Read from the database how many events are in the log and in the tables, over an independent connection.
+
+_POLL_S = 0.05
+_STALLED_S = 60.0
+_NO_LOG = ("no such table", "does not exist", "unable to open", "locked")
+
+
+class Progress(NamedTuple):
+    """Numbers of events in the log and in the tables."""
+
+    appended: int
+    folded: int
+
+
+def progress(url: str) -> Progress:
+    """Return the sums over all episodes; 0 if the log does not exist yet."""
+    try:
+        [(head, folded)] = ask(url, "SELECT coalesce(sum(head), 0), coalesce(sum(folded), 0) FROM episode")
+    except Exception as error:
+        if any(each in str(error) for each in _NO_LOG):
+            return Progress(0, 0)
+        raise
+    return Progress(int(head), int(folded))
+
+
+def until_folded(url: str, events: int) -> tuple[float, float]:
+    """Wait until `events` events are in the tables; return the seconds until they were in the log and in the tables.
+
+    Raises:
+        TimeoutError: the numbers did not change for a minute.
+    """
+    begin_s = changed_s = time.perf_counter()
+    appended_s = 0.0
+    previous = Progress(0, 0)
+    while True:
+        current = progress(url)
+        now_s = time.perf_counter() - begin_s
+        if current != previous:
+            previous, changed_s = current, time.perf_counter()
+        elif time.perf_counter() - changed_s > _STALLED_S:
+            raise TimeoutError(f"{url}: {current} of {events} events, without progress for {_STALLED_S:g} s")
+        if not appended_s and current.appended >= events:
+            appended_s = now_s
+        if current.folded >= events:
+            return appended_s, now_s
+        time.sleep(_POLL_S)
+
+
+# === spool recording ==========================================================================================
+#
+# Record task trees as events in a spool, by the real queue, as the hooks would record them.
+
+_CLASSES: tuple[type[Designator], ...] = (
+    NavigateActionPerformable,
+    FaceAtPerformable,
+    LookAtActionPerformable,
+    PickUpActionPerformable,
+    MoveMotion,
+    LookingMotion,
+    MoveTCPMotion,
+    MoveGripperMotion,
+)
+DECLARED: dict[str, DeclaredType] = {each.dtype: declared_type(each) for each in _CLASSES}
+
+
+def spool_tree(tree: Tree, spool: Path) -> int:
+    """Write the tree as one closed episode into the folder of a dead recorder; return the number of events."""
+    recording = Recording(spool)
+    recording.declare()
+    recording.begin(tree.began_ns)
+    for rollout in tree.rollouts:
+        recording.put_tree(rollout, recording.root)
+    recording.end()
+    recording.leave()
+    return recording.events
+
+
+def spool_rollouts(count: int, spool: Path, *, seed: int, an_episode: int = 100) -> int:
+    """Write `count` rollouts in episodes of `an_episode` into the folder of a dead recorder; return the event count.
+
+    The outcome of each rollout is drawn with the shares of the thesis. Only one episode is in memory at a time.
+    """
+    recording, rng = Recording(spool), random.Random(seed)
+    recording.declare()
+    for first in range(0, count, an_episode):
+        tree = tree_of(rng.choices((5, 3, 1), SHARES, k=min(an_episode, count - first)), seed + first)
+        recording.begin(tree.began_ns)
+        for rollout in tree.rollouts:
+            recording.put_tree(rollout, recording.root)
+        recording.end()
+    recording.leave()
+    return recording.events
+
+
+class Recording:
+    """A recorder that writes episodes one after the other, with the times of the values instead of the clock."""
+
+    def __init__(self, spool: Path, *, settings: Settings | None = None, live: bool = False) -> None:
+        self._now_ns = 1
+        clock = SYSTEM_CLOCK if live else Clock(lambda: self._now_ns, lambda: self._now_ns)
+        settings = settings or Settings(spool_bytes_max=64 * 2**30)
+        name = episode_id(SYSTEM_CLOCK.wall_ns(), os.urandom(10))
+        self.queue = RecorderQueue.create(spool, settings=settings, clock=clock, recorder=name, offered=True)
+        self._emitter = Emitter(self.queue, settings)
+        self._episode = EpisodeId(b"")
+        self._milk = ObjectReference(0, 0)
+        self.root = 0
+        self.events = 0
+        """Counts the events of episodes, without declarations, which every segment repeats."""
+
+    def declare(self) -> None:
+        """Declare the types; call it once, before the first episode."""
+        for each in DECLARED.values():
+            heading = Heading(None, DesignatorTypeDeclared.__name__, DesignatorTypeDeclared.version)
+            self._emitter.put_payload(heading, each.payload)
+
+    def begin(self, began_ns: int) -> None:
+        """Begin an episode with its root and the milk."""
+        self._now_ns = began_ns
+        self._episode = episode_id(SYSTEM_CLOCK.wall_ns(), os.urandom(10))
+        self._put(EpisodeStarted("rollouts", "bench", "here", __version__, "3"))
+        self.root = self._put(NodeStarted("root"))
+        milk = self._put(ObjectAdded(MILK.name, MILK.type, _pose(MILK.place)))
+        self._milk = ObjectReference(milk, milk)
+
+    def end(self) -> None:
+        self._put(NodeEnded(self.root, "SUCCEEDED"))
+        self._put(EpisodeEnded("SUCCEEDED"))
+
+    def put_tree(self, node: Node, parent: int, *, after: Callable[[], None] | None = None) -> None:
+        """Put this node and its descendants; `after` is called after the end of each node."""
+        declared = DECLARED[node.dtype]
+        self._now_ns = node.start_ns
+        sequence = self._put(
+            NodeStarted(
+                declared.declaration.kind,
+                parent,
+                declared.fingerprint,
+                {name: self._written(value) for name, value in node.values.items()},
+                _robot(node.robot),
+            )
+        )
+        for child in node.children:
+            self.put_tree(child, sequence, after=after)
+        self._now_ns = node.end_ns
+        failure = FailureValue(node.failure, "") if node.failure else None
+        self._put(NodeEnded(sequence, "FAILED" if failure else "SUCCEEDED", failure))
+        if after is not None:
+            after()
+
+    def leave(self) -> None:
+        """Sync everything and close the recorder, so that its folder is dead."""
+        asyncio.run(self.queue.synced_to(self.queue.written))
+        self.queue.close()
+        self.queue.release()
+
+    def _put(self, event: Happening) -> int:
+        self.events += 1
+        return self._emitter.put(self._episode, event)
+
+    def _written(self, value: object) -> Any:
+        match value:
+            case Place():
+                return _pose(value)
+            case WorldObject():
+                return self._milk
+            case _:
+                return value
+
+
+def _pose(place: Place) -> PoseValue:
+    return PoseValue(place.position, place.orientation, "map", place.time_ns)
+
+
+def _robot(robot: Robot | None) -> RobotValue | None:
+    return RobotValue(_pose(robot.place), "ROBOT", robot.torso_m) if robot is not None else None

@@ -11,10 +11,8 @@ from typing import Any, NamedTuple
 import pytest
 from sqlalchemy import Engine
 
-from bench.baseline.store import Statements, engine_of, store
-from bench.baseline.tables import BaselineBase
-from bench.material.rollouts import THESIS_NODES, Node, Place, Tree, WorldObject, tree, tree_of
-from bench.material.spool_recording import spool_tree
+from bench.material.baseline import BaselineBase, Statements, engine_of, store
+from bench.material.rollouts import THESIS_NODES, Node, Place, Tree, WorldObject, spool_tree, tree, tree_of
 from pycrorm_async.operations.recovery import recover
 from tests.databases import ask
 

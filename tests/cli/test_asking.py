@@ -19,7 +19,7 @@ from pycrorm_async.query.questions import QUESTIONS
 from pycrorm_async.world import Pose
 from tests.commands import COMMAND, answer, environment, one_line_of, pycrorm
 from tests.databases import Server, run_in_own_loop
-from tests.projections.factories import append_and_fold
+from tests.projections.event_script import append_and_fold
 from tests.query.random_memory import TYPES, RandomEpisode, root_failures_of
 
 pytestmark = pytest.mark.slow

@@ -1,9 +1,13 @@
-"""Bad input: one line that names the fault, the documented exit code, and no loss of recorded events."""
+"""Bad input, a bad database or server: one line that names the fault, the documented exit code, no lost event."""
 
+import json
 import os
 import signal
+import sqlite3
 import subprocess
+import sys
 import time
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -11,6 +15,11 @@ import pytest
 from tests.commands import COMMAND, Started, answer, environment, one_line_of, pycrorm
 
 pytestmark = pytest.mark.slow
+
+
+# === bad input ================================================================================================
+#
+# Bad input: one line that names the fault, the documented exit code, and no loss of recorded events.
 
 
 @pytest.mark.parametrize(
@@ -227,3 +236,245 @@ def test_an_answer_that_cannot_be_written_is_reported_in_one_line(folder: Path) 
     assert "No space left on device" in done.stderr.splitlines()[0]
     assert "Traceback" not in done.stderr
     assert done.returncode != 0
+
+
+# === bad plans ================================================================================================
+#
+# Hold the text of plans that fail, exit, never suspend, or pass values that cannot be recorded.
+
+PLANS = '''
+import asyncio, math, os, sys
+from dataclasses import dataclass
+from pycrorm_async.plan import ActionAbstract, NavigateActionPerformable, PlanFailure, simulated_robot
+from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
+
+@dataclass
+class NoteActionPerformable(ActionAbstract):
+    text: str
+    weight: float = 0.0
+    async def perform(self):
+        return None
+
+async def plan():
+    """Take a note."""
+    await NoteActionPerformable("a").perform()
+
+def sync():
+    pass
+
+async def greedy(memory, world):
+    pass
+
+async def raises():
+    await NoteActionPerformable("a").perform()
+    raise ValueError("the milk is sour")
+
+async def fails():
+    await NoteActionPerformable("a").perform()
+    raise PlanFailure("the milk is out of reach")
+
+async def cancels():
+    await NoteActionPerformable("a").perform()
+    asyncio.current_task().cancel()
+    await asyncio.sleep(1)
+
+async def nan_in_a_pose():
+    await NoteActionPerformable("a").perform()
+    with BulletWorld(), simulated_robot:
+        Object("pr2", ObjectType.ROBOT)
+        await NavigateActionPerformable(Pose([math.nan, 0, 0])).perform()
+
+async def unrecordable():
+    await NoteActionPerformable("a").perform()
+    await NoteActionPerformable("b", weight="heavy").perform()
+
+async def reserved():
+    @dataclass
+    class BadActionPerformable(ActionAbstract):
+        robot_state: str
+        async def perform(self):
+            return None
+    await NoteActionPerformable("a").perform()
+    await BadActionPerformable("x").perform()
+
+async def twins():
+    @dataclass
+    class NoteAction(ActionAbstract):
+        async def perform(self):
+            return None
+    await NoteActionPerformable("a").perform()
+    await NoteAction().perform()
+
+async def list_for_a_pose():
+    await NoteActionPerformable("a").perform()
+    NavigateActionPerformable([0.6, 0.4, 0])
+
+async def two_episodes(memory):
+    async with memory.episode(description="outer"):
+        await NoteActionPerformable("a").perform()
+        async with memory.episode(description="inner"):
+            pass
+
+async def leaves():
+    await NoteActionPerformable("a").perform()
+    sys.exit(5)
+
+async def opening(memory):
+    pass
+
+async def endless():
+    """Never suspends."""
+    while True:
+        await NoteActionPerformable("a").perform()
+        os.write(1, b".")
+'''
+
+
+# === fixtures =================================================================================================
+#
+# Provide a folder with plans that go wrong, and with modules that cannot be imported as plans.
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "plans.py").write_text(PLANS)
+    (tmp_path / "broken.py").write_text("import math\nmath.no_such_thing\n")
+    (tmp_path / "wrong.py").write_text("def plan(:\n")
+    (tmp_path / "turtle.py").write_text("async def plan(): pass\n")
+    (tmp_path / "leaving.py").write_text("raise SystemExit(4)\n")
+    return tmp_path
+
+
+# === bad database =============================================================================================
+#
+# A database that is none, is newer, belongs to another program or may only be read is refused in one line.
+
+
+def test_a_database_of_another_program_is_left_unchanged(folder: Path) -> None:
+    other = folder / "other.db"
+    with closing(sqlite3.connect(other)) as connection, connection:
+        connection.execute("CREATE TABLE recipe (name TEXT)")
+    connection.close()
+    before = other.read_bytes()
+    for arguments in (["run", "plans.py"], ["episodes"], ["writer", "--once"]):
+        done = pycrorm(*arguments, "--url", "sqlite:///other.db", cwd=folder)
+        assert "other.db" in one_line_of(done)
+        assert done.returncode == 3
+    assert other.read_bytes() == before
+
+
+def test_a_file_that_is_no_database_is_left_unchanged(folder: Path) -> None:
+    for arguments in (["run", "plans.py"], ["episodes"]):
+        done = pycrorm(*arguments, "--url", "sqlite:///plans.py", cwd=folder)
+        assert "plans.py" in one_line_of(done)
+        assert done.returncode == 3
+    assert (folder / "plans.py").read_text() == PLANS
+
+
+def test_a_database_in_a_folder_without_write_permission_is_reported_with_its_path(folder: Path) -> None:
+    assert pycrorm("run", "plans.py", cwd=folder).returncode == 0
+    (folder / "pycrorm.db-wal").mkdir()  # SQLite cannot make its file there: as on a read-only disk
+    for arguments in (["run", "plans.py"], ["episodes"]):
+        done = pycrorm(*arguments, "--url", f"sqlite:///{folder}/pycrorm.db", cwd=folder)
+        assert one_line_of(done) == (
+            f"pycrorm: sqlite:///{folder}/pycrorm.db cannot be opened: the file must be readable and its folder"
+            " writable, because SQLite creates files beside it, also for reading"
+        )
+        assert done.returncode == 3
+    (folder / "pycrorm.db-wal").rmdir()
+    assert len(answer("episodes", cwd=folder)) == 1
+
+
+def bound() -> list[str]:
+    """Return the command that runs another one as a user whom the modes of files bind, as they do not bind root."""
+    return ["setpriv", "--bounding-set=-dac_override,-dac_read_search"] if os.geteuid() == 0 else []
+
+
+def without_rights(*arguments: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+    command = [*bound(), *COMMAND, *arguments]
+    return subprocess.run(command, cwd=cwd, env=environment(), capture_output=True, text=True, timeout=60, check=False)
+
+
+def test_a_file_that_may_only_be_read_is_not_opened_for_recording(tmp_path: Path) -> None:
+    (tmp_path / "memory.db").touch(0o444)
+    opening = "from pycrorm_async.store.log import make_file; make_file(Path('memory.db'), 'memory.db', 'owner')"
+    command = [*bound(), sys.executable, "-c", f"from pathlib import Path; {opening}"]
+    done = subprocess.run(command, cwd=tmp_path, env=environment(), capture_output=True, text=True, check=False)
+    reason = "this user may only read it: record with a user who may write it, or name another file"
+    assert done.stderr.endswith(f"DatabaseUnavailable: memory.db cannot be written: {reason}\n")
+
+
+@pytest.mark.soak  # the test before it opens the file only
+def test_a_file_that_may_only_be_read_is_refused_before_the_plan_runs_and_can_be_read(folder: Path) -> None:
+    assert pycrorm("run", "plans.py", cwd=folder).returncode == 0
+    (folder / "pycrorm.db").chmod(0o444)
+    done = without_rights("run", "plans.py", cwd=folder)
+    reason = "this user may only read it: record with a user who may write it, or name another file"
+    assert one_line_of(done) == f"pycrorm: sqlite:///pycrorm.db cannot be written: {reason}"
+    assert (done.returncode, done.stdout) == (3, "")
+    assert json.loads(without_rights("episodes", "--json", cwd=folder).stdout)[0]["number"] == 1
+    for each in folder.glob("pycrorm.db-*"):
+        each.unlink()
+    folder.chmod(0o555)
+    done = without_rights("episodes", cwd=folder)
+    folder.chmod(0o755)
+    assert "the file must be readable and its folder writable" in one_line_of(done)
+    assert done.returncode == 3
+
+
+def test_a_database_of_a_newer_version_is_refused(folder: Path) -> None:
+    assert pycrorm("run", "plans.py", cwd=folder).returncode == 0
+    with closing(sqlite3.connect(folder / "pycrorm.db")) as connection, connection:
+        connection.execute("UPDATE pycrorm_log SET format = 99")
+    connection.close()
+    for arguments in (["run", "plans.py"], ["episodes"]):
+        done = pycrorm(*arguments, cwd=folder)
+        assert "newer" in one_line_of(done)
+        assert done.returncode == 3
+
+
+# === unavailable server =======================================================================================
+#
+# A PostgreSQL that cannot be used is one line, exit code 3 or 2, and no password on the screen.
+
+PLAN = """
+from dataclasses import dataclass
+from pycrorm_async.plan import ActionAbstract
+
+@dataclass
+class NoteActionPerformable(ActionAbstract):
+    text: str
+    async def perform(self):
+        return None
+
+async def plan():
+    await NoteActionPerformable("a").perform()
+"""
+
+
+@pytest.mark.parametrize("verb", [["episodes"], ["show", "last"], ["run", "plan.py"], ["writer", "--once"]])
+def test_an_unreachable_server_is_one_line_without_a_password(tmp_path: Path, verb: list[str]) -> None:
+    (tmp_path / "plan.py").write_text(PLAN)
+    done = pycrorm(*verb, "--url", "postgresql://ada:s3cr@127.0.0.1:1/memory", cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (3, "")
+    message = one_line_of(done)
+    reached = "cannot be reached: Connection refused: start the server, or correct the URL"
+    assert message == f"pycrorm: postgresql://ada:***@127.0.0.1:1/memory: {reached}"
+
+
+@pytest.mark.parametrize(
+    ("url", "reason"),
+    [
+        ("postgresql://ada:s3cr@127.0.0.1:99999/memory", "a port is a number from 1 to 65535"),
+        ("postgresql://ada:s3@cr@lab/memory", "an @ in a password is written %40"),
+        ("postgresql://ada@lab/memory?s3cr=1", "a PostgreSQL URL takes the parameters host, port"),
+        ("postgresql://ada:s3cr@lab", "a PostgreSQL URL names its database"),
+    ],
+)
+def test_an_invalid_url_is_one_line_without_a_password(tmp_path: Path, url: str, reason: str) -> None:
+    done = pycrorm("episodes", "--url", url, cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (2, "")
+    message = one_line_of(done)
+    assert message.startswith(f"pycrorm: {reason}")
+    assert "s3" not in message
+    assert "cr@" not in message

@@ -1,5 +1,6 @@
-"""A spool that is unusable or holds foreign content: one line, the documented exit code, no loss."""
+"""A spool or server that cannot be used: one line, the documented exit code, no password, no lost event."""
 
+import asyncio
 import shutil
 import sqlite3
 import subprocess
@@ -7,15 +8,21 @@ import sys
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import pytest
 
-from tests.cli.note_plan import NOTES_PLAN
-from tests.commands import answer, environment, one_line_of, pycrorm
-from tests.databases import ask
+from pycrorm_async.testing.postgresql_proxy import proxy_before
+from tests.commands import NOTES_PLAN, answer, environment, one_line_of, pycrorm
+from tests.databases import Server, ask
+from tests.store.test_postgresql_logins import WRITTEN, guarded_in
 
 pytestmark = pytest.mark.soak
-"""Each of these tests starts many processes."""
+
+
+# === bad spool ================================================================================================
+#
+# A spool that is unusable or holds foreign content: one line, the documented exit code, no loss.
 
 NOTES = "SELECT text FROM note_action ORDER BY id"
 EVENTS = 11
@@ -197,3 +204,89 @@ def test_the_same_event_with_other_bytes_is_damage_and_both_are_kept(folder: Pat
     assert ask(folder / "pycrorm.db", "SELECT payload FROM event WHERE sequence = 5") == [(changed,)]
     inspected = answer("spool", "inspect", spool, cwd=folder)
     assert [each["records"] for each in inspected["recorders"]] == [EVENTS]
+
+
+# === bad server ===============================================================================================
+#
+# A server that refuses the login, or is too old: one line, exit code 3, no password, and recorded events stay.
+
+PLAN = '''
+from dataclasses import dataclass
+from pycrorm_async.plan import ActionAbstract
+
+@dataclass
+class NoteActionPerformable(ActionAbstract):
+    text: str
+    async def perform(self): ...
+
+async def plan():
+    """Take a note."""
+    await NoteActionPerformable("a").perform()
+'''
+SERVER_EVENTS = 7
+"""The events of the plan, with the declaration."""
+VERBS = [["run", "notes.py"], ["writer"], ["writer", "--once"], ["episodes"]]
+NOTE_TEXTS = "SELECT text FROM note_action"
+
+
+@pytest.fixture
+def left_folder(tmp_path: Path) -> Path:
+    """A folder with a spool in which a plan has left its events."""
+    (tmp_path / "notes.py").write_text(PLAN)
+    left = pycrorm("run", "notes.py", "--writer", "daemon", "--spool", "spool", cwd=tmp_path)
+    assert left.returncode == 0
+    return tmp_path
+
+
+def refused(url: str, folder: Path, ending: str) -> None:
+    for verb in VERBS:
+        done = pycrorm(*verb, "--url", url, "--spool", "spool", cwd=folder)
+        message = one_line_of(done)
+        assert message.startswith("pycrorm: postgresql://")
+        assert message.endswith(ending)
+        assert "s3cr" not in message
+        assert (done.returncode, done.stdout) == (3, "")
+
+
+def drained(url: str, folder: Path) -> int:
+    stored: int = answer("writer", "--once", "--url", url, "--spool", "spool", cwd=folder)["events_stored"]
+    return stored
+
+
+def test_a_wrong_password_is_one_line_and_the_right_one_stores_the_waiting_events(
+    server: Server, left_folder: Path
+) -> None:
+    database = guarded_in(server)
+    refused(
+        server.url(database, user="guarded", password="s3cr-wrong"),
+        left_folder,
+        'password authentication failed for user "guarded": put the right password into PYCRORM_URL or ~/.pgpass',
+    )
+    assert drained(server.url(database, user="guarded", password=WRITTEN), left_folder) == SERVER_EVENTS
+    assert ask(server.url(database), NOTE_TEXTS) == [("a",)]
+
+
+def test_a_wrong_database_name_is_one_line_and_the_right_one_stores_the_waiting_events(
+    server: Server, left_folder: Path
+) -> None:
+    ending = 'database "nothing" does not exist: create it with `createdb`, or correct the URL'
+    refused(server.url("nothing", password="s3cr"), left_folder, ending)
+    url = server.new_database()
+    assert drained(url, left_folder) == SERVER_EVENTS
+    assert ask(url, NOTE_TEXTS) == [("a",)]
+
+
+async def test_a_server_that_is_too_old_is_one_line_and_nothing_is_made_there(
+    server: Server, left_folder: Path
+) -> None:
+    url = server.new_database()
+    [[version]] = ask(url, "SELECT current_setting('server_version_num')::int")
+    async with proxy_before(server.folder) as proxy:
+        # A real server, of which a proxy replaces only the answer with its version.
+        proxy.falsify(version.to_bytes(4), (130_011).to_bytes(4))
+        through = proxy.url(urlsplit(url).path.removeprefix("/"), password="s3cr")
+        await asyncio.to_thread(refused, through, left_folder, "PostgreSQL 14 or newer is needed, this is 13")
+        assert ask(url, "SELECT count(*) FROM pg_namespace WHERE nspname IN ('pycrorm', 'memory')") == [(0,)]
+        proxy.heal()
+        assert await asyncio.to_thread(drained, through, left_folder) == SERVER_EVENTS
+    assert ask(url, NOTE_TEXTS) == [("a",)]

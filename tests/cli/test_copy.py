@@ -13,9 +13,9 @@ import asyncpg
 import pytest
 
 from tests.commands import COMMAND, Started, answer, environment, one_line_of, pycrorm
-from tests.copying.memories import assert_same
 from tests.databases import Server
-from tests.projections.factories import append_and_fold
+from tests.operations.memories import assert_same
+from tests.projections.event_script import append_and_fold
 from tests.store.factories import episode, record, run_of
 from tests.table_comparison import logs_of
 from tests.test_table_comparison import episode as hand_written

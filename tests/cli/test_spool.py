@@ -1,4 +1,6 @@
-"""`pycrorm spool`: the files of a spool for an operator, and the events that are stored after a repair."""
+"""`pycrorm spool`: the files of a spool for an operator, repaired, and bound to a new database."""
+
+from __future__ import annotations
 
 import os
 import signal
@@ -9,10 +11,15 @@ import pytest
 from pycrorm_async.events.codec import Record
 from pycrorm_async.events.ids import parse_episode_id
 from pycrorm_async.queue.sources import DeadLetters
-from tests.commands import Started, answer, one_line_of, pycrorm
+from tests.commands import NOTES_PLAN, Started, answer, one_line_of, pycrorm
 from tests.queue.factories import FolderWriter, overwrite, started
 
 pytestmark = pytest.mark.slow
+
+
+# === spool ====================================================================================================
+#
+# `pycrorm spool`: the files of a spool for an operator, and the events that are stored after a repair.
 
 PLAN = '''
 import itertools, os
@@ -189,3 +196,37 @@ def test_dead_letters_are_reported_with_their_place_by_status_and_inspect(tmp_pa
     once = answer("writer", "--once", cwd=folder, code=1)
     assert list(once["stopped"].values()) == ["events 1 to 4 did not arrive before event 5"]
     assert place.exists()
+
+
+# === rebind ===================================================================================================
+#
+# `pycrorm spool rebind` and a deleted database, for a new user.
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "notes.py").write_text(NOTES_PLAN)
+    return tmp_path
+
+
+def test_the_next_run_makes_a_deleted_database_again(folder: Path) -> None:
+    for _ in range(2):
+        [episode] = answer("run", "notes.py", cwd=folder)["episodes"]
+        assert (episode["number"], episode["status"]) == (1, "SUCCEEDED")
+        (folder / "pycrorm.db").unlink()
+
+
+def test_with_events_in_the_spool_the_refusal_names_the_command_that_stores_them(folder: Path) -> None:
+    answer("run", "notes.py", cwd=folder)
+    assert pycrorm("run", "notes.py", "--writer", "daemon", cwd=folder).returncode == 0
+    (folder / "pycrorm.db").unlink()
+    refused = pycrorm("run", "notes.py", cwd=folder)
+    assert (refused.returncode, "with `pycrorm spool rebind`" in one_line_of(refused)) == (3, True)
+    document = answer("spool", "rebind", cwd=folder)
+    assert (document["events_found"], document["events_stored"], document["dead_letters"]) == (11, 11, {})
+    assert document["log_before"] != document["log"]
+    # The first event was stored in the deleted database, and comes from its kept segments.
+    assert [each["description"] for each in answer("episodes", cwd=folder)] == ["Take three notes."] * 2
+    assert len(answer("run", "notes.py", cwd=folder)["episodes"]) == 1
+    again = pycrorm("spool", "rebind", cwd=folder)
+    assert (again.returncode, again.stdout.startswith("0 dead recorders, 0 events stored")) == (0, True)

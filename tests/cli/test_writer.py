@@ -1,19 +1,35 @@
-"""`pycrorm writer` as a daemon and `pycrorm status`, as users run them: in processes of their own."""
+"""`pycrorm writer`, as a daemon and once, and `pycrorm status`, as users run them: in processes of their own."""
 
+from __future__ import annotations
+
+import asyncio
 import json
 import signal
+import tarfile
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from tests.cli.note_plan import NOTES_PLAN
-from tests.commands import Started, answer, one_line_of, pycrorm
-from tests.databases import ask_to_change
+from pycrorm_async import Memory
+from pycrorm_async.cli.status import RUNNING_MAX
+from pycrorm_async.events.codec import Record
+from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, parse_episode_id
+from pycrorm_async.queue.sources import DeadLetters
+from pycrorm_async.queue.spool import make_folder
+from pycrorm_async.world import COURIER, BulletWorld, Object, ObjectType
+from tests.commands import NOTES_PLAN, Started, answer, one_line_of, pycrorm
+from tests.databases import ask, ask_to_change
 
 pytestmark = pytest.mark.slow
+
+
+# === writer ===================================================================================================
+#
+# `pycrorm writer` as a daemon and `pycrorm status`, as users run them: in processes of their own.
 
 PLAN = f"""
 import asyncio, os
@@ -179,3 +195,122 @@ def test_no_verb_shows_a_password(folder: Path) -> None:
         done = pycrorm(verb, "--url", url, "--spool", "s", cwd=folder)
         assert done.returncode == 3
         assert "topsecret" not in done.stdout + done.stderr
+
+
+# === drain once ===============================================================================================
+#
+# The exit code of `pycrorm writer --once`: 1 if the database refused anything, with and without --json.
+
+RECORDER, EPISODE = "0190a000-0000-7000-8000-000000000001", "0190a000-0000-7000-8000-000000000002"
+FULL = (
+    f"all {EPISODE_NUMBER_MAX:,} episode numbers of this memory are used: move its spool to a new memory with"
+    " `pycrorm spool rebind`"
+)
+
+
+def use_up_episode_numbers(url: str) -> None:
+    taken = f"INSERT INTO episode (number, id, head, started_wall_ns) VALUES ({EPISODE_NUMBER_MAX}, 'x', 0, 0)"
+    ask_to_change(url, taken)
+    if url.startswith("postgresql:"):
+        ask_to_change(url, f"SELECT setval('pycrorm.episode_number', {EPISODE_NUMBER_MAX})")
+
+
+@pytest.mark.soak_on("postgresql")
+def test_an_episode_without_a_number_is_a_problem_each_time_and_is_kept(database_url: str, tmp_path: Path) -> None:
+    (tmp_path / "notes.py").write_text(NOTES_PLAN)
+    where = ("--url", database_url, "--spool", tmp_path / "spool")
+    assert answer("writer", "--once", *where, cwd=tmp_path)["dead_letters"] == {}
+    use_up_episode_numbers(database_url)
+    pycrorm("run", "notes.py", "--writer", "daemon", *where, cwd=tmp_path)
+    document = answer("writer", "--once", *where, cwd=tmp_path, code=1)
+    [(episode, folder)] = document["dead_letters"].items()
+    assert document["stopped"] == {episode: FULL}
+    assert (document["failed"], document["events_stored"], Path(folder).is_dir()) == ({}, 1, True)
+    done = pycrorm("writer", "--once", *where, cwd=tmp_path)
+    assert done.returncode == 1
+    assert one_line_of(done) == f"pycrorm: episode {episode} is stopped: {FULL}; its events are kept in {folder}"
+    assert ask(database_url, "SELECT count(*) FROM event") == [(0,)]
+
+
+@pytest.mark.soak_on("postgresql")
+@pytest.mark.parametrize("alive", [True, False])
+def test_an_earlier_refusal_is_a_problem_even_while_its_recorder_is_alive(tmp_path: Path, *, alive: bool) -> None:
+    spool = tmp_path / "pycrorm.db.spool"
+    folder, lock = make_folder(spool, RECORDER)
+    refused = DeadLetters(folder)
+    refused.put([Record(1, parse_episode_id(EPISODE), 5, "NodeStarted", 1, 7, 8, b"{}")])
+    refused.release()
+    if not alive:
+        lock.release()
+    kept = f"its events are kept in {folder}.{EPISODE}.refused"
+    done = pycrorm("writer", "--once", cwd=tmp_path)
+    reason = "was refused" if alive else "is stopped: events 1 to 4 did not arrive before event 5"
+    assert (done.returncode, one_line_of(done)) == (1, f"pycrorm: episode {EPISODE} {reason}; {kept}")
+    assert list(answer("writer", "--once", cwd=tmp_path, code=1)["dead_letters"]) == [EPISODE]
+    lock.release()
+
+
+# === running episodes =========================================================================================
+#
+# `pycrorm status` names the running episodes and their robots.
+
+MEMORY_OF_0_1_0 = Path(__file__).parents[1] / "golden" / "memory_v1.tar.gz"
+
+
+@pytest.mark.soak_on("postgresql")
+async def test_a_running_episode_is_named_with_its_robots_until_it_ends(database_url: str, tmp_path: Path) -> None:
+    asked = "--url", database_url
+    async with Memory.open(database_url, spool=tmp_path / "spool") as memory:
+        async with memory.episode(description="before"):
+            pass
+        with BulletWorld():
+            Object("eve", ObjectType.ROBOT, robot=replace(COURIER, serial="C-03"))
+            async with memory.episode(description="tidy up"):
+                Object("courier", ObjectType.ROBOT)
+                await memory.flush()
+                document = await asyncio.to_thread(answer, "status", *asked, cwd=tmp_path)
+                shown = await asyncio.to_thread(pycrorm, "status", *asked, cwd=tmp_path)
+        await memory.flush()
+        assert document["running_total"] == 1
+        [running] = document["running"]
+        [_, summary] = await memory.reading.episodes()
+    assert (running["number"], running["id"], running["description"]) == (2, summary.id, "tidy up")
+    assert [(each["name"], each["model"], each["serial"]) for each in running["robots"]] == [
+        ("eve", "courier", "C-03"),
+        ("courier", "courier", None),
+    ]
+    assert all(each["description"] for each in running["robots"])
+    assert "Running episodes" in shown.stdout
+    assert "eve (courier C-03), courier" in shown.stdout
+    after = answer("status", *asked, cwd=tmp_path)
+    assert (after["running"], after["running_total"]) == ([], 0)
+    assert "Running episodes" not in pycrorm("status", *asked, cwd=tmp_path).stdout
+
+
+async def test_of_many_running_episodes_the_newest_are_listed(tmp_path: Path) -> None:
+    url, count = f"sqlite:///{tmp_path}/memory.db", RUNNING_MAX + 2
+    started, done = asyncio.Barrier(count + 1), asyncio.Event()
+
+    async def run(number: int) -> None:
+        async with memory.episode(description=f"number {number}"):
+            await started.wait()
+            await done.wait()
+
+    async with Memory.open(url) as memory, asyncio.TaskGroup() as tasks:
+        for number in range(count):
+            tasks.create_task(run(number))
+        await started.wait()
+        await memory.flush()
+        document = await asyncio.to_thread(answer, "status", "--url", url, cwd=tmp_path)
+        shown = await asyncio.to_thread(pycrorm, "status", "--url", url, cwd=tmp_path)
+        done.set()
+    assert document["running_total"] == count
+    assert [each["number"] for each in document["running"]] == list(range(count, 2, -1))
+    assert f"The {RUNNING_MAX} newest of {count} running episodes" in shown.stdout
+
+
+def test_a_memory_whose_tables_are_those_of_another_version_has_a_status(tmp_path: Path) -> None:
+    with tarfile.open(MEMORY_OF_0_1_0) as archive:
+        archive.extractall(tmp_path, filter="data")
+    document = answer("status", "--url", f"sqlite:///{tmp_path}/memory.db", cwd=tmp_path)
+    assert (document["database"], document["running"], document["running_total"]) == ("ok", [], 0)

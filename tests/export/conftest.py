@@ -25,8 +25,7 @@ from pycrorm_async.plan import (
 from pycrorm_async.settings import Settings
 from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose
 from tests.databases import run_in_own_loop
-from tests.projections.event_script import NAVIGATE, PICK_UP, SAYING, declarations
-from tests.projections.factories import append_and_fold
+from tests.projections.event_script import NAVIGATE, PICK_UP, SAYING, append_and_fold, declarations
 from tests.query.test_reading import episode
 from tests.shared_folders import made_once
 

@@ -31,8 +31,7 @@ from pycrorm_async.events.types import (
 from pycrorm_async.export.export import export, export_again
 from pycrorm_async.report.output_files import new_folder
 from tests.full_disk import files_of_at_most
-from tests.projections.event_script import NAVIGATE, SAYING, Script, declarations, name_of, pose
-from tests.projections.factories import append_and_fold
+from tests.projections.event_script import NAVIGATE, SAYING, Script, append_and_fold, declarations, name_of, pose
 
 SCHEMA = json.loads(Path(__file__).with_name("lerobot_v3.json").read_text())
 

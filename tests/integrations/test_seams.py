@@ -1,13 +1,24 @@
-"""Seams around another library's methods, without that library; and `remember` where PyCRAM is not installed."""
+"""Seams around another library's methods, without that library; `remember` without PyCRAM, entered again, refused."""
 
 from __future__ import annotations
 
+import inspect
+import re
+import sys
+from types import FrameType
 from typing import Any
 
 import pytest
 
-from pycrorm_async.errors import MissingExtra
+from pycrorm_async.errors import CallerError, MissingExtra
+from pycrorm_async.integrations import pycram
+from pycrorm_async.integrations.foreign_package import ForeignPackage
 from pycrorm_async.integrations.pycram import Seams, guarded, remember
+from pycrorm_async.memory import Memory
+
+# === seams ====================================================================================================
+#
+# Seams around another library's methods, without that library; and `remember` where PyCRAM is not installed.
 
 
 class Counter:
@@ -86,3 +97,110 @@ def test_a_callback_that_another_library_removed_does_not_keep_the_others(seams:
 def test_without_pycram_remember_names_the_extra_to_install() -> None:
     with pytest.raises(MissingExtra, match=r"pip install 'pycrorm-async\[pycram\]'"), remember("sqlite://"):
         pass
+
+
+# === entering remember ========================================================================================
+#
+# `remember` of PyCRAM is entered again after Ctrl-C came while it was entered. This needs no PyCRAM.
+
+
+class Entered(Exception):
+    """Raised in place of opening the memory."""
+
+
+class AnyVersion:
+    """Takes the place of the installed PyCRAM."""
+
+    def installed_version(self, _distribution: str) -> str:
+        return "1.0.4"
+
+    def check_version(self, _version: str) -> None:
+        """Accept it."""
+
+
+def test_ctrl_c_at_any_call_of_entering_it_leaves_none_active(monkeypatch: pytest.MonkeyPatch) -> None:
+    def sync(*_arguments: Any, **_options: Any) -> None:
+        raise Entered
+
+    code = inspect.unwrap(pycram.remember).__code__
+    left = 0
+
+    def interrupt(frame: FrameType, what: str, _argument: object) -> None:
+        nonlocal left
+        if frame.f_code is code and what == "c_return":
+            left -= 1
+            if not left:
+                raise KeyboardInterrupt
+
+    def enter() -> None:
+        with pycram.remember("sqlite:///memory.db"):
+            pytest.fail("the block was entered")
+
+    monkeypatch.setattr(pycram, "_PYCRAM", AnyVersion())
+    monkeypatch.setattr(Memory, "sync", sync)
+    points = 0
+    while True:
+        left = points + 1
+        sys.setprofile(interrupt)
+        try:
+            enter()
+        except KeyboardInterrupt:
+            points += 1
+        except Entered:
+            break
+        finally:
+            sys.setprofile(None)
+        with pytest.raises(Entered):
+            enter()
+    assert points > 1
+
+
+# === foreign package ==========================================================================================
+#
+# A package that is not installed, or of an unknown version, is refused with the command that installs it.
+
+ENGINE = ForeignPackage("Engine", extra="engine", versions=["1.4.2", "2.*"])
+INSTALL = re.escape("pip install 'pycrorm-async[engine]'")
+
+
+def test_a_module_that_cannot_be_imported_is_a_missing_extra() -> None:
+    with (
+        pytest.raises(
+            MissingExtra, match=rf"Engine cannot be imported \(No module named 'no_such_engine'\): {INSTALL}"
+        ),
+        ENGINE.importing(),
+    ):
+        import no_such_engine  # type: ignore[import-not-found]  # noqa: F401
+    with pytest.raises(MissingExtra, match=rf"cannot import name 'no_such_name' .*: {INSTALL}"), ENGINE.importing():
+        from json import no_such_name  # type: ignore[attr-defined]  # noqa: F401
+
+
+def test_another_exception_of_an_import_reaches_the_program() -> None:
+    with pytest.raises(OSError, match="its library is broken"), ENGINE.importing():
+        raise OSError("its library is broken")
+
+
+@pytest.mark.parametrize("version", ["1.4.2", "2.0", "2.6.0"])
+def test_a_known_version_is_accepted(version: str) -> None:
+    ENGINE.check_version(version)
+
+
+@pytest.mark.parametrize("version", ["1.4.20", "1.4.3", "20.1", "3.0.0", ""])
+def test_an_unknown_version_is_refused(version: str) -> None:
+    message = re.escape(f"Engine {version} is unknown, only 1.4.2 or 2.* can be recorded: ")
+    with pytest.raises(CallerError, match=message + INSTALL):
+        ENGINE.check_version(version)
+
+
+def test_the_version_of_a_distribution_is_read_without_importing_it() -> None:
+    assert ENGINE.installed_version("msgspec")[0].isdigit()
+    expected = rf"Engine \(no-such-engine 1\.4\.2 or 2\.\*\) is not installed: {INSTALL}"
+    with pytest.raises(MissingExtra, match=expected):
+        ENGINE.installed_version("no-such-engine")
+
+
+def test_without_versions_any_version_is_accepted() -> None:
+    engine = ForeignPackage("Engine", extra="engine")
+    engine.check_version("0.0.1")
+    with pytest.raises(MissingExtra, match=rf"Engine \(no-such-engine\) is not installed: {INSTALL}"):
+        engine.installed_version("no-such-engine")

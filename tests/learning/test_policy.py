@@ -1,11 +1,24 @@
+"""A policy: the places that it samples, its file, and its record in the memory."""
+
 from __future__ import annotations
 
+import json
 import math
+import subprocess
+import sys
+import zlib
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
+from sqlalchemy import func, select
 
-from pycrorm_async.errors import CallerError, ImpossibleCondition
+from pycrorm_async import Memory, Reading
+from pycrorm_async.errors import CallerError, ImpossibleCondition, PolicyDamaged, PolicyFileRefused
+from pycrorm_async.learning import MoveAndPickUp, Scene, batch_rollout, name_of, read_policy, record_policy
+from pycrorm_async.learning.experiment import Experiment, run
 from pycrorm_async.learning.policy import (
     Evidence,
     Leaf,
@@ -16,8 +29,24 @@ from pycrorm_async.learning.policy import (
     Rectangle,
     Region,
     default_policy,
+    load_policy,
+    save_policy,
 )
+from pycrorm_async.learning.pool import MemoryLocation
+from pycrorm_async.learning.tree import learn
+from pycrorm_async.orm import (
+    BatchRolloutAction,
+    LearnPolicyAction,
+    MoveAndPickUpAction,
+    Observation,
+    PickUpWithContextView,
+    ProcessMetaData,
+    TaskTreeNode,
+)
+from pycrorm_async.plan import Retry
+from pycrorm_async.plan.failures import PlanFailure
 from pycrorm_async.world.pose import Arms, Grasp
+from tests.learning.geometric_rollouts import frame_of
 
 LEFT, RIGHT = frozenset({Arms.LEFT}), frozenset({Arms.RIGHT})
 WEST = Leaf(
@@ -231,3 +260,289 @@ def test_invalid_evidence_is_refused() -> None:
         default_policy().coverage([])
     with pytest.raises(CallerError, match="width_m must be > 0, got 0"):
         default_policy().mode(width_m=0)
+
+
+# === policy file ==============================================================================================
+
+LEARNED = Policy(
+    (
+        Leaf(
+            1 / 3, (1.0, 0.0), (0.1, 0.2, 0.7, 0.0), Linear((-1 / 3, 0.1, 1e-17 + 2), (0.0, 1 / 3, 1.0)), Normal(0, 1)
+        ),
+        Leaf(2 / 3, (0.3, 0.7), (1.0, 0.0, 0.0, 0.0), Normal(0.1, 0.2), Normal(0, 1), Linear((0.5, 0.9), (0.0, 1.0))),
+    ),
+    Evidence(
+        arms=frozenset({Arms.LEFT}),
+        grasps=frozenset({Grasp.TOP, Grasp.FRONT}),
+        region=Region((Rectangle(-1.0, 0.1, -0.7, 1 / 7), Rectangle(0.1, 2.0, -0.7, 1 / 7))),
+        height=(0.55, 0.95),
+    ),
+    constant_height=None,
+)
+
+ELSEWHERE = """
+import sys
+for name in ("jpt", "pandas", "scipy", "matplotlib"):
+    sys.modules[name] = None
+from pathlib import Path
+import numpy as np
+from pycrorm_async.learning.policy import load_policy
+for path in sys.argv[1:]:
+    policy = load_policy(Path(path))
+    print(policy.likelihood(policy.sample(np.random.default_rng(8), 500)).tolist())
+"""
+
+
+@pytest.mark.slow
+def test_a_policy_is_the_same_in_another_process_without_the_libraries_for_learning(tmp_path: Path) -> None:
+    policies = {tmp_path / "default.json": default_policy(), tmp_path / "learned.json": LEARNED}
+    for path, policy in policies.items():
+        save_policy(policy, path)
+        assert load_policy(path) == policy
+    here = [each.likelihood(each.sample(np.random.default_rng(8), 500)).tolist() for each in policies.values()]
+    other_process = subprocess.run(
+        [sys.executable, "-c", ELSEWHERE, *policies], check=True, capture_output=True, text=True
+    ).stdout
+    assert [json.loads(line) for line in other_process.splitlines()] == here
+
+
+def test_a_saved_policy_replaces_the_one_before_and_leaves_no_other_file(tmp_path: Path) -> None:
+    path = tmp_path / "policy.json"
+    save_policy(default_policy(), path)
+    save_policy(LEARNED, path)
+    assert load_policy(path) == LEARNED
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_the_file_is_json_with_enum_members_by_name(tmp_path: Path) -> None:
+    save_policy(LEARNED, tmp_path / "policy.json")
+    heading, content = (json.loads(line) for line in (tmp_path / "policy.json").read_text().splitlines())
+    assert (heading["format"], heading["version"]) == ("pycrorm policy", 1)
+    assert content["arms"] == ["LEFT", "RIGHT"]
+    assert content["evidence"]["grasps"] == ["FRONT", "TOP"]
+    assert content["leaves"][1]["height"] == {"type": "linear", "knots": [0.5, 0.9], "cumulative": [0.0, 1.0]}
+
+
+def test_no_changed_byte_yields_another_policy(tmp_path: Path) -> None:
+    path = tmp_path / "policy.json"
+    save_policy(LEARNED, path)
+    whole = path.read_bytes()
+    for at in range(len(whole)):
+        path.write_bytes(whole[:at] + bytes([whole[at] ^ 1]) + whole[at + 1 :])
+        with pytest.raises((PolicyFileRefused, PolicyDamaged), match=f"policy {path}"):
+            load_policy(path)
+
+
+def test_no_cut_yields_another_policy(tmp_path: Path) -> None:
+    path = tmp_path / "policy.json"
+    save_policy(LEARNED, path)
+    whole = path.read_bytes()
+    for length in range(len(whole) - 1):
+        path.write_bytes(whole[:length])
+        with pytest.raises((PolicyFileRefused, PolicyDamaged), match=f"policy {path}"):
+            load_policy(path)
+    path.write_bytes(whole[:-1])
+    assert load_policy(path) == LEARNED, "the last newline says nothing"
+    path.write_bytes(whole + b"more")
+    with pytest.raises(PolicyDamaged, match="checksum"):
+        load_policy(path)
+
+
+def test_another_version_is_refused_by_its_number(tmp_path: Path) -> None:
+    path = tmp_path / "policy.json"
+    path.write_text('{"format":"pycrorm policy","version":2,"crc32":0,"more":1}\n{"nodes":[]}\n')
+    with pytest.raises(PolicyFileRefused, match="has format version 2, but this program reads 1"):
+        load_policy(path)
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"\n\n", b"PK\x03\x04", b"[1]\n", b'{"format":"else","version":1,"crc32":0}\n']
+)
+def test_a_file_of_another_kind_is_no_policy(content: bytes, tmp_path: Path) -> None:
+    path = tmp_path / "model.bin"
+    path.write_bytes(content)
+    with pytest.raises(PolicyFileRefused, match="holds no policy"):
+        load_policy(path)
+
+
+def test_a_file_that_cannot_be_read_or_written_is_reported_in_one_line(tmp_path: Path) -> None:
+    with pytest.raises(PolicyFileRefused, match=r"nothing\.json: cannot be read: No such file"):
+        load_policy(tmp_path / "nothing.json")
+    with pytest.raises(PolicyFileRefused, match="cannot be read: Is a directory"):
+        load_policy(tmp_path)
+    with pytest.raises(PolicyFileRefused, match="cannot be written: No such file"):
+        save_policy(LEARNED, tmp_path / "no" / "policy.json")
+    (tmp_path / "taken").mkdir()
+    with pytest.raises(PolicyFileRefused, match="cannot be written: "):
+        save_policy(LEARNED, tmp_path / "taken")
+    assert [each.name for each in tmp_path.iterdir()] == ["taken"]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"arms": ["RIGHT", "LEFT"]}, "probabilities of arms"),
+        ({"leaves": []}, "weights of the leaves"),
+        ({"constant_height": "high"}, "constant_height"),
+        ({"more": 1}, "more"),
+        ({"evidence": {"arms": ["THIRD"], "grasps": None, "region": None, "height": None}}, "THIRD"),
+        ({"evidence": {"arms": [], "grasps": None, "region": None, "height": None}}, "no probability"),
+        ({"evidence": {"arms": None, "grasps": None, "region": None, "height": [2, 1]}}, "interval"),
+    ],
+)
+def test_a_crafted_file_is_checked_although_its_checksum_matches(
+    change: dict[str, object], message: str, tmp_path: Path
+) -> None:
+    _refused(change, message, tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"weight": 0.5}, "weights of the leaves"),
+        ({"weight": -1.0}, "weight"),
+        ({"arms": [0.5, 0.6]}, "probabilities"),
+        ({"arms": [1.0]}, "probabilities"),
+        ({"grasps": [1.5, -0.5, 0.0, 0.0]}, "probabilities"),
+        ({"x": {"type": "normal", "mean": 0.0, "sigma": 0.0}}, "sigma"),
+        ({"x": {"type": "linear", "knots": [0.0, 0.0], "cumulative": [0.0, 1.0]}}, "do not rise"),
+        ({"x": {"type": "linear", "knots": [0.0, 1.0, 2.0], "cumulative": [0.0, 1.1, 1.0]}}, "do not rise"),
+        ({"x": {"type": "linear", "knots": [0.0, 1.0], "cumulative": [0.1, 1.0]}}, "from 0 to 1"),
+        ({"x": {"type": "linear", "knots": [0.0], "cumulative": [0.0]}}, "two or more"),
+        ({"x": {"type": "linear", "knots": [0.0, None], "cumulative": [0.0, 1.0]}}, "knots"),
+        ({"x": {"type": "uniform"}}, "uniform"),
+    ],
+)
+def test_a_crafted_leaf_is_checked(change: dict[str, object], message: str, tmp_path: Path) -> None:
+    save_policy(default_policy(), tmp_path / "policy.json")
+    leaf = json.loads((tmp_path / "policy.json").read_text().splitlines()[1])["leaves"][0]
+    _refused({"leaves": [leaf | change]}, message, tmp_path)
+
+
+def _refused(change: dict[str, object], message: str, tmp_path: Path) -> None:
+    path = tmp_path / "policy.json"
+    save_policy(default_policy(), path)
+    heading, content = (json.loads(line) for line in path.read_text().splitlines())
+    line = json.dumps(content | change)
+    path.write_text(json.dumps(heading | {"crc32": zlib.crc32(line.encode())}) + "\n" + line + "\n")
+    with pytest.raises(PolicyDamaged, match=f"its checksum matches, but it holds no policy: .*{message}"):
+        load_policy(path)
+
+
+# === recorded policy ==========================================================================================
+#
+# A learned policy is in the memory with its content, its training episodes and its settings.
+
+SMALL = Experiment(rollouts=600, evaluate=30, held_out=30, rounds=2)
+
+
+@pytest.mark.slow
+@pytest.mark.soak_on("postgresql")
+async def test_a_recorded_policy_is_read_back_by_its_name(database_url: str, tmp_path: Path) -> None:
+    policy = default_policy()
+    async with Memory.open(database_url, spool=tmp_path / "spool") as memory:
+        async with memory.episode(description="training") as training:
+            pass
+        name = await record_policy(memory, policy, episodes=[str(training)], successes=7, min_samples_leaf=3)
+        await memory.flush()
+        read = await read_policy(memory.reading, name)
+        async with memory.session() as session:
+            (learned,) = (await session.scalars(select(LearnPolicyAction))).all()
+    assert name == name_of(policy) == name_of(read) == learned.policy
+    assert read.sample(np.random.default_rng(1), 5) == policy.sample(np.random.default_rng(1), 5)
+    assert (learned.successes, learned.min_samples_leaf, learned.rollouts, learned.scene) == (7, 3, None, None)
+    assert (learned.training_episodes, learned.episode_count, learned.seeds) == ([str(training)], 1, [])
+
+
+OTHER = replace(default_policy(), constant_height=0.25)
+"""A policy whose name is not that of the default one."""
+
+
+async def test_the_policy_of_rollouts_is_read_back_after_its_file_was_overwritten(
+    database_url: str, tmp_path: Path
+) -> None:
+    file = tmp_path / "policy.json"
+    save_policy(OTHER, file)
+    async with Memory.open(database_url, spool=tmp_path / "spool") as memory:
+        with Scene().entered() as stage:
+            for seed in (1, 2):
+                action = MoveAndPickUp(stage.target, policy=load_policy(file))
+                await batch_rollout(action, 2, seed=seed, reset=stage.reset)
+        save_policy(default_policy(), file)
+        await memory.flush()
+        async with memory.session() as session:
+            batches = (await session.scalars(select(BatchRolloutAction))).all()
+            chosen = set(await session.scalars(select(MoveAndPickUpAction.policy)))
+            contents = await session.scalar(select(func.count(Observation.id)))
+            picked = (await session.scalars(select(PickUpWithContextView.policy))).all()
+        read = await read_policy(memory.reading, batches[0].policy)
+    assert [each.policy for each in batches] == [name_of(OTHER)] * 2
+    assert (chosen, read, contents) == ({name_of(OTHER)}, OTHER, 1)
+    assert picked == [name_of(OTHER)] * 4
+
+
+async def test_rollouts_with_one_arm_keep_the_name_of_the_policy_as_it_was_passed(tmp_path: Path) -> None:
+    async with Memory.open(f"sqlite:///{tmp_path / 'm.db'}") as memory:
+        with Scene().entered() as stage:
+            action = MoveAndPickUp(stage.target, [Arms.LEFT], policy=OTHER)
+            await batch_rollout(action, 2, seed=1, reset=stage.reset)
+        await memory.flush()
+        async with memory.session() as session:
+            batch = (await session.scalars(select(BatchRolloutAction))).one()
+            tries = (await session.scalars(select(MoveAndPickUpAction))).all()
+            assert (batch.policy, batch.arms, batch.grasps) == (name_of(OTHER), ["LEFT"], [])
+            assert {(each.policy, each.arm) for each in tries} == {(name_of(OTHER), Arms.LEFT)}
+        assert await read_policy(memory.reading, batch.policy) == OTHER
+
+
+async def test_each_try_of_a_retried_pick_up_names_its_policy_and_the_memory_holds_it(tmp_path: Path) -> None:
+    async with Memory.open(f"sqlite:///{tmp_path / 'm.db'}") as memory:
+        with Scene().entered() as stage:
+            action = MoveAndPickUp(stage.target, policy=OTHER, rng=np.random.default_rng(1))
+            with suppress(PlanFailure):
+                await Retry(action, max_tries=2).perform()
+        await memory.flush()
+        async with memory.session() as session:
+            tries = (await session.scalars(select(MoveAndPickUpAction))).all()
+            assert {each.policy for each in tries} == {name_of(OTHER)}
+            kept = (await session.scalars(select(Observation))).one()
+            node = await session.get_one(TaskTreeNode, kept.node_id)
+            assert node.dtype == "Retry"
+        assert await read_policy(memory.reading, tries[0].policy or "") == OTHER
+
+
+@pytest.mark.soak_on("postgresql")
+async def test_a_policy_that_is_not_recorded_is_named(database_url: str, tmp_path: Path) -> None:
+    async with Memory.open(database_url, spool=tmp_path / "spool") as memory:
+        with pytest.raises(CallerError, match="the memory holds no policy '0123456789ab'"):
+            await read_policy(memory.reading, "0123456789ab")
+
+
+@pytest.mark.slow
+@pytest.mark.soak_on("postgresql")
+async def test_the_rollouts_of_an_experiment_lead_to_their_policy_and_its_training_episodes(
+    database_url: str, tmp_path: Path
+) -> None:
+    place = MemoryLocation(database_url, tmp_path / "spool")
+    learned = await run(SMALL, place)
+    save_policy(default_policy(), tmp_path / "policy.json")  # what the file holds does not matter
+    async with Reading.open(place.url) as reading:
+        evaluation = learned.evaluation
+        assert name_of(await read_policy(reading, evaluation.policy)) == name_of(learned.policy) == evaluation.policy
+        async with reading.session() as session:
+            first, last = (await session.scalars(select(LearnPolicyAction).order_by(LearnPolicyAction.id))).all()
+            batches = (await session.scalars(select(BatchRolloutAction))).all()
+            uuids = {each.id: each.uuid for each in await session.scalars(select(ProcessMetaData))}
+    assert (first.policy, last.policy) == (learned.phases[1].policy, evaluation.policy)
+    assert (first.rollouts, last.rollouts, first.seeds, last.seeds) == (600, 1_200, [69], [69, 70])
+    assert last.successes == len(learned.successes)
+    assert learn(frame_of(learned.successes), min_samples_leaf=25).leaves == learned.policy.leaves  # of both rounds
+    assert (last.min_samples_leaf, last.scene) == (25, str(SMALL.scene))
+    for each, seeds in ((first, {69}), (last, {69, 70})):
+        training = {uuids[batch.process_metadata_id] for batch in batches if batch.seed in seeds}
+        assert training == set(each.training_episodes)
+        assert each.episode_count == len(training) > 1
+    again = await run(Experiment(**{**vars(SMALL), "resume": True}), place)
+    assert again.policy.leaves == learned.policy.leaves
+    async with Reading.open(place.url) as reading, reading.session() as session:
+        assert len((await session.scalars(select(LearnPolicyAction))).all()) == 2

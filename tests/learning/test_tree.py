@@ -1,3 +1,5 @@
+"""A tree of places: learned as pyjpt learns it, queried, saved and read again, however many leaves it has."""
+
 from __future__ import annotations
 
 import json
@@ -15,12 +17,23 @@ import pandas as pd
 import pytest
 
 from pycrorm_async.errors import CallerError, ImpossibleCondition, MissingExtra, NotEnoughExperience
-from pycrorm_async.learning.policy import Evidence, PickUpChoice, Policy, Rectangle, Region, default_policy, save_policy
+from pycrorm_async.learning.policy import (
+    Evidence,
+    PickUpChoice,
+    Policy,
+    Rectangle,
+    Region,
+    default_policy,
+    load_policy,
+    name_of,
+    save_policy,
+)
 from pycrorm_async.learning.tree import learn
 from pycrorm_async.world.pose import Arms, Grasp
 from tests.learning.geometric_rollouts import frame_of, succeeds
 
 pytestmark = pytest.mark.slow
+
 
 LEFT = Evidence(arms=frozenset({Arms.LEFT}))
 ALIKE = {"arm": ["LEFT"] * 30, "grasp": ["FRONT"] * 30, "object_x": [0.5] * 30, "object_y": [0.1] * 30}
@@ -159,7 +172,7 @@ def test_learning_again_yields_the_same_policy(learned: Policy, successes: list[
 
 @pytest.mark.soak  # test_policy_file reads one there
 def test_a_learned_policy_is_the_same_in_another_process_without_pyjpt(learned: Policy, tmp_path: Path) -> None:
-    from tests.learning.test_policy_file import ELSEWHERE
+    from tests.learning.test_policy import ELSEWHERE
 
     save_policy(learned, tmp_path / "policy.json")
     elsewhere = [sys.executable, "-c", ELSEWHERE, str(tmp_path / "policy.json")]
@@ -337,3 +350,45 @@ def test_the_mode_for_every_arm_and_grasp_succeeds_nearly_always() -> None:
 
 def rng() -> np.random.Generator:
     return np.random.default_rng(9)
+
+
+# === large tree ===============================================================================================
+#
+# A tree with far more leaves than Python's recursion limit: learned, queried, saved and read again.
+
+SQUARE = Rectangle(0.0, 1.0, 0.0, 1.0)
+BESIDE = Evidence(region=Region((SQUARE,)), height=(-0.1, 0.1))
+
+
+@pytest.fixture(scope="module")
+def choices() -> list[PickUpChoice]:
+    return default_policy().sample(np.random.default_rng(5), 3_000)
+
+
+@pytest.fixture(scope="module")
+def learned_large(choices: list[PickUpChoice]) -> Policy:
+    heights = np.random.default_rng(6).uniform(-0.5, 0.5, len(choices))
+    return learn(frame_of(choices).assign(height=heights), min_samples_leaf=2)
+
+
+def test_a_tree_has_more_leaves_than_python_nests_calls(learned_large: Policy, choices: list[PickUpChoice]) -> None:
+    assert len(learned_large.leaves) > sys.getrecursionlimit()
+    assert learned_large.coverage(choices) == 1.0
+    assert learned_large.probability(LEFT) == pytest.approx(np.mean([each.arm is Arms.LEFT for each in choices]))
+
+
+def test_a_large_tree_answers_under_evidence(learned_large: Policy) -> None:
+    conditioned = learned_large.condition(LEFT).condition(BESIDE)
+    drawn = conditioned.sample(np.random.default_rng(7), 500)
+    assert {each.arm for each in drawn} == {Arms.LEFT}
+    assert all(0 <= each.relative_x <= 1 and 0 <= each.relative_y <= 1 for each in drawn)
+    assert (conditioned.likelihood(drawn) > 0).all()
+    assert conditioned.probability(LEFT) == pytest.approx(1.0)
+    assert conditioned.mode().probability(BESIDE) == pytest.approx(1.0)
+
+
+def test_a_large_tree_is_the_same_from_its_file(learned_large: Policy, tmp_path: Path) -> None:
+    save_policy(learned_large, tmp_path / "policy.json")
+    loaded = load_policy(tmp_path / "policy.json")
+    assert loaded == learned_large
+    assert name_of(loaded) == name_of(learned_large)

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from pycrorm_async import Settings
-from tests.memory.daemon_in_loop import QUICK, Daemon, Start
+from tests.writer.running_writers import QUICKLY_SYNCED, Daemon, Start
 
 
 @pytest.fixture
@@ -18,7 +18,7 @@ def spool(tmp_path: Path) -> Path:
 @pytest.fixture
 def daemon(database_url: str, spool: Path) -> Start:
     @asynccontextmanager
-    async def running(settings: Settings = QUICK) -> AsyncIterator[Daemon]:
+    async def running(settings: Settings = QUICKLY_SYNCED) -> AsyncIterator[Daemon]:
         started = Daemon(database_url, spool, settings)
         yield started
         started.leave.set()

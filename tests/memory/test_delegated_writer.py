@@ -1,28 +1,43 @@
-"""A memory whose events a daemon stores: the same promises, no connection for writing, clear errors without a
-daemon.
-"""
+"""A memory whose events a daemon stores: the same promises, clear errors, also when the daemon has faults."""
 
 import asyncio
 import logging
+import shutil
+import sqlite3
+import threading
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from sqlalchemy import select
 
-from pycrorm_async import Memory, Reading, recover
-from pycrorm_async.errors import CallerError, DatabaseUnavailable, EpisodeParked, FlushTimeout
+from pycrorm_async import Memory, Reading, Settings, UserView, recover
+from pycrorm_async.errors import (
+    CallerError,
+    DatabaseForeign,
+    DatabaseUnavailable,
+    EpisodeParked,
+    FlushTimeout,
+    SpoolForeign,
+    SpoolUnavailable,
+)
+from pycrorm_async.operations.daemon import serve
 from pycrorm_async.orm import ProcessMetaData
 from pycrorm_async.queue import Spool
 from pycrorm_async.queue.sources import LiveSource
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.databases import ask, ask_to_change
-from tests.memory.daemon_in_loop import QUICK, Daemon, Start, memory_at
 from tests.memory.note_actions import NoteActionPerformable, texts
+from tests.writer.running_writers import QUICKLY_SYNCED, Daemon, Start, memory_at
 
 pytestmark = [pytest.mark.slow, pytest.mark.soak_on("postgresql")]
-"""Files and processes keep this promise, without SQL of their own, so that servers test it in turns."""
+
+
+# === delegated writer =========================================================================================
+#
+# A memory whose events a daemon stores: the same promises, no connection for writing, clear errors without a daemon.
 
 
 async def test_flushed_records_are_in_the_tables_and_closing_leaves_no_folder(
@@ -76,7 +91,7 @@ async def test_the_daemon_may_start_before_the_database_exists(tmp_path: Path, s
 async def test_without_a_daemon_flush_raises_and_closing_leaves_the_events_to_the_next_drainer(
     database_url: str, spool: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    async with memory_at(database_url, spool, replace(QUICK, flush_timeout_s=0.3)) as memory:
+    async with memory_at(database_url, spool, replace(QUICKLY_SYNCED, flush_timeout_s=0.3)) as memory:
         await NoteActionPerformable("a").perform()
         with pytest.raises(FlushTimeout, match="no process drains this spool: start `pycrorm writer`"):
             await memory.flush()
@@ -92,7 +107,7 @@ async def test_without_a_daemon_flush_raises_and_closing_leaves_the_events_to_th
 async def test_closing_reports_that_all_is_stored_and_the_tables_are_behind(
     database_url: str, spool: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    async with memory_at(database_url, spool, replace(QUICK, flush_timeout_s=0.3)) as memory:
+    async with memory_at(database_url, spool, replace(QUICKLY_SYNCED, flush_timeout_s=0.3)) as memory:
         await NoteActionPerformable("a").perform()
         await memory.synced()
         [folder] = Spool(spool).recorders()
@@ -108,7 +123,7 @@ async def test_closing_reports_that_all_is_stored_and_the_tables_are_behind(
 async def test_a_flush_returns_when_a_daemon_died_between_storing_and_folding_and_the_next_one_folds(
     database_url: str, spool: Path, daemon: Start
 ) -> None:
-    async with memory_at(database_url, spool, replace(QUICK, flush_timeout_s=10.0)) as memory:
+    async with memory_at(database_url, spool, replace(QUICKLY_SYNCED, flush_timeout_s=10.0)) as memory:
         await NoteActionPerformable("a").perform()
         await memory.synced()
         [folder] = Spool(spool).recorders()
@@ -145,7 +160,9 @@ async def test_one_round_stores_what_a_live_process_has_synced_and_its_flush_ret
 async def test_the_daemon_drains_a_full_spool_and_the_plan_continues(
     database_url: str, spool: Path, daemon: Start
 ) -> None:
-    tiny = replace(QUICK, segment_bytes=2**14, record_bytes_max=2**12, spool_bytes_max=2**17, spool_reserve_bytes=2**15)
+    tiny = replace(
+        QUICKLY_SYNCED, segment_bytes=2**14, record_bytes_max=2**12, spool_bytes_max=2**17, spool_reserve_bytes=2**15
+    )
     async with memory_at(database_url, spool, tiny) as memory, memory.episode(description="e"):
 
         async def many() -> None:
@@ -182,7 +199,7 @@ async def test_a_flush_reports_a_parked_episode_once_and_the_others_continue(
 async def test_a_refused_episode_is_reported_and_kept_and_stored_by_a_later_daemon_when_possible(
     database_url: str, spool: Path, daemon: Start
 ) -> None:
-    settings = replace(QUICK, keep_stored_s=0)  # a daemon that keeps no stored segments repairs nothing
+    settings = replace(QUICKLY_SYNCED, keep_stored_s=0)  # a daemon that keeps no stored segments repairs nothing
     async with memory_at(database_url, spool, settings) as memory:
         async with memory.episode(description="refused") as refused:
             async with daemon(settings):
@@ -227,7 +244,7 @@ async def test_a_refused_episode_is_reported_and_kept_and_stored_by_a_later_daem
 async def test_one_round_reports_to_a_live_recorder_its_refused_and_parked_episodes(
     database_url: str, spool: Path
 ) -> None:
-    settings = replace(QUICK, connect_timeout_s=60)
+    settings = replace(QUICKLY_SYNCED, connect_timeout_s=60)
     async with Memory.open(database_url, spool=spool, settings=settings) as memory:
         async with memory.episode(description="of another"):
             await NoteActionPerformable("a").perform()
@@ -245,3 +262,148 @@ async def test_one_round_reports_to_a_live_recorder_its_refused_and_parked_episo
         with pytest.raises(EpisodeParked) as caught:
             await memory.flush()
         assert caught.value.reasons == {str(parked): "by hand"}
+
+
+# === daemon faults ============================================================================================
+#
+# A daemon on a database that is replaced, locked or foreign, on a damaged folder, or beside another daemon.
+
+
+async def test_a_daemon_ends_when_its_database_file_is_replaced_and_waits_when_the_file_is_deleted(
+    tmp_path: Path, spool: Path
+) -> None:
+    file = tmp_path / "memory.db"
+    url = f"sqlite:///{file}"
+    started = Daemon(url, spool)
+    async with memory_at(url, spool, replace(QUICKLY_SYNCED, flush_timeout_s=0.5)):
+        await NoteActionPerformable("a").perform()
+        await started.wait_for_line("appeared")
+        file.rename(tmp_path / "away.db")
+        await NoteActionPerformable("b").perform()
+        await started.wait_for_line("the database is unavailable: .*removed or replaced")
+        (tmp_path / "away.db").rename(file)
+        await started.wait_for_line("the database is available again")
+        shutil.copy(file, tmp_path / "copy.db")
+        (tmp_path / "copy.db").replace(file)
+        await NoteActionPerformable("c").perform()
+        async with asyncio.timeout(60):
+            with pytest.raises(DatabaseForeign, match=r"memory\.db was replaced while it was open: start"):
+                await started.task
+    assert not any("Traceback" in line for line in started.lines)
+    report = await recover(url, spool=spool)
+    assert report.failed == {}
+
+
+async def test_a_second_daemon_on_the_same_spool_is_refused_in_one_line(
+    database_url: str, spool: Path, daemon: Start
+) -> None:
+    async with daemon() as started:
+        await started.wait_for_line("draining")
+        with pytest.raises(SpoolUnavailable, match="another `pycrorm writer` drains it already") as refused:
+            await serve(database_url, spool=spool, stop=asyncio.Event(), report=print)
+        assert "\n" not in str(refused.value)
+    async with daemon() as started:
+        await started.wait_for_line("draining")
+
+
+async def test_a_daemon_that_is_cancelled_during_a_scan_leaves_the_folders_to_the_next(
+    database_url: str, spool: Path, daemon: Start, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    looking, cancelled = threading.Event(), threading.Event()
+
+    take = LiveSource.take
+
+    def take_late(folder: Path) -> LiveSource | None:
+        looking.set()
+        assert cancelled.wait(60)
+        return take(folder)
+
+    async with memory_at(database_url, spool) as memory:
+        await NoteActionPerformable("a").perform()
+        with monkeypatch.context() as patch:
+            patch.setattr(LiveSource, "take", take_late)
+            first = Daemon(database_url, spool)
+            assert await asyncio.to_thread(looking.wait, 60)
+            first.task.cancel()
+            cancelled.set()
+            with pytest.raises(asyncio.CancelledError):
+                await first.task
+        assert not memory.status.drained
+        async with daemon():
+            await memory.flush()
+            assert await texts(memory) == ["a"]
+
+
+async def test_a_spool_of_another_database_is_refused_and_left_unchanged(
+    database_url: str, spool: Path, tmp_path: Path
+) -> None:
+    async with memory_at(database_url, spool, replace(QUICKLY_SYNCED, flush_timeout_s=0.1)):
+        await NoteActionPerformable("a").perform()
+        await recover(database_url, spool=spool)
+        await NoteActionPerformable("b").perform()
+        async with Memory.open(f"sqlite:///{tmp_path}/other.db"):
+            pass
+        with pytest.raises(SpoolForeign, match="belongs to log"):
+            await serve(f"sqlite:///{tmp_path}/other.db", spool=spool, stop=asyncio.Event(), report=print)
+        await recover(database_url, spool=spool)
+    assert ask(f"sqlite:///{tmp_path}/other.db", "SELECT count(*) FROM event") == [(0,)]
+
+
+async def test_damage_in_one_folder_is_reported_and_the_others_are_drained(
+    database_url: str, spool: Path, daemon: Start
+) -> None:
+    for text in ("damaged", "whole"):
+        async with memory_at(database_url, spool, replace(QUICKLY_SYNCED, flush_timeout_s=0.1)) as memory:
+            await NoteActionPerformable(text).perform()
+    first, second = Spool(spool).recorders()
+    segment = first.path / "00000001.segment"
+    content = bytearray(segment.read_bytes())
+    content[content.index(b"damaged")] ^= 1
+    segment.write_bytes(content)
+    async with daemon() as started:
+        await started.wait_for_line(f"{first.name}: .*00000001.segment is damaged at byte .*; retrying")
+        await started.wait_for_line(f"{second.name} is recovered")
+    async with Reading.open(database_url) as reading:
+        assert await texts(reading) == ["whole"]
+    assert [each.name for each in Spool(spool).recorders()] == [first.name]
+    assert memory.is_open is False
+
+
+@pytest.mark.parametrize(
+    ("open_it", "words"),
+    [
+        (lambda: Memory.open("sqlite://", writer="daemon"), "sqlite:// is private to this process"),
+        (
+            lambda: Memory.open("sqlite:///x.db", writer="daemon", views=[UserView("v", select(ProcessMetaData.id))]),
+            "without the views of this process",
+        ),
+        (lambda: Memory.open("sqlite:///x.db", settings=Settings(writer="cron")), "use 'thread' or 'daemon'"),  # type: ignore[arg-type]
+    ],
+)
+def test_an_impossible_daemon_is_refused_at_once(open_it: Callable[[], Memory], words: str) -> None:
+    with pytest.raises(CallerError, match=words):
+        open_it()
+
+
+async def test_a_locked_database_is_unavailable_to_the_daemon_and_closing_does_not_wait_for_it(
+    tmp_path: Path, spool: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    url = f"sqlite:///{tmp_path / 'memory.db'}"
+    started = Daemon(url, spool)
+    async with memory_at(url, spool) as memory:
+        await NoteActionPerformable("a").perform()
+        await memory.flush()
+        other = sqlite3.connect(tmp_path / "memory.db", isolation_level=None)
+        other.execute("BEGIN IMMEDIATE")
+        await NoteActionPerformable("b").perform()
+        await started.wait_for_line("the database is unavailable: .*locked; retrying")
+    [line] = [each.getMessage() for each in caplog.records if each.levelno == logging.WARNING]
+    assert "the daemon reports that the database is unavailable" in line
+    other.execute("COMMIT")
+    other.close()
+    await started.wait_for_line("the database is available again after")
+    await started.wait_for_line("is recovered")
+    started.leave.set()
+    await started.task
+    async with Reading.open(url) as reading:
+        assert await texts(reading) == ["a", "b"]

@@ -1,23 +1,47 @@
-"""The life of a memory: opened, recorded into, queried, and closed."""
+"""The life of a memory: opened, recorded into, queried and closed; what it refuses and what it notices."""
+
+from __future__ import annotations
 
 import asyncio
+import gc
 import os
 import sqlite3
 import subprocess
 import sys
-from contextlib import closing
+import warnings
+from collections.abc import Iterator
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, ClassVar
 
 import pytest
 from sqlalchemy import select
 
-from pycrorm_async import Memory, Reading
+from pycrorm_async import Memory, Reading, Settings
+from pycrorm_async.errors import (
+    CallerError,
+    DatabaseForeign,
+    DatabaseUnavailable,
+    EpisodeParked,
+    FlushTimeout,
+    SpoolForeign,
+    SpoolStuck,
+    UnknownUrl,
+)
+from pycrorm_async.events.codec import Heading, encode, fingerprint
+from pycrorm_async.events.types import NodeStarted
 from pycrorm_async.orm import ProcessMetaData, TaskTreeNode
 from pycrorm_async.plan import ActionAbstract, PlanFailure
+from pycrorm_async.plan.execution import recorder
 from pycrorm_async.task_status import TaskStatus
-from tests.commands import environment
+from tests.commands import answer, environment
+from tests.databases import ask
 from tests.memory.note_actions import NoteActionPerformable, texts, url_of
+
+# === memory ===================================================================================================
+#
+# The life of a memory: opened, recorded into, queried, and closed.
 
 
 @pytest.mark.slow
@@ -97,3 +121,325 @@ async def test_importing_the_package_loads_no_optional_library() -> None:
     )
     assert done.stdout == "[]\n", done.stderr
     assert os.environ.get("PYCRORM_URL") is None
+
+
+# === refusals =================================================================================================
+#
+# Refusals by a memory and their messages; no recorded event is lost by one.
+
+
+@pytest.mark.slow
+async def test_a_memory_that_is_not_open_names_the_call_that_opens_it(tmp_path: Path) -> None:
+    memory = Memory.open(url_of(tmp_path))
+    with pytest.raises(CallerError, match=r"async with Memory\.open"):
+        await memory.flush()
+    async with memory:
+        pass
+    with pytest.raises(CallerError, match=r"async with Memory\.open"):
+        async with memory.episode(description="e"):
+            pass
+
+
+@pytest.mark.slow
+async def test_bad_addresses_are_refused_with_their_class(tmp_path: Path) -> None:
+    with pytest.raises(UnknownUrl):
+        Memory.open("mysql://lab/memory")
+    for url, error in (
+        (f"sqlite:///{tmp_path}/none/memory.db", DatabaseUnavailable),
+        ("postgresql://ada:secret@lab/memory", DatabaseUnavailable),
+    ):
+        with pytest.raises(error) as refused:
+            async with Memory.open(url):
+                pass
+        assert "secret" not in str(refused.value)
+    (tmp_path / "text.db").write_text("no database at all, and rather more than a hundred bytes of it" * 10)
+    with pytest.raises(DatabaseForeign):
+        async with Memory.open(f"sqlite:///{tmp_path}/text.db"):
+            pass
+    assert not (tmp_path / "text.db.spool").exists()
+    assert recorder.get() is None
+
+
+@pytest.mark.slow
+async def test_a_spool_belongs_to_one_database_while_it_holds_a_recorder(tmp_path: Path) -> None:
+    spool = tmp_path / "spool"
+    async with Memory.open(f"sqlite:///{tmp_path}/1.db", spool=spool):
+        await NoteActionPerformable("a").perform()
+    async with Memory.open(f"sqlite:///{tmp_path}/2.db", spool=spool) as memory:
+        await NoteActionPerformable("b").perform()
+        await memory.flush()
+        with pytest.raises(SpoolForeign, match="pycrorm spool rebind"):
+            async with Memory.open(f"sqlite:///{tmp_path}/1.db", spool=spool):
+                pass
+        with pytest.raises(DatabaseUnavailable, match="the spool belongs to log"):  # no other file is made
+            async with Memory.open(f"sqlite:///{tmp_path}/3.db", spool=spool):
+                pass
+        assert not (tmp_path / "3.db").exists()
+        assert await texts(memory) == ["b"]
+
+
+@pytest.mark.slow
+async def test_a_flush_that_cannot_reach_the_database_raises_and_loses_nothing(tmp_path: Path) -> None:
+    settings = Settings(flush_timeout_s=0.3)
+    async with Memory.open(url_of(tmp_path), settings=settings) as memory:
+        await NoteActionPerformable("before").perform()
+        await flushed(memory)
+        other = sqlite3.connect(tmp_path / "memory.db", isolation_level=None)
+        other.execute("BEGIN IMMEDIATE")
+        await NoteActionPerformable("meanwhile").perform()
+        with pytest.raises(FlushTimeout, match="safe in the spool"):
+            await memory.flush()
+        other.execute("ROLLBACK")
+        other.close()
+        await flushed(memory)
+        assert await texts(memory) == ["before", "meanwhile"]
+
+
+async def flushed(memory: Memory) -> None:
+    """Flush, and repeat it when its short timeout expires on a busy machine."""
+    async with asyncio.timeout(60):
+        while True:
+            with suppress(FlushTimeout):
+                return await memory.flush()
+
+
+@pytest.mark.slow
+async def test_a_field_that_contradicts_the_tables_has_a_column_of_its_own(tmp_path: Path) -> None:
+    async with Memory.open(url_of(tmp_path)):
+        await NoteActionPerformable("text").perform()
+
+    @dataclass
+    class Other(ActionAbstract):
+        dtype: ClassVar[str] = "NoteAction"
+        text: int
+
+        async def perform(self) -> None:
+            """Succeed without doing anything."""
+
+    async with Memory.open(url_of(tmp_path)) as memory:
+        await Other(7).perform()
+        await memory.flush()
+        assert await texts(memory) == ["text", None]
+    assert ask(url_of(tmp_path), "SELECT text_integer FROM note_action ORDER BY id") == [(None,), (7,)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("arguments", "named"),
+    [
+        ({"seed": 2**63}, "seed"),
+        ({"seed": "x"}, "seed"),
+        ({"seed": 1.5}, "seed"),
+        ({"description": 5}, "description"),
+        ({"description": "x" * 3_000_000}, "description"),
+        ({"plan": "x" * 3_000_000}, "plan"),
+    ],
+)
+async def test_an_impossible_argument_of_an_episode_is_refused_by_name(
+    tmp_path: Path, arguments: dict[str, Any], named: str
+) -> None:
+    async with Memory.open(url_of(tmp_path), settings=Settings(on_unrecordable="refuse")) as memory:
+        with pytest.raises(CallerError, match=f"the {named} of an episode must be"):
+            async with memory.episode(**arguments):
+                pass
+        async with memory.episode(description="fine", seed=-1):
+            await NoteActionPerformable("a").perform()
+        await memory.flush()
+        assert [each.description for each in await memory.reading.episodes()] == ["fine"]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "arguments", [{"on_full": "waait"}, {"on_unrecordable": ""}, {"batch_events_max": 0}, {"flush_timeout_s": -1.0}]
+)
+def test_an_impossible_setting_is_refused_by_name(arguments: dict[str, Any]) -> None:
+    with pytest.raises(CallerError, match=rf"Settings\.{next(iter(arguments))} is "):
+        Settings(**arguments)
+
+
+@pytest.mark.slow
+async def test_an_attribute_of_a_memory_that_is_not_open_raises_attribute_error(tmp_path: Path) -> None:
+    memory = Memory.open(url_of(tmp_path))
+    for use in (
+        lambda: memory.status,
+        lambda: memory.reading,
+        memory.session,
+        lambda: memory.mapped("NoteAction"),
+        lambda: memory.recent_episodes,
+    ):
+        with pytest.raises(CallerError, match=r"async with Memory\.open"):
+            use()
+
+
+@pytest.mark.slow
+async def test_a_parked_episode_is_reported_once(tmp_path: Path) -> None:
+    async with Memory.open(url_of(tmp_path)) as memory:
+        with sqlite3.connect(tmp_path / "memory.db") as plain:
+            plain.execute("CREATE TABLE note_action (mine TEXT)")
+        plain.close()
+        await NoteActionPerformable("a").perform()
+        with pytest.raises(EpisodeParked):
+            await memory.flush()
+        await memory.flush()
+        assert memory.status.faults.total == 0
+
+
+@pytest.mark.slow
+async def test_a_foreign_table_with_a_used_name_is_named_and_parks_that_type_until_it_is_renamed(
+    tmp_path: Path,
+) -> None:
+    in_the_way = r"note_action already exists: rename your table or view, then open the memory again"
+    async with Memory.open(url_of(tmp_path)) as memory:
+        with sqlite3.connect(tmp_path / "memory.db") as plain:
+            plain.execute("CREATE TABLE note_action (mine TEXT)")
+        await NoteActionPerformable("a").perform()
+        with pytest.raises(EpisodeParked, match=in_the_way):
+            await memory.flush()
+    with plain:
+        plain.execute("ALTER TABLE note_action RENAME TO my_notes")
+    plain.close()
+    async with Memory.open(url_of(tmp_path)) as memory:
+        await memory.flush()
+        assert await texts(memory) == ["a"]
+
+
+@pytest.mark.slow
+async def test_closing_logs_a_parked_episode_and_raises_nothing_over_a_plan_that_succeeded(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with Memory.open(url_of(tmp_path)) as memory:
+        with sqlite3.connect(tmp_path / "memory.db") as plain:
+            plain.execute("CREATE TABLE note_action (mine TEXT)")
+        plain.close()
+        async with memory.episode(description="well done") as episode:
+            await NoteActionPerformable("a").perform()
+    [line] = [each.message for each in caplog.records if each.name == "pycrorm_async"]
+    assert line.startswith(f"when closing the memory: not everything could be stored or folded: episode {episode}: ")
+    done = answer("status", "--url", url_of(tmp_path), cwd=tmp_path, code=1)
+    assert [(each["id"], "note_action already exists" in each["parked"]) for each in done["episodes"]] == [
+        (str(episode), True)
+    ]
+    assert [*done["unmade"]] == ["NoteAction"]
+
+
+@pytest.mark.slow
+async def test_a_declaration_this_version_cannot_read_parks_its_episode_alone(tmp_path: Path) -> None:
+    async with Memory.open(url_of(tmp_path)) as memory:
+        queue = memory._open_parts.queue
+        payload = b'{"kind":"action","dtype":"DreamAction","table":"dream_action","fields":[{"type":"dream"}]}'
+        queue.put_nowait(Heading(None, "DesignatorTypeDeclared", 1), payload)
+        with pytest.raises(EpisodeParked, match="cannot read the declaration of its type"):
+            async with memory.episode(description="newer") as episode:
+                started = NodeStarted("action", 2, fingerprint(payload))
+                queue.put_nowait(Heading(episode.id, "NodeStarted", 1), encode(started))
+                await memory.flush()
+        await NoteActionPerformable("fine").perform()
+        await memory.flush()
+        assert await texts(memory) == ["fine"]
+
+
+@pytest.mark.slow
+async def test_a_full_spool_without_a_drainer_fails_a_start_instead_of_blocking_for_ever(tmp_path: Path) -> None:
+    settings = Settings(
+        segment_bytes=2**18, record_bytes_max=2**12, spool_bytes_max=2**20 + 2**18, spool_reserve_bytes=2**18
+    )
+    reached = 0
+    async with Memory.open(url_of(tmp_path), settings=settings) as memory:
+        other = sqlite3.connect(tmp_path / "memory.db", isolation_level=None)
+        other.execute("BEGIN IMMEDIATE")  # nothing can be stored, so that no space is freed
+        with pytest.raises(SpoolStuck, match="the writer has stopped"):
+            async with memory.episode(description="e"):
+                memory._open_parts.queue.fail("the writer has stopped")
+                while True:
+                    await asyncio.wait_for(NoteActionPerformable("x" * 2_000).perform(), 30)
+                    reached += 1
+        other.execute("ROLLBACK")
+        other.close()
+    assert reached > 100
+    async with Reading.open(url_of(tmp_path)) as reading:
+        assert len(await texts(reading)) == reached
+
+
+# === unawaited performs =======================================================================================
+#
+# A perform that was called and never awaited is noticed and named, and differs from a cancelled one.
+
+SENTENCE = "NoteAction.perform() was called and never awaited, so it did not run: write `await`"
+FAULT = "NoteAction.perform() was called and never awaited"
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Ignore Python's own warning: the test is about the package's."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        yield
+        gc.collect()
+
+
+@pytest.mark.slow
+async def test_a_perform_that_is_not_awaited_is_a_fault_of_its_episode(tmp_path: Path) -> None:
+    async with Memory.open(url_of(tmp_path)) as memory:
+        async with memory.episode() as episode:
+            with quiet():
+                NoteActionPerformable("lost").perform()  # type: ignore[unused-coroutine]  # the fault here
+                NoteActionPerformable("lost again").perform()  # type: ignore[unused-coroutine]  # the fault here
+            await NoteActionPerformable("kept").perform()
+            assert episode.faults == (FAULT,)
+        async with memory.episode() as other:
+            await NoteActionPerformable("fine").perform()
+        assert other.faults == ()
+        assert memory.status.faults == (2, SENTENCE)
+        assert memory.status.unawaited == (SENTENCE,)
+        await memory.flush()
+        assert await texts(memory) == ["kept", "fine"]
+
+
+@pytest.mark.slow
+async def test_one_that_still_exists_at_the_end_of_its_episode_is_noticed_then_and_once(tmp_path: Path) -> None:
+    async with Memory.open(url_of(tmp_path)) as memory:
+        async with memory.episode() as episode:
+            forgotten = NoteActionPerformable("forgotten").perform()
+        assert episode.faults == (FAULT,)
+        with quiet():
+            del forgotten
+        assert memory.status.faults.total == 1
+
+
+@pytest.mark.slow
+async def test_outside_any_episode_it_is_a_fault_of_the_memory(tmp_path: Path) -> None:
+    async with Memory.open(url_of(tmp_path)) as memory:
+        with quiet():
+            NoteActionPerformable("lost").perform()  # type: ignore[unused-coroutine]  # the fault here
+        assert memory.status.unawaited == (SENTENCE,)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.version_info >= (3, 12), reason="Python keeps the frame of a coroutine closed before its start")
+async def test_a_perform_that_was_closed_before_its_start_is_no_fault(tmp_path: Path) -> None:
+    async with Memory.open(url_of(tmp_path)) as memory:
+        async with memory.episode() as episode:
+            closed = NoteActionPerformable("closed").perform()
+            closed.close()
+            del closed
+            gc.collect()
+        assert episode.faults == ()
+        assert memory.status.faults.total == 0
+
+
+@pytest.mark.slow
+async def test_a_perform_that_was_cancelled_before_its_start_or_starts_later_is_no_fault(tmp_path: Path) -> None:
+    async with Memory.open(url_of(tmp_path)) as memory:
+        async with memory.episode() as episode:
+            cancelled = asyncio.create_task(NoteActionPerformable("cancelled").perform())
+            cancelled.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await cancelled
+            with pytest.raises(TimeoutError):
+                await asyncio.wait_for(NoteActionPerformable("too late").perform(), 0)
+            later = asyncio.create_task(NoteActionPerformable("later").perform())
+            del cancelled
+            gc.collect()
+        await later
+        assert episode.faults == ()
+        assert memory.status.faults.total == 0

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import os
 import shutil
 import signal
 from collections.abc import Callable
@@ -10,19 +12,95 @@ from importlib.metadata import distribution
 from pathlib import Path
 
 import pytest
+from sqlalchemy import select
 
 from pycrorm_async import Memory, Reading, world_of
 from pycrorm_async.operations.rebuild import rebuild_memory
 from pycrorm_async.operations.recovery import recover
+from pycrorm_async.orm import Object as ObjectRow
+from pycrorm_async.orm import ObjectDescription
 from pycrorm_async.query.again import RecordedWorld
+from pycrorm_async.record.values import Missing
 from pycrorm_async.settings import Settings
-from pycrorm_async.world import BulletWorld, Object, ObjectType, copied
+from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose, copied
 from pycrorm_async.world.urdf import PR2
 from tests.commands import run_script
 from tests.golden.unpacking import unpack_memory_v1
-from tests.memory.recorded_arm import AT, RED, made_arm, recorded, wedge
 
 pytestmark = pytest.mark.usefixtures("in_a_folder_of_its_own")
+
+
+# === recorded arm =============================================================================================
+#
+# Write an arm with a mesh on each of its links, and record it with a milk that it carries.
+
+AT = Pose([1, -2, 0.5], [0, 0, 0.6, 0.8])
+RED = (1.0, 0.0, 0.0, 0.5)
+
+
+def wedge(height: float) -> str:
+    return f"v 0 0 0\nv 1 0 0\nv 0 2 0\nv 0 0 {height}\nf 1 3 2\nf 1 2 4\nf 2 3 4\nf 1 4 3\n"
+
+
+def made_arm(folder: Path, height: float = 3.0) -> Path:
+    """An arm of two joints with a mesh on each link; its frames are turned, its masses off the frames."""
+    (folder / "meshes").mkdir(parents=True, exist_ok=True)
+    (folder / "meshes" / "wedge.obj").write_text(wedge(height))
+
+    def link(name: str, at: str) -> str:
+        mesh = '<geometry><mesh filename="meshes/wedge.obj" scale="0.1 0.1 0.1"/></geometry>'
+        return (
+            f'<link name="{name}"><inertial><origin xyz="{at}" rpy="0.3 0.2 0.1"/><mass value="2"/>'
+            '<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>\n'
+            f'<visual>{mesh}<material name="m"><color rgba="0 1 0 1"/></material></visual>\n'
+            f'<collision><origin xyz="{at}"/>{mesh}</collision></link>\n'
+        )
+
+    def joint(name: str, kind: str, parent: str, child: str) -> str:
+        return (
+            f'<joint name="{name}" type="{kind}"><origin xyz="0.1 0.2 0.3" rpy="0.5 -0.4 0.3"/>'
+            f'<parent link="{parent}"/><child link="{child}"/><axis xyz="0 0.6 0.8"/>'
+            '<limit lower="-2" upper="2" effort="1" velocity="1"/></joint>\n'
+        )
+
+    file = folder / "arm.urdf"
+    file.write_text(
+        '<robot name="arm">\n'
+        + link("base", "0 0 0.1")
+        + link("upper", "0.2 0 0")
+        + link("tip", "0 0.3 0")
+        + joint("shoulder", "revolute", "base", "upper")
+        + joint("slide", "prismatic", "upper", "tip")
+        + "</robot>\n"
+    )
+    return file
+
+
+def link_poses(world: BulletWorld) -> dict[str, list[float]]:
+    return {
+        f"{each.name}/{link}": [*each.link_pose(link).position, *each.link_pose(link).orientation]
+        for each in world.objects
+        for link in each.links
+    }
+
+
+async def recorded(url: str, robot: Path | str, settings: Settings) -> tuple[dict[str, list[float]], Missing]:
+    """Record the robot beside a milk that it carries; return the poses of all links."""
+    async with Memory.open(url, settings=settings) as memory:
+        async with memory.episode(description="seen"):
+            with BulletWorld() as world:
+                arm = Object("arm", ObjectType.ROBOT, robot, AT)
+                milk = Object("milk", ObjectType.MILK, pose=Pose([0, 0, 1]), color=RED)
+                arm.attach(milk, arm.links[-1])
+                middles = {joint: sum(arm.joint_limits(joint)) / 2 + 0.01 for joint in arm.joints}
+                arm.set_joint_positions(middles)
+                poses = link_poses(world)
+        await memory.flush()
+        assert memory.status.faults.total == 0, memory.status.faults.last
+        return poses, memory.status.missing
+
+
+# === recorded geometry ========================================================================================
 
 ROBOTS = "cmeel.prefix/share/example-robot-data/robots"
 
@@ -226,3 +304,163 @@ async def test_objects_of_an_older_version_have_assumed_shapes_and_are_marked_so
     with world:
         assert [(each.name, each.color) for each in world.objects] == [("milk", None), ("pr2", None)]
         assert world.object("pr2").joint_position("torso_lift_joint") == 0.3
+
+
+# === recorded meshes ==========================================================================================
+#
+# Meshes are recorded by the hash of their content, and a mesh or description that cannot be kept is counted.
+
+
+async def test_a_mesh_that_changed_with_its_size_and_its_time_kept_is_hashed_again(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path / 'm.db'}"
+    hashes = []
+    async with Memory.open(url) as memory:
+        async with memory.episode(description="changed"):
+            with BulletWorld():
+                for height in (3, 5):
+                    robot = made_arm(tmp_path, height)
+                    os.utime(tmp_path / "meshes" / "wedge.obj", (1, 1))
+                    hashes.append(hashlib.sha256((tmp_path / "meshes" / "wedge.obj").read_bytes()).hexdigest())
+                    Object(f"arm {height}", ObjectType.GENERIC_OBJECT, robot)
+        await memory.flush()
+        async with memory.session() as session:
+            descriptions = {each.fingerprint: each for each in await session.scalars(select(ObjectDescription))}
+            rows = (await session.scalars(select(ObjectRow).order_by(ObjectRow.id))).all()
+    recorded_meshes = [mesh for row in rows for mesh in descriptions[row.description_fingerprint or ""].meshes]
+    assert [mesh.sha256 for mesh in recorded_meshes] == hashes
+
+
+async def test_one_robot_has_one_hash_wherever_it_is_and_however_its_meshes_are_recorded(tmp_path: Path) -> None:
+    descriptions = []
+    for meshes in ("boxes", "files"):
+        url = f"sqlite:///{tmp_path / meshes}.db"
+        await recorded(url, made_arm(tmp_path / meshes), Settings(record_meshes=meshes))
+        async with Reading.open(url) as reading, reading.session() as session:
+            descriptions += [each for each in await session.scalars(select(ObjectDescription)) if each.meshes]
+    assert len({each.fingerprint for each in descriptions}) == 2
+    assert len({each.text_sha256 for each in descriptions}) == 1
+
+
+@pytest.mark.soak_on("postgresql")
+async def test_a_mesh_that_changed_between_two_runs_has_two_hashes_and_both_are_kept(
+    database_url: str, tmp_path: Path
+) -> None:
+    heights = []
+    for height in (3.0, 5.0):
+        robot = made_arm(tmp_path, height)
+        os.utime(tmp_path / "meshes" / "wedge.obj", (height, height))
+        await recorded(database_url, robot, Settings())
+    async with Reading.open(database_url) as reading:
+        for episode in ("1", "2"):
+            with world_of(await reading.as_of(episode, sequence=3)) as world:
+                box = world.object("arm").box_in_link("tip")
+                assert box is not None
+                heights.append(box.size.z)
+        async with reading.session() as session:
+            descriptions = (await session.scalars(select(ObjectDescription))).all()
+            arms = [each for each in descriptions if each.meshes]
+            assert len(descriptions) == 3  # two arms and one milk
+            assert len({mesh.sha256 for each in arms for mesh in each.meshes}) == 2
+            rows = (
+                await session.scalars(select(ObjectRow).where(ObjectRow.name == "arm").order_by(ObjectRow.id))
+            ).all()
+            assert {row.description_fingerprint for row in rows} == {each.fingerprint for each in arms}
+    assert heights == pytest.approx([0.3, 0.5], abs=1e-6)
+
+
+@pytest.mark.soak_on("postgresql")
+async def test_a_mesh_that_changes_in_one_process_is_hashed_again(database_url: str, tmp_path: Path) -> None:
+    robot = made_arm(tmp_path)
+    async with Memory.open(database_url) as memory:
+        async with memory.episode(description="changed"):
+            with BulletWorld():
+                Object("arm", ObjectType.ROBOT, robot)
+                (tmp_path / "meshes" / "wedge.obj").write_text(wedge(5.0) + "# longer\n")
+                Object("again", ObjectType.ROBOT, robot)
+                Object("once more", ObjectType.ROBOT, robot)
+        await memory.flush()
+        then = await memory.as_of("last", sequence=5)
+    first, second, third = (each.description_fingerprint for each in then.world.objects)
+    assert first != second == third
+
+
+@pytest.mark.soak_on("postgresql")
+async def test_a_mesh_that_is_too_large_is_kept_as_its_box_and_counted(database_url: str, tmp_path: Path) -> None:
+    robot = made_arm(tmp_path / "files")
+    size = (tmp_path / "files" / "meshes" / "wedge.obj").stat().st_size
+    settings = Settings(record_meshes="files", blob_bytes_max=size - 1)
+    _, missing = await recorded(database_url, robot, settings)
+    reason = f"it takes {size} bytes, {size - 1} are allowed (blob_bytes_max)"
+    assert missing.total == 1
+    assert missing.last == f"DescriptionDeclared.meshes: wedge.obj: {reason}"
+    async with Reading.open(database_url) as reading:
+        then = await reading.as_of("last", sequence=3, meshes=True)
+    (mesh,) = next(each for each in then.world.descriptions.values() if each.meshes).meshes
+    assert (mesh.name, mesh.size, mesh.content, mesh.missing) == ("wedge.obj", size, None, reason)
+    assert mesh.sha256 is not None
+    with world_of(then) as world:
+        box = world.object("arm").box_in_link("tip")
+        assert box is not None
+        assert tuple(box.size) == pytest.approx((0.1, 0.2, 0.3), abs=1e-6)
+
+
+@pytest.mark.soak_on("postgresql")
+async def test_a_mesh_that_cannot_be_read_any_more_is_missing_with_the_reason(
+    database_url: str, tmp_path: Path
+) -> None:
+    robot = made_arm(tmp_path / "files")
+    async with Memory.open(database_url) as memory:
+        with BulletWorld():
+            arm = Object("arm", ObjectType.ROBOT, robot, AT)
+            shutil.rmtree(tmp_path / "files")
+            async with memory.episode(description="too late"):
+                arm.set_joint_position("shoulder", 0.5)
+            tip = arm.link_pose("tip").position
+        await memory.flush()
+        assert memory.status.faults.total == 0
+        assert memory.status.missing.last == "DescriptionDeclared.meshes: wedge.obj: No such file or directory"
+        then = await memory.as_of("last", sequence=4)
+    (mesh,) = next(iter(then.world.descriptions.values())).meshes
+    assert (mesh.sha256, mesh.missing) == (None, "No such file or directory")
+    with world_of(then) as world:
+        assert dict(world.assumed) == {}
+        assert world.object("arm").link_pose("tip").position == pytest.approx(tip, abs=1e-6)
+
+
+@pytest.mark.soak_on("postgresql")
+async def test_a_description_that_fits_no_record_is_missing_with_the_reason_and_shown_as_a_point(
+    database_url: str,
+) -> None:
+    names = [os.urandom(64).hex() for _ in range(40)]
+    links = "\n".join(f'<link name="{name}"/>' for name in names)
+    joints = "\n".join(
+        f'<joint name="to {name}" type="continuous"><parent link="base"/><child link="{name}"/></joint>'
+        for name in names
+    )
+    text = f'<robot name="hedge">\n<link name="base"/>\n{links}\n{joints}\n</robot>'
+    async with Memory.open(database_url, settings=Settings(record_bytes_max=4_096)) as memory:
+        async with memory.episode(description="large"):
+            with BulletWorld():
+                Object("hedge", ObjectType.GENERIC_OBJECT, text.replace("continuous", "fixed"), AT)
+                Object("milk", ObjectType.MILK)
+        await memory.flush()
+        assert memory.status.faults.total == 0
+        assert memory.status.missing.total == 1
+        then = await memory.as_of("last", sequence=4)
+    with world_of(then) as world:
+        assert world.object("hedge").pose == AT
+        assert list(world.assumed) == ["hedge"]
+        assert "4,096 are allowed (record_bytes_max)" in world.assumed["hedge"]
+
+
+@pytest.mark.soak_on("postgresql")
+async def test_a_color_that_is_not_finite_is_missing_and_the_object_is_recorded(database_url: str) -> None:
+    async with Memory.open(database_url) as memory:
+        async with memory.episode(description="odd"):
+            with BulletWorld():
+                Object("milk", ObjectType.MILK, color=(float("nan"), 0.0, 0.0, 1.0))
+        await memory.flush()
+        assert memory.status.faults.total == 0
+        assert memory.status.missing.last == "ObjectAdded.color: (nan, 0.0, 0.0, 1.0) is not finite"
+        then = await memory.as_of("last", sequence=3)
+    assert [(each.name, each.color) for each in then.world.objects] == [("milk", None)]

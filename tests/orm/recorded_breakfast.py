@@ -5,6 +5,8 @@ from __future__ import annotations
 from datetime import UTC, datetime, timedelta
 from typing import Any
 
+from sqlalchemy.ext.asyncio import AsyncSession
+
 from pycrorm_async.events.types import (
     CandidateValue,
     EpisodeEnded,
@@ -22,11 +24,12 @@ from pycrorm_async.events.types import (
     ObjectValue,
     RobotValue,
 )
+from pycrorm_async.orm.base import known_classes
+from pycrorm_async.query.reading import EpisodeSession, LoadOnAccess
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.projections.event_script import MOVE, NAVIGATE, PICK_UP, Script, declarations, declared, field, name_of, pose
 from tests.projections.sql_queries import stored_and_folded
-from tests.sessions import session_on
 
 OPEN = declared("OpenAction", "open_action", field("object_designator", "object", 2), field("arm", "enum", 3))
 MOVE_JOINTS = declared(
@@ -78,3 +81,16 @@ async def fill(url: str) -> None:
 async def every(log: EventLog, question: Any) -> list[Any]:
     async with session_on(log) as session:
         return list((await session.scalars(question)).unique().all())
+
+
+# === sessions =================================================================================================
+#
+# Open a session on a log, as `Reading.session` does, but without mapping the types that are declared in it.
+
+
+def session_on(log: EventLog) -> AsyncSession:
+    """Return a session whose objects load what is read of them, with the classes of the log's engine."""
+    engine = log.address.engine(read_only=True)
+    vars(engine.dialect)["pycrorm_known_classes"] = known_classes(log.engine.dialect)
+    on_access = LoadOnAccess(engine, log.translated)
+    return AsyncSession(log.engine, expire_on_commit=False, sync_session_class=EpisodeSession, on_access=on_access)

@@ -1,17 +1,32 @@
-"""The queries of the thesis, and the attributes of a row that are loaded without another query."""
+"""The queries of the thesis: rows with their attributes, their outcomes, their events and their failures."""
 
 from __future__ import annotations
 
 from datetime import UTC, datetime
+from typing import Any
 
 import pytest
 from sqlalchemy import func, select
-from sqlalchemy.orm import selectinload, undefer
+from sqlalchemy.orm import Mapped, selectinload, undefer
 
 import pycrorm_async.orm
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.ids import row_key
-from pycrorm_async.events.types import NodeStarted, ObjectAdded, ObjectReference
+from pycrorm_async.events.types import (
+    CandidateValue,
+    EpisodeEnded,
+    EpisodeStarted,
+    FailureValue,
+    LocationResolved,
+    NodeEnded,
+    NodeStarted,
+    ObjectAdded,
+    ObjectMoved,
+    ObjectReference,
+    ObjectValue,
+    RefusalValue,
+    RobotValue,
+)
 from pycrorm_async.orm import (
     Action,
     Attachment,
@@ -20,7 +35,10 @@ from pycrorm_async.orm import (
     Concept,
     ConceptAncestor,
     Designator,
+    EpisodeTag,
     JointChange,
+    LocationCandidate,
+    LocationRefusal,
     LocationResolution,
     Motion,
     MoveJointsMotion,
@@ -31,27 +49,45 @@ from pycrorm_async.orm import (
     ObjectPart,
     ObjectRemoval,
     OpenAction,
+    ParameterItem,
     PickUpAction,
+    PickUpWithContextView,
     Pose,
     Position,
     ProcessMetaData,
     Quaternion,
     RobotState,
     RootFailure,
+    SpatialRelation,
     TaskTreeNode,
 )
 from pycrorm_async.orm.base import Moment
+from pycrorm_async.projections.generations import current_generation
 from pycrorm_async.projections.projector import Projector
+from pycrorm_async.query.reading import Reading
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.pose import Arms, Grasp, ObjectType
-from tests.orm.recorded_breakfast import every, moment
-from tests.projections.event_script import PICK_UP, T0_NS, Script, declarations, name_of, pose, row
-from tests.projections.sql_queries import stored_and_folded
-from tests.sessions import session_on
+from tests.orm.recorded_breakfast import OPEN, every, moment, session_on
+from tests.projections.event_script import (
+    MOVE,
+    NAVIGATE,
+    PICK_UP,
+    T0_NS,
+    Script,
+    declarations,
+    declared,
+    field,
+    name_of,
+    pose,
+    row,
+    time_us,
+)
+from tests.projections.sql_queries import ask, stored_and_folded
 
-pytestmark = pytest.mark.slow
-
+# === queries ==================================================================================================
+#
+# The queries of the thesis, and the attributes of a row that are loaded without another query.
 
 CLASSES = sorted(
     (each for each in vars(pycrorm_async.orm).values() if isinstance(each, type) and issubclass(each, Base)),
@@ -59,6 +95,7 @@ CLASSES = sorted(
 )
 
 
+@pytest.mark.slow
 async def test_a_fresh_memory_has_no_rows_of_any_class(log: EventLog) -> None:
     await Projector(log).open()
     always_filled = (Base, Concept, ConceptAncestor, ObjectConcept)  # the concepts belong to the program
@@ -67,6 +104,7 @@ async def test_a_fresh_memory_has_no_rows_of_any_class(log: EventLog) -> None:
     assert {each.__name__: await every(log, select(each)) for each in mapped} == {each.__name__: [] for each in mapped}
 
 
+@pytest.mark.slow
 async def test_the_episode_has_its_author_and_its_outcome(breakfast: EventLog) -> None:
     (metadata,) = await every(breakfast, select(ProcessMetaData))
     assert repr(metadata) == (
@@ -78,12 +116,14 @@ async def test_the_episode_has_its_author_and_its_outcome(breakfast: EventLog) -
     )
 
 
+@pytest.mark.slow
 async def test_the_version_of_an_episode_has_the_name_from_the_thesis_as_a_synonym(breakfast: EventLog) -> None:
     (metadata,) = await every(breakfast, select(ProcessMetaData).where(ProcessMetaData.pycram_version == "1.0"))
     assert metadata.pycram_version == metadata.version == "1.0"
     assert await every(breakfast, select(ProcessMetaData.pycram_version)) == ["1.0"]
 
 
+@pytest.mark.slow
 async def test_a_navigation_has_its_start_and_its_target(breakfast: EventLog) -> None:
     (drive,) = await every(breakfast, select(NavigateAction))
     assert (drive.id, drive.dtype, drive.kind) == (row(6), "NavigateAction", "action")
@@ -98,6 +138,7 @@ async def test_a_navigation_has_its_start_and_its_target(breakfast: EventLog) ->
     assert state.pose.process_metadata is drive.process_metadata
 
 
+@pytest.mark.slow
 async def test_the_text_of_an_action_has_its_fields_and_its_robot(breakfast: EventLog) -> None:
     (pick,) = await every(breakfast, select(PickUpAction))
     assert repr(pick) == (
@@ -108,6 +149,7 @@ async def test_the_text_of_an_action_has_its_fields_and_its_robot(breakfast: Eve
     )
 
 
+@pytest.mark.slow
 async def test_every_action_is_an_instance_of_its_own_class(breakfast: EventLog) -> None:
     actions = await every(breakfast, select(Action).order_by(Action.id))
     assert [type(each) for each in actions] == [NavigateAction, PickUpAction, OpenAction]
@@ -126,12 +168,14 @@ async def test_every_action_is_an_instance_of_its_own_class(breakfast: EventLog)
     assert designators[0].target_location.position.x == 7.0
 
 
+@pytest.mark.slow
 async def test_the_pose_of_a_picked_up_object_is_the_one_at_execution(breakfast: EventLog) -> None:
     for picked in (PickUpAction.object, PickUpAction.object_designator):
         poses = await every(breakfast, select(Pose).join(picked).join(Object.pose))
         assert [(each.position.x, each.position.y, each.position.z) for each in poses] == [(1.0, 2.0, 3.0)]
 
 
+@pytest.mark.slow
 async def test_nodes_carry_their_action_parent_status_and_reason(breakfast: EventLog) -> None:
     nodes = {each.id: each for each in await every(breakfast, select(TaskTreeNode))}
     assert sorted(nodes) == [row(2), row(6), row(8), row(11), row(15), row(16)]
@@ -148,12 +192,14 @@ async def test_nodes_carry_their_action_parent_status_and_reason(breakfast: Even
     assert await every(breakfast, lost) == [row(2), row(15), row(16)]
 
 
+@pytest.mark.slow
 async def test_one_node_alone_has_its_parent_loaded(breakfast: EventLog) -> None:
     (node,) = await every(breakfast, select(TaskTreeNode).where(TaskTreeNode.id == row(8)))
     assert node.parent.id == row(6)
     assert node.parent.action.robot_state.pose.position.x == 0.5
 
 
+@pytest.mark.slow
 async def test_a_node_has_children_and_ancestors(breakfast: EventLog) -> None:
     async with session_on(breakfast) as session:
         move = (await session.scalars(select(TaskTreeNode).where(TaskTreeNode.id == row(8)))).one()
@@ -175,6 +221,7 @@ async def test_a_node_has_children_and_ancestors(breakfast: EventLog) -> None:
     assert [each.node and each.node.id for each in moved if each.name == "milk"] == [None, row(11)]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("class_", "sequence", "name"),
     [(TaskTreeNode, 2, "children"), (TaskTreeNode, 8, "ancestors"), (Object, 12, "node")],
@@ -194,6 +241,7 @@ async def test_an_attribute_that_is_not_loaded_names_the_remedy(
         getattr(closed, name)
 
 
+@pytest.mark.slow
 async def test_nodes_join_their_designators(breakfast: EventLog) -> None:
     question = (
         select(PickUpAction.arm, TaskTreeNode.status).join(PickUpAction.node).where(PickUpAction.arm == Arms.LEFT)
@@ -204,6 +252,7 @@ async def test_nodes_join_their_designators(breakfast: EventLog) -> None:
         assert [each.id for each in await session.scalars(other)] == [row(11)]
 
 
+@pytest.mark.slow
 async def test_the_parts_of_a_pose_can_be_joined(breakfast: EventLog) -> None:
     question = (
         select(Position.x, Quaternion.z)
@@ -217,6 +266,7 @@ async def test_the_parts_of_a_pose_can_be_joined(breakfast: EventLog) -> None:
         assert (await session.execute(question)).all() == [(0.5, 0.6)]
 
 
+@pytest.mark.slow
 async def test_objects_are_rows_of_moments_and_parts_refer_to_their_whole(breakfast: EventLog) -> None:
     milk = await every(breakfast, select(Object).where(Object.identity_id == row(4)).order_by(Object.id))
     assert [(each.id, each.pose.position.x, each.node_id) for each in milk] == [
@@ -230,6 +280,7 @@ async def test_objects_are_rows_of_moments_and_parts_refer_to_their_whole(breakf
     assert robot.joints == {"torso": 0.25}
 
 
+@pytest.mark.slow
 async def test_the_changes_of_objects_can_be_queried(breakfast: EventLog) -> None:
     (held,) = await every(breakfast, select(Attachment))
     assert (held.kind, held.parent.name, held.child.name, held.link) == (
@@ -241,6 +292,7 @@ async def test_the_changes_of_objects_can_be_queried(breakfast: EventLog) -> Non
     assert (gone.object.name, gone.identity_id, gone.node_id) == ("milk", row(4), None)
 
 
+@pytest.mark.slow
 async def test_a_resolved_location_has_its_candidates(breakfast: EventLog) -> None:
     (resolved,) = await every(breakfast, select(LocationResolution))
     assert (resolved.location, resolved.considered, resolved.offered, resolved.taken) == ("CostmapLocation", 9, 1, 0)
@@ -248,6 +300,7 @@ async def test_a_resolved_location_has_its_candidates(breakfast: EventLog) -> No
     assert [(each.x, each.reachable_arms, each.taken) for each in resolved.candidates] == [(7.0, [Arms.LEFT], True)]
 
 
+@pytest.mark.slow
 async def test_the_recorded_parameters_are_loaded_on_request(breakfast: EventLog) -> None:
     async with session_on(breakfast) as session:
         pick = (await session.scalars(select(PickUpAction))).one()
@@ -257,6 +310,7 @@ async def test_the_recorded_parameters_are_loaded_on_request(breakfast: EventLog
     assert joints.parameters == {"names": ["a", "b"], "positions": [0.5, -1.0]}
 
 
+@pytest.mark.slow
 async def test_an_object_type_that_is_unknown_to_this_process_is_its_name_and_an_arm_is_a_named_one(
     log: EventLog,
 ) -> None:
@@ -269,6 +323,7 @@ async def test_an_object_type_that_is_unknown_to_this_process_is_its_name_and_an
     assert (pick.arm, pick.grasp, pick.object.obj_type) == (Arms.named("THIRD"), Grasp.TOP, "OAT_MILK")
 
 
+@pytest.mark.slow
 async def test_times_can_be_compared_and_a_naive_one_is_refused(breakfast: EventLog) -> None:
     later = select(TaskTreeNode.id).where(TaskTreeNode.start_time > moment(11)).order_by(TaskTreeNode.id)
     assert await every(breakfast, later) == [row(15), row(16)]
@@ -277,6 +332,7 @@ async def test_times_can_be_compared_and_a_naive_one_is_refused(breakfast: Event
     assert int(moment(0).timestamp()) * 10**9 == T0_NS
 
 
+@pytest.mark.slow
 async def test_a_row_has_its_event_and_queries_filter_and_order_by_it(breakfast: EventLog) -> None:
     nodes = await every(breakfast, select(TaskTreeNode).order_by(TaskTreeNode.sequence.desc()))
     assert [each.sequence for each in nodes] == sorted((each.sequence for each in nodes), reverse=True)
@@ -289,6 +345,7 @@ async def test_a_row_has_its_event_and_queries_filter_and_order_by_it(breakfast:
         assert sequences == sum(each.sequence for each in await every(breakfast, select(class_))) > 0, class_
 
 
+@pytest.mark.slow
 async def test_plain_sql_has_the_events_of_a_row(breakfast: EventLog) -> None:
     nodes = await every(breakfast, select(TaskTreeNode).order_by(TaskTreeNode.id))
     expected = [(each.sequence, each.end_sequence) for each in nodes]
@@ -300,3 +357,273 @@ async def test_plain_sql_has_the_events_of_a_row(breakfast: EventLog) -> None:
         for view in ("action", "motion", "object", "pose", "robot_state", "attachment", "object_removal"):
             for row_ in await connection.exec_driver_sql(f"SELECT id, sequence FROM {view}"):
                 assert row_.sequence == row_key(row_.id).sequence
+
+
+# === action attributes ========================================================================================
+#
+# Actions have their node, their times and their outcome, also in filters and in plain SQL.
+
+WAIT = declared("WaitAction", "orm_wait", field("duration", "real", 2), field("status", "text", 3))
+
+
+class ORMWait(Action):
+    """A class whose fields have the names of attributes that every action has."""
+
+    __tablename__ = "orm_wait"
+
+    duration: Mapped[float]
+    status: Mapped[str]  # type: ignore[assignment]
+
+
+@pytest.mark.slow
+async def test_an_action_loads_its_node_on_request(breakfast: EventLog) -> None:
+    async with session_on(breakfast) as session:
+        pick = (await session.scalars(select(PickUpAction))).one()
+        assert (await pick.awaitable_attrs.node).status == TaskStatus.FAILED
+    (pick,) = await every(breakfast, select(PickUpAction).options(selectinload(PickUpAction.node)))
+    assert (pick.node.status, pick.node.reason) == (TaskStatus.FAILED, "IKError")
+
+
+@pytest.mark.slow
+async def test_an_action_has_its_times_and_its_outcome(breakfast: EventLog) -> None:
+    drive, pick, opening = await every(breakfast, select(Action).order_by(Action.start_time))
+    assert (drive.status, drive.reason, drive.duration) == (TaskStatus.SUCCEEDED, None, 4.0)
+    assert (pick.status, pick.reason, pick.duration) == (TaskStatus.FAILED, "IKError", 3.0)
+    assert (pick.start_time, pick.end_time) == (moment(11), moment(14))
+    assert (opening.status, opening.end_time, opening.duration) == (TaskStatus.LOST, None, None)
+    assert pick.episode is pick.process_metadata
+    (move,) = await every(breakfast, select(MoveMotion))
+    assert (move.status, move.duration) == (TaskStatus.SUCCEEDED, 1.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("condition", "expected"),
+    [
+        (Action.status == TaskStatus.FAILED, [11]),
+        (Action.duration >= 3, [6, 11]),
+        (Action.end_time.is_(None), [15]),
+        (Action.start_time > moment(6), [11, 15]),
+        (Action.reason == "IKError", [11]),
+        (Action.episode.has(description="Tutorial"), [6, 11, 15]),
+    ],
+)
+async def test_actions_are_filtered_and_ordered_by_times_and_outcome(
+    breakfast: EventLog, condition: Any, expected: list[int]
+) -> None:
+    slowest_last = select(Action.id).where(condition).order_by(Action.duration.is_(None), Action.start_time)
+    assert await every(breakfast, slowest_last) == [row(each) for each in expected]
+
+
+@pytest.mark.slow
+async def test_an_action_joins_its_episode(breakfast: EventLog) -> None:
+    question = select(ProcessMetaData.description, PickUpAction.duration).join(PickUpAction.episode)
+    async with session_on(breakfast) as session:
+        assert (await session.execute(question)).all() == [("Tutorial", 3.0)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("view", ["action", "motion", "designator", "task_tree_node"])
+async def test_plain_sql_reads_times_and_outcome_of_an_action_from_one_view(breakfast: EventLog, view: str) -> None:
+    columns = "process_metadata_id, dtype, status, start_time, end_time, duration, reason"
+    course = await ask(
+        breakfast, f"SELECT {columns} FROM {view} WHERE dtype IN ('PickUpAction', 'MoveMotion') ORDER BY id"
+    )
+    move = (1, "MoveMotion", "SUCCEEDED", time_us(8), time_us(9), 1.0, None)
+    pick = (1, "PickUpAction", "FAILED", time_us(11), time_us(14), 3.0, "IKError")
+    assert course == {"action": [pick], "motion": [move]}.get(view, [move, pick])
+
+
+@pytest.mark.slow
+async def test_a_field_with_the_name_of_an_action_attribute_hides_it(log: EventLog) -> None:
+    script = Script()
+    node = script.put(NodeStarted("action", None, name_of(WAIT), {"duration": 60.0, "status": "patient"}))
+    script.put(NodeEnded(node, "SUCCEEDED"))
+    await stored_and_folded(log, [*declarations(WAIT), *script.records])
+    (wait,) = await every(log, select(ORMWait).where(ORMWait.duration > 50, Action.duration < 50))
+    assert (wait.duration, wait.status, wait.reason) == (60.0, "patient", None)
+    assert await every(log, select(Action.duration)) == [1.0]
+
+
+# === event of rows ============================================================================================
+#
+# Every row of what happened has its event: as an attribute of the mapped classes, and in plain SQL.
+
+PLACE = declared("PlaceAction", "place_action", field("object_designator", "object", 2), field("arm", "enum", 3))
+SETS = declared("SetAction", "set_action", field("things", "list", 2, item="object"), field("sequence", "integer", 3))
+WITHOUT_EVENT = {"process_metadata", "position", "quaternion"}
+"""The views of episodes, and of the parts of a pose."""
+EVENTS: dict[Any, int] = {
+    EpisodeTag: 1,
+    LocationCandidate: 5,
+    LocationRefusal: 5,
+    ParameterItem: 6,
+    PickUpAction: 7,
+    PickUpWithContextView: 7,
+    RootFailure: 7,
+    SpatialRelation: 7,
+}
+
+
+@pytest.fixture
+async def filled(log: EventLog) -> EventLog:
+    """The log of an episode with a tag and a failed pick-up of milk beside a bowl."""
+    script = Script()
+    put = script.put
+    put(EpisodeStarted("Tutorial", "me", "host", "1.0", "3.11", tags=("kitchen",)))
+    root = put(NodeStarted("root"))
+    milk = put(ObjectAdded("milk", "MILK", pose(1, 2, 1)))
+    put(ObjectAdded("bowl", "BOWL", pose(1.15, 2, 1)))
+    offered, refused = (CandidateValue(pose(7, 8), ("LEFT",)),), (RefusalValue(pose(8, 8), "too far"),)
+    put(LocationResolved("CostmapLocation", offered, 0, 9, root, refused))
+    seen, state = ObjectReference(milk, milk), RobotValue(pose(0.5), "ROBOT", 0.25)
+    put(NodeStarted("action", root, name_of(SETS), {"things": [seen], "sequence": 70}, state))
+    parameters = {"object_designator": seen, "arm": "LEFT", "grasp": "TOP"}
+    pick = put(NodeStarted("action", root, name_of(PICK_UP), parameters, state))
+    put(NodeEnded(pick, "FAILED", FailureValue("plan.failures.IKError", "too far")))
+    await stored_and_folded(log, [*declarations(PICK_UP, PLACE, SETS), *script.records])
+    return log
+
+
+async def test_a_mapped_row_has_its_event_and_queries_order_by_it(filled: EventLog) -> None:
+    async with session_on(filled) as session:
+        for class_, event in EVENTS.items():
+            assert list(await session.scalars(select(func.max(class_.sequence)))) == [event], class_
+            loaded = (await session.scalars(select(class_).order_by(class_.sequence))).all()
+            assert {each.sequence for each in loaded} == {event}, class_
+
+
+async def test_every_view_of_what_happened_has_the_event_of_its_rows(filled: EventLog) -> None:
+    tables = {mapper.class_.__tablename__: mapper.class_ for mapper in Base.registry.mappers}
+    async with filled.engine.connect() as connection:
+        generation = await current_generation(connection)
+        assert generation is not None
+        for view in generation.views:
+            answer = await connection.exec_driver_sql(f'SELECT * FROM "{view}"')
+            columns = list(answer.keys())
+            if "process_metadata_id" not in columns or view in WITHOUT_EVENT:
+                continue
+            assert columns.count("sequence") == 1, view
+            key = getattr(tables.get(view), "_row", "id")
+            for row in answer.mappings():
+                # A field of a type that has this name takes precedence.
+                assert row["sequence"] == (70 if view == "set_action" else row_key(row[key]).sequence), view
+        for class_, event in EVENTS.items():
+            table = class_.__tablename__
+            sequences = await connection.exec_driver_sql(f'SELECT DISTINCT sequence FROM "{table}"')
+            assert sequences.scalars().all() == [event], table
+
+
+# === failures =================================================================================================
+#
+# The view of failures: where each began, with its path, its object, its arm and its message.
+
+RETRY = declared("Retry", "retry", field("times", "integer", 2), kind="language")
+
+
+def failing() -> Script:
+    """A transport fails in a motion of its second attempt, and the plan continues; then the plan itself raises."""
+    script = Script()
+    put = script.put
+    put(EpisodeStarted("Breakfast", "me", "host", "1.0", "3.11"))  # 1
+    root = put(NodeStarted("root"))  # 2
+    milk = put(ObjectAdded("milk", "MILK", pose(1, 2, 3)))  # 3
+    retry = put(NodeStarted("language", root, name_of(RETRY), {"times": 2}))  # 4
+    for arm in ("LEFT", "RIGHT"):  # 5 to 9, 10 to 14
+        seen = {"object_designator": ObjectReference(milk, milk), "arm": arm, "grasp": "TOP"}
+        pick = put(NodeStarted("action", retry, name_of(PICK_UP), seen))
+        move = put(NodeStarted("motion", pick, name_of(MOVE), {"target": pose(7, 8)}))
+        put(ObjectMoved(milk, "milk", "MILK", pose(9, 9, 9), move))
+        fault = FailureValue("plan.failures.IKError", f"{arm} is too short", [])
+        put(NodeEnded(move, "FAILED", fault))
+        put(NodeEnded(pick, "FAILED", fault))
+    put(NodeEnded(retry, "SUCCEEDED"))  # 15
+    handle = ObjectValue("ObjectPart", "handle", "GENERIC_OBJECT", pose(1))
+    opening = put(NodeStarted("action", root, name_of(OPEN), {"object_designator": handle, "arm": "LEFT"}))  # 16
+    put(NodeEnded(opening, "CANCELLED"))  # 17
+    drive = put(NodeStarted("action", root, name_of(NAVIGATE), {"target_location": pose(7)}))  # 18
+    put(NodeEnded(drive, "SUCCEEDED"))  # 19
+    opening = put(NodeStarted("action", root, name_of(OPEN), {"object_designator": handle, "arm": "LEFT"}))  # 20
+    put(NodeEnded(opening, "ERROR", FailureValue("builtins.KeyError", "door")))  # 21
+    put(NodeEnded(root, "ERROR", FailureValue("builtins.KeyError", "door")))  # 22
+    put(EpisodeEnded("ERROR"))  # 23
+    put = (second := Script(2)).put
+    put(EpisodeStarted("Lunch", "me", "host", "1.0", "3.11"))  # 1
+    root = put(NodeStarted("root"))  # 2
+    put(NodeEnded(root, "ERROR", FailureValue("builtins.ValueError", "no table")))  # 3
+    script.records += second.records
+    return script
+
+
+@pytest.mark.slow
+async def test_a_failure_is_listed_where_it_began_with_path_object_arm_and_message(log: EventLog) -> None:
+    await stored_and_folded(log, [*declarations(PICK_UP, MOVE, OPEN, NAVIGATE, RETRY), *failing().records])
+    first, second, opening, plan = await every(log, select(RootFailure).order_by(RootFailure.id))
+    path = "root > Retry > PickUpAction > MoveMotion"
+    assert (first.id, first.dtype, first.status) == (row(6), "MoveMotion", TaskStatus.FAILED)
+    assert (first.path, first.object, first.arm) == (path, "milk", Arms.LEFT)
+    assert (first.reason, first.message, first.recovered) == ("IKError", "LEFT is too short", True)
+    assert (first.start_time, first.end_time, first.episode.description) == (moment(6), moment(8), "Breakfast")
+    assert (second.id, second.path, second.arm, second.message) == (row(11), path, Arms.RIGHT, "RIGHT is too short")
+    assert (opening.id, opening.path, opening.status) == (row(20), "root > OpenAction", TaskStatus.ERROR)
+    assert (opening.object, opening.arm, opening.reason) == ("handle", Arms.LEFT, "KeyError")
+    assert (opening.message, opening.recovered) == ("door", False)
+    assert (plan.id, plan.dtype, plan.path, plan.object) == (row(2, number=2), None, "root", None)
+    assert (plan.arm, plan.message, plan.recovered) == (None, "no table", False)
+    lost = select(RootFailure.path).where(~RootFailure.recovered, RootFailure.object == "handle")
+    assert await every(log, lost) == ["root > OpenAction"]
+
+
+@pytest.mark.slow
+async def test_object_and_arm_of_a_failure_are_those_of_the_nearest_node(log: EventLog) -> None:
+    script = Script()
+    put = script.put
+    milk = put(ObjectAdded("milk", "MILK", pose(1, 2, 3)))
+    seen = {"object_designator": ObjectReference(milk, milk), "arm": "RIGHT", "grasp": "TOP"}
+    pick = put(NodeStarted("action", None, name_of(PICK_UP), seen))
+    handle = {"object_designator": ObjectValue("ObjectPart", "handle"), "arm": "LEFT"}
+    opening = put(NodeStarted("action", pick, name_of(OPEN), handle))
+    for node in (opening, pick):
+        put(NodeEnded(node, "FAILED", FailureValue("plan.failures.PlanFailure", "")))
+    await stored_and_folded(log, [*declarations(PICK_UP, OPEN), *script.records])
+    (failure,) = await every(log, select(RootFailure))
+    assert (failure.path, failure.object, failure.arm) == ("PickUpAction > OpenAction", "handle", Arms.LEFT)
+
+
+@pytest.mark.slow
+async def test_a_dict_field_is_no_object_of_a_failure(log: EventLog) -> None:
+    note = declared("NoteAction", "note_action", field("lines", "dict", 2, item="text"))
+    script = Script()
+    lines = {"object": "milk", "row": "first"}
+    node = script.put(NodeStarted("action", None, name_of(note), {"lines": lines}))
+    script.put(NodeEnded(node, "FAILED", FailureValue("plan.failures.PlanFailure", "")))
+    await stored_and_folded(log, [*declarations(note), *script.records])
+    (failure,) = await every(log, select(RootFailure))
+    assert (failure.path, failure.object, failure.recovered) == ("NoteAction", None, False)
+
+
+@pytest.mark.slow
+async def test_simulations_are_left_out_of_failures_unless_asked_for(log: EventLog) -> None:
+    script = failing()
+    for place, each in enumerate(script.records[:-3]):  # the second episode has none
+        if each.type in ("EpisodeStarted", "NodeStarted"):
+            simulated = each.payload.replace(b"{", b'{"simulated":true,', 1)
+            script.records[place] = each._replace(payload=simulated)
+    await stored_and_folded(log, [*declarations(PICK_UP, MOVE, OPEN, NAVIGATE, RETRY), *script.records])
+    reading = Reading(log)
+    counts = []
+    for also in (False, True):
+        async with reading.session(simulated=also) as session:
+            counts.append(len((await session.scalars(select(RootFailure))).all()))
+    assert counts == [1, 4]
+
+
+@pytest.mark.slow
+async def test_plain_sql_counts_where_failures_began(log: EventLog) -> None:
+    await stored_and_folded(log, [*declarations(PICK_UP, MOVE, OPEN, NAVIGATE, RETRY), *failing().records])
+    question = "SELECT path, object, count(*) FROM root_failure GROUP BY path, object ORDER BY path"
+    assert await ask(log, question) == [
+        ("root", None, 1),
+        ("root > OpenAction", "handle", 1),
+        ("root > Retry > PickUpAction > MoveMotion", "milk", 2),
+    ]

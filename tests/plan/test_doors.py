@@ -1,8 +1,10 @@
-"""Drawers and doors open and close with the hand on their handles; frames are computed from the kitchen's drawing."""
+"""Drawers and doors open and close with the hand on their handles: joints, paths, and poses of the base."""
 
 from __future__ import annotations
 
+import itertools
 import math
+import re
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -10,35 +12,58 @@ import numpy as np
 import pytest
 
 from pycrorm_async.plan import (
+    AccessingLocation,
     AccessingMotion,
     CloseActionPerformable,
     ClosingMotion,
     GraspingActionPerformable,
     IKError,
+    Location,
     MoveMotion,
     MoveTCPMotion,
     MoveTorsoActionPerformable,
+    NavigateActionPerformable,
+    NoRobotHere,
+    ObjectDesignator,
     ObjectPart,
     OpenAction,
     OpenActionPerformable,
     OpeningMotion,
+    ParkArmsActionPerformable,
     ResolutionError,
     Retry,
     SimulatedTaskTree,
     collected_tree,
 )
+from pycrorm_async.plan.execution import Candidate
 from pycrorm_async.plan.failures import (
     CapabilityAbsenceFailure,
     EnvironmentManipulationImpossible,
+    EnvironmentUnreachable,
     IllPosedGoalFailure,
     PerceptionObjectNotInWorld,
 )
-from pycrorm_async.world import Arms, Pose
-from pycrorm_async.world.pose import yaw_quaternion
-from tests.plan.bullet_frames import bullet_frame
+from pycrorm_async.plan.geometry import (
+    Handle,
+    closed_position,
+    grasp_pose,
+    hand_poses,
+    handle_of,
+    handle_poses,
+    opened_position,
+)
+from pycrorm_async.plan.locations import REFUSALS_MAX
+from pycrorm_async.world import Arms, Object, ObjectType, Pose
+from pycrorm_async.world.pose import UnknownLink, yaw_quaternion
 from tests.plan.conftest import Scene
+from tests.plan.fakes import Recording
 from tests.plan.test_actions import shape
-from tests.world.fakes import ChangeLog, Matrix, Z, shifted, turned
+from tests.world.fakes import CRANE, ChangeLog, Matrix, Z, matrix, shifted, turned
+from tests.world.loaded_model import bullet_frame
+
+# === doors ====================================================================================================
+#
+# Drawers and doors open and close with the hand on their handles; frames are computed from the kitchen's drawing.
 
 TOOL = {Arms.LEFT: "l_gripper_tool_frame", Arms.RIGHT: "r_gripper_tool_frame"}
 
@@ -307,3 +332,283 @@ async def test_opening_in_a_simulation_opens_nothing(scene: Scene) -> None:
         assert part.pose.position == pytest.approx((0.7, 1.3, 0.665), abs=1e-9)
     assert scene.world.save_state() == before
     assert part.pose.position == pytest.approx((1.0, 1.3, 0.665), abs=1e-9)
+
+
+# === articulation =============================================================================================
+#
+# The joint that a handle moves, its range, and its path, computed from the kitchen's drawing.
+
+DRAWER, FRIDGE_HANDLE = "sink_area_drawer_handle", "fridge_door_handle"
+
+
+def test_a_handle_moves_with_the_nearest_joint_above_it(scene: Scene) -> None:
+    assert handle_of(ObjectPart(DRAWER, scene.kitchen)) == Handle(scene.kitchen, DRAWER, "sink_area_drawer_joint")
+    assert handle_of(ObjectPart(FRIDGE_HANDLE, scene.kitchen)) == Handle(
+        scene.kitchen, FRIDGE_HANDLE, "fridge_door_joint"
+    )
+    crane = Object("crane", ObjectType.GENERIC_OBJECT, CRANE)
+    assert handle_of(ObjectPart("hook", crane)).joint == "reaching"
+    assert handle_of(ObjectPart("flag", crane)).joint == "turning"
+
+
+def test_opening_leaves_a_margin_and_never_closes(scene: Scene) -> None:
+    drawer = handle_of(ObjectPart(DRAWER, scene.kitchen))
+    assert opened_position(drawer) == pytest.approx(0.30)
+    assert closed_position(drawer) == 0.0
+    scene.kitchen.set_joint_position(drawer.joint, 0.33)
+    assert opened_position(drawer) == 0.33
+    door = handle_of(ObjectPart(FRIDGE_HANDLE, scene.kitchen))
+    assert [opened_position(door), closed_position(door)] == pytest.approx([1.85, 0.0])
+
+
+def test_a_drawers_handle_moves_straight_in_steps_of_five_centimetres(scene: Scene) -> None:
+    drawer = handle_of(ObjectPart(DRAWER, scene.kitchen))
+    way = handle_poses(drawer, 0.30)
+    # The front is at x 1.05, the handle 5 cm before it, in the middle of z 0.57 to 0.76.
+    expected = [(1.0 - 0.05 * number, 1.3, 0.665) for number in range(7)]
+    np.testing.assert_allclose([each.position for each in way], expected, atol=1e-9)
+    assert {each.orientation for each in way} == {(0.0, 0.0, 0.0, 1.0)}
+    assert scene.kitchen.joint_position(drawer.joint) == 0.0
+
+
+@pytest.mark.parametrize(("start", "goal", "steps"), [(0.0, 1.85, 19), (1.0, 0.0, 10), (0.3, 0.3, 1)])
+def test_a_doors_handle_moves_around_the_hinge_and_rotates_with_the_door(
+    scene: Scene, start: float, goal: float, steps: int
+) -> None:
+    scene.kitchen.set_pose(Pose([0.1, -0.2, 0.0], [0, 0, 0.6, 0.8]))
+    door = handle_of(ObjectPart(FRIDGE_HANDLE, scene.kitchen))
+    way = handle_poses(door, goal, start)
+    assert len(way) == steps + 1
+    for number, pose in enumerate(way):
+        angle = start + (goal - start) * number / steps
+        expected = matrix(scene.kitchen.pose) @ shifted(1.05, -1.25, 0) @ turned(Z, angle) @ shifted(-0.10, 0.59, 0.95)
+        np.testing.assert_allclose(matrix(pose), expected, atol=1e-9)
+    assert scene.kitchen.joint_position(door.joint) == 0.0
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.7, 1.85])
+def test_a_hand_grasps_a_drawer_from_the_front_and_a_door_from_the_side_of_its_hinge(
+    scene: Scene, angle: float
+) -> None:
+    scene.kitchen.set_pose(Pose([0.1, -0.2, 0.0], [0, 0, 0.6, 0.8]))
+    scene.kitchen.set_joint_position("fridge_door_joint", angle)
+    drawer = ObjectPart(DRAWER, scene.kitchen)
+    assert grasp_pose(drawer) == drawer.pose
+    hinge = matrix(scene.kitchen.pose) @ shifted(1.05, -1.25, 0)
+    # in the closed door's axes x points into the fridge, y from the hinge to the handle
+    taken = shifted(-0.10, 0.59, 0.95) @ turned(Z, math.pi / 2)
+    np.testing.assert_allclose(
+        matrix(grasp_pose(ObjectPart(FRIDGE_HANDLE, scene.kitchen))), hinge @ turned(Z, angle) @ taken, atol=1e-9
+    )
+    way = hand_poses(handle_of(ObjectPart(FRIDGE_HANDLE, scene.kitchen)), 1.0, 0.5)
+    for number, pose in enumerate(way):
+        np.testing.assert_allclose(matrix(pose), hinge @ turned(Z, 0.5 + 0.1 * number) @ taken, atol=1e-9)
+    assert len(way) == 6
+
+
+def test_a_door_with_its_hinge_on_the_other_side_is_grasped_from_there(scene: Scene) -> None:
+    mirrored = scene.kitchen.description_text.replace('xyz="-0.1 0.59 0.95"', 'xyz="-0.1 -0.59 0.95"')
+    cupboard = Object("cupboard", ObjectType.ENVIRONMENT, mirrored)
+    expected = shifted(1.05, -1.25, 0) @ shifted(-0.10, -0.59, 0.95) @ turned(Z, -math.pi / 2)
+    np.testing.assert_allclose(matrix(grasp_pose(ObjectPart(FRIDGE_HANDLE, cupboard))), expected, atol=1e-9)
+
+
+def test_objects_and_parts_without_a_joint_are_grasped_at_their_pose(scene: Scene) -> None:
+    scene.milk.set_pose(Pose([1.3, 1, 0.9], [0.1, 0.2, 0.3, 0.9]))
+    assert grasp_pose(scene.milk) == scene.milk.pose
+    tap = ObjectPart("sink_area_tap", scene.kitchen)
+    assert grasp_pose(tap) == tap.pose
+    scene.world.remove(scene.milk)
+    with pytest.raises(PerceptionObjectNotInWorld, match="milk"):
+        grasp_pose(scene.milk)
+
+
+def test_an_object_that_cannot_be_opened_is_refused_in_one_line(scene: Scene) -> None:
+    for part, message in (
+        (ObjectPart("kitchen_counter_surface", scene.kitchen), "no joint of kitchen moves kitchen_counter_surface"),
+        (scene.kitchen, "kitchen is not part of an object"),
+        (ObjectDesignator("milk", ObjectType.MILK, scene.milk), "milk is not part of an object"),
+    ):
+        with pytest.raises(EnvironmentManipulationImpossible, match=message) as caught:
+            handle_of(part)
+        assert caught.value.data[0] == part.name
+    with pytest.raises(UnknownLink, match=r"no link 'window'"):
+        handle_of(ObjectPart("window", scene.kitchen))
+    crane = Object("crane", ObjectType.GENERIC_OBJECT, CRANE)
+    for position in (opened_position, closed_position):
+        with pytest.raises(EnvironmentManipulationImpossible, match="turning has no limits"):
+            position(handle_of(ObjectPart("flag", crane)))
+    assert math.isinf(crane.joint_limits("turning")[1])
+    scene.world.remove(scene.kitchen)
+    with pytest.raises(PerceptionObjectNotInWorld, match="kitchen is not an object of the world"):
+        handle_of(ObjectPart(DRAWER, scene.kitchen))
+
+
+# === opening poses ============================================================================================
+#
+# Base poses for opening and closing: every candidate works, and an impossible request names its reason.
+
+DRAWERS = [
+    "kitchen_counter_upper_drawer",
+    "kitchen_counter_lower_drawer",
+    "sink_area_drawer",
+    "kitchen_island_upper_drawer",
+    "kitchen_island_lower_drawer",
+]
+TRAVEL = dict.fromkeys(DRAWERS, 0.35) | {"fridge_door": 1.9}
+"""The range of each joint by the kitchen's own description, in m or rad."""
+ABOUT = pytest.mark.parametrize("about", [4, pytest.param(12, marks=pytest.mark.soak)])
+"""This many of the candidates are tried, spread over the whole order."""
+
+
+def spread_candidates(places: list[Location], about: int) -> list[Location]:
+    return places[:: max(1, len(places) // about)]
+
+
+@pytest.mark.slow
+@pytest.mark.soak_on(
+    "kitchen_counter_upper_drawer", "kitchen_counter_lower_drawer", "kitchen_island_upper_drawer", "sink_area_drawer"
+)
+@ABOUT
+@pytest.mark.parametrize(
+    ("name", "torso"),
+    [
+        *((name, 0.3 if "lower" in name else 0.0) for name in TRAVEL),
+        pytest.param("fridge_door", 0.3, marks=pytest.mark.soak),
+    ],
+)
+async def test_from_every_candidate_the_furniture_can_be_opened_and_closed(
+    scene: Scene, name: str, torso: float, about: int
+) -> None:
+    await MoveTorsoActionPerformable(torso).perform()
+    handle, joint = ObjectPart(f"{name}_handle", scene.kitchen), f"{name}_joint"
+    before = scene.world.save_state()
+    places = list(AccessingLocation(handle, scene.robot))
+    assert len(places) >= 90
+    for place in spread_candidates(places, about):
+        for arm in place.reachable_arms:
+            await NavigateActionPerformable(place.pose).perform()
+            await OpenActionPerformable(handle, arm).perform()
+            assert scene.kitchen.joint_position(joint) == pytest.approx(TRAVEL[name] - 0.05)
+            tool = scene.robot.link_pose(f"{'l' if arm is Arms.LEFT else 'r'}_gripper_tool_frame")
+            assert tool.distance(scene.kitchen.link_pose(f"{name}_handle")) < 1e-5
+            await ParkArmsActionPerformable(Arms.BOTH).perform()
+            await CloseActionPerformable(handle, arm).perform()
+            assert scene.kitchen.joint_position(joint) == 0
+            scene.world.restore_state(before)
+
+
+@pytest.mark.slow
+@pytest.mark.soak_on("sink_area_drawer")
+@ABOUT
+@pytest.mark.parametrize(("name", "now"), [("sink_area_drawer", 0.13), ("fridge_door", 0.77)])
+async def test_half_open_furniture_can_be_opened_or_closed_from_every_candidate(
+    scene: Scene, name: str, now: float, about: int
+) -> None:
+    handle, joint = ObjectPart(f"{name}_handle", scene.kitchen), f"{name}_joint"
+    scene.kitchen.set_joint_position(joint, now)
+    before = scene.world.save_state()
+    for place in spread_candidates(list(AccessingLocation(handle, scene.robot)), about):
+        arm = place.reachable_arms[0]
+        for action, there in ((OpenActionPerformable, TRAVEL[name] - 0.05), (CloseActionPerformable, 0.0)):
+            await NavigateActionPerformable(place.pose).perform()
+            await action(handle, arm).perform()
+            assert scene.kitchen.joint_position(joint) == pytest.approx(there)
+            scene.world.restore_state(before)
+
+
+def gap(pose: Pose, low: tuple[float, float], high: tuple[float, float]) -> float:
+    """Return the distance of a base from a rectangle along the axis in which it is larger, m."""
+    x, y, _ = pose.position
+    return max(low[0] - x, x - high[0], low[1] - y, y - high[1])
+
+
+def assert_clear(places: list[Location], kitchen: Object) -> None:
+    boxes = [box for link in kitchen.links if (box := kitchen.bounding_box(link)).size != (0, 0, 0)]
+    for place in places:
+        assert place.pose.position.z == 0
+        for box in boxes:
+            assert gap(place.pose, box.min[:2], box.max[:2]) >= 0.4 - 1e-9
+
+
+@pytest.mark.slow
+def test_the_first_candidates_are_clear_of_furniture_and_a_place_for_both_arms_is_reached_by_each(scene: Scene) -> None:
+    lower, upper = (ObjectPart(f"{each}_handle", scene.kitchen) for each in (DRAWERS[1], DRAWERS[2]))
+    assert_clear([*itertools.islice(AccessingLocation(lower, scene.robot), 100)], scene.kitchen)
+    assert AccessingLocation(upper, scene.robot, Arms.BOTH).resolve().reachable_arms == (Arms.LEFT, Arms.RIGHT)
+
+
+@pytest.mark.slow
+@pytest.mark.soak  # the first hundred are checked before
+def test_candidates_are_clear_of_furniture_and_those_in_the_path_of_the_drawer_come_last(scene: Scene) -> None:
+    places = list(AccessingLocation(ObjectPart("kitchen_counter_lower_drawer_handle", scene.kitchen), scene.robot))
+    assert_clear(places, scene.kitchen)
+    # Pulled out by 0.3 m: the panel, 0.6 m wide, to 1.05 - 0.02 - 0.3, the handle to 1.05 - 0.05 - 0.008 - 0.3.
+    panel, bar = ((0.73, 0.05), (1.05, 0.65)), ((0.692, 0.28), (1.05, 0.42))
+    swept = [min(gap(place.pose, *panel), gap(place.pose, *bar)) < 0.4 for place in places]
+    assert swept == sorted(swept)
+    assert True in swept
+    assert False in swept
+    facing = [place for place in places if abs(_aside(place.pose, (1.0, 0.35))) < 1e-9]
+    assert 0 < len(facing) < len(places)
+    assert places[0] in facing
+
+
+def _aside(pose: Pose, goal: tuple[float, float]) -> float:
+    """Return the angle, in rad, between the pose's direction and the point."""
+    towards = math.atan2(goal[1] - pose.position.y, goal[0] - pose.position.x)
+    return math.remainder(pose.yaw - towards, math.tau)
+
+
+@pytest.mark.slow
+@pytest.mark.soak  # one place for both is required before
+def test_the_requested_arms_reach(scene: Scene) -> None:
+    handle = ObjectPart("sink_area_drawer_handle", scene.kitchen)
+
+    def reaching(arm: Arms | None) -> set[tuple[Arms, ...]]:
+        return {each.reachable_arms for each in AccessingLocation(handle, scene.robot, arm)}
+
+    assert reaching(Arms.RIGHT) == {(Arms.RIGHT,)}
+    assert reaching(Arms.BOTH) == {(Arms.LEFT, Arms.RIGHT)}
+    assert reaching(None) == {(Arms.LEFT,), (Arms.RIGHT,), (Arms.LEFT, Arms.RIGHT)}
+
+
+@pytest.mark.slow
+def test_resolving_moves_nothing_and_is_recorded_once(scene: Scene) -> None:
+    handle = ObjectPart("sink_area_drawer_handle", scene.kitchen)
+    before = scene.world.save_state()
+    with Recording().listening() as recording:
+        first, second = itertools.islice(AccessingLocation(handle, scene.robot), 2)
+    assert scene.world.save_state() == before
+    ((name, candidates, taken, considered, node),) = recording.places
+    assert (name, taken, node) == ("AccessingLocation", 1, None)
+    assert candidates == tuple(Candidate(each.pose, each.reachable_arms) for each in (first, second))
+    assert considered >= 2
+
+
+@pytest.mark.slow
+def test_an_unreachable_handle_is_a_failure_and_is_recorded(scene: Scene) -> None:
+    scene.kitchen.set_pose(Pose([0, 0, 1.5]))
+    with Recording().listening() as recording, pytest.raises(EnvironmentUnreachable, match="no place") as caught:
+        AccessingLocation(ObjectPart("sink_area_drawer_handle", scene.kitchen), scene.robot).resolve()
+    assert caught.value.data == ("sink_area_drawer_handle",)
+    ((name, candidates, taken, considered, _),) = recording.places
+    assert (name, candidates, taken) == ("AccessingLocation", (), None)
+    assert considered > REFUSALS_MAX == len(recording.refused[0])
+    assert all(re.fullmatch("LEFT: .+; RIGHT: .+", each.reason) for each in recording.refused[0])
+
+
+@pytest.mark.slow
+def test_an_object_that_cannot_be_opened_is_refused_with_the_reason(scene: Scene) -> None:
+    def request(part: ObjectPart) -> None:
+        AccessingLocation(part, scene.robot).resolve()
+
+    with pytest.raises(EnvironmentManipulationImpossible, match="no joint of kitchen moves sink_area_surface"):
+        request(ObjectPart("sink_area_surface", scene.kitchen))
+    with pytest.raises(UnknownLink, match="attic_handle"):
+        request(ObjectPart("attic_handle", scene.kitchen))
+    with pytest.raises(NoRobotHere, match="'milk' is not a robot"):
+        AccessingLocation(ObjectPart("sink_area_drawer_handle", scene.kitchen), scene.milk).resolve()
+    scene.world.remove(scene.kitchen)
+    with pytest.raises(PerceptionObjectNotInWorld, match="kitchen"):
+        request(ObjectPart("sink_area_drawer_handle", scene.kitchen))

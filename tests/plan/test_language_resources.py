@@ -1,4 +1,4 @@
-"""Branches take turns when they need the same part of the robot, and never deadlock."""
+"""Branches take turns when they need the same part of the robot; the parts that each designator requires."""
 
 from __future__ import annotations
 
@@ -7,28 +7,51 @@ import itertools
 import random
 from collections.abc import Iterable
 from contextlib import suppress
+from dataclasses import dataclass, field
 
 import pytest
 
 from pycrorm_async.plan import (
     ActionAbstract,
     Code,
+    Designator,
+    DetectActionPerformable,
+    FaceAtPerformable,
+    GripActionPerformable,
+    LookingMotion,
     Monitor,
+    MoveAndPickUpPerformable,
+    MoveArmJointsMotion,
+    MoveGripperMotion,
+    MoveJointsMotion,
+    MoveMotion,
+    MoveTCPMotion,
+    MoveTorsoActionPerformable,
     NavigateAction,
+    NavigateActionPerformable,
+    ObjectPart,
+    OpenActionPerformable,
     Parallel,
+    ParkArmsActionPerformable,
     PickUpActionPerformable,
+    PlaceActionPerformable,
     PlanFailure,
     Resource,
+    SetGripperActionPerformable,
     TaskStatus,
+    TransportActionPerformable,
     TryAll,
     collected_tree,
 )
-from pycrorm_async.plan.failures import ResourceDeadlock
-from pycrorm_async.world import Arms, BulletWorld, Grasp, Pose, WorldMode
+from pycrorm_async.plan.failures import ResourceDeadlock, ResourcesNotAMethod
+from pycrorm_async.world import Arms, BulletWorld, Grasp, GripperState, Pose, WorldMode
 from pycrorm_async.world.bullet import current_world
 from tests.plan.conftest import Scene
-from tests.plan.fake_observer import Recording
-from tests.plan.step_actions import Around, Step, drawn
+from tests.plan.fakes import Around, Recording, Step, drawn
+
+# === language resources =======================================================================================
+#
+# Branches take turns when they need the same part of the robot, and never deadlock.
 
 LEFT, RIGHT, BASE, HEAD = Resource.LEFT_ARM, Resource.RIGHT_ARM, Resource.BASE, Resource.HEAD
 
@@ -376,3 +399,77 @@ async def test_waiting_nodes_are_served_in_order_of_arrival(order: tuple[int, ..
 
     await (step("x", log, BASE, turns=9) | Later(0) | Later(1) | Later(2)).perform()
     assert [each for each in log if each in "012"] == [str(order.index(place)) for place in range(3)]
+
+
+# === resources ================================================================================================
+#
+# The parts of the robot that each built-in designator requires.
+
+THERE = Pose([1, 0, 0])
+LEFT_PART, RIGHT_PART, BASE_PART, TORSO, HEAD_PART = (
+    Resource.LEFT_ARM,
+    Resource.RIGHT_ARM,
+    Resource.BASE,
+    Resource.TORSO,
+    Resource.HEAD,
+)
+
+
+def needs(designator: Designator) -> set[Resource]:
+    return set(designator.resources())
+
+
+def test_a_motion_of_one_part_requires_that_part() -> None:
+    assert needs(MoveMotion(THERE)) == needs(NavigateActionPerformable(THERE)) == {BASE_PART}
+    assert needs(LookingMotion(THERE)) == {HEAD_PART}
+    assert needs(MoveGripperMotion(GripperState.OPEN, Arms.RIGHT)) == {RIGHT_PART}
+    assert needs(SetGripperActionPerformable(Arms.LEFT, GripperState.OPEN)) == {LEFT_PART}
+    assert needs(ParkArmsActionPerformable(Arms.BOTH)) == {LEFT_PART, RIGHT_PART}
+    assert needs(MoveTorsoActionPerformable(0.2)) == {TORSO}
+    assert needs(MoveArmJointsMotion({"l_elbow_flex_joint": -1.0})) == {LEFT_PART}
+    assert needs(MoveArmJointsMotion(None, {"r_elbow_flex_joint": -1.0})) == {RIGHT_PART}
+    assert needs(FaceAtPerformable(THERE)) == {BASE_PART, HEAD_PART}
+
+
+def test_a_reach_for_a_pose_in_the_map_requires_the_robot_to_stand_still(scene: Scene) -> None:
+    handle = ObjectPart("sink_area_drawer_handle", scene.kitchen)
+    assert needs(MoveTCPMotion(THERE, Arms.LEFT)) == {LEFT_PART, BASE_PART, TORSO}
+    assert needs(PickUpActionPerformable(scene.milk, Arms.RIGHT, Grasp.FRONT)) == {RIGHT_PART, BASE_PART, TORSO}
+    assert needs(PlaceActionPerformable(scene.milk, Arms.RIGHT, THERE)) == {RIGHT_PART, BASE_PART, TORSO}
+    assert needs(GripActionPerformable(Arms.LEFT, scene.milk, 1.0)) == {LEFT_PART, BASE_PART, TORSO}
+    assert needs(OpenActionPerformable(handle, Arms.LEFT)) == {LEFT_PART, BASE_PART, TORSO}
+    assert needs(MoveAndPickUpPerformable(THERE, scene.milk, Arms.LEFT, Grasp.TOP)) == {
+        LEFT_PART,
+        BASE_PART,
+        TORSO,
+        HEAD_PART,
+    }
+    assert needs(TransportActionPerformable(scene.milk, Arms.LEFT, THERE)) == {LEFT_PART, RIGHT_PART, BASE_PART, TORSO}
+    assert needs(DetectActionPerformable(scene.milk)) == {HEAD_PART}
+
+
+def test_joints_by_name_require_the_parts_they_belong_to(scene: Scene) -> None:
+    names = ["torso_lift_joint", "head_pan_joint", "r_elbow_flex_joint", "l_gripper_l_finger_joint", "no_such_joint"]
+    assert needs(MoveJointsMotion(names, [0.0] * 5)) == {TORSO, HEAD_PART, RIGHT_PART, LEFT_PART}
+    assert needs(MoveJointsMotion(["no_such_joint"], [0.0])) == set()
+
+
+def test_unknown_joints_require_nothing() -> None:
+    assert needs(MoveJointsMotion(["torso_lift_joint"], [0.0])) == set()
+
+
+def test_a_users_action_requires_nothing_by_default() -> None:
+    class Thinking(ActionAbstract):
+        async def perform(self) -> None: ...
+
+    assert needs(Thinking()) == set()
+
+
+def test_a_field_with_the_name_of_the_method_is_refused_when_the_class_is_made() -> None:
+    with pytest.raises(ResourcesNotAMethod, match=r"Cooking\.resources must be a method that returns a frozenset"):
+
+        @dataclass
+        class Cooking(ActionAbstract):
+            resources: list[str] = field(default_factory=list)  # type: ignore[assignment]  # what is refused
+
+            async def perform(self) -> None: ...

@@ -1,4 +1,4 @@
-"""The abilities of one hand: hold and release, pick up rotated objects, and its failures."""
+"""The abilities of one hand: hold and release, pick up rotated objects, transport them, and its failures."""
 
 from __future__ import annotations
 
@@ -27,6 +27,7 @@ from pycrorm_async.plan import (
     PlaceActionPerformable,
     ReleaseActionPerformable,
     SetGripperActionPerformable,
+    TransportAction,
     TransportActionPerformable,
     collected_tree,
     simulated_robot_within,
@@ -37,15 +38,23 @@ from pycrorm_async.plan.failures import (
     GripperClosedCompletely,
     IllPosedGoalFailure,
     ObjectLost,
+    ObjectUnfetchable,
     PerceptionObjectNotInWorld,
+    ReachabilityFailure,
 )
 from pycrorm_async.plan.objects import designator_of
 from pycrorm_async.world import Arms, BulletWorld, Grasp, GripperState, Limits, Object, ObjectType, Pose
 from pycrorm_async.world.pose import yaw_quaternion
-from tests.plan.bullet_frames import bullet_frame
+from pycrorm_async.world.urdf import PR2
 from tests.plan.conftest import Scene
+from tests.plan.fakes import Recording
 from tests.plan.test_actions import shape
 from tests.world.fakes import CRANE, ChangeLog, Matrix, X, Y, Z, matrix, shifted, turned
+from tests.world.loaded_model import bullet_frame
+
+# === manipulation =============================================================================================
+#
+# The abilities of one hand: hold and release, pick up rotated objects, and its failures.
 
 LEFT_TOOL, RIGHT_TOOL = "l_gripper_tool_frame", "r_gripper_tool_frame"
 
@@ -318,3 +327,76 @@ async def test_an_object_of_another_world_is_neither_held_nor_opened(scene: Scen
         with simulated_robot_within(Limits.HARD), pytest.raises(PerceptionObjectNotInWorld, match="kitchen is in"):
             await OpeningMotion(handle, Arms.LEFT).perform()
     assert scene.world.save_state() == before
+
+
+# === transport ================================================================================================
+#
+# An object is transported by the expected actions and locations, or the failure names the reason.
+
+ISLAND = Pose([-1.35, 1.0, 0.988], yaw_quaternion(math.pi))
+
+
+def parked(scene: Scene, *arms: Arms) -> bool:
+    joints = {name: value for arm in arms for name, value in PR2.arms[arm].park.items()}
+    return all(scene.robot.joint_position(name) == value for name, value in joints.items())
+
+
+@pytest.mark.parametrize("arm", [Arms.LEFT, Arms.RIGHT])
+async def test_a_transported_object_is_at_its_target_and_the_arms_are_parked(scene: Scene, arm: Arms) -> None:
+    await MoveTorsoActionPerformable(0.3).perform()
+    with collected_tree() as tree, Recording().listening() as recording:
+        await TransportActionPerformable(designator_of(scene.milk), arm, ISLAND).perform()
+    np.testing.assert_allclose(matrix(scene.milk.pose), matrix(ISLAND), atol=1e-6)
+    assert (scene.robot.attachments, scene.milk.attached_to) == ({}, None)
+    assert parked(scene, Arms.LEFT, Arms.RIGHT)
+    assert [line.strip() for line in shape(tree) if not line.startswith("    ")] == [
+        "TransportActionPerformable",
+        "ParkArmsActionPerformable",
+        "NavigateActionPerformable",
+        "PickUpActionPerformable",
+        "ParkArmsActionPerformable",
+        "NavigateActionPerformable",
+        "PlaceActionPerformable",
+        "ParkArmsActionPerformable",
+    ]
+    assert len(tree) == 1 + 2 + 2 + 6 + 2 + 2 + 4 + 2
+    assert [place[0] for place in recording.places] == ["CostmapLocation"] * 2
+    transport = next(iter(tree))
+    for _, candidates, taken, _, node in recording.places:
+        assert (taken, node) == (0, transport)
+        assert arm in candidates[0].arms
+    assert scene.robot.pose == recording.places[1][1][0].pose
+
+
+async def test_an_object_in_the_hand_is_only_brought(scene: Scene) -> None:
+    await MoveTorsoActionPerformable(0.3).perform()
+    await NavigateActionPerformable(Pose([0.6, 0.9, 0])).perform()
+    await PickUpActionPerformable(scene.milk, Arms.LEFT, Grasp.FRONT).perform()
+    with collected_tree() as tree:
+        await TransportAction(scene.milk, [Arms.LEFT], [ISLAND]).resolve().perform()
+    np.testing.assert_allclose(matrix(scene.milk.pose), matrix(ISLAND), atol=1e-6)
+    assert "  PickUpActionPerformable" not in shape(tree)
+
+
+async def test_an_object_that_cannot_be_picked_up_stays_in_place(scene: Scene) -> None:
+    scene.milk.set_pose(Pose([1.3, 1, 3.0]))
+    with pytest.raises(ObjectUnfetchable, match="no place to stand and pick up milk") as caught:
+        await TransportActionPerformable(scene.milk, Arms.LEFT, ISLAND).perform()
+    assert caught.value.data == ("milk",)
+    assert (scene.milk.pose, scene.robot.pose, scene.robot.attachments) == (Pose([1.3, 1, 3.0]), Pose(), {})
+
+
+async def test_an_object_that_cannot_be_delivered_stays_in_the_hand(scene: Scene) -> None:
+    await MoveTorsoActionPerformable(0.3).perform()
+    with pytest.raises(ReachabilityFailure, match="no place to stand and reach"):
+        await TransportActionPerformable(scene.milk, Arms.LEFT, Pose([0, -3, 3.0])).perform()
+    assert scene.robot.attachments == {scene.milk: LEFT_TOOL}
+    assert parked(scene, Arms.LEFT, Arms.RIGHT)
+
+
+async def test_a_robot_of_one_arm_transports_with_it(scene: Scene, one_armed: None) -> None:
+    await MoveTorsoActionPerformable(0.3).perform()
+    await TransportActionPerformable(scene.milk, Arms.LEFT, ISLAND).perform()
+    np.testing.assert_allclose(matrix(scene.milk.pose), matrix(ISLAND), atol=1e-6)
+    assert parked(scene, Arms.LEFT)
+    assert not parked(scene, Arms.RIGHT)

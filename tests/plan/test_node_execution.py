@@ -20,7 +20,7 @@ from pycrorm_async.plan.failures import ObjectUnreachable, PlanFailure
 from pycrorm_async.plan.language import ActionAbstract
 from pycrorm_async.plan.task import TaskTreeNode, collected_tree, current_node
 from pycrorm_async.task_status import TaskStatus
-from tests.plan.fake_observer import Recording
+from tests.plan.fakes import Recording
 
 pytestmark = pytest.mark.slow
 

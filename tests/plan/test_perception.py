@@ -32,11 +32,11 @@ from pycrorm_async.plan.task import TaskTreeNode
 from pycrorm_async.world import Arms, Grasp, Limits, Object, ObjectType, Pose
 from pycrorm_async.world.models import box_urdf
 from pycrorm_async.world.urdf import PR2
-from tests.plan.bullet_frames import bullet_frame
 from tests.plan.conftest import Scene
-from tests.plan.fake_observer import Recording
+from tests.plan.fakes import Recording
 from tests.plan.test_actions import shape
-from tests.plan.test_process_modules import Noting
+from tests.plan.test_motions import Noting
+from tests.world.loaded_model import bullet_frame
 
 DetectionNote = tuple[str, ObjectType | None, tuple[Seen, ...], TaskTreeNode | None]
 

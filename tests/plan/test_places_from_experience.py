@@ -22,7 +22,7 @@ from pycrorm_async.world import Arms, Grasp, Object, ObjectType, Pose
 from pycrorm_async.world.models import box_urdf
 from pycrorm_async.world.pose import yaw_quaternion
 from tests.plan.conftest import Scene
-from tests.plan.fake_observer import Recording
+from tests.plan.fakes import Recording
 
 BEFORE_IT = Pose([-0.7, 0.0, -0.9])
 ASIDE = Pose([-0.6, -0.4, -0.9], yaw_quaternion(0.5))

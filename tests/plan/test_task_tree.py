@@ -1,17 +1,38 @@
-"""The collected task tree: its order, its drawing, and its use beside a recorder."""
+"""The collected task tree: its order, its drawing, and that of the plan of the thesis."""
 
 from __future__ import annotations
 
 import asyncio
+import math
 import re
+from collections.abc import Awaitable
 from dataclasses import dataclass, field
 
 import pytest
 
+from pycrorm_async.plan import (
+    CostmapLocation,
+    MoveTorsoAction,
+    NavigateAction,
+    ObjectDesignatorDescription,
+    ParkArmsAction,
+    ParkArmsActionPerformable,
+    PickUpAction,
+    PlaceAction,
+    SemanticCostmapLocation,
+    TaskStatus,
+    simulated_robot,
+)
 from pycrorm_async.plan.failures import ObjectLost
 from pycrorm_async.plan.language import ActionAbstract, BaseMotion
 from pycrorm_async.plan.task import TaskTreeNode, collected_tree, current_node
-from tests.plan.fake_observer import Recording
+from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose, WorldMode
+from tests.plan.conftest import Scene
+from tests.plan.fakes import Recording
+
+# === task tree ================================================================================================
+#
+# The collected task tree: its order, its drawing, and its use beside a recorder.
 
 
 @dataclass
@@ -133,3 +154,118 @@ async def test_a_deep_tree_is_drawn_without_recursion() -> None:
         await deep.perform()
     assert len(str(tree).splitlines()) == 201
     assert str(tree).splitlines()[200].startswith("    " * 199 + "└── Plan")
+
+
+# === thesis plan ==============================================================================================
+#
+# The plan of thesis 5.1, from the first parked arm to the last.
+
+TREE = """\
+ParkArmsActionPerformable
+└── MoveArmJointsMotion
+MoveTorsoActionPerformable
+└── MoveJointsMotion
+NavigateActionPerformable
+└── MoveMotion
+PickUpActionPerformable
+├── MoveTCPMotion
+├── MoveGripperMotion
+├── MoveTCPMotion
+├── MoveGripperMotion
+└── MoveTCPMotion
+ParkArmsActionPerformable
+└── MoveArmJointsMotion
+NavigateActionPerformable
+└── MoveMotion
+PlaceActionPerformable
+├── MoveTCPMotion
+├── MoveGripperMotion
+└── MoveTCPMotion
+ParkArmsActionPerformable
+└── MoveArmJointsMotion"""
+
+
+async def thesis_plan() -> Pose:
+    """The plan as it is printed there, awaited; returns the target of the cereal."""
+    cereal_desig = ObjectDesignatorDescription(names=["cereal"])
+    robot_desig = ObjectDesignatorDescription(names=["pr2"]).resolve()
+    kitchen_desig = ObjectDesignatorDescription(names=["kitchen"])
+
+    await ParkArmsActionPerformable(Arms.BOTH).perform()
+    await MoveTorsoAction([0.3]).resolve().perform()
+    pickup_pose = CostmapLocation(target=cereal_desig.resolve(), reachable_for=robot_desig).resolve()
+    pickup_arm = pickup_pose.reachable_arms[0]
+    await NavigateAction(target_locations=[pickup_pose.pose]).resolve().perform()
+    await (
+        PickUpAction(object_designator_description=cereal_desig, arms=[pickup_arm], grasps=[Grasp.FRONT])
+        .resolve()
+        .perform()
+    )
+    await ParkArmsAction([Arms.BOTH]).resolve().perform()
+    place_island = SemanticCostmapLocation(
+        "kitchen_island_surface", kitchen_desig.resolve(), cereal_desig.resolve()
+    ).resolve()
+    place_stand = CostmapLocation(place_island.pose, reachable_for=robot_desig, reachable_arm=pickup_arm).resolve()
+    await NavigateAction(target_locations=[place_stand.pose]).resolve().perform()
+    await PlaceAction(cereal_desig, target_locations=[place_island.pose], arms=[pickup_arm]).resolve().perform()
+    await ParkArmsActionPerformable(Arms.BOTH).perform()
+    return place_island.pose
+
+
+async def test_the_thesis_plan_puts_the_cereal_on_the_island(scene: Scene) -> None:
+    with collected_tree() as tree:
+        goal = await thesis_plan()
+    assert scene.cereal.pose.distance(goal) < 0.01
+    island, cereal = scene.kitchen.bounding_box("kitchen_island_surface"), scene.cereal.bounding_box()
+    assert math.isclose(cereal.min.z, island.max.z, abs_tol=1e-9)
+    assert island.min.x < cereal.min.x < cereal.max.x < island.max.x
+    assert island.min.y < cereal.min.y < cereal.max.y < island.max.y
+    assert (scene.cereal.attached_to, scene.milk.pose.position) == (None, (1.3, 1, 0.9))
+    assert re.sub(r" SUCCEEDED \d+\.\d ms", "", str(tree)) == TREE
+    assert {node.status for node in tree} == {TaskStatus.SUCCEEDED}
+
+
+async def test_a_recorder_is_notified_of_the_whole_thesis_plan(scene: Scene) -> None:
+    with Recording().listening() as recording:
+        await thesis_plan()
+    assert len(recording.ended) == len(TREE.splitlines()) == 22
+    assert recording.open == []
+    assert [each for each in recording.notes if each.startswith("place")] == [
+        "place CostmapLocation",
+        "place SemanticCostmapLocation",
+        "place CostmapLocation",
+    ]
+    assert all((taken, len(candidates)) == (0, 1) for _, candidates, taken, _, _ in recording.places)
+
+
+class Alternating(Recording):
+    """Let other tasks run before every node."""
+
+    def admit(self) -> Awaitable[None]:
+        return asyncio.sleep(0)
+
+
+async def test_three_concurrent_plans_in_three_worlds_do_not_mix() -> None:
+    async def run_once() -> tuple[float, str]:
+        with BulletWorld(mode=WorldMode.DIRECT), simulated_robot, collected_tree() as tree:
+            Object("pr2", ObjectType.ROBOT)
+            Object("kitchen", ObjectType.ENVIRONMENT)
+            cereal = Object("cereal", ObjectType.BREAKFAST_CEREAL, pose=Pose([1.3, 0.7, 0.95]))
+            await all_ready.wait()
+            goal = await thesis_plan()
+            return cereal.pose.distance(goal), re.sub(r" SUCCEEDED \d+\.\d ms", "", str(tree))
+
+    all_ready = asyncio.Barrier(3)
+    with Alternating().listening() as recording:
+        for distance, tree in await asyncio.gather(run_once(), run_once(), run_once()):
+            assert distance < 0.01
+            assert tree == TREE
+    assert recording.notes[:3] == ["start ParkArmsActionPerformable"] * 3
+    assert [node.parent for node in recording.ended].count(None) == 3 * 8
+
+
+async def test_two_runs_of_the_plan_are_the_same(scene: Scene) -> None:
+    first = await thesis_plan()
+    robot = scene.robot.pose
+    scene.world.reset()
+    assert (await thesis_plan(), scene.robot.pose) == (first, robot)

@@ -1,8 +1,8 @@
-"""A script of events: an episode is a list of events, one second apart, at known times."""
+"""Scripts of events, one second apart, at known times; and the log and tables of a memory, made from records."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from pycrorm_async.events.codec import Record, encode, fingerprint
 from pycrorm_async.events.ids import EpisodeId
@@ -15,7 +15,14 @@ from pycrorm_async.events.types import (
     NodeKind,
     PoseValue,
 )
+from pycrorm_async.projections.projector import Projector
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import StoredEvent
+
+# === event script =============================================================================================
+#
+# A script of events: an episode is a list of events, one second apart, at known times.
 
 T0_NS = 1_700_000_000_000_000_000
 """2023-11-14 22:13:20 UTC: event n of an episode happens n seconds later."""
@@ -110,3 +117,21 @@ def mixed(*scripts: Script) -> Sequence[Record]:
     """Interleave the records of several episodes, one of each in turn."""
     longest = max(len(each.records) for each in scripts)
     return [each.records[index] for index in range(longest) for each in scripts if index < len(each.records)]
+
+
+# === factories ================================================================================================
+#
+# Make the log of a memory at a URL, with its tables, from records.
+
+
+async def append_and_fold(url: str, records: Iterable[Record], *, folded: bool = True) -> None:
+    """Append to a log that is opened for this call alone, and fold it unless `folded` is false; none is refused."""
+    log = await EventLog.open(DatabaseAddress.parse(url), create=True)
+    try:
+        assert await log.append(list(records)) == {}
+        if folded:
+            projector = Projector(log)
+            await projector.open()
+            await projector.catch_up()
+    finally:
+        await log.close()

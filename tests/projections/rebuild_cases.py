@@ -18,8 +18,17 @@ from pycrorm_async.events.types import (
     RobotValue,
 )
 from tests.databases import ask
-from tests.projections.event_script import PICK_UP, SAYING, Script, declarations, declared, field, name_of, pose
-from tests.projections.factories import append_and_fold
+from tests.projections.event_script import (
+    PICK_UP,
+    SAYING,
+    Script,
+    append_and_fold,
+    declarations,
+    declared,
+    field,
+    name_of,
+    pose,
+)
 from tests.table_comparison import Tables, tables_of
 
 TYPES = declarations(PICK_UP, SAYING)

@@ -1,18 +1,33 @@
-"""The layout of tables: what declarations add, and which declarations are refused."""
+"""The layout of tables: what declarations add, which are refused, and the names of the tables behind the views."""
 
 from __future__ import annotations
 
 from itertools import permutations
+from pathlib import Path
 
 import pytest
 from msgspec.structs import replace
+from sqlalchemy import select
 
+from pycrorm_async import Reading
 from pycrorm_async.events.types import DesignatorTypeDeclared
+from pycrorm_async.operations.rebuild import rebuild_memory
+from pycrorm_async.orm import PickUpAction, TaskTreeNode
+from pycrorm_async.projections import projector
 from pycrorm_async.projections.columns import Layout, LayoutConflict, Leaf
+from pycrorm_async.projections.mapped_tables import UserView
+from pycrorm_async.projections.verify import verify
 from pycrorm_async.projections.views import public_views
-from tests.projections.event_script import PICK_UP, SAYING, declared, field
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.log import EventLog
+from tests.databases import ask
+from tests.projections.event_script import PICK_UP, SAYING, append_and_fold, declared, field
+from tests.projections.rebuild_cases import TYPES, picking, traces
+from tests.table_comparison import differences, tables_of
 
-pytestmark = pytest.mark.slow
+# === layout ===================================================================================================
+#
+# The layout of tables: what declarations add, and which declarations are refused.
 
 
 def layout_of(*types: DesignatorTypeDeclared) -> Layout:
@@ -22,6 +37,7 @@ def layout_of(*types: DesignatorTypeDeclared) -> Layout:
     return layout
 
 
+@pytest.mark.slow
 def test_columns_of_one_type_unite_in_the_order_of_declaration() -> None:
     louder = declared("SayingAction", "saying_action", field("volume", "real", 2), field("text", "text", 3))
     layout = layout_of(SAYING, louder)
@@ -29,11 +45,13 @@ def test_columns_of_one_type_unite_in_the_order_of_declaration() -> None:
     assert layout_of(SAYING, louder, SAYING) == layout
 
 
+@pytest.mark.slow
 def test_lists_and_dicts_have_no_column() -> None:
     joints = declared("MoveJointsMotion", "move_joints_motion", field("names", "list", 2, item="text"), kind="motion")
     assert layout_of(joints).leaves == {"move_joints_motion": {}}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("second", "reason"),
     [
@@ -68,11 +86,13 @@ def test_a_declaration_that_contradicts_a_table_is_refused_with_both_named(
     assert str(raised.value) == reason
 
 
+@pytest.mark.slow
 def test_a_contradiction_with_another_table_of_the_same_type_is_refused() -> None:
     with pytest.raises(LayoutConflict):
         layout_of(SAYING, declared("SayingAction", "ORMSaying", field("text", "real", 2)))
 
 
+@pytest.mark.slow
 def test_a_table_with_a_contradicting_column_of_an_authors_class_cannot_join_the_type() -> None:
     layout = layout_of(SAYING).with_leaves([Leaf("ORMSaying", {"text": "real"})])
     with pytest.raises(LayoutConflict, match=r"SayingAction\.text is declared as text and as real"):
@@ -80,6 +100,7 @@ def test_a_table_with_a_contradicting_column_of_an_authors_class_cannot_join_the
     assert layout.with_declaration(SAYING) == layout
 
 
+@pytest.mark.slow
 def test_a_view_lists_all_tables_of_its_type_and_of_its_descendants() -> None:
     careful = declared("CarefulPickUpAction", "careful", bases=("PickUpAction",))
     gentle = declared("GentlePickUpAction", "gentle", bases=("CarefulPickUpAction", "PickUpAction"))
@@ -90,6 +111,7 @@ def test_a_view_lists_all_tables_of_its_type_and_of_its_descendants() -> None:
     assert layout.members("gentle") == ("gentle",)
 
 
+@pytest.mark.slow
 def test_a_lineage_names_the_type_its_tables_and_its_bases_and_ends_with_an_existing_class() -> None:
     careful = declared("CarefulPickUpAction", "careful", bases=("PickUpAction",))
     layout = layout_of(PICK_UP, careful, SAYING, declared("MoveMotion", "move_motion", kind="motion"))
@@ -98,6 +120,7 @@ def test_a_lineage_names_the_type_its_tables_and_its_bases_and_ends_with_an_exis
     assert layout.lineage("CarefulPickUpAction") == "CarefulPickUpAction careful PickUpAction Action"
 
 
+@pytest.mark.slow
 def test_mapped_classes_add_missing_columns_and_never_change_declared_ones() -> None:
     layout = layout_of(SAYING).with_leaves(
         [Leaf("saying_action", {"text": "integer", "volume": "real"}, "SayingAction", "action"), Leaf("ORMLog", {})]
@@ -117,6 +140,7 @@ HELLO = replace(declared("HelloAction", "hello_action", field("whom", "text", 2)
 LOUD = declared("LoudGreetAction", "loud_greet_action", bases=("GreetAction",))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", list(permutations([GREET, WELCOME, HELLO, LOUD])))
 def test_a_type_and_its_former_name_are_one_type_whichever_was_declared_first(
     order: tuple[DesignatorTypeDeclared, ...],
@@ -138,6 +162,7 @@ def test_a_type_and_its_former_name_are_one_type_whichever_was_declared_first(
     assert layout.lineage("LoudGreetAction").split()[:2] == ["LoudGreetAction", "HelloAction"]
 
 
+@pytest.mark.slow
 def test_a_former_name_that_two_types_claim_belongs_to_the_first() -> None:
     bow = replace(declared("BowAction", "bow_action"), aliases=("GreetAction",))
     layout = layout_of(GREET, WELCOME)
@@ -148,6 +173,7 @@ def test_a_former_name_that_two_types_claim_belongs_to_the_first() -> None:
     assert both.renamed == {"GreetAction": "BowAction", "WelcomeAction": "BowAction"}
 
 
+@pytest.mark.slow
 def test_a_type_that_returns_to_an_earlier_name_stays_one_type() -> None:
     back = replace(GREET, aliases=("WelcomeAction",))
     layout = layout_of(GREET, WELCOME, back)
@@ -155,6 +181,7 @@ def test_a_type_that_returns_to_an_earlier_name_stays_one_type() -> None:
     assert layout_of(GREET, WELCOME, back, GREET, WELCOME, back) == layout
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("former", "reason"),
     [
@@ -176,6 +203,7 @@ def test_an_impossible_former_name_is_refused_and_changes_nothing(former: Design
     assert layout_of(WELCOME).types["WelcomeAction"].tables == ("welcome_action",)
 
 
+@pytest.mark.slow
 def test_tables_that_become_one_type_must_all_agree() -> None:
     own = replace(declared("WelcomeAction", "ORMWelcome"), aliases=("GreetAction",))
     layout = layout_of(GREET, declared("WelcomeAction", "welcome_action", field("loud", "text", 2)))
@@ -183,6 +211,7 @@ def test_tables_that_become_one_type_must_all_agree() -> None:
         layout.with_declaration(own)
 
 
+@pytest.mark.slow
 def test_a_new_type_changes_only_the_views_that_show_its_rows() -> None:
     shouting = declared("ShoutingAction", "shouting_action", field("volume", "real", 2), bases=("SayingAction",))
     telling = declared("TellingAction", "telling_action", field("text", "text", 2))
@@ -194,3 +223,51 @@ def test_a_new_type_changes_only_the_views_that_show_its_rows() -> None:
 
     assert changed(before.with_declaration(telling)) == {"telling_action"}
     assert changed(before.with_declaration(shouting)) == {"shouting_action", "saying_action", "designator"}
+
+
+# === table names ==============================================================================================
+#
+# The tables behind the views come last in a list of names, and tables with former names are used until a rebuild.
+
+
+async def assert_verified(url: str) -> None:
+    log = await EventLog.open(DatabaseAddress.parse(url), create=False)
+    result = await verify(log)
+    await log.close()
+    assert (result.damage, result.differences) == (0, [])
+    assert result.episodes > 0
+
+
+@pytest.mark.slow
+async def test_the_tables_of_a_generation_come_last_in_a_list_of_names(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path}/memory.db"
+    await append_and_fold(url, [*TYPES, *picking(1).records])
+    for generation in (1001, 1002):
+        listed = ask(url, "SELECT name, type FROM sqlite_master WHERE type IN ('table', 'view')")
+        behind = {name for name, kind in listed if kind == "table" and name.endswith(f"__{generation}")}
+        assert len(behind) > 40
+        for names in (sorted(name for name, _ in listed), sorted((name for name, _ in listed), key=str.lower)):
+            assert set(names[-len(behind) :]) == behind
+        await rebuild_memory(url, views=[UserView("zoom_all", select(TaskTreeNode.id))])
+
+
+@pytest.mark.soak_on("postgresql")
+@pytest.mark.empty_database
+@pytest.mark.slow
+async def test_tables_with_former_names_are_used_until_a_rebuild_replaces_them(
+    database_url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(projector, "next_number", lambda _numbers: 7)
+    await append_and_fold(database_url, [*TYPES, *picking(1).records])
+    await append_and_fold(database_url, picking(2).records)
+    at = "memory_tables." if database_url.startswith("postgresql:") else ""
+    assert ask(database_url, f"SELECT count(*) FROM {at}pose__7")[0][0] > 0
+    async with Reading.open(database_url) as reading, reading.session() as session:
+        assert len((await session.scalars(select(PickUpAction.id))).all()) == 10
+    await assert_verified(database_url)
+    before = tables_of(database_url)
+    assert (await rebuild_memory(database_url)).generation == 1001
+    assert differences(before, tables_of(database_url)) == []
+    assert traces(database_url) == []
+    assert ask(database_url, f"SELECT count(*) FROM {at}zz_pose__1001")[0][0] > 0
+    await assert_verified(database_url)

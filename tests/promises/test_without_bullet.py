@@ -12,7 +12,8 @@ import pytest
 
 from tests.commands import environment, one_line_of
 
-pytestmark = [pytest.mark.slow, pytest.mark.every_python]
+pytestmark = pytest.mark.slow
+
 
 WITHOUT_EXTRAS = """
 import sys
@@ -99,6 +100,7 @@ def run(script: str, folder: Path) -> subprocess.CompletedProcess[str]:
     )
 
 
+@pytest.mark.every_python
 def test_recording_and_every_verb_that_needs_no_world_loads_no_extra(tmp_path: Path) -> None:
     done = run(WITHOUT_EXTRAS + RECORDING + VERBS + PRINTING, tmp_path)
     assert done.returncode == 0, done.stderr
@@ -143,12 +145,14 @@ def refused(tmp_path_factory: pytest.TempPathFactory) -> Any:
     return json.loads(done.stdout.splitlines()[-1])
 
 
+@pytest.mark.every_python
 def test_a_verb_that_needs_a_world_first_names_what_to_install(refused: Any) -> None:
     code, printed, files = refused[0]
     assert (code, printed.count("\n"), files) == (2, 1, ["sweep.py"])
     assert printed.startswith(f"pycrorm: {LINE}")
 
 
+@pytest.mark.every_python
 @pytest.mark.soak
 def test_learn_first_names_what_to_install(tmp_path: Path) -> None:
     pytest.importorskip("jpt", reason="learn names the first missing package")
@@ -159,6 +163,7 @@ def test_learn_first_names_what_to_install(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.every_python
 def test_the_error_of_a_world_names_what_to_install_and_how_long_that_takes(tmp_path: Path) -> None:
     opening = "from pycrorm_async.world import BulletWorld\ntry:\n    BulletWorld().__enter__()\n"
     done = run(f"{ABSENT}\n{opening}except Exception as error:\n    print(type(error).__mro__, error)", tmp_path)
@@ -167,12 +172,14 @@ def test_the_error_of_a_world_names_what_to_install_and_how_long_that_takes(tmp_
     assert done.stdout.endswith(f" {LINE}{compiling if sys.version_info >= (3, 13) else ''}\n")
 
 
+@pytest.mark.every_python
 def test_a_failed_plan_names_in_one_line_what_to_install(refused: Any) -> None:
     code, printed, _ = refused[1]
     assert (code, printed.count("\n")) == (1, 1)
     assert printed.startswith(f"pycrorm: the plan sweep.py:plan failed: BulletMissing: {LINE}")
 
 
+@pytest.mark.every_python
 @pytest.mark.parametrize(
     ("module", "absent", "extra"),
     [("py_trees", "py_trees", "py_trees"), ("callbacks", "langchain_core", "langchain")],
@@ -203,6 +210,7 @@ print(json.dumps(needing))
 """
 
 
+@pytest.mark.every_python
 def test_only_what_serves_an_extra_needs_it_to_be_imported(tmp_path: Path) -> None:
     done = run(WITHOUT_EXTRAS + IMPORTS, tmp_path)
     assert done.returncode == 0, done.stderr
@@ -212,3 +220,19 @@ def test_only_what_serves_an_extra_needs_it_to_be_imported(tmp_path: Path) -> No
         "integrations.py_trees",
         "live.server",
     ]
+
+
+# === import ===================================================================================================
+#
+# Importing the plan layer.
+
+
+def test_importing_plans_loads_neither_bullet_nor_a_database() -> None:
+    code = (
+        "import sys, pycrorm_async.plan as plan; assert all(hasattr(plan, name) for name in plan.__all__);"
+        "unwanted = {'pybullet', 'pycram_bullet', 'optik', 'sqlalchemy', 'pycrorm_async.events'};"
+        "unwanted.add('pycrorm_async.record');"
+        "print(sorted(unwanted & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout == "[]\n"

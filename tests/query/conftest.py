@@ -9,9 +9,8 @@ import pytest
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.store.postgresql import GRANTS
 from tests.databases import change_each, run_in_own_loop
-from tests.projections.factories import append_and_fold
-from tests.query.random_episodes import EPISODES
-from tests.query.random_memory import TYPES
+from tests.projections.event_script import append_and_fold
+from tests.query.random_memory import EPISODES, TYPES
 from tests.query.read_only_queries import RECORDS, SqlReader, is_sqlite, login, opened_reader
 
 

@@ -258,3 +258,10 @@ def course_of(episode: RandomEpisode, name: str) -> list[tuple[int, str, str | N
     failed = [each for each in root_failures_of([episode]) if each.object == name]
     course += [(each.sequence, "an action failed", None, each.reason) for each in failed]
     return sorted(course, key=lambda each: (each[0], each[1], each[3] or ""))
+
+
+# === random episodes ==========================================================================================
+#
+# Make the random episodes about which all named questions are asked.
+
+EPISODES = [RandomEpisode(number, seed=number) for number in range(1, 26)]

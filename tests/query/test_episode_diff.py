@@ -22,8 +22,7 @@ from pycrorm_async.events.types import (
 from pycrorm_async.query.episode_diff import Difference
 from pycrorm_async.query.reading import Reading
 from tests.databases import ask, run_in_own_loop
-from tests.projections.event_script import NAVIGATE, PICK_UP, SAYING, Script, name_of, pose, row
-from tests.projections.factories import append_and_fold
+from tests.projections.event_script import NAVIGATE, PICK_UP, SAYING, Script, append_and_fold, name_of, pose, row
 from tests.query.random_memory import TYPES, RandomEpisode
 
 pytestmark = pytest.mark.slow

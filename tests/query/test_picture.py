@@ -1,4 +1,4 @@
-"""Pictures of a scene are made from recorded shapes, frame what moves, and are not recorded themselves."""
+"""Pictures of a scene are made from recorded shapes and the triangles of mesh files, and frame what moves."""
 
 from __future__ import annotations
 
@@ -19,11 +19,16 @@ from pycrorm_async import Memory
 from pycrorm_async.cli.main import app
 from pycrorm_async.errors import CallerError, UnknownEpisode
 from pycrorm_async.plan import NavigateAction, simulated_robot
+from pycrorm_async.query import scene
+from pycrorm_async.query.scene import triangles_of
 from pycrorm_async.settings import Settings
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
 from pycrorm_async.world.models import box_urdf
+from tests import mesh_files
 
-pytestmark = pytest.mark.slow
+# === picture ==================================================================================================
+#
+# Pictures of a scene are made from recorded shapes, frame what moves, and are not recorded themselves.
 
 RED = (0.9, 0.1, 0.1, 1.0)
 CUBE = box_urdf("cube", x=(-0.2, 0.2), y=(-0.2, 0.2), z=(0, 0.4))
@@ -65,6 +70,7 @@ def redness(png: bytes) -> float:
     return float(((colors[..., 0] > 0.3) & (colors[..., 0] > 3 * colors[..., 1])).mean())
 
 
+@pytest.mark.slow
 async def test_a_picture_frames_what_moves_and_a_focus_one_object(url: str) -> None:
     memory = await Memory.connect(url)
     try:
@@ -91,6 +97,7 @@ CORNERS = "v -1 -1 0\nv 1 -1 0\nv 1 1 0\nv -1 1 0\nv 0 0 2\n"
 FACES = "f 1 3 2\nf 1 4 3\nf 1 2 5\nf 2 3 5\nf 3 4 5\nf 4 1 5\n"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("meshes", ["boxes", "files"])
 async def test_a_mesh_is_drawn_where_its_file_is_recorded_and_as_its_box_elsewhere(
     tmp_path: Path, meshes: Literal["boxes", "files"]
@@ -106,6 +113,7 @@ async def test_a_mesh_is_drawn_where_its_file_is_recorded_and_as_its_box_elsewhe
     assert (0.1 < share < 0.2) if meshes == "files" else (0.25 < share < 0.4), share
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("episode", "options", "message"),
     [
@@ -134,6 +142,7 @@ async def test_what_cannot_be_drawn_is_one_line(
             await memory.picture("9")
 
 
+@pytest.mark.slow
 def test_the_command_writes_a_file_and_replaces_none(url: str, tmp_path: Path) -> None:
     out = tmp_path / "scene.png"
     command = ["picture", "1", "--url", url, "--size", "64x48", "--out", str(out)]
@@ -150,3 +159,63 @@ def test_the_command_writes_a_file_and_replaces_none(url: str, tmp_path: Path) -
     wrong = CliRunner().invoke(app(), [*command[:-1], str(tmp_path / "other.png"), "--at", "noon"])
     assert (wrong.exit_code, "--at takes seconds" in wrong.stderr) == (2, True)
     assert [each.name for each in tmp_path.iterdir()] == ["scene.png"]
+
+
+# === mesh triangles ===========================================================================================
+#
+# The triangles of mesh files: the same pyramid from every format, and a reason for every file that has none.
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("a.stl", mesh_files.binary_stl()),
+        ("a.STL", mesh_files.text_stl()),
+        ("a.obj", mesh_files.obj()),
+        ("a.dae", mesh_files.collada()),
+        ("a.b.dae", mesh_files.collada(primitive="polylist")),
+    ],
+)
+def test_every_format_has_the_same_triangles(name: str, content: bytes) -> None:
+    triangles = triangles_of(name, content)
+    corners = {tuple(each) for each in triangles.vertices.tolist()}
+    assert corners == {tuple(map(float, each)) for each in mesh_files.CORNERS}
+    numbers = {tuple(each): number for number, each in enumerate(map(tuple, np.array(mesh_files.CORNERS, float)))}
+    drawn = {frozenset(numbers[tuple(triangles.vertices[each].tolist())] for each in face) for face in triangles.faces}
+    assert drawn == {frozenset(each) for each in mesh_files.SIDES}
+
+
+def test_a_collada_file_whose_y_axis_is_up_is_turned() -> None:
+    upright = triangles_of("a.dae", mesh_files.collada(up="Y_UP")).vertices
+    assert (upright.min(axis=0).tolist(), upright.max(axis=0).tolist()) == ([0, -1, 0], [1, 0, 1])
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "reason"),
+    [
+        ("a.ply", b"", "the format 'ply' is not read"),
+        ("mesh", b"", "the format 'mesh' is not read"),
+        ("a.stl", b"", "its length does not fit"),
+        ("a.stl", mesh_files.binary_stl()[:-1], "vertex|no triangles"),
+        ("a.stl", b"solid x\nvertex a b c", "not a readable stl file"),
+        ("a.stl", b"solid x\nvertex 1 1 1\nvertex 1 1 1", "not a readable stl|reshape"),
+        ("a.stl", b" " * 80 + struct.pack("<I12fH", 1, *[float("nan")] * 12, 0), "not finite"),
+        ("a.obj", b"v 1 2\nf 1 1 1", "not a readable obj file"),
+        ("a.obj", b"v 1 2 3\nf 1 2 3", "not a readable obj file"),
+        ("a.obj", b"v 1 2 3\n", "it has no triangles"),
+        ("a.obj", b"\xff\xfe", "not a readable obj file"),
+        ("a.dae", b"<COLLADA", "not a readable dae file"),
+        ("a.dae", b"<COLLADA/>", "it has no triangles"),
+        ("a.dae", mesh_files.collada().replace(b'url="#g"', b'url="#other"'), "not a readable dae file"),
+        ("a.dae", mesh_files.collada().replace(b"VERTEX", b"OTHER"), "not a readable dae file"),
+    ],
+)
+def test_a_file_without_triangles_has_a_reason(name: str, content: bytes, reason: str) -> None:
+    with pytest.raises(ValueError, match=reason):
+        triangles_of(name, content)
+
+
+def test_a_file_with_too_many_triangles_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scene, "TRIANGLES_MAX", 5)
+    with pytest.raises(ValueError, match="it has 6 triangles, more than 5"):
+        triangles_of("a.obj", mesh_files.obj())

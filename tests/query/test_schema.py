@@ -17,8 +17,7 @@ from pycrorm_async.query.memory_schema import CORE_VIEWS, as_text, read_schema
 from pycrorm_async.query.reading import Reading
 from tests.commands import pycrorm
 from tests.databases import Server, ask, run_in_own_loop
-from tests.projections.event_script import NAVIGATE, PICK_UP, SAYING, declarations
-from tests.projections.factories import append_and_fold
+from tests.projections.event_script import NAVIGATE, PICK_UP, SAYING, append_and_fold, declarations
 from tests.query.test_reading import episode
 
 README = Path(__file__).parents[2] / "pycrorm_async/query/README.md"

@@ -1,17 +1,22 @@
-"""Dead recorders' folders: whole records are supplied, torn ones are ignored, and lost synced ones are damage."""
+"""Dead recorders' folders: whole records are supplied, stored segments deleted, lost synced ones are damage."""
 
 import errno
 import os
+import shutil
+from collections.abc import Collection
 from pathlib import Path
 
 import pytest
 
 from pycrorm_async.errors import SpoolDamaged, SpoolForeign, SpoolUnavailable
+from pycrorm_async.events.codec import Record
 from pycrorm_async.events.ids import episode_id, episode_text
 from pycrorm_async.queue import Spool, open_dead
-from pycrorm_async.queue.format import CHECKSUM, salt_of
+from pycrorm_async.queue.format import CHECKSUM, salt_of, segment_numbers
 from pycrorm_async.queue.locks import FileLock
-from pycrorm_async.queue.scan import scan, tails
+from pycrorm_async.queue.maintenance import repair_folder
+from pycrorm_async.queue.scan import scan, seal, tails
+from pycrorm_async.queue.spool import parse_folder_name
 from tests.queue.factories import (
     DECLARED,
     RECORDER,
@@ -26,6 +31,10 @@ from tests.queue.factories import (
     second_frame,
     started,
 )
+
+# === dead source ==============================================================================================
+#
+# Dead recorders' folders: whole records are supplied, torn ones are ignored, and lost synced ones are damage.
 
 
 async def test_records_come_back_in_order_and_open_episodes_end_lost_in_the_order_of_their_ids(
@@ -330,3 +339,275 @@ async def test_a_disk_that_does_not_sync_a_dead_recorders_records_is_reported_be
     assert synced == ["00000001.segment", "00000002.segment"]
     monkeypatch.undo()
     assert await recover(author.folder) == [*author.records, lost(6, 1, 6)]
+
+
+# === dead source deletion =====================================================================================
+#
+# A dead recorder's stored segments are deleted and its torn tail is cut, wherever the process doing so is killed.
+
+# --- acknowledging and deleting ---------------------------------------------------------------------------------------
+
+
+def test_a_segment_may_be_deleted_only_when_the_header_after_it_is_synced(author: FolderWriter) -> None:
+    author.put(started())
+    for _ in range(4):
+        author.put(node(), b"x" * 900)
+    assert [each.number for each in author.appender.trimmable(stored=4, safe_number=1)] == []
+    assert [each.number for each in author.appender.trimmable(stored=3, safe_number=2)] == []
+    assert [each.number for each in author.appender.trimmable(stored=4, safe_number=2)] == [1]
+    assert [each.number for each in author.appender.trimmable(stored=5, safe_number=2)] == [1]
+
+
+async def test_after_stored_segments_are_deleted_the_next_header_yields_the_same_ends(author: FolderWriter) -> None:
+    author.put(started(1))
+    author.put(started(2))
+    for _ in range(7):
+        author.put(node(1), b"x" * 900)
+    ends = [lost(10, 1, 9), lost(11, 2, 2)]
+    assert len(author.segments) == 3
+    recovered = open_dead(author.folder)
+    assert recovered is not None
+    assert await drain(recovered) == [*author.records, *ends]
+    left = [sum(1 for path, _, _ in author.places if path == segment) for segment in author.segments]
+    for gone in range(3):
+        await recovered.acknowledge(sum(left[:gone]))
+        assert [path for path in author.segments if path.exists()] == author.segments[gone:]
+        recovered.release()
+        recovered = open_dead(author.folder)
+        assert recovered is not None
+        assert await drain(recovered) == [*author.records[sum(left[:gone]) :], *ends]
+    await recovered.acknowledge(11)
+    assert author.segments[2].exists()
+    recovered.release()
+    assert not author.folder.exists()
+
+
+async def test_a_commit_that_covers_only_stored_and_deleted_records_is_no_damage(author: FolderWriter) -> None:
+    author.put(started(), b"x" * 900)
+    author.put(node(), b"x" * 900)
+    span = author.appender.begin_sync()
+    author.put(node(), b"x" * 1700)
+    for _ in range(4):
+        author.put(node(), b"x" * 100)
+    author.appender.append_commit(span)
+    author.sync()
+    assert [path for path, _, _ in author.places] == [author.segments[0]] * 3 + [author.segments[1]] * 4
+    author.segments[0].unlink()
+    assert await recover(author.folder) == [*author.records[3:], lost(8, 1, 8)]
+
+
+async def test_the_end_of_an_episode_whose_records_are_all_deleted_has_the_times_of_its_last_record(
+    author: FolderWriter,
+) -> None:
+    author.put(started())
+    for _ in range(4):
+        author.put(node(), b"x" * 900)
+    author.segments[0].unlink()
+    path, offset, size = author.places[4]
+    overwrite(path, offset, bytes(size))
+    assert await recover(author.folder) == [lost(5, 1, 5)]
+
+
+async def test_a_deletion_killed_anywhere_leaves_the_same_records_or_nothing(author: FolderWriter) -> None:
+    author.put(started())
+    for _ in range(4):
+        author.put(node(), b"x" * 900)
+    whole = [*author.records, lost(6, 1, 6)]
+    assert await recover(author.folder) == whole
+    author.segments[0].unlink()
+    assert await recover(author.folder) == whole[4:]
+    author.segments[1].unlink()
+    assert await recover(author.folder) == []
+    assert not author.folder.exists()
+    author.folder.mkdir()
+    (author.folder / "alive").touch()
+    assert await recover(author.folder) == []
+    assert not author.folder.exists()
+    author.folder.mkdir()
+    assert Spool(author.folder.parent).recorders() == []
+
+
+# --- sealing ---------------------------------------------------------------------------------------------------
+
+
+async def test_sealing_copies_the_tail_aside_and_cuts_it_and_supplies_the_same_records_again(
+    author: FolderWriter,
+) -> None:
+    author.put(started())
+    author.sync()
+    for _ in range(5):
+        author.put(node(), b"x" * 900)
+    path, offset, size = author.places[2]
+    overwrite(path, offset, bytes(size))
+    first, second = author.segments
+    tails = [first.read_bytes()[offset:].rstrip(b"\0"), second.read_bytes().rstrip(b"\0")]
+    for _ in range(2):
+        seal(author.folder, scan(author.folder, RECORDER))
+        assert await recover(author.folder) == [*author.records[:2], lost(3, 1, 3)]
+        assert first.stat().st_size == offset
+        assert not second.exists()
+        assert [path.with_name(f"{path.name}.tail").read_bytes() for path in (first, second)] == tails
+
+
+async def test_a_sealing_that_was_killed_anywhere_can_be_repeated(author: FolderWriter) -> None:
+    author.put(started())
+    author.put(node(), b"torn")
+    path, offset, _ = author.places[1]
+    overwrite(path, offset + 64, b"#")
+    tail = path.read_bytes()[offset:].rstrip(b"\0")
+    copy = path.with_name(f"{path.name}.tail")
+    copy.with_name(f"{copy.name}.making").write_bytes(tail[:10])
+    seal(author.folder, scan(author.folder, RECORDER))
+    assert copy.read_bytes() == tail
+    assert path.stat().st_size == offset
+    assert await recover(author.folder) == [author.records[0], lost(2, 1, 2)]
+
+
+async def test_a_released_live_queue_has_no_tail(spool: Path) -> None:
+    queue = make(spool)
+    queue.put_nowait(started(), b"{}")
+    queue.release()
+    recovered = open_dead(queue.folder, check=True)
+    assert recovered is not None
+    assert len(await drain(recovered)) == 2
+    recovered.release()
+    result = scan(queue.folder, parse_folder_name(queue.name).recorder)
+    assert [tail for _, tail in tails(queue.folder, result) if tail] == []
+
+
+# === dead source incremental ==================================================================================
+#
+# Records of a dead recorder are supplied while the rest of its folder is still being scanned, if that is safe.
+
+RECORDS, SYNCED_EVERY, SEGMENTS = 20, 3, 4
+
+
+def long_folder(
+    spool: Path, *, synced: Collection[int] = range(0, RECORDS, SYNCED_EVERY), letter: bytes = b"x"
+) -> FolderWriter:
+    """A folder with a commit frame after every third record, across segments, and two records that were never
+    synced.
+    """
+    author = FolderWriter(spool)
+    author.put(started())
+    for number in range(2, RECORDS + 1):
+        author.put(node(), b'"%d %s"' % (number, letter * 600))
+        if number in synced:
+            author.sync()
+    assert len(author.segments) == SEGMENTS
+    return author
+
+
+async def supplied_before_damage(folder: Path, *, events_max: int = 10_000) -> list[Record]:
+    """Return all records that are supplied and acknowledged before the scan or the opening meets damage."""
+    records: list[Record] = []
+    try:
+        recovered = open_dead(folder)
+    except SpoolDamaged:
+        return records
+    assert recovered is not None
+    try:
+        with pytest.raises(SpoolDamaged):
+            while True:
+                batch = await recovered.get_batch(events_max=events_max, bytes_max=2**22, age_s_max=0.0)
+                assert batch
+                records += batch
+                await recovered.acknowledge(batch[-1].position)
+                assert not recovered.all_stored
+        with pytest.raises(SpoolDamaged):  # the source repeats the error
+            await recovered.get_batch(events_max=events_max, bytes_max=2**22, age_s_max=0.0)
+        assert not recovered.lost
+    finally:
+        assert recovered.release() is None
+    with pytest.raises(SpoolDamaged):
+        open_dead(folder, check=True)
+    return records
+
+
+@pytest.mark.parametrize("events_max", [1, 2, 5, 100])
+async def test_whole_files_are_supplied_and_deleted_before_the_scan_has_ended(spool: Path, events_max: int) -> None:
+    author = long_folder(spool)
+    recovered = open_dead(author.folder)
+    assert recovered is not None
+    assert not recovered.lost
+    records: list[Record] = []
+    while batch := await recovered.get_batch(events_max=events_max, bytes_max=2**22, age_s_max=0.0):
+        records += batch
+        await recovered.acknowledge(batch[-1].position)
+        begun = sum(path in {place[0] for place in author.places[len(records) :]} for path in author.segments)
+        # Each file is deleted when the next one is in order and nothing in the file is needed; the last file stays.
+        assert max(1, begun) <= len(segment_numbers(author.folder)) <= max(1, begun) + 1
+        if events_max == 1 and len(records) == 10:
+            assert (len(segment_numbers(author.folder)) < SEGMENTS, recovered.lost) == (True, ())
+    assert records == [*author.records, lost(RECORDS + 1, 1, RECORDS + 1)]
+    assert recovered.lost == (records[-1],)
+    assert recovered.all_stored
+    recovered.release()
+    assert not author.folder.exists()
+
+
+@pytest.mark.parametrize("events_max", [2, 10_000])
+@pytest.mark.parametrize("changed", range(RECORDS - RECORDS % SYNCED_EVERY))
+async def test_a_damaged_folder_supplies_what_was_synced_before_the_damage(
+    spool: Path, changed: int, events_max: int
+) -> None:
+    author = long_folder(spool)
+    path, offset, _ = author.places[changed]
+    overwrite(path, offset + 68, b"#")
+    supplied = await supplied_before_damage(author.folder, events_max=events_max)
+    safe = changed - changed % SYNCED_EVERY
+    assert supplied == author.records[: len(supplied)]
+    assert len(supplied) <= safe
+    in_segments_before = [place[0] for place in author.places].index(path)
+    assert (
+        len(supplied) >= (in_segments_before - 1) // SYNCED_EVERY * SYNCED_EVERY
+    )  # the commit frame is on the disk too
+    again = await supplied_before_damage(author.folder)
+    assert again == supplied[len(supplied) - len(again) :]  # only the deleted records are missing
+
+    repair_folder(author.folder)
+    repaired = await recover(author.folder)
+    whole = supplied + [each for each in repaired if each.position > len(supplied)]
+    assert whole[:-1] == author.records[:changed]  # an episode ends where the gap is
+    assert whole[-1:] == ([lost(changed + 1, 1, changed + 1)] if changed else [])
+
+
+@pytest.mark.parametrize("number", range(2, SEGMENTS + 1))
+async def test_a_damaged_header_costs_nothing_although_the_files_before_it_were_deleted(
+    spool: Path, number: int
+) -> None:
+    author = long_folder(spool)
+    overwrite(author.segments[number - 1], 60, b"#")
+    supplied = await supplied_before_damage(author.folder, events_max=2)
+    assert supplied == author.records[: len(supplied)]
+    assert len(segment_numbers(author.folder)) <= SEGMENTS - max(0, number - 3)
+    report = repair_folder(author.folder)
+    assert report is not None
+    assert report.complete
+    repaired = await recover(author.folder)
+    whole = supplied + [each for each in repaired if each.position > len(supplied)]
+    assert whole == [*author.records, lost(RECORDS + 1, 1, RECORDS + 1)]
+
+
+@pytest.mark.parametrize("first", [0, 3])
+async def test_records_that_a_later_commit_frame_contradicts_are_not_supplied(
+    spool: Path, tmp_path: Path, first: int
+) -> None:
+    author = long_folder(spool, synced=[first, 18])
+    other = long_folder(tmp_path / "other", synced=[first, 18], letter=b"y")
+    shutil.copyfile(other.segments[1], author.segments[1])  # whole frames of the same recorder and segment
+    assert await supplied_before_damage(author.folder) == author.records[:first]
+
+
+async def test_the_next_source_supplies_again_what_was_not_deleted(spool: Path) -> None:
+    author = long_folder(spool)
+    for count in (3, 9):
+        recovered = open_dead(author.folder)
+        assert recovered is not None
+        batch = await recovered.get_batch(events_max=count, bytes_max=2**22, age_s_max=0.0)
+        await recovered.acknowledge(batch[-1].position)
+        recovered.release()
+        assert batch == author.records[:count]
+    records = await recover(author.folder)
+    assert records == [*author.records[records[0].position - 1 :], lost(RECORDS + 1, 1, RECORDS + 1)]
+    assert 1 < records[0].position <= 10

@@ -20,7 +20,7 @@ from pycrorm_async.events.codec import LOST, Record
 from pycrorm_async.queue import LiveSource, RecorderQueue, Spool, open_dead
 from pycrorm_async.queue.maintenance import inspect_spool
 from pycrorm_async.queue.spool import finish_folder
-from tests.crash.test_queue_disk import SLOW
+from tests.crash.test_disk import SLOW
 from tests.queue.factories import SMALL, copy_beside_recording, drain, ended, make, node, recover, started
 
 ROOMY = replace(SLOW, spool_bytes_max=64 * SMALL.segment_bytes)

@@ -19,8 +19,7 @@ from pycrorm_async.queue.format import EVENT, read_segment, segment_path
 from pycrorm_async.queue.scan import survey
 from pycrorm_async.queue.spool import DrainNote, DrainStatus
 from pycrorm_async.writer.drain import ClaimedSource, Source
-from tests.queue.factories import RECORDER, crashed_copy, ended, episode, fill, make, node, started
-from tests.queue.live_sources import take
+from tests.queue.factories import RECORDER, crashed_copy, ended, episode, fill, make, node, started, take
 
 AnySource = RecorderQueue | LiveSource | DeadSource
 Opened = TypeVar("Opened")

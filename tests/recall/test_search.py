@@ -1,19 +1,43 @@
-"""The search finds exactly the cases, in exactly the order, that comparing every case in plain Python finds."""
+"""The search finds exactly the cases of a cue in exact order, refuses a wrong cue, and hides nothing silently."""
 
 from __future__ import annotations
 
 import math
 import random
 from itertools import pairwise
+from typing import Any
 
+import numpy as np
 import pytest
 
+from pycrorm_async.errors import CallerError
 from pycrorm_async.events.ids import row_id
+from pycrorm_async.recall import search as activations
 from pycrorm_async.recall import search as searching
-from pycrorm_async.recall.blocks import Block, CaseLibrary, Group, decode, encode
-from pycrorm_async.recall.columns import Case, bounded_case
-from pycrorm_async.recall.search import Cue, Match, Wanted, Weights, search, weights_of
-from tests.recall.random_cases import STATUSES, TYPES, WORDS, random_cases
+from pycrorm_async.recall.answer import answer
+from pycrorm_async.recall.blocks import WORDS_MAX, Block, CaseLibrary, Group, decode, encode
+from pycrorm_async.recall.columns import FEATURES_MAX, Case, bounded_case
+from pycrorm_async.recall.recall import cue_like
+from pycrorm_async.recall.search import (
+    K_MAX,
+    Cue,
+    Match,
+    Wanted,
+    Weights,
+    activation,
+    check_cue,
+    forgotten,
+    numbers_of,
+    search,
+    symbols_of,
+    weights_of,
+)
+from pycrorm_async.world.pose import Arms, ObjectType
+from tests.recall.cases import CASE_STATUSES, CASE_TYPES, WORDS, random_cases
+
+# === search ===================================================================================================
+#
+# The search finds exactly the cases, in exactly the order, that comparing every case in plain Python finds.
 
 CASES = [bounded_case(case) for case in random_cases(400, seed=1)]
 Answer = list[tuple[float, int]]
@@ -89,7 +113,7 @@ def random_cue(chance: random.Random, cases: list[Case]) -> Cue:
         return value if chance.random() < 0.25 else None
 
     def pairs(most: int) -> tuple[tuple[str, str], ...]:
-        possible = [("arm", "LEFT"), ("arm", "RIGHT"), ("status", chance.choice(STATUSES)), ("reason", "IKError")]
+        possible = [("arm", "LEFT"), ("arm", "RIGHT"), ("status", chance.choice(CASE_STATUSES)), ("reason", "IKError")]
         possible += [(feature, word) for feature in ("object_type", "near") for word in (*WORDS, "CACTUS")]
         return tuple(chance.sample(possible, chance.randrange(most + 1)))
 
@@ -101,7 +125,7 @@ def random_cue(chance: random.Random, cases: list[Case]) -> Cue:
     ]
     start = chance.randrange(45)
     return Cue(
-        type=chance.choice((None, *TYPES)),
+        type=chance.choice((None, *CASE_TYPES)),
         has=pairs(5),
         near=tuple(chance.sample(numbers, chance.choice((0, 0, 1, 3)))),
         lacks=pairs(1),
@@ -199,3 +223,172 @@ def test_the_tolerance_of_a_number_does_not_depend_on_the_blocks() -> None:
         assert len({library.tolerance("PickUpAction", feature) for library in libraries}) == 1
     assert libraries[0].tolerance("PickUpAction", "height") == pytest.approx(0.29, abs=0.03)
     assert libraries[0].tolerance("PickUpAction", "stand_yaw") == 0.5
+
+
+# === activation ===============================================================================================
+#
+# The activation is near that of ACT-R, and what falls below a threshold is counted before anything is hidden.
+
+NOW_US = 10_000_000_000
+
+
+def test_up_to_three_uses_are_counted_exactly_and_more_nearly() -> None:
+    assert activation(np.array([4.0])) == pytest.approx(np.log(0.5))
+    assert activation(np.array([1.0, 4.0, 100.0])) == pytest.approx(np.log(1.6))
+    assert activation(np.array([0.0])) < 4, "an action that starts now does not outweigh all others"
+    assert activation(np.full(10, 4.0)) == pytest.approx(np.log(5))
+    chance = np.random.default_rng(1)
+    for size in (4, 20, 300):
+        ages = np.sort(chance.uniform(1, 10_000, size))
+        assert activation(ages) == pytest.approx(float(np.log(np.sum(ages**-0.5))), abs=0.15)
+
+
+def use(sequence: int, age_s: float, arm: str, name: str = "A") -> Case:
+    texts: dict[str, str | tuple[str, ...]] = {"arm": arm, "near": ("CUP",) if sequence % 2 else ("BOWL",)}
+    status = "FAILED" if sequence % 3 else "SUCCEEDED"
+    return Case(row_id(1, sequence, 0), NOW_US - round(age_s * 1e6), name, texts, {"x": age_s}, status, None, 1.0)
+
+
+@pytest.mark.parametrize("numbers_max", [2**62, 3])
+def test_all_cases_of_a_way_have_its_activation(numbers_max: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(activations, "_NUMBERS_MAX", numbers_max)
+    chance = random.Random(2)
+    cases = [use(n, chance.uniform(1, 9_000), chance.choice("LR"), chance.choice("AB")) for n in range(1, 200)]
+    library = CaseLibrary([Block.of(cases[:50]), Block.of(cases[50:])])
+
+    def hidden(threshold: float) -> set[int]:
+        return set(forgotten(library, threshold=threshold, now_us=NOW_US).nodes.tolist())
+
+    for name in "AB":
+        for arm in "LR":
+            way = [case for case in cases if (case.type, case.symbols["arm"]) == (name, arm)]
+            ages = np.sort([(NOW_US - case.started_us) / 1e6 for case in way])
+            nodes, value = {case.node for case in way}, activation(ages)
+            assert nodes <= hidden(value + 1e-9)
+            assert not nodes & hidden(value - 1e-9)
+
+
+def test_what_is_forgotten_is_what_lies_below_the_threshold() -> None:
+    cases = [use(1, 1.0, "L"), use(2, 2.0, "L"), use(3, 9_000.0, "R"), use(4, 8_000.0, "R"), use(5, 9_000.0, "L")]
+    library = CaseLibrary([Block.of(cases)])
+    hidden = forgotten(library, threshold=-2.0, now_us=NOW_US)
+    assert (hidden.cases, hidden.ways) == (2, 1)
+    assert hidden.nodes.tolist() == [cases[2].node, cases[3].node]
+    assert forgotten(library, threshold=-99.0, now_us=NOW_US).cases == 0
+    assert forgotten(library, threshold=99.0, now_us=NOW_US)[:2] == (5, 2)
+    assert forgotten(CaseLibrary(), threshold=99.0, now_us=NOW_US)[:2] == (0, 0)
+
+
+# === cue ======================================================================================================
+#
+# A cue that cannot be answered is refused in one line that names the nearest known feature.
+
+LIBRARY = CaseLibrary([Block.of(random_cases(50, seed=1))])
+TYPE = "PickUpAction"
+
+BAD_CUES: dict[str, tuple[Cue, str]] = {
+    "empty": (Cue(), "the cue is empty"),
+    "a feature no case has": (Cue(type=TYPE, has=(("amr", "LEFT"),)), "'amr'; did you mean arm?"),
+    "a number no case has": (Cue(type=TYPE, near=(Wanted("heigth", 1.0),)), "'heigth'; did you mean height?"),
+    "nothing near": (Cue(has=(("qqqq", "x"),)), "'qqqq'; there are arm, near, object_type, reason, status"),
+    "in lacks": (Cue(type=TYPE, lacks=(("amr", "LEFT"),)), "did you mean arm?"),
+    "a text for a number": (
+        Cue(type=TYPE, has=(("height", "high"),)),
+        "height is a number: ask for it with `near`",
+    ),
+    "a number for a text": (
+        Cue(type=TYPE, near=(Wanted("arm", 1.0),)),
+        "arm is a text: ask for it with `has`",
+    ),
+    "k 0": (Cue(type=TYPE, k=0), "k must be 1 to 10,000, got 0"),
+    "k too large": (Cue(type=TYPE, k=K_MAX + 1), "k must be 1 to 10,000"),
+    "minimum": (Cue(type=TYPE, minimum=1.5), "minimum must be a score from 0 to 1"),
+    "minimum NaN": (Cue(type=TYPE, minimum=float("nan")), "minimum must be a score from 0 to 1"),
+    "before is not later": (Cue(type=TYPE, before_us=5, after_us=5), "`before` is not later than `after`"),
+    "during ends early": (Cue(type=TYPE, during_us=(5, 4)), "`during` ends before it starts"),
+    "contradiction": (
+        Cue(type=TYPE, has=(("arm", "LEFT"),), lacks=(("arm", "LEFT"),)),
+        "arm=LEFT is both in `has` and in `lacks`",
+    ),
+    "10,000 features": (
+        Cue(type=TYPE, has=tuple((f"f{number}", "x") for number in range(10_000))),
+        "the cue has 10,000 features, and at most 256 are compared",
+    ),
+}
+
+
+@pytest.mark.parametrize(("cue", "line"), BAD_CUES.values(), ids=BAD_CUES.keys())
+def test_a_cue_that_cannot_be_answered_is_refused_in_one_line(cue: Cue, line: str) -> None:
+    with pytest.raises(CallerError) as error:
+        check_cue(cue, LIBRARY)
+    assert line in str(error.value)
+    assert "\n" not in str(error.value)
+    assert len(str(error.value)) < 200
+
+
+BAD_VALUES: dict[str, tuple[dict[str, Any], dict[str, Any], str]] = {
+    "1 MB": ({"arm": "x" * 1_000_000}, {}, "arm is a text of 1,000,000 characters; cases have at most 120"),
+    "empty": ({"arm": ""}, {}, "arm is an empty text"),
+    "number": ({"height": 0.9}, {}, "height is given as the number 0.9: ask for numbers with `near`"),
+    "text": ({}, {"height": "high"}, "height is given as 'high', which is not a number"),
+    "long text": ({}, {"height": "x" * 1_000_000}, "(1,000,002 characters), which is not a number"),
+    "yes": ({}, {"height": True}, "height is given as True, which is not a number"),
+    "tolerance 0": ({}, {"height": (0.9, 0)}, "the tolerance of height must be greater than 0, got 0"),
+    "tolerance -1": ({}, {"height": (0.9, -1)}, "the tolerance of height must be greater than 0, got -1"),
+    "tolerance NaN": ({}, {"height": (0.9, float("nan"))}, "height must be a finite number, got nan"),
+    "infinite": ({}, {"height": float("inf")}, "height must be a finite number, got inf"),
+    "three": ({}, {"height": (1, 2, 3)}, "height is given as 3 values"),
+}
+
+
+@pytest.mark.parametrize(("has", "near", "line"), BAD_VALUES.values(), ids=BAD_VALUES.keys())
+def test_a_value_that_no_case_can_have_is_refused(has: dict[str, Any], near: dict[str, Any], line: str) -> None:
+    with pytest.raises(CallerError) as error:
+        symbols_of(has), numbers_of(near)
+    assert line in str(error.value)
+    assert len(str(error.value)) < 200
+
+
+def test_enums_classes_and_lists_are_words() -> None:
+    pairs = symbols_of({"arm": Arms.LEFT, "near": [ObjectType.BOWL, "CUP"], "reason": ValueError, "fragile": True})
+    assert pairs == (
+        ("arm", "LEFT"), ("near", "BOWL"), ("near", "CUP"), ("reason", "ValueError"), ("fragile", "True"),
+    )  # fmt: skip
+
+
+def test_a_type_or_a_word_that_never_occurred_is_no_error() -> None:
+    check_cue(Cue(type="FlyAction", has=(("amr", "LEFT"),)), LIBRARY)
+    check_cue(Cue(type=TYPE, has=(("arm", "THIRD"),)), LIBRARY)
+    check_cue(Cue(type=TYPE, has=(("amr", "LEFT"),)), CaseLibrary())
+
+
+def test_a_feature_with_too_many_words_is_refused_by_its_name() -> None:
+    cases = [Case(row_id(1, n, 0), n, "A", {"id": f"{n}"}, {}, "FAILED") for n in range(1, WORDS_MAX + 2)]
+    half = len(cases) // 2
+    library = CaseLibrary([Block.of(cases[:half]), Block.of(cases[half:])])
+    assert library.left_out == {"id"}
+    with pytest.raises(CallerError, match="id has more than 16,384 different values"):
+        check_cue(Cue(type="A", has=(("id", "5"),)), library)
+
+
+def test_a_cue_reads_as_the_command_takes_it() -> None:
+    cue = Cue(type=TYPE, has=(("arm", "LEFT"),), near=(Wanted("height", 0.93, 0.1),), lacks=(("near", "BOWL"),))
+    assert str(cue) == "PickUpAction arm=LEFT height~0.93±0.1 not:near=BOWL"
+
+
+def test_a_case_with_too_many_features_is_compared_by_those_that_weigh_most_and_the_others_are_counted() -> None:
+    numbers = {f"n{number:03}": 1.0 for number in range(60)}
+    common, rare = [f"common {number:03}" for number in range(150)], [f"rare {number:03}" for number in range(150)]
+    others = [Case(row_id(1, n, 0), n, "A", {"near": tuple(common)}, numbers, "FAILED") for n in range(1, 100)]
+    crowded = Case(row_id(1, 100, 0), 100, "A", {"near": (*common, *rare), "arm": "LEFT"}, numbers, "FAILED")
+    library = CaseLibrary([Block.of([*others, crowded])])
+    cue = cue_like(crowded, library)
+    assert (len(cue.has) + len(cue.near), cue.left_out) == (FEATURES_MAX, 361 - FEATURES_MAX)
+    words = [word for _, word in cue.has]
+    assert set(rare) | {"LEFT"} <= set(words)
+    assert len(cue.near) == 60, "a number weighs more than a word that almost every case has"
+    check_cue(cue, library)
+    assert "  left out: 105 features of the action that weigh least" in answer(cue, library).why().splitlines()
+    plain = cue_like(others[0], library)
+    assert (len(plain.has), len(plain.near), plain.left_out) == (150, 60, 0)
+    assert "left out" not in answer(plain, library).why()

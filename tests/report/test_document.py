@@ -1,7 +1,12 @@
-"""The document of an episode, without a browser: what the page is given, and what it is given of a window."""
+"""The document of an episode: what the page is given, whole or in parts; and the bundle that draws it."""
 
+import json
+import shutil
+import subprocess
 import zlib
 from base64 import b64encode
+from collections.abc import AsyncIterator, Sequence
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +23,16 @@ from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.scene import object_model
 from pycrorm_async.record.recorded_episode import RecordedEpisode
 from pycrorm_async.report import document as episode_fold
-from pycrorm_async.report.document import Texts, Track, episode_document
+from pycrorm_async.report.document import EpisodeFold, Texts, Track, document_behind, episode_document, read_into
 from pycrorm_async.report.write import Report, page_of
+from pycrorm_async.store.log import episode_named
+from pycrorm_async.store.stored import StoredEvent
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
+from tests.report.browser import Browser
+
+# === document =================================================================================================
+#
+# The document of an episode, without a browser: what the page is given, and what it is given of a window.
 
 HOSTILE = "</script><script>alert(1)</script> & \u2028\u202e]]> {title} <!--"
 
@@ -247,3 +259,102 @@ async def test_an_object_without_a_description_that_a_built_in_one_fits_has_its_
     assert one["assumed"] == "the built-in shape, because its description was not recorded"
     assert len(one["shapes"]) > 10
     assert two["assumed"].startswith("a point")
+
+
+# === bundle ===================================================================================================
+#
+# The committed bundle of three.js is the one that its build command makes from the packages it names.
+
+ASSETS = resources.files("pycrorm_async.report").joinpath("assets")
+
+
+def test_the_bundle_has_its_version_licence_and_build_command() -> None:
+    package = json.loads(ASSETS.joinpath("package.json").read_text())
+    version = package["devDependencies"]["three"]
+    assert ASSETS.joinpath("three.bundle.js").read_text().startswith(f"/* three.js {version}, MIT licence")
+    assert "MIT License" in ASSETS.joinpath("LICENSE.three").read_text()
+    assert version in ASSETS.joinpath("README.md").read_text()
+    assert "</script" not in ASSETS.joinpath("three.bundle.js").read_text()
+
+
+@pytest.mark.soak
+def test_the_build_command_makes_the_committed_bundle(tmp_path: Path) -> None:
+    npm = shutil.which("npm")
+    if npm is None:
+        pytest.skip("no npm is installed")
+    with resources.as_file(ASSETS) as committed:
+        shutil.copytree(committed, tmp_path / "assets")
+    (tmp_path / "assets" / "three.bundle.js").unlink()
+    folder = tmp_path / "assets"
+    installed = subprocess.run([npm, "ci"], cwd=folder, capture_output=True, text=True, timeout=300, check=False)
+    if installed.returncode != 0:
+        pytest.skip(f"the packages cannot be installed: {installed.stderr[-300:]}")
+    subprocess.run([npm, "run", "build"], cwd=folder, check=True, capture_output=True, timeout=300)
+    assert (tmp_path / "assets" / "three.bundle.js").read_bytes() == ASSETS.joinpath("three.bundle.js").read_bytes()
+
+
+# === parts ====================================================================================================
+#
+# A document in parts: the page that is given one part after the other has the same episode as from the whole.
+
+SUMMARY = """
+const summary = (episode) => JSON.stringify(episode, (name, value) => {
+  if (value instanceof Map) return [...value];
+  if (name === "episode") return null;
+  if (name === "texts" || name === "head") return undefined;
+  return ["parent", "children"].includes(name) ? [value].flat().map((each) => each?.start) : value;
+});
+"""
+
+
+async def one_page(events: Sequence[StoredEvent]) -> AsyncIterator[Sequence[StoredEvent]]:
+    yield events
+
+
+async def parts_of(recorded: Path, number: int, step: int) -> list[dict[str, Any]]:
+    """Return an episode's document in parts of so many events."""
+    async with Reading.open(f"sqlite:///{recorded / 'pycrorm.db'}") as reading:
+        log = await reading.log()
+        fold = EpisodeFold(await episode_named(log, str(number)))
+        parts = []
+        while events := await log.events(number, after=fold.last, limit=step):
+            after = fold.last
+            await read_into(fold, log, one_page(events))
+            parts.append(await document_behind(fold, log, after))
+        return parts
+
+
+@pytest.mark.slow
+@pytest.mark.soak_on("dies")
+@pytest.mark.parametrize(("page", "number", "step"), [("plan", 1, 7), ("dies", 2, 1)])
+async def test_parts_make_the_same_episode_as_the_whole(
+    chrome: Browser, pages: dict[str, Path], recorded: Path, page: str, number: int, step: int
+) -> None:
+    parts = json.dumps(await parts_of(recorded, number, step))
+    script = f"""
+    (() => {{
+      {SUMMARY}
+      const parts = {parts};
+      const made = new pycrormPage.episode.constructor(parts[0]);
+      for (const each of parts.slice(1)) made.extend(each);
+      return [summary(made), summary(pycrormPage.episode)];
+    }})()"""
+    with chrome.open(pages[page]) as tab:
+        in_parts, whole = map(json.loads, tab.ask(script))
+    assert in_parts == whole
+
+
+@pytest.mark.slow
+async def test_the_part_behind_any_event_is_the_end_of_the_whole(recorded: Path) -> None:
+    async with Reading.open(f"sqlite:///{recorded / 'pycrorm.db'}") as reading:
+        log = await reading.log()
+        whole = await episode_document(reading, 1)
+        fold = EpisodeFold(await episode_named(log, "1"))
+        await read_into(fold, log, log.pages(fold.row))
+        last = whole["episode"]["last"]
+        middle = await document_behind(fold, log, last // 2)
+        end = await document_behind(fold, log, last)
+    assert sum(middle["times"]) == sum(whole["times"])
+    assert [each for each in whole["nodes"][0] if each > last // 2] == middle["nodes"][0]
+    assert [len(end[name]) for name in ("times", "texts", "objects", "models", "attachments", "series")] == [0] * 6
+    assert len(msgspec.json.encode(end)) < 1_500

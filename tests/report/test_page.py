@@ -1,17 +1,29 @@
-"""The page in a real Chromium: it opens by one request and shows the episode, at any width and without WebGL."""
+"""The page in a real Chromium: it shows the episode at any width and length, readable, also by keyboard."""
 
+import random
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from pycrorm_async import world_of
+from pycrorm_async.events.types import NodeStatus
+from pycrorm_async.memory import Memory
 from pycrorm_async.query.reading import Reading
+from pycrorm_async.report.write import report
+from pycrorm_async.world import Pose
 from tests.commands import pycrorm
 from tests.report.browser import Browser, Tab
+from tests.report.test_document import HOSTILE, record
 
 pytestmark = pytest.mark.slow
+
+
+# === page =====================================================================================================
+#
+# The page in a real Chromium: it opens by one request and shows the episode, at any width and without WebGL.
 
 NO_WEBGL = """
 HTMLCanvasElement.prototype.getContext = ((original) => function (kind, ...rest) {
@@ -276,3 +288,398 @@ def test_a_moment_at_which_nothing_runs_shows_the_episode(chrome: Browser, pages
         text = tab.ask("document.querySelector('.panel').innerText")
         assert text.startswith("No node runs at this moment.\n\nEpisode\nid\n")
         assert "plan\nbreakfast.py:drives" in text
+
+
+# === gantt ====================================================================================================
+#
+# The chart of the nodes: statuses readable without colour at any width, labels that are whole, an axis in sight.
+
+MARKS = """(() => {
+  const { gantt, episode } = pycrormPage;
+  gantt.setAxis(false);
+  gantt.window = [episode.first, episode.first + gantt.width / WIDTH];
+  gantt.show(episode.last, null);
+  const [from, to] = gantt.window;
+  const pen = gantt.canvas.getContext("2d");
+  const grey = ([red, green, blue]) => 0.3 * red + 0.59 * green + 0.11 * blue;
+  return Object.fromEntries(episode.nodes.filter((each) => each.parent).map((node) => {
+    const left = Math.round(8 + ((node.start - from) / (to - from)) * gantt.width);
+    const wide = Math.max(1, Math.floor(WIDTH - 2));
+    const rows = Array.from({ length: 19 }, (_, y) => {
+      const { data } = pen.getImageData(left, gantt.lanes.of.get(node) * 19 + y, wide, 1);
+      const pixels = Array.from({ length: wide }, (_, x) => data.slice(4 * x, 4 * x + 4));
+      const signOf = (each) => (each[3] < 128 ? "." : grey(each) > 120 ? "o" : grey(each) < 50 ? "x" : "#");
+      return pixels.map(signOf).join("");
+    });
+    return [node.status, rows.join(" ")];
+  }));
+})()"""
+"""The pixels of a node's bar without colour, by status; each bar is WIDTH pixels wide."""
+
+STATUSES: tuple[NodeStatus, ...] = ("SUCCEEDED", "FAILED", "CANCELLED")
+
+
+async def test_every_status_is_readable_without_colour_on_wide_and_narrow_bars(chrome: Browser, tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path / 'memory.db'}"
+    with Memory.sync(url) as memory:
+        drive = memory.recording.type("action", "DriveAction", {"target": Pose})
+        with memory.recording.episode(description="statuses") as episode:
+            for status in STATUSES:
+                episode.start(status, drive, {"target": Pose([0, 0, 0])})
+                episode.end(status, status, None if status == "SUCCEEDED" else "why")
+                for volts in (24.0, 23.9):  # so that bars are not drawn together
+                    episode.observe("battery", volts)
+            episode.start("open", drive, {"target": Pose([0, 0, 0])})
+            memory.flush()
+            async with Reading.open(url) as reading:
+                await report(reading, 1, tmp_path / "running.html")
+        memory.flush()
+    async with Reading.open(url) as reading:
+        await report(reading, 1, tmp_path / "ended.html")
+    wide: dict[str, str] = {}
+    narrow: dict[str, str] = {}
+    for page in ("running", "ended"):
+        with chrome.open(tmp_path / f"{page}.html") as tab:
+            wide |= tab.ask(MARKS.replace("WIDTH", "12"))
+            narrow |= tab.ask(MARKS.replace("WIDTH", "2.9"))
+    for marks in (wide, narrow):
+        assert sorted(marks) == sorted([*STATUSES, "RUNNING", "LOST"])
+        plain = marks.pop("SUCCEEDED")
+        assert plain not in marks.values()
+    assert len(set(wide.values())) == len(wide)
+    assert narrow["FAILED"] != narrow["CANCELLED"]
+
+
+async def test_many_narrow_nodes_are_drawn_as_a_band_without_gaps(chrome: Browser, tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path / 'memory.db'}"
+    record_pick_ups(url, 400)
+    async with Reading.open(url) as reading:
+        await report(reading, 1, tmp_path / "page.html")
+    row = """(() => {
+      const { canvas, width } = pycrormPage.gantt;
+      const { data } = canvas.getContext("2d").getImageData(12, 2 * 19 + 4, width - 24, 1);
+      return new Set(Array.from({ length: width - 24 }, (_, x) => data.slice(4 * x, 4 * x + 4).join())).size;
+    })()"""
+    with chrome.open(tmp_path / "page.html") as tab:
+        tab.ask("pycrormPage.gantt.setAxis(false); pycrormPage.seek(pycrormPage.episode.last)")
+        assert tab.ask(row) == 1
+
+
+def test_the_labels_of_the_axis_differ_and_the_axis_is_in_sight(chrome: Browser, pages: dict[str, Path]) -> None:
+    labels = "pycrormPage.gantt.ticks().map(({ text, left, width }) => [left, left + width, text])"
+    for width in (420, 1400):
+        with chrome.open(pages["drives"], width=width) as tab:
+            for window in ("[1, 16]", "[1, 4]", "[1, 2.5]", "[3, 12]", "[0, 0.2336]", "[0.5, 1.03]"):
+                by_time = "true" if "0" in window else "false"
+                tab.ask(f"pycrormPage.gantt.setAxis({by_time}); pycrormPage.gantt.window = {window}")
+                placed = sorted(tab.ask(f"pycrormPage.gantt.draw() ?? {labels}"))
+                assert len(placed) == len({text for _, _, text in placed}) >= 2
+                assert all(end < begin for (_, end, _), (begin, _, _) in pairwise(placed))
+            tab.ask("pycrormPage.gantt.lanes.nodes.push(...Array(12).fill([])); pycrormPage.gantt.draw()")
+            bottoms = "[...document.querySelectorAll('#gantt, #gantt .axis')]"
+            holder, axis = tab.ask(f"{bottoms}.map((each) => each.getBoundingClientRect().bottom)")
+            assert holder == axis
+            assert tab.problems() == []
+
+
+# === keyboard =================================================================================================
+#
+# The page by keyboard and for screen readers: the focus stays where it was, and each row and control has its words.
+
+FOCUSED = "document.activeElement.textContent"
+CURRENT = "document.getElementById(document.getElementById('tree').getAttribute('aria-activedescendant'))"
+
+
+def test_the_focus_stays_on_the_control_that_was_used(chrome: Browser, pages: dict[str, Path]) -> None:
+    with chrome.open(pages["plan"]) as tab:
+        tab.ask("document.querySelector('[role=tab][aria-selected=true]').focus()")
+        for name in ("Objects4", "Attachments1"):
+            tab.press("ArrowRight")
+            assert tab.ask(FOCUSED) == name
+        assert tab.ask("document.querySelectorAll('[role=tab][tabindex=\"0\"]').length") == 1
+        assert tab.ask("document.getElementById('panel').getAttribute('aria-labelledby')") == "tab-attachments"
+        tab.ask("document.querySelector('.panel .moment').focus()")
+        moment = tab.ask(FOCUSED)
+        tab.ask("document.activeElement.click()")
+        assert tab.ask(FOCUSED) == moment
+        assert tab.ask("`e${pycrormPage.event}`") == moment
+        tab.ask("pycrormPage.panels.open('failures')")
+        assert tab.ask("document.activeElement.id") == "panel"  # the control is gone
+
+
+def test_the_tree_is_walked_from_the_current_row_which_is_announced(chrome: Browser, pages: dict[str, Path]) -> None:
+    with chrome.open(pages["plan"]) as tab:
+        tab.ask("document.getElementById('tree').focus()")
+        assert tab.ask(f"{CURRENT}.getAttribute('aria-label')").startswith("TransportAction, SUCCEEDED, took ")
+        tab.press("ArrowUp")
+        spoken = tab.ask(f"{CURRENT}.getAttribute('aria-label')")
+        assert spoken.startswith("MoveTCPMotion, FAILED, IKError, took ")
+        assert "l_gripper_tool_frame cannot reach" in spoken
+        assert tab.ask("pycrormPage.selected.reason") == "IKError"
+        tab.press("ArrowLeft")
+        assert tab.ask("pycrormPage.selected.name") == "PickUpAction"
+        tab.press("ArrowLeft")
+        assert tab.ask(f"{CURRENT}.getAttribute('aria-expanded')") == "false"
+        tab.press("ArrowLeft")
+        assert tab.ask("pycrormPage.selected.name") == "root"
+        tab.press("ArrowRight")
+        assert tab.ask("pycrormPage.selected.name") == "ParkArmsAction"
+        places = f"['aria-level', 'aria-posinset', 'aria-setsize'].map((each) => {CURRENT}.getAttribute(each))"
+        assert tab.ask(places) == ["2", "1", "5"]
+
+
+def test_every_control_has_a_name_that_is_no_sign(chrome: Browser, pages: dict[str, Path]) -> None:
+    with chrome.open(pages["plan"]) as tab:
+        tree = tab.call("Accessibility.getFullAXTree")["nodes"]
+        roles = ("button", "slider", "tab", "treeitem")
+        names = [
+            (each["role"]["value"], each["name"]["value"])
+            for each in tree
+            if not each["ignored"] and each["role"]["value"] in roles
+        ]
+        assert {role for role, _ in names} == set(roles)
+        assert [each for each in names if not any(map(str.isalnum, each[1]))] == []
+
+
+def test_a_table_of_episodes_is_sorted_by_keys_and_announces_it(chrome: Browser, overview: Path) -> None:
+    with chrome.open(overview) as tab:
+        tab.ask("document.querySelector('th button').focus()")
+        assert tab.ask("document.querySelector('th').getAttribute('aria-sort')") == "descending"
+        tab.ask("document.activeElement.click()")
+        assert tab.ask("document.querySelector('th').getAttribute('aria-sort')") == "ascending"
+        assert tab.ask(FOCUSED) == "episode ▴"
+
+
+@pytest.mark.soak_on(800)
+@pytest.mark.parametrize("width", [420, 800, 1400])
+def test_the_table_of_episodes_is_in_sight_without_scrolling(chrome: Browser, overview: Path, width: int) -> None:
+    with chrome.open(overview, width=width) as tab:
+        heads = "[...document.querySelectorAll('#episodes th')].map((each) => each.textContent)"
+        assert tab.ask(heads) == [
+            "episode ▾",
+            "started (UTC)",
+            "status",
+            "took",
+            "nodes",
+            "failed",
+            "robots",
+            "description",
+        ]
+        assert tab.ask("document.documentElement.scrollWidth") == width
+        robots = "[...document.querySelectorAll('#episodes tbody td:nth-child(7)')].map((each) => each.textContent)"
+        assert tab.ask(robots) == ["courier, other", "pr2", "pr2"]
+        texts = tab.ask("[...document.querySelectorAll('#success text')].map((each) => each.textContent)")
+        assert [each for each in texts if "_" in each] == ["relative_x (m)", "relative_y (m)"]
+        edges = """[...document.querySelectorAll('#episodes td, #episodes th')].map((each) => {
+          const { left, right } = each.getBoundingClientRect();
+          return [left, right];
+        })"""
+        assert all(0 <= left <= right <= width for left, right in tab.ask(edges))
+        assert tab.ask("document.querySelector('#episodes').scrollHeight") == tab.ask(
+            "document.querySelector('#episodes').clientHeight"
+        )
+        if width == 1400:
+            assert tab.ask("document.querySelector('#episodes tbody').getBoundingClientRect().bottom") < 900
+        assert tab.problems() == []
+
+
+def test_episodes_without_a_page_name_the_reason_and_what_still_runs_has_no_chart(
+    chrome: Browser, overview: Path
+) -> None:
+    with chrome.open(overview) as tab:
+        assert tab.ask("document.getElementById('trend').textContent").startswith("Success")
+        assert "no page" not in tab.ask("document.getElementById('episodes').textContent")
+        tab.ask(
+            "new pycrormOverview.constructor({ title: '', total: 3, episodes: pycrormOverview.episodes"
+            ".map((each) => ({ ...each, status: 'RUNNING', page: null })) })"
+        )
+        assert tab.ask("document.getElementById('trend').textContent") == ""
+        text = tab.ask("document.getElementById('episodes').textContent")
+        assert text.count(" no page") == 4
+        assert text.endswith(
+            "3 older episodes have no page here. One of them gets a page of its own by pycrorm report 3"
+        )
+
+
+# === long page ================================================================================================
+#
+# The page of a long episode: collapsed, opened at failures, with few elements, below 20 MB.
+
+
+def record_pick_ups(url: str, count: int) -> None:
+    """Record pick-ups of four motions each; the last motion of every seventh fails."""
+    generator = random.Random(1)
+    with Memory.sync(url) as memory:
+        pick_up = memory.recording.type("action", "PickUpAction", {"target_location": Pose, "arm": str})
+        move = memory.recording.type("motion", "MoveTCPMotion", {"target": Pose, "arm": str})
+        with memory.recording.episode(description="a learning run") as episode:
+            episode.object_added("base", "pr2", "ROBOT", Pose([0, 0, 0]))
+            for index in range(count):
+                pose = Pose([generator.random() * 3, generator.random() * 3, 0])
+                failure = "too far away" if index % 7 == 3 else None
+                episode.start(index, pick_up, {"target_location": pose, "arm": "LEFT"}, robot="base")
+                for step in range(4):
+                    episode.start((index, step), move, {"target": pose, "arm": "LEFT"}, robot="base", parent=index)
+                    episode.object_moved("base", pose, node=(index, step))
+                    failed = failure is not None and step == 3
+                    episode.end((index, step), "FAILED" if failed else "SUCCEEDED", failure if failed else None)
+                episode.end(index, "FAILED" if failure else "SUCCEEDED", failure)
+        memory.flush()
+
+
+@pytest.mark.parametrize("pick_ups", [1_000, pytest.param(19_999, marks=pytest.mark.soak)])
+async def test_a_long_episode_is_collapsed_and_opened_at_its_first_failures(
+    chrome: Browser, tmp_path: Path, pick_ups: int
+) -> None:
+    url = f"sqlite:///{tmp_path / 'memory.db'}"
+    record_pick_ups(url, pick_ups)
+    async with Reading.open(url) as reading:
+        written = await report(reading, 1, tmp_path / "long.html")
+    assert written.last == written.events
+    assert written.path.stat().st_size < 20_000_000
+    with chrome.open(written.path) as tab:
+        nodes = pick_ups * 5 + 1
+        assert tab.ask("pycrormPage.episode.nodes.length") == nodes
+        rows = tab.ask("pycrormPage.tree.rows.length")
+        assert pick_ups < rows < pick_ups + 500
+        assert tab.ask("document.querySelectorAll('*').length") < 1_000
+        failures = len(range(3, pick_ups, 7))
+        assert tab.ask("document.querySelector('.failure').textContent").startswith(f"✗ {failures} × ")  # noqa: RUF001
+        tab.ask("document.getElementById('tree').scrollTop = 1e9")
+        tab.wait_for("document.querySelector('#tree').textContent.includes('PickUpAction')")
+        tab.press("f")
+        assert tab.ask("pycrormPage.selected.status") == "FAILED"
+        assert tab.problems() == []
+
+
+# === reading ==================================================================================================
+#
+# Pages are easy to read: contrast, room, whole words, signs for control characters, shapes as recorded.
+
+CONTRASTS = """(() => {
+  const linear = (part) => (part <= 0.04045 ? part / 12.92 : ((part + 0.055) / 1.055) ** 2.4);
+  const light = (color) => {
+    const [red, green, blue] = color.match(/[\\d.]+/g).map((each) => linear(each / 255));
+    return 0.2126 * red + 0.7152 * green + 0.0722 * blue;
+  };
+  const paper = light(getComputedStyle(document.body).backgroundColor);
+  return [...document.querySelectorAll(".row.later :is(bdi, .took), .row.message bdi, .panel .later")].map((each) => {
+    const ink = light(getComputedStyle(each).color);
+    let opacity = 1;
+    for (let around = each; around; around = around.parentElement) opacity *= getComputedStyle(around).opacity;
+    return (opacity * (Math.max(ink, paper) + 0.05)) / (Math.min(ink, paper) + 0.05);
+  });
+})()"""
+"""The contrasts of the texts of later rows, and of messages, with the page."""
+
+
+@pytest.mark.parametrize("dark", [False, True])
+def test_rows_of_later_moments_can_be_read(chrome: Browser, pages: dict[str, Path], dark: bool) -> None:
+    with chrome.open(pages["plan"], dark=dark, fragment="#e10") as tab:
+        tab.ask("pycrormPage.panels.open('attachments')")
+        contrasts = tab.ask(CONTRASTS)
+        assert len(contrasts) > 20
+        assert min(contrasts) > 4.5
+        later = "document.querySelectorAll('.row.message.later').length"
+        assert tab.ask(later) == 2
+        tab.press("End")
+        assert tab.ask(later) == 0
+
+
+def test_a_narrow_page_has_room_for_the_slider_the_help_and_whole_names(
+    chrome: Browser, pages: dict[str, Path]
+) -> None:
+    with chrome.open(pages["plan"], width=420) as tab:
+        assert tab.ask("document.querySelector('#controls input').clientWidth") > 250
+        assert tab.ask("document.querySelector('.help').getBoundingClientRect().width") > 20
+        assert tab.ask("document.querySelector('.clock').scrollWidth <= document.querySelector('.clock').clientWidth")
+    with chrome.open(pages["plan"], width=800) as tab:
+        cut = "[...document.querySelectorAll('.row .name')].filter((each) => each.scrollWidth > each.clientWidth)"
+        names = tab.ask(f"{cut}.map((each) => each.textContent)")
+        assert set(names) <= {"MoveArmJointsMotion", "MoveGripperMotion"}  # the longest, where they are deepest
+        widths = """[...document.querySelectorAll('.parameters bdi')].filter((each) => each.textContent
+          && getComputedStyle(each).visibility === 'visible').map((each) => each.parentElement.clientWidth)"""
+        assert min(tab.ask(widths)) >= 60
+
+
+@pytest.mark.soak_on(1400)
+@pytest.mark.parametrize("width", [420, 1400])
+def test_the_names_in_the_scene_are_inside_it_and_below_no_button(
+    chrome: Browser, pages: dict[str, Path], width: int
+) -> None:
+    places = """[...document.querySelectorAll('#stage, #views button, .names span')].map((each) => {
+      const { left, right, top, bottom } = each.getBoundingClientRect();
+      return [each.tagName, left, right, top, bottom];
+    })"""
+    for page, events in (("drives", (8, 12)), ("plan", (25, 60))):
+        with chrome.open(pages[page], width=width) as tab:
+            for event in events:
+                tab.ask(f"pycrormPage.seek({event})")
+                tab.press("w")  # as large as can be, so that names are near the edges
+                tab.settle()
+                stage, *others = tab.ask(places)
+                buttons = [each[1:] for each in others if each[0] == "BUTTON" and each[1] != each[2]]
+                names = [each[1:] for each in others if each[0] == "SPAN"]
+                assert names
+                for left, right, top, bottom in names:
+                    assert stage[1] <= left < right <= stage[2]
+                    assert stage[3] <= top < bottom <= stage[4]
+                    for west, east, north, south in buttons:
+                        assert right <= west or east <= left or bottom <= north or south <= top
+
+
+def test_the_page_plays_by_events_or_in_proportion_to_time(chrome: Browser, pages: dict[str, Path]) -> None:
+    schedule = "pycrormPage.playback.constructor.schedule({}, {})"
+    with chrome.open(pages["drives"]) as tab:
+
+        def ask(times: list[int], by_time: bool) -> Any:
+            return tab.ask(schedule.format(times, str(by_time).lower()))
+
+        assert ask([0, 5, 1000, 1001], False) == {"at": [0, 0.25, 0.5, 0.75], "shortened": False}
+        even = ask([0, 1_000_000, 1_500_000, 2_500_000, *range(4_000_000, 20_000_001, 2_000_000)], True)
+        assert not even["shortened"]
+        assert [round(each, 6) for each in even["at"][:4]] == [0, 1, 1.5, 2.5]
+        assert ask([0, 0, 1_000_000], True) == {"at": [0, 0, 2], "shortened": True}
+        tab.ask("pycrormPage.gantt.setAxis(true); pycrormPage.togglePlay()")
+        assert tab.ask("pycrormPage.playback.running")
+        assert tab.ask("document.querySelector('.clock').textContent").endswith(" · pauses cut")
+        tab.ask("pycrormPage.togglePlay()")
+        assert not tab.ask("document.querySelector('.clock').textContent").endswith("cut")
+
+
+async def test_control_characters_are_signs_in_titles_and_hints(chrome: Browser, tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path / 'memory.db'}"
+    with Memory.sync(url) as memory:
+        with memory.recording.episode(description=HOSTILE) as episode:
+            record(memory, episode)
+        memory.flush()
+    async with Reading.open(url) as reading:
+        await report(reading, 1, tmp_path / "page.html")
+    with chrome.open(tmp_path / "page.html", script=NO_WEBGL, fragment="#e4") as tab:
+        assert tab.ask("document.title").endswith("<U+2028><U+202E>]]> {title} <!-- · episode 1")
+        hints = """[
+          ...[...document.querySelectorAll('[title]')].map((each) => each.title),
+          ...[...document.querySelectorAll('[aria-label]')].map((each) => each.getAttribute('aria-label')),
+          ...[...document.querySelectorAll('svg title, svg text')].map((each) => each.textContent),
+        ].join()"""
+        text = tab.ask(hints)
+        assert "\u202e" not in text
+        assert "turtle<U+202E>" in text
+        assert "<U+202E>]]>" in text
+
+
+def test_a_capsule_has_round_ends(chrome: Browser, pages: dict[str, Path]) -> None:
+    corners = """(() => {
+      const model = { root: "base", joints: [], shapes: { base: [["capsule", [0.3, 1], [0, 0, 0], [0, 0, 0], null]] } };
+      const { group } = new (pycrormPage.bodies.of(pycrormPage.episode.objects[0]).constructor)({}, model);
+      let positions = [];
+      group.traverse((each) => each.isMesh && (positions = [...each.geometry.attributes.position.array]));
+      return positions;
+    })()"""
+    with chrome.open(pages["drives"]) as tab:
+        numbers = tab.ask(corners)
+    points = [numbers[at : at + 3] for at in range(0, len(numbers), 3)]
+    assert max(z for _, _, z in points) == pytest.approx(0.8)
+    assert min(z for _, _, z in points) == pytest.approx(-0.8)
+    for x, y, z in points:
+        assert (x * x + y * y + (abs(z) - 0.5) ** 2) ** 0.5 == pytest.approx(0.3)

@@ -1,24 +1,38 @@
-"""`pycrorm report`: the file it writes, and one line for each mistake that prevents it."""
+"""`pycrorm report`: the files it writes whole or not at all, the table of episodes, and its mistakes."""
 
+from __future__ import annotations
+
+import errno
 import json
+import os
 import shutil
 import sqlite3
 from contextlib import closing
+from functools import partial
 from pathlib import Path
+from typing import Any
+from unittest.mock import ANY
 
 import msgspec
 import pytest
+from typer.testing import CliRunner
 
-from pycrorm_async import Reading
+from pycrorm_async import Memory, Reading
 from pycrorm_async.cli import report as command
+from pycrorm_async.cli.main import app
+from pycrorm_async.errors import CallerError
 from pycrorm_async.report import document
+from pycrorm_async.report.output_files import new_file, new_folder, write_file
 from pycrorm_async.report.write import overview, write_page
 from tests.commands import one_line_of, pycrorm
 from tests.full_disk import files_of_at_most
 
-pytestmark = pytest.mark.slow
+# === report command ===========================================================================================
+#
+# `pycrorm report`: the file it writes, and one line for each mistake that prevents it.
 
 
+@pytest.mark.slow
 def test_the_command_prints_the_file_and_its_size(recorded: Path, tmp_path: Path) -> None:
     done = pycrorm("report", "1", "--out", tmp_path / "a b.html", "--json", cwd=recorded)
     answer = json.loads(done.stdout)
@@ -26,12 +40,14 @@ def test_the_command_prints_the_file_and_its_size(recorded: Path, tmp_path: Path
     assert (answer["first"], answer["last"]) == (1, answer["events"])
 
 
+@pytest.mark.slow
 def test_without_a_name_the_file_is_named_after_the_episode(recorded: Path) -> None:
     done = pycrorm("report", "last", cwd=recorded)
     assert (done.returncode, done.stdout) == (0, "episode-3.html\n")
     assert (recorded / "episode-3.html").exists()
 
 
+@pytest.mark.slow
 def test_a_file_that_exists_is_replaced_only_when_asked(recorded: Path, tmp_path: Path) -> None:
     file = tmp_path / "page.html"
     file.write_text("mine")
@@ -43,6 +59,7 @@ def test_a_file_that_exists_is_replaced_only_when_asked(recorded: Path, tmp_path
     assert file.read_text().startswith("<!doctype html>")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -65,6 +82,7 @@ def test_mistakes_are_one_line_and_leave_no_file(recorded: Path, arguments: tupl
     assert sorted(recorded.glob("*.html")) == before
 
 
+@pytest.mark.slow
 def test_a_memory_that_does_not_exist_is_one_line(tmp_path: Path) -> None:
     done = pycrorm("report", "1", cwd=tmp_path)
     assert done.returncode == 3
@@ -72,6 +90,7 @@ def test_a_memory_that_does_not_exist_is_one_line(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_all_episodes_are_a_table_with_pages_behind_it(recorded: Path, tmp_path: Path) -> None:
     out = tmp_path / "my robots.html"
     done = pycrorm("report", "--all", "--out", out, "--json", cwd=recorded)
@@ -89,6 +108,7 @@ def test_all_episodes_are_a_table_with_pages_behind_it(recorded: Path, tmp_path:
     assert pycrorm("report", "--all", "--out", out, "--force", cwd=recorded).returncode == 0
 
 
+@pytest.mark.slow
 def test_a_damaged_episode_has_a_row_with_the_reason_and_the_others_their_pages(recorded: Path, tmp_path: Path) -> None:
     shutil.copy(recorded / "pycrorm.db", tmp_path / "copy.db")
     with closing(sqlite3.connect(tmp_path / "copy.db")) as database, database:
@@ -111,6 +131,7 @@ def test_a_damaged_episode_has_a_row_with_the_reason_and_the_others_their_pages(
     ]
 
 
+@pytest.mark.slow
 def test_a_disk_that_fills_leaves_no_partial_file(tmp_path: Path) -> None:
     with files_of_at_most(10_000), pytest.raises(OSError, match="File too large") as raised:
         write_page("x" * 100_000, tmp_path / "page.html")
@@ -118,6 +139,7 @@ def test_a_disk_that_fills_leaves_no_partial_file(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 async def test_a_disk_that_fills_leaves_no_page_and_no_folder_of_a_table_of_episodes(
     recorded: Path, tmp_path: Path
 ) -> None:
@@ -127,6 +149,7 @@ async def test_a_disk_that_fills_leaves_no_page_and_no_folder_of_a_table_of_epis
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("first", "last", "continues"), [(None, None, True), (3, None, True), (None, 4, False)])
 def test_a_full_page_names_the_next_window(
     recorded: Path,
@@ -143,3 +166,195 @@ def test_a_full_page_names_the_next_window(
     url = f"sqlite:///{recorded / 'pycrorm.db'}"
     command.report("1", every=False, out=tmp_path / "page.html", first=first, last=last, url=url)
     assert any("the next page: --from " in each for each in notes) == continues
+
+
+# === output files =============================================================================================
+#
+# A file or folder has its name only when it is complete and on the disk.
+
+
+class WatchedSyncs:
+    """Notes, for each sync, the file or folder, its bytes, and whether the target has its name already."""
+
+    def __init__(self, target: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.noted: list[tuple[str, bytes | None, bool]] = []
+        fsync = os.fsync
+
+        def watched(descriptor: int) -> None:
+            path = Path(f"/proc/self/fd/{descriptor}").readlink()
+            content = path.read_bytes() if path.is_file() else None
+            self.noted.append((path.name, content, target.exists()))
+            fsync(descriptor)
+
+        monkeypatch.setattr(os, "fsync", watched)
+
+
+@pytest.mark.parametrize("force", [False, True])
+def test_a_file_is_synced_before_it_gets_its_name_and_its_folder_afterwards(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, force: bool
+) -> None:
+    target = tmp_path / "rows.csv"
+    syncs = WatchedSyncs(target, monkeypatch)
+    write_file(b"all of it", target, force=force)
+    assert [(content, named) for _, content, named in syncs.noted] == [(b"all of it", False), (None, True)]
+    assert syncs.noted[-1][0] == tmp_path.name
+    assert [each.name for each in tmp_path.iterdir()] == ["rows.csv"]
+
+
+@pytest.mark.parametrize("below", ["rows.csv", "folder/rows.csv"])
+@pytest.mark.parametrize("force", [False, True])
+def test_a_file_that_is_named_as_a_folder_is_called_a_file(tmp_path: Path, below: str, *, force: bool) -> None:
+    file = tmp_path / "notes.txt"
+    file.write_bytes(b"notes")
+    with pytest.raises(CallerError) as refused:
+        write_file(b"rows", file / below, force=force)
+    assert str(refused.value) == (
+        f"{file} is a file, so {file / below} cannot be written below it: give the name of a folder"
+    )
+    assert file.read_bytes() == b"notes"
+
+
+@pytest.mark.parametrize("exists", [False, True])
+def test_a_new_file_gets_its_name_on_a_file_system_without_links_too(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, exists: bool
+) -> None:
+    target = tmp_path / "rows.csv"
+
+    def link(*_: object, **__: object) -> None:
+        if exists:
+            target.write_bytes(b"of another process")
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(os, "link", link)
+    if exists:
+        with pytest.raises(CallerError, match="exists: add --force"):
+            write_file(b"all of it", target)
+    else:
+        write_file(b"all of it", target)
+    assert target.read_bytes() == (b"of another process" if exists else b"all of it")
+    assert [each.name for each in tmp_path.iterdir()] == ["rows.csv"]
+
+
+def test_all_files_of_a_folder_are_synced_before_it_gets_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    target = tmp_path / "set"
+    syncs = WatchedSyncs(target, monkeypatch)
+    with new_folder(target, force=False, marker="info") as written:
+        (written / "info").write_bytes(b"1")
+        (written / "data").mkdir()
+        (written / "data" / "rows").write_bytes(b"2")
+    *before, after = syncs.noted
+    assert {name: content for name, content, _ in before} | {written.name: None} == {
+        "info": b"1",
+        "data": None,
+        "rows": b"2",
+        written.name: None,
+    }
+    assert [named for *_, named in before] == [False] * 4
+    assert (after[0], after[2]) == (tmp_path.name, True)
+
+
+@pytest.mark.parametrize("new", [new_file, partial(new_folder, marker="meta")])
+def test_an_error_of_a_part_names_the_file_that_the_user_asked_for_and_another_keeps_its_name(
+    new: Any, tmp_path: Path
+) -> None:
+    manifest = tmp_path / "a.manifest.json"
+    with (
+        pytest.raises(OSError, match="No space left") as refused,
+        new_file(manifest, force=False),
+        new(tmp_path / "a", force=False) as part,
+    ):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(part))
+    assert refused.value.filename == str(tmp_path / "a")
+    with pytest.raises(FileNotFoundError) as missing, new(tmp_path / "a", force=False):
+        (tmp_path / "mesh.stl").read_bytes()
+    assert missing.value.filename == str(tmp_path / "mesh.stl")
+    assert list(tmp_path.iterdir()) == []
+
+
+# === overview =================================================================================================
+#
+# The table of episodes has those that `pycrorm episodes` lists with the same options, and names the choice.
+
+
+@pytest.fixture(scope="module")
+def url(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Return the URL of a memory with three episodes: the second fails, the third has a tag."""
+    address = f"sqlite:///{tmp_path_factory.mktemp('overview') / 'memory.db'}"
+    with Memory.sync(address) as memory:
+        grasp = memory.recording.type("action", "GraspAction", {"arm": str, "grams": float})
+        for number in range(3):
+            tags = ("night",) if number == 2 else ()
+            with memory.recording.episode(description=f"grasp {'milk' if number else 'bowl'}", tags=tags) as episode:
+                for arm in ("left", "right"):
+                    episode.start(arm, grasp, {"arm": arm, "grams": 100.0 * number})
+                    episode.end(arm, "FAILED" if number == 1 else "SUCCEEDED", "slipped")
+        memory.flush()
+    return address
+
+
+def report(url: str, out: Path, *options: str) -> tuple[int, str]:
+    done = CliRunner().invoke(app("report"), ["report", "--all", "--out", str(out), "--url", url, *options])
+    return done.exit_code, done.output
+
+
+def in_page(page: Path) -> Any:
+    return msgspec.json.decode(page.read_text().partition('id="document">')[2].partition("</script>")[0])
+
+
+@pytest.mark.parametrize(
+    ("options", "numbers", "title"),
+    [
+        ((), [1, 2, 3], "Episodes"),
+        (("--text", "milk"), [2, 3], "Episodes: text milk"),
+        (("--tag", "night", "--status", "succeeded"), [3], "Episodes: status succeeded; tag night"),
+        (
+            ("--since", "2026-01-02 03:04", "--limit", "2"),
+            [2, 3],
+            "Episodes: since 2026-01-02 03:04:00 UTC; the newest 2",
+        ),
+    ],
+)
+def test_a_table_has_the_chosen_episodes_and_their_pages(
+    url: str, tmp_path: Path, options: tuple[str, ...], numbers: list[int], title: str
+) -> None:
+    assert report(url, tmp_path / "all.html", *options)[0] == 0
+    document = in_page(tmp_path / "all.html")
+    assert (document["title"], document["total"]) == (title, len(numbers))
+    assert [each["number"] for each in document["episodes"]] == numbers
+    assert sorted(each.stem for each in (tmp_path / "all.pages").iterdir()) == [f"episode-{each}" for each in numbers]
+
+
+def test_a_choice_of_no_episode_is_refused_as_by_the_list_of_episodes(url: str, tmp_path: Path) -> None:
+    code, text = report(url, tmp_path / "all.html", "--robot", "pr3")
+    assert (code, text) == (2, "pycrorm: no episode matches these options; the memory has no robot pr3\n")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_successes_over_any_columns_of_the_chosen_episodes_are_in_the_page(url: str, tmp_path: Path) -> None:
+    plots = ("--plot", "arm,grams,GraspAction", "--plot", "kind, dtype, action")
+    assert report(url, tmp_path / "all.html", "--text", "milk", *plots) == (0, ANY)
+    grasps, actions = in_page(tmp_path / "all.html")["successes"]
+    assert (grasps["of"], grasps["x"]["name"], grasps["y"]["name"]) == ("GraspAction", "arm", "grams")
+    assert (grasps["succeeded"], grasps["rows"], grasps["x"]["labels"]) == (2, 4, ["left", "right"])
+    assert sorted(rows for *_, rows in grasps["cells"]) == [1, 1, 1, 1]
+    assert (actions["of"], actions["rows"], actions["y"]["labels"]) == ("action", 4, ["GraspAction"])
+
+
+@pytest.mark.parametrize(
+    ("plot", "message"),
+    [
+        ("arm", "--plot 'arm' must be X,Y or X,Y,VIEW, for example arm,grasp,PickUpAction"),
+        ("arm,grasp,GraspActoin", "there is no view 'GraspActoin'; did you mean grasp_action"),
+        ("arm,gram,GraspAction", "GraspAction has no column 'gram'; did you mean grams?"),
+        ("arm,grasp", "no row of PickUpWithContextView has ended"),
+    ],
+)
+def test_a_plot_that_cannot_be_drawn_is_one_line_and_leaves_no_file(
+    url: str, tmp_path: Path, plot: str, message: str
+) -> None:
+    code, text = report(url, tmp_path / "all.html", "--plot", plot)
+    assert (code, text.count("\n")) == (2, 1)
+    assert message in text
+    assert list(tmp_path.iterdir()) == []

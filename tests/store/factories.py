@@ -1,11 +1,16 @@
-"""Factories of records for the tests of the store and the writer."""
+"""Factories of records for the tests of the store and the writer, and faults of an append."""
 
 from __future__ import annotations
+
+import asyncio
+from typing import Any
 
 from pycrorm_async.events.codec import Record
 from pycrorm_async.events.ids import EpisodeId
 
-__all__ = ["episode", "record", "run_of", "declaration", "name", "HEADS"]
+# === factories ================================================================================================
+#
+# Factories of records for the tests of the store and the writer.
 
 HEADS = "SELECT number, id, head, folded, started_wall_ns, ended_wall_ns, refused, parked FROM episode ORDER BY number"
 
@@ -50,3 +55,20 @@ def declaration(payload: bytes, *, position: int = 1) -> Record:
 
 def name(number: int) -> str:
     return f"00000000-0000-0000-0000-{number:012x}"
+
+
+# === faults ===================================================================================================
+#
+# Inject faults into an append.
+
+
+async def cancel_at_await(task: asyncio.Task[Any], count: int) -> None:
+    """Cancel the task at its await number `count`, or when it has ended, and wait for its end."""
+    awaited: list[object] = []
+    while len(awaited) < count and not task.done():
+        waiter = getattr(task, "_fut_waiter", None)
+        if waiter is not None and waiter not in awaited[-1:]:
+            awaited.append(waiter)
+        await asyncio.sleep(0)
+    task.cancel()
+    await asyncio.wait([task])

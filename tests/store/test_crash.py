@@ -1,3 +1,5 @@
+"""Processes that are killed while they append, and a database on a full disk: no event is lost or doubled."""
+
 from __future__ import annotations
 
 import asyncio
@@ -5,23 +7,29 @@ import gc
 import os
 import random
 import signal
+import sqlite3
 import subprocess
 import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+from sqlalchemy import event
+from sqlalchemy.ext.asyncio import AsyncEngine
 
+from pycrorm_async.errors import DatabaseUnavailable
 from pycrorm_async.events.codec import Record
+from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.sqlite_engine import translate_error
+from pycrorm_async.writer.drain import Backoff, Drain
 from tests.crash.recorder_process import report
 from tests.databases import ask
-from tests.store.factories import episode, run_of
-from tests.store.faults import cancel_at_await
-
-pytestmark = pytest.mark.slow
+from tests.store.factories import cancel_at_await, episode, record, run_of
+from tests.writer.fakes import KeptSource
 
 PER_BATCH = 300
 
@@ -63,6 +71,7 @@ async def append_all(address: DatabaseAddress, numbers: Iterable[int]) -> None:
     await log.close()
 
 
+@pytest.mark.slow
 def test_a_process_killed_during_an_append_leaves_whole_batches_and_the_next_one_continues(
     address: DatabaseAddress,
 ) -> None:
@@ -111,6 +120,7 @@ def test_a_process_killed_during_an_append_leaves_whole_batches_and_the_next_one
     assert ask(address.path, "PRAGMA integrity_check") == [("ok",)]
 
 
+@pytest.mark.slow
 def test_an_append_cancelled_at_any_await_leaves_a_whole_batch_or_nothing_and_no_lock(
     address: DatabaseAddress,
 ) -> None:
@@ -146,3 +156,86 @@ def test_an_append_cancelled_at_any_await_leaves_a_whole_batch_or_nothing_and_no
     assert stored_though_cancelled == {False, True}  # cancelled before the commit, and during it
     asyncio.run(append_all(address, range(stored_batches + 1)))
     assert ask(address.path, "SELECT count(*) FROM event") == [((stored_batches + 1) * PER_BATCH * 2,)]
+
+
+# === full disk ================================================================================================
+#
+# A database on a full disk is unavailable: events stay in the source, and are stored when there is space again.
+
+
+class SmallDisk:
+    """A disk of 2 MiB; where the machine permits no mount, a limit on SQLite's pages replaces it."""
+
+    def __init__(self, place: Path, *, mounted: bool) -> None:
+        self.place = place
+        self._mounted = mounted and self._mount("size=2m") == 0
+        self._pages = 256
+
+    def fill(self) -> None:
+        if self._mounted:
+            (self.place / "ballast").write_bytes(bytes(2**20))
+
+    def limit(self, engine: AsyncEngine) -> None:
+        if not self._mounted:
+            event.listen(engine.sync_engine, "checkout", self._limit_pages)
+
+    def free_space(self) -> None:
+        self._pages = 2**20
+        if self._mounted:
+            (self.place / "ballast").unlink()
+            assert self._mount("remount,size=8m") == 0
+
+    def release(self) -> None:
+        if self._mounted:
+            subprocess.run(["umount", str(self.place)], check=True)
+
+    def _mount(self, options: str) -> int:
+        command = ["mount", "-t", "tmpfs", "-o", options, "tmpfs", str(self.place)]
+        return subprocess.run(command, capture_output=True, check=False).returncode
+
+    def _limit_pages(self, connection: Any, *_: object) -> None:
+        cursor = connection.cursor()
+        cursor.execute(f"PRAGMA max_page_count = {self._pages}")
+        cursor.close()
+
+
+@pytest.fixture(params=["mounted", "simulated"])
+def small_disk(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[SmallDisk]:
+    disk = SmallDisk(tmp_path, mounted=request.param == "mounted")
+    yield disk
+    disk.release()
+
+
+@pytest.mark.parametrize("code", [sqlite3.SQLITE_IOERR_SHMSIZE, sqlite3.SQLITE_IOERR_WRITE])
+def test_a_disk_without_room_for_the_files_of_sqlite_is_named_as_the_cause(code: int) -> None:
+    fault = sqlite3.OperationalError("disk I/O error")
+    fault.sqlite_errorcode = code
+    error = translate_error(fault, "sqlite:///memory.db")
+    assert isinstance(error, DatabaseUnavailable)
+    assert str(error).startswith("sqlite:///memory.db: disk I/O error: the disk may be full; SQLite needs some space")
+
+
+async def test_a_database_on_a_full_disk_is_unavailable_and_stores_everything_once_when_there_is_space(
+    small_disk: SmallDisk,
+) -> None:
+    small_disk.fill()
+    file = small_disk.place / "memory.db"
+    records = [record(episode(1), sequence, payload=b'"%s"' % (b"x" * 1000)) for sequence in range(1, 1001)]
+    log = await EventLog.open(DatabaseAddress.parse(f"sqlite:///{file}"), create=True)
+    small_disk.limit(log.engine)
+    source = KeptSource(records, closed=True)
+    backoff = Backoff(first_s=0.005, longest_s=0.02)
+    drain = Drain(source, log.append, settings=Settings(batch_events_max=50), backoff=backoff)
+    running = asyncio.create_task(drain.run())
+    while drain.state.retries < 5:  # noqa: ASYNC110
+        await asyncio.sleep(0.001)
+    assert "database or disk is full" in (drain.state.unavailable or "")
+    assert 0 < len(source.kept) < 1000
+    with pytest.raises(DatabaseUnavailable, match="full"):
+        await log.append(records)
+    await asyncio.to_thread(small_disk.free_space)
+    await asyncio.wait_for(running, 60)
+    await log.close()
+    assert source.kept == []
+    assert ask(file, "SELECT count(*), min(sequence), max(sequence) FROM event") == [(1000, 1, 1000)]
+    assert ask(file, "PRAGMA integrity_check") == [("ok",)]

@@ -24,8 +24,7 @@ from pycrorm_async.store.log import EventLog
 from pycrorm_async.testing.postgresql_proxy import Proxy, proxy_before
 from pycrorm_async.writer.drain import Backoff, Drain
 from tests.databases import Server, ask, ask_each, server_in_memory
-from tests.store.factories import declaration, episode, run_of
-from tests.store.faults import cancel_at_await
+from tests.store.factories import cancel_at_await, declaration, episode, run_of
 from tests.writer.fakes import KeptSource
 
 pytestmark = pytest.mark.slow

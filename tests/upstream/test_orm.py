@@ -1,8 +1,5 @@
-"""PyCRAM's tests of its ORM (July 2024), by name; the assertions are those that theirs were meant to make.
+"""PyCRAM's tests of its ORM and merger (July 2024), by name; the assertions are those that theirs should make."""
 
-Names and the common plan are facts of that system, the bodies are new. Where this package differs by design, its own
-number is asserted, and computed in a comment.
-"""
 # ruff: noqa: N802  the names are theirs
 
 from __future__ import annotations
@@ -17,6 +14,7 @@ import pytest
 from sqlalchemy import func, select
 
 from pycrorm_async import Memory
+from pycrorm_async.operations.copy import copy_episodes
 from pycrorm_async.orm import (
     Action,
     CloseAction,
@@ -57,11 +55,22 @@ from pycrorm_async.plan import ObjectPart as Part
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world import Arms, Grasp, GripperState, ObjectType, Pose
 from pycrorm_async.world.pose import yaw_quaternion
+from tests.commands import pycrorm
+from tests.databases import Server, ask
 from tests.plan.conftest import kitchen
 from tests.promises.lab import at, url_of
+from tests.table_comparison import Tables, differences, logs_of, tables_of, united
 from tests.upstream.conftest import DESCRIPTION, Recorded, common_plan
 
 pytestmark = pytest.mark.slow
+
+
+# === orm ======================================================================================================
+#
+# PyCRAM's tests of its ORM (July 2024), by name; the assertions are those that theirs were meant to make.
+#
+# Names and the common plan are facts of that system, the bodies are new. Where this package differs by design, its own
+# number is asserted, and computed in a comment.
 
 
 async def test_schema_creation(tmp_path: Path) -> None:
@@ -296,3 +305,66 @@ async def test_pickUpWithContextView_conditions(planned: Recorded) -> None:
     assert await planned.all(select(PickUpWithContextView).where(PickUpWithContextView.arm == Arms.RIGHT)) == []
     left = select(func.count()).where(PickUpWithContextView.arm == Arms.LEFT)
     assert await planned.all(left) == [1]
+
+
+# === database merger ==========================================================================================
+#
+# PyCRAM's tests of its merging of databases (July 2024), by name; the assertions are those that theirs were meant to
+# make.
+#
+# There, three runs of a pick-and-place plan were stored in SQLite and moved to PostgreSQL: the primary keys of the
+# existing run were shifted until none collided, then every row was inserted. Here no existing row is changed, and
+# copying twice has the same result as once.
+
+RUNS = 3
+
+
+@pytest.fixture
+async def source(tmp_path: Path) -> str:
+    """Three runs of the common plan, each with its own metadata."""
+    async with Memory.open(url_of(tmp_path)) as memory:
+        for run in range(RUNS):
+            with kitchen():
+                async with memory.episode(description=f"run {run}"):
+                    await common_plan()
+    return url_of(tmp_path)
+
+
+@pytest.fixture
+async def destination(server: Server, tmp_path: Path) -> str:
+    """A memory with a run of its own, whose rows have the ids of the first run in the source."""
+    url = server.new_database()
+    opened = Memory.open(url, spool=tmp_path / "spool")
+    async with opened as memory, memory.episode(description="was here before"):
+        with kitchen():
+            await common_plan()
+    return url
+
+
+def assert_holds(destination: str, source: Tables, before: Tables) -> None:
+    """Assert that every table has all rows of the source, and all that it had before."""
+    tables_before = tables_of(destination)
+    for table, rows in source.items():
+        assert rows.items() <= tables_before[table].items(), table
+    assert differences(tables_before, united(source, before)) == []
+
+
+async def test_merge_databases(source: str, destination: str) -> None:
+    same_ids = "SELECT id FROM pose WHERE process_metadata_id = 1 ORDER BY id"
+    assert ask(source, same_ids) == ask(destination, same_ids)
+    rows, before = tables_of(source), tables_of(destination)
+    for _ in range(2):
+        await copy_episodes(source, destination)
+        assert_holds(destination, rows, before)
+    described = ask(destination, "SELECT description FROM process_metadata ORDER BY description")
+    assert described == [("run 0",), ("run 1",), ("run 2",), ("was here before",)]
+    assert tables_of(source) == rows
+
+
+async def test_migrate_neems(source: str, destination: str, tmp_path: Path) -> None:
+    rows, before, log = tables_of(source), tables_of(destination), logs_of(destination)
+    for _ in range(2):
+        done = pycrorm("copy", "--from", source, "--to", destination, cwd=tmp_path)
+        assert (done.returncode, done.stderr) == (0, "")
+        assert_holds(destination, rows, before)
+    assert logs_of(destination) == log | logs_of(source)

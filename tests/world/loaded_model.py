@@ -1,4 +1,4 @@
-"""A model loaded directly into Bullet, without the package's world: the oracle for frames and forward kinematics."""
+"""Models loaded directly into Bullet, without the package's world: the oracle for frames and forward kinematics."""
 
 from __future__ import annotations
 
@@ -7,9 +7,17 @@ import random
 from collections.abc import Mapping
 from pathlib import Path
 
+import numpy as np
+
+from pycrorm_async.world import Object
 from pycrorm_async.world.pose import Arms, Pose, Quaternion, Vector, product
 from pycrorm_async.world.urdf import PR2, Limits
 from tests import bullet
+from tests.world.fakes import Matrix
+
+# === loaded model =============================================================================================
+#
+# A model loaded directly into Bullet, without the package's world: the oracle for frames and forward kinematics.
 
 LINK_WORLD_POSITION, LINK_WORLD_ORIENTATION = 4, 5
 
@@ -73,3 +81,22 @@ def angle_between(a: Quaternion, b: Quaternion) -> float:
     """Return the angle in rad; it is exact also for small angles."""
     x, y, z, _ = product((-a.x, -a.y, -a.z, a.w), b)
     return 2 * math.hypot(x, y, z)
+
+
+# === bullet frames ============================================================================================
+#
+# Return a link's frame by Bullet's own forward kinematics, in single precision, without the package's code.
+
+
+def bullet_frame(target: Object, link: str) -> Matrix:
+    """Return the link's frame in the map as a 4 by 4 matrix."""
+    number, client = target.body.number, target.world.client
+    names = [
+        bullet.getJointInfo(number, joint, physicsClientId=client)[12].decode()
+        for joint in range(bullet.getNumJoints(number, physicsClientId=client))
+    ]
+    state = bullet.getLinkState(number, names.index(link), computeForwardKinematics=True, physicsClientId=client)
+    result = np.eye(4)
+    result[:3, :3] = np.reshape(bullet.getMatrixFromQuaternion(state[5]), (3, 3))
+    result[:3, 3] = state[4]
+    return result

@@ -25,8 +25,7 @@ from pycrorm_async.world.pose import ObjectRefused, UnknownLink, yaw_quaternion
 from pycrorm_async.world.queries import collisions_at, footprint_of
 from pycrorm_async.world.urdf import Limits
 from pycrorm_async.world.world_copy import copied, counterpart
-from tests.world.base_links import HEIGHT_M, RAILS, link_poses, rail_robot, raised_robot
-from tests.world.fakes import ChangeLog
+from tests.world.fakes import HEIGHT_M, RAILS, ChangeLog, link_poses, rail_robot, raised_robot
 
 LEANING = Pose([0.3, -1.2, 0.7], [0.2, -0.4, 0.1, 0.8])
 AHEAD = Pose([1, 2, 0.5], yaw_quaternion(0.4))

@@ -1,3 +1,5 @@
+"""Drain a source into the log: batches, outages reported once, retries, and drains that run once."""
+
 from __future__ import annotations
 
 import asyncio
@@ -10,12 +12,13 @@ from pathlib import Path
 
 import pytest
 
-from pycrorm_async.errors import DatabaseUnavailable, LogDamaged, SpoolUnavailable
+from pycrorm_async.errors import DatabaseUnavailable, LogDamaged, SpoolDamaged, SpoolUnavailable
 from pycrorm_async.events.codec import Record
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.writer.drain import Backoff, Drain, run_to_completion
+from pycrorm_async.writer.daemon import Availability
+from pycrorm_async.writer.drain import Backoff, Drain, drain_once, run_to_completion
 from tests.databases import ask
 from tests.store.factories import episode, record, run_of
 from tests.writer.fakes import CountingFold, ForwardingDestination, KeptSource, LosesReplies
@@ -339,3 +342,228 @@ async def test_uninterruptible_work_is_completed_even_when_it_is_cancelled_twice
     with pytest.raises(asyncio.CancelledError):
         await task
     assert ended.is_set()
+
+
+# === availability =============================================================================================
+#
+# An outage of the database is reported once when it has lasted a second, and so is its end.
+
+
+class Observed:
+    """A database whose calls take a given time by a clock that the test moves."""
+
+    def __init__(self) -> None:
+        self.now_s = 0.0
+        self.reports: list[str | float] = []
+        self.availability = Availability(
+            now_s=lambda: self.now_s, on_lost=self.reports.append, on_back=self.reports.append
+        )
+
+    async def call(self, *, takes_s: float = 0.0, fails: bool = False) -> int:
+        async def answer() -> int:
+            self.now_s += takes_s
+            if fails:
+                raise DatabaseUnavailable(f"away at {self.now_s:g} s")
+            return 7
+
+        return await self.availability.observe(answer())
+
+    async def fail(self, *, takes_s: float = 0.0) -> None:
+        with pytest.raises(DatabaseUnavailable):
+            await self.call(takes_s=takes_s, fails=True)
+
+
+async def test_an_outage_shorter_than_a_second_is_not_reported() -> None:
+    observed = Observed()
+    await observed.fail(takes_s=0.5)
+    await observed.fail(takes_s=0.4)
+    assert await observed.call() == 7
+    await observed.fail(takes_s=0.9)  # another outage
+    assert observed.reports == []
+
+
+async def test_a_longer_outage_and_its_end_are_reported_once() -> None:
+    observed = Observed()
+    for _ in range(3):
+        await observed.fail(takes_s=0.6)
+    observed.now_s = 5.0
+    assert await observed.call() == 7
+    assert await observed.call() == 7
+    assert observed.reports == ["away at 1.2 s", 5.0]
+    await observed.fail(takes_s=2.0)
+    assert observed.reports[2:] == ["away at 7 s"]
+
+
+async def test_an_answer_to_a_call_from_before_the_outage_does_not_end_it() -> None:
+    observed = Observed()
+    answered = asyncio.Event()
+
+    async def answer_late() -> None:
+        await answered.wait()
+
+    early = asyncio.create_task(observed.availability.observe(answer_late()))
+    await asyncio.sleep(0)
+    observed.now_s = 1.0
+    await observed.fail(takes_s=2.0)
+    answered.set()
+    await early
+    assert observed.reports == ["away at 3 s"]
+    assert await observed.call() == 7
+    assert observed.reports == ["away at 3 s", 2.0]
+
+
+# === drain once ===============================================================================================
+
+SETTINGS = Settings(batch_events_max=10)
+
+
+async def test_one_round_stores_folds_and_reports_all_records(log: EventLog) -> None:
+    sources = [KeptSource(run_of(episode(which), 1, 15), closed=True, name=f"robot {which}") for which in (1, 2)]
+    recovered = await drain_once(sources, CountingFold(log), settings=SETTINGS)
+    assert [(each.source, each.records) for each in recovered.drained] == [("robot 1", 15), ("robot 2", 15)]
+    assert (recovered.folded, recovered.failed, recovered.stopped) == (30, {}, {})
+    assert ask(log.address.path, "SELECT head, folded FROM episode") == [(15, 15), (15, 15)]
+    assert [each.kept for each in sources] == [[], []]
+
+
+async def test_a_round_without_records_does_nothing(log: EventLog) -> None:
+    recovered = await drain_once([], CountingFold(log), settings=SETTINGS)
+    assert (recovered.drained, recovered.folded) == ((), 0)
+
+
+async def test_records_that_are_already_stored_are_counted_once(log: EventLog) -> None:
+    await log.append(run_of(episode(1), 1, 12))
+    recovered = await drain_once(
+        [KeptSource(run_of(episode(1), 1, 15), closed=True)], CountingFold(log), settings=SETTINGS
+    )
+    assert recovered.folded == 15
+    assert ask(log.address.path, "SELECT count(*) FROM event") == [(15,)]
+
+
+async def test_a_damaged_source_is_reported_and_the_others_are_drained(log: EventLog) -> None:
+    class Damaged(KeptSource):
+        async def get_batch(self, *, events_max: int, bytes_max: int, age_s_max: float) -> Sequence[Record]:
+            if self.acknowledgements:
+                raise SpoolDamaged(Path("/spool/1/2.seg"), 64, "a frame does not match its checksum")
+            return await super().get_batch(events_max=events_max, bytes_max=bytes_max, age_s_max=age_s_max)
+
+    damaged = Damaged(run_of(episode(1), 1, 15), name="robot 1")
+    healthy = KeptSource(run_of(episode(2), 1, 3), closed=True, name="robot 2")
+    recovered = await drain_once([damaged, healthy], CountingFold(log), settings=SETTINGS)
+    assert {source: str(error) for source, error in recovered.failed.items()} == {
+        "robot 1": "/spool/1/2.seg is damaged at byte 64: a frame does not match its checksum"
+    }
+    assert recovered.folded == 13
+    assert ask(log.address.path, "SELECT head FROM episode ORDER BY number") == [(10,), (3,)]
+
+
+async def test_a_gap_in_an_episode_is_reported_with_its_reason(log: EventLog) -> None:
+    source = KeptSource([*run_of(episode(1), 1, 3), *run_of(episode(1), 5, 6)], closed=True)
+    recovered = await drain_once([source], CountingFold(log), settings=SETTINGS)
+    assert recovered.stopped == {"00000000-0000-0000-0000-000000000001": "event 4 did not arrive before event 5"}
+    assert recovered.folded == 3
+
+
+async def test_a_refusal_without_dead_letters_is_a_failure_of_its_source(log: EventLog) -> None:
+    class Full(KeptSource):
+        def dead_letter(self, records: Sequence[Record]) -> bool:
+            raise SpoolUnavailable(Path("/spool/1.refused"), "No space left on device")
+
+    full = Full([*run_of(episode(1), 1, 3), *run_of(episode(1), 5, 6)], closed=True, name="robot 1")
+    healthy = KeptSource(run_of(episode(2), 1, 3), closed=True, name="robot 2")
+    recovered = await drain_once([full, healthy], CountingFold(log), settings=SETTINGS)
+    assert {source: str(error) for source, error in recovered.failed.items()} == {
+        "robot 1": "spool /spool/1.refused: No space left on device"
+    }
+    assert list(recovered.stopped.values()) == ["event 4 did not arrive before event 5"]
+    assert (full.kept, healthy.kept) == ([1, 2, 3, 5, 6], [])
+
+
+@pytest.mark.slow
+@pytest.mark.every_python
+async def test_a_database_that_stays_unavailable_is_raised(log: EventLog) -> None:
+    holder = sqlite3.connect(log.address.path, isolation_level=None)
+    holder.execute("BEGIN IMMEDIATE")
+    source = KeptSource(run_of(episode(1), 1, 3), closed=True)
+    with pytest.raises(DatabaseUnavailable, match="database is locked"):
+        await drain_once([source], CountingFold(log), settings=SETTINGS)
+    holder.close()
+    assert source.kept == [1, 2, 3]
+
+
+class LockedAfterAppend(ForwardingDestination):
+    """A second process that locks the database at the first fold, for a given number of attempts."""
+
+    def __init__(self, log: EventLog, *, folds_met: int) -> None:
+        super().__init__(CountingFold(log))
+        self.folds = 0
+        self._folds_met = folds_met
+        self._holder = sqlite3.connect(log.address.path, isolation_level=None)
+
+    async def fold(self) -> int:
+        if self.folds == 0:
+            self._holder.execute("BEGIN IMMEDIATE")
+        if self.folds == self._folds_met:
+            self.release()
+        self.folds += 1
+        return await super().fold()
+
+    def release(self) -> None:
+        self._holder.close()
+
+
+async def test_a_fold_on_a_locked_database_is_retried(log: EventLog) -> None:
+    destination = LockedAfterAppend(log, folds_met=2)
+    recovered = await drain_once([KeptSource(run_of(episode(1), 1, 3), closed=True)], destination, settings=SETTINGS)
+    assert (recovered.folded, destination.folds) == (3, 3)
+    assert ask(log.address.path, "SELECT head, folded FROM episode") == [(3, 3)]
+
+
+@pytest.mark.slow
+@pytest.mark.every_python
+async def test_a_database_that_stays_locked_during_the_fold_is_raised_and_stored_records_remain(log: EventLog) -> None:
+    destination = LockedAfterAppend(log, folds_met=99)
+    source = KeptSource(run_of(episode(1), 1, 3), closed=True)
+    with pytest.raises(DatabaseUnavailable, match="database is locked"):
+        await drain_once([source], destination, settings=SETTINGS)
+    destination.release()
+    assert (destination.folds, source.kept) == (5, [])
+    assert ask(log.address.path, "SELECT head, folded FROM episode") == [(3, 0)]
+
+
+async def test_a_query_for_stopped_episodes_on_an_unavailable_database_is_retried(log: EventLog) -> None:
+    class UnavailableTwice(ForwardingDestination):
+        requests = 0
+
+        async def stopped(self) -> Mapping[str, str]:
+            self.requests += 1
+            if self.requests < 3:
+                raise DatabaseUnavailable("the connection was closed")
+            return await super().stopped()
+
+    destination = UnavailableTwice(CountingFold(log))
+    source = KeptSource([*run_of(episode(1), 1, 3), *run_of(episode(1), 5, 6)], closed=True)
+    recovered = await drain_once([source], destination, settings=SETTINGS)
+    assert recovered.stopped == {"00000000-0000-0000-0000-000000000001": "event 4 did not arrive before event 5"}
+
+
+# === retry ====================================================================================================
+
+
+def test_each_pause_is_twice_the_previous_one_up_to_the_longest() -> None:
+    backoff = Backoff(first_s=0.5, longest_s=5.0)
+    assert [backoff.pause_s(attempt, 1.0) for attempt in range(1, 7)] == [0.5, 1.0, 2.0, 4.0, 5.0, 5.0]
+
+
+def test_jitter_takes_up_to_half_of_a_pause() -> None:
+    backoff = Backoff(first_s=0.5, longest_s=5.0)
+    assert [backoff.pause_s(3, randomness) for randomness in (0.0, 0.5, 1.0)] == [1.0, 1.5, 2.0]
+
+
+def test_a_policy_without_a_last_attempt_continues_for_years() -> None:
+    assert Backoff(first_s=0.5, longest_s=5.0).pause_s(10**9, 1.0) == 5.0
+
+
+def test_a_policy_with_a_last_attempt_ends_at_it() -> None:
+    backoff = Backoff(first_s=1.0, longest_s=5.0, attempts_max=3)
+    assert [backoff.pause_s(attempt, 1.0) for attempt in (1, 2, 3, 4)] == [1.0, 2.0, None, None]

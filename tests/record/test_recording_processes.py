@@ -1,0 +1,277 @@
+"""Threads and processes that record together: limits, forks, kills, and contradicting declarations."""
+
+from __future__ import annotations
+
+import asyncio
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+
+from pycrorm_async import Memory, Settings, recover
+from pycrorm_async.events.codec import declaration_of
+from pycrorm_async.events.types import NodeStarted
+from pycrorm_async.operations.rebuild import rebuild_memory
+from pycrorm_async.projections import columns as union
+from pycrorm_async.projections.verify import verify
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.log import EventLog
+from pycrorm_async.world.pose import Pose
+from tests.commands import environment, pycrorm, run_script
+from tests.databases import ask
+from tests.projections.event_script import Script, declarations, declared, field, name_of
+from tests.projections.sql_queries import stored_and_folded
+from tests.record.recordings import assert_verified, events, nodes, opened, url_of
+from tests.record.test_recorded_episode import HERE
+from tests.table_comparison import differences, tables_of
+from tests.writer.running_writers import Daemon
+
+# === recording processes ======================================================================================
+#
+# Threads and processes that record: they reach limits together, outlive the episode, fork, wait, and are killed.
+
+
+def test_a_thread_that_outlives_the_episode_is_counted_and_disturbs_nothing(tmp_path: Path) -> None:
+    with opened(tmp_path) as memory:
+        kind = memory.recording.type("action", "Step")
+        ended = threading.Event()
+        with memory.recording.episode(description="d") as episode:
+            episode.start("in time", kind)
+
+            def late() -> None:
+                ended.wait()
+                episode.end("in time")
+                episode.start("late", kind)
+                episode.observe("late", 1.0)
+
+            thread = threading.Thread(target=late)
+            thread.start()
+            episode.end("in time")
+        ended.set()
+        thread.join()
+        assert memory.status.faults.total == 3
+    assert len(nodes(tmp_path)) == 1
+    assert events(tmp_path, "Observed") == []
+
+
+def test_a_long_episode_continues_with_its_open_nodes_and_its_objects(tmp_path: Path) -> None:
+    with opened(tmp_path, Settings(episode_events_max=200)) as memory:
+        kind = memory.recording.type("action", "Step", {"number": int, "what": "object"})
+        with memory.recording.episode(description="long") as episode:
+            episode.object_added("x", "cup", "CUP", HERE)  # so that the follow-ups have the others at other sequences
+            episode.object_added("r", "pr2", "ROBOT", HERE, {"j": 1.0})
+            episode.object_added("m", "milk", "MILK", HERE)
+            episode.object_attached("r", "m")
+            episode.object_removed("x")
+            episode.start("outer", kind, {"what": "m"}, robot="r")
+            for number in range(300):
+                episode.start(number, kind, {"number": number, "what": "m"}, parent="outer", robot="r")
+                episode.object_moved("m", Pose([number, 0, 0]), node=number)
+                episode.end(number)
+            episode.end("outer")
+        assert memory.status.faults == (0, None)
+        continued = memory.status.episodes_continued
+        assert continued > 3
+    assert_verified(tmp_path)
+    file = tmp_path / "memory.db"
+    numbers = ask(file, "SELECT number FROM step JOIN task_tree_node USING (id) WHERE status = 'SUCCEEDED' ORDER BY id")
+    assert [each for (each,) in numbers if each is not None] == list(range(300))
+    outers = [
+        each for each in events(tmp_path, "NodeStarted") if "designator" in each and "number" not in each["parameters"]
+    ]
+    assert len(outers) == continued + 1
+    rows = [each["parameters"]["what"] for each in outers]
+    assert rows[0] == {"object": 5, "row": 5}
+    assert {each["object"] for each in rows[1:]} == {4}  # as the follow-ups number it
+    assert len(events(tmp_path, "ObjectAttached")) == continued + 1
+
+
+def test_threads_that_reach_the_limit_together_continue_the_episode_once(tmp_path: Path) -> None:
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-6)
+    try:
+        with opened(tmp_path, Settings(episode_events_max=200)) as memory:
+            kind = memory.recording.type("action", "Step", {"thread": int, "number": int})
+            with memory.recording.episode(description="long") as episode:
+
+                def work(thread: int) -> None:
+                    episode.start(thread, kind, {"thread": thread})
+                    for number in range(300):
+                        episode.start((thread, number), kind, {"thread": thread, "number": number}, parent=thread)
+                        episode.end((thread, number))
+                    episode.end(thread)
+
+                threads = [threading.Thread(target=work, args=(each,)) for each in range(4)]
+                for each in threads:
+                    each.start()
+                for each in threads:
+                    each.join()
+            assert memory.status.faults == (0, None)
+    finally:
+        sys.setswitchinterval(interval)
+    assert_verified(tmp_path)
+    rows = ask(
+        tmp_path / "memory.db",
+        "SELECT step.thread, step.number, above.thread FROM step JOIN task_tree_node AS node USING (id)"
+        " JOIN step AS above ON above.id = node.parent_id"
+        " WHERE node.status = 'SUCCEEDED' AND step.number IS NOT NULL ORDER BY 1, 2",
+    )
+    assert rows == [(thread, number, thread) for thread in range(4) for number in range(300)]
+
+
+@pytest.mark.slow
+def test_a_forked_child_records_nothing_and_does_not_hang(tmp_path: Path) -> None:
+    script = (
+        "import os, sys, threading\n"
+        "from pycrorm_async import Memory\n"
+        "with Memory.sync(sys.argv[1]) as memory, memory.recording.episode(description='d') as episode:\n"
+        "    kind = memory.recording.type('action', 'Step')\n"
+        "    episode.start('a', kind)\n"
+        "    recording = memory.recording\n"
+        "    with episode._calls._lock, recording._lock:\n"
+        "        child = os.fork()\n"
+        "        if child == 0:\n"
+        "            def work():\n"
+        "                episode.start('child', recording.type('action', 'Other'))\n"
+        "                episode.node_reference('a')\n"
+        "                episode.tag('late')\n"
+        "            late = threading.Thread(target=work, daemon=True)\n"
+        "            late.start()\n"
+        "            late.join(10)\n"
+        "            memory.__exit__(None, None, None)\n"
+        "            os._exit(8 if late.is_alive() else 7)\n"
+        "    _, status = os.waitpid(child, 0)\n"
+        "    assert os.waitstatus_to_exitcode(status) == 7\n"
+        "    episode.end('a')\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", script, url_of(tmp_path)],
+        env=environment(), capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, "")
+    assert nodes(tmp_path) == [("Step", None, "SUCCEEDED", None)]
+
+
+@pytest.mark.slow
+def test_what_was_written_before_a_kill_is_stored_by_the_next_memory(tmp_path: Path) -> None:
+    script = (
+        "import os, sys\n"
+        "from pycrorm_async import Memory\n"
+        "memory = Memory.sync(sys.argv[1]).__enter__()\n"
+        "episode = memory.recording.episode(description='d')\n"
+        "kind = memory.recording.type('action', 'Step', {'number': int})\n"
+        "for number in range(10**6):\n"
+        "    episode.start(number, kind, {'number': number})\n"
+        "    episode.end(number)\n"
+        "    os.write(1, b'%d\\n' % number)\n"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", script, url_of(tmp_path)], env=environment(), stdout=subprocess.PIPE
+    ) as process:
+        assert process.stdout is not None
+        announced = [int(process.stdout.readline()) for _ in range(500)]
+        process.kill()
+        announced += map(int, process.stdout.read().rpartition(b"\n")[0].split())
+    asyncio.run(recover(url_of(tmp_path)))
+    succeeded = "SELECT number FROM step JOIN task_tree_node USING (id) WHERE status = 'SUCCEEDED'"
+    assert set(announced) <= {number for (number,) in ask(tmp_path / "memory.db", succeeded)}
+    assert_verified(tmp_path)
+
+
+@pytest.mark.slow
+@pytest.mark.every_python
+def test_a_full_spool_is_waited_for_by_a_thread(tmp_path: Path) -> None:
+    small = Settings(spool_bytes_max=2**20, spool_reserve_bytes=2**18, segment_bytes=2**16, record_bytes_max=2**14)
+    with Memory.sync(url_of(tmp_path), settings=small, writer="daemon") as memory:
+        kind = memory.recording.type("action", "Step", {"text": str})
+        with memory.recording.episode(description="d") as episode:
+            assert episode.wait_for_room(0.0)
+            for number in range(10_000):
+                if not episode.wait_for_room(0.0):
+                    break
+                episode.start(number, kind, {"text": "x" * 1_000})
+                episode.end(number)
+            assert number < 9_999
+            assert not episode.wait_for_room(0.05)
+        assert memory.status.faults == (0, None)
+
+
+# === contradicting processes ==================================================================================
+#
+# Processes that declare one type with other fields, and record at the same time through a daemon.
+
+_RECORD = """
+import sys
+from pycrorm_async import Memory
+
+url, spool, kind, text = sys.argv[1:]
+value = {"integer": int, "text": str, "boolean": bool}[kind](text)
+with Memory.sync(url, spool=spool, writer="daemon") as memory:
+    with memory.recording.episode(description=kind) as episode:
+        for number in range(3):
+            wave = memory.recording.type("action", "Wave", {"times": kind, "arm": "text"})
+            episode.start(number, wave, {"times": value, "arm": "LEFT"})
+            episode.end(number)
+    memory.flush()
+    assert memory.status.missing.total == 0
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.soak_on("sqlite")
+async def test_each_type_of_a_field_has_a_column_and_no_episode_is_parked(database_url: str, tmp_path: Path) -> None:
+    spool = tmp_path / "spool"
+    daemon = Daemon(database_url, spool)
+    values = {"integer": "3", "text": "three", "boolean": "x"}
+    runs = (asyncio.to_thread(run_script, _RECORD, database_url, spool, *each) for each in values.items())
+    assert [(each.returncode, each.stderr) for each in await asyncio.gather(*runs)] == [(0, "")] * 3
+    await daemon.stop()
+    log = await EventLog.open(DatabaseAddress.parse(database_url), create=False)
+    try:
+        assert await log.stopped() == []
+        first, *later = [declaration_of(each).fields[0].type for each in await log.declarations()]
+        result = await verify(log)
+        assert (result.damages, result.differences, result.unmade) == ([], [], {})
+    finally:
+        await log.close()
+    columns = ", ".join(("times", *(f"times_{each}" for each in later), "arm"))
+    rows = ask(database_url, f"SELECT {columns} FROM wave ORDER BY id")
+    recorded = {"integer": 3, "text": "three", "boolean": True}
+    for place, kind in enumerate((first, *later)):
+        assert [row[place] for row in rows if row[place] is not None] == [recorded[kind]] * 3
+    assert [row[3] for row in rows] == ["LEFT"] * 9
+    lines = [
+        f"warning: Wave.times is declared as {first} and as {each}; the {each} is kept as times_{each}"
+        for each in later
+    ]
+    status = await asyncio.to_thread(pycrorm, "status", "--url", database_url, "--spool", spool, cwd=tmp_path)
+    assert (status.returncode, [each for each in status.stderr.splitlines() if "Wave" in each]) == (0, lines)
+    before = tables_of(database_url)
+    await rebuild_memory(database_url)
+    assert differences(before, tables_of(database_url)) == []
+
+
+@pytest.mark.slow
+async def test_episodes_that_an_earlier_version_parked_are_folded_when_the_tables_are_opened_or_rebuilt(
+    database_url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(_layout: object, _declared: object, reason: Exception) -> None:
+        raise reason
+
+    types = declared("Wave", "wave", field("times", "integer", 2)), declared("Wave", "wave", field("times", "text", 2))
+    scripts = Script(1), Script(2)
+    scripts[0].put(NodeStarted("action", None, name_of(types[0]), {"times": 3}))
+    scripts[1].put(NodeStarted("action", None, name_of(types[1]), {"times": "three"}))
+    log = await EventLog.open(DatabaseAddress.parse(database_url), create=True)
+    try:
+        with monkeypatch.context() as earlier:
+            earlier.setattr(union, "_fit", refuse)
+            await stored_and_folded(log, [*declarations(*types), *scripts[0].records, *scripts[1].records])
+            assert [each.number for each in await log.stopped()] == [2]
+        await rebuild_memory(database_url)
+        assert await log.stopped() == []
+        assert ask(database_url, "SELECT times, times_text FROM wave ORDER BY id") == [(3, None), (None, "three")]
+    finally:
+        await log.close()

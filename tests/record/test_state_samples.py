@@ -1,0 +1,631 @@
+"""The samples of a robot's state during a motion: their times, channels and values, also in the tables."""
+
+from __future__ import annotations
+
+import asyncio
+import contextvars
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Generator, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+from sqlalchemy import select
+
+from pycrorm_async import Memory
+from pycrorm_async.clock import monotonic_ns
+from pycrorm_async.errors import CallerError
+from pycrorm_async.events.types import Happening, NodeEnded, NodeStarted, StateSampled
+from pycrorm_async.orm import Object as ObjectRow
+from pycrorm_async.orm import StateSample, TaskTreeNode
+from pycrorm_async.plan import (
+    ActionAbstract,
+    ChosenRobot,
+    LookAtActionPerformable,
+    MoveMotion,
+    MoveTorsoActionPerformable,
+    NavigateActionPerformable,
+    SimulatedTaskTree,
+    simulated_robot,
+)
+from pycrorm_async.plan.objects import require_robot
+from pycrorm_async.settings import Settings
+from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
+from pycrorm_async.world.pose import yaw_quaternion
+from tests.commands import environment
+from tests.memory.note_actions import url_of
+from tests.record.fakes import RecorderCase, findings, recorder_case
+
+# === sampler ==================================================================================================
+#
+# The sampling of the robot's state during a motion: times, channels and values.
+
+TURNED = yaw_quaternion(1.0)
+
+
+async def test_the_first_sample_of_an_episode_has_every_channel_and_the_next_one_only_changes(
+    case: RecorderCase,
+) -> None:
+    with case.episode():
+        await NavigateActionPerformable(Pose([0.5, 0, 0])).perform()
+        await MoveTorsoActionPerformable(0.25).perform()
+        await NavigateActionPerformable(Pose([0.5, 0.25, 0], TURNED)).perform()
+    robot = require_robot().body
+    first, *others = samples(case)
+    assert set(first.channels) == BASE | set(robot.joints)
+    assert (first.channels["base.x"], first.channels["base.qw"], first.channels["torso_lift_joint"]) == (0.0, 1.0, 0.0)
+    assert [each.channels for each in others] == [
+        {"base.x": 0.5},
+        {"torso_lift_joint": 0.25},
+        {"base.y": 0.25, "base.qz": TURNED.z, "base.qw": TURNED.w},
+    ]
+
+
+async def test_a_motion_that_changes_nothing_has_no_sample(case: RecorderCase) -> None:
+    with case.episode():
+        await NavigateActionPerformable(Pose([0.5, 0, 0])).perform()
+        count = len(samples(case))
+        await NavigateActionPerformable(Pose([0.5, 0, 0])).perform()
+        await LookAtActionPerformable(Pose([9, 0, 1.2])).perform()
+        looked = samples(case)[count:]
+    assert len(looked) == 1
+    assert set(looked[0].channels) <= {"head_pan_joint", "head_tilt_joint"}
+
+
+async def test_changes_between_motions_are_in_the_first_sample_of_the_next(case: RecorderCase) -> None:
+    with case.episode():
+        await NavigateActionPerformable(Pose([0.5, 0, 0])).perform()
+        require_robot().body.set_pose(Pose([2, 3, 0]))
+        await NavigateActionPerformable(Pose([4, 3, 0])).perform()
+    assert [each.channels for each in samples(case)[2:]] == [{"base.x": 2.0, "base.y": 3.0}, {"base.x": 4.0}]
+
+
+async def test_every_episode_begins_with_all_channels(case: RecorderCase) -> None:
+    for _ in range(2):
+        with case.episode():
+            await NavigateActionPerformable(Pose([0.5, 0, 0])).perform()
+    whole = [each for each in samples(case) if len(each.channels) > len(BASE)]
+    assert [each.channels["base.x"] for each in whole] == [0.0, 0.5]
+
+
+async def test_a_long_motion_is_sampled_in_between(case: RecorderCase) -> None:
+    steps = [step / 20 for step in range(1, 21)]
+
+    async def drive(body: Object, target: Pose) -> None:
+        for share in steps:
+            body.set_pose(Pose([target.position.x * share, 0, 0]))
+            await seen(case, "base.x", share)
+
+    with case.episode(), ChosenRobot("mine", Robot(drive)):
+        await NavigateActionPerformable(Pose([1, 0, 0])).perform()
+    assert values(case, "base.x") == [0.0, *steps]
+    assert {tuple(each.channels) for each in samples(case)[1:]} == {("base.x",)}
+
+
+async def test_a_motion_without_an_await_is_sampled_too(case: RecorderCase) -> None:
+    def drive(body: Object, target: Pose) -> None:
+        for x in (0.5, target.position.x):
+            body.set_pose(Pose([x, 0, 0]))
+            end_s = time.monotonic() + 10
+            while not written(case, "base.x", x) and time.monotonic() < end_s:
+                pass
+
+    with case.episode(), ChosenRobot("mine", Robot(drive)):
+        await NavigateActionPerformable(Pose([1, 0, 0])).perform()
+    assert values(case, "base.x") == [0.0, 0.5, 1.0]
+
+
+async def test_between_start_and_end_only_changes_beyond_the_margin_are_written() -> None:
+    settings = Settings(sample_interval_ms=1, sample_change_min=0.1)
+    with recorder_case(settings) as case, BulletWorld():
+
+        async def drive(body: Object, target: Pose) -> None:
+            body.set_pose(Pose([0.5, 0.0, 0]))
+            await seen(case, "base.x", 0.5)
+            body.set_pose(Pose([0.59, 0.09, 0]))
+            await asyncio.sleep(0.03)
+            body.set_pose(Pose([0.62, 0.09, 0]))
+            await seen(case, "base.x", 0.62)
+            body.set_pose(target)
+
+        Object("pr2", ObjectType.ROBOT)
+        with case.episode(), ChosenRobot("mine", Robot(drive)):
+            await NavigateActionPerformable(Pose([0.625, 0.095, 0])).perform()
+        assert [each.channels for each in samples(case)[1:]] == [
+            {"base.x": 0.5},
+            {"base.x": 0.62},
+            {"base.x": 0.625, "base.y": 0.095},  # the final position, to the last bit
+        ]
+
+
+async def test_a_cancelled_motion_ends_with_the_state_in_which_it_stopped(case: RecorderCase) -> None:
+    arrived = asyncio.Event()
+
+    async def drive(body: Object, _target: Pose) -> None:
+        body.set_pose(Pose([0.25, 0, 0]))
+        await seen(case, "base.x", 0.25)
+        body.set_pose(Pose([0.375, 0, 0]))
+        arrived.set()
+        await asyncio.sleep(60)
+
+    with case.episode(), ChosenRobot("mine", Robot(drive)):
+        task = asyncio.create_task(NavigateActionPerformable(Pose([1, 0, 0])).perform())
+        await arrived.wait()
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+        count = len(samples(case))
+        require_robot().body.set_pose(Pose([7, 0, 0]))
+        await asyncio.sleep(0.02)
+        assert len(samples(case)) == count
+    assert values(case, "base.x") == [0.0, 0.25, 0.375]
+
+
+async def test_concurrent_motions_each_have_the_state_in_which_they_ended(case: RecorderCase) -> None:
+    first_ended = asyncio.Event()
+
+    async def drive(body: Object, target: Pose) -> None:
+        await seen(case, "base.z", 0.0)
+        if target.position.x:
+            body.set_pose(Pose([target.position.x, body.pose.position.y, 0]))
+            await seen(case, "base.x", 1.0)
+        else:
+            await first_ended.wait()
+            body.set_pose(Pose([body.pose.position.x, target.position.y, 0]))
+
+    async def first() -> None:
+        await NavigateActionPerformable(Pose([1, 0, 0])).perform()
+        first_ended.set()
+
+    with case.episode(), ChosenRobot("mine", Robot(drive)):
+        await asyncio.gather(first(), NavigateActionPerformable(Pose([0, 2, 0])).perform())
+    # A channel is written when it differs from its last value: the state at a moment is the last written one before it.
+    state: dict[str, float] = {}
+    ends: dict[int, dict[str, float]] = {}
+    for each in samples(case):
+        assert each.node is not None
+        state |= each.channels
+        ends.pop(each.node, None)
+        ends[each.node] = dict(state)
+    one, two = ends.values()  # by their last samples: a plan yields to the loop now and then, so either may start first
+    assert one["base.x"] == 1.0
+    assert (two["base.x"], two["base.y"]) == (1.0, 2.0)
+
+
+async def test_a_sample_without_space_is_left_out_and_the_next_one_has_all_changes_since_the_last_written(
+    case: RecorderCase,
+) -> None:
+    with case.episode():
+        await NavigateActionPerformable(Pose([0.5, 0, 0])).perform()
+        count = len(samples(case))
+        case.sink.full = True
+        target = MoveMotion(Pose([1, 0, 0]))
+        case.sink.space.set()
+        await target.perform()
+        assert len(samples(case)) == count
+        assert case.recorder.samples_left_out == 1
+        case.sink.full = False
+        await NavigateActionPerformable(Pose([1, 2, 0])).perform()
+    assert [each.channels for each in samples(case)[count:]] == [{"base.x": 1.0}, {"base.y": 2.0}]
+    assert case.recorder.samples_left_out == 1
+    assert case.emitter.faults.total == 0
+
+
+async def test_a_fault_of_the_recorder_is_counted_and_the_motion_continues(case: RecorderCase) -> None:
+    with case.episode():
+        await NavigateActionPerformable(Pose([0.5, 0, 0])).perform()
+        before = case.emitter.faults.total
+
+        def broken(*_arguments: object) -> None:
+            raise RuntimeError("the sampler is on fire")
+
+        case.emitter.offer = broken  # type: ignore[method-assign,assignment]
+        await NavigateActionPerformable(Pose([1, 0, 0])).perform()
+    assert require_robot().body.pose == Pose([1, 0, 0])
+    assert case.emitter.faults.total == before + 1
+    assert case.emitter.faults.last == "StateSampled: RuntimeError: the sampler is on fire"
+
+
+# === sampled motions ==========================================================================================
+#
+# Move a robot of the user during a recorded motion, and read the samples of its state.
+
+SAMPLED = Settings(sample_interval_ms=1)
+BASE = {"base.x", "base.y", "base.z", "base.qx", "base.qy", "base.qz", "base.qw"}
+
+
+class Robot:
+    """A user's robot, whose base goes where the test sends it."""
+
+    def __init__(self, drive: Callable[[Object, Pose], object]) -> None:
+        self.drive = drive
+
+    async def navigate(self, motion: MoveMotion) -> None:
+        going = self.drive(require_robot().body, motion.target)
+        if asyncio.iscoroutine(going):
+            await going
+
+    async def move_tcp(self, motion: object) -> None: ...
+    async def looking(self, motion: object) -> None: ...
+    async def move_gripper(self, motion: object) -> None: ...
+    async def move_arm_joints(self, motion: object) -> None: ...
+    async def move_joints(self, motion: object) -> None: ...
+
+
+def samples(case: RecorderCase) -> list[StateSampled]:
+    """Return all samples in the order of writing, and assert that each is inside its motion."""
+    result = []
+    for name in case.sink.sequences:
+        events = case.sink.of(name)
+        assert findings(events) == []
+        started = {sequence: event for sequence, event in events if isinstance(event, NodeStarted)}
+        ended = {event.node: sequence for sequence, event in events if isinstance(event, NodeEnded)}
+        for sequence, event in events:
+            if isinstance(event, StateSampled):
+                assert event.node is not None
+                assert started[event.node].kind == "motion"
+                assert event.node < sequence < ended.get(event.node, sequence + 1)
+                result.append(event)
+    return result
+
+
+def values(case: RecorderCase, channel: str) -> list[float]:
+    return [each.channels[channel] for each in samples(case) if channel in each.channels]
+
+
+def written(case: RecorderCase, channel: str, value: float) -> bool:
+    """Return whether a sample with this value is written yet, while other threads write."""
+    with case.sink.lock:
+        events: list[Happening] = [event for _, _, event in case.sink.records]
+    return any(isinstance(each, StateSampled) and each.channels.get(channel) == value for each in events)
+
+
+async def seen(case: RecorderCase, channel: str, value: float) -> None:
+    async with asyncio.timeout(10):
+        while not written(case, channel, value):  # noqa: ASYNC110  the sampler sets no event of ours
+            await asyncio.sleep(0.001)
+
+
+# === fixtures =================================================================================================
+#
+# Provide a recorder that samples the state of a PR2 in a world.
+
+
+@pytest.fixture
+def case() -> Iterator[RecorderCase]:
+    with recorder_case(SAMPLED) as sampled_case, BulletWorld(), simulated_robot:
+        Object("pr2", ObjectType.ROBOT)
+        yield sampled_case
+
+
+# === sampler lifetime =========================================================================================
+#
+# The sampler follows the robot, the simulation and the episode of a motion, and ends with all of them.
+
+
+async def test_another_robot_begins_with_every_channel(case: RecorderCase) -> None:
+    async def drive(body: Object, target: Pose) -> None:
+        body.set_pose(target)
+        await seen(case, "base.x", target.position.x)
+        body.remove()
+        other = Object("pr2", ObjectType.ROBOT, pose=Pose([8, 8, 0]))
+        await seen(case, "base.x", 8.0)
+        other.set_pose(Pose([9, 8, 0]))
+
+    with case.episode(), ChosenRobot("mine", Robot(drive)):
+        await NavigateActionPerformable(Pose([1, 0, 0])).perform()
+    result = samples(case)
+    objects = [each.object.object for each in result]
+    assert [len(each.channels) > len(BASE) for each in result] == [True, False, True, False]
+    assert objects[0] == objects[1] != objects[2] == objects[3]
+    assert result[3].channels == {"base.x": 9.0}
+
+
+@dataclass
+class ThinkActionPerformable(ActionAbstract):
+    async def perform(self) -> None:
+        with SimulatedTaskTree():
+            await NavigateActionPerformable(Pose([3, 0, 0])).perform()
+
+
+async def test_the_robot_of_a_simulation_is_sampled_in_the_simulation(case: RecorderCase) -> None:
+    with case.episode() as episode:
+        await NavigateActionPerformable(Pose([1, 0, 0])).perform()
+        await ThinkActionPerformable().perform()
+        await NavigateActionPerformable(Pose([2, 0, 0])).perform()
+    (simulated,) = (name for name in case.sink.sequences if name != episode.id)
+    real = [event for _, event in case.sink.of(episode) if isinstance(event, StateSampled)]
+    only_thought = [event for _, event in case.sink.of(simulated) if isinstance(event, StateSampled)]
+    assert [each.channels["base.x"] for each in real] == [0.0, 1.0, 2.0]
+    assert [each.channels["base.x"] for each in only_thought] == [1.0, 3.0]
+    assert len(samples(case)) == 5
+
+
+async def test_a_motion_that_outlives_its_episode_is_not_sampled_afterwards(case: RecorderCase) -> None:
+    going = asyncio.Event()
+
+    async def drive(body: Object, _target: Pose) -> None:
+        body.set_pose(Pose([0.25, 0, 0]))
+        await going.wait()
+        body.set_pose(Pose([0.5, 0, 0]))
+
+    with ChosenRobot("mine", Robot(drive)):
+        with case.episode():
+            task = asyncio.create_task(NavigateActionPerformable(Pose([1, 0, 0])).perform())
+            await seen(case, "base.x", 0.25)
+        going.set()
+        await task
+        await asyncio.sleep(0.01)
+    assert values(case, "base.x") == [0.0, 0.25]
+
+
+async def test_without_a_robot_or_a_world_no_samples_are_taken_and_no_thread_runs() -> None:
+    async def drive(*_: object) -> None: ...
+
+    class Bodiless(Robot):
+        async def navigate(self, motion: MoveMotion) -> None: ...
+
+    with recorder_case(SAMPLED) as case, ChosenRobot("mine", Bodiless(drive)):
+        with case.episode():
+            await MoveMotion(Pose()).perform()
+        with case.episode(), BulletWorld():
+            await MoveMotion(Pose()).perform()
+        assert "pycrorm sampler" not in [each.name for each in threading.enumerate()]
+        assert samples(case) == []
+
+
+async def test_a_thread_samples_only_on_request_and_ends_with_the_memory() -> None:
+    def threads() -> list[str]:
+        return [each.name for each in threading.enumerate() if each.name == "pycrorm sampler"]
+
+    for settings, running in ((Settings(), []), (SAMPLED, ["pycrorm sampler"])):
+        with recorder_case(settings) as case, BulletWorld(), simulated_robot:
+            Object("pr2", ObjectType.ROBOT)
+            await NavigateActionPerformable(Pose([1, 0, 0])).perform()
+            await NavigateActionPerformable(Pose([2, 0, 0])).perform()
+            assert threads() == running
+            assert bool(samples(case)) is bool(running)
+        assert threads() == []
+
+
+class Interrupting(Object):
+    """At its first reading in the sampler's thread, the collector closes the plan that moves this robot."""
+
+    def __init__(self) -> None:
+        self.close: Callable[[], None] | None = None
+        self.closed = asyncio.Event()
+        super().__init__("pr2", ObjectType.ROBOT)
+
+    def joint_positions(self) -> dict[str, float]:
+        if self.close is not None and threading.current_thread().name == "pycrorm sampler":
+            close, self.close = self.close, None
+            close()
+        return super().joint_positions()
+
+
+async def test_a_motion_that_ends_during_its_own_sample_has_none_after_its_end() -> None:
+    """The collector, which may run in any thread, closes an abandoned plan like this."""
+    with recorder_case(SAMPLED) as case, BulletWorld():
+        robot = Interrupting()
+        with case.episode() as episode:
+            driving, ended = threading.Event(), threading.Event()
+
+            async def drive(_body: Object, _target: Pose) -> None:
+                driving.set()
+                await Suspended()
+
+            with ChosenRobot("mine", Robot(drive)):
+                dropped = MoveMotion(Pose([1, 0, 0])).perform()
+                context = contextvars.copy_context()
+                while not driving.is_set():  # the hook may let the loop run first
+                    context.run(dropped.send, None)
+            robot.set_pose(Pose([0.5, 0, 0]))
+
+            def close() -> None:
+                robot.set_pose(Pose([0.75, 0, 0]))
+                dropped.close()
+                ended.set()
+
+            robot.close = close
+            assert await asyncio.to_thread(ended.wait, 10)
+            await asyncio.sleep(0.01)
+            events = [type(event).__name__ for _, event in case.sink.of(episode)]
+        last_end = len(events) - 1 - events[::-1].index("NodeEnded")
+        assert "StateSampled" not in events[last_end:]
+        assert values(case, "base.x")[-1] == 0.75
+        assert case.emitter.faults.total == 0
+
+
+class Suspended:
+    """An await that never ends."""
+
+    def __await__(self) -> Generator[None, None, None]:
+        yield
+
+
+@pytest.mark.parametrize("interval", [0, -1, "5", float("nan")])
+def test_an_invalid_interval_is_refused(interval: object) -> None:
+    with pytest.raises(CallerError, match=r"sample_interval_ms is .*: it must be a number above zero"):
+        Settings(sample_interval_ms=interval)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("margin", [-0.1, float("nan"), float("inf"), None, "1"])
+def test_an_invalid_margin_is_refused(margin: object) -> None:
+    with pytest.raises(CallerError, match=r"sample_change_min is .*: it must be a number, zero or above"):
+        Settings(sample_change_min=margin)  # type: ignore[arg-type]
+
+
+# === state stream =============================================================================================
+#
+# A robot's trajectory during a motion, as a memory has it: times and positions, to the last bit.
+
+STEPS = 20
+SAMPLED_SELDOM = Settings(sample_interval_ms=2)
+
+
+class Driving:
+    """Move the base along x to its goal in 20 steps of 5 ms, and log the time and position of each step."""
+
+    def __init__(self) -> None:
+        self.log: list[tuple[int, float]] = []
+
+    async def navigate(self, motion: MoveMotion) -> None:
+        body = require_robot().body
+        start = body.pose.position.x
+        for step in range(1, STEPS + 1):
+            await asyncio.sleep(0.005)
+            x = start + (motion.target.position.x - start) * step / STEPS
+            body.set_pose(Pose([x, 0, 0]))
+            self.log.append((monotonic_ns(), x))
+
+    async def move_tcp(self, motion: object) -> None: ...
+    async def looking(self, motion: object) -> None: ...
+    async def move_gripper(self, motion: object) -> None: ...
+    async def move_arm_joints(self, motion: object) -> None: ...
+    async def move_joints(self, motion: object) -> None: ...
+
+
+@pytest.mark.slow
+async def test_a_trajectory_is_recorded_with_its_values_and_times(tmp_path: Path) -> None:
+    robot = Driving()
+    async with Memory.open(url_of(tmp_path), settings=SAMPLED_SELDOM) as memory:
+        with BulletWorld(), ChosenRobot("mine", robot):
+            body = Object("pr2", ObjectType.ROBOT)
+            joints = body.joint_positions()
+            async with memory.episode(description="driving"):
+                await NavigateActionPerformable(Pose([1, 0, 0])).perform()
+        await memory.flush()
+        assert memory.status.faults.total == 0
+        assert memory.status.samples_left_out == 0
+        async with memory.session() as session:
+            motion = (await session.scalars(select(TaskTreeNode).where(TaskTreeNode.dtype == "MoveMotion"))).one()
+            rows = (await session.scalars(select(StateSample).order_by(StateSample.id, StateSample.channel))).all()
+            robot_row = await session.get(ObjectRow, rows[-1].object_id)
+    assert {row.node_id for row in rows} == {motion.id}
+    assert robot_row is not None
+    assert robot_row.name == "pr2"
+    assert motion.end_ns is not None
+
+    times = [row.ns for row in rows]
+    assert times == sorted(times)
+    assert motion.start_ns < times[0]
+    assert times[-1] < motion.end_ns
+
+    first = {row.channel: row.value for row in rows if row.id == rows[0].id}
+    base = {"base.x": 0.0, "base.y": 0.0, "base.z": 0.0, "base.qx": 0.0, "base.qy": 0.0, "base.qz": 0.0, "base.qw": 1.0}
+    assert first == base | joints
+    way = [(row.ns, row.value) for row in rows if row.channel == "base.x"]
+    assert all(row.channel == "base.x" for row in rows if row.id != rows[0].id)
+    assert [x for _, x in way] == sorted(
+        {x for _, x in way}
+    )  # the base never moved back, and no sample is written twice
+    assert way[-1][1] == 1.0
+    stations = [0.0, *(x for _, x in robot.log)]
+    for ns, value in way:
+        # The value in force when the sample was written, or the one before or after if a step fell in between.
+        so_far = sum(set_ns <= ns for set_ns, _ in robot.log)
+        assert value in stations[max(0, so_far - 1) : so_far + 2]
+
+
+@pytest.mark.slow
+async def test_the_state_at_any_moment_is_the_last_written_value_of_each_channel(tmp_path: Path) -> None:
+    """Over several motions of several parts, the samples up to the end of a motion add up to the robot's state then."""
+    stood: list[dict[str, float]] = []
+    async with Memory.open(url_of(tmp_path), settings=Settings(sample_interval_ms=1)) as memory:
+        async with memory.episode(description="moving"):
+            with BulletWorld(), simulated_robot:
+                body = Object("pr2", ObjectType.ROBOT)
+                for round_ in range(1, 5):
+                    for moving in (
+                        NavigateActionPerformable(Pose([round_ / 8, -round_ / 3, 0])),
+                        MoveTorsoActionPerformable(round_ / 16),
+                    ):
+                        await moving.perform()
+                        x, y, z = body.pose.position
+                        stood.append({"base.x": x, "base.y": y, "base.z": z, **body.joint_positions()})
+        await memory.flush()
+        async with memory.session() as session:
+            node = TaskTreeNode
+            motions = (await session.scalars(select(node).where(node.kind == "motion").order_by(node.id))).all()
+            rows = (await session.scalars(select(StateSample).order_by(StateSample.id))).all()
+    assert len(motions) == len(stood) == 8
+    for motion, expected in zip(motions, stood, strict=True):
+        assert motion.end_ns is not None
+        state = {row.channel: row.value for row in rows if row.ns <= motion.end_ns}
+        assert {channel: state[channel] for channel in expected} == expected
+
+
+@pytest.mark.slow
+async def test_no_samples_are_taken_unless_requested(tmp_path: Path) -> None:
+    async with Memory.open(url_of(tmp_path)) as memory:
+        with BulletWorld(), simulated_robot:
+            Object("pr2", ObjectType.ROBOT)
+            await NavigateActionPerformable(Pose([1, 0, 0])).perform()
+        await memory.flush()
+        assert "pycrorm sampler" not in [each.name for each in threading.enumerate()]
+        async with memory.session() as session:
+            assert (await session.scalars(select(StateSample))).all() == []
+
+
+@pytest.mark.slow
+async def test_a_memory_that_is_closed_during_a_motion_ends_its_thread(tmp_path: Path) -> None:
+    with BulletWorld(), ChosenRobot("mine", Driving()):
+        Object("pr2", ObjectType.ROBOT)
+        memory = Memory.open(url_of(tmp_path), settings=SAMPLED_SELDOM)
+        await memory.__aenter__()
+        driving = asyncio.create_task(NavigateActionPerformable(Pose([1, 0, 0])).perform())
+        async with asyncio.timeout(10):
+            while "pycrorm sampler" not in [each.name for each in threading.enumerate()]:  # noqa: ASYNC110  it sets no event of ours
+                await asyncio.sleep(0.001)
+        await memory.__aexit__(None, None, None)
+        assert "pycrorm sampler" not in [each.name for each in threading.enumerate()]
+        await driving
+        assert require_robot().body.pose == Pose([1, 0, 0])
+
+
+@pytest.mark.slow
+@pytest.mark.soak
+def test_a_forked_child_continues_without_sampling_and_its_parent_keeps_sampling(tmp_path: Path) -> None:
+    script = (
+        "import asyncio, os, sys, threading, warnings\n"
+        "warnings.simplefilter('ignore')\n"
+        "from sqlalchemy import select\n"
+        "from pycrorm_async import Memory, Settings\n"
+        "from pycrorm_async.orm import StateSample\n"
+        "from pycrorm_async.plan import *\n"
+        "from pycrorm_async.plan.objects import require_robot\n"
+        "from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose\n"
+        "from tests.record.test_state_samples import Driving\n"
+        "class Forking(Driving):\n"
+        "    child = None\n"
+        "    async def navigate(self, motion):\n"
+        "        if self.child is None:\n"
+        "            self.child = os.fork()\n"
+        "        require_robot().body.set_pose(motion.target)\n"
+        "async def main():\n"
+        "    robot = Forking()\n"
+        "    async with Memory.open(sys.argv[1], settings=Settings(sample_interval_ms=1)) as memory:\n"
+        "        with BulletWorld(), ChosenRobot('mine', robot):\n"
+        "            Object('pr2', ObjectType.ROBOT)\n"
+        "            await NavigateActionPerformable(Pose([1, 0, 0])).perform()\n"
+        "            if robot.child == 0:\n"
+        "                await NavigateActionPerformable(Pose([2, 0, 0])).perform()\n"
+        "                names = [each.name for each in threading.enumerate()]\n"
+        "                os._exit(7 if 'pycrorm sampler' not in names else 1)\n"
+        "            assert os.waitstatus_to_exitcode(os.waitpid(robot.child, 0)[1]) == 7\n"
+        "            await NavigateActionPerformable(Pose([3, 0, 0])).perform()\n"
+        "        await memory.flush()\n"
+        "        async with memory.session() as session:\n"
+        "            rows = (await session.scalars(select(StateSample).order_by(StateSample.id))).all()\n"
+        "            values = [row.value for row in rows if row.channel == 'base.x']\n"
+        "            print(values, memory.status.faults.total)\n"
+        "asyncio.run(main())\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script, url_of(tmp_path)],
+        env=environment(), capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert (done.stdout, done.returncode) == ("[0.0, 1.0, 1.0, 3.0] 0\n", 0), done.stderr
