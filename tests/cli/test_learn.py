@@ -142,7 +142,7 @@ def test_the_result_is_printed_as_tables(capsys: pytest.CaptureFixture[str], mon
     ]
 
 
-@pytest.mark.soak  # test_interruption sends the second signal to a script
+@pytest.mark.soak  # test_run sends the second signal to a script
 def test_a_second_interrupt_ends_at_once_and_resume_continues(tmp_path: Path) -> None:
     command = [*COMMAND, *BY_ONE, "--rollouts", "100000", "--json"]
     process = subprocess.Popen(

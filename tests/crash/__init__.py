@@ -3,38 +3,37 @@
 `python -m bench.faults` runs more and longer rounds, some on disks of their own.
 
  1  SIGKILL at any moment
-        test_queue_kill (48 rounds, 10,000 in the soak), test_killed_plan, test_daemon_kill, test_many_machines,
-        store/test_crash
+        test_killed (48 rounds, 10,000 in the soak), test_daemon, test_many_machines, store/test_crash
  2  killed at each step that touches disk or log, and once more
-        test_crash_points; queue/test_dead_source_deletion (sealing, removing), queue/test_repair
+        test_crash_points; queue/test_dead_source (sealing, removing), queue/test_maintenance
  3  power cut: any sectors of what was not synced
-        test_queue_power; a mounted image of a disk: the bench
+        test_disk; a mounted image of a disk: the bench
  4  torn write at every byte
-        queue/test_dead_source, queue/test_frame, queue/test_segment, queue/test_drain_status
+        queue/test_dead_source, queue/test_format, queue/test_drain_notes
  5  every bit flipped
-        queue/test_dead_source, queue/test_frame, queue/test_segment; queue/test_repair (any byte changed)
+        queue/test_dead_source, queue/test_format; queue/test_maintenance (any byte changed)
  6  an older record on the same blocks; segments are never reused
         queue/test_dead_source
  7  a sync that fails
-        test_queue_disk, queue/test_dead_source (a disk that fails while a dead recorder's records are made durable)
+        test_disk, queue/test_dead_source (a disk that fails while a dead recorder's records are made durable)
  8  a full disk, below the queue and below the database
-        test_queue_disk, store/test_full_disk, cli/test_bad_spool
+        test_disk, store/test_crash, cli/test_bad_spool
  9  a COMMIT whose reply is lost
         store/test_postgresql_faults, writer/test_drain, writer/test_writer_thread
 10  a database stopped or killed under load, a network that cuts, stalls, resets, dribbles
-        test_many_machines, test_daemon_kill, store/test_postgresql_faults
+        test_many_machines, test_daemon, store/test_postgresql_faults
 11  commits out of order, gaps
-        store/test_postgresql_schema (an earlier number is committed later), store/test_refused_events
+        store/test_postgresql_schema (an earlier number is committed later), store/test_append
 12  a writer that is suspended and resumes, a second writer
-        test_stopped_daemon, queue/test_locks, queue/test_live_source, cli/test_writer
+        test_daemon, queue/test_locks_and_forks, queue/test_live_source, cli/test_writer
 13  a projection killed, several at once, an event that cannot be folded
-        test_daemon_kill, test_cancelled, projections/test_projector (parked once, visible once),
+        test_daemon, test_cancelled, projections/test_projector (parked once, visible once),
         memory/test_delegated_writer
 14  cancelled at every await, fork, exit with a full queue, a requested stop
-        test_cancelled, store/test_crash, store/test_postgresql_faults, queue/test_fork, test_exit_and_clock,
-        test_stopped_daemon
+        test_cancelled, store/test_crash, store/test_postgresql_faults, queue/test_locks_and_forks,
+        test_killed, test_daemon
 15  a plan faster than its writer, clocks set back
-        queue/test_full_spool, memory/test_delegated_writer (a full spool), test_exit_and_clock
+        queue/test_full_spool, memory/test_delegated_writer (a full spool), test_killed
 
 A simulated disk replaces a mounted one where the machine permits no mount; no test is skipped. A pipe that outlives the
 process keeps what was acknowledged, and random choices follow from a printed seed.

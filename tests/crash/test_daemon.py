@@ -75,7 +75,7 @@ def own_server() -> Iterator[Server]:
         yield running
 
 
-@pytest.mark.soak  # store/test_postgresql_faults kills a server, memory/test_daemon_faults locks a daemon out
+@pytest.mark.soak  # store/test_postgresql_faults kills a server, memory/test_delegated_writer locks a daemon out
 def test_a_server_that_restarts_under_load_costs_no_event(own_server: Server, tmp_path: Path) -> None:
     lab = Lab(tmp_path, own_server.new_database(), random.randrange(2**31))
     try:
@@ -95,7 +95,7 @@ def test_a_server_that_restarts_under_load_costs_no_event(own_server: Server, tm
         lab.clear()
 
 
-@pytest.mark.soak  # memory/test_daemon_faults locks it
+@pytest.mark.soak  # memory/test_delegated_writer locks it
 def test_a_database_file_that_another_program_locks_costs_no_event(tmp_path: Path) -> None:
     lab = Lab(tmp_path, f"sqlite:///{tmp_path / 'memory.db'}", random.randrange(2**31))
     try:

@@ -207,8 +207,8 @@ def test_a_queue_that_does_not_fit_on_the_disk_is_refused_in_one_line_and_leaves
 #
 # A power cut before and after every sync takes no blob that a surviving record refers to.
 #
-# The machine is that of `test_queue_power`. A blob whose file was not synced may be missing, empty, zero or whole after
-# a cut, whatever the cut leaves of the record that refers to it.
+# The machine is that of the power cuts below. A blob whose file was not synced may be missing, empty, zero or whole
+# after a cut, whatever the cut leaves of the record that refers to it.
 
 
 class BlobMachine:

@@ -74,7 +74,7 @@ async def test_a_rebuild_killed_anywhere_changes_nothing_readers_see_and_the_nex
     await kill_again_and_again(database_url, 2, workers=1)
 
 
-@pytest.mark.soak  # above without workers; operations/test_fold_workers: they end with a process that is killed
+@pytest.mark.soak  # above without workers; operations/test_workers: they end with a process that is killed
 async def test_a_rebuild_with_workers_killed_anywhere_changes_nothing_readers_see(tmp_path: Path) -> None:
     await kill_again_and_again(f"sqlite:///{tmp_path}/memory.db", 1, workers=2)
 

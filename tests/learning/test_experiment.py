@@ -264,7 +264,7 @@ async def test_too_few_successes_are_reported_and_all_rollouts_kept(tmp_path: Pa
     assert len(frame) == 40
 
 
-@pytest.mark.soak  # test_recorded_policy learns in two rounds too
+@pytest.mark.soak  # test_policy learns in two rounds too
 async def test_a_second_round_learns_from_the_first_ones_policy_too(tmp_path: Path) -> None:
     place = MemoryLocation(f"sqlite:///{tmp_path}/memory.db")
     learned = await run(replace(SMALL, rounds=2, workers=1, evaluate=200, held_out=100, rollouts=600), place)

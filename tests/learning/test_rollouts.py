@@ -52,7 +52,7 @@ async def frame_of(memory: Memory, *, seed: int = 69, policy: Policy | None = No
     )
 
 
-@pytest.mark.soak  # plan/test_default_policy performs other samples, test_policy compares their distributions
+@pytest.mark.soak  # plan/test_actions performs other samples, test_policy compares their distributions
 async def test_default_rollouts_succeed_as_often_as_in_the_thesis_and_never_from_the_top() -> None:
     """15.77 % there; two standard errors of 5,000 are one percent."""
     tried: Counter[Grasp] = Counter()

@@ -170,7 +170,7 @@ def test_learning_again_yields_the_same_policy(learned: Policy, successes: list[
     assert learn(frame_of(successes)) == learned
 
 
-@pytest.mark.soak  # test_policy_file reads one there
+@pytest.mark.soak  # test_policy reads one there
 def test_a_learned_policy_is_the_same_in_another_process_without_pyjpt(learned: Policy, tmp_path: Path) -> None:
     from tests.learning.test_policy import ELSEWHERE
 

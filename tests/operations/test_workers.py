@@ -197,7 +197,7 @@ def verify_each_note_is_stored(folder: Path, url: str) -> None:
     assert answer("verify", cwd=folder)["differences"] == []
 
 
-@pytest.mark.soak  # test_faulty_workers kills one in its transaction
+@pytest.mark.soak  # below one is killed in its transaction
 def test_a_daemon_whose_workers_are_both_killed_continues_to_fold(folder: Path) -> None:
     url = leave_many_notes(folder)
     with started(folder) as process:

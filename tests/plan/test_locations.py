@@ -116,7 +116,7 @@ def test_candidates_are_on_the_floor_face_the_target_and_are_clear_of_furniture(
     assert distances == pytest.approx(sorted(distances))
 
 
-@pytest.mark.soak  # test_opening_poses requires both arms of one place
+@pytest.mark.soak  # test_doors requires both arms of one place
 @pytest.mark.slow
 def test_the_requested_arms_reach(scene: Scene) -> None:
     def reaching(arm: Arms | None) -> set[tuple[Arms, ...]]:
