@@ -94,7 +94,7 @@ def test_every_kind_of_field_has_its_column() -> None:
         FieldDeclared("inner_side", "inner_side", "enum", 13, optional=True, enum=f"{module}.Colour"),
         FieldDeclared("mode", "mode", "text", 14),
         FieldDeclared("number", "number", "real", 15),
-        FieldDeclared("maybe", "maybe", "enum", 16, optional=True, enum="pycrorm_async.world.pose.Arms"),
+        FieldDeclared("maybe", "maybe", "enum", 16, optional=True, enum="pycrorm_async.world.enums.Arms"),
         FieldDeclared("poses", "poses", "list", 17, item="pose"),
         FieldDeclared("triple", "triple", "list", 18, item="real"),
     )
