@@ -628,6 +628,8 @@ _WIDTHS: dict[Storage, int] = {"number": 4, "boolean": 1, "text": 0, "json": 0, 
 """The bytes to which PostgreSQL aligns a column, 8 for the others. Columns in this order need no bytes in between."""
 
 _ORDER = "order"
+MARKED: Final = "marked"
+"""The entry of a table's `info` that is True if its column `simulated` marks simulations, and is no field of a type."""
 
 
 def make_table(name: str, columns: dict[str, Storage], generation: int, stored: Callable[[str], str]) -> Table:
@@ -657,7 +659,7 @@ def _make_table(
             )
             for column, storage in sorted(columns.items(), key=lambda item: -_WIDTHS.get(item[1], 8))
         ),
-        info={_ORDER: tuple(columns)},
+        info={_ORDER: tuple(columns), MARKED: "simulated" in CORE.get(name, ())},
     )
     if keys := [table.c[column] for column, storage in columns.items() if storage == "key"]:
         table.append_constraint(_Key(*keys))

@@ -43,6 +43,7 @@ from pycrorm_async.projections.columns import (
     CORE,
     EPISODE,
     LINK_BOX,
+    MARKED,
     OF_NO_EPISODE,
     OWN,
     Layout,
@@ -195,7 +196,7 @@ def _of_concepts(_tables: Tables, name: str) -> View:
 
 def _happened(rows: Table, simulations: Table) -> ColumnElement[bool]:
     """Return the condition that a row does not belong to a simulation."""
-    if "simulated" in rows.c:
+    if rows.info[MARKED]:
         return ~rows.c.simulated
     return absent(rows.c[EPISODE], simulations.c.id)
 
