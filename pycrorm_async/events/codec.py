@@ -29,12 +29,12 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Callable, Mapping
-from typing import Any, Final, NamedTuple, TypeAlias
+from typing import Any, Final, NamedTuple, TypeAlias, get_args
 
 import msgspec
 
 from pycrorm_async.events.ids import EpisodeId
-from pycrorm_async.events.types import EVENT_TYPES, DescriptionDeclared, DesignatorTypeDeclared, Happening
+from pycrorm_async.events.types import EVENT_TYPES, DescriptionDeclared, DesignatorTypeDeclared, Happening, NodeKind
 
 # === upcasters ================================================================================================
 
@@ -95,7 +95,10 @@ class Decoder:
                 if not 1 <= version < current:
                     raise UnknownShape(f"{type_name} has version {version}, this version reads {current}")
                 payload = self._upcast(type_name, payload, version, current)
-            return decode_current(payload)
+            try:
+                return decode_current(payload)
+            except msgspec.ValidationError:
+                return decode_current(_described_by_class(type_name, payload))
         except (UnicodeDecodeError, RecursionError) as error:  # invalid UTF-8, or nesting too deep
             raise msgspec.DecodeError(str(error)) from None
 
@@ -126,6 +129,21 @@ class Decoder:
             except (LookupError, TypeError, ValueError, AttributeError) as error:
                 raise msgspec.DecodeError(f"the payload is not of version {old}: {error!r}") from error
         return msgspec.json.encode(document)
+
+
+def _described_by_class(type_name: str, payload: bytes) -> bytes:
+    """Return a node's start with a valid kind, and a designator type with a valid concept.
+
+    Earlier versions wrote the value of the designator's own field `kind` or `concept`, whatever its type. The fold has
+    the kind from the declaration; a node without a declaration is an action.
+    """
+    document = msgspec.json.decode(payload)
+    if isinstance(document, dict):
+        if type_name == "NodeStarted" and document.get("kind", "root") not in get_args(NodeKind):
+            document["kind"] = "action"
+        if type_name == "DesignatorTypeDeclared" and not isinstance(document.get("concept"), str):
+            document.pop("concept", None)
+    return msgspec.json.encode(document)
 
 
 class _Versioned(msgspec.Struct):

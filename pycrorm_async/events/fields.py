@@ -8,6 +8,7 @@
 | list, dict | none: rows in `parameter_item` |
 | `true`, `false`, in any case | `_true`, `_false`, because SQLite cannot name a view's column `true` or `false` |
 | a name of more than 60 bytes | its beginning, `_` and 12 hexadecimal digits of the whole name's BLAKE2b |
+| a reserved name, such as `kind` | `kind_`: the recorder declares the field itself under that name |
 
 A column's name depends on the field's name and type alone, so it is the same in every process and on both databases.
 Field names never begin with an underscore, so `_true` cannot collide with another field's column. A mapped class
@@ -199,6 +200,30 @@ def fault_in_fields(fields: Sequence[FieldDeclared]) -> str | None:
     return None
 
 
+def without_reserved_names(fields: Iterable[FieldDeclared]) -> list[FieldDeclared]:
+    """Return these fields, with as many `_` behind a reserved name as make it one that no other field has.
+
+    >>> [each.name for each in without_reserved_names([FieldDeclared("kind", "kind", "text", 2)])]
+    ['kind_']
+    """
+    renamed = list(fields)
+    taken = set().union(*map(_names, renamed))
+    kinds: set[str] = set()
+    for index, own in enumerate(renamed):
+        field = own
+        while (
+            _names(field) & RESERVED_COLUMNS
+            or any(_is_named(field, kind) and not _is_first(field, kind, kinds) for kind in _SPECIAL_KINDS)
+            or (field is not own and _names(field) & taken)
+        ):
+            name = f"{field.name}_"
+            field = msgspec.structs.replace(field, name=name, column=column_name(name, field.type))
+        renamed[index] = field
+        taken |= _names(field)
+        kinds.add(field.type)
+    return renamed
+
+
 class AcceptedFields:
     """The fields that one table has so far; checks each further one alone, so its cost does not grow with their number.
 
@@ -219,8 +244,7 @@ class AcceptedFields:
         if fault is not None:
             return fault
         for kind in _SPECIAL_KINDS:
-            is_first = field.type == kind and kind not in self._kinds
-            if not is_first and _is_named(field, kind):
+            if _is_named(field, kind) and not _is_first(field, kind, self._kinds):
                 return _misnamed(field.name, kind)
         return None
 
@@ -241,7 +265,7 @@ def _misnamed(name: str, kind: str) -> str:
 
 def _fault_in_names(field: FieldDeclared, owners: Mapping[str, str]) -> str | None:
     """Return the reason why a field cannot have its name and column beside the names in `owners`, in lower case."""
-    names = {field.name.lower(), field.column.lower()}
+    names = _names(field)
     reserved = names & RESERVED_COLUMNS
     if reserved:
         return f"field {field.name!r} has a reserved name ({', '.join(sorted(reserved))})"
@@ -258,7 +282,15 @@ def _fields_named(fields: Iterable[FieldDeclared], kind: str) -> set[str]:
 
 
 def _is_named(field: FieldDeclared, kind: str) -> bool:
-    return bool({field.name.lower(), field.column.lower()} & {kind, f"{kind}_id"})
+    return bool(_names(field) & {kind, f"{kind}_id"})
+
+
+def _is_first(field: FieldDeclared, kind: str, kinds: Collection[str]) -> bool:
+    return field.type == kind and kind not in kinds
+
+
+def _names(field: FieldDeclared) -> set[str]:
+    return {field.name.lower(), field.column.lower()}
 
 
 # === tags =====================================================================================================

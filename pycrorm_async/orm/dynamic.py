@@ -110,7 +110,7 @@ class DynamicClasses:
     def of(self, name: str | type) -> type[Designator]:
         """Return the mapped class of a dtype, a table or a designator class, also built-in. Raises `CallerError`."""
         self.map()
-        wanted = getattr(name, "dtype", name.__name__) if isinstance(name, type) else name
+        wanted = getattr(name, "__dtype__", name.__name__) if isinstance(name, type) else name
         of_table = (
             dtype
             for dtype, declarations in self._declared.items()
@@ -243,9 +243,9 @@ class DynamicClasses:
         reference = f"{field.name}_id"
         related = one_of(lambda: getattr(class_, reference), target.__tablename__, target, lazy="selectin")
         mapper.add_property(field.name, related)
-        if not mapper.has_property(field.type):  # the first pose is also `pose`, the first object also `object`
-            mapper.add_property(field.type, synonym(field.name))
-            mapper.add_property(f"{field.type}_id", synonym(f"{field.name}_id"))
+        for name, own in ((field.type, field.name), (f"{field.type}_id", reference)):
+            if not mapper.has_property(name):  # the first pose is also `pose`, the first object also `object`
+                mapper.add_property(name, synonym(own))
 
     def _introduce(self, engine: AsyncEngine) -> None:
         identities = {dtype: str(class_.__mapper__.polymorphic_identity) for dtype, class_ in self._classes.items()}

@@ -139,7 +139,7 @@ def _with_node(  # noqa: C901  one function, because a call costs more than most
                 await admission
                 now_ns = monotonic_ns()
 
-            node = TaskTreeNode(self, self.kind, parent, now_ns)
+            node = TaskTreeNode(self, self.__kind__, parent, now_ns)
             if observer is not None:
                 observer.node_started(node)
             for tree in collecting.get():
@@ -623,7 +623,10 @@ class Arbiter:
                 if holder in ends:
                     resource = min((resource for _, resource in first.parts & claim.parts), key=lambda each: each.name)
                     raise ResourceDeadlock(
-                        resource, first.designator.dtype, claim.designator.dtype, holder.designator.dtype
+                        resource,
+                        first.designator.__dtype__,
+                        claim.designator.__dtype__,
+                        holder.designator.__dtype__,
                     )
                 if holder not in seen:
                     seen.add(holder)

@@ -491,6 +491,15 @@ class ResourcesNotAMethod(CallerError, TypeError):
         self.designator = designator
 
 
+class FieldHidesMethod(CallerError, TypeError):
+    """A designator class has a field with the name of a method."""
+
+    def __init__(self, designator: str, name: str) -> None:
+        super().__init__(f"{designator}.{name} must not be a field, because {name}() is a method: rename the field")
+        self.designator = designator
+        self.name = name
+
+
 class NotResolved(CallerError, AttributeError):
     """A description is used where a resolved designator is needed: `.resolve()` is missing."""
 

@@ -53,13 +53,15 @@ import operator
 from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Callable, Generator, Iterable, Iterator, Mapping
 from contextvars import Context, copy_context
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from numbers import Real
+from types import FunctionType
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, NamedTuple, NoReturn, Self, TypeAlias, TypeVar
 
 from pycrorm_async.plan.execution import Arbiter, is_wrapped, wrap_perform
 from pycrorm_async.plan.failures import (
     NOTHING,
+    FieldHidesMethod,
     IllPosedGoalFailure,
     NoRobotHere,
     NotALanguageExpression,
@@ -259,9 +261,13 @@ class Designator(Composable, ABC):
             it, so that two types never share a name by accident. Set it to keep the name when the class is renamed.
         aliases: a tuple of former names; queries for this type include records under them. Not inherited.
         concept: the SOMA concept it corresponds to, if there is one.
-        orm_class: a mapped class of the user's own for queries.
+        orm_class: a mapped class of the user's own for queries. Not inherited.
+
+    A field of a designator may have such a name too. Therefore the definition of the class keeps these attributes as
+    `__kind__`, `__dtype__` and so on, and all code reads them there.
 
     Raises:
+        FieldHidesMethod: at class definition, if a field has the name of a method, such as `perform`.
         PerformNotAsync: at class definition, if `perform` is not a coroutine function.
         ResourcesNotAMethod: at class definition, if `resources` is a field or a value.
     """
@@ -270,14 +276,25 @@ class Designator(Composable, ABC):
     dtype: ClassVar[str]
     concept: ClassVar[str | None] = None
     orm_class: ClassVar[type | None] = None
+    __kind__: ClassVar[NodeKind]
+    __dtype__: ClassVar[str]
+    __aliases__: ClassVar[Any] = ()
+    __concept__: ClassVar[str | None] = None
+    __orm_class__: ClassVar[type | None] = None
 
     def __init_subclass__(cls, **arguments: Any) -> None:
         super().__init_subclass__(**arguments)
-        own = vars(cls)
-        if not isinstance(own.get("dtype"), str):
-            cls.dtype = cls._name_in_memory()
-        if "resources" in own.get("__annotations__", ()) or not callable(own.get("resources", len)):
+        own, parameters = vars(cls), _annotated(cls)
+        if "resources" in parameters or not callable(own.get("resources", len)):
             raise ResourcesNotAMethod(cls.__qualname__)
+        if (hidden := next((name for name in parameters if _is_method(cls, name)), None)) is not None:
+            raise FieldHidesMethod(cls.__qualname__, hidden)
+        _describe(cls, {name: value for name, value in own.items() if name not in parameters})
+        if "dtype" not in own and "dtype" not in parameters:
+            cls.dtype = cls.__dtype__
+        for name in own.get("__annotations__", {}):
+            if name in parameters and name not in own and hasattr(ActionAbstract, name):
+                setattr(cls, name, field())  # otherwise `@dataclass` would take the inherited attribute as its default
         initialise = own.get("__init__")
         if inspect.isfunction(initialise) and "__dataclass_fields__" not in own and not _is_built_in(cls):
             cls.__init__ = record_arguments(initialise)  # type: ignore[method-assign]  # as `perform` below
@@ -303,6 +320,38 @@ class Designator(Composable, ABC):
 
 def _is_built_in(designator: type) -> bool:
     return designator.__module__.startswith("pycrorm_async.")
+
+
+def _annotated(designator: type) -> frozenset[str]:
+    """Return the annotated attributes of the user's classes that this one consists of, except those of the class."""
+    return frozenset(
+        name
+        for each in designator.__mro__
+        if not _is_built_in(each)
+        for name, kind in vars(each).get("__annotations__", {}).items()
+        if "ClassVar" not in str(kind)
+    )
+
+
+def _is_method(designator: type, name: str) -> bool:
+    """Return whether one of our classes that this one derives from has a method or property of this name."""
+    if name == "resolve":  # that of descriptions, which plans call on what may be resolved already
+        return True
+    kinds = (FunctionType, classmethod, staticmethod, property)
+    return any(isinstance(vars(each).get(name), kinds) for each in designator.__mro__ if _is_built_in(each))
+
+
+def _describe(designator: type[Designator], own: Mapping[str, Any]) -> None:
+    """Keep the attributes that describe a class, from its own ones without fields; ignore a value of another type."""
+    kind, dtype = own.get("kind"), own.get("dtype")
+    if isinstance(kind, str) and kind in ("action", "motion", "language"):
+        designator.__kind__ = kind  # type: ignore[assignment]  # just checked
+    designator.__dtype__ = dtype if isinstance(dtype, str) else designator._name_in_memory()  # noqa: SLF001  below it
+    designator.__aliases__ = own.get("aliases", ())
+    if isinstance(own.get("concept", 0), str | None):
+        designator.__concept__ = own["concept"]
+    orm_class = own.get("orm_class")
+    designator.__orm_class__ = orm_class if isinstance(orm_class, type) else None
 
 
 class ActionAbstract(Designator):
@@ -521,7 +570,7 @@ def name_of(value: Any) -> str:
     if isinstance(value, functools.partial):
         return name_of(value.func)
     if isinstance(value, Designator):
-        return value.dtype
+        return value.__dtype__
     if isinstance(value, ActionDescription):
         return type(value).__name__
     named = value if hasattr(value, "__qualname__") else type(value)
@@ -543,7 +592,7 @@ async def _run_branches(expression: Expression) -> list[Attempt]:
         return await attempt(functools.partial(perform_operand, operand))
 
     tasks = [
-        asyncio.create_task(branch(operand), name=f"{expression.dtype} {number}: {name_of(operand)}")
+        asyncio.create_task(branch(operand), name=f"{expression.__dtype__} {number}: {name_of(operand)}")
         for number, operand in enumerate(expression.operands)
     ]
     outside = await join_tasks(tasks)

@@ -166,6 +166,11 @@ class Performable(Protocol):
     kind: ClassVar[NodeKind]
     dtype: ClassVar[str]
     concept: ClassVar[str | None]
+    __kind__: ClassVar[NodeKind]
+    __dtype__: ClassVar[str]
+    __aliases__: ClassVar[Any]
+    __concept__: ClassVar[str | None]
+    __orm_class__: ClassVar[type | None]
 
     def perform(self) -> Coroutine[Any, Any, Any]:
         """Perform it and return when it has ended."""

@@ -223,6 +223,7 @@ def _node_started(event: StoredEvent, started: NodeStarted, designators: Designa
         columns[ROBOT] = robot.name
     if designator is not None:
         columns[DTYPE] = designator.dtype
+        columns[KIND] = designator.kind
         columns[PARAMETERS] = parameters
         rows.leaves.setdefault(designator.leaf, []).append(leaf)
         for table, each in parameter_rows:

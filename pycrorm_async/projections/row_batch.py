@@ -351,12 +351,13 @@ class DesignatorFold:
     `own_names` are the names under which events have the values of renamed fields, by the fields' names.
 
     Attributes:
+        kind: the kind of its nodes; earlier versions recorded the value of a field `kind` as the kind of a node.
         leaf: the leaf table and its columns.
     """
 
     def __init__(self, declared: DesignatorTypeDeclared, own_names: Mapping[str, str] = MappingProxyType({})) -> None:
         columned = [each for each in declared.fields if each.type not in ("list", "dict")]
-        self.dtype = declared.dtype
+        self.dtype, self.kind = declared.dtype, declared.kind
         self.leaf = (declared.table, ("id", EPISODE, *(each.column for each in columned)))
         self._columned = [
             (own_names.get(f.name, f.name), AS_IT_IS.get(f.type), _CONVERTED.get(f.type, _scalar), f) for f in columned

@@ -30,6 +30,7 @@ import typing
 from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime, timedelta
 from enum import Enum
+from functools import lru_cache
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from types import MappingProxyType, TracebackType
@@ -41,6 +42,7 @@ from sqlalchemy import inspect as inspect_row
 from pycrorm_async import orm
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.types import DescriptionDeclared
+from pycrorm_async.plan.field_types import ARGUMENTS
 from pycrorm_async.plan.language import Designator
 from pycrorm_async.plan.objects import (
     BelieveObject,
@@ -52,6 +54,7 @@ from pycrorm_async.plan.objects import (
 )
 from pycrorm_async.projections.row_batch import is_missing
 from pycrorm_async.query.snapshot import Moment, ObjectThen, WorldThen
+from pycrorm_async.record.declarations import declared_type
 from pycrorm_async.record.parameters import Parameter, Shape, Unresolved, parameters_of, shape_of
 from pycrorm_async.world.bounding_boxes import BoundingBox
 from pycrorm_async.world.bullet import BulletWorld, Object
@@ -94,7 +97,7 @@ def performable_of(row: orm.Designator, /, **replacements: Any) -> Designator:
     parameters = inspect.signature(kind).parameters
     if (unknown := next((name for name in replacements if name not in parameters), None)) is not None:
         raise CallerError(f"{row.dtype} has no parameter {unknown!r}; its parameters: {', '.join(parameters)}")
-    return typing.cast("Designator", _made(kind, _RowReader(row), (), replacements))
+    return typing.cast("Designator", _made(kind, _RowReader(row, names_in_rows(kind)), (), replacements))
 
 
 def _class_of(dtype: str) -> type[Designator]:
@@ -102,7 +105,7 @@ def _class_of(dtype: str) -> type[Designator]:
     classes = {
         f"{each.__module__}.{each.__qualname__}": each
         for each in _descendants(Designator)  # type: ignore[type-abstract]  # its concrete descendants are wanted
-        if each.dtype == dtype or dtype in vars(each).get("aliases", ())
+        if each.__dtype__ == dtype or dtype in each.__aliases__
     }
     if not classes:
         raise NotPerformable(f"no imported class has the dtype {dtype!r}: import the module that defines it")
@@ -143,17 +146,26 @@ def _made(kind: type, reader: _RowReader, outer: tuple[str, ...], replacements: 
     return kind(*positional, **named)
 
 
-class _RowReader:
-    """Reads parameters from one row."""
+@lru_cache(maxsize=1024)
+def names_in_rows(kind: type[Designator]) -> Mapping[str, str]:
+    """Return the names of the declared fields by those of the parameters, which differ for reserved names."""
+    fields = declared_type(kind, strict=False).fields
+    return {"_".join(each for each in path if each != ARGUMENTS): field.name for field, path, _ in fields}
 
-    def __init__(self, row: orm.Designator) -> None:
+
+class _RowReader:
+    """Reads parameters from one row; `names_in_rows` has the names of its attributes by those of the parameters."""
+
+    def __init__(self, row: orm.Designator, names_in_rows: Mapping[str, str]) -> None:
         self._row = row
+        self._names_in_rows = names_in_rows
         self._parameters: Mapping[str, Any] = vars(row).get("_parameters", {})  # empty unless the query loads them
 
     def missing(self, names: tuple[str, ...], reason: str) -> NotPerformable:
         name = "_".join(names)
-        if self._is_missing(name):
-            reason = f"it was not recorded, because {self._parameters[name]['missing']}"
+        recorded = self._names_in_rows.get(name, name)
+        if self._is_missing(recorded):
+            reason = f"it was not recorded, because {self._parameters[recorded]['missing']}"
         return NotPerformable(
             f"row {self._row.id} of {self._row.dtype} has no value for {name!r}: {reason}; pass one, as in"
             f" performable_of(row, {names[0]}=…)"
@@ -166,6 +178,7 @@ class _RowReader:
         """Return the parameter's value, converted to its declared type. Raises `NotPerformable`."""
         names = (*outer, parameter.name)
         name = "_".join(names)
+        name = self._names_in_rows.get(name, name)
         shape = None if isinstance(parameter.hint, Unresolved) else shape_of(parameter.hint)
         if shape is None:
             raise self.missing(names, "its type has no column")
@@ -175,10 +188,11 @@ class _RowReader:
             if self._is_missing(name):
                 raise self.missing(names, "it was not recorded")
             return self._container(name, parameter.hint, shape)
-        if hasattr(orm.Designator, name):
-            raise self.missing(names, "every row has another attribute of this name")
-        if not hasattr(self._row, name):
+        owner = next((each for each in type(self._row).__mro__ if name in vars(each)), None)
+        if owner is None:
             raise self.missing(names, f"the class {type(self._row).__name__} has no such attribute")
+        if issubclass(orm.Designator, owner):
+            raise self.missing(names, "every row has another attribute of this name")
         value = getattr(self._row, name)
         if value is None and (not shape.optional or self._is_missing(name)):
             raise self.missing(names, "it was not recorded")

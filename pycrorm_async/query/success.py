@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import NDArray
-from sqlalchemy import Select, column, inspect, select, table
+from sqlalchemy import Select, Text, column, inspect, select, table, type_coerce
 from sqlalchemy.ext.asyncio import AsyncConnection
 from sqlalchemy.orm import DeclarativeBase
 
@@ -294,6 +294,9 @@ async def success_samples(
         name, statement = await _statement(reading, connection, of)
         columns = {each.name: each for each in columns_of(statement, deferred=True)}
         wanted = [_column(each, columns, name) for each in (x, y, "status")]
+        whole_class = statement.column_descriptions[0]["expr"]
+        if isinstance(whole_class, type) and issubclass(whole_class, orm.Designator):  # not that of a field `status`
+            wanted[2] = wanted[2]._replace(expression=type_coerce(whole_class._status, Text()))  # noqa: SLF001
         if episodes is not None:
             statement = statement.where(_column(EPISODE, columns, name).expression.in_(episodes))
         plain = statement.with_only_columns(*(each.expression for each in wanted))

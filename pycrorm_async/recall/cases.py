@@ -230,6 +230,7 @@ class FeatureFields(NamedTuple):
     numbers: tuple[tuple[str, str], ...]
     poses: tuple[tuple[str, tuple[str, str, str, str]], ...]
     objects: tuple[str, ...]
+    kind: str
 
     @classmethod
     def of(cls, declaration: DesignatorTypeDeclared) -> FeatureFields:
@@ -243,7 +244,8 @@ class FeatureFields(NamedTuple):
 
         objects = tuple(named.get("object", ()))
         poses = tuple((name, (f"{each}_x", f"{each}_y", f"{each}_z", f"{each}_yaw")) for name, each in features("pose"))
-        return cls(declaration.dtype, features("text", "enum", "boolean"), features("integer", "real"), poses, objects)
+        texts, numbers = features("text", "enum", "boolean"), features("integer", "real")
+        return cls(declaration.dtype, texts, numbers, poses, objects, declaration.kind)
 
 
 def situation(
@@ -478,11 +480,11 @@ class EpisodeCases:
         parent = started.parent
         scope = self._running.get(parent) or self._scopes.get(parent) if parent is not None else None
         fields = None
-        if started.kind == "action" and started.designator is not None:
+        if started.designator is not None:
             fields = self._types.get(started.designator)
             if fields is None and (declaration := declaration_of(started.designator)) is not None:
                 fields = self._types[started.designator] = FeatureFields.of(declaration)
-        if fields is None:
+        if fields is None or fields.kind != "action":
             if scope is not None:
                 self._scopes[sequence] = scope
             return

@@ -611,7 +611,7 @@ def dtype_of(designator: str | type | None) -> str | None:
     """
     if designator is None or isinstance(designator, str):
         return designator
-    dtype = getattr(designator, "dtype", None)
+    dtype = getattr(designator, "__dtype__", None)
     if isinstance(dtype, str):
         return dtype
     if not isinstance(designator, type):
@@ -621,7 +621,7 @@ def dtype_of(designator: str | type | None) -> str | None:
 
 def aliases_of(designator: str | type | None) -> tuple[str, ...]:
     """Return the former names that a designator class declares."""
-    aliases = vars(designator).get("aliases", ()) if isinstance(designator, type) else ()
+    aliases = getattr(designator, "__aliases__", ())
     return tuple(aliases) if isinstance(aliases, tuple | list) else ()
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import inspect
 import re
 import typing
@@ -23,6 +22,7 @@ from pycrorm_async.events.fields import (
     fault_in_fields,
     fault_in_table,
     table_name,
+    without_reserved_names,
 )
 from pycrorm_async.events.ids import SLOT_FIRST_FIELD
 from pycrorm_async.events.types import (
@@ -408,7 +408,7 @@ class Declarations:
             declared = declared_type(
                 designator,
                 strict=self._strict,
-                field_types=self.known.fields_of(designator.dtype),
+                field_types=self.known.fields_of(designator.__dtype__),
                 classes_by_alias=self._classes_by_alias,
             )
             fault = declared.fault or self._fault_in_names(designator, declared)
@@ -428,8 +428,8 @@ class Declarations:
     def _fault_in_names(self, designator: type[Performable], declared: DeclaredType) -> str | None:
         """Return the reason why another live class already has the dtype or table name; None if none has."""
         if not designator.__module__.startswith(OUR_PACKAGE):
-            for other in _built_in_classes(designator.dtype):
-                return f"{_path(other)} already has the dtype {other.dtype!r} (set a class attribute `dtype`)"
+            for other in _built_in_classes(designator.__dtype__):
+                return f"{_path(other)} already has the dtype {other.__dtype__!r} (set a class attribute `dtype`)"
         names = (declared.declaration.dtype, declared.declaration.table)
         return _conflict(designator, self._classes_by_name, names, _DTYPE_IN_USE)
 
@@ -497,9 +497,8 @@ def declared_type(
             designator, list(_fields(designator, leave_out)), field_types or {}, undeclared, strict=strict
         )
     )
-    orm_class = vars(designator).get("orm_class")
-    table = getattr(orm_class, "__tablename__", None) or table_name(designator.dtype)
-    fault = fault_in_dtype(designator.dtype) or fault_in_table(table)
+    table = getattr(designator.__orm_class__, "__tablename__", None) or table_name(designator.__dtype__)
+    fault = fault_in_dtype(designator.__dtype__) or fault_in_table(table)
     if fault is not None:
         if strict:
             raise DeclarationRefused(_path(designator), fault)
@@ -508,10 +507,10 @@ def declared_type(
     if strict and fault is not None:
         raise DeclarationRefused(_path(designator), fault)
     declaration = DesignatorTypeDeclared(
-        kind=designator.kind,
-        dtype=designator.dtype,
+        kind=designator.__kind__,
+        dtype=designator.__dtype__,
         table=table,
-        concept=designator.concept,
+        concept=designator.__concept__,
         bases=_bases(designator),
         fields=tuple(field.declared for field in fields),
         aliases=aliases,
@@ -521,15 +520,15 @@ def declared_type(
             raise DeclarationRefused(_path(designator), reason)
         return _without_type(designator, fields, tuple(undeclared), reason)
     payload = encode(declaration)
-    return DeclaredType(designator.dtype, payload, fingerprint(payload), fields, declaration, tuple(undeclared), fault)
+    return DeclaredType(declaration.dtype, payload, fingerprint(payload), fields, declaration, tuple(undeclared), fault)
 
 
 def _without_type(
     designator: type[Performable], fields: tuple[Field, ...], undeclared: tuple[Undeclared, ...], fault: str
 ) -> DeclaredType:
     """Build the record of a class that cannot be declared: its nodes keep their parameters, but have no type."""
-    dtype = cut(clean(designator.dtype), _REASON_MAX)
-    placeholder = DesignatorTypeDeclared(kind=designator.kind, dtype=dtype, table="")
+    dtype = cut(clean(designator.__dtype__), _REASON_MAX)
+    placeholder = DesignatorTypeDeclared(kind=designator.__kind__, dtype=dtype, table="")
     return DeclaredType(dtype, b"", "", fields, placeholder, undeclared, fault)
 
 
@@ -538,6 +537,8 @@ def _declarable_fields(
 ) -> typing.Iterator[Field]:
     """Yield the fields that can be columns of one table, each with its own slot; add the others to `undeclared`."""
     accepted: list[FieldDeclared] = []
+    renamed = without_reserved_names(field.declared for field in fields)
+    fields = [field._replace(declared=declared) for field, declared in zip(fields, renamed, strict=True)]
     combined_fault = fault_in_fields([field.declared for field in fields])
     if strict and combined_fault is not None:
         raise DeclarationRefused(_path(designator), combined_fault)
@@ -558,7 +559,7 @@ def _declarable_fields(
 def _bases(designator: type[Performable]) -> tuple[str, ...]:
     """Return the dtypes of the base classes, nearest first, without the abstract roots of the plan layer."""
     return tuple(
-        base.dtype
+        base.__dtype__
         for base in designator.__mro__[1:]
         if issubclass(base, Designator) and not getattr(base, "__abstractmethods__", None)
     )
@@ -577,10 +578,8 @@ def _aliases_or_fault(
 
 
 def _aliases(designator: type[Performable]) -> tuple[str, ...]:
-    """Read the class attribute `aliases`, the former names of this type; a subclass does not inherit them."""
-    aliases = vars(designator).get("aliases", ())
-    if dataclasses.is_dataclass(designator) and "aliases" in {each.name for each in dataclasses.fields(designator)}:
-        return ()
+    """Read the former names of this type; a subclass does not inherit them."""
+    aliases = designator.__aliases__
     if not isinstance(aliases, tuple | list) or not all(isinstance(each, str) for each in aliases):
         raise DeclarationRefused(
             _path(designator), f"its aliases {aliases!r} are not a tuple of names such as ('OldAction',)"
@@ -595,7 +594,7 @@ def _aliases(designator: type[Performable]) -> tuple[str, ...]:
 def _fault_in_alias(alias: str, designator: type[Performable]) -> str | None:
     if fault_in_dtype(alias) is not None:
         return "is not a name (letters, digits and single underscores)"
-    if alias == designator.dtype:
+    if alias == designator.__dtype__:
         return "is its current dtype"
     if alias in _bases(designator):
         return "is the dtype of one of its base classes, which is another type"
@@ -606,7 +605,7 @@ def _fault_in_alias(alias: str, designator: type[Performable]) -> str | None:
 
 def _built_in_classes(dtype: str) -> typing.Iterator[type[Designator]]:
     for other in _descendants(Designator):
-        if other.__module__.startswith(OUR_PACKAGE) and getattr(other, "dtype", None) == dtype:
+        if other.__module__.startswith(OUR_PACKAGE) and getattr(other, "__dtype__", None) == dtype:
             yield other
 
 

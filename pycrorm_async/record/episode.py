@@ -158,7 +158,7 @@ class Episode(EpisodeWriter[TaskTreeNode]):
                 result = encode_or_missing(node.result, self) if node.result is not None else None
                 status: NodeStatus = node.status._value_  # `value` takes 0.1 µs longer
                 assert node.designator is not None
-                self._close_node(NodeEnded(record.sequence, status, failure, result), node.designator.dtype)
+                self._close_node(NodeEnded(record.sequence, status, failure, result), node.designator.__dtype__)
         finally:
             self._ending.discard(node)
 
@@ -229,8 +229,8 @@ class Episode(EpisodeWriter[TaskTreeNode]):
         return self._entered_world
 
     def _note_unawaited(self, designator: type[Designator]) -> None:
-        self.emitter.note_unawaited(designator.dtype)
-        fault = f"{designator.dtype}.perform() was called and never awaited"
+        self.emitter.note_unawaited(designator.__dtype__)
+        fault = f"{designator.__dtype__}.perform() was called and never awaited"
         if fault not in self.faults:
             self.faults = (*self.faults[1 - UNAWAITED_MAX :], fault)
 

@@ -73,7 +73,7 @@ class Recorder:
         self._strict = emitter.settings.on_unrecordable == "refuse"
         self._declarations = Declarations(strict=self._strict)
         self._sampler = _sampler_of(emitter)
-        self.calls = CalledPerforms(lambda designator: emitter.note_unawaited(getattr(designator, "dtype", "it")))
+        self.calls = CalledPerforms(lambda designator: emitter.note_unawaited(getattr(designator, "__dtype__", "it")))
         """Performs called outside any episode."""
 
     @property
@@ -333,7 +333,7 @@ def _description_of(simulation: Simulation) -> str:
     if simulation.description is not None:
         return simulation.description[:EPISODE_TEXT_MAX]
     if simulation.by is not None and simulation.by.designator is not None:
-        return f"simulation in {simulation.by.designator.dtype}"
+        return f"simulation in {simulation.by.designator.__dtype__}"
     return "simulation"
 
 

@@ -25,6 +25,7 @@ from pycrorm_async.orm import TaskTreeNode
 from pycrorm_async.plan import ActionAbstract
 from pycrorm_async.projections.custom import Projection, columns_of, states
 from pycrorm_async.projections.verify import verify
+from pycrorm_async.query.again import names_in_rows
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.record.recording import Recording
 from pycrorm_async.settings import Settings
@@ -87,10 +88,11 @@ async def check_designator(designator: ActionAbstract, folder: Path) -> Any:
             mapped = memory.mapped(type(designator))
             row = (await session.scalars(select(mapped).order_by(mapped.id))).first()
     assert row is not None, f"{type(designator).__name__} has no row: does its perform() run?"
+    names = names_in_rows(type(designator))
     for field in dataclasses.fields(designator):
         value = getattr(designator, field.name)
         if value is None or isinstance(value, str | int | float | datetime):
-            stored = getattr(row, field.name)
+            stored = getattr(row, names.get(field.name, field.name))
             expected = value.name if isinstance(value, Enum) and not isinstance(stored, Enum) else value
             assert stored == expected, f"{field.name} is {stored!r} in the table instead of {expected!r}"
     return row

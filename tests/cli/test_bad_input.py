@@ -114,7 +114,7 @@ def test_a_plan_that_fails_ends_with_one_line_and_what_it_did_is_recorded(
     ("function", "line", "second"),
     [
         ("unrecordable", "NoteAction.weight is recorded as missing: declared as float, got a str", "NoteAction"),
-        ("reserved", "BadAction.robot_state is recorded as missing: field 'robot_state' has a reserved", "BadAction"),
+        ("without_column", "BadAction.words is recorded as missing: has the type set[str], which has no", "BadAction"),
         ("twins", "plans.NoteActionPerformable already has the dtype or table 'NoteAction'", None),
     ],
 )
@@ -288,14 +288,14 @@ async def unrecordable():
     await NoteActionPerformable("a").perform()
     await NoteActionPerformable("b", weight="heavy").perform()
 
-async def reserved():
+async def without_column():
     @dataclass
     class BadActionPerformable(ActionAbstract):
-        robot_state: str
+        words: set[str]
         async def perform(self):
             return None
     await NoteActionPerformable("a").perform()
-    await BadActionPerformable("x").perform()
+    await BadActionPerformable({"x"}).perform()
 
 async def twins():
     @dataclass

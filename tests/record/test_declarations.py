@@ -125,7 +125,7 @@ def test_a_field_without_a_column_is_refused_by_name_and_type(kind: Any) -> None
         declared_type(made)
 
 
-def test_a_reserved_name_is_refused() -> None:
+def test_a_reserved_name_gets_an_underscore() -> None:
     @dataclass
     class ReservedActionPerformable(ActionAbstract):
         robot_state: str
@@ -133,8 +133,8 @@ def test_a_reserved_name_is_refused() -> None:
         async def perform(self) -> None:
             """Succeed without doing anything."""
 
-    with pytest.raises(DeclarationRefused, match=r"ReservedActionPerformable cannot be declared: field 'robot_state'"):
-        declared_type(ReservedActionPerformable)
+    (declared,) = declared_type(ReservedActionPerformable).fields
+    assert declared == (FieldDeclared("robot_state_", "robot_state_", "text", 2), ("robot_state",), None)
 
 
 def test_a_class_with_fields_that_is_no_dataclass_is_refused() -> None:

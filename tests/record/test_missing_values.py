@@ -264,19 +264,19 @@ async def test_fields_that_cannot_be_declared_are_missing_and_the_others_recorde
         await OddActionPerformable({"a"}, 3, "upright").perform()
     parameters = started(case.sink.of(episode)).parameters
     assert {name: value for name, value in parameters.items() if not isinstance(value, dict)} == {
+        "robot_state_": "upright",
         "inner_width": 2.0,
         "weight": 1.5,
     }
     reasons = {name: value["missing"] for name, value in parameters.items() if isinstance(value, dict)}
-    assert reasons.keys() == {"odd", "nowhere", "robot_state", "inner_depth"}
+    assert reasons.keys() == {"odd", "nowhere", "inner_depth"}
     assert reasons["odd"].startswith("has the type set[str], which has no column")
     assert reasons["nowhere"] == "has a type that cannot be resolved: name 'Nowhere' is not defined"
-    assert reasons["robot_state"] == "field 'robot_state' has a reserved name (robot_state)"
     assert parameters["odd"]["repr"] == "{'a'}"
-    assert case.emitter.missing.count.total == 4
+    assert case.emitter.missing.count.total == 3
     (declared,) = [event for owner, _, event in case.sink.records if owner is None]
-    assert [each.name for each in declared.fields] == ["inner_width", "weight"]  # type: ignore[attr-defined]
-    assert [each.slot for each in declared.fields] == [2, 3]  # type: ignore[attr-defined]
+    assert [each.name for each in declared.fields] == ["robot_state_", "inner_width", "weight"]  # type: ignore[attr-defined]
+    assert [each.slot for each in declared.fields] == [2, 3, 4]  # type: ignore[attr-defined]
 
 
 async def test_nodes_of_a_class_that_cannot_be_declared_are_recorded_without_a_type() -> None:
