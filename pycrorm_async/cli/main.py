@@ -28,7 +28,6 @@ import typer
 from typer.exceptions import TyperException
 
 from pycrorm_async import __version__
-from pycrorm_async.cli.output import LogLines, print_line, problem, stdout
 from pycrorm_async.errors import (
     CallerError,
     DamageError,
@@ -38,7 +37,6 @@ from pycrorm_async.errors import (
     FlushTimeout,
     PycrormError,
 )
-from pycrorm_async.query.text import nearest
 
 
 def exit_code(error: PycrormError) -> int:
@@ -64,23 +62,30 @@ def _with_exit_code(verb: Callable[..., int | None]) -> Callable[..., None]:
             code = verb(*arguments, **options) or 0
             sys.stdout.flush()
         except PycrormError as error:
-            problem(str(error))
+            _problem(str(error))
             code = exit_code(error)
         except BrokenPipeError:  # the reader closed the pipe, as `head` does; Python's final flush would raise again
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             code = 0
         except OSError as error:
             what = error.filename if isinstance(error.filename, str) else "the output"
-            problem(f"{what} cannot be written: {error.strerror or error}")
+            _problem(f"{what} cannot be written: {error.strerror or error}")
             code = 1
         raise typer.Exit(code)
 
     return run
 
 
+def _problem(line: str) -> None:
+    """Print a problem; the console is loaded here, because `--version` and `--help` need none."""
+    from pycrorm_async.cli.output import problem
+
+    problem(line)
+
+
 def _print_version(requested: bool) -> None:  # noqa: FBT001  typer passes it by position
     if requested:
-        stdout.print(f"pycrorm {__version__}", markup=False, highlight=False)
+        sys.stdout.write(f"pycrorm {__version__}\n")
         raise typer.Exit
 
 
@@ -91,48 +96,54 @@ _UNKNOWN = re.compile(
 """Finds the names that typer suggests: their form differs from that of our lines, and --json is not near --since."""
 _INTERRUPTED = 130
 _HELP = "Episodic memory for robots: record plans as events and query them as tables."
-_VERBS = (
-    "demo",
-    "run",
-    "episodes",
-    "show",
-    "report",
-    "recall",
-    "picture",
-    "export",
-    "datasette-metadata",
-    "watch",
-    "plot",
-    "diff",
-    "query",
-    "schema",
-    "events",
-    "tag",
-    "copy",
-    "writer",
-    "status",
-    "rebuild",
-    "verify",
-    "learn",
-    "mcp",
-)
-_GROUPS: Mapping[str, tuple[str, tuple[str, ...]]] = {
-    "ask": ("Answer a named question; `pycrorm ask NAME --help` lists its options.", ()),
-    "spool": (
-        "The write-ahead queue's files: inspect, repair, or store them in another database.",
-        ("inspect", "repair", "rebind"),
-    ),
+_VERBS: Mapping[str, Mapping[str, str]] = {
+    "Record": {
+        "demo": "Run and record the thesis' example plan, then query it.",
+        "run": "Run a plan and record it.",
+        "tag": "Add tags to an episode that has ended, and remove others.",
+        "learn": "Record random pick-ups, learn a policy from the successful ones, and evaluate it.",
+    },
+    "Look at episodes": {
+        "episodes": "List the recorded episodes, the oldest first.",
+        "show": "Show the task tree of an episode; with --at, tree and world at one moment.",
+        "watch": "Follow running episodes live, on a page or in the terminal.",
+        "report": "Write an episode, or a table of all of them, as HTML that opens offline.",
+        "picture": "Write the scene at a moment as PNG.",
+        "events": "Print the events of an episode in their order, one JSON object per line.",
+    },
+    "Ask": {
+        "ask": "Answer a named question; `pycrorm ask NAME --help` lists its options.",
+        "recall": "List the past actions most like a cue, with their outcomes.",
+        "diff": "Compare two episodes: facts, task trees, last places of objects.",
+        "plot": "Draw how often actions succeeded over two columns of a view.",
+        "query": "Run one read-only query in SQL.",
+        "schema": "Describe the views of a memory and their columns.",
+        "mcp": "Serve the memory to an agent by the Model Context Protocol.",
+    },
+    "Hand over": {
+        "export": "Write episodes, or the rows of a view or a question, to files of other programs.",
+        "copy": "Append the episodes of one memory to another.",
+        "datasette-metadata": "Print Datasette's metadata of a SQLite memory.",
+    },
+    "Operate": {
+        "status": "Report recorders, writers, running episodes, and the lag of database and tables.",
+        "writer": "Drain a spool continuously: append its events and fold them into the tables.",
+        "rebuild": "Make all tables and views again from the log.",
+        "verify": "Check the log for damage, and compare the tables with it.",
+        "spool": "The write-ahead queue's files: inspect, repair, or store them in another database.",
+    },
 }
+"""The verbs with their lines in `pycrorm --help`, which loads no verb."""
+_GROUPS: Mapping[str, tuple[str, ...]] = {"ask": (), "spool": ("inspect", "repair", "rebind")}
+_NAMES: Mapping[str, str] = {name: line for panel in _VERBS.values() for name, line in panel.items()}
 
 
 def app(requested: str | None = None) -> typer.Typer:
-    """Build the command with the requested verb, or with all verbs if `requested` is not a verb.
+    """Build the command with the requested verb, with all verbs, or with the names of all if it is not a verb.
 
     Each verb is a function in the module of the same name, with `_` for `-` (for a group, of the group's name). Only
-    requested modules are loaded, because loading all takes a second, and most single ones take half of that.
+    requested modules are loaded, because loading all takes two seconds, and most single ones take half of that.
     """
-    names = {*_VERBS, *_GROUPS}
-    chosen = {requested} if requested in names else names
     command = typer.Typer(
         name="pycrorm",
         help=_HELP,
@@ -141,17 +152,32 @@ def app(requested: str | None = None) -> typer.Typer:
         context_settings={"help_option_names": ["-h", "--help"]},
     )
     command.callback()(_options)  # without a callback, typer would make a single verb the command itself
-    for verb in (each for each in _VERBS if each in chosen):
-        command.command(verb)(_load_verb(verb.replace("-", "_"), verb.replace("-", "_")))
-    for group, (text, verbs) in _GROUPS.items():
-        if group in chosen:
-            subcommand = typer.Typer(help=text, no_args_is_help=bool(verbs))
-            for verb in verbs or import_module(f"pycrorm_async.cli.{group}").verbs():
-                subcommand.command(verb)(_load_verb(group, verb))
+    for verb in [each for each in _NAMES if each == requested] or _NAMES:
+        if requested is not None and requested != verb:
+            command.command(verb, help=_NAMES[verb])(lambda: None)
+        elif verb not in _GROUPS:
+            command.command(verb)(_load_verb(verb.replace("-", "_"), verb.replace("-", "_")))
+        else:
+            verbs = _GROUPS[verb]
+            group = typer.Typer(help=_NAMES[verb], no_args_is_help=bool(verbs))
+            for each in verbs or import_module(f"pycrorm_async.cli.{verb}").verbs():
+                group.command(each)(_load_verb(verb, each))
             if not verbs:
-                subcommand.callback(invoke_without_command=True)(_list_verbs)
-            command.add_typer(subcommand, name=group)
+                group.callback(invoke_without_command=True)(_list_verbs)
+            command.add_typer(group, name=verb)
     return command
+
+
+def _help() -> str:
+    """Return the lines of `pycrorm --help`, as plain text: loading what draws frames would take twice the time."""
+    panels = (
+        "\n".join([f"{panel}:", *(f"  {name:<20}{line}" for name, line in verbs.items())])
+        for panel, verbs in _VERBS.items()
+    )
+    options = "--version             Print the version and exit.\n  -h, --help            Show this message and exit."
+    shell = "--install-completion  Install completion for the current shell; --show-completion prints it."
+    usage = "Usage: pycrorm VERB [OPTIONS] [ARGUMENTS]...    (`pycrorm VERB --help` lists those of a verb)"
+    return "\n\n".join([usage, _HELP, *panels, f"Options:\n  {options}\n  {shell}"]) + "\n"
 
 
 def _options(
@@ -165,7 +191,7 @@ def _options(
 def _list_verbs(context: typer.Context) -> None:
     """Print the verbs of a group, when it is called without one."""
     if context.invoked_subcommand is None:
-        print_line(context.get_help())
+        sys.stdout.write(f"{context.get_help()}\n")
 
 
 def _load_verb(module: str, name: str) -> Callable[..., None]:
@@ -174,12 +200,22 @@ def _load_verb(module: str, name: str) -> Callable[..., None]:
 
 def _words() -> list[str]:
     """Return the words of the command line; for a shell's completion, those typed so far."""
-    return os.environ["COMP_WORDS"].split() if "_PYCRORM_COMPLETE" in os.environ else sys.argv
+    return os.environ["COMP_WORDS"].split() if _is_completing() else sys.argv
+
+
+def _is_completing() -> bool:
+    return "_PYCRORM_COMPLETE" in os.environ
 
 
 def main() -> None:
     """Run the console script `pycrorm`."""
     _open_closed_streams()
+    words = _words()[1:]
+    if not _is_completing() and words[:1] in ([], ["-h"], ["--help"], ["--version"]):
+        sys.stdout.write(f"pycrorm {__version__}\n" if words[:1] == ["--version"] else _help())
+        sys.exit(0 if words else 2)
+    from pycrorm_async.cli.output import LogLines
+
     logging.basicConfig(level=logging.WARNING, format="%(message)s", handlers=[LogLines()])
     # After an interruption the pool drops a connection whose event loop is closed, and would log a long traceback.
     logging.getLogger("sqlalchemy.pool").setLevel(logging.CRITICAL)
@@ -188,9 +224,9 @@ def main() -> None:
             stream.reconfigure(errors="replace")
     gc.disable()  # while modules are loaded, nothing becomes garbage, and collections would take a sixth of the time
     try:
-        command = app(next(iter(_words()[1:]), None))
+        command = app(words[0] if words else "")
     except KeyboardInterrupt:  # while the verb's module was being loaded
-        problem("interrupted before the command started")
+        _problem("interrupted before the command started")
         sys.exit(_INTERRUPTED)
     gc.freeze()
     gc.enable()
@@ -200,7 +236,7 @@ def main() -> None:
         _print_usage_error(error)
         code = 2
     if code == _INTERRUPTED:  # typer turns a KeyboardInterrupt into this code, also one while it reads the arguments
-        problem("interrupted; all events recorded so far are kept")
+        _problem("interrupted; all events recorded so far are kept")
     sys.exit(code)
 
 
@@ -226,6 +262,8 @@ def _print_usage_error(error: TyperException) -> None:
             listed = "commands" if line.startswith("No such command") else "arguments"
             hint = f"; `{context.command_path} --help` lists the {listed}"
         if unknown := _UNKNOWN.fullmatch(line):
+            from pycrorm_async.query.text import nearest
+
             line = unknown["fault"]
             hint = nearest(unknown["name"], unknown["names"].replace("'", "").split(", ")) or hint
-        problem(f"{line[0].lower()}{line[1:]}{hint}")
+        _problem(f"{line[0].lower()}{line[1:]}{hint}")
