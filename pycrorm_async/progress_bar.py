@@ -4,12 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Protocol
+from typing import Any, Protocol
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.text import Text
 
-stderr = Console(stderr=True, highlight=False, soft_wrap=True)
+from pycrorm_async.visible_text import visible
+
+
+class VisibleConsole(Console):
+    """A console that makes the control characters of each text it gets visible; the styles are its own."""
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        """Return a text, also that of a cell, as rich prints it."""
+        return super().render_str(visible(text), **options)
+
+
+stderr = VisibleConsole(stderr=True, highlight=False, soft_wrap=True)
 """The only console for stderr, because rich redraws a bar below other output only if both use one console."""
 
 

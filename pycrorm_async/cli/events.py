@@ -17,6 +17,7 @@ from pycrorm_async.events.types import EVENT_TYPES
 from pycrorm_async.operations.destination import shared_address
 from pycrorm_async.store.log import EventLog, episode_named
 from pycrorm_async.store.stored import StoredEvent
+from pycrorm_async.visible_text import escaped_json
 
 
 def events(
@@ -54,7 +55,7 @@ async def _print(url: str, episode: str, after: int, event_types: frozenset[str]
 def _line(episode: str, event: StoredEvent) -> bytes:
     try:
         msgspec.json.decode(event.payload)
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise LogDamaged(episode, event.sequence, f"its payload cannot be read: {error}") from None
     seconds, nanoseconds = divmod(event.wall_ns, 10**9)
     line = {
@@ -66,4 +67,4 @@ def _line(episode: str, event: StoredEvent) -> bytes:
         "monotonic_ns": event.monotonic_ns,
         "payload": msgspec.Raw(event.payload),
     }
-    return msgspec.json.encode(line) + b"\n"
+    return escaped_json(msgspec.json.encode(line).decode()).encode() + b"\n"

@@ -21,6 +21,7 @@ from pycrorm_async.cli.output import (
     parse_since,
     print_json,
     print_line,
+    problem,
 )
 from pycrorm_async.cli.reading import note_pending_events
 from pycrorm_async.errors import CallerError
@@ -83,7 +84,10 @@ def export(
     spool: SpoolOption = None,
     as_json: JsonOption = False,
 ) -> int:
-    """Write episodes, or the rows of a view, to a file, with a manifest from which it can be made again."""
+    """Write episodes, or the rows of a view, to a file, with a manifest from which it can be made again.
+
+    Exit code 1 if an episode cannot be read and is left out of a lerobot data set.
+    """
     shared_address(url)
     if again is not None and what:
         raise CallerError(f"name {' '.join(what)} or make an export again with --again, not both")
@@ -112,7 +116,9 @@ def export(
         exported = asyncio.run(write(report_progress if stderr.is_terminal else None))
     note_pending_events(url, spool)
     _print(exported, as_json=as_json)
-    return 0
+    for number, reason in exported.unreadable.items():
+        problem(f"episode {number} is not in it: {reason}")
+    return 1 if exported.unreadable else 0
 
 
 def _unit(file_format: str) -> str:
@@ -172,6 +178,7 @@ def _print(exported: Exported, *, as_json: bool) -> None:
     manifest = exported.manifest
     if as_json:
         counts = {"rows": exported.rows, "episodes": exported.episodes, "left_out": exported.left_out}
+        counts |= {"unreadable": exported.unreadable} if exported.unreadable else {}
         print_json({"file": exported.path, "format": manifest.file_format, **counts, "files": manifest.files})
         return
     print_line(exported.path)

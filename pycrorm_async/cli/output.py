@@ -15,13 +15,13 @@ from typing import Annotated, Any, overload
 import msgspec
 import typer
 from rich.cells import cell_len
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from pycrorm_async.errors import CallerError
-from pycrorm_async.progress_bar import stderr
+from pycrorm_async.progress_bar import VisibleConsole, stderr
 from pycrorm_async.settings import FileAccess, Writer
+from pycrorm_async.visible_text import escaped_json
 
 _WIDTH_PIPED = 160
 """Width of tables in characters if stdout is not a terminal; wide enough to keep most rows on one line."""
@@ -31,7 +31,7 @@ _WORD_MAX = 24
 _READABLE = 0.75
 """The least part of the width its words need at which a table is printed; with less, it would break most words."""
 
-stdout = Console(highlight=False, width=None if sys.stdout and sys.stdout.isatty() else _WIDTH_PIPED)
+stdout = VisibleConsole(highlight=False, width=None if sys.stdout and sys.stdout.isatty() else _WIDTH_PIPED)
 
 
 def problem(line: str) -> None:
@@ -67,7 +67,7 @@ class LogLines(logging.Handler):
 def print_json(document: Any) -> None:
     """Print the JSON document of a `--json` call on stdout."""
     encoded = msgspec.json.Encoder(enc_hook=str, decimal_format="number").encode(document)
-    sys.stdout.write(msgspec.json.format(encoded, indent=2).decode() + "\n")
+    sys.stdout.write(escaped_json(msgspec.json.format(encoded, indent=2).decode()) + "\n")
 
 
 def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:

@@ -11,6 +11,7 @@ from pycrorm_async.cli.output import DEFAULT_URL, JsonOption, SpoolOption, UrlOp
 from pycrorm_async.cli.reading import read_memory
 from pycrorm_async.errors import CallerError
 from pycrorm_async.query.memory_schema import CORE_VIEWS, as_mermaid, as_text, read_schema
+from pycrorm_async.visible_text import visible
 
 
 def schema(
@@ -33,4 +34,4 @@ def schema(
     if as_json:
         print_json(described)
     else:
-        sys.stdout.write((as_mermaid if form == "mermaid" else as_text)(described) + "\n")
+        sys.stdout.write(visible((as_mermaid if form == "mermaid" else as_text)(described)) + "\n")

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Annotated, TypeAlias
 
 import typer
-from rich.markup import escape
 from rich.text import Text
 from rich.tree import Tree
 
@@ -40,6 +39,7 @@ from pycrorm_async.query.named_queries import (
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.snapshot import Moment, ObjectThen, ObservationThen, RobotThen, parse_moment
 from pycrorm_async.query.text import duration, one_line, parameters_text
+from pycrorm_async.visible_text import visible
 
 _Answers: TypeAlias = "tuple[Sequence[Percept], Sequence[PlaceSearch]]"
 
@@ -329,9 +329,9 @@ def tree_of(
 
 
 def _line(node: NodeSummary, *, events: bool, full: bool) -> Text:
-    line = Text.from_markup(escape(node.dtype or node.kind))
+    line = Text(visible(node.dtype or node.kind))
     if node.parameters:
-        line.append(f"  {parameters_text(node.parameters, full=full, exact=full)}", style="dim")
+        line.append(f"  {visible(parameters_text(node.parameters, full=full, exact=full))}", style="dim")
     line.append(f"  {node.status}", style=_STYLES.get(node.status, "red"))
     line.append(f"  {duration(node.duration_ns)}", style="dim")
     if events:
@@ -343,7 +343,7 @@ def _line(node: NodeSummary, *, events: bool, full: bool) -> Text:
         line.append(f"  {counts}", style="dim")
     if node.reason:
         message = one_line(node.failure_message or "", None if full else _MESSAGE_MAX)
-        line.append(f"  {node.reason}{': ' if message else ''}{message}", style="red")
+        line.append(visible(f"  {node.reason}{': ' if message else ''}{message}"), style="red")
     if node.thoughts:
         listed = node.thoughts if full else node.thoughts[:_SIMULATIONS_MAX]
         numbers = ", ".join(map(str, listed))

@@ -39,6 +39,7 @@ from pycrorm_async.projections.row_batch import CannotFold
 from pycrorm_async.query.snapshot import Moment, MomentFold, NodeThen, unreadable
 from pycrorm_async.store.log import episode_named
 from pycrorm_async.store.stored import EpisodeRow
+from pycrorm_async.visible_text import visible
 
 
 def watch(
@@ -166,7 +167,7 @@ async def draw_episode(follower: LogFollower, name: str, stop: asyncio.Event) ->
                 if await drawing.draw():
                     return
             except DatabaseUnavailable as error:
-                live.update(Text(f"waiting: {error}"), refresh=True)
+                live.update(Text(visible(f"waiting: {error}")), refresh=True)
             await _rest(stop, max(_INTERVAL_S, _SHARE * (time.monotonic() - began)))
 
 
@@ -207,7 +208,7 @@ async def _wait_for(follower: LogFollower, name: str, live: Live, stop: asyncio.
                 return await episode_named(log, name)
             live.update(Text(f"{follower.address} has no episode yet: waiting for the first."), refresh=True)
         except DatabaseUnavailable as error:
-            live.update(Text(f"waiting: {error}"), refresh=True)
+            live.update(Text(visible(f"waiting: {error}")), refresh=True)
         await _rest(stop, _INTERVAL_S * 2)
     return None
 
@@ -227,7 +228,7 @@ def _live() -> Iterator[Live]:
 
 
 def _picture(moment: Moment, lines_max: int) -> RenderableType:
-    head = Text.from_markup(f"[bold]Episode {moment.number}: {escape(moment.description)}[/]")
+    head = Text(visible(f"Episode {moment.number}: {moment.description}"), style="bold")
     head.append(f"  {moment.status}", style=_SIGNS.get(moment.status, "red"))
     failed = sum(each.status in ("FAILED", "ERROR", "LOST") for each in moment.tree)
     facts = [f"{moment.time_s:.2f} s", f"event {moment.sequence}", f"{len(moment.tree)} nodes"]
@@ -240,7 +241,7 @@ def _picture(moment: Moment, lines_max: int) -> RenderableType:
     hidden = len(moment.tree) - len(shown)
     if hidden:
         facts.append(f"{hidden} nodes that have ended are not drawn")
-    return Group(head, Text("  " + " · ".join(facts), style="dim"), tree_of(shown, no_wrap=True) or Text(""))
+    return Group(head, Text(visible("  " + " · ".join(facts)), style="dim"), tree_of(shown, no_wrap=True) or Text(""))
 
 
 def in_sight(nodes: Sequence[NodeThen], lines_max: int) -> list[NodeThen]:
@@ -291,7 +292,7 @@ def _table(follower: LogFollower) -> RenderableType:
         cells = (each["number"], ", ".join(each["robots"]), now, each["nodes"], each["failed"], each["description"])
         table.add_row(*(escape(str(cell)) for cell in cells), style=None if each in running else "dim")
     if follower.fault is not None:
-        return Group(Text(f"waiting: {follower.fault}", style="yellow"), table)
+        return Group(Text(visible(f"waiting: {follower.fault}"), style="yellow"), table)
     return table if entries else Group(Text("No episode runs; waiting for the next."), table)
 
 

@@ -32,7 +32,7 @@ from sqlalchemy import LargeBinary, Select, func, select
 from sqlalchemy import inspect as inspect_database
 from sqlalchemy.exc import CompileError
 
-from pycrorm_async.errors import CallerError
+from pycrorm_async.errors import CallerError, DatabaseForeign, LogDamaged
 from pycrorm_async.export.lerobot import DEFAULT_FPS, MARKER, ImageSize, LeRobotFolder, check_size, draw_frames
 from pycrorm_async.export.scenes import Clock, frames_of, read_episode, scene_objects, write_mcap, write_rerun
 from pycrorm_async.export.selection import (
@@ -77,6 +77,8 @@ class Exported(NamedTuple):
         episodes: number of episodes that it covers.
         left_out: number of episodes without rows in the export, because they run or are not in the tables yet.
         manifest: the description, which is in the file `PATH.manifest.json`.
+        unreadable: of LeRobot, by number, the reasons why episodes are not in the export: they are damaged, or of a
+            newer version.
         unknown_name: a line about an argument of a question without rows, such as an object, that is nowhere in the
             memory; empty without one.
     """
@@ -87,6 +89,7 @@ class Exported(NamedTuple):
     left_out: int
     manifest: Manifest
     unknown_name: str = ""
+    unreadable: Mapping[int, str] = MappingProxyType({})
 
 
 class ExportComparison(NamedTuple):
@@ -162,7 +165,7 @@ async def export(
     if chosen not in get_args(FileFormat):
         raise CallerError(f"there is no format {chosen!r}{nearest(chosen, get_args(FileFormat))}; formats: {_listed()}")
     options = _options(chosen, clock, fps, images)
-    left_out, unknown_name = 0, ""
+    left_out, unknown_name, unreadable = 0, "", dict[int, str]()
     with new_file(manifest_path(target), force=force) as described:
         match chosen:
             case "parquet" | "csv" | "jsonl":
@@ -176,7 +179,8 @@ async def export(
             case "lerobot":
                 covered = await _episodes(reading, what, episodes, chosen)
                 with new_folder(target, force=force, marker=MARKER) as written:
-                    frames = await write_lerobot(reading, covered, written, options, report_progress)
+                    frames = await write_lerobot(reading, covered, written, options, report_progress, unreadable)
+                    covered = tuple(each for each in covered if each.number not in unreadable)
                     manifest = await _described(reading, covered, chosen, options, frames)
                     manifest = _complete(manifest, checksums(written), described)
             case "rrd" | "mcap":
@@ -185,7 +189,7 @@ async def export(
                     changes = await write_scene(reading, covered, written, chosen, options, report_progress)
                     manifest = await _described(reading, covered, chosen, options, changes)
                     manifest = _complete(manifest, {target.name: checksums(written)[written.name]}, described)
-    return Exported(target, manifest.rows, len(manifest.episodes), left_out, manifest, unknown_name)
+    return Exported(target, manifest.rows, len(manifest.episodes), left_out, manifest, unknown_name, unreadable)
 
 
 async def export_again(
@@ -418,15 +422,23 @@ async def write_lerobot(
     folder: Path,
     options: EpisodeOptions,
     report_progress: ProgressCallback | None,
+    unreadable: dict[int, str],
 ) -> int:
     """Write the episodes into an empty folder; return the number of frames.
 
-    Raises `CallerError` for episodes that the format cannot hold, and `MissingExtra`.
+    An episode that cannot be read is left out, with its reason in `unreadable`, unless it is the only one. Raises
+    `CallerError` for episodes that the format cannot hold, and `MissingExtra`.
     """
     progress = _Progress(report_progress, sum(each.events for each in episodes))
     dataset = LeRobotFolder(folder, fps=options.fps)
     for each in episodes:
-        episode = await read_episode(reading, each, progress.of("reading"))
+        try:
+            episode = await read_episode(reading, each, progress.of("reading"))
+        except (LogDamaged, DatabaseForeign) as error:
+            unreadable[each.number] = str(error)
+            if len(unreadable) == len(episodes):
+                raise
+            continue
         frames = await run_to_completion(asyncio.to_thread(frames_of, episode, options.clock, options.fps))
         pictures = None
         if options.images is not None:

@@ -26,6 +26,7 @@ from pycrorm_async.query.snapshot import parse_moment
 from pycrorm_async.query.sql import SqlLimits, json_rows
 from pycrorm_async.query.text import duration, nearest, one_line, parameters_text
 from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.visible_text import escaped_json, visible
 
 try:
     from mcp.server import MCPServer
@@ -87,7 +88,7 @@ class _Server(MCPServer):
                 raise
             schemas = {each.name: each.input_schema for each in await self.list_tools()}
             faults = _argument_faults(name, error.__cause__, schemas[name]["properties"])
-            raise ToolError(f"Error executing tool {name}: {one_line(faults, _ERROR_MAX)}") from None
+            raise ToolError(f"Error executing tool {name}: {visible(one_line(faults, _ERROR_MAX))}") from None
 
 
 def _tool_of(function: _Function) -> Tool:
@@ -126,8 +127,8 @@ def _with_tool_errors(tool: _Function, tools: _Tools) -> _Function:
         except PycrormError as error:
             if isinstance(error, DatabaseError):
                 await tools.close()
-            raise ToolError(one_line(error, _ERROR_MAX)) from error
-        text = result if isinstance(result, str) else _json(_short(msgspec.to_builtins(result, enc_hook=str)))
+            raise ToolError(visible(one_line(error, _ERROR_MAX))) from error
+        text = visible(result) if isinstance(result, str) else _json(_short(msgspec.to_builtins(result, enc_hook=str)))
         if (size := len(text.encode())) > _ANSWER_BYTES:
             raise ToolError(f"the answer has {size} bytes, but at most {_ANSWER_BYTES} are returned: ask for less")
         return text
@@ -329,7 +330,7 @@ def _short(value: Any) -> Any:
 
 
 def _json(document: Any) -> str:
-    return msgspec.json.Encoder(enc_hook=str, decimal_format="number").encode(document).decode()
+    return escaped_json(msgspec.json.Encoder(enc_hook=str, decimal_format="number").encode(document).decode())
 
 
 def _cut(lines: Sequence[str]) -> str:

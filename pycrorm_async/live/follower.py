@@ -16,7 +16,7 @@ from contextlib import asynccontextmanager
 from datetime import UTC, datetime
 from typing import Any
 
-from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable, LogDamaged
+from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable, LogDamaged, PycrormError
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX
 from pycrorm_async.events.types import EpisodeEnded, EpisodeStarted, NodeEnded, NodeStarted, ObjectAdded
 from pycrorm_async.projections.fold import happening_of
@@ -80,6 +80,10 @@ class EpisodeFeed:
                 await read_into(fold, log, log.pages(row, after=fold.last))
             except (LogDamaged, DatabaseForeign) as error:
                 self.fault = str(error)
+            except PycrormError:
+                raise
+            except Exception as error:  # noqa: BLE001  one episode must not end the server of all
+                self.fault = f"its events cannot be shown: {type(error).__name__}: {error}"
 
     async def document(self, log: EventLog, after: int = 0) -> dict[str, Any]:
         """Return the document, or the part of it behind event `after`."""
@@ -307,8 +311,9 @@ class LiveOverview:
             for event in page:
                 try:
                     activity.read(event, designators)
-                except CannotFold as reason:
-                    activity.fault = f"event {event.sequence}: {reason}"
+                except Exception as reason:  # noqa: BLE001  one episode must not end the list of all
+                    kind = "" if isinstance(reason, CannotFold) else f"{type(reason).__name__}: "
+                    activity.fault = f"event {event.sequence}: {kind}{reason}"
                     return
 
     def _forget(self) -> None:

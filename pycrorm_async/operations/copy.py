@@ -245,7 +245,7 @@ def _refuse_unreadable(episode: str, event: StoredEvent) -> None:
             decode(event.type, event.payload)
         else:
             msgspec.json.decode(event.payload)
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise LogDamaged(episode, event.sequence, f"its payload cannot be read: {error}") from None
 
 

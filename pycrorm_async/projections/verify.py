@@ -339,11 +339,12 @@ class EpisodeCheck:
                         self._result.remarks += 1
             if shown and self._lost is None:
                 fold_happening(event, happening, designators, rows)
-        except CannotFold as reason:
+        except Exception as reason:  # noqa: BLE001  one event must not end the check of all others
             # An event that is in the tables could be folded once, so the log has changed since.
-            if shown or isinstance(reason, UndecodablePayload):
+            if shown or isinstance(reason, UndecodablePayload) or not isinstance(reason, CannotFold):
                 self._damaged(
-                    event.sequence, f"is in the tables, and cannot be folded: {reason}" if shown else str(reason)
+                    event.sequence,
+                    f"is in the tables, and cannot be folded: {_named(reason)}" if shown else _named(reason),
                 )
             self._lose(event.sequence, folded, rows)
 
@@ -357,6 +358,10 @@ class EpisodeCheck:
     def _damaged(self, sequence: int, reason: str) -> None:
         self.damaged_blocks.add((sequence - 1) // BLOCK_EVENTS)
         self._result.add_damage(self.number, sequence, reason)
+
+
+def _named(reason: Exception) -> str:
+    return str(reason) if isinstance(reason, CannotFold) else f"{type(reason).__name__}: {reason}"
 
 
 # === verify ===================================================================================================

@@ -52,6 +52,7 @@ from pycrorm_async.query.scene import Frame, assumed_model, link_frames, object_
 from pycrorm_async.query.text import Drawing, NotebookValue, one_line, with_object_names
 from pycrorm_async.store.log import EventLog, episode_named
 from pycrorm_async.store.stored import StoredEvent
+from pycrorm_async.visible_text import visible
 from pycrorm_async.world.bullet_body import ObjectState, WorldState
 from pycrorm_async.world.pose import MalformedPose, Pose
 from pycrorm_async.world.urdf import robot_description
@@ -231,7 +232,7 @@ class Moment(NotebookValue):
         lines = [f"episode {self.number} at {self.time_s:.3f} s, event {self.sequence}: {self.status}"]
         lines += [f"{'  ' * (each.depth + 1)}{each.dtype or each.kind} {each.status}" for each in self.tree]
         lines += [f"{each.name} {each.pose!r}" for each in self.world.objects]
-        return "\n".join(lines)
+        return "\n".join(visible(each, kept="") for each in lines)
 
     __repr__ = __str__
 

@@ -33,7 +33,7 @@ def parameters_text(parameters: Mapping[str, Any], *, full: bool = False, exact:
 
 
 def _value_text(value: Any, *, full: bool, exact: bool) -> str:
-    if isinstance(value, dict) and "position" in value:
+    if isinstance(value, dict) and _is_position(value.get("position")):
         if exact:
             return _pose_text(value)
         return "(" + ", ".join(f"{round(each, 2) + 0.0:.2f}" for each in value["position"]) + ")"
@@ -50,6 +50,10 @@ def _value_text(value: Any, *, full: bool, exact: bool) -> str:
         count = "1 entry" if len(value) == 1 else f"{len(value)} entries"
         return msgspec.json.encode(value).decode() if full else count
     return one_line(value, None if full else _TEXT_MAX)
+
+
+def _is_position(value: Any) -> bool:
+    return isinstance(value, list) and bool(value) and all(isinstance(each, int | float) for each in value)
 
 
 def _pose_text(pose: Mapping[str, Any]) -> str:

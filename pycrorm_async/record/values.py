@@ -39,6 +39,7 @@ from pycrorm_async.events.types import (
 from pycrorm_async.plan.language import Outcome
 from pycrorm_async.plan.objects import BelieveObject, LocatedObject, ObjectDesignator, ObjectPart
 from pycrorm_async.recorded_names import recorded_name
+from pycrorm_async.visible_text import visible
 from pycrorm_async.world.bullet import Object
 from pycrorm_async.world.pose import Pose
 
@@ -548,7 +549,8 @@ class MissingValues:
         if len(self._warned) > WARNED_MAX:
             _log.warning("more than %d fields have missing values; further ones are only counted in status", WARNED_MAX)
         else:
-            _log.warning("%s.%s %s (further values of this field are only counted in status)", owner, field, text)
+            warning = f"{owner}.{field} {text} (further values of this field are only counted in status)"
+            _log.warning("%s", visible(warning))
 
 
 # === observed values ==========================================================================================

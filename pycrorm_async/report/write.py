@@ -33,6 +33,7 @@ from pycrorm_async.errors import (
     DatabaseForeign,
     DatabaseUnavailable,
     LogDamaged,
+    PycrormError,
     TablesOutdated,
 )
 from pycrorm_async.events.ids import SLOT_NODE, row_id
@@ -49,6 +50,7 @@ from pycrorm_async.recall.recall import CaseReader, DatabaseSource, cue_like
 from pycrorm_async.report.document import episode_document
 from pycrorm_async.report.output_files import refuse_existing, write_file
 from pycrorm_async.task_status import TaskStatus
+from pycrorm_async.visible_text import visible
 
 _PAGES_MAX = 200
 """Bounds the pages behind an overview: one has about 0.7 MB."""
@@ -185,6 +187,10 @@ async def _write_pages(
             await _report(similar, reading, each, folder / page_name(each.number), force=force)
         except (LogDamaged, DatabaseForeign) as error:
             unreadable[each.number] = str(error)
+        except (PycrormError, OSError):
+            raise
+        except Exception as error:  # noqa: BLE001  whatever an episode holds, the others get their pages
+            unreadable[each.number] = f"its page cannot be made: {type(error).__name__}: {error}"
     return unreadable
 
 
@@ -215,7 +221,6 @@ _ESCAPES = {
     b"\xe2\x80\xa8": rb"\u2028",
     b"\xe2\x80\xa9": rb"\u2029",
 }
-_CONTROL = re.compile("[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]")
 _IMPORT = re.compile(r"^import \{[^}]*\} from \"\./\w+\.js\";\n", re.MULTILINE)
 _EXPORT = re.compile(r"^export (?=(const|class|function) )", re.MULTILINE)
 
@@ -246,19 +251,13 @@ def _page(document: Mapping[str, Any], heading: str, suffix: str, body: str, scr
     )
     parts = {
         "policy": policy,
-        "title": html.escape(_CONTROL.sub(_visible, heading) + suffix),
+        "title": html.escape(visible(heading, kept="") + suffix),
         "style": style,
         "body": body.replace("{heading}", html.escape(heading)),
         "document": _safe_json(document),
         "scripts": "\n".join(f"<script>{each}</script>" for each in scripts),
     }
     return re.sub(r"\{(\w+)\}", lambda match: parts[match[1]], _asset("web/page.html"))
-
-
-def _visible(control: re.Match[str]) -> str:
-    """Return a sign for a control character, which would reorder or break the title of a window."""
-    code = ord(control[0])
-    return chr(0x2400 + code) if code < 0x20 else f"<U+{code:04X}>"
 
 
 def write_page(page: str, path: Path, *, force: bool = False) -> None:

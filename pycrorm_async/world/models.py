@@ -17,6 +17,7 @@ approaching from the front has the handle's orientation. A drawer or door at joi
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterable, Sequence
 from functools import cache
 from importlib.metadata import PackageNotFoundError, distribution
@@ -138,6 +139,10 @@ _SHAPES: dict[ObjectType, _Box | _Cylinder] = {
 }
 
 
+_NOT_IN_XML = re.compile("[^\t\n\r -\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+"""Finds characters that XML cannot hold, not even as references: a recorded name may have any."""
+
+
 def built_in_urdf(name: str, object_type: ObjectType) -> str:
     """Return the built-in description of an object: by type, for robots and environments by name.
 
@@ -146,7 +151,7 @@ def built_in_urdf(name: str, object_type: ObjectType) -> str:
     """
     if object_type is ObjectType.ROBOT or object_type is ObjectType.ENVIRONMENT:
         return _by_name(name, object_type)
-    shape = _SHAPES[object_type]
+    shape, name = _SHAPES[object_type], _NOT_IN_XML.sub("_", name)
     if isinstance(shape, _Box):
         return box_urdf(name, x=shape.x, y=shape.y, z=shape.z, color=shape.color, mass_kg=shape.mass_kg)
     return cylinder_urdf(name, radius=shape.radius, z=shape.z, color=shape.color, mass_kg=shape.mass_kg)

@@ -1,0 +1,117 @@
+"""One episode that cannot be read or shown stops no other: not in reports, exports, copies, checks or the live list."""
+
+from __future__ import annotations
+
+import sqlite3
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pycrorm_async.live.server import LogFollower
+from pycrorm_async.projections import verify as verification
+from pycrorm_async.query.reading import Reading
+from pycrorm_async.report import document
+from pycrorm_async.report.write import overview
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.log import EventLog
+from tests.cli.hostile_memory import record_hostile_episodes
+from tests.commands import answer, pycrorm
+
+pytestmark = pytest.mark.slow
+DAMAGED, HOSTILE, CLEAN = 1, 2, 3
+
+
+@pytest.fixture
+def url(tmp_path: Path) -> str:
+    """The URL of a memory with a damaged episode, a hostile one and a clean one."""
+    url = record_hostile_episodes(tmp_path / "pycrorm.db")
+    with sqlite3.connect(tmp_path / "pycrorm.db") as database:
+        database.execute("DROP TRIGGER event_is_not_updated")
+        for sequence, payload in ((5, "no JSON"), (9, "[" * 100_000)):
+            changed = database.execute(
+                "UPDATE event SET payload = ? WHERE episode = ? AND sequence = ?", (payload, DAMAGED, sequence)
+            )
+            assert changed.rowcount == 1
+    return url
+
+
+def test_every_verb_names_the_damaged_episode_and_serves_the_others(url: str, tmp_path: Path) -> None:
+    written = pycrorm("report", "--all", "--out", "all.html", cwd=tmp_path)
+    assert (written.returncode, written.stderr.count("episode 1 has no page: ")) == (1, 1)
+    pages = {each.name for each in (tmp_path / "all.pages").iterdir()}
+    assert pages == {f"episode-{HOSTILE}.html", f"episode-{CLEAN}.html"}
+    exported = pycrorm("export", "1", "2", "3", "--format", "lerobot", "--out", "set", cwd=tmp_path)
+    assert exported.returncode == 1
+    assert "episode 1 is not in it: " in exported.stderr
+    assert "of 2 episodes" in exported.stderr
+    alone = pycrorm("export", "1", "--format", "lerobot", "--out", "alone", cwd=tmp_path)
+    assert (alone.returncode, "Traceback" in alone.stderr, (tmp_path / "alone").exists()) == (4, False, False)
+    copied = answer("copy", "--to", "sqlite:///copy.db", cwd=tmp_path, code=4)
+    assert [bool(each["damage"]) for each in copied["episodes"]] == [True, False, False]
+    assert [each["copied"] > 0 for each in copied["episodes"][1:]] == [True, True]
+    checked = answer("verify", cwd=tmp_path, code=4)
+    assert {each["sequence"] for each in checked["damages"]} == {5, 9}
+    assert checked["episodes"] == 3
+    for verb in ("episodes", "status"):
+        assert "clean" in pycrorm(verb, cwd=tmp_path).stdout or verb == "status"
+
+
+async def test_an_episode_that_no_page_can_be_made_of_leaves_the_pages_of_the_others(
+    url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _break(monkeypatch, document.EpisodeFold, "read", lambda fold, *_: fold.row.number == HOSTILE)
+    async with Reading.open(url) as reading:
+        written = await overview(reading, tmp_path / "all.html")
+    assert set(written.unreadable) == {DAMAGED, HOSTILE}
+    assert written.unreadable[HOSTILE] == "its page cannot be made: TypeError: broken"
+    follower = LogFollower(DatabaseAddress.parse(url))
+    try:
+        faults = [(await follower.feed(str(number))).fault for number in (HOSTILE, CLEAN)]
+        assert faults == ["its events cannot be shown: TypeError: broken", None]
+    finally:
+        await follower.close()
+
+
+async def test_an_episode_that_cannot_be_folded_leaves_the_list_of_the_others_and_their_check(
+    url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    follower = LogFollower(DatabaseAddress.parse(url))
+    try:
+        log = await follower.log()
+        from pycrorm_async.live.server import Activity
+
+        _break(monkeypatch, Activity, "read", lambda activity, *_: activity.row.number == HOSTILE)
+        assert await follower.overview.catch_up(log, await log.episodes())
+        entries = {each["number"]: each for each in follower.overview.entries(0)}
+        assert entries[CLEAN]["status"] == "SUCCEEDED"
+        assert "TypeError: broken" in str(entries[HOSTILE])
+    finally:
+        await follower.close()
+    real = verification.fold_happening
+
+    def fold(event: Any, *others: Any) -> None:
+        if event.type == "Observed":
+            raise TypeError("broken")
+        real(event, *others)
+
+    monkeypatch.setattr(verification, "fold_happening", fold)
+    log = await EventLog.open(DatabaseAddress.parse(url), create=False)
+    try:
+        found = await verification.verify(log)
+    finally:
+        await log.close()
+    assert found.episodes == 3
+    assert [each.number for each in found.damages if "TypeError: broken" in str(each)] == [HOSTILE]
+
+
+def _break(monkeypatch: pytest.MonkeyPatch, owner: type, name: str, is_bad: Any) -> None:
+    """Let a method raise, as a defect of ours would, where its arguments are bad."""
+    real = getattr(owner, name)
+
+    def method(*arguments: Any) -> Any:
+        if is_bad(*arguments):
+            raise TypeError("broken")
+        return real(*arguments)
+
+    monkeypatch.setattr(owner, name, method)
