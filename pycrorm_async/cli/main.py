@@ -130,6 +130,7 @@ _VERBS: Mapping[str, Mapping[str, str]] = {
         "writer": "Drain a spool continuously: append its events and fold them into the tables.",
         "rebuild": "Make all tables and views again from the log.",
         "verify": "Check the log for damage, and compare the tables with it.",
+        "roles": "Show the roles of a memory on PostgreSQL; with --create, make them.",
         "spool": "The write-ahead queue's files: inspect, repair, or store them in another database.",
     },
 }

@@ -45,7 +45,7 @@ def query(
 ) -> None:
     """Run one read-only query in SQL: no statement can change the memory or the machine.
 
-    On PostgreSQL the login in the URL must have no more rights than the role pycrorm_reader. Times are integers, µs
+    On PostgreSQL it runs as the role pycrorm_reader, which `pycrorm roles --create` makes. Times are integers, µs
     since 1970-01-01 UTC; columns that end in _ns are ns of the robot's monotonic clock. Bytes are hexadecimal
     digits; JSON has "NaN", "Infinity" and "-Infinity" as texts.
     """

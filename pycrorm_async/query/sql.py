@@ -5,7 +5,10 @@
 **Theory of operation.** A read-only transaction is not enough: as a superuser, `pg_read_file` reads files of the server
 and COPY … TO PROGRAM runs programs on it. Four independent checks apply:
 
-1. The login has no more rights than `pycrorm_reader` (`_RIGHTS`). SET ROLE then leads nowhere.
+1. The login has no more rights than `pycrorm_reader` (`_RIGHTS`). SET ROLE then leads nowhere. Or it takes this role
+   for the transaction, as the owner on a laptop does. Code that runs in the query could then return to the login's
+   rights, so none may be there: no function but PostgreSQL's own is called, and what the reader can reach, such as a
+   view or a domain, belongs to the login itself or to roles that have its rights anyway (`_PLANTED`).
 2. The text is prepared, so it is one statement, and becomes the query of a cursor: PostgreSQL takes nothing but SELECT,
    VALUES and TABLE there, no SET, COPY, DO, CALL or SELECT INTO.
 3. The transaction is READ ONLY and always rolled back, and the connection is closed after it.
@@ -106,7 +109,9 @@ _MORE = (
 )
 """The condition that the login has one of these rights outside the system's schemas, and the reader has none."""
 _RIGHTS = f"""
-SELECT session_user::text AS login, to_regrole('{READER}') IS NOT NULL AS has_roles, CASE
+SELECT session_user::text AS login, coalesce(pg_has_role(session_user, to_regrole('{READER}'), 'MEMBER'), false)
+    AS may_take, coalesce(has_schema_privilege(to_regrole('{READER}'), '{VIEWS_SCHEMA}', 'USAGE'), false) AS has_roles,
+CASE
     WHEN login.rolsuper THEN 'is a superuser'
     WHEN pg_has_role(session_user, datdba, 'MEMBER') THEN 'owns the database'
     WHEN login.rolcreaterole OR login.rolcreatedb OR login.rolreplication OR login.rolbypassrls
@@ -152,19 +157,35 @@ FROM pg_roles AS login CROSS JOIN pg_database LEFT JOIN LATERAL (
 WHERE login.rolname = session_user AND datname = current_database()"""  # noqa: S608  our own names only
 """Selects the rights of the login that `pycrorm_reader` has not; null if there are none. Any table may be read."""
 
+_PLANTED = f"""
+SELECT min(kind || nspname || '.' || name || ' of ' || pg_get_userbyid(owner)) FROM (
+    SELECT 'function ', pronamespace, proname, proowner FROM pg_proc
+    UNION ALL SELECT 'operator ', oprnamespace, oprname, oprowner FROM pg_operator
+    UNION ALL SELECT 'type ', typnamespace, typname, typowner FROM pg_type WHERE typtype = 'd'
+    UNION ALL SELECT 'relation ', relnamespace, relname, relowner FROM pg_class
+        WHERE relkind IN ('v', 'f') OR relrowsecurity
+) AS code (kind, space, name, owner) JOIN pg_namespace ON pg_namespace.oid = space JOIN pg_roles ON pg_roles.oid = owner
+WHERE nspname NOT IN ('pg_catalog', 'information_schema') AND has_schema_privilege('{READER}', space, 'USAGE')
+AND NOT rolsuper AND EXISTS (
+    SELECT FROM pg_roles AS other WHERE other.rolcanlogin AND NOT other.rolsuper AND other.rolname <> session_user
+    AND pg_has_role(other.oid, owner, 'MEMBER')
+)"""  # noqa: S608  our own names only
+"""Selects code that a query could run and that a login made which has not the rights of this one; null without any."""
+
 _VOLATILE = """
 SELECT 'function ' || f.proname FROM pg_proc AS f JOIN pg_namespace ON pg_namespace.oid = f.pronamespace
 LEFT JOIN pg_aggregate ON aggfnoid = f.oid LEFT JOIN pg_proc AS transition ON transition.oid = aggtransfn
-WHERE 'v' IN (f.provolatile, transition.provolatile) AND f.proname = ANY($1::text[]) AND f.proname <> ALL($2)
+WHERE ('v' IN (f.provolatile, transition.provolatile) OR $4 AND nspname NOT IN ('pg_catalog', 'information_schema'))
+AND f.proname = ANY($1::text[]) AND f.proname <> ALL($2)
 AND (nspname = ANY(current_schemas(true)) OR nspname = ANY($1::text[]))
 UNION ALL
 SELECT 'operator ' || oprname FROM pg_operator JOIN pg_proc ON pg_proc.oid = oprcode
 JOIN pg_namespace ON pg_namespace.oid = oprnamespace
-WHERE provolatile = 'v' AND strpos($3, oprname) > 0
+WHERE (provolatile = 'v' OR $4 AND nspname NOT IN ('pg_catalog', 'information_schema')) AND strpos($3, oprname) > 0
 AND (nspname = ANY(current_schemas(true)) OR nspname = ANY($1::text[]))
 LIMIT 1"""
-"""Selects a function or an operator of the text that may have effects. One of another schema is called with its schema
-only."""
+"""Selects a function or an operator of the text that may have effects; with $4 also each that is not PostgreSQL's own.
+One of another schema is called with its schema only."""
 _HARMLESS = (
     "random", "random_normal", "gen_random_uuid", "clock_timestamp", "timeofday", "pg_sleep", "pg_relation_size",
     "pg_table_size", "pg_indexes_size", "pg_total_relation_size", "pg_database_size",
@@ -188,6 +209,7 @@ class _Cursor:
         self._connection = connection
         self._bytes_max = bytes_max
         self._is_first = True
+        self._has_taken_role = False
 
     async def start(self, sql: str, seconds: float) -> None:
         for statement in (*_BEGIN, f"SET LOCAL statement_timeout = {max(int(seconds * 1000), 1)}"):
@@ -241,17 +263,27 @@ class _Cursor:
         rights = await self._connection.fetchrow(_RIGHTS)
         if rights is None or rights["excess"] is None:
             return
-        first = "" if rights["has_roles"] else " (first make the roles: operations/README.md, PostgreSQL)"
+        login = f"{rights['login']} {rights['excess']}"
+        if not rights["has_roles"]:
+            raise QueryRefused(
+                f"a query in SQL needs a role that can only read, and {login}: run `pycrorm roles --create` once"
+            )
+        planted = await self._connection.fetchval(_PLANTED)
+        if rights["may_take"] and planted is None:
+            await self._connection.execute(f"SET LOCAL ROLE {READER}")
+            self._has_taken_role = True
+            return
+        why = "" if planted is None else f", whose rights the {planted} could use"
         raise QueryRefused(
-            f"a query in SQL needs a login that can only read, and {rights['login']} {rights['excess']}; make one:"
-            f" CREATE ROLE pycrorm_query LOGIN PASSWORD '…' IN ROLE {READER}{first}, and use it in the URL"
+            f"a query in SQL needs a login that can only read, and {login}{why}; make one:"
+            f" CREATE ROLE pycrorm_query LOGIN PASSWORD '…' IN ROLE {READER}, and use it in the URL"
         )
 
     async def _check_functions(self, sql: str) -> None:
         lowered = sql.lower()
         if 'u&"' in lowered:
             raise QueryRefused('a query writes names as they are, not as U&"…"')
-        name = await self._connection.fetchval(_VOLATILE, sorted(_names(sql)), _HARMLESS, sql)
+        name = await self._connection.fetchval(_VOLATILE, sorted(_names(sql)), _HARMLESS, sql, self._has_taken_role)
         if name is not None:
             raise QueryRefused(f"{ONLY_READS}; the {name} can do more and is not allowed")
 

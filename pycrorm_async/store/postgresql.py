@@ -43,7 +43,14 @@ from sqlalchemy.exc import DBAPIError
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.bulk_records import make
-from pycrorm_async.errors import DatabaseError, DatabaseForeign, DatabaseUnavailable, PycrormError, TablesUntrusted
+from pycrorm_async.errors import (
+    CallerError,
+    DatabaseError,
+    DatabaseForeign,
+    DatabaseUnavailable,
+    PycrormError,
+    TablesUntrusted,
+)
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX
 from pycrorm_async.store import postgresql_errors
 from pycrorm_async.store.dialect import (
@@ -96,6 +103,15 @@ NEW_VIEWS_SCHEMA = (
     f"CREATE SCHEMA {_NEW}",
     f"SET LOCAL search_path = {_NEW}, {TABLES}, {LOG}",
 )
+LET_READ_VIEWS = f"""
+DO $$
+BEGIN
+    IF pg_catalog.has_schema_privilege(pg_catalog.to_regrole('pycrorm_reader'), '{TABLES}', 'USAGE') THEN
+        GRANT USAGE ON SCHEMA {VIEWS} TO pycrorm_reader;
+        GRANT SELECT ON ALL TABLES IN SCHEMA {VIEWS} TO pycrorm_reader;
+    END IF;
+END $$"""
+"""Gives the reader the views of a new schema, where it may read the tables (`OWNER_GRANTS`)."""
 SHOW_NEW_VIEWS_SCHEMA = (
     f"""
 DO $$
@@ -652,7 +668,7 @@ class PostgreSQL:
         await self.only_views(connection, before)
         quote = connection.dialect.identifier_preparer.quote
         creations = [f"CREATE VIEW {quote(name)} AS {text}" for name, text in after.items()]
-        await self.execute_all(connection, [*NEW_VIEWS_SCHEMA, *creations, *SHOW_NEW_VIEWS_SCHEMA])
+        await self.execute_all(connection, [*NEW_VIEWS_SCHEMA, *creations, *SHOW_NEW_VIEWS_SCHEMA, LET_READ_VIEWS])
 
     async def comment_views(self, connection: AsyncConnection, comments: Mapping[str, Mapping[str, str]]) -> None:
         columns = (await connection.exec_driver_sql(COLUMNS_OF_VIEWS)).all()
@@ -770,7 +786,10 @@ def _arrays(rows: Sequence[tuple[Any, ...]], columns: int) -> tuple[list[Any], .
 
 # === roles ====================================================================================================
 
-_TRANSFER = f"""
+
+def _roles(names: str, member_of: str, then: str) -> str:
+    """Return the block that makes the missing roles, and the login a member of one, before it runs other statements."""
+    return f"""
 DO $$
 DECLARE
     name text;
@@ -781,7 +800,7 @@ BEGIN
         RAISE EXCEPTION 'the memory has no tables yet: run `pycrorm writer --once` first';
     END IF;
     missing := ARRAY(
-        SELECT each FROM unnest(ARRAY['pycrorm_recorder', 'pycrorm_folder', 'pycrorm_reader']) AS each
+        SELECT each FROM unnest(string_to_array('{names}', ', ')) AS each
         WHERE NOT EXISTS (SELECT FROM pg_roles WHERE rolname = each)
     );
     BEGIN
@@ -792,18 +811,25 @@ BEGIN
         RAISE EXCEPTION 'the roles % are missing and % may not create roles; a role with CREATEROLE runs: %',
             array_to_string(missing, ', '), current_user, (
                 SELECT string_agg(format('CREATE ROLE %I NOLOGIN; ', each), '') FROM unnest(missing) AS each
-            ) || format('GRANT pycrorm_folder TO %I', current_user);
+            ) || format('GRANT {member_of} TO %I', current_user);
     END;
     BEGIN
-        EXECUTE format('ALTER SCHEMA {TABLES} OWNER TO pycrorm_folder');
+        {then}
     EXCEPTION WHEN insufficient_privilege THEN
         BEGIN  -- the creator of a role is not a member of it, but may become one
-            EXECUTE format('GRANT pycrorm_folder TO %I', current_user);
+            EXECUTE format('GRANT {member_of} TO %I', current_user);
         EXCEPTION WHEN insufficient_privilege THEN
-            RAISE EXCEPTION '% cannot hand the tables over; a role with CREATEROLE runs: GRANT pycrorm_folder TO %',
+            RAISE EXCEPTION '% is not a member of {member_of}; a role with CREATEROLE runs: GRANT {member_of} TO %',
                 current_user, quote_ident(current_user);
         END;
     END;
+"""
+
+
+_READING = "pycrorm_recorder, pycrorm_folder, pycrorm_reader"
+_TRANSFER = (
+    _roles(_READING, "pycrorm_folder", f"EXECUTE format('ALTER SCHEMA {TABLES} OWNER TO pycrorm_folder');")
+    + f"""
     EXECUTE format('GRANT CREATE ON DATABASE %I TO pycrorm_folder', current_database());
     EXECUTE 'ALTER SCHEMA {TABLES} OWNER TO pycrorm_folder';
     EXECUTE 'ALTER SCHEMA {VIEWS} OWNER TO pycrorm_folder';
@@ -812,28 +838,89 @@ BEGIN
         EXECUTE format('ALTER TABLE %s OWNER TO pycrorm_folder', name);
     END LOOP;
 END $$"""
+)
+_TAKE = "SET LOCAL ROLE pycrorm_reader; RESET ROLE;"
 
-_READING = "pycrorm_recorder, pycrorm_folder, pycrorm_reader"
-_APPENDING = "pycrorm_recorder, pycrorm_folder"
+
+def _grants(appending: str) -> tuple[str, ...]:
+    """Return the rights of roles that append, and of the reader."""
+    reading = f"{appending}, pycrorm_reader"
+    return (
+        INCARNATION,
+        *BLOB,
+        *DIGEST,
+        f"REVOKE ALL ON SCHEMA {LOG}, {TABLES}, {VIEWS} FROM PUBLIC",
+        f"GRANT USAGE ON SCHEMA {LOG} TO {reading}",
+        f"GRANT SELECT ON ALL TABLES IN SCHEMA {LOG} TO {reading}",
+        f"GRANT INSERT ON {LOG}.event, {LOG}.episode, {LOG}.pycrorm_declaration TO {appending}",
+        f"GRANT INSERT ON {LOG}.pycrorm_incarnation, {LOG}.pycrorm_blob, {LOG}.pycrorm_digest TO {appending}",
+        f"GRANT UPDATE (head, ended_wall_ns, refused) ON {LOG}.episode TO {appending}",
+        f"GRANT USAGE ON SEQUENCE {LOG}.episode_number TO {appending}",
+        f"GRANT USAGE ON SCHEMA {TABLES}, {VIEWS} TO pycrorm_reader",
+        f"GRANT SELECT ON ALL TABLES IN SCHEMA {TABLES} TO pycrorm_reader",
+        f"GRANT SELECT ON ALL TABLES IN SCHEMA {VIEWS} TO pycrorm_reader",
+    )
+
+
+OWNER_GRANTS: tuple[str, ...] = (
+    _roles("pycrorm_recorder, pycrorm_reader", "pycrorm_reader", _TAKE) + "END $$",
+    *_grants("pycrorm_recorder"),
+    # For later tables; `replace_views` does the same for the schema of the views, which each change of them replaces.
+    f"ALTER DEFAULT PRIVILEGES IN SCHEMA {TABLES} GRANT SELECT ON TABLES TO pycrorm_reader",
+)
+"""Statements for an owner who goes on folding: roles that read and append, while the tables stay the owner's."""
 
 GRANTS: tuple[str, ...] = (
     _TRANSFER,
-    INCARNATION,
-    *BLOB,
-    *DIGEST,
-    f"REVOKE ALL ON SCHEMA {LOG}, {TABLES}, {VIEWS} FROM PUBLIC",
-    f"GRANT USAGE ON SCHEMA {LOG} TO {_READING}",
-    f"GRANT SELECT ON ALL TABLES IN SCHEMA {LOG} TO {_READING}",
-    f"GRANT INSERT ON {LOG}.event, {LOG}.episode, {LOG}.pycrorm_declaration TO {_APPENDING}",
-    f"GRANT INSERT ON {LOG}.pycrorm_incarnation, {LOG}.pycrorm_blob, {LOG}.pycrorm_digest TO {_APPENDING}",
-    f"GRANT UPDATE (head, ended_wall_ns, refused) ON {LOG}.episode TO {_APPENDING}",
-    f"GRANT USAGE ON SEQUENCE {LOG}.episode_number TO {_APPENDING}",
+    *_grants("pycrorm_recorder, pycrorm_folder"),
     f"GRANT UPDATE (folded, parked) ON {LOG}.episode TO pycrorm_folder",
-    f"GRANT USAGE ON SCHEMA {TABLES}, {VIEWS} TO pycrorm_reader",
-    f"GRANT SELECT ON ALL TABLES IN SCHEMA {TABLES} TO pycrorm_reader",
-    f"GRANT SELECT ON ALL TABLES IN SCHEMA {VIEWS} TO pycrorm_reader",
     # For later objects of the folder: tables, and the schema of the views, which each change of the views replaces.
     "ALTER DEFAULT PRIVILEGES FOR ROLE pycrorm_folder GRANT USAGE ON SCHEMAS TO pycrorm_reader",
     "ALTER DEFAULT PRIVILEGES FOR ROLE pycrorm_folder GRANT SELECT ON TABLES TO pycrorm_reader",
 )
-"""Statements for the owner of the database, in order; each may be run again."""
+"""Statements for the owner of a database that several logins fold, in order; each may be run again."""
+
+
+class Roles(NamedTuple):
+    """The roles of a memory.
+
+    Attributes:
+        login: of this connection.
+        tables_owner: the role to which the tables belong; None without tables.
+        members: the logins that may act as each role, by role; a role that is missing is not in it.
+    """
+
+    login: str
+    tables_owner: str | None
+    members: dict[str, list[str]]
+
+
+async def roles_of(connection: AsyncConnection) -> Roles:
+    """Read the roles of a memory."""
+    login, owner = (await connection.exec_driver_sql(_OWNER)).one()
+    return Roles(login, owner, {name: list(logins) for name, logins in await connection.exec_driver_sql(_MEMBERS)})
+
+
+async def make_roles(connection: AsyncConnection, *, shared: bool) -> None:
+    """Make the roles: with `shared` those of `GRANTS`, also where its roles exist, else those of `OWNER_GRANTS`.
+
+    Raises `CallerError` with the statements that another login must run first.
+    """
+    owner = (await roles_of(connection)).tables_owner
+    try:
+        for statement in GRANTS if shared or owner == "pycrorm_folder" else OWNER_GRANTS:
+            await connection.exec_driver_sql(statement)
+    except DBAPIError as error:
+        if postgresql_errors.sqlstate(error) == _RAISED:
+            raise CallerError(postgresql_errors.message(error)) from None
+        raise
+
+
+_RAISED = "P0001"
+_OWNER = f"""
+SELECT session_user::text, (SELECT pg_get_userbyid(nspowner)::text FROM pg_namespace WHERE nspname = '{TABLES}')"""
+_MEMBERS = """
+SELECT role.rolname::text, ARRAY(
+    SELECT login.rolname::text FROM pg_roles AS login
+    WHERE login.rolcanlogin AND NOT login.rolsuper AND pg_has_role(login.oid, role.oid, 'MEMBER') ORDER BY 1
+) FROM pg_roles AS role WHERE rolname IN ('pycrorm_recorder', 'pycrorm_folder', 'pycrorm_reader') ORDER BY 1"""

@@ -125,6 +125,16 @@ def is_missing_table(error: DBAPIError) -> bool:
     return error.orig is not None and _code(error.orig) == "42P01"
 
 
+def sqlstate(error: DBAPIError) -> str:
+    """Return the SQLSTATE of an error; empty without one."""
+    return "" if error.orig is None else _code(error.orig)
+
+
+def message(error: DBAPIError) -> str:
+    """Return the server's message, without class names."""
+    return str(error) if error.orig is None else _text(error.orig)
+
+
 def _code(fault: BaseException) -> str:
     """Return the SQLSTATE; empty if the error has none."""
     return getattr(fault, "sqlstate", None) or getattr(fault.__cause__, "sqlstate", None) or ""

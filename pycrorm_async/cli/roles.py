@@ -1,0 +1,80 @@
+"""`pycrorm roles` shows the roles of a memory on PostgreSQL, and makes them."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Annotated
+
+import typer
+
+from pycrorm_async.cli.output import (
+    DEFAULT_URL,
+    JsonOption,
+    SpoolOption,
+    UrlOption,
+    print_json,
+    print_line,
+    print_table,
+)
+from pycrorm_async.cli.reading import note_pending_events
+from pycrorm_async.errors import CallerError
+from pycrorm_async.operations.destination import shared_address
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.postgresql import Roles, make_roles, roles_of
+
+_WORK = {
+    "pycrorm_recorder": "appends to the log",
+    "pycrorm_folder": "appends, and makes tables and views from the log",
+    "pycrorm_reader": "reads log, tables and views; queries in SQL run as this role",
+}
+
+
+def roles(
+    create: Annotated[bool, typer.Option("--create", help="Make the roles; may be repeated.")] = False,
+    shared: Annotated[
+        bool,
+        typer.Option("--shared", help="With --create: hand the tables over to pycrorm_folder, for several logins."),
+    ] = False,
+    url: UrlOption = DEFAULT_URL,
+    spool: SpoolOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Show the roles of a memory on PostgreSQL and the logins that have them; with --create, make them.
+
+    The owner of the database runs it once, and then goes on as before: the tables stay the owner's, and queries in SQL
+    run as pycrorm_reader. With --shared the tables belong to pycrorm_folder, whose members fold; the owner then reads
+    and folds with another login (operations/README.md, PostgreSQL).
+    """
+    address = shared_address(url)
+    if address.is_sqlite:
+        raise CallerError("SQLite has no roles: the permissions of the file say who may read and write it")
+    if shared and not create:
+        raise CallerError("--shared says how the roles are made: add --create")
+    made = asyncio.run(_roles(address, create=create, shared=shared))
+    note_pending_events(url, spool)
+    if as_json:
+        print_json(made._asdict())
+        return
+    rows = [(name, work, "yes" if name in made.members else "no", _listed(made, name)) for name, work in _WORK.items()]
+    print_table(f"Roles of {address}", ("role", "its work", "exists", "logins"), rows)
+    print_line(f"The tables belong to {made.tables_owner or 'no role yet'}; this login is {made.login}.")
+
+
+def _listed(made: Roles, name: str) -> str:
+    return ", ".join(made.members.get(name, ()))
+
+
+async def _roles(address: DatabaseAddress, *, create: bool, shared: bool) -> Roles:
+    log = await EventLog.open(address, create=False)
+    if create:  # not at once, because a memory that is missing must not be made
+        await log.close()
+        log = await EventLog.open(address, create=True, belongs_to=log.log_id)
+    try:
+        with log.translated():
+            async with log.engine.begin() as connection:
+                if create:
+                    await make_roles(connection, shared=shared)
+                return await roles_of(connection)
+    finally:
+        await log.close()
