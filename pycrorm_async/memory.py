@@ -176,6 +176,15 @@ class PartsHolder:
         return self._parts
 
 
+def _reported(state: Any) -> str:
+    """Return a state as text, without fields that are None, 0 or empty; False counts."""
+    if not hasattr(state, "_asdict"):
+        return repr(state)
+    fields = ((name, each) for name, each in state._asdict().items() if each or each is False)
+    shown = (f"{name}={_reported(each)}" for name, each in fields if not isinstance(each, tuple) or any(each))
+    return f"{type(state).__name__}({', '.join(shown)})"
+
+
 class MemoryStatus(NamedTuple):
     """The state of a memory.
 
@@ -215,6 +224,10 @@ class MemoryStatus(NamedTuple):
     spool_fault: str | None
     spool_lost: tuple[str, ...]
     declarations_unrepeated: int
+
+    def __repr__(self) -> str:
+        """Leave out the fields that report nothing, so that a fault is seen."""
+        return _reported(self)
 
     @classmethod
     def of(cls, parts: Parts, unadopted: Mapping[str, PycrormError]) -> Self:

@@ -26,6 +26,19 @@ def _sign(code: int) -> str:
     return chr(0x2400 + code) if code < 0x20 else f"<U+{code:04X}>"
 
 
+def without_formula(text: str) -> str:
+    """Return a text that a spreadsheet takes for a text: an apostrophe comes before one that begins as a formula.
+
+    >>> without_formula("=HYPERLINK(A1)"), without_formula("milk")
+    ("'=HYPERLINK(A1)", 'milk')
+    """
+    return f"'{text}" if text[:1] in _FORMULA else text
+
+
+_FORMULA = frozenset("=+-@\t\r\n\uff1d\uff0b\uff0d\uff20")
+"""The characters with which a formula begins, full-width ones too, and those that spreadsheets skip before one."""
+
+
 def escaped_json(document: str) -> str:
     """Return a JSON document that means the same and has no control character but line ends between its values.
 

@@ -14,6 +14,7 @@ import typer
 
 from pycrorm_async.cli.output import (
     DEFAULT_URL,
+    CsvOption,
     JsonOption,
     SpoolOption,
     UrlOption,
@@ -82,6 +83,7 @@ def _verb(name: str) -> Callable[..., None]:
         sql: bool,
         simulated: bool,
         as_json: bool,
+        as_csv: bool | None,
         **options: Any,
     ) -> None:
         arguments = {
@@ -90,7 +92,7 @@ def _verb(name: str) -> Callable[..., None]:
         if sql:
             print_line(getattr(Reading(DatabaseAddress.parse(url)).ask, name)(**arguments).sql)
             return
-        _answer(name, arguments, url, spool, simulated=simulated, as_json=as_json)
+        _answer(name, arguments, url, spool, simulated=simulated, as_json=as_json, as_csv=as_csv)
 
     parameters = [
         each.replace(kind=inspect.Parameter.KEYWORD_ONLY, annotation=_option(each), default=each.default)
@@ -102,6 +104,7 @@ def _verb(name: str) -> Callable[..., None]:
         "url": (UrlOption, DEFAULT_URL),
         "spool": (SpoolOption, None),
         "as_json": (JsonOption, False),
+        "as_csv": (CsvOption, None),
     }
     parameters += [
         inspect.Parameter(key, inspect.Parameter.KEYWORD_ONLY, annotation=annotation, default=default)
@@ -128,7 +131,14 @@ def _option(parameter: inspect.Parameter) -> Any:
 
 
 def _answer(
-    name: str, arguments: dict[str, Any], url: str, spool: Path | None, *, simulated: bool, as_json: bool
+    name: str,
+    arguments: dict[str, Any],
+    url: str,
+    spool: Path | None,
+    *,
+    simulated: bool,
+    as_json: bool,
+    as_csv: bool | None,
 ) -> None:
     async def ask(reading: Reading) -> tuple[list[str], list[tuple[Any, ...]], str]:
         question: Question = getattr(reading.ask, name)(**arguments)
@@ -140,8 +150,11 @@ def _answer(
     if as_json:
         print_json([dict(zip(columns, map(_plain, row), strict=True)) for row in rows])
         return
-    headings = [each.removesuffix("_s") for each in columns]
-    print_table(name, headings, ([*map(_cell, columns, row)] for row in rows))
+    if as_csv is not None:
+        print_table(name, columns, ([*map(_plain, row)] for row in rows), as_csv=as_csv)
+    else:
+        headings = [each.removesuffix("_s") for each in columns]
+        print_table(name, headings, ([*map(_cell, columns, row)] for row in rows))
     if not rows:
         note(f"no row answers; {unknown or '`--sql` shows the question.'}")
 

@@ -8,6 +8,7 @@ import typer
 
 from pycrorm_async.cli.output import (
     DEFAULT_URL,
+    CsvOption,
     JsonOption,
     SpoolOption,
     UrlOption,
@@ -31,6 +32,7 @@ def diff(
     url: UrlOption = DEFAULT_URL,
     spool: SpoolOption = None,
     as_json: JsonOption = False,
+    as_csv: CsvOption = None,
     sql: Annotated[bool, typer.Option("--sql", help="Print the SQL of the rows that are compared.")] = False,
 ) -> None:
     """Compare two episodes: their circumstances, their task trees, and the last places of their objects.
@@ -45,7 +47,7 @@ def diff(
     if as_json:
         print_json(compared)
         return
-    for letter, episode in (("A", compared.first), ("B", compared.second)):
+    for letter, episode in (("A", compared.first), ("B", compared.second)) if as_csv is None else ():
         stdout.print(f"{letter}: {_line(episode)}", markup=False)
     rows = [
         (
@@ -57,8 +59,8 @@ def diff(
         )
         for each in compared.differences
     ]
-    if rows:
-        print_table("Differences", ("of", "where", "what", "A", "B"), rows)
+    if rows or as_csv is not None:
+        print_table("Differences", ("of", "where", "what", "A", "B"), rows, as_csv=as_csv)
     note(f"{counted(len(rows), 'difference')}; nodes that are the same: {compared.same_nodes:,}")
 
 

@@ -9,6 +9,7 @@ import typer
 
 from pycrorm_async.cli.output import (
     DEFAULT_URL,
+    CsvOption,
     JsonOption,
     LimitOption,
     RobotOption,
@@ -51,6 +52,7 @@ def episodes(
     text: TextOption = None,
     limit: LimitOption = None,
     as_json: JsonOption = False,
+    as_csv: CsvOption = None,
 ) -> None:
     """List the recorded episodes, the oldest first."""
     choice = EpisodeChoice(status, parse_since(since), tuple(tag or ()), robot, text, limit)
@@ -65,11 +67,12 @@ def episodes(
         return
     if not summaries:
         note(absence)
+    if not summaries and as_csv is None:
         return
     numbers = {e.id: e.number for e in summaries}
     columns: tuple[str, ...] = ("episode", "started", "took", "status", "nodes", "failed", "description")
     rows: list[tuple[object, ...]] = [
-        (e.number, moment(e.started_at), duration(e.duration_ns), e.status, e.nodes, e.failed, _description(e, numbers))
+        (e.number, moment(e.started_at), _took(e, as_csv=as_csv), e.status, e.nodes, e.failed, _description(e, numbers))
         for e in summaries
     ]
     if stdout.width >= _WIDTH_WITH_ROBOTS and any(each.robots for each in summaries):
@@ -82,7 +85,14 @@ def episodes(
     if simulated:
         columns = (*columns, "simulated")
         rows = [(*row, simulated_by(e) if e.simulated else "") for row, e in zip(rows, summaries, strict=True)]
-    print_table(f"Episodes of {DatabaseAddress.parse(url)}", columns, rows)
+    print_table(f"Episodes of {DatabaseAddress.parse(url)}", columns, rows, as_csv=as_csv)
+
+
+def _took(episode: EpisodeSummary, *, as_csv: bool | None) -> object:
+    """Return the duration: of CSV in s, for programs."""
+    if as_csv is None or episode.duration_ns is None:
+        return duration(episode.duration_ns)
+    return episode.duration_ns / 1e9
 
 
 def _description(episode: EpisodeSummary, numbers: Mapping[str, int]) -> str:

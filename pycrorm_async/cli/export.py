@@ -15,6 +15,8 @@ from pycrorm_async.cli.output import (
     DEFAULT_URL,
     JsonOption,
     SpoolOption,
+    StatusOption,
+    TagOption,
     UrlOption,
     counted,
     note,
@@ -30,6 +32,8 @@ from pycrorm_async.export.export import export as write_export
 from pycrorm_async.export.selection import read_manifest
 from pycrorm_async.operations.destination import shared_address
 from pycrorm_async.progress_bar import ProgressCallback, progress_bar, stderr
+from pycrorm_async.query.named_queries import EpisodeChoice
+from pycrorm_async.query.question import absence_of_episodes
 from pycrorm_async.query.questions import QUESTIONS, Ask
 from pycrorm_async.query.reading import Reading
 
@@ -59,6 +63,11 @@ def export(
         list[str] | None,
         typer.Option("--episode", metavar="EPISODE", help="Of a view or a question: only this episode; repeatable."),
     ] = None,
+    status: StatusOption = None,
+    tag: TagOption = None,
+    without_tag: Annotated[
+        list[str] | None, typer.Option("--without-tag", metavar="TAG", help="No episodes with this tag; repeatable.")
+    ] = None,
     arguments: Annotated[
         list[str] | None,
         typer.Option("--with", metavar="NAME=VALUE", help="Of a question: an argument, as in object=milk; repeatable."),
@@ -79,6 +88,9 @@ def export(
     images: Annotated[
         str | None, typer.Option(metavar="WIDTHxHEIGHT", help="Of lerobot: a picture of the scene at each frame.")
     ] = None,
+    no_formulas: Annotated[
+        bool, typer.Option("--no-formulas", help="Of csv: an apostrophe before each text that a spreadsheet would run.")
+    ] = False,
     force: Annotated[bool, typer.Option("--force", help="Replace the file and its manifest if they exist.")] = False,
     url: UrlOption = DEFAULT_URL,
     spool: SpoolOption = None,
@@ -86,29 +98,40 @@ def export(
 ) -> int:
     """Write episodes, or the rows of a view, to a file, with a manifest from which it can be made again.
 
-    Exit code 1 if an episode cannot be read and is left out of a lerobot data set.
+    --status, --tag and --without-tag choose among the episodes that have ended, of which a view or a question has the
+    rows; without a name each node of them is a row. Exit code 1 if an episode cannot be read and is left out of a
+    lerobot data set.
     """
     shared_address(url)
     if again is not None and what:
         raise CallerError(f"name {' '.join(what)} or make an export again with --again, not both")
-    if again is None and not what:
+    choice = EpisodeChoice(status, tags=tuple(tag or ()), without_tags=tuple(without_tag or ()))
+    if again is None and not what and choice == EpisodeChoice():
         raise CallerError("name what to export, for example `pycrorm export last --out last.parquet`, or --again")
     if again is not None:
-        if file_format is not None or episode or arguments or clock is not None or fps is not None or images:
+        given = file_format, clock, fps
+        if given != (None, None, None) or episode or arguments or images or no_formulas or choice != EpisodeChoice():
             raise CallerError("--again takes all but --out and --force from the manifest: leave the other options out")
         return _again(again, out, url, spool, force=force, as_json=as_json)
-    assert what, "checked above"
+    if choice != EpisodeChoice() and episode:
+        raise CallerError("--episode names episodes, and --status, --tag and --without-tag choose them: leave one out")
     if out is None:
         file_format = file_format or "parquet"
-        out = Path(f"{'-'.join(what)[:100].replace('/', '-')}.{file_format}")
-    options: dict[str, Any] = {"file_format": file_format, "clock": clock, "fps": fps}
+        out = Path(f"{'-'.join(what or ['episodes'])[:100].replace('/', '-')}.{file_format}")
+    options: dict[str, Any] = {"file_format": file_format, "clock": clock, "fps": fps, "no_formulas": no_formulas}
     options["images"] = _size(images)
-    options["arguments"] = _arguments(what[0], arguments or [])
+    options["arguments"] = _arguments(what[0], arguments or []) if what else {}
 
     async def write(report_progress: ProgressCallback | None) -> Exported:
         async with Reading.open(url) as reading:
+            chosen = episode or []
+            if choice != EpisodeChoice():
+                chosen = [str(each.number) for each in await reading.episodes(choice) if each.status != "RUNNING"]
+                if not chosen:
+                    raise CallerError(f"{await absence_of_episodes(reading, choice)}: nothing is exported")
+            named, limited = (what, chosen) if what else (chosen, [])
             return await write_export(
-                reading, what, out, episodes=episode or (), force=force, report_progress=report_progress, **options
+                reading, named, out, episodes=limited, force=force, report_progress=report_progress, **options
             )
 
     interrupt_on_termination()
@@ -177,7 +200,7 @@ def _again(manifest: Path, out: Path | None, url: str, spool: Path | None, *, fo
 def _print(exported: Exported, *, as_json: bool) -> None:
     manifest = exported.manifest
     if as_json:
-        counts = {"rows": exported.rows, "episodes": exported.episodes, "left_out": exported.left_out}
+        counts: dict[str, Any] = {"rows": exported.rows, "episodes": exported.episodes, "left_out": exported.left_out}
         counts |= {"unreadable": exported.unreadable} if exported.unreadable else {}
         print_json({"file": exported.path, "format": manifest.file_format, **counts, "files": manifest.files})
         return

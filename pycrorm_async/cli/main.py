@@ -27,28 +27,20 @@ from typing import Annotated, Any
 import typer
 from typer.exceptions import TyperException
 
-from pycrorm_async import __version__
-from pycrorm_async.errors import (
-    CallerError,
-    DamageError,
-    DatabaseError,
-    EpisodeParked,
-    FilesError,
-    FlushTimeout,
-    PycrormError,
-)
+from pycrorm_async import __version__, errors
+from pycrorm_async.errors import PycrormError
 
 
 def exit_code(error: PycrormError) -> int:
     """Return the documented exit code of an error; it depends on the party at fault."""
     match error:
-        case CallerError():
+        case errors.CallerError():
             return 2
-        case EpisodeParked() | FlushTimeout():
+        case errors.EpisodeParked() | errors.FlushTimeout():
             return 1
-        case FilesError() | DatabaseError():
+        case errors.FilesError() | errors.DatabaseError():
             return 3
-        case DamageError():
+        case errors.DamageError():
             return 4
     return 1
 
@@ -59,6 +51,8 @@ def _with_exit_code(verb: Callable[..., int | None]) -> Callable[..., None]:
     @functools.wraps(verb)
     def run(*arguments: Any, **options: Any) -> None:
         try:
+            if options.get("as_json") and options.get("as_csv") is not None:
+                raise errors.CallerError("--json and --csv exclude each other")
             code = verb(*arguments, **options) or 0
             sys.stdout.flush()
         except PycrormError as error:

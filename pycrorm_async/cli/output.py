@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import logging
 import os
 import re
@@ -21,10 +22,10 @@ from rich.table import Table
 from pycrorm_async.errors import CallerError
 from pycrorm_async.progress_bar import VisibleConsole, stderr
 from pycrorm_async.settings import FileAccess, Writer
-from pycrorm_async.visible_text import escaped_json
+from pycrorm_async.visible_text import escaped_json, visible, without_formula
 
-_WIDTH_PIPED = 160
-"""Width of tables in characters if stdout is not a terminal; wide enough to keep most rows on one line."""
+_WIDTH_PIPED = 10_000
+"""Width in characters if stdout is not a terminal, so that `grep` finds whole lines; more would make huge tables."""
 
 _WORD_MAX = 24
 """Bounds the longest word of a column for which a table needs room: ids and paths may be broken."""
@@ -70,8 +71,17 @@ def print_json(document: Any) -> None:
     sys.stdout.write(escaped_json(msgspec.json.format(encoded, indent=2).decode()) + "\n")
 
 
-def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
-    """Print a table; columns of numbers alone are right-aligned. In a narrow terminal print a block for each row."""
+def print_table(
+    title: str, columns: Sequence[str], rows: Iterable[Sequence[object]], *, as_csv: bool | None = None
+) -> None:
+    """Print a table; columns of numbers alone are right-aligned. In a narrow terminal print a block for each row.
+
+    `as_csv` is the value of `CsvOption`.
+    """
+    if as_csv is not None:
+        lines = ([csv_cell(each, no_formulas=not as_csv) for each in row] for row in (columns, *rows))
+        csv.writer(sys.stdout).writerows(lines)
+        return
     rows = [tuple(row) for row in rows]
     stdout.print(f"[bold]{escape(title)}[/]")  # not the title of the table, which is wrapped to the table's width
     if stdout.width < _READABLE * _width_of_words(columns, rows):
@@ -85,6 +95,14 @@ def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[obje
     for row in rows:
         table.add_row(*(_cell(value) for value in row))
     stdout.print(table)
+
+
+def csv_cell(value: object, *, no_formulas: bool) -> object:
+    """Return a value as CSV has it: a pipe or file gets each text unchanged, a terminal visible control characters."""
+    if not isinstance(value, str):
+        return value.isoformat() if isinstance(value, datetime) else value
+    text = without_formula(value) if no_formulas else value
+    return visible(text) if stdout.is_terminal else text
 
 
 def _width_of_words(columns: Sequence[str], rows: Sequence[Sequence[object]]) -> int:
@@ -212,6 +230,14 @@ TextOption = Annotated[
 ]
 LimitOption = Annotated[
     int | None, typer.Option("--limit", metavar="N", min=1, help="Only the newest N of these episodes.")
+]
+CsvOption = Annotated[
+    bool | None,
+    typer.Option(
+        "--csv/--csv-no-formulas",
+        help="Print CSV; without formulas: with an apostrophe before each text that a spreadsheet would run.",
+        show_default=False,
+    ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document.")]
 

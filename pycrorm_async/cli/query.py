@@ -11,10 +11,12 @@ import typer
 
 from pycrorm_async.cli.output import (
     DEFAULT_URL,
+    CsvOption,
     JsonOption,
     SpoolOption,
     UrlOption,
     counted,
+    csv_cell,
     note,
     print_json,
     print_table,
@@ -42,6 +44,7 @@ def query(
     url: UrlOption = DEFAULT_URL,
     spool: SpoolOption = None,
     as_json: JsonOption = False,
+    as_csv: CsvOption = None,
 ) -> None:
     """Run one read-only query in SQL: no statement can change the memory or the machine.
 
@@ -55,8 +58,8 @@ def query(
     limits = SqlLimits(rows=limit or None, bytes=max(int(megabytes * _MEGABYTE), 1), seconds=seconds)
     if as_json and form == "csv":
         raise CallerError("--json and --format csv exclude each other")
-    if form == "csv":
-        more = read_memory(url, spool, lambda reading: _write_csv(reading, text, limits))
+    if form == "csv" or as_csv is not None:
+        more = read_memory(url, spool, lambda reading: _write_csv(reading, text, limits, no_formulas=as_csv is False))
     else:
         result = read_memory(url, spool, lambda reading: reading.query(text, limits))
         more = result.more
@@ -71,12 +74,14 @@ def query(
         )
 
 
-async def _write_csv(reading: Reading, sql: str, limits: SqlLimits) -> bool:
+async def _write_csv(reading: Reading, sql: str, limits: SqlLimits, *, no_formulas: bool) -> bool:
     async with reading.stream(sql, limits) as rows:
         lines = csv.writer(sys.stdout)
         lines.writerow(rows.columns)
         async for row in rows:
-            lines.writerow(_cell(each) for each in row)
+            lines.writerow(
+                csv_cell(each, no_formulas=no_formulas) if isinstance(each, str) else _cell(each) for each in row
+            )
         sys.stdout.flush()
         return rows.more
 

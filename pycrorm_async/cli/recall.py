@@ -10,6 +10,7 @@ import typer
 
 from pycrorm_async.cli.output import (
     DEFAULT_URL,
+    CsvOption,
     JsonOption,
     SpoolOption,
     UrlOption,
@@ -52,7 +53,7 @@ def recall(
     ] = False,
     status: Annotated[str | None, typer.Option(help="With --follows: only after actions that ended so.")] = None,
     reason: Annotated[str | None, typer.Option(help="With --follows: only after actions that failed so.")] = None,
-    k: Annotated[int, typer.Option("--k", help="The number of actions.")] = _K,
+    k: Annotated[int, typer.Option("--limit", "--k", metavar="N", help="The number of actions.")] = _K,
     before: Annotated[
         str | None, typer.Option(metavar="MOMENT", help="Started before: 2026-11-20, with time, in UTC.")
     ] = None,
@@ -70,8 +71,11 @@ def recall(
     url: UrlOption = DEFAULT_URL,
     spool: SpoolOption = None,
     as_json: JsonOption = False,
+    as_csv: CsvOption = None,
 ) -> None:
     """List the past actions most like a cue, with their outcomes."""
+    if as_csv is not None and why:
+        raise CallerError("--why prints no table: leave --csv out")
     parsed = _parse(cue or [])
     conditions: dict[str, Any] = {
         "before": before, "after": after, "episode": episode, "tag": tag, "robot": robot,
@@ -84,7 +88,7 @@ def recall(
             conditions, "--follows" if follows else "--like", taken=() if follows else ("simulated", "k")
         )
     if follows:
-        _follows(parsed, like, url, spool, status=status, reason=reason, as_json=as_json)
+        _follows(parsed, like, url, spool, status=status, reason=reason, as_json=as_json, as_csv=as_csv)
         return
     if like is None and not any(parsed[:-1]):  # `only:` chooses among the cases of a cue
         raise CallerError("name a type or features, for example `pycrorm recall PickUpAction arm=LEFT`, or add --like")
@@ -104,9 +108,12 @@ def recall(
         return answer, await memory.types()
 
     answer, types = read_memory(url, spool, query)
-    _note_unknown(answer.cue.type, types)
+    if as_json or as_csv is not None:  # else the answer itself has the line
+        _note_unknown(answer.cue.type, types)
     if as_json:
         print_json(_document(answer))
+    elif as_csv is not None:
+        print_table("", *answer.table(), as_csv=as_csv)
     else:
         _print(answer, why=why)
 
@@ -160,7 +167,11 @@ def _number(text: str, term: str) -> float:
 def _refuse_conditions(conditions: dict[str, Any], option: str, *, taken: tuple[str, ...]) -> None:
     """Raise `CallerError` for a condition that a search with this option does not have."""
     defaults: dict[str, Any] = {"simulated": False, "k": _K, "minimum": 0.0}
-    ignored = [f"--{name}" for name, each in conditions.items() if name not in taken and each != defaults.get(name)]
+    ignored = [
+        f"--{'limit' if name == 'k' else name}"
+        for name, each in conditions.items()
+        if name not in taken and each != defaults.get(name)
+    ]
     if ignored:
         raise CallerError(
             f"{option} does not take {', '.join(ignored)}: leave {'it' if len(ignored) == 1 else 'them'} out"
@@ -211,6 +222,7 @@ def _document(answer: Answer) -> dict[str, Any]:
         "left_out": answer.cue.left_out,
         "never_seen": [list(each) for each in answer.never_seen],
         "joined": list(answer.joined),
+        "notes": list(answer.notes),
         "success": None if success is None else success._asdict(),
         "reasons": dict(answer.reasons),
         "cases": [_case(each) for each in answer],
@@ -246,6 +258,7 @@ def _follows(
     status: str | None,
     reason: str | None,
     as_json: bool,
+    as_csv: bool | None,
 ) -> None:
     dtype = parsed.type
     if dtype is None or like is not None or any(parsed[1:]):
@@ -271,4 +284,4 @@ def _follows(
         for each in following.followers
     ]
     after = " ".join([dtype, *([status] if status else []), *([f"({reason})"] if reason else [])])
-    print_table(f"After {following.cases:,} {after}", ("next", "times", "share", "success"), rows)
+    print_table(f"After {following.cases:,} {after}", ("next", "times", "share", "success"), rows, as_csv=as_csv)

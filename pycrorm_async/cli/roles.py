@@ -21,13 +21,7 @@ from pycrorm_async.errors import CallerError
 from pycrorm_async.operations.destination import shared_address
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.postgresql import Roles, make_roles, roles_of
-
-_WORK = {
-    "pycrorm_recorder": "appends to the log",
-    "pycrorm_folder": "appends, and makes tables and views from the log",
-    "pycrorm_reader": "reads log, tables and views; queries in SQL run as this role",
-}
+from pycrorm_async.store.postgresql import RoleState, make_roles, roles_of
 
 
 def roles(
@@ -51,21 +45,17 @@ def roles(
         raise CallerError("SQLite has no roles: the permissions of the file say who may read and write it")
     if shared and not create:
         raise CallerError("--shared says how the roles are made: add --create")
-    made = asyncio.run(_roles(address, create=create, shared=shared))
+    states = asyncio.run(_roles(address, create=create, shared=shared))
     note_pending_events(url, spool)
     if as_json:
-        print_json(made._asdict())
+        print_json([each._asdict() for each in states])
         return
-    rows = [(name, work, "yes" if name in made.members else "no", _listed(made, name)) for name, work in _WORK.items()]
-    print_table(f"Roles of {address}", ("role", "its work", "exists", "logins"), rows)
-    print_line(f"The tables belong to {made.tables_owner or 'no role yet'}; this login is {made.login}.")
+    rows = [(each.name, "yes" if each.exists else "no", ", ".join(each.members)) for each in states]
+    print_table(f"Roles of {address}", ("role", "exists", "logins"), rows)
+    print_line(f"The tables belong to {states[0].tables_owner or 'no role yet'}; this login is {states[0].login}.")
 
 
-def _listed(made: Roles, name: str) -> str:
-    return ", ".join(made.members.get(name, ()))
-
-
-async def _roles(address: DatabaseAddress, *, create: bool, shared: bool) -> Roles:
+async def _roles(address: DatabaseAddress, *, create: bool, shared: bool) -> list[RoleState]:
     log = await EventLog.open(address, create=False)
     if create:  # not at once, because a memory that is missing must not be made
         await log.close()

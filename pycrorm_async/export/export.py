@@ -55,6 +55,7 @@ from pycrorm_async.query.questions import QUESTIONS, Ask
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.text import nearest
 from pycrorm_async.report.output_files import new_file, new_folder, refuse_existing
+from pycrorm_async.visible_text import without_formula
 from pycrorm_async.writer.drain import run_to_completion
 
 if TYPE_CHECKING:
@@ -134,6 +135,7 @@ async def export(
     clock: Clock | None = None,
     fps: int | None = None,
     images: ImageSize | None = None,
+    no_formulas: bool = False,
     report_progress: ProgressCallback | None = None,
 ) -> Exported:
     """Write rows or episodes to a file that gets its name when it is complete, and its manifest beside it.
@@ -151,6 +153,7 @@ async def export(
             frames each second (`time`). Of MCAP: the wall time of the events (`time`, the default), or `fps` events in
             each second (`event`).
         images: of LeRobot: width and height of a picture of the scene at each frame, which needs the extra `world`.
+        no_formulas: of CSV: an apostrophe before each text that a spreadsheet would run as a formula.
         report_progress: gets the number of rows, done and of all; of the formats of episodes that of events, with the
             phase, `reading`, `drawing` or `writing`, also from another thread.
 
@@ -164,6 +167,8 @@ async def export(
     chosen = file_format or format_of(target)
     if chosen not in get_args(FileFormat):
         raise CallerError(f"there is no format {chosen!r}{nearest(chosen, get_args(FileFormat))}; formats: {_listed()}")
+    if no_formulas and chosen != "csv":
+        raise CallerError("no_formulas is an option of the format csv")
     options = _options(chosen, clock, fps, images)
     left_out, unknown_name, unreadable = 0, "", dict[int, str]()
     with new_file(manifest_path(target), force=force) as described:
@@ -172,7 +177,9 @@ async def export(
                 selection = await select_rows(reading, what, episodes, arguments=arguments)
                 left_out = selection.left_out
                 with new_file(target, force=force) as written:
-                    manifest = await _write_rows(reading, selection, written, chosen, report_progress)
+                    manifest = await _write_rows(
+                        reading, selection, written, chosen, report_progress, no_formulas=no_formulas
+                    )
                     manifest = _complete(manifest, {target.name: checksums(written)[written.name]}, described)
                 if selection.question is not None and not manifest.rows:
                     unknown_name = await selection.question.unknown_name()
@@ -285,7 +292,13 @@ def _changes(subject: str, before: dict[str, str], now: dict[str, str]) -> list[
 
 
 async def _write_rows(
-    reading: Reading, selection: Selection, path: Path, file_format: RowFormat, report_progress: ProgressCallback | None
+    reading: Reading,
+    selection: Selection,
+    path: Path,
+    file_format: RowFormat,
+    report_progress: ProgressCallback | None,
+    *,
+    no_formulas: bool,
 ) -> Manifest:
     log = await reading.log()
     columns = columns_of(selection.statement, deferred=True)
@@ -303,12 +316,14 @@ async def _write_rows(
     )
     async with aclosing(stream) as batches:
         json_columns = frozenset(each.name for each in columns if each.kind == "json")
-        rows, schema = await write_rows(batches, path, file_format, json_columns, _reporting(report_progress, total))
+        shown = (_guarded(each) async for each in batches) if no_formulas else batches
+        rows, schema = await write_rows(shown, path, file_format, json_columns, _reporting(report_progress, total))
     return Manifest(
         kind=selection.kind,
         names=(selection.name,) if selection.name else tuple(each.id for each in selection.episodes),
         file_format=file_format,
-        options={"arguments": dict(selection.arguments)} if selection.arguments else {},
+        options=({"arguments": dict(selection.arguments)} if selection.arguments else {})
+        | ({"no_formulas": True} if no_formulas else {}),
         query=_sql(plain, log.engine.dialect),
         columns={each.name: str(each.type) for each in schema},
         rows=rows,
@@ -503,6 +518,18 @@ class _Progress:
 
 RowFormat: TypeAlias = Literal["parquet", "csv", "jsonl"]
 _Write: TypeAlias = "Callable[[pa.RecordBatch], object]"
+
+
+def _guarded(batch: pa.RecordBatch) -> pa.RecordBatch:
+    """Return the rows with no text that a spreadsheet would run as a formula."""
+    pa = needed_pyarrow()
+    columns = [
+        pa.array([None if text is None else without_formula(text) for text in each.to_pylist()], each.type)
+        if pa.types.is_string(each.type) or pa.types.is_large_string(each.type)
+        else each
+        for each in batch.columns
+    ]
+    return pa.RecordBatch.from_arrays(columns, schema=batch.schema)
 
 
 async def write_rows(

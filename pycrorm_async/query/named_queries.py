@@ -340,6 +340,7 @@ class EpisodeChoice:
         robot: name or model of a robot that took part.
         text: a part of the description, the plan's name or a tag.
         limit: the largest number of episodes; the newest that fulfil all conditions are taken.
+        without_tags: an episode has none of them.
     """
 
     status: str | None = None
@@ -348,10 +349,11 @@ class EpisodeChoice:
     robot: str | None = None
     text: str | None = None
     limit: int | None = None
+    without_tags: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         check_texts({"status": self.status, "robot": self.robot, "text": self.text})
-        for each in self.tags:
+        for each in (*self.tags, *self.without_tags):
             check_texts({"tag": each})
         if self.since is not None and not isinstance(self.since, datetime):
             raise CallerError(f"since must be a datetime with a time zone, got {self.since!r}")
@@ -367,6 +369,7 @@ class EpisodeChoice:
             "status": self.status,
             "since": None if self.since is None else f"{self.since.astimezone(UTC):%Y-%m-%d %H:%M:%S} UTC",
             "tags" if len(self.tags) > 1 else "tag": ", ".join(self.tags) or None,
+            "without": ", ".join(self.without_tags) or None,
             "robot": self.robot,
             "text": self.text,
             "the newest": self.limit,
@@ -380,16 +383,19 @@ class EpisodeChoice:
             conditions.append(episode.status == member_of(TaskStatus, self.status, "status"))
         if self.since is not None:
             conditions.append(episode.created_at >= self.since)
-        conditions += [
-            exists().where(EpisodeTag.process_metadata_id == episode.id, EpisodeTag.tag == each) for each in self.tags
-        ]
+        tagged = {
+            each: exists().where(EpisodeTag.process_metadata_id == episode.id, EpisodeTag.tag == each)
+            for each in (*self.tags, *self.without_tags)
+        }
+        conditions += [tagged[each] for each in self.tags]
+        conditions += [~tagged[each] for each in self.without_tags]
         if self.robot is not None:
             robot = EpisodeRobot
             named = or_(robot.name == self.robot, robot.model == self.robot)
             conditions.append(exists().where(robot.process_metadata_id == episode.id, named))
         if self.text is not None:
-            tagged = exists().where(EpisodeTag.process_metadata_id == episode.id, containing(self.text, EpisodeTag.tag))
-            conditions.append(or_(containing(self.text, episode.description, episode.plan), tagged))
+            by_tag = exists().where(EpisodeTag.process_metadata_id == episode.id, containing(self.text, EpisodeTag.tag))
+            conditions.append(or_(containing(self.text, episode.description, episode.plan), by_tag))
         return conditions
 
     def newest(self) -> Select[*tuple[int]]:

@@ -590,6 +590,10 @@ class Ask(Generic[Q]):
     def __init__(self, make: Callable[[QuestionPlan], Q]) -> None:
         self._make = make
 
+    def __repr__(self) -> str:
+        """Name the questions, for an interpreter."""
+        return f"<Ask: {', '.join(QUESTIONS)}; help(memory.ask.NAME) describes one>"
+
     # --- failures ---------------------------------------------------------------------------------------------
 
     def root_failures(

@@ -198,6 +198,7 @@ _DATABASE_FAULTS = ("08", "40", "53", "55", "57", "58", "XX")
 """Classes of errors that are the database's; all others are the query's own."""
 _CANCELLED = "57014"
 _UNDEFINED_TABLE = "42P01"
+_UNDEFINED_COLUMN = "42703"
 _MISSING_FROM = "errorMissingRTE"
 """The server's function that reports a table that exists, but not in this FROM, with the same code. Its message has the
 language of the server."""
@@ -308,7 +309,8 @@ class _Cursor:
             if "multiple commands" in text:
                 raise QueryRefused(NOT_ONE) from None
             notes = " ".join(each for each in (error.detail, error.hint) if each)
-            raise QueryRefused(f"the query is refused: {text}{f' ({notes})' if notes else ''}") from None
+            hint = missing_column(text) if code == _UNDEFINED_COLUMN else ""
+            raise QueryRefused(f"the query is refused: {text}{f' ({notes})' if notes else ''}{hint}") from None
         except (OverflowError, ValueError) as error:  # a date before year 1 or after 9999, or the time 24:00
             raise QueryRefused(f"Python has no such date or time ({error}): cast the column to text") from None
 
@@ -511,6 +513,16 @@ def missing_relation(name: str, valid: Iterable[str]) -> QueryRefused:
     return QueryRefused(f"there is no table or view {name}{hint or '; `pycrorm schema` lists them'}")
 
 
+def missing_column(text: str) -> str:
+    """Return the hint for an error about a column that another view has; empty for others."""
+    name = re.search(r"""(?:such column: |column ["'\u201e\u00ab]?)(?:\w+\.)?(\w+)""", text)
+    from pycrorm_async.orm import TaskTreeNode  # only here, because it takes longer to load than a query to run
+
+    if name is None or name[1] not in TaskTreeNode.__table__.columns:
+        return ""
+    return f"; task_tree_node has {name[1]}: JOIN task_tree_node USING (id)"
+
+
 # === sqlite reader ============================================================================================
 #
 # Run one query on a SQLite file, in a process of its own that can only read.
@@ -686,7 +698,8 @@ def _refusal(
     if code is None or code & 0xFF in _REFUSALS:
         if text.startswith("no such table: "):
             return missing_relation(text.removeprefix("no such table: "), names)
-        return QueryRefused(f"the query is refused: {text}")
+        hint = missing_column(text) if text.startswith("no such column: ") else ""
+        return QueryRefused(f"the query is refused: {text}{hint}")
     error = sqlite3.OperationalError(text)
     error.sqlite_errorcode = code
     return error

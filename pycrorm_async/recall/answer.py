@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import Enum
 from functools import cached_property
@@ -28,7 +28,8 @@ from pycrorm_async.query.snapshot import Moment
 from pycrorm_async.query.success import interval_95
 from pycrorm_async.recall.blocks import EPISODE_SHIFT, CaseLibrary, Group
 from pycrorm_async.recall.columns import Case, Mask, is_angle, joined_words
-from pycrorm_async.recall.search import Cue, Match, Weights, search, weights_of
+from pycrorm_async.recall.search import Cue, Match, Weights, closest, search, weights_of
+from pycrorm_async.visible_text import visible
 
 _TRIED = ("SUCCEEDED", "FAILED", "ERROR")
 """The statuses of an action that ran to its end; a cancelled, interrupted or lost one is no evidence of success."""
@@ -202,14 +203,23 @@ class Answer(Sequence[RecalledCase]):
         considered: the number of cases of the type, among which words were counted.
         never_seen: pairs of feature and word in `has` or `only` that none of them has.
         joined: the names under which the cases of the type were recorded, if it was renamed.
+        notes: lines about a type that never occurred, with the nearest ones, and numbers out of the range seen.
     """
 
-    def __init__(self, cue: Cue, cases: Sequence[RecalledCase], weights: Weights, joined: Sequence[str] = ()) -> None:
+    def __init__(
+        self,
+        cue: Cue,
+        cases: Sequence[RecalledCase],
+        weights: Weights,
+        joined: Sequence[str] = (),
+        notes: Sequence[str] = (),
+    ) -> None:
         self.cue = cue
         self.cases = tuple(cases)
         self.considered = weights.cases
         self.never_seen = weights.never_seen
         self.joined = tuple(joined)
+        self.notes = tuple(notes)
 
     def __len__(self) -> int:
         """Return the number of cases."""
@@ -270,9 +280,14 @@ class Answer(Sequence[RecalledCase]):
         if self.joined:
             lines.append(f"  renamed: counts the cases of {' and '.join(self.joined)}")
         lines += [f"  never seen: {feature}={word}" for feature, word in self.never_seen]
+        lines += [f"  {each}" for each in self.notes]
         return "\n".join(lines)
 
     __str__ = why
+
+    def __repr__(self) -> str:
+        """Return the summary in one line, for an interpreter."""
+        return f"<Answer: {visible('; '.join(map(str.strip, self.why().splitlines())), kept='')}>"
 
     def table(self) -> tuple[tuple[str, ...], list[tuple[object, ...]]]:
         """Return the header and the rows of the table that commands and notebooks print."""
@@ -304,7 +319,17 @@ def answer(cue: Cue, library: CaseLibrary, memory: Surroundings | None = None) -
     unseen = tuple(pair for pair in cue.requires if library.seen(cue.type, *pair) == 0)
     weights = weights._replace(never_seen=tuple(dict.fromkeys((*weights.never_seen, *unseen))))
     joined = library.names_of(cue.type) if cue.type is not None else ()
-    return Answer(cue, cases, weights, joined if {*joined} - {cue.type} else ())
+    return Answer(cue, cases, weights, joined if {*joined} - {cue.type} else (), [*_notes(cue, library)])
+
+
+def _notes(cue: Cue, library: CaseLibrary) -> Iterator[str]:
+    """Yield a line for a type that never occurred, and for each number that is out of the range of its cases."""
+    if cue.type is not None and not library.size(cue.type):
+        yield f"never seen: type {cue.type}{closest(cue.type, library.types)}"
+    for each in cue.near:
+        seen = None if is_angle(each.feature) else library.range_of(cue.type, each.feature)
+        if seen is not None and not seen[0] <= each.value <= seen[1]:
+            yield f"out of range: {each.feature} {each.value:.4g}; seen are {seen[0]:.4g} to {seen[1]:.4g}"
 
 
 def compare(cue: Cue, case: Case, weights: Weights) -> tuple[Compared, ...]:

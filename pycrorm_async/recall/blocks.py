@@ -653,6 +653,15 @@ class CaseLibrary:
             spread = self._spreads[type, feature] = float(f"{_standard_deviation(groups, feature):.1e}")
         return spread if spread > 0 else 1.0
 
+    def range_of(self, type: str | None, feature: str) -> tuple[float, float] | None:  # noqa: A002
+        """Return the least and the greatest number of a feature among the cases of a type; None without any."""
+        groups = [group for group in self.groups(type) if feature in group.numbers]
+        ranges = [_cached(group, ("range", feature), lambda group: _range(group, feature)) for group in groups]
+        lows_and_highs = [each for each in ranges if each is not None]
+        if not lows_and_highs:
+            return None
+        return min(low for low, _ in lows_and_highs), max(high for _, high in lows_and_highs)
+
     def find(self, node: int) -> Case | None:
         """Return the case of a node; None if it has none."""
         for group in self.groups():

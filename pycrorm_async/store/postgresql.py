@@ -43,14 +43,7 @@ from sqlalchemy.exc import DBAPIError
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.bulk_records import make
-from pycrorm_async.errors import (
-    CallerError,
-    DatabaseError,
-    DatabaseForeign,
-    DatabaseUnavailable,
-    PycrormError,
-    TablesUntrusted,
-)
+from pycrorm_async.errors import DatabaseError, DatabaseForeign, DatabaseUnavailable, PycrormError, TablesUntrusted
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX
 from pycrorm_async.store import postgresql_errors
 from pycrorm_async.store.dialect import (
@@ -881,46 +874,32 @@ GRANTS: tuple[str, ...] = (
 """Statements for the owner of a database that several logins fold, in order; each may be run again."""
 
 
-class Roles(NamedTuple):
-    """The roles of a memory.
+class RoleState(NamedTuple):
+    """A role of a memory and the logins that have it, beside this connection's login and the owner of the tables."""
 
-    Attributes:
-        login: of this connection.
-        tables_owner: the role to which the tables belong; None without tables.
-        members: the logins that may act as each role, by role; a role that is missing is not in it.
-    """
-
+    name: str
+    exists: bool
+    members: list[str]
     login: str
     tables_owner: str | None
-    members: dict[str, list[str]]
 
 
-async def roles_of(connection: AsyncConnection) -> Roles:
-    """Read the roles of a memory."""
-    login, owner = (await connection.exec_driver_sql(_OWNER)).one()
-    return Roles(login, owner, {name: list(logins) for name, logins in await connection.exec_driver_sql(_MEMBERS)})
+async def roles_of(connection: AsyncConnection) -> list[RoleState]:
+    """Return the state of the three roles."""
+    return await _rows(RoleState, connection, _ROLE_STATES)
 
 
 async def make_roles(connection: AsyncConnection, *, shared: bool) -> None:
-    """Make the roles: with `shared` those of `GRANTS`, also where its roles exist, else those of `OWNER_GRANTS`.
-
-    Raises `CallerError` with the statements that another login must run first.
-    """
-    owner = (await roles_of(connection)).tables_owner
-    try:
-        for statement in GRANTS if shared or owner == "pycrorm_folder" else OWNER_GRANTS:
-            await connection.exec_driver_sql(statement)
-    except DBAPIError as error:
-        if postgresql_errors.sqlstate(error) == _RAISED:
-            raise CallerError(postgresql_errors.message(error)) from None
-        raise
+    """Make the roles: with `shared`, or where `GRANTS` did it before, by `GRANTS`, else by `OWNER_GRANTS`."""
+    shared = shared or (await roles_of(connection))[0].tables_owner == "pycrorm_folder"
+    for statement in GRANTS if shared else OWNER_GRANTS:
+        await connection.exec_driver_sql(statement)
 
 
-_RAISED = "P0001"
-_OWNER = f"""
-SELECT session_user::text, (SELECT pg_get_userbyid(nspowner)::text FROM pg_namespace WHERE nspname = '{TABLES}')"""
-_MEMBERS = """
-SELECT role.rolname::text, ARRAY(
-    SELECT login.rolname::text FROM pg_roles AS login
-    WHERE login.rolcanlogin AND NOT login.rolsuper AND pg_has_role(login.oid, role.oid, 'MEMBER') ORDER BY 1
-) FROM pg_roles AS role WHERE rolname IN ('pycrorm_recorder', 'pycrorm_folder', 'pycrorm_reader') ORDER BY 1"""
+_ROLE_STATES = f"""
+SELECT role, to_regrole(role) IS NOT NULL, ARRAY(
+    SELECT rolname::text FROM pg_roles
+    WHERE rolcanlogin AND NOT rolsuper AND pg_has_role(oid, to_regrole(role), 'MEMBER')
+    ORDER BY 1
+), session_user::text, (SELECT pg_get_userbyid(nspowner)::text FROM pg_namespace WHERE nspname = '{TABLES}')
+FROM unnest(string_to_array('{_READING}', ', ')) AS role"""

@@ -15,7 +15,7 @@ from contextlib import contextmanager
 import asyncpg
 from sqlalchemy.exc import DataError, DBAPIError, IntegrityError, InterfaceError
 
-from pycrorm_async.errors import DamageError, DatabaseUnavailable, InternalError, PycrormError
+from pycrorm_async.errors import CallerError, DamageError, DatabaseUnavailable, InternalError, PycrormError
 from pycrorm_async.store.dialect import RowRefused
 
 FAULTS: tuple[type[Exception], ...] = (
@@ -36,6 +36,8 @@ _ROW_FAULTS: tuple[type[Exception], ...] = (
 """The errors of a row that the database cannot store."""
 
 _NO_RIGHT = "42501"
+_RAISED = "P0001"
+"""Our own statements raise it: those that make roles, with what another login must run first."""
 _UNAVAILABLE = (
     "08",  # connection
     "25",  # invalid transaction state, such as a read-only one
@@ -97,6 +99,8 @@ def translate_error(error: Exception, database: str) -> PycrormError:
         )
     if code.startswith(_UNAVAILABLE):
         return DatabaseUnavailable(f"{database}: {text}")
+    if code == _RAISED:
+        return CallerError(f"{database}: {text}")
     if not code or isinstance(error, InterfaceError):  # the connection was refused, reset, closed or timed out
         return DatabaseUnavailable(f"{database}: {text}")
     return InternalError(f"{database}: {text}")
@@ -123,16 +127,6 @@ def refusal(error: Exception) -> str | None:
 def is_missing_table(error: DBAPIError) -> bool:
     """Return whether a named table is missing."""
     return error.orig is not None and _code(error.orig) == "42P01"
-
-
-def sqlstate(error: DBAPIError) -> str:
-    """Return the SQLSTATE of an error; empty without one."""
-    return "" if error.orig is None else _code(error.orig)
-
-
-def message(error: DBAPIError) -> str:
-    """Return the server's message, without class names."""
-    return str(error) if error.orig is None else _text(error.orig)
 
 
 def _code(fault: BaseException) -> str:

@@ -102,11 +102,13 @@ def test_what_follows_is_a_table_of_types(folder: Path) -> None:
 def test_a_type_that_never_occurred_is_an_empty_answer_with_a_note(folder: Path) -> None:
     done = pycrorm("recall", "GripSlidingActon", cwd=folder)
     assert done.returncode == 0
-    assert done.stdout.splitlines() == ["0 of 0 cases for GripSlidingActon"]
-    assert (
-        done.stderr
-        == "no GripSlidingActon has ended in this memory; did you mean GripSlidingAction or FetchSlidingAction?\n"
-    )
+    near = "did you mean GripSlidingAction or FetchSlidingAction?"
+    assert done.stdout.splitlines() == [
+        "0 of 0 cases for GripSlidingActon", f"  never seen: type GripSlidingActon; {near}",
+    ]  # fmt: skip
+    assert done.stderr == ""
+    as_json = pycrorm("recall", "GripSlidingActon", "--json", cwd=folder)
+    assert as_json.stderr == f"no GripSlidingActon has ended in this memory; {near}\n"
 
 
 @pytest.mark.parametrize(
@@ -153,7 +155,7 @@ WRONG: dict[str, tuple[list[str], dict[str, Any]]] = {
     "there is no case of event 1 of episode 1": ([], {"like": "1/1"}),
     "leave out the type and the features": ([GRIP], {"like": "1/e3"}),
     "--follows takes one type": ([GRIP, "arm=LEFT"], {"follows": True}),
-    "--follows does not take --tag, --k: leave them out": ([GRIP], {"follows": True, "tag": "kitchen", "k": 3}),
+    "--follows does not take --tag, --limit: leave them out": ([GRIP], {"follows": True, "tag": "kitchen", "k": 3}),
     "--like does not take --episode: leave it out": ([], {"like": "1/e3", "episode": "1"}),
     "no episode has the robot 'pr22'; did you mean pr2?": ([DRIVE], {"robot": "pr22"}),
     "arm is a text of 100,000 characters": ([GRIP, f"arm={'x' * 100_000}"], {}),

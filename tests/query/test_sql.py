@@ -266,6 +266,7 @@ async def test_a_login_with_more_rights_than_a_reader_is_refused(server: Server)
     )
     async with opened_reader(reader) as sql:  # reading more is no excess, nor is what every login may
         assert (await sql.query("SELECT count(*) FROM lab.notes"))[1] == [(0,)]
+    login(owner_url, "IN ROLE pycrorm_folder")  # could have planted code in the views, which an owner's query would run
     for right, (attributes, *after) in MORE_RIGHTS.items():
         url = login(owner_url, attributes, *(each.format(database=database, name="{name}") for each in after))
         async with opened_reader(url) as sql:
