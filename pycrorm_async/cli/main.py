@@ -122,7 +122,7 @@ _VERBS: Mapping[str, Mapping[str, str]] = {
     "Operate": {
         "status": "Report recorders, writers, running episodes, and the lag of database and tables.",
         "writer": "Drain a spool continuously: append its events and fold them into the tables.",
-        "rebuild": "Make all tables and views again from the log.",
+        "rebuild": "Rebuild all tables and views from the log, while recording continues.",
         "verify": "Check the log for damage, and compare the tables with it.",
         "roles": "Show the roles of a memory on PostgreSQL; with --create, make them.",
         "spool": "The write-ahead queue's files: inspect, repair, or store them in another database.",
