@@ -74,8 +74,6 @@ def recall(
     as_csv: CsvOption = None,
 ) -> None:
     """List the past actions most like a cue, with their outcomes."""
-    if as_csv is not None and why:
-        raise CallerError("--why prints no table: leave --csv out")
     parsed = _parse(cue or [])
     conditions: dict[str, Any] = {
         "before": before, "after": after, "episode": episode, "tag": tag, "robot": robot,
@@ -112,10 +110,8 @@ def recall(
         _note_unknown(answer.cue.type, types)
     if as_json:
         print_json(_document(answer))
-    elif as_csv is not None:
-        print_table("", *answer.table(), as_csv=as_csv)
     else:
-        _print(answer, why=why)
+        _print(answer, why=why, as_csv=as_csv)
 
 
 class _Parsed(NamedTuple):
@@ -193,7 +189,10 @@ def _note_unknown(dtype: str | None, types: tuple[str, ...]) -> None:
 # --- printing -------------------------------------------------------------------------------------------------
 
 
-def _print(answer: Answer, *, why: bool) -> None:
+def _print(answer: Answer, *, why: bool, as_csv: bool | None) -> None:
+    if as_csv is not None:
+        print_table("", *answer.table(), as_csv=as_csv)
+        return
     if why:
         for each in answer:
             stdout.print(each.why(), markup=False, highlight=False)
