@@ -34,6 +34,7 @@ CALLS: list[tuple[str, dict[str, Any]]] = [
 
 async def test_no_answer_to_an_agent_drives_a_terminal(tmp_path: Path) -> None:
     from mcp import Client
+    from mcp.types import TextContent
 
     from pycrorm_async.integrations.mcp_server import memory_server
 
@@ -44,6 +45,7 @@ async def test_no_answer_to_an_agent_drives_a_terminal(tmp_path: Path) -> None:
             for name, arguments in CALLS:
                 done = await client.call_tool(name, arguments)
                 for each in done.content:
+                    assert isinstance(each, TextContent)
                     assert not DRIVES_A_TERMINAL.search(each.text), (name, arguments)
                     answers[name] = each.text
     assert len(answers) == len({name for name, _ in CALLS})

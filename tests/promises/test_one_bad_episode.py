@@ -8,8 +8,9 @@ from typing import Any
 
 import pytest
 
-from pycrorm_async.live.server import LogFollower
+from pycrorm_async.live.follower import Activity, LogFollower
 from pycrorm_async.projections import verify as verification
+from pycrorm_async.projections.fold import fold_happening
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.report import document
 from pycrorm_async.report.write import overview
@@ -79,7 +80,6 @@ async def test_an_episode_that_cannot_be_folded_leaves_the_list_of_the_others_an
     follower = LogFollower(DatabaseAddress.parse(url))
     try:
         log = await follower.log()
-        from pycrorm_async.live.server import Activity
 
         _break(monkeypatch, Activity, "read", lambda activity, *_: activity.row.number == HOSTILE)
         assert await follower.overview.catch_up(log, await log.episodes())
@@ -88,7 +88,7 @@ async def test_an_episode_that_cannot_be_folded_leaves_the_list_of_the_others_an
         assert "TypeError: broken" in str(entries[HOSTILE])
     finally:
         await follower.close()
-    real = verification.fold_happening
+    real = fold_happening
 
     def fold(event: Any, *others: Any) -> None:
         if event.type == "Observed":

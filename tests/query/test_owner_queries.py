@@ -15,9 +15,9 @@ from pycrorm_async.query.reading import Reading
 from pycrorm_async.store.postgresql import OWNER_GRANTS
 from tests.commands import answer, pycrorm
 from tests.databases import Server, ask, change_each
-from tests.projections.factories import append_and_fold
+from tests.projections.event_script import append_and_fold
 from tests.query.read_only_queries import RECORDS, login, opened_reader
-from tests.query.test_read_only_sql import ON_BOTH, ON_POSTGRESQL, _state_of
+from tests.query.test_sql import ON_BOTH, ON_POSTGRESQL, _state_of
 
 pytestmark = pytest.mark.slow
 
