@@ -34,6 +34,8 @@ from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.text import duration
 from pycrorm_async.store.address import DatabaseAddress
 
+_LISTED = 50
+"""The episodes that are listed without --limit or --all: about as many as a terminal has lines."""
 _WIDTH_WITH_ROBOTS = 100
 """Bounds the width of a terminal on which the table has the robots: on one of 80 characters the description has none
 to spare."""
@@ -51,19 +53,27 @@ def episodes(
     robot: RobotOption = None,
     text: TextOption = None,
     limit: LimitOption = None,
+    every: Annotated[bool, typer.Option("--all", help=f"All of them, instead of the newest {_LISTED}.")] = False,
     as_json: JsonOption = False,
     as_csv: CsvOption = None,
 ) -> None:
-    """List the recorded episodes, the oldest first."""
-    choice = EpisodeChoice(status, parse_since(since), tuple(tag or ()), robot, text, limit)
+    """List the newest 50 of the recorded episodes, the oldest of them first, and say how many there are."""
+    listed = None if every else _LISTED
+    choice = EpisodeChoice(status, parse_since(since), tuple(tag or ()), robot, text, limit or listed)
 
-    async def read(reading: Reading) -> tuple[list[EpisodeSummary], str]:
+    async def read(reading: Reading) -> tuple[list[EpisodeSummary], int, str]:
         chosen = await reading.episodes(choice, simulated=simulated)
-        return chosen, "" if chosen else await absence_of_episodes(reading, choice)
+        if len(chosen) != choice.limit:
+            return chosen, len(chosen), "" if chosen else await absence_of_episodes(reading, choice)
+        [(total,)] = await reading.rows(choice.counted(), simulated=simulated)
+        return chosen, total, ""
 
-    summaries, absence = read_memory(url, spool, read)
+    summaries, total, absence = read_memory(url, spool, read)
     if as_json:
         print_json(summaries)
+    if total > len(summaries):
+        note(f"the newest {len(summaries)} of {total:,} episodes; --all lists all, --limit N the newest N")
+    if as_json:
         return
     if not summaries:
         note(absence)

@@ -39,7 +39,7 @@ from pycrorm_async.events.fields import checked_tags
 from pycrorm_async.memory import Memory
 from pycrorm_async.progress_bar import stderr
 from pycrorm_async.projections.custom import load_projections
-from pycrorm_async.query.named_queries import EpisodeSummary
+from pycrorm_async.query.named_queries import EpisodeChoice, EpisodeSummary
 from pycrorm_async.record.episode_writer import PlanSource
 from pycrorm_async.record.values import message_of
 from pycrorm_async.settings import OnFull, OnUnrecordable, RecordMeshes, Settings
@@ -260,7 +260,7 @@ async def _summarise(memory: Memory, outcome: _Outcome) -> None:
     recent = memory.recent_episodes
     if memory.opened_count > len(recent):
         note(f"showing the last {len(recent)} of {memory.opened_count} episodes; `pycrorm episodes` lists all")
-    outcome.episodes = [each for each in await memory.reading.episodes() if each.id in recent]
+    outcome.episodes = await memory.reading.episodes(EpisodeChoice(ids=recent))
 
 
 async def _wait_for_writer(memory: Memory) -> bool:

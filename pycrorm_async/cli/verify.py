@@ -46,7 +46,7 @@ def verify(
         Path | None,
         typer.Option(
             "--digests",
-            help="Compare also with these digests: a file from `pycrorm episodes --simulated --json`, or - for stdin.",
+            help="Compare also with these digests, from `pycrorm episodes --all --simulated --json`; - is stdin.",
             allow_dash=True,
             dir_okay=False,
         ),
@@ -95,7 +95,9 @@ def _read_digests(path: Path) -> list[OutsideDigest]:
     except OSError as error:
         raise CallerError(f"{path} cannot be read: {error.strerror}") from error
     except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        raise CallerError(f"{path} holds no digests: {error}; write them with `pycrorm episodes --json`") from error
+        raise CallerError(
+            f"{path} holds no digests: {error}; write them with `pycrorm episodes --all --json`"
+        ) from error
     return [
         OutsideDigest(each.id, each.digest_sequence, each.digest)
         for each in episodes
@@ -113,7 +115,7 @@ async def _verify(
             result = await verify_log(
                 log, episode=only, projections=projections, digests=digests, report_progress=report_progress
             )
-        return result, {each.number: each.id for each in await log.episodes()}
+        return result, {each.number: each.id for each in ([only] if only else await log.episodes())}
     finally:
         await log.close()
 

@@ -130,7 +130,7 @@ async def _check(follower: LogFollower, episode: str | None) -> None:
     """Raise `UnknownEpisode` for a wrong name, and database errors that do not pass by waiting."""
     try:
         log = await follower.log()
-        if not await log.episodes():
+        if not await log.last_number():
             note(f"{follower.address} has no episode yet: waiting for the first.")
         elif episode is not None:
             await episode_named(log, episode)
@@ -204,7 +204,7 @@ async def _wait_for(follower: LogFollower, name: str, live: Live, stop: asyncio.
     while not stop.is_set():
         try:
             log = await follower.log()
-            if await log.episodes():
+            if await log.last_number():
                 return await episode_named(log, name)
             live.update(Text(f"{follower.address} has no episode yet: waiting for the first."), refresh=True)
         except DatabaseUnavailable as error:

@@ -110,7 +110,7 @@ async def read_episode(
     Raises `CallerError` for one without an event; `LogDamaged` or `DatabaseForeign` for an event that cannot be read.
     """
     log = await reading.log()
-    row = next(each for each in await log.episodes() if each.number == covered.number)
+    [row] = await log.episodes(covered.number, covered.number)
     if covered.events == 0:
         raise CallerError(f"the log has no event of episode {covered.number}")
     fold = _EpisodeFold(RecordedEpisode(row.number, row.id), await log.dtypes())

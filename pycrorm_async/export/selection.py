@@ -250,9 +250,10 @@ async def _named(reading: Reading, names: Iterable[str], *, running: bool = Fals
 
 async def _covered(reading: Reading, statuses: dict[int, str]) -> tuple[CoveredEpisode, ...]:
     log = await reading.log()
-    rows = {each.number: each for each in await log.episodes()}
+    span = min(statuses, default=1), max(statuses, default=0)
+    rows = {each.number: each for each in await log.episodes(*span)}
     digests = {
-        number: each for number, each in (await log.last_digests()).items() if each.sequence == rows[number].head
+        number: each for number, each in (await log.last_digests(*span)).items() if each.sequence == rows[number].head
     }
     return tuple(
         CoveredEpisode(

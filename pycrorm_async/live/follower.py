@@ -218,7 +218,7 @@ class LogFollower:
         """Fold the events stored since the last turn; return whether there were any."""
         epoch, log = self.epoch, await self.log()
         if self._newest is None:
-            self._newest = max([each.number for each in await log.episodes()], default=0)
+            self._newest = await log.last_number()
         rows = {each.number: each for each in await grown_episodes(log, above=self._newest, numbers=self._growing)}
         self._growing = {each.number for each in rows.values() if each.ended_wall_ns is None}
         added = [each for each in rows.values() if each.number > self._newest]

@@ -156,7 +156,7 @@ class LiveServer:
 
     async def _waits_for_first_episode(self) -> bool:
         try:
-            return not await (await self._follower.log()).episodes()
+            return not await (await self._follower.log()).last_number()
         except PycrormError:
             return True
 

@@ -138,7 +138,7 @@ class _Copier:
 
     async def copy(self, rows: Sequence[EpisodeRow]) -> tuple[EpisodeCopy, ...]:
         self._of = sum(row.head for row in rows)
-        before = {row.id: row.head for row in await self._target.episodes()}
+        before = await self._heads(rows)
         for row in rows:
             try:
                 await self._copy(row, before.get(row.id, 0))
@@ -147,7 +147,7 @@ class _Copier:
         await self._append()
         await self._fold({row.id for row in rows})
         await retry(self._destination.fold, backoff=BRIEF)  # the cases, too
-        after = {row.id: row.head for row in await self._target.episodes()}
+        after = await self._heads(rows)
         stopped = {**await self._destination.stopped(), **self._refused}
         return tuple(
             EpisodeCopy(
@@ -161,6 +161,11 @@ class _Copier:
             )
             for row in rows
         )
+
+    async def _heads(self, rows: Sequence[EpisodeRow]) -> dict[str, int]:
+        """Return the last event that the target has of each of these episodes, by id."""
+        heads = await self._target.heads([parse_episode_id(row.id) for row in rows])
+        return {row.id: row.head for row in heads.values()}
 
     async def _copy(self, row: EpisodeRow, head: int) -> None:
         shared = min(row.head, head)

@@ -300,6 +300,8 @@ _EXPECTED = {"process_metadata": 1_000, "simulated_episode": 100, LINK_BOX: 1_00
 _EXPECTED_CORE, _EXPECTED_LEAF = 1_000_000, 50_000
 _ALIKE = {
     "process_metadata_id": [1_000],
+    "uuid": [1],
+    "tag": [50_000, 1],
     "parent_id": [4],
     "status": [250_000],
     "dtype": [50_000, 25_000],
@@ -597,6 +599,7 @@ _TEXT_KEYS = {
 }
 
 _INDEXED = {
+    "process_metadata": ("uuid", "thought_by"),
     "episode_tagging": ("process_metadata_id", "tag"),
     "task_tree_node": ("process_metadata_id", "parent_id", "status", "dtype"),
     "pose": ("process_metadata_id",),
@@ -614,8 +617,9 @@ _INDEXED = {
     "observation_value": ("process_metadata_id",),
 }
 
-_FURTHER = {("task_tree_node", "dtype"): ("status",)}
-"""Further key columns of an index, after its first: learning queries filter the nodes of a type by status."""
+_FURTHER = {("task_tree_node", "dtype"): ("status",), ("episode_tagging", "tag"): (EPISODE,)}
+"""Further key columns of an index, after its first: learning queries filter the nodes of a type by status, and
+`episode_tag` looks for later changes of a tag of the same episode."""
 
 _FURTHER_ON_POSTGRESQL = {("task_tree_node", EPISODE): ("id",), ("task_tree_node", "dtype"): ("simulated",)}
 """Key columns that follow on PostgreSQL: plans look nodes up by episode and id, and all views read `simulated`."""

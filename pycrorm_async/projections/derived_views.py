@@ -392,7 +392,8 @@ _STARTED = """WITH RECURSIVE up(id, parent_id, parameters, depth) AS (
  SELECT above.id, above.parent_id, above.parameters, up.depth + 1 FROM up {above})
  SELECT {value} FROM up"""
 _NEAREST = "ORDER BY up.depth LIMIT 1"
-_ABOVE_SQLITE = f"JOIN {{node}} AS above ON above.id = up.parent_id AND above.{EPISODE} = {{node}}.{EPISODE}"
+_ABOVE_SQLITE = "JOIN {node} AS above ON above.id = up.parent_id"
+"""The id alone. For a second condition on `above`, SQLite would first read all nodes of the memory into a filter."""
 _ABOVE_POSTGRESQL = f"""CROSS JOIN LATERAL (
  SELECT * FROM {{node}} AS one WHERE one.id = up.parent_id AND one.{EPISODE} = {{node}}.{EPISODE} OFFSET 0) AS above"""  # noqa: S608
 """OFFSET 0 keeps the lookup of each step apart. Without statistics PostgreSQL would join the steps with all nodes of

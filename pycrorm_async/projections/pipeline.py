@@ -414,8 +414,8 @@ async def _damage(log: EventLog, spans: Sequence[Span], events: Sequence[StoredE
         for sequence in range(span.after + 1, span.last + 1)
         if (span.number, sequence) not in present
     )
-    ids = {each.number: each.id for each in await log.episodes()}
-    return LogDamaged(ids[number], sequence, f"is missing in {log.address}")
+    [episode] = await log.episodes(number, number)
+    return LogDamaged(episode.id, sequence, f"is missing in {log.address}")
 
 
 async def _fold_all(

@@ -30,7 +30,15 @@ from pycrorm_async.orm import (
     TaskTreeNode,
 )
 from pycrorm_async.orm.base import same_row
-from pycrorm_async.query.frames import EpisodeNumber, check_texts, containing, limited, member_of, of_episode
+from pycrorm_async.query.frames import (
+    EpisodeNumber,
+    check_texts,
+    containing,
+    limited,
+    member_of,
+    of_episode,
+    times_with,
+)
 from pycrorm_async.query.running_episodes import RobotSummary, robots_of
 from pycrorm_async.query.text import NotebookValue, with_object_names
 from pycrorm_async.store.log import number_named
@@ -150,19 +158,31 @@ class NodeSummary:
     detected: int = 0
 
 
+_AT_ONCE = 500
+"""Bounds the episodes that one query names, because a database takes 32,766 parameters."""
+
+
 async def episodes(connection: AsyncConnection, chosen: int | EpisodeChoice | None = None) -> list[EpisodeSummary]:
     """Return every episode that the connection sees, the oldest first; or one by its number, or a choice."""
-    query = _overview()
-    numbers = chosen.newest() if isinstance(chosen, EpisodeChoice) else None if chosen is None else [chosen]
-    if numbers is not None:
-        query = query.where(ProcessMetaData.id.in_(numbers))
+    if isinstance(chosen, int):
+        return await _summaries(connection, [chosen])
+    newest = (EpisodeChoice() if chosen is None else chosen).newest()
+    numbers = sorted((await connection.execute(newest)).scalars())
+    parts = [numbers[first : first + _AT_ONCE] for first in range(0, len(numbers), _AT_ONCE)]
+    return [each for part in parts for each in await _summaries(connection, part)]
+
+
+async def _summaries(connection: AsyncConnection, numbers: Sequence[int]) -> list[EpisodeSummary]:
+    """Return the episodes with these numbers, by number."""
     robots = await robots_of(connection, numbers)
     tags: dict[int, list[str]] = {}
     tagged = select(EpisodeTag.process_metadata_id, EpisodeTag.tag).order_by(EpisodeTag.tag)
-    if numbers is not None:
-        tagged = tagged.where(EpisodeTag.process_metadata_id.in_(numbers))
-    for episode, tag in await connection.execute(tagged):
+    for episode, tag in await connection.execute(tagged.where(EpisodeTag.process_metadata_id.in_(numbers))):
         tags.setdefault(episode, []).append(tag)
+    node = TaskTreeNode
+    ended_badly = times_with(node.status.in_([TaskStatus.FAILED, TaskStatus.ERROR, TaskStatus.LOST]))
+    counted = select(node.process_metadata_id, func.count(), ended_badly).group_by(node.process_metadata_id)
+    counts = {row[0]: row[1:] for row in await connection.execute(counted.where(node.process_metadata_id.in_(numbers)))}
     return [
         EpisodeSummary(
             number=row.id,
@@ -173,8 +193,8 @@ async def episodes(connection: AsyncConnection, chosen: int | EpisodeChoice | No
             status=row.status,
             description=row.description,
             created_by=row.created_by,
-            nodes=row.nodes,
-            failed=row.failed,
+            nodes=counts.get(row.id, (0, 0))[0],
+            failed=int(counts.get(row.id, (0, 0))[1]),
             simulated=row.simulated,
             thought_by=SimulatingNode(row.thought_by, row.simulating_number, row.simulating_id, row.simulating_dtype)
             if row.thought_by is not None
@@ -195,24 +215,18 @@ async def episodes(connection: AsyncConnection, chosen: int | EpisodeChoice | No
             tags=tuple(tags.get(row.id, ())),
             metadata=row.metadata,
         )
-        for row in await connection.execute(query)
+        for row in await connection.execute(_overview().where(ProcessMetaData.id.in_(numbers)))
     ]
 
 
 def _overview() -> Select[*tuple[Any, ...]]:
-    node, episode = TaskTreeNode, ProcessMetaData
+    episode = ProcessMetaData
     simulating_episode, simulating_node = aliased(ProcessMetaData), aliased(TaskTreeNode)
-    ended_badly = node.status.in_([TaskStatus.FAILED, TaskStatus.ERROR, TaskStatus.LOST])
-    of_it = node.process_metadata_id == episode.id
-    nodes = select(func.count()).where(of_it).scalar_subquery()
-    failed = select(func.count()).where(of_it, ended_badly).scalar_subquery()
     first_row = simulating_episode.id * row_id(1, 0, SLOT_NODE)
     simulating_node_id = first_row + episode.thought_by_node * row_id(0, 1, SLOT_NODE)
     return (
         select(
             episode.__table__,
-            nodes.label("nodes"),
-            failed.label("failed"),
             simulating_episode.id.label("simulating_number"),
             simulating_node.id.label("simulating_id"),
             simulating_node.dtype.label("simulating_dtype"),
@@ -233,11 +247,13 @@ async def episode_named(connection: AsyncConnection, name: str) -> EpisodeSummar
 
     Raises `UnknownEpisode`, also when several ids have these first digits.
     """
-    query = select(ProcessMetaData.id, ProcessMetaData.uuid, ProcessMetaData.simulated).order_by(ProcessMetaData.id)
-    rows = (await connection.execute(query)).all()
-    real = [each.id for each in rows if not each.simulated]
-    ids = {each.id: each.uuid for each in rows}
-    number = real[-1] if name == "last" and real else number_named(name, ids, listed=len(real))
+    episode = ProcessMetaData
+    last = select(func.max(episode.id)).where(~episode.simulated)
+    number = (await connection.execute(last)).scalar() if name == "last" else None
+    if number is None:
+        listed = select(func.count()).where(~episode.simulated)
+        columns = episode.__table__.c
+        number = await number_named(connection, name, columns.id, columns.uuid, listed)
     return (await episodes(connection, number))[0]
 
 
@@ -300,10 +316,10 @@ async def task_tree(connection: AsyncConnection, number: int) -> list[NodeSummar
 async def _simulations_by_node(connection: AsyncConnection, number: int) -> dict[int, list[int]]:
     """Return the numbers of the simulations of this episode, by the id of the node that performed them."""
     simulating_episode, simulation = aliased(ProcessMetaData), ProcessMetaData
+    own = select(simulating_episode.uuid).where(simulating_episode.id == number).scalar_subquery()
     query = (
         select(simulation.id, simulation.thought_by_node)
-        .join(simulating_episode, simulating_episode.uuid == simulation.thought_by)
-        .where(simulating_episode.id == number, simulation.thought_by_node.is_not(None))
+        .where(simulation.thought_by == own, simulation.thought_by_node.is_not(None))
         .order_by(simulation.id)
     )
     numbers: dict[int, list[int]] = {}
@@ -341,6 +357,7 @@ class EpisodeChoice:
         text: a part of the description, the plan's name or a tag.
         limit: the largest number of episodes; the newest that fulfil all conditions are taken.
         without_tags: an episode has none of them.
+        ids: the UUIDs to choose from.
     """
 
     status: str | None = None
@@ -350,6 +367,7 @@ class EpisodeChoice:
     text: str | None = None
     limit: int | None = None
     without_tags: tuple[str, ...] = ()
+    ids: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
         check_texts({"status": self.status, "robot": self.robot, "text": self.text})
@@ -389,6 +407,8 @@ class EpisodeChoice:
         }
         conditions += [tagged[each] for each in self.tags]
         conditions += [~tagged[each] for each in self.without_tags]
+        if self.ids is not None:
+            conditions.append(episode.uuid.in_(self.ids))
         if self.robot is not None:
             robot = EpisodeRobot
             named = or_(robot.name == self.robot, robot.model == self.robot)
@@ -397,6 +417,10 @@ class EpisodeChoice:
             by_tag = exists().where(EpisodeTag.process_metadata_id == episode.id, containing(self.text, EpisodeTag.tag))
             conditions.append(or_(containing(self.text, episode.description, episode.plan), by_tag))
         return conditions
+
+    def counted(self) -> Select[*tuple[int]]:
+        """Return the select of the number of episodes that fulfil the conditions, whatever the limit."""
+        return select(func.count(ProcessMetaData.id)).where(*self.conditions())
 
     def newest(self) -> Select[*tuple[int]]:
         """Return the select of the numbers of the chosen episodes."""

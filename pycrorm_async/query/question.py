@@ -5,13 +5,14 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Coroutine, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeVar
 
-from sqlalchemy import CompoundSelect, Dialect, Row, Select, func, select, union
+from sqlalchemy import CompoundSelect, Dialect, Row, Select, func, select
 
 from pycrorm_async.errors import CallerError, InternalError, QueryRefused, UnknownEpisode
 from pycrorm_async.orm import DesignatorType, Detection, EpisodeRobot, EpisodeTag, Object, ProcessMetaData, TaskTreeNode
+from pycrorm_async.orm.base import EPISODE
 from pycrorm_async.query.frames import EpisodeNumber
 from pycrorm_async.query.named_queries import EpisodeChoice, EpisodeSummary
 from pycrorm_async.query.text import NotebookValue, nearest
@@ -114,8 +115,13 @@ class Question(NotebookValue):
         return rows, "" if rows else await self.unknown_name()
 
     async def unknown_name(self) -> str:
-        """Return a line about an argument, such as an object, that is nowhere in the memory; empty without one."""
-        return await unknown_name(self._reading, self._plan.names)
+        """Return a line about an argument, such as an object, that is nowhere in the memory; empty without one.
+
+        A question about one episode is compared with the names of that episode, so that it reads no others.
+        """
+        episode = self.episode
+        number = None if episode is None else (await self._reading.episode(episode_name(episode))).number
+        return await unknown_name(self._reading, self._plan.names, number)
 
     def __await__(self) -> Generator[Any, Any, Any]:
         return self.frame().__await__()
@@ -334,16 +340,16 @@ def classes_meant_by(words: str) -> list[str]:
 #
 # Suggest the right name after an empty answer, where a question names what is nowhere in the memory.
 
-_OBJECTS = union(select(Object.name), select(Detection.name))
-_RECORDED: dict[str, Any] = {
-    "dtype": select(DesignatorType.dtype).distinct(),
+_OBJECTS = Object.name, Detection.name
+_RECORDED: dict[str, Sequence[Any]] = {
+    "dtype": (DesignatorType.dtype,),
     "name": _OBJECTS,
     "object": _OBJECTS,
-    "reason": select(TaskTreeNode.reason).distinct(),
-    "robot": union(select(EpisodeRobot.name), select(EpisodeRobot.model)),
-    "tag": select(EpisodeTag.tag).distinct(),
+    "reason": (TaskTreeNode.reason,),
+    "robot": (EpisodeRobot.name, EpisodeRobot.model),
+    "tag": (EpisodeTag.tag,),
 }
-"""The select of all names of an argument that a memory has."""
+"""The columns with the names of an argument that a memory has."""
 _FIXED: dict[str, tuple[str, ...]] = {"arm": tuple(Arms.__members__), "reason": SEARCH_WORDS}
 """The names of an argument that every memory has."""
 _WHATS = {"dtype": "type", "name": "object"}
@@ -355,24 +361,27 @@ CHECKED = frozenset((*_RECORDED, *_FIXED))
 """The arguments that are names."""
 
 
-async def unknown_name(reading: EpisodeReader, names: Mapping[str, str]) -> str:
+async def unknown_name(reading: EpisodeReader, names: Mapping[str, str], episode: int | None = None) -> str:
     """Return a line about the first of these arguments that the memory does not have; empty if it has them all.
 
-    It reads the names of the whole memory, so it is for questions without an answer only.
+    Without an episode it reads the names of the whole memory, so it is for questions without an answer only.
     """
     for argument, name in names.items():
         valid = list(_FIXED.get(argument, ()))
-        if argument in _RECORDED:
-            rows = await reading.rows(_RECORDED[argument], simulated=True)
-            valid += [each for (each,) in rows if each is not None]
+        where = "the memory"
+        for each in _RECORDED.get(argument, ()):
+            query = select(each).distinct()
+            if episode is not None and (own := each.class_.__table__.c.get(EPISODE)) is not None:
+                where, query = f"episode {episode}", query.where(own == episode)
+            valid += [value for (value,) in await reading.rows(query, simulated=True) if value is not None]
         if not _is_one(argument, name, valid):
-            return f"the memory has no {_WHATS.get(argument, argument)} {name or repr(name)}{nearest(name, valid)}"
+            return f"{where} has no {_WHATS.get(argument, argument)} {name or repr(name)}{nearest(name, valid)}"
     return ""
 
 
 async def absence_of_episodes(reading: EpisodeReader, choice: EpisodeChoice) -> str:
     """Return the line that a verb prints when no episode fulfils a choice, with the nearest tag or robot."""
-    if choice == EpisodeChoice():
+    if not str(replace(choice, limit=None)):
         return "no episode yet: record one with `pycrorm run` or `pycrorm demo`"
     names = [*([] if choice.robot is None else [("robot", choice.robot)]), *(("tag", each) for each in choice.tags)]
     for argument, name in names:

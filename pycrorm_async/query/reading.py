@@ -263,9 +263,9 @@ class Reading:
         """Return the episodes, all or a choice, the oldest first, as a list that a notebook draws as a table."""
         await self._ready()
         with self._log.translated():
-            digests = await self._log.last_digests()
             async with self._connection(simulated=simulated) as connection:
                 summaries = await named_queries.episodes(connection, choice)
+            digests = await self._log.last_digests(summaries[0].number, summaries[-1].number) if summaries else {}
         return Episodes(
             replace(each, digest_sequence=digest.sequence, digest=digest.digest)
             if (digest := digests.get(each.number)) is not None

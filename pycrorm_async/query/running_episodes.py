@@ -9,7 +9,7 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 
-from sqlalchemy import BigInteger, Select, column, func, select, table
+from sqlalchemy import BigInteger, column, func, select, table
 from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.task_status import TaskStatus
@@ -76,13 +76,9 @@ async def running_episodes(connection: AsyncConnection, limit: int) -> tuple[lis
     return episodes, rows[0].total if rows else 0
 
 
-async def robots_of(
-    connection: AsyncConnection, numbers: Collection[int] | Select[*tuple[int]] | None
-) -> dict[int, list[RobotSummary]]:
-    """Return the robots of every episode, or of those with these numbers, by episode."""
-    query = select(_robot).order_by(_robot.c.id)
-    if numbers is not None:
-        query = query.where(_robot.c.process_metadata_id.in_(numbers))
+async def robots_of(connection: AsyncConnection, numbers: Collection[int]) -> dict[int, list[RobotSummary]]:
+    """Return the robots of the episodes with these numbers, by episode."""
+    query = select(_robot).where(_robot.c.process_metadata_id.in_(numbers)).order_by(_robot.c.id)
     robots: dict[int, list[RobotSummary]] = {}
     for row in await connection.execute(query):
         summary = RobotSummary(row.name, row.model, row.serial, row.description_fingerprint)

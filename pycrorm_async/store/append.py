@@ -236,7 +236,10 @@ _EPISODES_MAX: Final = 1_000
 _AT = text("SELECT digest FROM pycrorm_digest WHERE episode = :number AND sequence = :sequence")
 _LAST = text("""
 SELECT episode, sequence, digest
-FROM (SELECT episode, max(sequence) AS sequence FROM pycrorm_digest GROUP BY episode) AS last
+FROM (
+    SELECT episode, max(sequence) AS sequence FROM pycrorm_digest
+    WHERE episode BETWEEN :first AND :last GROUP BY episode
+) AS last
 JOIN pycrorm_digest USING (episode, sequence)""")
 
 
@@ -322,11 +325,12 @@ async def has_digests(dialect: Dialect, connection: AsyncConnection, *, insert: 
     return bool(row[1 if insert else 0])
 
 
-async def last_digests(dialect: Dialect, connection: AsyncConnection) -> dict[int, DigestRow]:
-    """Read the last digest of each episode, by number."""
+async def last_digests(dialect: Dialect, connection: AsyncConnection, first: int, last: int) -> dict[int, DigestRow]:
+    """Read the last digest of each episode from number `first` to `last`, by number."""
     if not await has_digests(dialect, connection):
         return {}
-    return {each.episode: DigestRow(*each) for each in await connection.execute(_LAST)}
+    rows = await connection.execute(_LAST, {"first": first, "last": last})
+    return {each.episode: DigestRow(*each) for each in rows}
 
 
 # === append ===================================================================================================

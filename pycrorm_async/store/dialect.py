@@ -177,7 +177,9 @@ class Dialect(Protocol):
 
     async def episode(self, connection: AsyncConnection, identity: str) -> EpisodeRow | None: ...
 
-    async def episodes(self, connection: AsyncConnection) -> list[EpisodeRow]: ...
+    async def episodes(self, connection: AsyncConnection, first: int, last: int) -> list[EpisodeRow]:
+        """Read the episodes with these numbers and those between them, by number."""
+        ...
 
     async def behind(self, connection: AsyncConnection, *, after: int, limit: int) -> list[EpisodeRow]:
         """Read the episodes with unfolded events whose number is above `after`, by number, without parked ones."""

@@ -18,16 +18,17 @@ from collections.abc import AsyncIterator, Collection, Iterator, Mapping, Sequen
 from contextlib import asynccontextmanager, contextmanager, nullcontext
 from pathlib import Path
 from types import MappingProxyType
+from typing import Any
 
 import msgspec
-from sqlalchemy import bindparam, text
+from sqlalchemy import ColumnElement, Select, bindparam, column, func, select, table, text
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
 from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable, LogDamaged, PycrormError, UnknownEpisode
 from pycrorm_async.events.codec import Record, declared_dtype, fingerprint
 from pycrorm_async.events.fields import retagged
-from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, EpisodeId, episode_text
+from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, EpisodeId, episode_text, parse_episode_id
 from pycrorm_async.settings import FILE_MODES, FileAccess
 from pycrorm_async.store.address import BUSY_TIMEOUT_S, DatabaseAddress
 from pycrorm_async.store.append import (
@@ -215,20 +216,25 @@ class EventLog:
 
     # --- read -------------------------------------------------------------------------------------------------
 
-    async def episodes(self) -> list[EpisodeRow]:
-        """Read every episode, by number."""
+    async def episodes(self, first: int = 1, last: int = EPISODE_NUMBER_MAX) -> list[EpisodeRow]:
+        """Read every episode from number `first` to `last`, by number."""
         async with self.reading() as connection:
-            return await self._dialect.episodes(connection)
+            return await self._dialect.episodes(connection, first, last)
+
+    async def last_number(self) -> int:
+        """Return the highest episode number; 0 for a log without episodes."""
+        async with self.reading() as connection:
+            return await self._dialect.last_number(connection)
 
     async def episode(self, episode: EpisodeId) -> EpisodeRow | None:
         """Read an episode's row; None if no event of it is stored."""
         async with self.reading() as connection:
             return await self._dialect.episode(connection, episode_text(episode))
 
-    async def last_digests(self) -> dict[int, DigestRow]:
-        """Read the last kept digest of each episode that has one, by number."""
+    async def last_digests(self, first: int = 1, last: int = EPISODE_NUMBER_MAX) -> dict[int, DigestRow]:
+        """Read the last kept digest of each episode from number `first` to `last` that has one, by number."""
         async with self.reading() as connection:
-            return await last_digests(self._dialect, connection)
+            return await last_digests(self._dialect, connection, first, last)
 
     async def episode_number(self, episode: EpisodeId) -> int | None:
         """Return an episode's number; None if no event of it is stored."""
@@ -488,24 +494,50 @@ async def _find_log(dialect: Dialect, connection: AsyncConnection, name: str, fo
 #
 # Find an episode by its number, its id, the first digits of its id, or `last`.
 #
-# `last` is the newest episode that is not a simulation. The lookup reads only the log, so it works without tables.
+# `last` is the newest episode that is not a simulation. The lookup in the log works without tables. It costs the same
+# however many episodes there are.
+
+_DIGITS_MAX = 7
+"""The largest number of an episode has seven digits."""
+_DIGITS_OF_ID = 4
+"""Fewer digits are a number and not the first ones of an id."""
+_LOOKED_AT = 100
+"""The episodes that are read at once in search of the last one that is not a simulation."""
+
+_NO_ID, _LAST_ID = (str(uuid.UUID(32 * each)) for each in "0f")
+_EPISODE = table("episode", column("number"), column("id"))
 
 
-def number_named(name: str, ids: Mapping[int, str], *, listed: int) -> int:
-    """Return the number of the named episode among these ids by number.
+async def number_named(
+    connection: AsyncConnection, name: str, numbers: ColumnElement[int], ids: ColumnElement[str], listed: Select[Any]
+) -> int:
+    """Return the number of the named episode; `numbers` and `ids` are columns with an index each.
 
-    `listed` is the number of episodes that `pycrorm episodes` lists. Raises `UnknownEpisode`, also if several ids
+    `listed` selects the number of episodes that `pycrorm episodes` lists. Raises `UnknownEpisode`, also if several ids
     match.
     """
     # Four digits may be a number, or the beginning of an id without a letter: the number wins.
-    numbers = [number for number in ids if str(number) == name] or [
-        number for number, identity in ids.items() if len(name) >= 4 and identity.startswith(name.lower())
-    ]
-    if len(numbers) > 1:
-        raise UnknownEpisode(f"{len(numbers)} episodes have an id that begins with {name!r}: use more of its digits")
-    if not numbers:
-        raise UnknownEpisode(f"there is no episode {name!r} ({_present(listed)})")
-    return numbers[0]
+    if name.isdecimal() and name.isascii() and len(name) <= _DIGITS_MAX and str(int(name)) == name:
+        number = (await connection.execute(select(numbers).where(numbers == int(name)))).scalar()
+        if number is not None:
+            return int(number)
+    # Between two whole ids, because no order of texts then depends on where their hyphens are.
+    first, last = (name.lower() + end[len(name) :] for end in (_NO_ID, _LAST_ID))
+    if len(name) >= _DIGITS_OF_ID and _is_id(first):
+        begins = select(func.count(), func.min(numbers)).where(ids.between(first, last))
+        count, number = (await connection.execute(begins)).one()
+        if count > 1:
+            raise UnknownEpisode(f"{count} episodes have an id that begins with {name!r}: use more of its digits")
+        if count:
+            return int(number)
+    raise UnknownEpisode(f"there is no episode {name!r} ({_present((await connection.execute(listed)).scalar_one())})")
+
+
+def _is_id(text_: str) -> bool:
+    try:
+        return episode_text(parse_episode_id(text_)) == text_
+    except ValueError:
+        return False
 
 
 def _present(listed: int) -> str:
@@ -516,12 +548,18 @@ def _present(listed: int) -> str:
 
 async def episode_named(log: EventLog, name: str) -> EpisodeRow:
     """Find the named episode. Raises `UnknownEpisode`."""
-    rows = {row.number: row for row in await log.episodes()}
-    if name == "last":
-        for row in reversed(rows.values()):
+    last = await log.last_number() if name == "last" else 0
+    while last > 0:
+        first = max(1, last - _LOOKED_AT + 1)
+        for row in reversed(await log.episodes(first, last)):
             if not await is_simulated(log, row):
                 return row
-    return rows[number_named(name, {number: row.id for number, row in rows.items()}, listed=len(rows))]
+        last = first - 1
+    async with log.reading() as connection:
+        listed = select(func.count()).select_from(_EPISODE)
+        number = await number_named(connection, name, _EPISODE.c.number, _EPISODE.c.id, listed)
+    (row,) = await log.episodes(number, number)
+    return row
 
 
 _GROWN = text(

@@ -371,7 +371,7 @@ SELECT * FROM locked UNION ALL SELECT {_EPISODE_ROW} FROM pycrorm.episode WHERE 
 
 SELECT_HEADS = f"SELECT {_EPISODE_ROW} FROM pycrorm.episode WHERE id = ANY ($1::text[])"
 SELECT_EPISODE_BY_ID = f"SELECT {_EPISODE_ROW} FROM pycrorm.episode WHERE id = $1"
-SELECT_EPISODES = f"SELECT {_EPISODE_ROW} FROM pycrorm.episode ORDER BY number"
+SELECT_EPISODES = f"SELECT {_EPISODE_ROW} FROM pycrorm.episode WHERE number BETWEEN $1 AND $2 ORDER BY number"
 SELECT_BEHIND = f"""
 SELECT {_EPISODE_ROW} FROM pycrorm.episode
 WHERE folded < head AND parked IS NULL AND number > $1 ORDER BY number LIMIT $2"""
@@ -554,8 +554,8 @@ class PostgreSQL:
     async def episode(self, connection: AsyncConnection, identity: str) -> EpisodeRow | None:
         return next(iter(await _rows(EpisodeRow, connection, SELECT_EPISODE_BY_ID, identity)), None)
 
-    async def episodes(self, connection: AsyncConnection) -> list[EpisodeRow]:
-        return await _rows(EpisodeRow, connection, SELECT_EPISODES)
+    async def episodes(self, connection: AsyncConnection, first: int, last: int) -> list[EpisodeRow]:
+        return await _rows(EpisodeRow, connection, SELECT_EPISODES, first, last)
 
     async def behind(self, connection: AsyncConnection, *, after: int, limit: int) -> list[EpisodeRow]:
         return await _rows(EpisodeRow, connection, SELECT_BEHIND, after, limit)

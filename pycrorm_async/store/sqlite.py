@@ -212,7 +212,7 @@ SELECT value->>0, value->>1, value->>2 FROM json_each(?) WHERE true ON CONFLICT 
 _EPISODE_ROW = "number, id, head, folded, started_wall_ns, ended_wall_ns, refused, parked"
 
 SELECT_EPISODES_BY_ID = f"SELECT {_EPISODE_ROW} FROM episode WHERE id IN (SELECT value FROM json_each(?))"
-SELECT_EPISODES = f"SELECT {_EPISODE_ROW} FROM episode ORDER BY number"
+SELECT_EPISODES = f"SELECT {_EPISODE_ROW} FROM episode WHERE number BETWEEN ? AND ? ORDER BY number"
 SELECT_BEHIND = f"""
 SELECT {_EPISODE_ROW} FROM episode WHERE folded < head AND parked IS NULL AND number > ? ORDER BY number LIMIT ?"""
 SELECT_STOPPED = f"SELECT {_EPISODE_ROW} FROM episode WHERE refused IS NOT NULL OR parked IS NOT NULL ORDER BY number"
@@ -356,8 +356,8 @@ class SQLite:
     async def episode(self, connection: AsyncConnection, identity: str) -> EpisodeRow | None:
         return next(iter(await self.episodes_by_id(connection, [identity])), None)
 
-    async def episodes(self, connection: AsyncConnection) -> list[EpisodeRow]:
-        return await _rows(EpisodeRow, connection, SELECT_EPISODES)
+    async def episodes(self, connection: AsyncConnection, first: int, last: int) -> list[EpisodeRow]:
+        return await _rows(EpisodeRow, connection, SELECT_EPISODES, first, last)
 
     async def behind(self, connection: AsyncConnection, *, after: int, limit: int) -> list[EpisodeRow]:
         return await _rows(EpisodeRow, connection, SELECT_BEHIND, after, limit)
