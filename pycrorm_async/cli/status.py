@@ -337,7 +337,7 @@ def _print_workers(workers: Sequence[FoldWorkerState]) -> None:
             (
                 each.number,
                 each.state,
-                round((now_ns - each.since_wall_ns) / 1e9),
+                max(0, round((now_ns - each.since_wall_ns) / 1e9)),
                 each.pid,
                 each.restarts,
                 each.reason,
@@ -375,7 +375,8 @@ async def _query(address: DatabaseAddress) -> DatabaseState:
         episode_states = []
         for row in (rows[number] for number in sorted(rows)):
             following = await log.events(row.number, after=row.folded, limit=1)
-            lag_s = (now_ns - following[0].wall_ns) / 1e9 if following else None
+            # The wall clock of the recorder may be ahead of this one.
+            lag_s = max(0.0, (now_ns - following[0].wall_ns) / 1e9) if following else None
             lag_events = row.head - row.folded
             episode_states.append(
                 EpisodeState(row.number, row.id, row.head, row.folded, lag_events, lag_s, row.refused, row.parked)

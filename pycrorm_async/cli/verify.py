@@ -46,7 +46,7 @@ def verify(
         Path | None,
         typer.Option(
             "--digests",
-            help="Compare also with these digests, from `pycrorm episodes --all --simulated --json`; - is stdin.",
+            help="Compare also with these digests: a file from `pycrorm episodes --all --simulated --json`; or -.",
             allow_dash=True,
             dir_okay=False,
         ),

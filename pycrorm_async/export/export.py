@@ -150,7 +150,7 @@ async def export(
         arguments: of a question that is named.
         force: replace the file if it exists; a folder only if it is such a data set.
         clock, fps: of LeRobot: a frame for each event that changed the robot's state (`event`, the default), or `fps`
-            frames each second (`time`). Of MCAP: the wall time of the events (`time`, the default), or `fps` events in
+            frames each second (`time`). Of MCAP: the times of the events (`time`, the default), or `fps` events in
             each second (`event`).
         images: of LeRobot: width and height of a picture of the scene at each frame, which needs the extra `world`.
         no_formulas: of CSV: an apostrophe before each text that a spreadsheet would run as a formula.

@@ -45,11 +45,10 @@ _BASE = ("base.x", "base.y", "base.z", "base.qx", "base.qy", "base.qz", "base.qw
 
 
 class EventTime(NamedTuple):
-    """An event: its sequence, the ns since the episode's first event, and the wall time in ns."""
+    """An event: its sequence, and the ns since the episode's first event."""
 
     sequence: int
     since_ns: int
-    wall_ns: int
 
 
 class Change(NamedTuple):
@@ -136,7 +135,7 @@ class _EpisodeFold:
         happening = happening_of(event)
         if event.sequence == 1:
             self._begin_ns, self.episode.started_wall_ns = event.monotonic_ns, event.wall_ns
-        when = EventTime(event.sequence, event.monotonic_ns - self._begin_ns, event.wall_ns)
+        when = EventTime(event.sequence, event.monotonic_ns - self._begin_ns)
         self.episode.events.append(when)
         match happening:
             case EpisodeStarted():
@@ -343,8 +342,8 @@ def _subtasks(nodes: Sequence[ExportedNode], at: Sequence[EventTime]) -> Iterato
 #
 # `/tf` has a `FrameTransforms` for each event that moved objects or joints, `/scene` a `SceneUpdate` with the shapes of
 # each object, in the frames of its links, and the deletion when it is removed, and `/plan` a `Log` for the start and
-# the end of each node. The time of a message is the wall time of its event, or, by event, `fps` events in a second; its
-# sequence is that of the event.
+# the end of each node. The time of a message is the wall time of the episode's start and the monotonic time since then,
+# or, by event, `fps` events in a second; its sequence is that of the event.
 
 _TOPICS = {"/tf": "FrameTransforms", "/scene": "SceneUpdate", "/plan": "Log"}
 
@@ -370,7 +369,7 @@ def write_mcap(
 
     Args:
         report_events: gets the event up to which the messages are written.
-        clock: the axis of the messages: `time`, the wall time of each event, or `event`, `fps` events in a second.
+        clock: the axis of the messages: `time`, the time of each event, or `event`, `fps` events in a second.
 
     Raises `MissingExtra`.
     """
@@ -387,8 +386,8 @@ def write_mcap(
         writer.add_metadata("episode", _metadata(episode))
         channels = {topic: _channel(writer, topic, getattr(messages, name)) for topic, name in _TOPICS.items()}
         for each in sorted(_messages(episode, objects, messages), key=lambda message: message.when.sequence):
-            since_ns = each.when.sequence * _SECOND_NS // fps
-            time_ns = each.when.wall_ns if clock == "time" else episode.started_wall_ns + since_ns
+            by_event_ns = each.when.sequence * _SECOND_NS // fps
+            time_ns = episode.started_wall_ns + (each.when.since_ns if clock == "time" else by_event_ns)
             stamped = each.content(messages.Timestamp(sec=time_ns // _SECOND_NS, nsec=time_ns % _SECOND_NS))
             writer.add_message(channels[each.topic], time_ns, stamped.encode(), time_ns, each.when.sequence)
             count += 1

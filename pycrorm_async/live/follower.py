@@ -386,7 +386,8 @@ class Activity:
         self._reasons: dict[str, int] = {}
         self._robots: dict[str, None] = {}
         self._names: dict[int, str] = {}
-        self._ended_wall_ns: int | None = None
+        self._start_ns = 0
+        self._seconds: float | None = None
 
     @property
     def has_ended(self) -> bool:
@@ -399,6 +400,7 @@ class Activity:
             return
         match happening_of(event):
             case EpisodeStarted() as started:
+                self._start_ns = event.monotonic_ns
                 self._description, self.simulated = started.description[:_TEXT_MAX], started.simulated
             case NodeStarted() as started:
                 self._nodes += 1
@@ -415,7 +417,7 @@ class Activity:
                 if added.object_type == "ROBOT":
                     self._robots[added.name] = None
             case EpisodeEnded() as ended_episode:
-                self._status, self._ended_wall_ns = ended_episode.status, event.wall_ns
+                self._status, self._seconds = ended_episode.status, (event.monotonic_ns - self._start_ns) / 1e9
                 if ended_episode.status == "LOST":
                     self._failed += len(self._running)
                 self._running.clear()
@@ -450,13 +452,12 @@ class Activity:
 
     def entry(self) -> dict[str, Any]:
         """Return its row, with the keys of `report.write`; its times are those of the tables, in µs."""
-        ended = self._ended_wall_ns
         return {
             "number": self.row.number,
             "started": f"{datetime.fromtimestamp(self.row.started_wall_ns // 10**9, UTC):%Y-%m-%d %H:%M:%S}",
             "description": self._description,
             "status": self._status,
-            "seconds": None if ended is None else (ended // 1000 - self.row.started_wall_ns // 1000) / 1e6,
+            "seconds": None if self._seconds is None else round(self._seconds, 6),
             "nodes": self._nodes,
             "failed": self._failed,
             "reasons": dict(self._reasons),

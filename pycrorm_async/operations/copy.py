@@ -334,9 +334,8 @@ async def _append(log: EventLog, row: EpisodeRow, event: EpisodeTagged, clock: C
     if row.refused is not None:
         raise CallerError(f"episode {row.number} cannot be tagged, because events of it are missing: {row.refused}")
     (last,) = await log.events(row.number, after=row.head - 1, limit=1)
-    wall_ns = clock.wall_ns()
-    # The monotonic clock of this process may have started later than that of the recorder.
-    monotonic_ns = last.monotonic_ns + max(0, wall_ns - last.wall_ns)
+    # No time passes on the recorder's monotonic clock any more, and this process may have another one.
+    wall_ns, monotonic_ns = clock.wall_ns(), last.monotonic_ns
     episode, kind = parse_episode_id(row.id), type(event)
     record = Record(0, episode, row.head + 1, kind.__name__, kind.version, wall_ns, monotonic_ns, encode(event))
     try:

@@ -31,7 +31,7 @@ _ENTRY = re.compile(r"^    (\w+(?:, \w+)*): (.*)$")
 _OF_LOADING = re.compile(r"[Ll]oaded|load them|awaitable_attrs|selectinload|undefer|[Ll]ikewise|has the field instead")
 _KINDS = (Action, Motion, Language)
 """Classes whose views also have the columns of `designator`, which their own tables do not declare."""
-_ALIKE = ("sequence", "end_sequence", "duration", "start_ns", "end_ns")
+_ALIKE = ("sequence", "end_sequence", "duration", "duration_s", "start_ns", "end_ns")
 """Columns whose text is always that of `_USUAL`, even if their attribute has a docstring."""
 _USUAL = {
     "id": "of the row; computed from the episode's number, its event and a slot",
@@ -46,7 +46,8 @@ _USUAL = {
     "pose_id": "its row in `pose`",
     "object_id": "its row in `object`, as the object was then",
     "identity_id": "the object's first row, which all its rows share",
-    "duration": "s; null while it runs, and if it is LOST",
+    "duration_s": "s by the robot's monotonic clock; null while it runs, and if it is LOST",
+    "duration": "the former name of duration_s",
     "start_ns": "ns of the robot's monotonic clock",
     "end_ns": "ns of the robot's monotonic clock",
     "ns": "ns of the robot's monotonic clock",

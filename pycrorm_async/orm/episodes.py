@@ -37,7 +37,8 @@ class ProcessMetaData(Base):
     """
     seed: Mapped[int | None]
     status: Mapped[str]
-    ended_at: Mapped[datetime | None]
+    start_ns: Mapped[int]
+    end_ns: Mapped[int | None]
     end_sequence: Mapped[int | None]
     """The sequence of its last event; None while it runs."""
     failure_type: Mapped[str | None]
@@ -63,6 +64,10 @@ class ProcessMetaData(Base):
     clock_synchronized: Mapped[bool | None]
     """True if a time service kept the wall clock; `clock_error_us` is its estimated error, µs."""
     clock_error_us: Mapped[int | None]
+    ended_at: Mapped[datetime | None]
+    """`created_at` and the duration; None while it runs."""
+    duration_s: Mapped[float | None]
+    """From its first to its last event by the robot's monotonic clock, s; None while it runs."""
     episode_metadata: Mapped[dict[str, Any] | None] = mapped_column("metadata", JsonText())
     """The metadata of the executive; the column is `metadata`, a name that SQLAlchemy reserves as an attribute."""
     tag_rows: Mapped[list[Any]] = relationship("EpisodeTag", viewonly=True, order_by="EpisodeTag.tag")

@@ -400,7 +400,8 @@ class Designator(RowOfEvent, Base):
             `await action.awaitable_attrs.parameters`.
         status, start_time, end_time, reason: of its node. A type with a field of such a name has the field instead.
         robot: the name of the robot that acted; None without one. A type with a field `robot` has the field instead.
-        duration: of its node, in s; None while it runs, and if it is LOST.
+        duration_s: of its node by the robot's monotonic clock, in s; None while it runs, and if it is LOST. `duration`
+            is its former name.
         sequence, end_sequence: the events of its start and its end, 1, 2, 3 … inside the episode.
         episode: the same as `process_metadata`.
         node: its node of the task tree, mainly for joins: `select(...).join(PickUpAction.node)`. Not loaded by default:
@@ -442,6 +443,7 @@ class Designator(RowOfEvent, Base):
     _status: Mapped[TaskStatus] = mapped_column("status")
     _start_time: Mapped[datetime] = mapped_column("start_time")
     _end_time: Mapped[datetime | None] = mapped_column("end_time")
+    _duration_s: Mapped[float | None] = mapped_column("duration_s")
     _duration: Mapped[float | None] = mapped_column("duration")
     _reason: Mapped[str | None] = mapped_column("reason")
     _end_sequence: Mapped[int | None] = mapped_column("end_sequence")
@@ -468,12 +470,17 @@ class Designator(RowOfEvent, Base):
 
     @hybrid_property
     def end_time(self) -> datetime | None:
-        """The end of its node; None while it runs, and if it is LOST."""
+        """The start of its node and the duration; None while it runs, and if it is LOST."""
         return self._end_time
 
     @hybrid_property
-    def duration(self) -> float | None:
+    def duration_s(self) -> float | None:
         """The duration of its node in s; None while it runs, and if it is LOST."""
+        return self._duration_s
+
+    @hybrid_property
+    def duration(self) -> float | None:
+        """The former name of `duration_s`."""
         return self._duration
 
     @hybrid_property
@@ -638,11 +645,12 @@ class TaskTreeNode(RowOfEvent, Base):
         children: the nodes that it performed, in order. Not loaded by default, because it would nearly double the time
             of a query: use `selectinload(TaskTreeNode.children)` or `await node.awaitable_attrs.children`.
         ancestors: the parent, its parent and so on to the root: `await node.awaitable_attrs.ancestors`.
-        end_time: None while it runs, and if it is LOST.
+        start_time: by the wall clock, which may be set while the plan runs.
+        end_time: `start_time` and the duration; None while it runs, and if it is LOST.
         start_ns, end_ns: monotonic time, for exact durations.
         sequence, end_sequence: the events of its start and its end, 1, 2, 3 … inside the episode. `end_sequence` is
             None while it runs, and if it is LOST.
-        duration: in s; None while it runs, and if it is LOST.
+        duration_s: by the monotonic clock, in s; None while it runs, and if it is LOST. `duration` is its former name.
         reason: the class of the failure it ended with; `failure_message` and `failure_arguments` belong to it.
         result: the return value of perform, as JSON.
         robot: the name of the robot that acted; None without one.
@@ -672,6 +680,7 @@ class TaskTreeNode(RowOfEvent, Base):
     robot_object_id: Mapped[int | None] = mapped_column(ForeignKey("object.id"))
     robot: Mapped[str | None]
     simulated: Mapped[bool]
+    duration_s: Mapped[float | None]
     duration: Mapped[float | None]
 
     action: Mapped[Designator | None] = one_of(lambda: TaskTreeNode.action_id, "designator")
@@ -693,11 +702,6 @@ class TaskTreeNode(RowOfEvent, Base):
             node = node.parent
             nodes += [] if node is None else [node]
         return nodes
-
-    @property
-    def duration_s(self) -> float | None:
-        """The same as `duration`."""
-        return self.duration
 
 
 class LocationCandidate(RowOfEvent, Base):

@@ -109,6 +109,7 @@ class RootFailure(RowOfEvent, Base):
     recovered: Mapped[bool]
     start_time: Mapped[datetime]
     end_time: Mapped[datetime | None]
+    duration_s: Mapped[float | None]
 
     process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True)
 

@@ -461,7 +461,6 @@ def root_failures(nodes: Table, objects: Table) -> Select[*tuple[Any, ...]]:
         nodes.c.failure_message.label("message"),
         sql_of(Boolean(), *climbing(_RECOVERED)).label("recovered"),
         nodes.c.start_time,
-        nodes.c.end_time,
         event_of(nodes.c.id).label("sequence"),
     ).where(nodes.c.status.in_(_FAILED), ~failed_child)
 

@@ -138,7 +138,8 @@ def _episode_started(event: StoredEvent, started: EpisodeStarted, _designators: 
         "world": started.world,
         "seed": started.seed,
         "status": "RUNNING",
-        "ended_at": None,
+        "start_ns": event.monotonic_ns,
+        "end_ns": None,
         "end_sequence": None,
         "failure_type": None,
         "failure_message": None,
@@ -181,7 +182,7 @@ def _episode_ended(event: StoredEvent, ended: EpisodeEnded, _designators: Design
         EpisodeEnd(
             event.number,
             ended.status,
-            microseconds(event.wall_ns),
+            event.monotonic_ns,
             event.sequence,
             failure.type if failure else None,
             failure.message if failure else None,
@@ -231,13 +232,13 @@ def _node_started(event: StoredEvent, started: NodeStarted, designators: Designa
 
 
 def _node_ended(event: StoredEvent, ended: NodeEnded, _designators: Designators, rows: Rows) -> None:
-    number, sequence, _, _, wall_ns, monotonic_ns, _ = event
+    number, sequence, _, _, _, monotonic_ns, _ = event
     node, status = row_of(number, ended.node), ended.status
     outcome = _outcome(ended) if ended.failure is not None or ended.result is not None else _NO_OUTCOME
     if status == "LOST":  # recovery computed this end; the true end time was never recorded
-        rows.end_node(node, status, None, None, None, outcome)
+        rows.end_node(node, status, None, None, outcome)
     else:
-        rows.end_node(node, status, wall_ns // 1000, monotonic_ns, sequence, outcome)
+        rows.end_node(node, status, monotonic_ns, sequence, outcome)
 
 
 def _outcome(ended: NodeEnded) -> Row:

@@ -18,7 +18,6 @@ from pycrorm_async.projections import columns
     DTYPE,
     STATUS,
     START_TIME,
-    END_TIME,
     START_NS,
     END_NS,
     END_SEQUENCE,
@@ -33,7 +32,7 @@ from pycrorm_async.projections import columns
     ROBOT,
     SIMULATED,
     PARAMETERS,
-) = range(22)
+) = range(21)
 assert [each.lower() for each in globals() if each.isupper()] == [*columns.CORE["task_tree_node"]], "the order differs"
 
 OUTCOME: Final = slice(REASON, RESULT + 1)

@@ -27,7 +27,7 @@ from pycrorm_async.events.types import (
     PoseValue,
 )
 from pycrorm_async.projections.columns import COLUMNS, EPISODE, Union
-from pycrorm_async.projections.node_row import END_NS, END_SEQUENCE, END_TIME, OUTCOME, PROCESS_METADATA_ID, STATUS
+from pycrorm_async.projections.node_row import END_NS, END_SEQUENCE, OUTCOME, PROCESS_METADATA_ID, STATUS
 from pycrorm_async.store.stored import StoredEvent
 
 Row: TypeAlias = tuple[Any, ...]
@@ -40,7 +40,6 @@ class NodeEnd(NamedTuple):
 
     id: int
     status: str
-    end_time: int | None
     end_ns: int | None
     end_sequence: int | None
     reason: str | None
@@ -54,7 +53,7 @@ class EpisodeEnd(NamedTuple):
 
     id: int
     status: str
-    ended_at: int
+    end_ns: int
     end_sequence: int
     failure_type: str | None
     failure_message: str | None
@@ -62,7 +61,7 @@ class EpisodeEnd(NamedTuple):
     entered_world: str | None
 
 
-assert NodeEnd._fields == ("id", "status", "end_time", "end_ns", "end_sequence", *COLUMNS["task_tree_node"][OUTCOME])
+assert NodeEnd._fields == ("id", "status", "end_ns", "end_sequence", *COLUMNS["task_tree_node"][OUTCOME])
 
 
 class Rows:
@@ -91,7 +90,6 @@ class Rows:
         self,
         node: int,
         status: str,
-        end_time: int | None,
         end_ns: int | None,
         end_sequence: int | None,
         outcome: Row,
@@ -99,10 +97,9 @@ class Rows:
         """Set the end of a node's row, in this batch or in the tables. `outcome`: the columns reason to result."""
         row = self.nodes.get(node)
         if row is None:
-            self.node_ends.append(make(NodeEnd, (node, status, end_time, end_ns, end_sequence, *outcome)))
+            self.node_ends.append(make(NodeEnd, (node, status, end_ns, end_sequence, *outcome)))
             return
         row[STATUS] = status
-        row[END_TIME] = end_time
         row[END_NS] = end_ns
         row[END_SEQUENCE] = end_sequence
         row[OUTCOME] = outcome

@@ -207,7 +207,7 @@ def _process_metadata(tables: Tables) -> Select[Any]:
     world = func.coalesce(episodes.c.world, episodes.c.entered_world, line).label("world")
     columns = columns_in_order(episodes)
     first, *others = (world if each.name == "world" else each for each in columns if each.name != "entered_world")
-    return select(first, *others)
+    return select(first, *others, _end(episodes.c.created_at, episodes).label("ended_at"), _duration_s(episodes))
 
 
 def _episode_tag(tables: Tables) -> Select[Any]:
@@ -260,7 +260,7 @@ def _task_tree_node(tables: Tables) -> Select[Any]:
     nodes = tables["task_tree_node"]
     action_id = case((nodes.c.dtype.is_not(None), nodes.c.id), else_=null())
     columns = (each for each in columns_in_order(nodes) if each.key != "parameters")
-    return select(*columns, *_sequence(nodes), action_id.label("action_id"), _duration(nodes))
+    return select(*columns, *_sequence(nodes), action_id.label("action_id"), *_end_and_durations(nodes))
 
 
 def _sequence(rows: Table) -> tuple[ColumnElement[Any], ...]:
@@ -269,14 +269,25 @@ def _sequence(rows: Table) -> tuple[ColumnElement[Any], ...]:
     return (event_of(first).label("sequence"),)
 
 
-def _duration(nodes: Table) -> ColumnElement[Any]:
-    """Return the column `duration` (s); null while the node runs, and if it is LOST."""
-    return (cast(nodes.c.end_ns - nodes.c.start_ns, Double()) / 1e9).label("duration")
+def _duration_s(rows: Table) -> ColumnElement[Any]:
+    """Return the column `duration_s` by the monotonic clock; null without an end: while it runs, and of a LOST node."""
+    return (cast(rows.c.end_ns - rows.c.start_ns, Double()) / 1e9).label("duration_s")
+
+
+def _end(start: ColumnElement[int], rows: Table) -> ColumnElement[int]:
+    """Return the end in µs: the start and the duration, because the wall clock may be set between the two."""
+    return start + (rows.c.end_ns - rows.c.start_ns) // 1000
+
+
+def _end_and_durations(nodes: Table) -> tuple[ColumnElement[Any], ...]:
+    """Return the columns of the end of a node; `duration` is the former name of `duration_s`."""
+    duration = _duration_s(nodes)
+    return _end(nodes.c.start_time, nodes).label("end_time"), duration, duration.element.label("duration")
 
 
 def _course(nodes: Table) -> tuple[ColumnElement[Any], ...]:
     """Return the columns of a node's course: start and end by time and by event, robot, parent, and outcome."""
-    times = nodes.c.start_time, nodes.c.end_time, _duration(nodes)
+    times = nodes.c.start_time, *_end_and_durations(nodes)
     ended = nodes.c.reason, nodes.c.failure_message, nodes.c.result
     return nodes.c.status, *times, *ended, *_sequence(nodes), nodes.c.end_sequence, nodes.c.robot, nodes.c.parent_id
 
@@ -330,7 +341,10 @@ def _robot_state(tables: Tables) -> Select[Any]:
 
 
 def _root_failure(tables: Tables) -> Select[Any]:
-    return root_failures(tables["task_tree_node"], tables["object"])
+    nodes = tables["task_tree_node"]
+    return root_failures(nodes, tables["object"]).add_columns(
+        _end(nodes.c.start_time, nodes).label("end_time"), _duration_s(nodes)
+    )
 
 
 def _pose(tables: Tables) -> Select[Any]:

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from enum import Enum
 from typing import Any, TypeAlias
 
-from sqlalchemy import ColumnElement, Select, and_, exists, func, or_, select
+from sqlalchemy import ColumnElement, Row, Select, and_, exists, func, or_, select
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncSession
 from sqlalchemy.orm import aliased
 
@@ -68,7 +68,7 @@ class EpisodeSummary(NotebookValue):
 
     Attributes:
         number, id: its number in this database, its UUID.
-        duration_ns: from its first to its last event; None while it runs.
+        duration_ns: from its first to its last event by the monotonic clock; None while it runs.
         end_sequence: the sequence of its last event; None while it runs.
         nodes, failed: number of nodes in its task tree, the root included, and of those that FAILED, ended in ERROR or
             are LOST.
@@ -135,6 +135,7 @@ class NodeSummary:
         observations: number of observations that a program made at it.
         considered, offered: number of places that location designators checked for it, and of those they offered.
         detected: number of percepts that it had.
+        start_ns: of the robot's monotonic clock, which only the times of one episode are compared by.
     """
 
     id: int
@@ -156,6 +157,7 @@ class NodeSummary:
     considered: int = 0
     offered: int = 0
     detected: int = 0
+    start_ns: int = field(default=0, compare=False)
 
 
 _AT_ONCE = 500
@@ -174,11 +176,15 @@ async def episodes(connection: AsyncConnection, chosen: int | EpisodeChoice | No
 
 async def _summaries(connection: AsyncConnection, numbers: Sequence[int]) -> list[EpisodeSummary]:
     """Return the episodes with these numbers, by number."""
+    episode = ProcessMetaData.__table__
+    query = select(episode).where(episode.c.id.in_(numbers)).order_by(episode.c.id)
+    rows = (await connection.execute(query)).all()
+    simulating = await _simulating_nodes(connection, rows)
     robots = await robots_of(connection, numbers)
     tags: dict[int, list[str]] = {}
     tagged = select(EpisodeTag.process_metadata_id, EpisodeTag.tag).order_by(EpisodeTag.tag)
-    for episode, tag in await connection.execute(tagged.where(EpisodeTag.process_metadata_id.in_(numbers))):
-        tags.setdefault(episode, []).append(tag)
+    for number, tag in await connection.execute(tagged.where(EpisodeTag.process_metadata_id.in_(numbers))):
+        tags.setdefault(number, []).append(tag)
     node = TaskTreeNode
     ended_badly = times_with(node.status.in_([TaskStatus.FAILED, TaskStatus.ERROR, TaskStatus.LOST]))
     counted = select(node.process_metadata_id, func.count(), ended_badly).group_by(node.process_metadata_id)
@@ -189,16 +195,14 @@ async def _summaries(connection: AsyncConnection, numbers: Sequence[int]) -> lis
             id=row.uuid,
             started_at=row.created_at,
             ended_at=row.ended_at,
-            duration_ns=_nanoseconds(row.created_at, row.ended_at),
+            duration_ns=None if row.end_ns is None else row.end_ns - row.start_ns,
             status=row.status,
             description=row.description,
             created_by=row.created_by,
             nodes=counts.get(row.id, (0, 0))[0],
             failed=int(counts.get(row.id, (0, 0))[1]),
             simulated=row.simulated,
-            thought_by=SimulatingNode(row.thought_by, row.simulating_number, row.simulating_id, row.simulating_dtype)
-            if row.thought_by is not None
-            else None,
+            thought_by=simulating.get(row.id),
             continues=row.continues,
             continued_in=row.continued_in,
             end_sequence=row.end_sequence,
@@ -215,31 +219,36 @@ async def _summaries(connection: AsyncConnection, numbers: Sequence[int]) -> lis
             tags=tuple(tags.get(row.id, ())),
             metadata=row.metadata,
         )
-        for row in await connection.execute(_overview().where(ProcessMetaData.id.in_(numbers)))
+        for row in rows
     ]
 
 
-def _overview() -> Select[*tuple[Any, ...]]:
-    episode = ProcessMetaData
-    simulating_episode, simulating_node = aliased(ProcessMetaData), aliased(TaskTreeNode)
-    first_row = simulating_episode.id * row_id(1, 0, SLOT_NODE)
-    simulating_node_id = first_row + episode.thought_by_node * row_id(0, 1, SLOT_NODE)
-    return (
-        select(
-            episode.__table__,
-            simulating_episode.id.label("simulating_number"),
-            simulating_node.id.label("simulating_id"),
-            simulating_node.dtype.label("simulating_dtype"),
-        )
-        .outerjoin(simulating_episode, simulating_episode.uuid == episode.thought_by)
-        .outerjoin(
-            simulating_node,
-            and_(
-                simulating_node.id == simulating_node_id, simulating_node.process_metadata_id == simulating_episode.id
-            ),
-        )
-        .order_by(episode.id)
+async def _simulating_nodes(connection: AsyncConnection, episodes: Sequence[Row[Any]]) -> dict[int, SimulatingNode]:
+    """Return the nodes that performed these simulations, by the number of the simulation."""
+    simulated = [each for each in episodes if each.thought_by is not None]
+    if not simulated:
+        return {}
+    episode, node = ProcessMetaData, TaskTreeNode
+    named = select(episode.uuid, episode.id).where(episode.uuid.in_({each.thought_by for each in simulated}))
+    numbers: dict[str, int] = {row[0]: row[1] for row in await connection.execute(named)}
+    ids = {
+        each.id: row_id(numbers[each.thought_by], each.thought_by_node, SLOT_NODE)
+        for each in simulated
+        if each.thought_by in numbers and each.thought_by_node is not None
+    }
+    by_key = select(node.id, node.dtype).where(
+        node.id.in_(ids.values()), node.process_metadata_id.in_(numbers.values())
     )
+    dtypes: dict[int, str | None] = {row[0]: row[1] for row in await connection.execute(by_key)}
+    return {
+        each.id: SimulatingNode(
+            each.thought_by,
+            numbers.get(each.thought_by),
+            id_ if (id_ := ids.get(each.id)) in dtypes else None,
+            dtypes.get(ids.get(each.id, 0)),
+        )
+        for each in simulated
+    }
 
 
 async def episode_named(connection: AsyncConnection, name: str) -> EpisodeSummary:
@@ -308,6 +317,7 @@ async def task_tree(connection: AsyncConnection, number: int) -> list[NodeSummar
                 considered=considered,
                 offered=offered,
                 detected=detected.get(row.id, 0),
+                start_ns=row.start_ns,
             )
         )
     return list(_depth_first(children))
@@ -334,10 +344,6 @@ def _depth_first(children: dict[int | None, list[NodeSummary]]) -> Iterator[Node
         node, depth = stack.pop()
         yield replace(node, depth=depth)
         stack.extend((child, depth + 1) for child in reversed(children.get(node.id, [])))
-
-
-def _nanoseconds(start: datetime, end: datetime | None) -> int | None:
-    return None if end is None else (end - start) // timedelta(microseconds=1) * 1000
 
 
 # === episode list =============================================================================================
@@ -437,6 +443,7 @@ def episode_list(episode: EpisodeNumber | None, choice: EpisodeChoice) -> Select
         listed.uuid.label("id"),
         listed.created_at.label("started_at"),
         listed.ended_at,
+        listed.duration_s,
         listed.status,
         listed.description,
         listed.plan,

@@ -337,11 +337,11 @@ def _note(drawn: Sequence[NodeSummary], nodes: Sequence[NodeSummary]) -> str:
 def _bars(nodes: Sequence[NodeSummary], *, by_time: bool) -> list[_Bar]:
     """Give each node the first free lane below its parent's, so that concurrent branches do not cover each other."""
     ordered = sorted(nodes, key=lambda each: each.sequence)
-    begin = min((each.started_at for each in nodes), default=None)
+    begin_ns = min((each.start_ns for each in nodes), default=0)
     spans: list[tuple[float, float | None]] = []
     for each in ordered:
-        if by_time and begin is not None:
-            start = (each.started_at - begin).total_seconds()
+        if by_time:
+            start = (each.start_ns - begin_ns) / 1e9
             spans.append((start, None if each.duration_ns is None else start + each.duration_ns / 1e9))
         else:
             spans.append((each.sequence, each.end_sequence))

@@ -13,7 +13,7 @@ from sqlalchemy import CompoundSelect, Dialect, Row, Select, func, select
 from pycrorm_async.errors import CallerError, InternalError, QueryRefused, UnknownEpisode
 from pycrorm_async.orm import DesignatorType, Detection, EpisodeRobot, EpisodeTag, Object, ProcessMetaData, TaskTreeNode
 from pycrorm_async.orm.base import EPISODE
-from pycrorm_async.query.frames import EpisodeNumber
+from pycrorm_async.query.frames import EpisodeNumber, is_named
 from pycrorm_async.query.named_queries import EpisodeChoice, EpisodeSummary
 from pycrorm_async.query.text import NotebookValue, nearest
 from pycrorm_async.store.log import EventLog
@@ -375,7 +375,11 @@ async def unknown_name(reading: EpisodeReader, names: Mapping[str, str], episode
                 where, query = f"episode {episode}", query.where(own == episode)
             valid += [value for (value,) in await reading.rows(query, simulated=True) if value is not None]
         if not _is_one(argument, name, valid):
-            return f"{where} has no {_WHATS.get(argument, argument)} {name or repr(name)}{nearest(name, valid)}"
+            absence = f"{where} has no {_WHATS.get(argument, argument)} {name or repr(name)}"
+            for each in () if episode is None else _RECORDED.get(argument, ()):
+                if await reading.rows(select(each).where(is_named(each, name)).limit(1), simulated=True):
+                    return absence  # other episodes have it, so that it is no mistake
+            return f"{absence}{nearest(name, valid)}"
     return ""
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from datetime import datetime
 from functools import partial, wraps
 from inspect import signature
@@ -178,6 +178,8 @@ def successful_pick_ups(
     )
     if episode is not None:
         statement = statement.where(of_episode(node.process_metadata_id, episode))
+        if not isinstance(episode, Sequence):  # a range of ids, because the pick-ups have no index of episodes
+            statement = statement.where(pick_up.c.id.between(_first_id(episode), _first_id(episode + 1)))
     if object_ is not None:
         statement = statement.where(containing(object_, taken.c.name))
     if object_type is not None:

@@ -766,6 +766,7 @@ class MomentFold:
             simulated=node.simulated,
             sequence=sequence,
             end_sequence=node.end_sequence,
+            start_ns=node.monotonic_ns,
             start_s=(node.monotonic_ns - start_ns) / 1e9,
             end_s=(node.ended_ns - start_ns) / 1e9 if node.ended_ns is not None else None,
             considered=node.considered,

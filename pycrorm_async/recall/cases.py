@@ -445,6 +445,9 @@ class EpisodeCases:
         """The nearest action around each other node that runs, without those outside any."""
         self._after: tuple[str, str] | None = None
         self._simulated = False
+        self._wall_at_zero_ns: int | None = None
+        """The wall time at which the monotonic clock of the episode was zero, according to its first event. Starts are
+        reckoned from it, so that actions keep their order when the wall clock is set meanwhile."""
 
     def read(self, events: Iterable[StoredEvent], declaration_of: DeclarationOf, cases: list[Case]) -> Refused | None:
         """Apply the next events, of the types in `READS`; append the cases of the actions that they end to `cases`.
@@ -464,6 +467,7 @@ class EpisodeCases:
                         self._scopes.pop(happening.node, None)
                 elif isinstance(happening, EpisodeStarted):
                     self._simulated = happening.simulated
+                    self._wall_at_zero_ns = event.wall_ns - event.monotonic_ns
                 elif isinstance(happening, EpisodeEnded):
                     if happening.status == "LOST":
                         cases += [each.case("LOST") for each in self._running.values()]
@@ -504,7 +508,7 @@ class EpisodeCases:
         simulated = self._simulated or started.simulated
         self._running[sequence] = _Action(
             row_of(number, sequence),
-            wall_ns // 1000,
+            (wall_ns if self._wall_at_zero_ns is None else self._wall_at_zero_ns + monotonic_ns) // 1000,
             monotonic_ns,
             fields.dtype,
             scope,
@@ -750,7 +754,7 @@ class CaseProjection(PackedProjection):
     """Makes a case of each action that ends. The row of a case is packed with others into a block."""
 
     name = "recall"
-    version = 1
+    version = 2
     tables: ClassVar[Any] = {BLOCKS: BLOCK_COLUMNS, COLUMNS: COLUMN_COLUMNS}
     reads = READS
 

@@ -302,7 +302,7 @@ class Case(NamedTuple):
 
     Attributes:
         node: id of its task-tree node: episode number, sequence and slot 0 in one integer.
-        started_us: wall time of its start, µs since 1970.
+        started_us: its start, µs since 1970: the wall time of the episode's start and the monotonic time since then.
         type: its dtype, as `PickUpAction`.
         symbols: texts by feature; a tuple for a feature with several values at once, as the types of nearby objects.
         numbers: finite numbers by feature, in m, rad and s. A feature whose name ends in `yaw` is an angle.

@@ -240,7 +240,7 @@ FROM (
     SELECT episode, max(sequence) AS sequence FROM pycrorm_digest
     WHERE episode BETWEEN :first AND :last GROUP BY episode
 ) AS last
-JOIN pycrorm_digest USING (episode, sequence)""")
+JOIN pycrorm_digest USING (episode, sequence) WHERE episode BETWEEN :first AND :last""")
 
 
 class Extension:

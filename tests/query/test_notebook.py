@@ -54,6 +54,7 @@ def node(number: int, parent: int | None = None, status: str = "SUCCEEDED", **fi
         parameters={},
         status=status,
         started_at=START + timedelta(milliseconds=number),
+        start_ns=number * 1_000_000,
         duration_ns=5_000_000,
         reason=None,
         failure_message=None,

@@ -244,7 +244,7 @@ async def test_a_frame_of_a_mapped_class_has_its_attributes_once(reading: Readin
     frame = await reading.dataframe(select(NavigateAction))
     assert list(frame.columns) == [
         "id", "process_metadata_id", "dtype", "kind", "robot_state_id", "pose_id",
-        "status", "start_time", "end_time", "duration", "reason", "end_sequence", "robot", "sequence",
+        "status", "start_time", "end_time", "duration_s", "duration", "reason", "end_sequence", "robot", "sequence",
     ]  # fmt: skip
     assert [*frame.sequence, *frame.end_sequence] == [4, 4, 8, 8]
     assert [*frame.status, *frame.duration, *frame.reason.isna()] == ["SUCCEEDED"] * 2 + [4.0] * 2 + [True] * 2
