@@ -8,8 +8,7 @@ from pathlib import Path
 from pycrorm_async.events.types import EpisodeEnded, EpisodeStarted
 from tests.commands import pycrorm
 from tests.databases import put_memory, run_in_own_loop
-from tests.projections.event_script import Script
-from tests.projections.factories import append_and_fold
+from tests.projections.event_script import Script, append_and_fold
 
 NOTE = "the newest 50 of 61 episodes; --all lists all, --limit N the newest N\n"
 

@@ -14,7 +14,7 @@ from mcap.reader import make_reader
 from pycrorm_async import Memory, Reading
 from pycrorm_async.clock import Clock
 from pycrorm_async.export.export import export
-from pycrorm_async.live.server import Activity
+from pycrorm_async.live.follower import Activity
 from pycrorm_async.operations.copy import tag_episode
 from pycrorm_async.plan import ActionAbstract, PlanFailure, Sequential, TryInOrder
 from pycrorm_async.query.named_queries import EpisodeSummary
