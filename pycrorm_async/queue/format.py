@@ -225,10 +225,11 @@ class Segment:
         return self.identity.is_at(self.path)
 
     def close(self) -> None:
-        """Close the mapping and the file. Idempotent."""
+        """Close the mapping and the file. Idempotent. An error of the disk concerns nothing that was synced."""
         if self.descriptor >= 0:
             self.buffer.close()
-            os.close(self.descriptor)
+            with suppress(OSError):
+                os.close(self.descriptor)
             self.descriptor = -1
 
 

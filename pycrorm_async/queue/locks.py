@@ -146,21 +146,21 @@ class FileLock:
             descriptor = open_file(path, os.O_RDWR) if create else os.open(path, os.O_RDWR | os.O_CLOEXEC)
         except FileNotFoundError:
             return None
-        for _ in range(_ATTEMPTS):
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
+        lock = None
+        try:
+            for _ in range(_ATTEMPTS):
+                with suppress(BlockingIOError):
+                    fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    # The previous holder may have deleted the file after it was opened here: then this lock protects
+                    # nothing.
+                    if FileIdentity.of(os.fstat(descriptor)).is_at(path):
+                        lock = cls(descriptor)
+                    break
                 time.sleep(_RETRY_S)
-            else:
-                break
-        else:
-            os.close(descriptor)
-            return None
-        # The previous holder may have deleted the file after it was opened here: then this lock protects nothing.
-        if not FileIdentity.of(os.fstat(descriptor)).is_at(path):
-            os.close(descriptor)
-            return None
-        return cls(descriptor)
+        finally:
+            if lock is None:  # also after an error, which would otherwise leave the lock to this process
+                os.close(descriptor)
+        return lock
 
     def write_note(self, note: bytes) -> None:
         """Replace the holder's note in the lock file, for `read_note`. Raises `OSError`."""
@@ -168,14 +168,16 @@ class FileLock:
             os.pwrite(self._descriptor, _NOTE.pack(len(note), crc32(note)) + note, 0)
 
     def release(self) -> None:
-        """Release the lock, also where a forked child still shares it. Idempotent."""
+        """Release the lock, also where a forked child still shares it. Idempotent. Ignores a failing disk."""
         if self._descriptor >= 0:
-            fcntl.flock(self._descriptor, fcntl.LOCK_UN)
+            with suppress(OSError):
+                fcntl.flock(self._descriptor, fcntl.LOCK_UN)
             self._close()
 
     def _close(self) -> None:
         if self._descriptor >= 0:
-            os.close(self._descriptor)
+            with suppress(OSError):  # Linux closes the descriptor nevertheless
+                os.close(self._descriptor)
             self._descriptor = -1
 
 

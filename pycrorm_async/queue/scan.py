@@ -56,7 +56,7 @@ from pycrorm_async.queue.format import (
     span_checksum,
     sync_folder,
 )
-from pycrorm_async.queue.locks import BLOBS, TAIL
+from pycrorm_async.queue.locks import TAIL
 from pycrorm_async.queue.spool import write_durably
 
 _SALT_OFFSET = HEADER_BYTES - 8
@@ -402,8 +402,6 @@ def truncate_at_lost_blob(folder: Path, recorder: bytes) -> None:
 
     Leaves a damaged folder as it is, because a repair decides about its records.
     """
-    if not (folder / BLOBS).is_dir():
-        return
     unsynced: list[_Referring] = []
     sizes: dict[int, int] = {}
 

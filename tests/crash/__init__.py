@@ -7,7 +7,8 @@
  2  killed at each step that touches disk or log, and once more
         test_crash_points; queue/test_dead_source (sealing, removing), queue/test_maintenance
  3  power cut: any sectors of what was not synced
-        test_disk; a mounted image of a disk: the bench
+        test_disk; everything that was not synced, of the whole memory: test_forgetful_disk; a mounted image of a disk:
+        the bench
  4  torn write at every byte
         queue/test_dead_source, queue/test_format, queue/test_drain_notes
  5  every bit flipped
@@ -16,6 +17,8 @@
         queue/test_dead_source
  7  a sync that fails
         test_disk, queue/test_dead_source (a disk that fails while a dead recorder's records are made durable)
+ 7b each system call of queue, writer and SQLite fails once
+        test_failing_calls
  8  a full disk, below the queue and below the database
         test_disk, store/test_crash, cli/test_bad_spool
  9  a COMMIT whose reply is lost

@@ -12,6 +12,7 @@ import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from hashlib import sha256
 from pathlib import Path
 
@@ -23,6 +24,7 @@ from pycrorm_async.events.codec import Heading, Record, is_computed_end
 from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.events.types import references_in
 from pycrorm_async.queue import RecorderQueue, blobs, open_dead
+from pycrorm_async.queue import format as queue_format
 from pycrorm_async.queue.appender import Span, SyncableAppender
 from pycrorm_async.queue.blobs import is_whole
 from pycrorm_async.queue.format import EVENT, Segment, salt_of
@@ -217,19 +219,28 @@ class BlobMachine:
     def __init__(self, machine: Machine, rng: random.Random, patch: pytest.MonkeyPatch) -> None:
         self.machine = machine
         self._rng = rng
-        self._synced: set[str] = set()
-        sync_file, cut = blobs._sync_file, machine.cut
+        self._whole: set[str] = set()  # blobs whose content was synced
+        self._named: set[str] = set()  # blobs, and their folder, whose name was synced
+        fsync, sync_file, cut = os.fsync, blobs._sync_file, machine.cut
 
         def sync(path: Path) -> None:
             machine.cut()
             sync_file(path)
-            self._synced.add(path.name)
             machine.cut()
+
+        def observed_fsync(descriptor: int) -> None:
+            fsync(descriptor)
+            path = Path(f"/proc/self/fd/{descriptor}").readlink()
+            if path.is_dir():
+                self._named.update(each.name for each in path.iterdir())
+            elif path.parent.name == "blobs":
+                self._whole.add(path.name)
 
         def cut_with_blobs() -> None:
             cut()
             self._keep_some(machine.cuts[-1][0] / "blobs")
 
+        patch.setattr(os, "fsync", observed_fsync)
         patch.setattr(blobs, "_sync_file", sync)
         patch.setattr(machine, "cut", cut_with_blobs)
 
@@ -244,9 +255,11 @@ class BlobMachine:
         source = self.machine.queue.folder / "blobs"
         if not source.is_dir():
             return
+        if "blobs" not in self._named and self._rng.random() < 0.5:
+            return
         target.mkdir()
         for blob in source.iterdir():
-            if blob.name in self._synced or self._rng.random() < 0.3:
+            if blob.name in self._whole & self._named or self._rng.random() < 0.3:
                 shutil.copy(blob, target / blob.name)
             elif self._rng.random() < 0.6:
                 (target / blob.name).write_bytes(self._rng.choice([b"", bytes(blob.stat().st_size)]))
@@ -264,6 +277,24 @@ def blob_machine(tmp_path: Path, seed: int, monkeypatch: pytest.MonkeyPatch) -> 
 async def test_a_record_that_survives_a_power_cut_has_its_blob_and_a_synced_one_survives(
     blob_machine: BlobMachine, seed: int
 ) -> None:
+    await survive_cuts_with_blobs(blob_machine, seed)
+
+
+FORGOTTEN_BLOBS = {"the sync of a blob": "_sync_file", "the sync of a blob's name": "sync_folder"}
+
+
+@pytest.mark.parametrize("forgotten", FORGOTTEN_BLOBS)
+async def test_the_power_cuts_are_noticed_by_blobs_that_forget(
+    tmp_path: Path, forgotten: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(blobs, FORGOTTEN_BLOBS[forgotten], lambda path: None)
+    rng = random.Random(0)
+    with pytest.raises(AssertionError), machine_on(tmp_path, rng) as machine:
+        await survive_cuts_with_blobs(BlobMachine(machine, rng, monkeypatch), 0)
+
+
+async def survive_cuts_with_blobs(blob_machine: BlobMachine, seed: int) -> None:
+    """Run the recorder, and look for the blob of each record that a power cut left."""
     rng, machine = random.Random(seed + 3000), blob_machine.machine
     machine.put(started(1), b"{}")
     machine.put(started(2), b"{}")
@@ -301,10 +332,10 @@ async def test_a_record_that_survives_a_power_cut_has_its_blob_and_a_synced_one_
 #
 # Cut the power before and after every sync, on a disk that keeps any subset of what was not synced.
 #
-# The queue and its files are real. The test calls each turn of the sync thread itself and observes each `fdatasync`. A
-# power cut mixes, sector by sector, the state that the last sync of a file made durable with all states since; a
-# deleted file may exist again if the deletion was not durable. The recorder may also be killed, and the power may fail
-# after another program has recovered its folder.
+# The queue and its files are real. The test calls each turn of the sync thread itself and observes each system call
+# that syncs. A power cut mixes, sector by sector, the state that the last sync of a file made durable with all states
+# since. A file whose name no sync of its folder covers may be missing, and a deleted file may exist again. The recorder
+# may also be killed, and the power may fail after another program has recovered its folder.
 
 SECTOR = 512
 ROOMY = replace(SMALL, spool_bytes_max=64 * SMALL.segment_bytes)
@@ -314,7 +345,6 @@ class Machine:
     """A queue on a disk that forgets, and the record of what was put."""
 
     def __init__(self, place: Path, rng: random.Random) -> None:
-        self.queue: RecorderQueue = make(place / "running", settings=ROOMY)
         self.put_so_far: list[Record] = []
         self.cuts: list[tuple[Path, int, int, int]] = []
         self._place = place
@@ -322,8 +352,13 @@ class Machine:
         self.meanwhile: Callable[[], Heading] = node  # records of other threads
         self.sequences: dict[EpisodeId, int] = {}
         self._safe: dict[Path, bytes] = {}
+        self._allocated: set[int] = set()  # inodes
+        self._named: set[Path] = set()
         self._since: dict[Path, list[bytes]] = {}
         self._deleted: list[tuple[Path, bytes]] = []
+
+    def start(self) -> None:
+        self.queue: RecorderQueue = make(self._place / "running", settings=ROOMY)
 
     def put(self, heading: Heading, payload: bytes) -> None:
         assert heading.episode is not None
@@ -340,8 +375,15 @@ class Machine:
         for size in self._rng.choice([[], [], [], [], [], [10], [3000], [10, 3000]]):
             self.put(self.meanwhile(), b"m" * size)
 
-    def synced(self, path: Path) -> None:
-        self._safe[path], self._since[path] = path.read_bytes(), []
+    def synced(self, descriptor: int) -> None:
+        """Note that a system call has synced this file or folder."""
+        path = Path(f"/proc/self/fd/{descriptor}").readlink()
+        if path.is_dir():
+            self._named.update(path.iterdir())
+        elif path.suffix == ".segment":
+            self._safe[path], self._since[path] = path.read_bytes(), []
+        else:  # an allocated segment before it gets its name
+            self._allocated.add(path.stat().st_ino)
 
     def turn(self) -> None:
         """Run one turn of the sync thread."""
@@ -355,7 +397,8 @@ class Machine:
         folder.mkdir(parents=True)
         (folder / "alive").touch()
         for path in self._files():
-            (folder / path.name).write_bytes(self._mixed(path))
+            if path in self._named or self._rng.random() < 0.5:
+                (folder / path.name).write_bytes(self._mixed(path))
         for path, content in self._deleted[self._rng.randrange(len(self._deleted) + 1) :]:
             (folder / path.name).write_bytes(content)
         self.cuts.append((folder, self.queue.synced, self.queue.stored, len(self.put_so_far)))
@@ -386,6 +429,8 @@ class Machine:
 
     def _mixed(self, path: Path) -> bytes:
         now = path.read_bytes()
+        if path.stat().st_ino not in self._allocated:
+            return now[: self._rng.randrange(len(now))]
         states = [self._safe.get(path, bytes(len(now))), *self._since.get(path, []), now]
         if self._rng.random() < 0.2:
             states = [self._rng.choice(states)]
@@ -428,12 +473,14 @@ def machine_on(place: Path, rng: random.Random) -> Iterator[Machine]:
         patch.setattr(SyncThread, "start", lambda self: None)
         machine = Machine(place, rng)
         sync = Segment.sync
+        for name in ("fsync", "fdatasync"):
+            patch.setattr(os, name, partial(observed, getattr(os, name), machine))
+        machine.start()
 
         def watched(segment: Segment) -> None:
             machine.cut()
             machine.put_meanwhile()
             sync(segment)
-            machine.synced(segment.path)
             machine.put_meanwhile()
             machine.cut()
 
@@ -451,6 +498,11 @@ def machine_on(place: Path, rng: random.Random) -> Iterator[Machine]:
         finally:
             machine.queue._appender.close()
             machine.queue._source.reader.close()
+
+
+def observed(system_call: Callable[[int], None], machine: Machine, descriptor: int) -> None:
+    system_call(descriptor)
+    machine.synced(descriptor)
 
 
 async def live_through_cuts(machine: Machine, rng: random.Random) -> None:
@@ -478,6 +530,11 @@ async def live_through_cuts(machine: Machine, rng: random.Random) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.soak) for seed in (0, *range(2, 200)))])
 async def test_a_power_cut_costs_no_synced_record_and_is_never_reported_as_damage(machine: Machine, seed: int) -> None:
+    await survive_cuts(machine, seed)
+
+
+async def survive_cuts(machine: Machine, seed: int) -> None:
+    """Run the recorder, and compare what each power cut left with what had been put and reported as synced."""
     rng = random.Random(seed + 1000)
     await live_through_cuts(machine, rng)
 
@@ -496,6 +553,21 @@ async def test_a_power_cut_costs_no_synced_record_and_is_never_reported_as_damag
             spoil(folder, synced)
             with pytest.raises(SpoolDamaged):
                 await recover(folder)
+
+
+FORGOTTEN = {
+    "a sync of a segment": (Segment, "sync", lambda segment: None),
+    "the sync of a new segment's name": (queue_format, "sync_folder", lambda folder: None),
+}
+
+
+@pytest.mark.parametrize("forgotten", FORGOTTEN)
+async def test_the_power_cuts_are_noticed_by_a_queue_that_forgets(
+    tmp_path: Path, forgotten: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(*FORGOTTEN[forgotten])
+    with pytest.raises((AssertionError, SpoolDamaged)), machine_on(tmp_path, random.Random(1)) as machine:
+        await survive_cuts(machine, 1)
 
 
 @pytest.mark.slow
