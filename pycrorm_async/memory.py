@@ -853,6 +853,7 @@ class Memory(RecordingMemory):
                 open_destination=partial(open_, views=self._views, projections=self._projections),
                 adopt=lambda: dead_queues(spool, self._unadopted, settings=self._settings),
                 settings=self._settings,
+                local=address.is_sqlite,
             )
             await writer.start()
         self._stack.push_async_exit(partial(self._drain, queue, writer))

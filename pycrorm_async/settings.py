@@ -70,7 +70,7 @@ class Settings:
         recall: make a case of each action that ends, for `memory.recall`, when the tables are folded. Without it, cases
             are made by the next process that has it, or by `pycrorm rebuild`.
         flush_timeout_s: `flush` and closing fail when the database has stored no event for this long; none is lost.
-        connect_timeout_s: the first connection to a database may take this long.
+        connect_timeout_s: opening a database on a server fails when it has not answered for this long.
         sample_interval_ms: the robot's state is sampled at this interval while a motion runs, and also at the motion's
             start and end; None samples nothing.
         sample_change_min: samples between start and end hold only the joints (rad or m) and the numbers of the base

@@ -276,8 +276,7 @@ async def _connect(uri: str, busy_timeout_s: float) -> Connection:
 
 def _join(thread: threading.Thread) -> None:
     """Wait for the end of a thread that was stopped, and that may not have started yet."""
-    until_s = time.monotonic() + _START_S
-    while time.monotonic() < until_s:
+    for _ in range(round(_START_S / _POLL_S)):
         try:
             thread.join()
         except RuntimeError:  # it is starting, or Ctrl-C came before it was to start
@@ -293,15 +292,16 @@ def _wait_for_turn(connection: sqlite3.Connection, statement: str, patience_s: f
     an event that way and 8.6 this way. SQLite does not wait at all before it changes the journal mode.
     """
     connection.execute("PRAGMA busy_timeout = 0")
-    until_s = time.monotonic() + patience_s
+    polls_left = round(patience_s / _POLL_S)  # not a time: on a busy machine the holder of the lock is slower too
     try:
         while True:
             try:
                 return connection.execute(statement)
             except sqlite3.OperationalError as error:
                 busy = error.sqlite_errorcode & 0xFF == sqlite3.SQLITE_BUSY  # the primary code, without the detail
-                if not busy or time.monotonic() >= until_s:
+                if not busy or polls_left <= 0:
                     raise
+                polls_left -= 1
                 time.sleep(_POLL_S)
     finally:
         connection.execute(f"PRAGMA busy_timeout = {int(patience_s * 1000)}")
@@ -449,8 +449,7 @@ def move_leftovers(database: Path) -> None:
 
 
 def _lock_folder(folder: int) -> None:
-    until_s = time.monotonic() + _LOCK_WAIT_S
-    while time.monotonic() < until_s:
+    for _ in range(round(_LOCK_WAIT_S / _RETRY_S)):
         try:
             fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

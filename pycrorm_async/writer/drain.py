@@ -24,7 +24,8 @@ from __future__ import annotations
 import asyncio
 import logging
 import random
-from collections.abc import Awaitable, Callable, Collection, Coroutine, Iterable, Mapping, Sequence
+import types
+from collections.abc import Awaitable, Callable, Collection, Coroutine, Generator, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -568,3 +569,30 @@ class Patience:
             if not task.done():
                 task.cancel()
                 await asyncio.wait([task])
+
+
+class Answers:
+    """Counts how often a coroutine resumed, because something that it had awaited was done: the progress of opening."""
+
+    count = 0
+
+    async def counted(self, work: Coroutine[Any, Any, _T]) -> _T:
+        """Await the work and count its steps."""
+        return await self._steps(work)
+
+    @types.coroutine
+    def _steps(self, work: Coroutine[Any, Any, _T]) -> Generator[Any, Any, _T]:
+        resume: Callable[[], Any] = partial(work.send, None)
+        while True:
+            try:
+                awaited = resume()
+            except StopIteration as done:
+                result: _T = done.value
+                return result
+            self.count += 1
+            try:
+                yield awaited
+            except BaseException as error:  # noqa: BLE001  a cancellation, which the work meets where it waits
+                resume = partial(work.throw, error)
+            else:
+                resume = partial(work.send, None)

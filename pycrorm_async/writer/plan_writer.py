@@ -21,6 +21,7 @@ from pycrorm_async.settings import Settings
 from pycrorm_async.writer.drain import (
     PATIENT,
     TOO_MANY_EVENTS,
+    Answers,
     Destination,
     Drain,
     DrainState,
@@ -365,7 +366,8 @@ class WriterThread:
         await writer.flush(position)        # stored and folded
         queue.close(); await writer.close() # drains the rest, folds, closes the database, ends the thread
 
-    `open_destination` is entered and left in the thread's loop. Call `start`, `flush` and `close` from the plan's loop.
+    `open_destination` is entered and left in the thread's loop; opening a `local` one has no limit of time. Call `start`,
+    `flush` and `close` from the plan's loop.
     """
 
     def __init__(
@@ -375,8 +377,10 @@ class WriterThread:
         open_destination: Callable[[], AbstractAsyncContextManager[Destination]],
         adopt: Callable[[], Iterable[Source]],
         settings: Settings,
+        local: bool = False,
     ) -> None:
         self._source = source
+        self._local = local
         self._open_destination = open_destination
         self._adopt = adopt
         self._settings = settings
@@ -511,9 +515,13 @@ class WriterThread:
                 raise outcome
 
     async def _open(self, stack: AsyncExitStack) -> Destination:
+        opening = stack.enter_async_context(self._open_destination())
+        if self._local:  # a file needs no limit: waits for the locks of other processes are bounded where they wait
+            return await opening
+        answers = Answers()
         timeout_s = self._settings.connect_timeout_s
         try:
-            async with asyncio.timeout(timeout_s):
-                return await stack.enter_async_context(self._open_destination())
-        except TimeoutError:
+            patience = Patience(timeout_s, progress=lambda: answers.count)
+            return await patience.run(answers.counted(opening), name="pycrorm open destination")
+        except PatienceEnded:
             raise DatabaseUnavailable(f"the database did not answer within {timeout_s:g} s") from None
