@@ -157,7 +157,7 @@ def _print(result: VerifyResult) -> None:
     elif result.damage:
         stdout.print(f"{checked}the log is damaged; copy its intact events to another memory with `pycrorm copy`")
     elif result.drift:
-        stdout.print(f"{checked}the log is intact, but the tables differ from it; run `pycrorm rebuild`")
+        stdout.print(f"{checked}{_drift(result.undecided)}", soft_wrap=True)
     elif result.outdated is not None:
         stdout.print(f"{checked}the tables are outdated; run `pycrorm rebuild`")
     elif result.stopped or result.unmade or result.failed_views:
@@ -171,13 +171,24 @@ def _print(result: VerifyResult) -> None:
         stdout.print(f"{checked}no problem")
 
 
+def _drift(undecided: int) -> str:
+    if not undecided:
+        return "the log is intact, but the tables differ from it; run `pycrorm rebuild`"
+    return (
+        f"the tables of {counted(undecided, 'episode')} without a digest differ from the log, so that either these"
+        " tables or these events were changed; compare them with a backup before `pycrorm rebuild`, which makes the"
+        " tables from the events"
+    )
+
+
 def _document(result: VerifyResult, ids: dict[int, str]) -> dict[str, Any]:
     def id_of(number: int | None) -> str | None:
         return None if number is None else ids.get(number)
 
     return {
-        **vars(result),
+        **{name: value for name, value in vars(result).items() if not name.startswith("_")},
         "blobs": len(result.blobs),
+        "undecided": result.undecided,
         "deleted": sorted(result.deleted),
         "damages": [{"episode": id_of(each.number), **each._asdict()} for each in result.damages],
         "stopped": [{"episode": id_of(each.number), **each._asdict()} for each in result.stopped],

@@ -31,7 +31,6 @@ from pycrorm_async.cli.output import (
 from pycrorm_async.cli.reading import note_pending_events
 from pycrorm_async.cli.show import tree_of
 from pycrorm_async.errors import CallerError, DatabaseUnavailable, UnknownEpisode
-from pycrorm_async.events.ids import parse_episode_id
 from pycrorm_async.live.access import kept_token
 from pycrorm_async.live.follower import LogFollower
 from pycrorm_async.operations.destination import shared_address
@@ -177,7 +176,7 @@ class _Drawing:
     def __init__(self, follower: LogFollower, begun: EpisodeRow, live: Live) -> None:
         self._follower = follower
         self._live = live
-        self._identity = parse_episode_id(begun.id)
+        self._identity = begun.identity
         self._fold = MomentFold(begun.number, begun.id)
         self._last = 0
 

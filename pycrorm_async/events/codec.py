@@ -217,6 +217,11 @@ def declaration_type(fingerprint: str) -> str:
     return "DescriptionDeclared" if fingerprint.startswith(DESCRIPTION_PREFIX) else "DesignatorTypeDeclared"
 
 
+def clean(text: str) -> str:
+    """Replace U+0000 and lone surrogates, which no event can hold, with escapes."""
+    return str.replace(text, "\x00", "\\x00").encode("utf-8", "backslashreplace").decode()
+
+
 def unwritable(value: Any) -> str | None:
     """Return the reason why JSON cannot hold this scalar unchanged; None if it can."""
     if isinstance(value, float) and not math.isfinite(value):

@@ -28,7 +28,7 @@ from typing import Final
 import msgspec
 
 from pycrorm_async.errors import CallerError
-from pycrorm_async.events.codec import unwritable
+from pycrorm_async.events.codec import clean
 from pycrorm_async.events.ids import SLOT_FIRST_FIELD, SLOT_MAX
 from pycrorm_async.events.types import DesignatorTypeDeclared, FieldDeclared, FieldType
 
@@ -304,7 +304,9 @@ _TAGS_MAX: Final = 100
 
 
 def checked_tags(tags: object) -> tuple[str, ...]:
-    """Return these tags, each once. Raises `CallerError` for one that is not a text of 1 to 100 characters.
+    """Return these tags, each once, cleaned as all recorded texts are.
+
+    Raises `CallerError` for one that is not a text of 1 to 100 characters.
 
     >>> checked_tags(["kitchen", "good", "kitchen"])
     ('kitchen', 'good')
@@ -315,9 +317,7 @@ def checked_tags(tags: object) -> tuple[str, ...]:
     for tag in tags:
         if not isinstance(tag, str) or not 0 < len(tag.strip()) <= len(tag) <= _CHARACTERS_MAX:
             raise CallerError(f"a tag must be a text of 1 to {_CHARACTERS_MAX} characters, not {tag!r:.110}")
-        if (reason := unwritable(tag)) is not None:
-            raise CallerError(f"the tag {tag!r:.110} cannot be recorded: {reason}")
-        checked[tag] = None
+        checked[clean(tag)] = None
     if len(checked) > _TAGS_MAX:
         raise CallerError(f"at most {_TAGS_MAX} tags may be given at once, not {len(checked)}")
     return tuple(checked)

@@ -22,7 +22,7 @@ from pycrorm_async.clock import SYSTEM_CLOCK, Clock
 from pycrorm_async.errors import CallerError, DamageError, DatabaseError, DatabaseUnavailable, LogDamaged
 from pycrorm_async.events.codec import Record, declaration_type, decode, encode, fingerprint
 from pycrorm_async.events.fields import changed_tags
-from pycrorm_async.events.ids import EpisodeId, episode_text, parse_episode_id
+from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.events.types import EVENT_TYPES, EpisodeTagged
 from pycrorm_async.operations.destination import LogAndTables, shared_address
 from pycrorm_async.projections.custom import own_projections
@@ -172,7 +172,7 @@ class _Copier:
         if shared:
             await self._compare(row._replace(head=shared))
         async for page in self._source.pages(row, after=shared):
-            events = self._batch.setdefault(parse_episode_id(row.id), [])
+            events = self._batch.setdefault(row.identity, [])
             for event in page:
                 _refuse_unreadable(row.id, event)
                 events.append(event)
@@ -187,7 +187,7 @@ class _Copier:
 
     async def _compare(self, shared: EpisodeRow) -> None:
         """Compare the shared events of both logs. Raises `LogDamaged` at the first difference."""
-        target_row = await self._target.episode(parse_episode_id(shared.id))
+        target_row = await self._target.episode(shared.identity)
         assert target_row is not None, "its head is above zero"
         target_pages = self._target.pages(target_row._replace(head=shared.head))
         async for page in self._source.pages(shared):
@@ -336,7 +336,7 @@ async def _append(log: EventLog, row: EpisodeRow, event: EpisodeTagged, clock: C
     (last,) = await log.events(row.number, after=row.head - 1, limit=1)
     # No time passes on the recorder's monotonic clock any more, and this process may have another one.
     wall_ns, monotonic_ns = clock.wall_ns(), last.monotonic_ns
-    episode, kind = parse_episode_id(row.id), type(event)
+    episode, kind = row.identity, type(event)
     record = Record(0, episode, row.head + 1, kind.__name__, kind.version, wall_ns, monotonic_ns, encode(event))
     try:
         refusals = await log.append([record])

@@ -291,6 +291,15 @@ class VerifyResult:
     rows_without_event: int = 0
     outdated: str | None = None
 
+    def __post_init__(self) -> None:
+        self._without_digest: set[int] = set()
+        self._drifted: set[int] = set()
+
+    @property
+    def undecided(self) -> int:
+        """The number of episodes without a digest whose tables differ: either these or the log was changed."""
+        return len(self._without_digest & self._drifted)
+
     def add_damage(self, number: int | None, sequence: int | None, reason: str) -> None:
         """Count a damage and keep it, unless there are many."""
         self.damage += 1
@@ -303,9 +312,15 @@ class VerifyResult:
             self.deleted.add(number)
             self.add_damage(None if first is None else number, first, reason)
 
+    def add_without_digest(self, number: int) -> None:
+        """Count an episode without a digest."""
+        self.without_digest += 1
+        self._without_digest.add(number)
+
     def add_difference(self, difference: Difference) -> None:
         """Count a difference and keep it, unless there are many."""
         self.drift += 1
+        self._drifted.add(difference.number)
         if len(self.differences) < _FINDINGS_MAX:
             self.differences.append(difference)
 

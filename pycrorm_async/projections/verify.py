@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from sqlalchemy import text
 from sqlalchemy.ext.asyncio import AsyncConnection
 
-from pycrorm_async.errors import DamageError, DatabaseUnavailable, TablesOutdated
+from pycrorm_async.errors import DamageError, DatabaseUnavailable, LogDamaged, TablesOutdated
 from pycrorm_async.events.codec import DESCRIPTION_PREFIX, fingerprint
-from pycrorm_async.events.ids import parse_episode_id, row_id, row_id_min, row_key
+from pycrorm_async.events.ids import row_id, row_id_min, row_key
 from pycrorm_async.events.order import OrderCheck
 from pycrorm_async.events.types import EpisodeEnded, ObjectAdded, references_in
 from pycrorm_async.projections import pipeline
@@ -103,7 +103,7 @@ class DigestCheck:
         self._number = episode.number
         self._result = result
         self._certain = certain
-        self._running: RunningDigest | None = RunningDigest.at_start(parse_episode_id(episode.id))
+        self._running: RunningDigest | None = RunningDigest.at_start(episode.identity)
         tags = () if episode.ended_wall_ns is None else ("EpisodeTagged",)  # behind the end each has a digest
         self._last_types = ("EpisodeEnded", *tags)
         self._has_digest = False
@@ -162,7 +162,7 @@ class DigestCheck:
             reason = "its digest is missing, although the version that stored the episode keeps digests"
             self._result.add_damage(self._number, sequence, reason)
         else:
-            self._result.without_digest += 1
+            self._result.add_without_digest(self._number)
 
 
 def _behind(digest: str, sequence: int) -> RunningDigest | None:
@@ -557,7 +557,12 @@ class _TablesCheck:
         for span in spans:
             if span.after == 0:
                 self._unfinished = EpisodeCheck(span.number, self.result)
-                self._digests = DigestCheck(by_number[span.number], self.result, certain=self._log.address.is_sqlite)
+                try:
+                    certain = self._log.address.is_sqlite
+                    self._digests = DigestCheck(by_number[span.number], self.result, certain=certain)
+                except LogDamaged as fault:
+                    self._digests = None
+                    self.result.add_damage(span.number, fault.sequence, fault.reason)
                 self.result.episodes += 1
             read[span.number] = self._unfinished
             self._unfinished.descriptions = descriptions

@@ -25,6 +25,7 @@ from typing import Any, Final, Literal, NamedTuple, Protocol, TypeAlias, cast
 
 import numpy as np
 
+from pycrorm_async.events.codec import clean as clean
 from pycrorm_async.events.codec import unwritable
 from pycrorm_async.events.types import (
     Blob,
@@ -396,11 +397,6 @@ def message_of(failure: BaseException) -> str:
         return str(failure)
     except Exception as error:  # noqa: BLE001  a user's __str__ may raise anything
         return f"<its __str__ raised {type(error).__name__}>"
-
-
-def clean(text: str) -> str:
-    """Replace U+0000 and lone surrogates, which no event can hold, with escapes."""
-    return str.replace(text, "\x00", "\\x00").encode("utf-8", "backslashreplace").decode()
 
 
 def cut(text: str, characters_max: int) -> str:

@@ -36,7 +36,7 @@ from sqlalchemy.ext.asyncio import AsyncConnection
 
 from pycrorm_async.errors import DamageError, LogDamaged, LogWentBack
 from pycrorm_async.events.codec import DECLARATION_TYPES, Record, fingerprint, is_computed_end
-from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX, EpisodeId, episode_text, parse_episode_id
+from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX, EpisodeId, episode_text
 from pycrorm_async.events.types import Blob, BlobReference, references_in
 from pycrorm_async.store.dialect import Dialect, Insertion
 from pycrorm_async.store.stored import (
@@ -301,7 +301,7 @@ class RunningDigests:
                 return kept and kept.copy()
         start = row.head - row.head % BLOCK_EVENTS
         if start == 0:
-            running = RunningDigest.at_start(parse_episode_id(row.id))
+            running = RunningDigest.at_start(row.identity)
         else:
             at_start = (await connection.execute(_AT, {"number": row.number, "sequence": start})).scalar()
             if at_start is None:

@@ -31,8 +31,9 @@ from typing import Final, NamedTuple
 
 import msgspec
 
+from pycrorm_async.errors import LogDamaged
 from pycrorm_async.events.codec import Record
-from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, EpisodeId
+from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, EpisodeId, parse_episode_id
 
 
 class StoredEvent(NamedTuple):
@@ -76,6 +77,15 @@ class EpisodeRow(NamedTuple):
     ended_wall_ns: int | None = None
     refused: str | None = None
     parked: str | None = None
+
+    @property
+    def identity(self) -> EpisodeId:
+        """The id in 16 bytes. Raises `LogDamaged` if the text is not an id."""
+        try:
+            return parse_episode_id(self.id)
+        except ValueError:
+            reason = f"its id {self.id!r:.100} was changed after it was stored: it is not a UUID"
+            raise LogDamaged(str(self.number), 1, reason) from None
 
 
 class Basis(NamedTuple):

@@ -366,8 +366,8 @@ class WriterThread:
         await writer.flush(position)        # stored and folded
         queue.close(); await writer.close() # drains the rest, folds, closes the database, ends the thread
 
-    `open_destination` is entered and left in the thread's loop; opening a `local` one has no limit of time. Call `start`,
-    `flush` and `close` from the plan's loop.
+    `open_destination` is entered and left in the thread's loop; opening a `local` one has no limit of time.
+    Call `start`, `flush` and `close` from the plan's loop.
     """
 
     def __init__(

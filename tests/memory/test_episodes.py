@@ -225,7 +225,6 @@ async def test_a_follow_up_has_the_tags_that_the_episode_had_when_it_was_continu
         ([7], "a tag must be a text of 1 to 100 characters, not 7"),
         ([" "], "a tag must be a text of 1 to 100 characters"),
         (["x" * 2**20], "a tag must be a text of 1 to 100 characters"),
-        (["a\0b"], "the text holds U\\+0000"),
         ([str(number) for number in range(101)], "at most 100 tags may be given at once, not 101"),
     ],
 )

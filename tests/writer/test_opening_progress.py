@@ -56,7 +56,7 @@ async def test_a_server_that_never_answers_is_given_up_and_the_opening_is_cancel
             ended.append(True)
         yield  # type: ignore[misc]
 
-    with pytest.raises(DatabaseUnavailable, match="did not answer within 0.05 s"):
+    with pytest.raises(DatabaseUnavailable, match=r"did not answer within 0\.05 s"):
         await thread_with(opening, 0.05).start()
     assert ended == [True]
 
