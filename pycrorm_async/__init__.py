@@ -20,7 +20,7 @@ from pycrorm_async.moved_modules import keep_former_paths
 if TYPE_CHECKING:
     from pycrorm_async.errors import PycrormError
     from pycrorm_async.events.types import Blob
-    from pycrorm_async.memory import Memory, MemoryStatus
+    from pycrorm_async.memory import Memory, MemoryStatus, with_tree
     from pycrorm_async.operations.recovery import recover
     from pycrorm_async.projections.custom import EpisodeProjection, Projection
     from pycrorm_async.projections.mapped_tables import UserView
@@ -44,6 +44,7 @@ __all__ = [
     "UserView",
     "performable_of",
     "recover",
+    "with_tree",
     "world_of",
 ]
 
@@ -60,6 +61,7 @@ _MODULES = {
     "UserView": "projections.mapped_tables",
     "performable_of": "query.again",
     "recover": "operations.recovery",
+    "with_tree": "memory",
     "world_of": "query.again",
 }
 

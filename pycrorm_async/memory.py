@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import asyncio
 import html
+import inspect
 import logging
 import os
 import threading
@@ -39,11 +40,11 @@ from contextlib import (
 )
 from dataclasses import replace
 from datetime import datetime
-from functools import partial
+from functools import partial, wraps
 from os import PathLike
 from pathlib import Path
 from types import MappingProxyType, TracebackType
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self, TypeVar, overload
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, ParamSpec, Self, TypeVar, overload
 
 from sqlalchemy import Select, func, select
 from sqlalchemy.ext.asyncio import AsyncSession
@@ -565,25 +566,11 @@ class RecordingMemory(ReadableMemory, ABC):
             CallerError: for an argument of the wrong type, and a tag that is not a text of 1 to 100 characters.
         """
         parts = self._open_parts
-        recorder = parts.recorder
-        if (room := recorder.admit()) is not None:
-            await room
-        labels = read_labels(tags, metadata, parts.emitter)
         text = description or plan or "an episode"
-        episode = recorder.open_episode(description=text, plan=plan, seed=seed, labels=labels)
-        failure: BaseException | None = None
-        with (
-            parts.in_context(),
-            set_inside(current_episode, episode),
-            set_inside(called_performs, episode.calls),
-        ):
-            try:
+        labels = read_labels(tags, metadata, parts.emitter)
+        with parts.in_context():
+            async with _episode_of(parts.recorder, description=text, plan=plan, seed=seed, labels=labels) as episode:
                 yield episode
-            except BaseException as raised:
-                failure = raised
-                raise
-            finally:
-                recorder.close_episode(episode, failure)
 
     async def tag(self, episode: AnyEpisode, *tags: str, remove: Sequence[str] = ()) -> None:
         """Add and remove tags of an episode of this database: a number, id, `last`, or object.
@@ -1145,3 +1132,53 @@ class SyncMemory:
         """Write episodes or rows to a file; see `Memory.export`, which has the same options."""
         exported = what.question if isinstance(what, SyncQuestion) else what
         return self._await(self._memory.export(exported, path, **options))
+
+
+# === with tree ================================================================================================
+
+_P = ParamSpec("_P")
+
+
+@asynccontextmanager
+async def _episode_of(own: Recorder, **opening: Any) -> AsyncIterator[Episode]:
+    """Record an episode in this context; the arguments are those of `Recorder.open_episode`."""
+    if (room := own.admit()) is not None:
+        await room
+    episode = own.open_episode(**opening)
+    failure: BaseException | None = None
+    with set_inside(current_episode, episode), set_inside(called_performs, episode.calls):
+        try:
+            yield episode
+        except BaseException as raised:
+            failure = raised
+            raise
+        finally:
+            own.close_episode(episode, failure)
+
+
+def with_tree(plan: Callable[_P, Coroutine[Any, Any, T]]) -> Callable[_P, Coroutine[Any, Any, T]]:
+    """Record each call of a plan as one episode in the open memory, unless an episode is open already.
+
+    >>> @with_tree
+    ... async def plan():
+    ...     with simulated_robot:
+    ...         await ParkArmsActionPerformable(Arms.BOTH).perform()
+    >>> await plan()
+
+    The episode is named by the first line of the plan's docstring, or else by its name. Without an open memory the plan
+    is only performed. Raises `CallerError` for a function that is not `async def`.
+    """
+    if not inspect.iscoroutinefunction(plan):
+        raise CallerError(f"with_tree needs an `async def`, got {plan!r:.100}")
+    name = plan.__name__
+    description = (inspect.getdoc(plan) or name).partition("\n")[0]
+
+    @wraps(plan)
+    async def performed(*arguments: _P.args, **named: _P.kwargs) -> T:
+        own = recorder.get()
+        if not isinstance(own, Recorder) or own.is_closed or own.episode_here() is not None:
+            return await plan(*arguments, **named)
+        async with _episode_of(own, description=description, plan=name):
+            return await plan(*arguments, **named)
+
+    return performed

@@ -26,14 +26,7 @@ from contextvars import ContextVar
 from typing import Any, Literal
 
 from pycrorm_async.connected_var import ConnectedVar
-from pycrorm_async.errors import (
-    DeclarationRefused,
-    EpisodeRefused,
-    SpoolFull,
-    SpoolStuck,
-    SpoolUnavailable,
-    Unrecordable,
-)
+from pycrorm_async.errors import DeclarationRefused, EpisodeRefused, FilesError, SpoolFull, SpoolStuck, Unrecordable
 from pycrorm_async.events.types import Blob, NodeReference, StateSampled
 from pycrorm_async.plan.execution import CalledPerforms, Candidate, Cells, Refusal, Seen, Simulation, current_simulation
 from pycrorm_async.plan.task import TaskTreeNode, current_node
@@ -130,7 +123,7 @@ class Recorder:
         self.episodes.add(episode)  # first, so that the memory ends an episode whose start Ctrl-C interrupted
         try:
             episode.open()
-        except SpoolUnavailable as error:  # of a disk that failed meanwhile: the plan goes on and is not recorded
+        except FilesError as error:  # of a disk that failed meanwhile: the plan goes on and is not recorded
             self._emitter.note_fault("EpisodeStarted", error)
         except Exception:
             self.episodes.by_id.pop(episode.id, None)

@@ -296,9 +296,9 @@ def _invert(frame: Frame) -> Frame:
 #
 # Load Bullet when the first world is entered, and keep its output away from stdout and stderr.
 #
-# Two packages ship the same Bullet: pybullet has wheels up to Python 3.11, and pycram-bullet, the fork of the institute
-# behind PyCRAM, has wheels for 3.11 and 3.12 and calls its module `pycram_bullet`. Either one works; no other module of
-# this package imports one of them.
+# Three packages ship the same Bullet: pybullet has wheels up to Python 3.11; pycram-bullet, the fork of the institute
+# behind PyCRAM, has wheels for 3.11 and 3.12 and calls its module `pycram_bullet`; pybullet-arm64, a fork that is kept
+# up to date, has wheels for 3.12 and 3.13 on x86-64 too. Each one works; no other module of this package imports one.
 #
 # Bullet prints with C's `printf`, which cannot be switched off: a greeting at import, warnings when it loads a body.
 # Meanwhile this module points C's own `stdout` and `stderr` to a buffer in memory. Python and child processes write to

@@ -287,7 +287,7 @@ class BulletMissing(WorldUnavailable, MissingExtra):
 
     def __init__(self) -> None:
         message = "no world can be opened, because no Bullet is installed: pip install 'pycrorm-async[world]'"
-        if sys.version_info >= (3, 13):
+        if sys.version_info >= (3, 14):
             message += " pybullet (no wheel for this Python: compiles for about 8 minutes with a C++ compiler)"
         super().__init__(message)
 

@@ -67,6 +67,18 @@ def every_expression_succeeds_and_the_milk_is_at_its_goal(reader: PageReader) ->
     assert resting == pytest.approx((1.3, 0.45, 0.95), abs=1e-6)
 
 
+def the_plan_of_the_thesis_is_one_episode(reader: PageReader) -> None:
+    reader.cell("await memory.flush()")
+    [episode] = answer("episodes", "--url", "sqlite:///memory.db", cwd=reader.folder)
+    assert episode["description"] == "Tutorial for getting familiar with the ORM."
+    tree = answer("show", "1", "--url", "sqlite:///memory.db", cwd=reader.folder)["tree"]
+    assert len([node for node in tree if node["depth"] == 1]) == 8
+
+
+def the_queries_of_the_thesis_have_its_answers(reader: PageReader) -> None:
+    reader.cell("assert [len(each) for each in (navigations, actions, object_poses)] == [2, 8, 1]")
+
+
 def a_robot_acts_beside_another_and_each_node_names_its_robot(reader: PageReader) -> None:
     assert "courier has no torso to lift" in reader.shown.out
     *_, episode = answer("episodes", cwd=reader.folder)
@@ -293,6 +305,10 @@ RESULTS: Final[Mapping[str, Mapping[str, Callable[[PageReader], None]]]] = {
         "A robot of your own": a_robot_acts_beside_another_and_each_node_names_its_robot,
         "Perception of a robot of your own": the_percepts_are_in_the_table,
         "In a notebook": a_perform_in_a_later_cell_is_recorded,
+    },
+    "pycrorm_async/orm/README.md": {
+        "The demonstration": the_plan_of_the_thesis_is_one_episode,
+        "Its queries": the_queries_of_the_thesis_have_its_answers,
     },
     "pycrorm_async/export/README.md": {
         "Data for other programs": rows_are_exported_and_made_again,

@@ -169,7 +169,7 @@ def test_the_error_of_a_world_names_what_to_install_and_how_long_that_takes(tmp_
     done = run(f"{ABSENT}\n{opening}except Exception as error:\n    print(type(error).__mro__, error)", tmp_path)
     assert all(name in done.stdout for name in ("BulletMissing", "WorldUnavailable", "MissingExtra"))
     compiling = " pybullet (no wheel for this Python: compiles for about 8 minutes with a C++ compiler)"
-    assert done.stdout.endswith(f" {LINE}{compiling if sys.version_info >= (3, 13) else ''}\n")
+    assert done.stdout.endswith(f" {LINE}{compiling if sys.version_info >= (3, 14) else ''}\n")
 
 
 @pytest.mark.every_python
