@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
+from importlib.metadata import distributions
 from typing import Any
 
 from pycrorm_async.world.bullet_body import engine
 
-INSTALLED_BULLETS = tuple(name for name in ("pybullet", "pycram-bullet") if find_spec(name.replace("-", "_")))
+INSTALLED_BULLETS = tuple(
+    name for name in ("pybullet", "pycram-bullet", "pybullet-arm64") if any(distributions(name=name))
+)
 """The installed packages that contain Bullet."""
 
 

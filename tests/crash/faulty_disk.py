@@ -24,7 +24,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from pycrorm_async import Blob, Memory, PycrormError, Settings
+from pycrorm_async import Blob, Memory, PycrormError, Settings, recover
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.events.codec import Heading
 from pycrorm_async.plan import ActionAbstract
@@ -69,7 +69,7 @@ class Ended(NamedTuple):
 
     def steps(self, word: str) -> set[tuple[int, int]]:
         """Return the steps performed before the last line that begins with this word."""
-        last = max((at for at, line in enumerate(self.lines) if line[0] == word), default=0)
+        last = max((at for at, line in enumerate(self.lines) if line[0] == word), default=-1)
         return {(int(line[1]), int(line[2])) for line in self.lines[: last + 1] if line[0] == "did"}
 
     @property
@@ -322,10 +322,9 @@ def examine(folder: str) -> None:
 
 
 async def _examine(url: str) -> dict[str, Any]:
-    problems = []
-    async with Memory.open(url, settings=SETTINGS) as memory:
-        await memory.flush()
-        problems += [f"{name}: {error}" for name, error in memory.status.unadopted.items()]
+    async with Memory.open(url, settings=SETTINGS):
+        pass  # what dead recorders left is stored meanwhile, or else below
+    problems = [f"{name}: {error}" for name, error in (await recover(url, settings=SETTINGS)).failed.items()]
     log = await EventLog.open(DatabaseAddress.parse(url), create=False)
     result = await verify(log)
     await log.close()

@@ -60,7 +60,7 @@ def check_memory(process: DiskProcess, place: Path, n: int, number: int) -> bool
 
 
 TURNS = 250
-"""Each turn takes every 250th call, of some 3,000 that may meet EIO and 1,300 that may meet ENOSPC."""
+"""Each turn takes every 250th call, of some 2,500 that may meet EIO and 1,100 that may meet ENOSPC."""
 
 
 @pytest.mark.parametrize("number", [EIO, ENOSPC], ids=["EIO", "ENOSPC"])
