@@ -164,7 +164,7 @@ class _Copier:
 
     async def _heads(self, rows: Sequence[EpisodeRow]) -> dict[str, int]:
         """Return the last event that the target has of each of these episodes, by id."""
-        heads = await self._target.heads([parse_episode_id(row.id) for row in rows])
+        heads = await self._target.heads([row.identity for row in rows])
         return {row.id: row.head for row in heads.values()}
 
     async def _copy(self, row: EpisodeRow, head: int) -> None:
