@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from pycrorm_async.errors import CallerError, MissingExtra
 from pycrorm_async.events.codec import description_of
+from pycrorm_async.events.reasons import reason_of
 from pycrorm_async.events.types import (
     EpisodeEnded,
     EpisodeStarted,
@@ -211,7 +212,7 @@ class _EpisodeFold:
         node.status = ended.status
         node.end = when if ended.status != "LOST" else None
         if ended.failure is not None:
-            node.reason, node.message = ended.failure.type.rpartition(".")[2], ended.failure.message
+            node.reason, node.message = reason_of(ended.failure), ended.failure.message
 
 
 # === states ===================================================================================================

@@ -14,6 +14,7 @@ from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.events.codec import UPCASTERS, Decoder, UnknownShape, description_of, fingerprint
 from pycrorm_async.events.ids import SLOT_ROBOT_POSE
+from pycrorm_async.events.reasons import reason_of
 from pycrorm_async.events.types import (
     EVENT_TYPES,
     DescriptionDeclared,
@@ -245,7 +246,7 @@ def _outcome(ended: NodeEnded) -> Row:
     """Return a node's columns from reason to result."""
     failure = ended.failure
     return (
-        failure.type.rpartition(".")[2] if failure else None,
+        reason_of(failure) if failure else None,
         failure.message if failure else None,
         json_text(failure.arguments) if failure and failure.arguments else None,
         json_text(ended.result) if ended.result is not None else None,

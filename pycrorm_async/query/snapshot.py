@@ -31,6 +31,7 @@ from pycrorm_async.errors import CallerError, DatabaseForeign, LogDamaged, Pycro
 from pycrorm_async.events.codec import description_of
 from pycrorm_async.events.fields import retagged
 from pycrorm_async.events.ids import SLOT_NODE, row_id
+from pycrorm_async.events.reasons import reason_of
 from pycrorm_async.events.types import (
     EVENT_TYPES,
     DescriptionDeclared,
@@ -761,7 +762,7 @@ class MomentFold:
             status=node.status,
             started_at=_moment(node.wall_ns),
             duration_ns=node.ended_ns - node.monotonic_ns if node.ended_ns is not None else None,
-            reason=node.failure.type.rpartition(".")[2] if node.failure is not None else None,
+            reason=reason_of(node.failure) if node.failure is not None else None,
             failure_message=node.failure.message if node.failure is not None else None,
             simulated=node.simulated,
             sequence=sequence,

@@ -44,6 +44,7 @@ from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 from pycrorm_async.bulk_records import make
 from pycrorm_async.errors import DamageError, DatabaseForeign
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, row_key
+from pycrorm_async.events.reasons import reason_of
 from pycrorm_async.events.types import (
     DesignatorTypeDeclared,
     EpisodeEnded,
@@ -525,7 +526,7 @@ class EpisodeCases:
         else:
             action.scope.after = action.type, status
         duration_s = (monotonic_ns - action.monotonic_ns) / 1e9 if status != "LOST" else None
-        reason = failure.type.rpartition(".")[2] if failure is not None else None
+        reason = reason_of(failure) if failure is not None else None
         return action.case(status, reason, duration_s)
 
 

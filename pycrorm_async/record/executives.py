@@ -40,9 +40,9 @@ from dataclasses import dataclass
 from time import perf_counter
 from typing import Any, Final, Generic, Self, TypeAlias, TypeVar
 
-from pycrorm_async.events.types import FailureValue, NodeStatus
+from pycrorm_async.events.types import NodeStatus
 from pycrorm_async.record.declarations import FieldSpec, RecordedKind
-from pycrorm_async.record.recorded_episode import RecordedEpisode
+from pycrorm_async.record.recorded_episode import FailureCause, RecordedEpisode
 from pycrorm_async.record.recording import EpisodeBlock, Recording
 from pycrorm_async.record.values import RefusedValue, json_text, plain_value, reading_fault
 
@@ -352,7 +352,7 @@ class Runs(EpisodeBlock):
         self,
         run_id: Hashable,
         status: NodeStatus | None = None,
-        failure: BaseException | FailureValue | str | None = None,
+        failure: FailureCause | None = None,
         result: Any = None,
     ) -> None:
         """Record that a run ended, as `RecordedEpisode.end` does, if it is open."""

@@ -11,7 +11,7 @@ an event that names an object without a row would be damage.
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Collection, Hashable, Mapping
+from collections.abc import Callable, Collection, Hashable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Generic, NamedTuple, TypeVar
 
@@ -176,6 +176,10 @@ class RecordedObjects(ObjectRows[Hashable]):
     def reference(self, key: Hashable) -> ObjectReference | None:
         """Return the current row of an object; None if there is none of this key."""
         return self._references.get(key)
+
+    def names(self) -> Iterator[str]:
+        """Yield the names of the objects."""
+        return (each.name for each in self._objects.values())
 
     def robot(self, key: Hashable) -> RobotValue | None:
         """Return the state of the object as that of the acting robot; None if there is none of this key."""

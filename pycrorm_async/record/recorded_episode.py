@@ -10,7 +10,7 @@ from collections.abc import Callable, Hashable, Mapping, Sequence
 from enum import Enum
 from functools import partial
 from types import TracebackType
-from typing import Any, Concatenate, Literal, ParamSpec, Protocol, Self, TypeVar, get_args
+from typing import Any, Concatenate, Literal, ParamSpec, Protocol, Self, TypeAlias, TypeVar, get_args
 
 import msgspec
 from msgspec.structs import replace
@@ -18,6 +18,7 @@ from msgspec.structs import replace
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.fields import checked_tags
 from pycrorm_async.events.ids import EpisodeId
+from pycrorm_async.events.reasons import UNNAMED, template_of
 from pycrorm_async.events.types import (
     EpisodeStatus,
     FailureValue,
@@ -202,6 +203,8 @@ def noted(emitter: Any, event_type: str, read: Callable[P, R], /, *args: P.args,
 
 FOREVER_S = 1e8
 """The seconds that a start waits for room: three years, because a wait takes a number."""
+FailureCause: TypeAlias = BaseException | FailureValue | tuple[str, str] | str
+"""A failure as an executive gives it: an exception, a pair of reason and message, or a text."""
 _ENDED_MAX = 1_000
 """Bounds the keys of ended nodes that a child can still name as its parent."""
 
@@ -351,23 +354,29 @@ class RecordedNodes(EpisodeWriter[_Node]):
         self,
         key: Hashable,
         status: NodeStatus | None = None,
-        failure: BaseException | FailureValue | str | None = None,
+        failure: FailureCause | None = None,
         result: Any = None,
         *,
         below: NodeStatus | None = None,
     ) -> None:
         """Record that a node ended. A key that no open node has is counted, and so is an unknown status, as ERROR.
 
+        >>> episode.end("drive", failure=("WheelSlipped", "the left wheel turned 3 rad without moving"))
+
         Args:
-            status: by default SUCCEEDED without a failure, FAILED for a plan failure or a text, CANCELLED for a
-                cancellation, Ctrl-C or an exit, and ERROR for any other exception.
-            failure, result: why it failed; what it returned.
+            status: by default SUCCEEDED without a failure, FAILED for a plan failure, a text or a pair of texts,
+                CANCELLED for a cancellation, Ctrl-C or an exit, and ERROR for any other exception.
+            failure: why it failed: an exception, whose class is the reason by which failures are counted; a pair of
+                reason and message; or a text, whose reason is the text without its numbers, ids, names of objects and
+                values of the node's own parameters.
+            result: what it returned.
             below: first end the nodes that are open below this one, the innermost first, with this status.
         """
         key = key.key if isinstance(key, _Node) and self._nodes.get(key.key) is key else key
         hash(key)
         if status is None:
-            status = "FAILED" if isinstance(failure, str | FailureValue) else end_statuses(failure, self._failures)[1]
+            raised = failure if isinstance(failure, BaseException) else None
+            status = end_statuses(raised, self._failures)[1] if raised is failure else "FAILED"
         status, below = self._checked_status(status), self._checked_status(below) if below is not None else None
         prepared = self.id
         value = noted(self.emitter, "NodeEnded", self._values.failure, failure) if failure is not None else None
@@ -390,6 +399,10 @@ class RecordedNodes(EpisodeWriter[_Node]):
         if below is not None:
             for each in [each for each in reversed(self._nodes.values()) if _is_below(each, node)]:
                 self._end_node(each, NodeEnded(each.sequence, below))
+        if failure is not None and failure.type == UNNAMED:
+            parameters = (each for each in node.parameters.values() if isinstance(each, str))
+            template = template_of(failure.message, (*parameters, *self._objects.names()))
+            failure = replace(failure, type=template or UNNAMED)
         self._end_node(node, NodeEnded(node.sequence, status, failure, self._now(result, prepared)))
         return 0  # an end continues no episode
 
@@ -710,10 +723,14 @@ class RecordedValues:
         return self._checked(value) if isinstance(value, msgspec.Struct) else value
 
     def failure(self, failure: object) -> FailureValue:
-        """Copy a failure: an exception, a `FailureValue`, or a text. Raises `CallerError` for anything else."""
-        if isinstance(failure, BaseException):
-            return failure_value(failure, self._references)
-        return FailureValue("Failure", clean(failure)) if isinstance(failure, str) else struct_of(failure, FailureValue)
+        """Copy a `FailureCause`; a text is of the type `UNNAMED`. Raises `CallerError` for anything else."""
+        match failure:
+            case BaseException():
+                return failure_value(failure, self._references)
+            case (str(), str()) | str():
+                reason, message = (UNNAMED, failure) if isinstance(failure, str) else failure
+                return FailureValue(clean(reason), clean(message))
+        return struct_of(failure, FailureValue)
 
     def _checked(self, value: msgspec.Struct) -> Any:
         """Return a value of an event if it is whole, and its rows are those of this episode."""

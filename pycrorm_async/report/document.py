@@ -23,6 +23,7 @@ import msgspec
 from pycrorm_async.errors import CallerError, UnknownEpisode
 from pycrorm_async.events.codec import description_of
 from pycrorm_async.events.fields import retagged
+from pycrorm_async.events.reasons import reason_of
 from pycrorm_async.events.types import (
     DescriptionDeclared,
     EpisodeEnded,
@@ -159,14 +160,13 @@ class EpisodeFold:
         if ended.status != "LOST":
             node[1] = sequence
         if ended.failure is not None:
-            node[7] = self._texts.number(ended.failure.type.rpartition(".")[2])
+            node[7] = self._texts.number(reason_of(ended.failure))
             node[8] = self._texts.number(ended.failure.message)
 
     def _ended(self, sequence: int, ended: EpisodeEnded) -> None:
         self._status = ended.status
         if ended.failure is not None:
-            reason = ended.failure.type.rpartition(".")[2]
-            self._failure = {"reason": reason, "message": ended.failure.message[:_TEXT_LONGEST]}
+            self._failure = {"reason": reason_of(ended.failure), "message": ended.failure.message[:_TEXT_LONGEST]}
         if ended.status == "LOST":
             running, lost = self._texts.number("RUNNING"), self._texts.number("LOST")
             for start, node in self._nodes.items():

@@ -75,7 +75,7 @@ async def test_they_are_those_that_recall_finds_before_the_action(url: str) -> N
                 for each in expected
             ]
     left, right = document["nodes"].values()
-    assert (left["success"], left["reasons"]) == ("1 of 2 succeeded (9-91 %)", "Failure 1")
+    assert (left["success"], left["reasons"]) == ("1 of 2 succeeded (9-91 %)", "it slipped 1")
     assert (right["success"], len(right["cases"])) == ("1 of 3 succeeded (6-79 %)", 3)
     texts = document["texts"]
     first, other = right["cases"][0], right["cases"][1]
@@ -165,7 +165,7 @@ def test_a_node_shows_them_as_text_and_leads_to_them(chrome: Browser, url: str, 
             )
             shown = tab.ask("[...document.querySelectorAll('.similar')].map((each) => each.innerText)")
             assert len(shown) == 2
-            assert "FAILED Failure" in shown[0]
+            assert "FAILED it slipped" in shown[0]
             assert f"tool {HOSTILE}" in shown[0]
             assert tab.ask("document.querySelectorAll('.panel b').length") == 0
             assert tab.ask("document.documentElement.scrollWidth") == width
