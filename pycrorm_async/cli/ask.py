@@ -47,7 +47,7 @@ _HELP = {
     "object_type": "Type of the object, such as MILK.",
     "radius_m": "Distance from the place, m.",
     "reason": "Class of the failure or a part of it, or words for it, such as unreachable.",
-    "recovered": "Only failures around which a node succeeded all the same, or only others.",
+    "recovered": "Only failures after which the same, or an alternative, succeeded; or only others.",
     "robot": "Name of the robot; for episodes also its model.",
     "since": "Started then or later: 2026-11-23, 2026-11-23T14:30, 90min, 7d.",
     "status": "Status, such as SUCCEEDED or FAILED.",

@@ -67,4 +67,4 @@ def diff(
 def _line(episode: EpisodeSummary) -> str:
     took = duration(episode.duration_ns) or "not ended"
     nodes = counted(episode.nodes, "node")
-    return f"episode {episode.number}, {episode.description}: {episode.status}, {took}, {nodes}"
+    return f"episode {episode.number}, {episode.description}: {episode.status_text}, {took}, {nodes}"

@@ -82,8 +82,8 @@ def episodes(
     numbers = {e.id: e.number for e in summaries}
     columns: tuple[str, ...] = ("episode", "started", "took", "status", "nodes", "failed", "description")
     rows: list[tuple[object, ...]] = [
-        (e.number, moment(e.started_at), _took(e, as_csv=as_csv), e.status, e.nodes, e.failed, _description(e, numbers))
-        for e in summaries
+        (e.number, moment(e.started_at), _took(e, as_csv=as_csv), e.status_text, e.nodes, e.failed, text)
+        for e, text in ((each, _description(each, numbers)) for each in summaries)
     ]
     if stdout.width >= _WIDTH_WITH_ROBOTS and any(each.robots for each in summaries):
         columns = (*columns, "robots")

@@ -93,7 +93,7 @@ def recall(
     if like is not None and cue:
         raise CallerError("--like takes the cue from an action: leave out the type and the features")
 
-    async def query(reading: Reading) -> tuple[Answer, tuple[str, ...]]:
+    async def query(reading: Reading) -> tuple[Answer, tuple[str, ...], list[tuple[str, int]]]:
         memory = Recall.of(reading)
         if like is not None:
             answer = await memory.like(await _node(reading, like), k=k, simulated=simulated)
@@ -103,15 +103,15 @@ def recall(
             )
         if robot is not None and ("robot", robot) in answer.never_seen:
             await EpisodeNames(reading).check_robot(robot)
-        return answer, await memory.types()
+        return answer, await memory.types(), await answer.outcomes()
 
-    answer, types = read_memory(url, spool, query)
+    answer, types, outcomes = read_memory(url, spool, query)
     if as_json or as_csv is not None:  # else the answer itself has the line
         _note_unknown(answer.cue.type, types)
     if as_json:
-        print_json(_document(answer))
+        print_json(_document(answer, outcomes))
     else:
-        _print(answer, why=why, as_csv=as_csv)
+        _print(answer, outcomes, why=why, as_csv=as_csv)
 
 
 class _Parsed(NamedTuple):
@@ -189,7 +189,7 @@ def _note_unknown(dtype: str | None, types: tuple[str, ...]) -> None:
 # --- printing -------------------------------------------------------------------------------------------------
 
 
-def _print(answer: Answer, *, why: bool, as_csv: bool | None) -> None:
+def _print(answer: Answer, outcomes: list[tuple[str, int]], *, why: bool, as_csv: bool | None) -> None:
     if as_csv is not None:
         print_table("", *answer.table(), as_csv=as_csv)
         return
@@ -211,9 +211,11 @@ def _print(answer: Answer, *, why: bool, as_csv: bool | None) -> None:
         ]
         print_table(f"Most like {answer.cue}", columns, rows)
     stdout.print(answer.why(), markup=False, highlight=False)
+    if outcomes:
+        stdout.print(f"  after failures: {', '.join(f'{name} {count}' for name, count in outcomes)}", highlight=False)
 
 
-def _document(answer: Answer) -> dict[str, Any]:
+def _document(answer: Answer, outcomes: list[tuple[str, int]]) -> dict[str, Any]:
     success = answer.success
     return {
         "cue": str(answer.cue),
@@ -224,6 +226,7 @@ def _document(answer: Answer) -> dict[str, Any]:
         "notes": list(answer.notes),
         "success": None if success is None else success._asdict(),
         "reasons": dict(answer.reasons),
+        "outcomes": dict(outcomes),
         "cases": [_case(each) for each in answer],
     }
 

@@ -156,7 +156,7 @@ def run(
         print_table(
             loaded.name,
             ("episode", "description", "status", "nodes"),
-            [(each.number, each.description, each.status, each.nodes) for each in episodes],
+            [(each.number, each.description, each.status_text, each.nodes) for each in episodes],
         )
     if outcome.left is not None:
         where = _place(outcome.left)

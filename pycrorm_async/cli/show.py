@@ -99,7 +99,7 @@ def _show(episode: str, url: str, spool: Path | None, *, events: bool, full: boo
             "by": summary.created_by,
             "took": duration(summary.duration_ns),
             "events": summary.end_sequence,
-            "status": summary.status,
+            "status": summary.status_text,
             "continues": f"episode {summary.continues}" if summary.continues else None,
             "continued": f"in episode {summary.continued_in}" if summary.continued_in else None,
             "simulated": simulated_by(summary) if summary.simulated else None,

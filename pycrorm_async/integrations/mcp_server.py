@@ -199,7 +199,10 @@ class _Tools:
         """List the nodes at which failures began, and count their causes, in one episode or, without one, in all.
 
         `object` is a part of an object's name; `text` are words in the object, arm, type, message or reason, as in
-        "milk unreachable". `recovered`: a node around it succeeded all the same. `limit` is 1 to 100.
+        "milk unreachable". `outcome` of a failure: recovered (the same was tried again and succeeded, or an alternative
+        did), tolerated by the plan language, ignored (nothing was tried again), failed (nothing around it succeeded) or
+        open (the plan runs). `rates` are the actions of each type with their share of successes and its 95 % interval,
+        `low` to `high`, unless `object` or `text` is given. `limit` is 1 to 100.
         """
         rows = _bounded("limit", limit, 100)
         ask = (await self._open()).ask
@@ -208,7 +211,10 @@ class _Tools:
         question = ask.root_failures(episode=episode, object=object, text=text, limit=rows)
         failures, unknown = await question.rows_or_unknown_name()
         note = {"note": unknown} if unknown else {}
-        return {"causes": [*map(_row, causes)], "failures": [*map(_row, failures)], **note}
+        lists = {"causes": causes, "failures": failures}
+        if object is None and text is None:
+            lists["rates"] = await ask.success_rates(episode=episode, limit=rows).rows()
+        return {name: [*map(_row, each)] for name, each in lists.items()} | note
 
     async def at(self, when: str | float, episode: int | str = "last") -> str:
         """Show the running nodes and the place of every object at a moment of an episode.
@@ -289,6 +295,7 @@ def _episode(episode: EpisodeSummary) -> dict[str, Any]:
         "duration": duration(episode.duration_ns),
         "nodes": episode.nodes,
         "failed_nodes": episode.failed,
+        "failed_actions": episode.failed_actions or None,
         "last_event": episode.end_sequence,
         "plan": episode.plan,
         "robots": [str(each) for each in episode.robots],
@@ -305,6 +312,7 @@ def _node(node: NodeSummary) -> str:
         node.status,
         duration(node.duration_ns),
         f"{node.reason}: {node.failure_message}" if node.reason else "",
+        f"({node.outcome})" if node.outcome else "",
     ]
     return "  " * min(node.depth, _DEPTH_MAX) + one_line(" ".join(filter(None, facts)), _LINE_MAX)
 

@@ -220,8 +220,8 @@ class MoveAndPickUp(ActionDescription[MoveAndPickUpPerformable]):
         return select(
             view.arm,
             view.grasp,
-            view.object_x,
-            view.object_y,
+            view.robot_in_object_x.label("object_x"),
+            view.robot_in_object_y.label("object_y"),
             view.height_over_torso.label("height"),
         ).where(view.status == TaskStatus.SUCCEEDED)
 
@@ -525,8 +525,8 @@ def rollouts_question(*, scene: str, seed: int, policy: str | None = None) -> Se
             rollout.c.reason.label("failure"),
             view.arm,
             view.grasp,
-            view.object_x,
-            view.object_y,
+            view.robot_in_object_x.label("object_x"),
+            view.robot_in_object_y.label("object_y"),
             view.height_over_torso.label("height"),
             goals.label("goals"),
         )
@@ -564,7 +564,7 @@ def successes(frame: pd.DataFrame, *, among: int | None = None) -> pd.DataFrame:
 def tally_of(frame: pd.DataFrame) -> Tally:
     """Count successes and, per failure class, failures."""
     failed = frame[frame.status != TaskStatus.SUCCEEDED.value]
-    return Tally(len(frame) - len(failed), Counter(each.rpartition(".")[2] for each in failed.failure))
+    return Tally(len(frame) - len(failed), Counter(failed.failure))
 
 
 def stages_of(frame: pd.DataFrame) -> dict[str, int]:

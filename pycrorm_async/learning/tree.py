@@ -1,7 +1,7 @@
 """Learn a policy from successful pick-ups: a Joint Probability Tree over arm, grasp and place (thesis, section 5.2).
 
->>> statement = select(View.arm, View.grasp, View.object_x, View.object_y).where(View.status == TaskStatus.SUCCEEDED)
->>> policy = learn(await memory.dataframe(statement))
+>>> statement = select(View.arm, View.grasp, View.robot_in_object_x, View.robot_in_object_y)
+>>> policy = learn(await memory.dataframe(statement.where(View.status == TaskStatus.SUCCEEDED)))
 
 pyjpt chooses every split and fits the distributions of every leaf; the loop over the nodes is in this module. pyjpt's
 own loop recurses once per split, so that it raises RecursionError at about 500 leaves, and it builds an array of all
@@ -48,8 +48,9 @@ def learn(successes: pd.DataFrame, *, min_samples_leaf: int = 25) -> Policy:
     """Fit a policy to successful pick-ups. Blocks: 0.5 s for 8,000 rows, 10 s for 100,000.
 
     Args:
-        successes: one row for each successful pick-up: `arm` and `grasp` as names; `object_x` and `object_y`, the
-            position of the robot's base in the object's own frame, m, as in `PickUpWithContextView`; optionally
+        successes: one row for each successful pick-up: `arm` and `grasp` as names; `robot_in_object_x` and
+            `robot_in_object_y`, the position of the robot's base in the object's own frame, m, as in
+            `PickUpWithContextView`, or under their former names `object_x` and `object_y`; optionally
             `height`, the object's height minus the torso's, m. Other columns are ignored. If all heights are equal,
             the height is not learned but kept as the policy's `constant_height`. Condition a policy that has learned
             heights on the present height, plus or minus 1 to 5 cm; unconditioned, it mixes the samples of all heights.
@@ -67,7 +68,9 @@ def learn(successes: pd.DataFrame, *, min_samples_leaf: int = 25) -> Policy:
         remedy = "record more rollouts or choose a smaller --min-samples-leaf (min_samples_leaf=)"
         raise NotEnoughExperience(f"{message}; {remedy}")
     columns: dict[str, Any] = {name: _labels(successes, name, members) for name, members in SYMBOLS.items()}
-    columns |= {name: _numbers(successes, name) for name in PLACE}
+    for name in PLACE:
+        own = f"robot_in_{name}"  # the policy's name is that of policy files
+        columns[name] = _numbers(successes, own if own in successes.columns else name)
     constant_height = None
     if HEIGHT in successes.columns:
         heights = _numbers(successes, HEIGHT)

@@ -11,20 +11,30 @@ it was replaced, the feeds are thrown away and `epoch` counts it, and the pages 
 from __future__ import annotations
 
 import asyncio
+import math
+import time
 from collections.abc import AsyncIterator, Iterable, Mapping
 from contextlib import asynccontextmanager
 from datetime import UTC, datetime
 from typing import Any
 
-from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable, LogDamaged, PycrormError
+from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable, LogDamaged, PycrormError, TablesOutdated
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX
+from pycrorm_async.events.reasons import reason_of
 from pycrorm_async.events.types import EpisodeEnded, EpisodeStarted, NodeEnded, NodeStarted, ObjectAdded
 from pycrorm_async.projections.fold import happening_of
 from pycrorm_async.projections.row_batch import CannotFold
+from pycrorm_async.query.frames import TRIED
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.text import parameters_text, with_object_names
 from pycrorm_async.report.document import EpisodeFold, document_behind, read_into
-from pycrorm_async.report.write import newest_episodes, overview_document
+from pycrorm_async.report.write import (
+    NO_REASON,
+    failures_by_reason,
+    newest_episodes,
+    outcomes_of,
+    overview_document,
+)
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog, episode_named, grown_episodes, is_simulated
 from pycrorm_async.store.stored import EpisodeRow, StoredEvent
@@ -37,6 +47,8 @@ _IDLE_TURNS = 40
 """The turns without a change after which the log is queried less often, to spare the robot's processor."""
 _RETRY_S = 0.5
 """Delays the next attempt if the database does not answer."""
+OUTCOMES_S = 1.0
+"""The shortest time between two queries of the outcomes of failures, which need the tables and not the events."""
 _FEEDS_MAX = 8
 """Bounds the folded episodes that are kept for pages without a listener, which load again or come back."""
 
@@ -272,9 +284,17 @@ class LiveOverview:
         """The turn in which an episode's entry changed last, by its number."""
         self._turn = 0
         self._folding = asyncio.Lock()
+        self._unjudged: set[int] = set()
+        """Numbers of the episodes whose failures may have other outcomes by now."""
+        self._asked_s = -math.inf
 
     async def close(self) -> None:
         await self._reading.close()
+
+    async def outcomes(self, log: EventLog, number: int) -> dict[str, str] | None:
+        """Return the outcomes of an episode's failures; None while the tables do not show all its events."""
+        is_behind = any(each.number == number for each in await log.behind())
+        return None if is_behind else await outcomes_of(self._reading, number)
 
     @property
     def turn(self) -> int:
@@ -285,17 +305,36 @@ class LiveOverview:
         """Fold the new events of these episodes; return whether any entry changed."""
         async with self._folding:
             grown = [each for each in rows if self._is_behind(each)]
-            if not grown:
-                return False
-            self._turn += 1
-            designators = await log.dtypes()
+            designators = await log.dtypes() if grown else {}
+            turn = self._turn + 1
             for row in grown:
                 activity = self._activities.setdefault(row.number, Activity(row))
                 activity.row = row
                 await self._read(activity, log, designators)
-                self._changed_at[row.number] = self._turn
+                self._changed_at[row.number] = turn
+                self._unjudged.add(row.number)
+            judged = await self._judge(log)
+            if not grown and not judged:
+                return False
+            self._changed_at |= dict.fromkeys(judged, turn)
+            self._turn = turn
             self._forget()
             return True
+
+    async def _judge(self, log: EventLog) -> list[int]:
+        """Read the outcomes of failures from the tables, once these show all events; return the episodes judged."""
+        if not self._unjudged or time.monotonic() < self._asked_s + OUTCOMES_S:
+            return []
+        self._asked_s = time.monotonic()
+        shown = (self._unjudged - {each.number for each in await log.behind()}) & self._activities.keys()
+        try:
+            outcomes = await failures_by_reason(self._reading, shown) if shown else {}
+        except (DatabaseUnavailable, TablesOutdated):  # the list shows what the events say
+            return []
+        self._unjudged -= shown
+        for each in shown:
+            self._activities[each].outcomes = outcomes.get(each, {})
+        return sorted(shown)
 
     def _is_behind(self, row: EpisodeRow) -> bool:
         activity = self._activities.get(row.number)
@@ -320,6 +359,7 @@ class LiveOverview:
         ended = [number for number, each in self._activities.items() if each.has_ended]
         for number in ended[:-_ENDED_MAX]:
             del self._activities[number], self._changed_at[number]
+        self._unjudged &= self._activities.keys()
 
     def entries(self, since: int) -> list[dict[str, Any]]:
         """Return the entries that changed behind a turn, without those of simulations."""
@@ -330,6 +370,7 @@ class LiveOverview:
         """Return the document of the list: the newest episodes of the tables, running ones, and those not folded."""
         unended = [number for number, each in self._activities.items() if not each.has_ended]
         running = await grown_episodes(log, above=EPISODE_NUMBER_MAX, numbers=unended)
+        self._asked_s = -math.inf
         await self.catch_up(log, {each.number: each for each in [*await log.behind(), *running]}.values())
         try:
             episodes, total = await newest_episodes(self._reading)
@@ -352,6 +393,7 @@ class LiveOverview:
 
 _READ = frozenset({"EpisodeStarted", "EpisodeEnded", "NodeStarted", "NodeEnded", "ObjectAdded"})
 _FAILED = frozenset({"FAILED", "ERROR"})
+_TRIED = frozenset(each.name for each in TRIED)
 _TEXT_MAX = 200
 """Bounds the characters of a description, and of the text of the running nodes."""
 _NODES_IN_FULL = 2
@@ -365,10 +407,12 @@ class Activity:
         last: sequence of the last event that was read.
         simulated: True for a simulation, performed in a copy of the world.
         fault: the reason for which its events cannot be read any further, or None.
+        outcomes: of its failures, counted by reason, as far as they were read from the tables.
     """
 
     def __init__(self, row: EpisodeRow) -> None:
         self.row = row
+        self.outcomes: dict[str, dict[str, int]] = {}
         self.last = 0
         self.simulated = False
         self.fault: str | None = None
@@ -377,8 +421,10 @@ class Activity:
         self._nodes = self._failed = 0
         self._parents: dict[int, int | None] = {}
         self._running: dict[int, str] = {}
-        self._actions: set[int] = set()
-        """The running nodes that are actions."""
+        self._actions: dict[int, str] = {}
+        """The types of the running nodes that are actions."""
+        self._tries: dict[str, list[int]] = {}
+        """Successes and tries of actions, by type."""
         self._latest = ""
         """The action that ended last."""
         self._causes: set[int] = set()
@@ -408,7 +454,7 @@ class Activity:
                 parameters = with_object_names(started.parameters, lambda each: self._names.get(each["object"]))
                 self._parents[event.sequence] = started.parent
                 if started.kind == "action":
-                    self._actions.add(event.sequence)
+                    self._actions[event.sequence] = dtype
                 self._running[event.sequence] = f"{dtype or started.kind} {parameters_text(parameters)}".strip()
             case NodeEnded() as ended:
                 self._node_ended(ended)
@@ -427,13 +473,16 @@ class Activity:
     def _node_ended(self, ended: NodeEnded) -> None:
         text = self._running.pop(ended.node, "")
         self._latest = text if ended.node in self._actions else self._latest
-        self._actions.discard(ended.node)
+        if (dtype := self._actions.pop(ended.node, None)) is not None and ended.status in _TRIED:
+            tries = self._tries.setdefault(dtype, [0, 0])
+            tries[0] += ended.status == "SUCCEEDED"
+            tries[1] += 1
         parent = self._parents.pop(ended.node, None)
         if ended.status not in _FAILED:
             return
         self._failed += 1
         if ended.node not in self._causes:
-            reason = ended.failure.type.rpartition(".")[2] if ended.failure is not None else "no reason"
+            reason = reason_of(ended.failure) if ended.failure is not None else NO_REASON
             self._reasons[reason] = self._reasons.get(reason, 0) + 1
         self._causes.discard(ended.node)
         if parent is not None:
@@ -460,7 +509,10 @@ class Activity:
             "seconds": None if self._seconds is None else round(self._seconds, 6),
             "nodes": self._nodes,
             "failed": self._failed,
+            "failed_actions": sum(tries - good for good, tries in self._tries.values()),
+            "actions": {dtype: list(each) for dtype, each in self._tries.items()},
             "reasons": dict(self._reasons),
+            "outcomes": self.outcomes,
             "page": f"episode/{self.row.number}",
             "unreadable": self.row.refused or self.fault or "",
             "robots": list(self._robots),

@@ -13,7 +13,9 @@ from __future__ import annotations
 
 import asyncio
 import html
+import math
 import socket
+import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import nullcontext
 from errno import EACCES, EADDRINUSE
@@ -24,7 +26,7 @@ import msgspec
 from pycrorm_async import __version__
 from pycrorm_async.errors import CallerError, MissingExtra, PycrormError, UnknownEpisode
 from pycrorm_async.live.access import HEADERS, refusal
-from pycrorm_async.live.follower import EpisodeFeed, LogFollower
+from pycrorm_async.live.follower import OUTCOMES_S, EpisodeFeed, LogFollower
 from pycrorm_async.report.write import overview_page_of, page_of
 
 try:
@@ -192,6 +194,7 @@ class LiveServer:
 
     async def _episode_parts(self, feed: EpisodeFeed, after: int) -> AsyncIterator[str]:
         follower, epoch = self._follower, self._follower.epoch
+        judged, asked_s = 0, -math.inf
         async with follower.listening(feed):
             async for _ in self._turns():
                 if follower.epoch != epoch:
@@ -201,6 +204,12 @@ class LiveServer:
                     part = await feed.document(await follower.log(), after)
                     after = part["episode"]["last"]
                     yield _message("part", part, after)
+                if after > judged and time.monotonic() > asked_s + OUTCOMES_S:
+                    asked_s = time.monotonic()
+                    outcomes = await follower.overview.outcomes(await follower.log(), feed.number)
+                    if outcomes is not None:
+                        judged = after
+                        yield _message("outcomes", outcomes)
                 yield self._state(feed.fault)
 
     async def _turns(self) -> AsyncIterator[None]:

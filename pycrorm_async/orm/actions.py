@@ -207,7 +207,8 @@ class LearnPolicyAction(Action):
         policy: its name, which is the hash of its content and the `policy` of the rollouts under it.
         successes: number of samples from which it was learned.
         min_samples_leaf: the setting of `learn`.
-        rollouts, scene: of the rollouts that the samples come from; None if they come from other episodes.
+        rollouts: number of the rollouts that the samples come from; None if they come from other episodes.
+        scene: of these rollouts, if any.
         episode_count: number of the episodes that hold the samples.
     """
 

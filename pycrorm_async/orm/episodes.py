@@ -23,6 +23,7 @@ class ProcessMetaData(Base):
     id: Mapped[int] = mapped_column(primary_key=True)
     uuid: Mapped[str]
     created_at: Mapped[datetime]
+    """Its start."""
     created_by: Mapped[str]
     description: Mapped[str]
     version: Mapped[str]
@@ -98,7 +99,8 @@ class EpisodeRobot(RowOfEvent, Base):
 
     Attributes:
         id: of its first row in `object`.
-        model, serial: of its `RobotDescription`; None without one, and in episodes of version 0.1.0.
+        model: of its `RobotDescription`; None without one, and in episodes of version 0.1.0.
+        serial: the serial number in it, if it has one.
         description_fingerprint: of its `ObjectDescription`; None in episodes of version 0.1.0.
     """
 

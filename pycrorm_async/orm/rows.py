@@ -165,7 +165,8 @@ class Object(RowOfEvent, Base):
         color: red, green, blue, opacity, 0 to 1, when it was added; None in later rows, and if only its description
             has it.
         description_fingerprint: fingerprint of its description when it was added; None in later rows.
-        model, serial: of a robot with a `RobotDescription`, when it was added; None in later rows.
+        model: of a robot with a `RobotDescription`, when it was added; None in later rows.
+        serial: the serial number of such a robot; None in later rows.
         mass_kg: when it was added; None in later rows, and if it is not known.
         base_link: of a robot, when it was added: the link that has the pose; None in later rows, and for the root link.
         description: its description, in every row; None in episodes of older versions. Not loaded by default: use
@@ -398,7 +399,10 @@ class Designator(RowOfEvent, Base):
         items: the entries of its list and dict fields.
         parameters: its fields as recorded. Deferred: load them with `undefer(Action.parameters)` or
             `await action.awaitable_attrs.parameters`.
-        status, start_time, end_time, reason: of its node. A type with a field of such a name has the field instead.
+        status: of its node. A type with a field of such a name, or of one of the next three, has the field instead.
+        start_time: when its node started.
+        end_time: when its node ended; None while it runs, and if it is LOST.
+        reason: why its node failed.
         robot: the name of the robot that acted; None without one. A type with a field `robot` has the field instead.
         duration_s: of its node by the robot's monotonic clock, in s; None while it runs, and if it is LOST. `duration`
             is its former name.
@@ -647,14 +651,18 @@ class TaskTreeNode(RowOfEvent, Base):
         ancestors: the parent, its parent and so on to the root: `await node.awaitable_attrs.ancestors`.
         start_time: by the wall clock, which may be set while the plan runs.
         end_time: `start_time` and the duration; None while it runs, and if it is LOST.
-        start_ns, end_ns: monotonic time, for exact durations.
+        start_ns: monotonic time of the start, for exact durations.
+        end_ns: monotonic time of the end.
         sequence, end_sequence: the events of its start and its end, 1, 2, 3 … inside the episode. `end_sequence` is
             None while it runs, and if it is LOST.
         duration_s: by the monotonic clock, in s; None while it runs, and if it is LOST. `duration` is its former name.
-        reason: the class of the failure it ended with; `failure_message` and `failure_arguments` belong to it.
+        reason: why it failed: the class of an exception, or a text without its numbers and names; `failure_message`
+            and `failure_arguments` belong to it.
         result: the return value of perform, as JSON.
         robot: the name of the robot that acted; None without one.
         simulated: whether it belongs to a simulation, performed in a copy of the world.
+        outcome: how the plan went on after it failed, as `RootFailure.outcome`; None for a node that did not fail.
+            Loaded on request.
     """
 
     __tablename__ = "task_tree_node"
@@ -682,7 +690,9 @@ class TaskTreeNode(RowOfEvent, Base):
     simulated: Mapped[bool]
     duration_s: Mapped[float | None]
     duration: Mapped[float | None]
+    _outcome: Mapped[str | None] = mapped_column("outcome", deferred=True)
 
+    outcome: Mapped[str | None] = synonym("_outcome", descriptor=on_request("outcome"))
     action: Mapped[Designator | None] = one_of(lambda: TaskTreeNode.action_id, "designator")
     parent: Mapped[TaskTreeNode | None] = one_of(lambda: TaskTreeNode.parent_id, "task_tree_node")
     _children: Mapped[list[TaskTreeNode]] = many_of(
@@ -705,7 +715,11 @@ class TaskTreeNode(RowOfEvent, Base):
 
 
 class LocationCandidate(RowOfEvent, Base):
-    """A place that a location designator offered; `position` is its rank, 0 first."""
+    """A place that a location designator offered; `position` is its rank, 0 first.
+
+    Attributes:
+        torso_height: at which the robot was to stand there, m.
+    """
 
     __tablename__ = "location_candidate"
     _row = "resolution_id"
@@ -759,14 +773,18 @@ class LocationResolution(RowOfEvent, Base):
 
     Attributes:
         location: the designator's class.
-        considered, offered, refused: the number of places it checked, of those it offered, and of all others.
+        considered: the number of places it checked.
+        offered: the number of those it offered.
+        refused: the number of all others.
         candidates: the first 999 places that it offered, and the last one.
         taken: the rank among `candidates` of the place that the plan used, whose pose is `pose`; None if it used none.
         node: the node that made the request.
         refusals: the first 1,000 places that it refused. Not loaded by default: use
             `await resolution.awaitable_attrs.refusals`.
-        occupied_cells, hidden_cells, free_cells: the places in its costmaps that are too near an obstacle, those from
-            which the target is not visible, and those it chose from. None without costmaps and in older episodes.
+        occupied_cells: the places in its costmaps that are too near an obstacle. None without costmaps and in older
+            episodes, also of the next two.
+        hidden_cells: the places from which the target is not visible.
+        free_cells: the places it chose from.
     """
 
     __tablename__ = "location_resolution"
@@ -816,7 +834,9 @@ class Detection(RowOfEvent, Base):
         confidence: the confidence that the robot's perception computed; None if it computed none.
         object: the row of the object of the world at that moment; None for a hypothesis or a false positive, which
             matches none.
-        x, y, z, qx, qy, qz, qw, frame: the perceived pose.
+        x, y, z: the perceived position.
+        qx, qy, qz, qw: the perceived orientation.
+        frame: of the perceived pose.
         node: the node that performed the detection.
     """
 
@@ -906,7 +926,9 @@ class ObservationValue(RowOfEvent, Base):
 
     Attributes:
         key: the keys and indices that lead to it, joined by dots; `value` if the observation is this value.
-        number, text, truth: the scalar.
+        number: the scalar, if it is a number.
+        text: the scalar, if it is a text.
+        truth: the scalar, if it is a truth value.
         blob: the SHA-256 of a blob, for `memory.blob`; with its `media_type` and its `size` in bytes.
         missing: the reason why the value could not be recorded.
     """

@@ -28,13 +28,17 @@ class PickUpWithContextView(RowOfEvent, Base):
         status: of the action's node.
         process_metadata_id: the episode.
         node_id: the node; the same number as `id`.
-        object_x, object_y, object_z: of the robot's base in the object's own frame, m.
-        object_qx, object_qy, object_qz, object_qw: of the robot's base in the object's own frame. They and `object_z`
-            are loaded on request: `select(PickUpWithContextView.object_z)`, `undefer` or `awaitable_attrs`.
+        robot_in_object_x, robot_in_object_y, robot_in_object_z: of the robot's base in the object's own frame, m.
+        robot_in_object_qx, robot_in_object_qy, robot_in_object_qz, robot_in_object_qw: of the robot's base in the
+            object's own frame. They and `robot_in_object_z` are loaded on request:
+            `select(PickUpWithContextView.robot_in_object_z)`, `undefer` or `awaitable_attrs`.
+        object_x, object_y, object_z: the names of `robot_in_object_x` and the others until the next release, m.
+        object_qx, object_qy, object_qz, object_qw: the names of `robot_in_object_qx` and the others until then.
         height_over_torso: height of the object above the robot's torso, m: its z minus that of the robot's base minus
             `torso_height`. The reach of an arm depends on it. Loaded on request.
         robot: the name of the robot; None if a memory of version 0.1.0 recorded it. Loaded on request.
-        description, scene: of the episode: its description, and its world in one line. Loaded on request.
+        description: of the episode. Loaded on request.
+        scene: the world of the episode, in one line. Loaded on request.
         policy: the name of the policy that chose the pick-up: that of the `MoveAndPickUpAction` around it, or of the
             `BatchRolloutAction` around that. None if none is named. Loaded on request.
     """
@@ -62,6 +66,13 @@ class PickUpWithContextView(RowOfEvent, Base):
     _object_qy: Mapped[float] = mapped_column("object_qy", deferred=True)
     _object_qz: Mapped[float] = mapped_column("object_qz", deferred=True)
     _object_qw: Mapped[float] = mapped_column("object_qw", deferred=True)
+    robot_in_object_x: Mapped[float]
+    robot_in_object_y: Mapped[float]
+    _robot_in_object_z: Mapped[float] = mapped_column("robot_in_object_z", deferred=True)
+    _robot_in_object_qx: Mapped[float] = mapped_column("robot_in_object_qx", deferred=True)
+    _robot_in_object_qy: Mapped[float] = mapped_column("robot_in_object_qy", deferred=True)
+    _robot_in_object_qz: Mapped[float] = mapped_column("robot_in_object_qz", deferred=True)
+    _robot_in_object_qw: Mapped[float] = mapped_column("robot_in_object_qw", deferred=True)
     _height_over_torso: Mapped[float | None] = mapped_column("height_over_torso", deferred=True)
     _robot: Mapped[str | None] = mapped_column("robot", deferred=True)
     _description: Mapped[str] = mapped_column("description", deferred=True)
@@ -73,6 +84,11 @@ class PickUpWithContextView(RowOfEvent, Base):
     object_qy: Mapped[float] = synonym("_object_qy", descriptor=on_request("object_qy"))
     object_qz: Mapped[float] = synonym("_object_qz", descriptor=on_request("object_qz"))
     object_qw: Mapped[float] = synonym("_object_qw", descriptor=on_request("object_qw"))
+    robot_in_object_z: Mapped[float] = synonym("_robot_in_object_z", descriptor=on_request("robot_in_object_z"))
+    robot_in_object_qx: Mapped[float] = synonym("_robot_in_object_qx", descriptor=on_request("robot_in_object_qx"))
+    robot_in_object_qy: Mapped[float] = synonym("_robot_in_object_qy", descriptor=on_request("robot_in_object_qy"))
+    robot_in_object_qz: Mapped[float] = synonym("_robot_in_object_qz", descriptor=on_request("robot_in_object_qz"))
+    robot_in_object_qw: Mapped[float] = synonym("_robot_in_object_qw", descriptor=on_request("robot_in_object_qw"))
     height_over_torso: Mapped[float | None] = synonym("_height_over_torso", descriptor=on_request("height_over_torso"))
     robot: Mapped[str | None] = synonym("_robot", descriptor=on_request("robot"))
     description: Mapped[str] = synonym("_description", descriptor=on_request("description"))
@@ -89,9 +105,14 @@ class RootFailure(RowOfEvent, Base):
         path: the names of the nodes from the root to this one, as in `root > TransportAction > PickUpAction`.
         object: the name of the object that the designator, or else the nearest one around it, has as a parameter.
         arm: the arm that the designator, or else the nearest one around it, has as a parameter.
-        reason: the class of the failure.
+        reason: the class of the failure, or its text without numbers and names.
         message: its message.
-        recovered: whether a node around this one succeeded all the same.
+        start_time: when the node started.
+        end_time: when it ended.
+        recovered: whether `outcome` is `recovered`.
+        outcome: `recovered` if the same was tried again and succeeded, or an alternative of the plan language did;
+            `tolerated` by an expression of the plan language; `ignored` if the action or plan around it succeeded all
+            the same; `failed` if nothing around it succeeded; `open` while the plan runs.
         episode: the same as `process_metadata`.
     """
 
@@ -110,6 +131,7 @@ class RootFailure(RowOfEvent, Base):
     start_time: Mapped[datetime]
     end_time: Mapped[datetime | None]
     duration_s: Mapped[float | None]
+    outcome: Mapped[str]
 
     process_metadata: Mapped[ProcessMetaData] = relationship(viewonly=True)
 
@@ -126,9 +148,11 @@ class SpatialRelation(RowOfEvent, Base):
 
     Attributes:
         node_id: of the pick-up or the placing; `sequence` is the event of its start.
-        object, object_id: the picked up or placed object: its name, and its row at that moment.
+        object: the name of the picked up or placed object.
+        object_id: its row at that moment.
         relation: `on`, `in` or `next to`.
-        other, other_id: the other object: its name, and its row at that moment.
+        other: the name of the other object.
+        other_id: the row of the other object at that moment.
         link: of the other object, such as `sink_area_surface`; an object of one link has its name.
         node: the pick-up or the placing. Loaded on request.
     """

@@ -97,6 +97,7 @@ def pick_ups_with_context(
         # A subquery, which costs nothing where the column is not selected.
         return select(value).where(episode.c.id == node.c.process_metadata_id).scalar_subquery()
 
+    seen = dict(zip(_POSE.split(), _seen_from(lies, stands), strict=True))
     in_world = world_line(object_, removal, episode.c.id)  # of an episode that has not ended, or was LOST
     world = func.coalesce(episode.c.world, episode.c.entered_world, in_world)
 
@@ -116,13 +117,14 @@ def pick_ups_with_context(
             node.c.status,
             node.c.process_metadata_id,
             node.c.id.label("node_id"),
-            *_seen_from(lies, stands),
+            *(each.label(f"object_{name}") for name, each in seen.items()),  # the names until the next release
             (lies.z - stands.z - node.c.torso_height).label("height_over_torso"),
             node.c.robot,
             of_episode(episode.c.description).label("description"),
             of_episode(world).label("scene"),
             _policy(node).label("policy"),
             event_of(node.c.id).label("sequence"),
+            *(each.label(f"robot_in_object_{name}") for name, each in seen.items()),
         )
         .select_from(picked)
         .join(node, same_episode(node, picked, node.c.id == picked.c.id))
@@ -154,14 +156,14 @@ def _seen_from(place: Any, robot: Any) -> Iterator[ColumnElement[Any]]:
     dx, dy, dz = robot.x - place.x, robot.y - place.y, robot.z - place.z
     x, y, z, w = place.qx, place.qy, place.qz, place.qw
     # The rows of the transposed rotation matrix.
-    yield ((1 - 2 * (y * y + z * z)) * dx + 2 * (x * y + z * w) * dy + 2 * (x * z - y * w) * dz).label("object_x")
-    yield (2 * (x * y - z * w) * dx + (1 - 2 * (x * x + z * z)) * dy + 2 * (y * z + x * w) * dz).label("object_y")
-    yield (2 * (x * z + y * w) * dx + 2 * (y * z - x * w) * dy + (1 - 2 * (x * x + y * y)) * dz).label("object_z")
+    yield (1 - 2 * (y * y + z * z)) * dx + 2 * (x * y + z * w) * dy + 2 * (x * z - y * w) * dz
+    yield 2 * (x * y - z * w) * dx + (1 - 2 * (x * x + z * z)) * dy + 2 * (y * z + x * w) * dz
+    yield 2 * (x * z + y * w) * dx + 2 * (y * z - x * w) * dy + (1 - 2 * (x * x + y * y)) * dz
     # The conjugate of the object's quaternion times the robot's.
-    yield (w * robot.qx - x * robot.qw - y * robot.qz + z * robot.qy).label("object_qx")
-    yield (w * robot.qy + x * robot.qz - y * robot.qw - z * robot.qx).label("object_qy")
-    yield (w * robot.qz - x * robot.qy + y * robot.qx - z * robot.qw).label("object_qz")
-    yield (w * robot.qw + x * robot.qx + y * robot.qy + z * robot.qz).label("object_qw")
+    yield w * robot.qx - x * robot.qw - y * robot.qz + z * robot.qy
+    yield w * robot.qy + x * robot.qz - y * robot.qw - z * robot.qx
+    yield w * robot.qz - x * robot.qy + y * robot.qx - z * robot.qw
+    yield w * robot.qw + x * robot.qx + y * robot.qy + z * robot.qz
 
 
 # === joins ====================================================================================================
@@ -369,7 +371,7 @@ def _literal(value: str | float | None) -> str:
 #
 # Define `root_failure`: every failed node without a failed child, which is where a failure began.
 #
-# Path, object, arm and `recovered` are found by climbing from the failed node to the root, one lookup by primary key
+# Path, object, arm and outcome are found by climbing from the failed node to the root, one lookup by primary key
 # for each ancestor. A query that does not select them does not climb: both databases compute only the columns they
 # need. The object and the arm are those of the nearest node that has such a parameter, because a motion that failed
 # often has neither while the action around it has both. They are read from the recorded parameters of these nodes,
@@ -385,7 +387,6 @@ _CLIMB = """WITH RECURSIVE up(id, parent_id, path, status, depth) AS (
  SELECT above.id, above.parent_id, coalesce(above.dtype, above.kind) || ' > ' || up.path, above.status, up.depth + 1
  FROM up {above})"""
 _PATH = f"({_CLIMB} SELECT path FROM up ORDER BY depth DESC LIMIT 1)"  # noqa: S608  constants only, also below
-_RECOVERED = f"EXISTS ({_CLIMB} SELECT 1 FROM up WHERE status = '{TaskStatus.SUCCEEDED.name}')"  # noqa: S608
 _STARTED = """WITH RECURSIVE up(id, parent_id, parameters, depth) AS (
  SELECT {node}.id, {node}.parent_id, {node}.parameters, 0
  UNION ALL
@@ -410,10 +411,10 @@ _OBJECT_SQLITE = f"""CASE WHEN json_extract(field.value, '$.object') IS NULL
  ELSE ({_OBJECT_ROW} + (json_extract(field.value, '$.row') << {_SLOT_BITS})) END"""
 _OBJECT_POSTGRESQL = f"""CASE WHEN field.value ->> 'object' IS NULL THEN field.value ->> 'name'
  ELSE ({_OBJECT_ROW} + (CAST(field.value ->> 'row' AS bigint) << {_SLOT_BITS})) END"""
-_FIELDS_SQLITE = """, json_each(up.parameters) AS field WHERE field.type = 'object' AND (
+_FIELDS_SQLITE = """json_each(up.parameters) AS field WHERE field.type = 'object' AND (
  (json_extract(field.value, '$.object') IS NOT NULL AND json_type(field.value, '$.row') = 'integer')
  OR (json_extract(field.value, '$.dtype') IS NOT NULL AND json_extract(field.value, '$.name') IS NOT NULL))"""
-_FIELDS_POSTGRESQL = """, json_each(CAST(up.parameters AS json)) AS field WHERE
+_FIELDS_POSTGRESQL = """json_each(CAST(up.parameters AS json)) AS field WHERE
  json_typeof(field.value) = 'object' AND (
  (field.value ->> 'object' IS NOT NULL AND field.value ->> 'row' ~ '^[0-9]+$')
  OR (field.value ->> 'dtype' IS NOT NULL AND field.value ->> 'name' IS NOT NULL))"""
@@ -441,8 +442,8 @@ def root_failures(nodes: Table, objects: Table) -> Select[*tuple[Any, ...]]:
 
     object_ = sql_of(
         Text(),
-        nearest(_OBJECT_SQLITE, _FIELDS_SQLITE, _ABOVE_SQLITE),
-        nearest(_OBJECT_POSTGRESQL, _FIELDS_POSTGRESQL, _ABOVE_POSTGRESQL),
+        nearest(_OBJECT_SQLITE, f", {_FIELDS_SQLITE}", _ABOVE_SQLITE),
+        nearest(_OBJECT_POSTGRESQL, f", {_FIELDS_POSTGRESQL}", _ABOVE_POSTGRESQL),
     )
     arm = sql_of(
         Text(),
@@ -459,10 +460,102 @@ def root_failures(nodes: Table, objects: Table) -> Select[*tuple[Any, ...]]:
         arm.label("arm"),
         nodes.c.reason,
         nodes.c.failure_message.label("message"),
-        sql_of(Boolean(), *climbing(_RECOVERED)).label("recovered"),
+        (outcome_of(nodes) == RECOVERED).label("recovered"),
         nodes.c.start_time,
         event_of(nodes.c.id).label("sequence"),
+        outcome_of(nodes).label("outcome"),
     ).where(nodes.c.status.in_(_FAILED), ~failed_child)
+
+
+# === failure outcomes =========================================================================================
+#
+# Decide how a plan went on after a node had failed. Every reader takes the answer from here, by the column `outcome` of
+# `root_failure` and `task_tree_node`.
+#
+# From the failed node up to the first node around it that succeeded, the first of these that holds is the outcome:
+#
+#     recovered   a later node of the same type, with the same object, succeeded below the same parent; or the node that
+#                 succeeded is a retry, a fallback or a choice of alternatives of the plan language
+#     tolerated   it is another expression of the plan language, whose rule lets a part of it fail
+#     ignored     it is an action or the plan itself: nothing was tried again
+#     open        no node has succeeded yet, and one still runs
+#     failed      no node around it succeeded
+#
+# A node without an object must have the same parameters, except arms and grasps. Below an expression that failed, a
+# later success recovers nothing: a `Repeat` of which one round failed has failed because of it.
+
+RECOVERED: Final = "recovered"
+OUTCOMES: Final = (RECOVERED, "tolerated", "ignored", "failed", "open")
+"""The outcomes of a failure."""
+_LATER_MAX = 50
+"""Bounds the later successes of its type that are compared with a failed node, because a plan may have any number."""
+_OFFERS = ("retry", "fallback", "selector", "alternative")
+"""Parts of the names of expressions that try something else; as is one whose name begins with `try`."""
+_OFFERS_SQLITE = " OR ".join(
+    ["lower(substr(up.dtype, 1, 3)) = 'try'", *(f"instr(lower(up.dtype), '{each}') > 0" for each in _OFFERS)]
+)
+_OFFERS_POSTGRESQL = f"up.dtype ~* '^try|{'|'.join(_OFFERS)}'"
+_ABOUT_SQLITE = f"""coalesce(CASE WHEN instr(substr(up.parameters, 2), '{{') THEN (SELECT
+  group_concat(coalesce(json_extract(field.value, '$.object'), json_extract(field.value, '$.name')))
+  FROM {_FIELDS_SQLITE}) END,
+ CASE WHEN instr(up.parameters, '"object') THEN coalesce(json_extract(up.parameters, '$.object'),
+  json_extract(up.parameters, '$.object_'), json_extract(up.parameters, '$.object_name')) END,
+ CASE WHEN instr(up.parameters, '"time_ns"') THEN (
+  SELECT group_concat(part.fullkey || part.atom) FROM json_tree(up.parameters) AS part
+  WHERE part.atom IS NOT NULL AND part.key NOT IN ('arm', 'gripper', 'grasp', 'time_ns'))
+ ELSE json_remove(up.parameters, '$.arm', '$.gripper', '$.grasp') END, '')"""  # noqa: S608
+_ABOUT_POSTGRESQL = f"""coalesce(CASE WHEN strpos(substr(up.parameters, 2), '{{') > 0 THEN (
+  SELECT string_agg(coalesce(field.value ->> 'object', field.value ->> 'name'), ',') FROM {_FIELDS_POSTGRESQL}) END,
+ CASE WHEN strpos(up.parameters, '"object') > 0 THEN coalesce(CAST(up.parameters AS json) ->> 'object',
+  CAST(up.parameters AS json) ->> 'object_', CAST(up.parameters AS json) ->> 'object_name') END,
+ regexp_replace(up.parameters, '"(arm|gripper|grasp|time_ns)":("[^"]*"|[0-9-]+),?', '', 'g'), '')"""  # noqa: S608
+"""The objects of a node, or else its parameters without those by which a second try may differ."""
+_SUCCEEDED = TaskStatus.SUCCEEDED.name
+_FAILED_SQL = ", ".join(f"'{each}'" for each in _FAILED)
+_AGAIN = f"""up.status IN ({_FAILED_SQL}) AND up.kind <> 'language' AND EXISTS (SELECT 1 FROM (
+ SELECT later.id, later.parent_id, later.parameters FROM {{node}} AS later
+ WHERE later.{EPISODE} = {{node}}.{EPISODE} AND {{later_dtype}} = up.dtype AND later.status = '{_SUCCEEDED}'
+  AND later.id > {_FIRST_ID} + (CAST(up.end_sequence AS bigint) << {_SLOT_BITS}) AND later.id < (
+   SELECT CASE WHEN within.kind <> 'language' OR within.status NOT IN ({_FAILED_SQL})
+    THEN {_FIRST_ID} + (CAST(coalesce(within.end_sequence, {SEQUENCE_MAX}) AS bigint) << {_SLOT_BITS}) END
+   FROM {{node}} AS within WHERE within.id = up.parent_id AND within.{EPISODE} = {{node}}.{EPISODE})
+ ORDER BY later.id LIMIT {_LATER_MAX}) AS later
+ WHERE {{later_about}} = up.about AND up.parent_id IN (WITH RECURSIVE around(id, parent_id) AS (
+  SELECT later.id, later.parent_id UNION ALL SELECT above.id, above.parent_id FROM around {{around}})
+  SELECT around.parent_id FROM around))"""  # noqa: S608
+_UP = "id, parent_id, kind, dtype, status, parameters, end_sequence"
+_OUTCOME = f"""CASE WHEN {{node}}.status IN ({_FAILED_SQL}) THEN coalesce((
+ WITH RECURSIVE up({_UP}, depth) AS (
+  SELECT {", ".join(f"{{node}}.{each}" for each in _UP.split(", "))}, 0 UNION ALL
+  SELECT {", ".join(f"above.{each}" for each in _UP.split(", "))}, up.depth + 1 FROM up {{above}}
+  WHERE up.status <> '{_SUCCEEDED}')
+ SELECT judged.outcome FROM (SELECT up.depth, CASE
+   WHEN up.status = '{_SUCCEEDED}' AND up.kind <> 'language' THEN 'ignored'
+   WHEN up.status = '{_SUCCEEDED}' AND ({{offers}}) THEN '{RECOVERED}'
+   WHEN up.status = '{_SUCCEEDED}' THEN 'tolerated'
+   WHEN up.status = '{TaskStatus.RUNNING.name}' THEN 'open'
+   WHEN {_AGAIN} THEN '{RECOVERED}' END AS outcome FROM (SELECT up.*, {{about}} AS about FROM up) AS up) AS judged
+ WHERE judged.outcome IS NOT NULL ORDER BY judged.depth LIMIT 1), 'failed') END"""  # noqa: S608
+
+
+def outcome_of(nodes: Table) -> ColumnElement[str]:
+    """Return the outcome of a node that FAILED or ended in ERROR, one of `OUTCOMES`; null for any other node.
+
+    On PostgreSQL no index fits the expression of a later node's type, so that later nodes are read in their order by
+    id up to the limit. By the index on the type it would sort all of them for each failure.
+    """
+
+    def sql(above: str, about: str, offers: str, later_dtype: str) -> str:
+        joined = above.format(node=nodes.name)
+        later = {"later_about": about.replace("up.", "later."), "later_dtype": later_dtype}
+        ways = {"above": joined, "around": joined.replace("up.", "around."), "offers": offers}
+        return _OUTCOME.format(node=nodes.name, about=about, **later, **ways)
+
+    return sql_of(
+        Text(),
+        sql(_ABOVE_SQLITE, _ABOUT_SQLITE, _OFFERS_SQLITE, "later.dtype"),
+        sql(_ABOVE_POSTGRESQL, _ABOUT_POSTGRESQL, _OFFERS_POSTGRESQL, "later.dtype || ''"),
+    )
 
 
 # === spatial relation view ====================================================================================

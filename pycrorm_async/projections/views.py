@@ -59,6 +59,7 @@ from pycrorm_async.projections.derived_views import (
     absent,
     event_of,
     member,
+    outcome_of,
     pick_ups_with_context,
     root_failures,
     spatial_relations,
@@ -260,7 +261,8 @@ def _task_tree_node(tables: Tables) -> Select[Any]:
     nodes = tables["task_tree_node"]
     action_id = case((nodes.c.dtype.is_not(None), nodes.c.id), else_=null())
     columns = (each for each in columns_in_order(nodes) if each.key != "parameters")
-    return select(*columns, *_sequence(nodes), action_id.label("action_id"), *_end_and_durations(nodes))
+    outcome = outcome_of(nodes).label("outcome")
+    return select(*columns, *_sequence(nodes), action_id.label("action_id"), *_end_and_durations(nodes), outcome)
 
 
 def _sequence(rows: Table) -> tuple[ColumnElement[Any], ...]:

@@ -85,6 +85,10 @@ _STATEMENT = TypeVar("_STATEMENT", bound=Select[Any])
 _CHARACTERS = re.compile("[^\0\ud800-\udfff]*")
 
 FAILED = (TaskStatus.FAILED, TaskStatus.ERROR, TaskStatus.LOST)
+TRIED = (TaskStatus.SUCCEEDED, TaskStatus.FAILED, TaskStatus.ERROR)
+"""The statuses that count in a rate of success: what was cancelled, interrupted or lost is no evidence of either."""
+NORMAL_95 = 1.959964
+"""95 % of a normal distribution are within this many standard deviations."""
 
 
 def of_episode(column: Any, episode: EpisodeNumber) -> ColumnElement[bool]:
@@ -114,9 +118,19 @@ def times_with(condition: Any) -> ColumnElement[int]:
     return cast(func.coalesce(func.sum(case((condition, 1), else_=0)), 0), Integer)
 
 
-def share_succeeded(status: Any) -> ColumnElement[float]:
-    """Return the share of the rows of a group that succeeded."""
-    return cast(func.avg(case((status == TaskStatus.SUCCEEDED, 1.0), else_=0.0)), Double)
+def success_rate(status: Any, among: Any) -> tuple[ColumnElement[float], ...]:
+    """Return share, low and high: the share of successes in a group, and its 95 % interval by Wilson's score.
+
+    Only rows that fulfil `among` count; all three are null without one. `query.success.interval_95` computes the same.
+    """
+    tries = func.nullif(cast(times_with(among), Double), 0.0)
+    share = func.avg(case((status == TaskStatus.SUCCEEDED, 1.0), (among, 0.0)))
+    spread = NORMAL_95 * NORMAL_95 / tries
+    half = NORMAL_95 * func.sqrt(share * (1 - share) / tries + spread / (4 * tries))
+    low = case((share == 0, 0.0), else_=(share + spread / 2 - half) / (1 + spread))
+    high = case((share == 1, 1.0), else_=(share + spread / 2 + half) / (1 + spread))
+    rate = (("share", share), ("low", case((tries > 0, low))), ("high", case((tries > 0, high))))
+    return tuple(cast(value, Double).label(name) for name, value in rate)
 
 
 def containing(text: str, *columns: Any) -> ColumnElement[bool]:

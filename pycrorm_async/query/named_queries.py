@@ -72,6 +72,7 @@ class EpisodeSummary(NotebookValue):
         end_sequence: the sequence of its last event; None while it runs.
         nodes, failed: number of nodes in its task tree, the root included, and of those that FAILED, ended in ERROR or
             are LOST.
+        failed_actions: number of actions that FAILED or ended in ERROR.
         simulated: whether it is a simulation, performed in a copy of the world.
         thought_by: the node that performed this simulation, if recorded.
         continues: UUID of the episode that this one continues.
@@ -117,6 +118,14 @@ class EpisodeSummary(NotebookValue):
     digest: str | None = None
     tags: tuple[str, ...] = ()
     metadata: dict[str, Any] | None = None
+    failed_actions: int = field(default=0, compare=False)
+
+    @property
+    def status_text(self) -> str:
+        """The status, and of an episode that SUCCEEDED how many of its actions failed."""
+        if self.status != TaskStatus.SUCCEEDED.name or not self.failed_actions:
+            return self.status
+        return f"{self.status}, {self.failed_actions:,} action{'s' * (self.failed_actions > 1)} failed"
 
 
 @dataclass(frozen=True)
@@ -130,7 +139,8 @@ class NodeSummary:
         sequence, end_sequence: the events of its start and its end; `end_sequence` is None while it runs, and if it is
             LOST.
         parameters: as recorded, empty at the root; a reference to an object of the world also has the object's name.
-        reason, failure_message: the class and the text of the failure it ended with.
+        reason, failure_message: the reason and the text of the failure it ended with.
+        outcome: how the plan went on after it failed (`RootFailure.outcome`); None for a node that did not.
         thoughts: numbers of the simulations that it performed.
         observations: number of observations that a program made at it.
         considered, offered: number of places that location designators checked for it, and of those they offered.
@@ -158,6 +168,7 @@ class NodeSummary:
     offered: int = 0
     detected: int = 0
     start_ns: int = field(default=0, compare=False)
+    outcome: str | None = field(default=None, compare=False)
 
 
 _AT_ONCE = 500
@@ -187,7 +198,8 @@ async def _summaries(connection: AsyncConnection, numbers: Sequence[int]) -> lis
         tags.setdefault(number, []).append(tag)
     node = TaskTreeNode
     ended_badly = times_with(node.status.in_([TaskStatus.FAILED, TaskStatus.ERROR, TaskStatus.LOST]))
-    counted = select(node.process_metadata_id, func.count(), ended_badly).group_by(node.process_metadata_id)
+    raised = times_with(node.status.in_([TaskStatus.FAILED, TaskStatus.ERROR]) & (node.kind == "action"))
+    counted = select(node.process_metadata_id, func.count(), ended_badly, raised).group_by(node.process_metadata_id)
     counts = {row[0]: row[1:] for row in await connection.execute(counted.where(node.process_metadata_id.in_(numbers)))}
     return [
         EpisodeSummary(
@@ -199,8 +211,9 @@ async def _summaries(connection: AsyncConnection, numbers: Sequence[int]) -> lis
             status=row.status,
             description=row.description,
             created_by=row.created_by,
-            nodes=counts.get(row.id, (0, 0))[0],
-            failed=int(counts.get(row.id, (0, 0))[1]),
+            nodes=nodes,
+            failed=int(failed),
+            failed_actions=int(failed_actions),
             simulated=row.simulated,
             thought_by=simulating.get(row.id),
             continues=row.continues,
@@ -220,6 +233,7 @@ async def _summaries(connection: AsyncConnection, numbers: Sequence[int]) -> lis
             metadata=row.metadata,
         )
         for row in rows
+        for nodes, failed, failed_actions in [counts.get(row.id, (0, 0, 0))]
     ]
 
 
@@ -308,6 +322,7 @@ async def task_tree(connection: AsyncConnection, number: int) -> list[NodeSummar
                 started_at=row.start_time,
                 duration_ns=None if row.end_ns is None else row.end_ns - row.start_ns,
                 reason=row.reason,
+                outcome=row.outcome,
                 failure_message=row.failure_message,
                 simulated=row.simulated,
                 thoughts=tuple(simulations.get(row.id, ())),

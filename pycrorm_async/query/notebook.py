@@ -55,7 +55,7 @@ class Episodes(_Listing[EpisodeSummary]):
 
     def __repr__(self) -> str:
         lines = (
-            f"{each.number} {each.started_at:%Y-%m-%d %H:%M:%S} {each.status} {each.description}"
+            f"{each.number} {each.started_at:%Y-%m-%d %H:%M:%S} {each.status_text} {each.description}"
             f" ({each.nodes} nodes, {each.failed} failed)"
             for each in self
         )

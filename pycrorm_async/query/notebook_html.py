@@ -58,7 +58,7 @@ def _row(each: EpisodeSummary) -> tuple[str, ...]:
         str(each.number),
         moment(each.started_at),
         duration(each.duration_ns),
-        status(each.status),
+        f"{status(each.status)}{_failed_actions(each)}",
         f"{each.nodes:,}",
         f"{each.failed:,}" if each.failed else "",
         recorded(each.description, 100),
@@ -91,8 +91,12 @@ def episode_html(each: EpisodeSummary) -> str:
 
 
 def _title(each: EpisodeSummary) -> str:
-    simulated = f" {quiet('simulated')}" if each.simulated else ""
-    return f"<b>Episode {each.number} · {recorded(each.description)}</b> · {status(each.status)}{simulated}"
+    more = f"{_failed_actions(each)} {quiet('simulated')}" if each.simulated else _failed_actions(each)
+    return f"<b>Episode {each.number} · {recorded(each.description)}</b> · {status(each.status)}{more}"
+
+
+def _failed_actions(each: EpisodeSummary) -> str:
+    return quiet(each.status_text.removeprefix(each.status))
 
 
 def task_tree_html(nodes: Sequence[NodeSummary], episode: EpisodeSummary | None) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import datetime
 from functools import partial, wraps
 from inspect import signature
@@ -44,9 +44,11 @@ from pycrorm_async.orm import (
     TaskTreeNode,
 )
 from pycrorm_async.orm.base import same_row
+from pycrorm_async.projections.derived_views import OUTCOMES, RECOVERED
 from pycrorm_async.query import named_queries
 from pycrorm_async.query.frames import (
     FAILED,
+    TRIED,
     EpisodeNumber,
     check_texts,
     checked_count,
@@ -57,7 +59,7 @@ from pycrorm_async.query.frames import (
     limited,
     member_of,
     of_episode,
-    share_succeeded,
+    success_rate,
     times_with,
 )
 from pycrorm_async.query.question import CHECKED, AskedEpisode, QuestionPlan, classes_meant_by
@@ -95,9 +97,24 @@ def longest_actions(
     return limited(statement.order_by((node.end_ns - node.start_ns).desc(), node.id), limit)
 
 
-def durations(
-    episode: EpisodeNumber | None, dtype: str | None, kind: str, limit: int | None
+def success_rates(episode: EpisodeNumber | None, *, limit: int | None, **types: Any) -> Select[*tuple[Any, ...]]:
+    node = TaskTreeNode
+    episodes = func.count(node.process_metadata_id.distinct()).label("episodes")
+    statement = _by_type(episode, (*success_rate(node.status, node.status.in_(TRIED)), episodes), **types)
+    return limited(statement.order_by(func.count().desc(), node.dtype), limit)
+
+
+def durations(episode: EpisodeNumber | None, *, limit: int | None, **types: Any) -> Select[*tuple[Any, ...]]:
+    node = TaskTreeNode
+    sums: dict[str, Any] = {"total_s": func.sum, "mean_s": func.avg, "shortest_s": func.min, "longest_s": func.max}
+    statement = _by_type(episode, [each(node.duration).label(name) for name, each in sums.items()], **types)
+    return limited(statement.order_by(func.sum(node.duration).desc(), node.dtype), limit)
+
+
+def _by_type(
+    episode: EpisodeNumber | None, columns: Iterable[Any], *, dtype: str | None, kind: str
 ) -> Select[*tuple[Any, ...]]:
+    """Count the nodes of each type, with their successes and failures and further columns."""
     node = TaskTreeNode
     if kind not in ("action", "motion", "language"):
         raise CallerError(f"kind must be action, motion or language, got {kind!r}")
@@ -106,16 +123,13 @@ def durations(
         func.count().label("times"),
         times_with(node.status == TaskStatus.SUCCEEDED).label("succeeded"),
         times_with(node.status.in_(FAILED)).label("failed"),
-        func.sum(node.duration).label("total_s"),
-        func.avg(node.duration).label("mean_s"),
-        func.min(node.duration).label("shortest_s"),
-        func.max(node.duration).label("longest_s"),
+        *columns,
     ).where(node.kind == kind)
     if episode is not None:
         statement = statement.where(of_episode(node.process_metadata_id, episode))
     if dtype is not None:
         statement = statement.where(node.dtype == dtype)
-    return limited(statement.group_by(node.dtype).order_by(func.sum(node.duration).desc(), node.dtype), limit)
+    return statement.group_by(node.dtype)
 
 
 def arms_used(episode: EpisodeNumber | None, dtype: str | None, limit: int | None) -> Select[*tuple[Any, ...]]:
@@ -209,7 +223,7 @@ def experience_at(
             func.count().label("times"),
             times_with(node.status == TaskStatus.SUCCEEDED).label("succeeded"),
             times_with(node.status.in_(FAILED)).label("failed"),
-            share_succeeded(node.status).label("share"),
+            *success_rate(node.status, node.status.is_not(None)),
             func.avg(node.duration).label("mean_s"),
             func.max(node.start_time).label("last_time"),
         )
@@ -296,24 +310,28 @@ def root_failures(episode: EpisodeNumber | None, limit: int | None, **search: An
         failure.path,
         failure.start_time.label("time"),
         failure.id.label("node_id"),
+        failure.outcome,
     )
     # Not `order_by(failure.id)`, for which SQLite reads all nodes in order instead of the failed ones by an index.
     return limited(statement.where(*matching(episode, **search)).order_by(failure.id + 0), limit)
 
 
 def failures_by_cause(episode: EpisodeNumber | None, limit: int | None, **search: Any) -> Select[*tuple[Any, ...]]:
-    failure = RootFailure
-    causes = failure.reason, failure.dtype, failure.object
+    names = "reason dtype object process_metadata_id start_time message outcome".split()
+    chosen = select(*(getattr(RootFailure, each) for each in names)).where(*matching(episode, **search))
+    # With a limit no database replaces the columns by their expressions, and computes an outcome for each of them.
+    failed = chosen.limit(literal_column(str(2**62))).subquery("failed").c
+    causes = failed.reason, failed.dtype, failed.object
     statement = (
         select(
             *causes,
             func.count().label("times"),
-            times_with(failure.recovered).label("recovered"),
-            func.count(failure.process_metadata_id.distinct()).label("episodes"),
-            func.max(failure.start_time).label("last_time"),
-            func.min(failure.message).label("a_message"),
+            times_with(failed.outcome == RECOVERED).label(RECOVERED),
+            func.count(failed.process_metadata_id.distinct()).label("episodes"),
+            func.max(failed.start_time).label("last_time"),
+            func.min(failed.message).label("a_message"),
+            *(times_with(failed.outcome == each).label(each) for each in OUTCOMES if each != RECOVERED),
         )
-        .where(*matching(episode, **search))
         .group_by(*causes)
         .order_by(func.count().desc(), *causes)
     )
@@ -584,9 +602,10 @@ class Ask(Generic[Q]):
     the node started or the change happened, in UTC.
 
     An empty answer to a question about a name that is nowhere in the memory, such as `object="mlik"`, is a warning with
-    the nearest name that is. Without `episode`, `longest_actions`, `durations`, `arms_used`, `successful_pick_ups`,
-    `experience_at` and `episodes` read all nodes, pick-ups or episodes of the memory, because they are about all of
-    them; the others find what they are about by an index, but that names of objects are compared one by one.
+    the nearest name that is. Without `episode`, `success_rates`, `longest_actions`, `durations`, `arms_used`,
+    `successful_pick_ups`, `experience_at` and `episodes` read all nodes, pick-ups or episodes of the memory, because
+    they are about all of them; the others find what they are about by an index, but that names of objects are compared
+    one by one.
     """
 
     def __init__(self, make: Callable[[QuestionPlan], Q]) -> None:
@@ -612,6 +631,8 @@ class Ask(Generic[Q]):
     ) -> Q:
         """List the nodes at which failures began.
 
+        `outcome` says how the plan went on: recovered, tolerated, ignored, failed or open (`RootFailure.outcome`).
+
         Args:
             episode: only of this episode.
             object: its name, or a part of it.
@@ -619,7 +640,7 @@ class Ask(Generic[Q]):
             reason: the class of the failure or a part of it, or words for it: `unreachable` also finds `IKError`.
             message: a part of the message.
             text: words that are all in the object, arm, type, message or reason, as in `milk unreachable`.
-            recovered: whether a node around it succeeded all the same.
+            recovered: whether the same was tried again and succeeded, or an alternative did.
             limit: of rows.
         """
         search = _search(object, arm, reason, message, text, recovered)
@@ -639,7 +660,8 @@ class Ask(Generic[Q]):
     ) -> Q:
         """Count failures by reason, type of the failed node and object, the most frequent first.
 
-        The arguments are those of `root_failures`. A failure counts once, where it began.
+        The arguments are those of `root_failures`. A failure counts once, where it began, and in the column of its
+        outcome.
         """
         search = _search(object, arm, reason, message, text, recovered)
         return self._ask("failures_by_cause", episode, partial(failures_by_cause, limit=limit, **search))
@@ -666,6 +688,20 @@ class Ask(Generic[Q]):
         return self._ask("steps_before_failures", episode, make)
 
     # --- actions ----------------------------------------------------------------------------------------------
+
+    def success_rates(
+        self,
+        *,
+        episode: AskedEpisode | None = None,
+        dtype: str | None = None,
+        kind: Literal["action", "motion", "language"] = "action",
+        limit: int | None = None,
+    ) -> Q:
+        """Count successes and failures of each type, with the share of successes and its 95 % interval, low to high.
+
+        A share counts what succeeded, failed or ended in an error; not what was cancelled, interrupted or lost.
+        """
+        return self._ask("success_rates", episode, partial(success_rates, dtype=dtype, kind=kind, limit=limit))
 
     def longest_actions(
         self,

@@ -20,7 +20,7 @@ from pycrorm_async import orm
 from pycrorm_async.errors import CallerError, MissingExtra
 from pycrorm_async.orm.base import EPISODE
 from pycrorm_async.orm.documentation import unit_of
-from pycrorm_async.query.frames import FrameColumn, columns_of
+from pycrorm_async.query.frames import NORMAL_95, FrameColumn, columns_of
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.text import nearest, one_line
 from pycrorm_async.task_status import TaskStatus
@@ -150,6 +150,8 @@ def _text(cell: Cell, cells_drawn: int) -> str:
     if cells_drawn <= _CELLS_WITH_INTERVAL:
         low, high = cell.interval
         return f"{rate}\n{100 * low:.0f} to {100 * high:.0f} %\nn = {cell.rows:,}"
+    if cell.rows < _FEW and cells_drawn <= _CELLS_WITH_RATE:  # a rate would need its interval
+        return f"{cell.succeeded}/{cell.rows}"
     if cells_drawn <= _CELLS_WITH_COUNT:
         return f"{rate}\n{cell.rows:,}"
     return f"{100 * cell.rate:.0f}" if cells_drawn <= _CELLS_WITH_RATE else ""
@@ -171,16 +173,19 @@ def _plain(text: str) -> str:
 def _draw_points(axes: Axes, samples: Samples) -> None:
     x, y = _places(samples.x, seed=0), _places(samples.y, seed=1)
     faint = max(0.15, min(0.9, 60 / len(x) ** 0.6))
+    # A success is a ring around the cross of a failure at the same place, so that neither hides the other.
     for succeeded, marker, color, label in ((False, "x", _ORANGE, "did not succeed"), (True, "o", _BLUE, "succeeded")):
         chosen = samples.succeeded == succeeded
         axes.scatter(
             x[chosen],
             y[chosen],
-            s=22,
+            s=48 if succeeded else 22,
             marker=marker,
-            c=color,
+            facecolors="none" if succeeded else color,
+            edgecolors=color if succeeded else None,
             alpha=faint,
-            linewidths=1,
+            linewidths=1.5,
+            zorder=2 if succeeded else 3,
             rasterized=len(x) > 5_000,  # an SVG of 50,000 points has 10 MB
             label=f"{label}: {int(chosen.sum()):,}",
         )
@@ -204,9 +209,6 @@ def _places(values: Values, *, seed: int) -> NDArray[Any]:
 #
 # Compute the 95 % interval of a success rate.
 
-_Z = 1.959964
-"""95 % of a normal distribution are within this many standard deviations."""
-
 
 def interval_95(successes: int, tries: int) -> tuple[float, float]:
     """Return the interval by Wilson's score, which also holds for few tries and for rates near 0 and 1.
@@ -218,9 +220,9 @@ def interval_95(successes: int, tries: int) -> tuple[float, float]:
     """
     if not tries:
         return 0.0, 1.0
-    rate, spread = successes / tries, _Z * _Z / tries
+    rate, spread = successes / tries, NORMAL_95**2 / tries
     middle = (rate + spread / 2) / (1 + spread)
-    half = _Z * math.sqrt(rate * (1 - rate) / tries + spread / (4 * tries)) / (1 + spread)
+    half = NORMAL_95 * math.sqrt(rate * (1 - rate) / tries + spread / (4 * tries)) / (1 + spread)
     return max(0.0, middle - half), min(1.0, middle + half)
 
 

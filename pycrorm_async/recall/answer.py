@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.ids import SEQUENCE_MAX, row_id
+from pycrorm_async.query.frames import TRIED
 from pycrorm_async.query.notebook_html import cases_html
 from pycrorm_async.query.snapshot import Moment
 from pycrorm_async.query.success import interval_95
@@ -30,9 +31,6 @@ from pycrorm_async.recall.blocks import EPISODE_SHIFT, CaseLibrary, Group
 from pycrorm_async.recall.columns import Case, Mask, is_angle, joined_words
 from pycrorm_async.recall.search import Cue, Match, Weights, closest, search, weights_of
 from pycrorm_async.visible_text import visible
-
-_TRIED = ("SUCCEEDED", "FAILED", "ERROR")
-"""The statuses of an action that ran to its end; a cancelled, interrupted or lost one is no evidence of success."""
 
 
 class Rate(NamedTuple):
@@ -89,12 +87,13 @@ class Typical(NamedTuple):
 
 
 class Surroundings(Protocol):
-    """Protocol that finds the neighbours of a case in its episode, and the state of the memory when it started."""
+    """Protocol that finds the neighbours of a case, the state of the memory when it started, and failures' outcomes."""
 
     async def next(self, case: Case) -> Case | None: ...
     async def previous(self, case: Case) -> Case | None: ...
     async def parent(self, case: Case) -> Case | None: ...
     async def moment(self, case: Case) -> Moment: ...
+    async def outcomes(self, nodes: Sequence[int]) -> Mapping[int, str]: ...
 
 
 @dataclass(frozen=True)
@@ -177,6 +176,10 @@ class RecalledCase:
         """Return the task tree and the world as they were when it started."""
         return await self._memory.moment(self.case)
 
+    async def outcome(self) -> str | None:
+        """Return how the plan went on after it failed, as `RootFailure.outcome`; None for a case that did not fail."""
+        return (await self._memory.outcomes([self.node])).get(self.node)
+
     @property
     def _memory(self) -> Surroundings:
         if self.memory is None:
@@ -241,8 +244,19 @@ class Answer(Sequence[RecalledCase]):
     @property
     def reasons(self) -> list[tuple[str, int]]:
         """The reasons of the failures among the cases, the commonest first, with their numbers."""
-        counts = Counter(each.case.reason for each in self.cases if each.case.reason)
-        return sorted(counts.items(), key=lambda item: (-item[1], item[0]))
+        return _commonest(each.case.reason for each in self._failed() if each.case.reason)
+
+    async def outcomes(self) -> list[tuple[str, int]]:
+        """Return how plans went on after the failures among the cases, the commonest first, with their numbers.
+
+        See `RootFailure.outcome`.
+        """
+        failed = self._failed()
+        memory = failed[0].memory if failed else None
+        return _commonest((await memory.outcomes([each.node for each in failed])).values()) if memory else []
+
+    def _failed(self) -> list[RecalledCase]:
+        return [each for each in self.cases if each.status in ("FAILED", "ERROR")]
 
     def typical(self, feature: str, *, status: str | None = None) -> Typical | None:
         """Summarise one feature over the cases, each weighted by its score (blending, in the terms of ACT-R).
@@ -332,6 +346,10 @@ def _notes(cue: Cue, library: CaseLibrary) -> Iterator[str]:
             yield f"out of range: {each.feature} {each.value:.4g}; seen are {seen[0]:.4g} to {seen[1]:.4g}"
 
 
+def _commonest(words: Iterable[str]) -> list[tuple[str, int]]:
+    return sorted(Counter(words).items(), key=lambda item: (-item[1], item[0]))
+
+
 def compare(cue: Cue, case: Case, weights: Weights) -> tuple[Compared, ...]:
     """Return each feature of the cue beside that of a case."""
     whole = weights.total
@@ -361,7 +379,7 @@ def success_of(cases: Iterable[Case]) -> Rate | None:
 
 def rate_of(statuses: Mapping[str, int]) -> Rate | None:
     """Return the success rate from the number of cases with each status; None if none ran to its end."""
-    tries, successes = sum(statuses.get(each, 0) for each in _TRIED), statuses.get("SUCCEEDED", 0)
+    tries, successes = sum(statuses.get(each.name, 0) for each in TRIED), statuses.get("SUCCEEDED", 0)
     if not tries:
         return None
     share = successes / tries

@@ -35,7 +35,7 @@ from pycrorm_async.errors import (
 from pycrorm_async.events.codec import encode
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, EpisodeId, episode_text, parse_episode_id, row_id, row_key
 from pycrorm_async.events.types import DesignatorTypeDeclared, EpisodeEnded, ObjectReference, RobotValue
-from pycrorm_async.orm import EpisodeRobot, EpisodeTag
+from pycrorm_async.orm import EpisodeRobot, EpisodeTag, TaskTreeNode
 from pycrorm_async.plan.language import Designator
 from pycrorm_async.plan.objects import ObjectDesignator
 from pycrorm_async.projections.fold import WorldFold, WorldObject
@@ -276,6 +276,15 @@ class Recall:
         """Return the task tree and the world as they were when an action started; see `Reading.as_of`."""
         action = await self.case(case)
         return await self._reading.as_of(action.episode, sequence=action.sequence)
+
+    async def outcomes(self, nodes: Sequence[int]) -> dict[int, str]:
+        """Return how plans went on after those of these nodes that failed, by node id; see `RootFailure.outcome`.
+
+        Leaves out a node that is not in the tables yet.
+        """
+        failed = TaskTreeNode.id.in_(nodes), TaskTreeNode.status.in_((TaskStatus.FAILED, TaskStatus.ERROR))
+        rows = await self._reading.rows(select(TaskTreeNode.id, TaskTreeNode.outcome).where(*failed), simulated=True)
+        return {each.id: each.outcome for each in rows}
 
     async def follows(
         self,

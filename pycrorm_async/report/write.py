@@ -25,7 +25,6 @@ from urllib.parse import quote
 import msgspec
 import numpy as np
 from sqlalchemy import func, select
-from sqlalchemy.orm import aliased
 
 from pycrorm_async.errors import (
     CallerError,
@@ -37,7 +36,8 @@ from pycrorm_async.errors import (
     TablesOutdated,
 )
 from pycrorm_async.events.ids import SLOT_NODE, row_id
-from pycrorm_async.orm import TaskTreeNode
+from pycrorm_async.orm import RootFailure, TaskTreeNode
+from pycrorm_async.query.frames import TRIED, times_with
 from pycrorm_async.query.named_queries import EpisodeChoice, EpisodeSummary
 from pycrorm_async.query.question import absence_of_episodes
 from pycrorm_async.query.reading import Reading
@@ -117,6 +117,7 @@ async def _report(
         refuse_existing(Path(path), force=force)
     name = str(episode.number if isinstance(episode, EpisodeSummary) else episode)
     document = await episode_document(reading, name, first=first, last=last)
+    document["outcomes"] = await outcomes_of(reading, document["episode"]["number"])
     document["similar"] = await similar.document(document["episode"]["number"], document["nodes"][0])
     file = Path(path) if path is not None else Path(page_name(document["episode"]["number"]))
     await asyncio.to_thread(lambda: write_page(page_of(document), file, force=force))
@@ -297,9 +298,10 @@ _EPISODES_MAX = 20_000
 """Bounds the episodes of an overview: it then has about 5 MB."""
 _DESCRIPTION_MAX = 200
 """Bounds the characters of a description in the table."""
+NO_REASON: Final = "no reason"
+"""The name under which failures without a reason are counted."""
 _REASON_MAX = 500
 """Bounds the characters of the reason for which an episode cannot be read."""
-_FAILED = (TaskStatus.FAILED, TaskStatus.ERROR)
 
 
 async def newest_episodes(reading: Reading, choice: EpisodeChoice | None = None) -> tuple[list[EpisodeSummary], int]:
@@ -320,7 +322,7 @@ async def overview_document(
 
     `pages` are the addresses of their pages, `unreadable` the reasons why others have none, both by number.
     """
-    reasons = await _reasons(reading)
+    failures, actions = await failures_by_reason(reading), await _actions(reading)
     return {
         "title": title,
         "total": total,
@@ -334,7 +336,10 @@ async def overview_document(
                 "seconds": None if each.duration_ns is None else round(each.duration_ns / 1e9, 6),
                 "nodes": each.nodes,
                 "failed": each.failed,
-                "reasons": reasons.get(each.number, {}),
+                "failed_actions": each.failed_actions,
+                "actions": actions.get(each.number, {}),
+                "reasons": {name: sum(each.values()) for name, each in failures.get(each.number, {}).items()},
+                "outcomes": failures.get(each.number, {}),
                 "page": pages.get(each.number),
                 "unreadable": unreadable.get(each.number, "")[:_REASON_MAX],
             }
@@ -343,18 +348,39 @@ async def overview_document(
     }
 
 
-async def _reasons(reading: Reading) -> dict[int, dict[str, int]]:
-    """Count the root failures of each episode by reason: failed nodes below which no node failed."""
-    below = aliased(TaskTreeNode)
-    episode, reason = TaskTreeNode.process_metadata_id, TaskTreeNode.reason
-    of_node = below.parent_id == TaskTreeNode.id, below.process_metadata_id == episode
-    caused = select(below.id).where(*of_node, below.status.in_(_FAILED)).exists()
-    counts: dict[int, dict[str, int]] = {}
-    query = select(episode, reason, func.count()).where(TaskTreeNode.status.in_(_FAILED), ~caused)
-    async with reading.session() as session:
-        for number, name, count in await session.execute(query.group_by(episode, reason)):
-            counts.setdefault(number, {})[name or "no reason"] = count
+async def failures_by_reason(
+    reading: Reading, numbers: Collection[int] | None = None
+) -> dict[int, dict[str, dict[str, int]]]:
+    """Count root failures, of all episodes or of those with these numbers, by episode, reason and outcome."""
+    columns = RootFailure.process_metadata_id, RootFailure.reason, RootFailure.outcome
+    query = select(*columns, func.count()).group_by(*columns)
+    if numbers is not None:
+        query = query.where(RootFailure.process_metadata_id.in_(numbers))
+    counts: dict[int, dict[str, dict[str, int]]] = {}
+    for number, reason, outcome, count in await reading.rows(query):
+        counts.setdefault(number, {}).setdefault(reason or NO_REASON, {})[outcome] = count
     return counts
+
+
+async def outcomes_of(reading: Reading, number: int) -> dict[str, str]:
+    """Return the outcomes of an episode's root failures by the event of the node's start, as far as it is folded."""
+    query = select(RootFailure.sequence, RootFailure.outcome).where(RootFailure.process_metadata_id == number)
+    try:
+        rows = await reading.rows(query, simulated=True)
+    except (DatabaseUnavailable, TablesOutdated):  # the page shows the events alone
+        return {}
+    return {str(row.sequence): row.outcome for row in rows}
+
+
+async def _actions(reading: Reading) -> dict[int, dict[str, list[int]]]:
+    """Count successes and tries of the actions of each episode, by type."""
+    node = TaskTreeNode
+    counted = times_with(node.status == TaskStatus.SUCCEEDED), times_with(node.status.in_(TRIED))
+    query = select(node.process_metadata_id, node.dtype, *counted).where(node.kind == "action")
+    actions: dict[int, dict[str, list[int]]] = {}
+    for number, dtype, *counts in await reading.rows(query.group_by(node.process_metadata_id, node.dtype)):
+        actions.setdefault(number, {})[dtype] = counts
+    return actions
 
 
 # === similar cases ============================================================================================

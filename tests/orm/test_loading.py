@@ -165,8 +165,9 @@ CLASSES = [
     for each in sorted(Base.registry.mappers, key=str)
     if each.class_.__module__.startswith("pycrorm_async.orm")
 ]
-ON_REQUEST = {"children", "ancestors", "node", "parameters", "refusals", "description", "robots"}
+ON_REQUEST = {"children", "ancestors", "node", "parameters", "refusals", "description", "robots", "outcome"}
 ON_REQUEST_OF_PICK_UPS = {"object_z", "object_qx", "object_qy", "object_qz", "object_qw", "height_over_torso"}
+ON_REQUEST_OF_PICK_UPS |= {f"robot_in_{name}" for name in ON_REQUEST_OF_PICK_UPS if name != "height_over_torso"}
 ON_REQUEST_OF_PICK_UPS |= {"policy", "robot", "scene"}
 
 
@@ -256,7 +257,8 @@ async def test_attributes_on_request_are_loaded_as_the_error_advises(
             (Action, "parameters", undefer(Action.parameters)),
             (ProcessMetaData, "robots", selectinload(ProcessMetaData.robots)),
             (LocationResolution, "refusals", selectinload(LocationResolution.refusals)),
-            (PickUpWithContextView, "object_z", undefer(PickUpWithContextView.object_z)),
+            (TaskTreeNode, "outcome", undefer(TaskTreeNode.outcome)),
+            (PickUpWithContextView, "robot_in_object_z", undefer(PickUpWithContextView.robot_in_object_z)),
         ]
         for class_, name, option in cases:
             async with memory.session() as session:

@@ -84,6 +84,7 @@ async def test_the_pick_up_view_has_the_columns_of_the_thesis_and_the_pose_at_ex
             "quaternion_z", "quaternion_w", "obj_type", "status", "process_metadata_id", "node_id",
             "object_x", "object_y", "object_z", "object_qx", "object_qy", "object_qz", "object_qw",
             "height_over_torso", "robot", "description", "scene", "policy", "sequence",
+            *(f"robot_in_object_{each}" for each in ("x", "y", "z", "qx", "qy", "qz", "qw")),
         ]  # fmt: skip
         assert [tuple(each)[:14] for each in answer] == [
             (row(2), "LEFT", "TOP", 0.3, -0.75, 0.5, 0.0, 0.0, 0.6, 0.8, "MILK", "FAILED", 1, row(2)),
@@ -166,10 +167,20 @@ async def test_the_pick_up_view_has_the_robots_position_in_the_frame_of_the_obje
     async with AsyncSession(log.engine) as session:
         (seen,) = await session.execute(
             select(
-                view.object_x, view.object_y, view.object_z,
-                view.object_qx, view.object_qy, view.object_qz, view.object_qw,
+                view.robot_in_object_x, view.robot_in_object_y, view.robot_in_object_z,
+                view.robot_in_object_qx, view.robot_in_object_qy, view.robot_in_object_qz, view.robot_in_object_qw,
             )
         )  # fmt: skip
+        former = (
+            view.object_x,
+            view.object_y,
+            view.object_z,
+            view.object_qx,
+            view.object_qy,
+            view.object_qz,
+            view.object_qw,
+        )
+        assert (await session.execute(select(*former))).one() == seen
     object_rotation = turn(axis, angle)
     np.testing.assert_allclose(seen[:3], object_rotation.T @ (stand - object_position), atol=1e-12)
     # The robot's heading as a direction, which the quaternion rotates into the object's frame.

@@ -196,8 +196,40 @@ class Node:
         return None
 
     @property
+    def subject(self) -> tuple[Any, ...]:
+        """The object, or else the parameters by which a second try is the same."""
+        parameters = self.started.parameters
+        if "object_designator" in parameters:
+            return ("object", parameters["object_designator"].object)
+        places = (
+            msgspec.structs.replace(each, time_ns=0) for each in parameters.values() if isinstance(each, PoseValue)
+        )
+        return (*places, parameters.get("text"))
+
+    def down(self) -> Iterator[Node]:
+        yield self
+        for each in self.children:
+            yield from each.down()
+
+    @property
+    def outcome(self) -> str:
+        for node in self.up():
+            if node.status == "SUCCEEDED":
+                return "ignored"
+            if node.status == "RUNNING":
+                return "open"
+            others = node.parent.down() if node.is_failed and node.parent is not None else ()
+            if any(each.repeats(node) for each in others):
+                return "recovered"
+        return "failed"
+
+    def repeats(self, failed: Node) -> bool:
+        is_later = failed.end is not None and self.sequence > failed.end
+        return is_later and self.status == "SUCCEEDED" and (self.dtype, self.subject) == (failed.dtype, failed.subject)
+
+    @property
     def recovered(self) -> bool:
-        return any(each.status == "SUCCEEDED" for each in self.up())
+        return self.outcome == "recovered"
 
 
 def nodes_of(episodes: Iterable[RandomEpisode]) -> list[Node]:

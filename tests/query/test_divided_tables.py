@@ -259,7 +259,7 @@ ROLLOUTS = rollouts_question(scene="kitchen", seed=69)
 ROUNDS = episodes_question(scene="kitchen", seeds=[69], policies=["seen"])
 QUESTIONS = [
     *((name, ()) for name in ("root_failures", "failures_by_cause", "steps_before_failures", "longest_actions")),
-    *((name, ()) for name in ("durations", "arms_used", "successful_pick_ups")),
+    *((name, ()) for name in ("success_rates", "durations", "arms_used", "successful_pick_ups")),
     *((name, ("milk",)) for name in ("object_history", "moves_of")),
 ]
 

@@ -58,7 +58,7 @@ def rollouts(request: pytest.FixtureRequest, server: Server, tmp_path_factory: p
     server.drop(url)
 
 
-WHOLE_MEMORY = "longest_actions durations arms_used successful_pick_ups experience_at episodes".split()
+WHOLE_MEMORY = "success_rates longest_actions durations arms_used successful_pick_ups experience_at episodes".split()
 """The questions that without an episode read all nodes, pick-ups or episodes, because they are about all of them."""
 
 
@@ -88,7 +88,7 @@ def test_a_question_reads_no_table_of_nodes_or_poses_as_a_whole(database_url: st
             return [{name: each.sql for name, each in {**about_all, **about_one}.items()}]
 
     [statements] = run_in_own_loop(asked())
-    assert len(statements) == 5 + 9
+    assert len(statements) == 5 + 10
     explain = "EXPLAIN" if on_server else "EXPLAIN QUERY PLAN"
     plans = dict(zip(statements, ask_each(url, [f"{explain} {each}" for each in statements.values()]), strict=True))
     scans = {name: [step for *_, step in plan if _WHOLE_TABLE.search(step)] for name, plan in plans.items()}

@@ -207,13 +207,13 @@ async def test_a_frame_of_the_view_has_its_columns_and_names_of_enum_members(rea
     assert list(frame.columns) == [
         "id", "arm", "grasp", "torso_height", "relative_x", "relative_y", "quaternion_x", "quaternion_y",
         "quaternion_z", "quaternion_w", "obj_type", "status", "process_metadata_id", "node_id",
-        "object_x", "object_y", "sequence",
+        "object_x", "object_y", "robot_in_object_x", "robot_in_object_y", "sequence",
     ]  # fmt: skip
     assert frame.to_dict("records")[0] == {
         "id": row(6), "arm": "LEFT", "grasp": "TOP", "torso_height": 0.25, "relative_x": -0.5, "relative_y": -2.0,
         "quaternion_x": 0.0, "quaternion_y": 0.0, "quaternion_z": 0.0, "quaternion_w": 1.0, "obj_type": "MILK",
         "status": "FAILED", "process_metadata_id": 1, "node_id": row(6),
-        "object_x": -0.5, "object_y": -2.0, "sequence": 6,
+        "object_x": -0.5, "object_y": -2.0, "robot_in_object_x": -0.5, "robot_in_object_y": -2.0, "sequence": 6,
     }  # fmt: skip
     assert len(frame) == 2
 
@@ -459,6 +459,7 @@ async def test_columns_on_request_are_in_a_frame_that_asks_for_them(reading: Rea
     columns = [*(await reading.dataframe(select(view))).columns]
     whole = await reading.dataframe(select(view).order_by(view.id), deferred=True)
     more = ["object_z", "object_qx", "object_qy", "object_qz", "object_qw", "height_over_torso", "robot"]
+    more += [f"robot_in_{each}" for each in more[:5]]
     assert sorted(whole.columns) == sorted([*columns, *more, "description", "scene", "policy"])
     assert whole.description.tolist() == ["episode 1", "episode 2"]
     action = await reading.dataframe(select(NavigateAction), deferred=True)

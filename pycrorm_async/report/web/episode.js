@@ -93,6 +93,7 @@ export class Episode {
     append(this.texts, part.texts);
     Object.assign(this.models, part.models);
     this.#extendNodes(part);
+    this.judge(part.outcomes ?? {});
     for (const each of part.objects) this.#extendObject(each);
     this.#extendAttachments(part.attachments);
     for (const each of LISTS) append(this[each], part[each]);
@@ -132,6 +133,13 @@ export class Episode {
     for (const failure of this.rootFailures) {
       failure.isRootFailure = true;
       for (let each = failure; each !== null && !each.holdsFailure; each = each.parent) each.holdsFailure = true;
+    }
+  }
+
+  /** Take in how the plan went on after failures: outcomes by the event of the failed node's start. */
+  judge(outcomes) {
+    for (const [start, outcome] of Object.entries(outcomes)) {
+      this.nodeAt.get(Number(start))?.judge(outcome);
     }
   }
 
@@ -211,6 +219,8 @@ export class Episode {
 }
 
 export class Node {
+  #outcome = null; // a part of the document has none, because the tables decide it
+
   constructor(episode, start, parent, kind, type) {
     Object.assign(this, { episode, start, parent, kind, type, children: [], isRootFailure: false, holdsFailure: false });
     this.depth = parent === null ? 0 : parent.depth + 1;
@@ -222,6 +232,15 @@ export class Node {
     Object.assign(this, { end, status, reason, message });
   }
 
+  judge(outcome) {
+    this.#outcome = outcome;
+  }
+
+  /** How the plan went on after the node had failed; null as long as it is not decided. */
+  get outcome() {
+    return this.#outcome === "open" ? null : this.#outcome;
+  }
+
   get failed() {
     return FAILED.has(this.status) || this.status === "LOST";
   }
@@ -230,6 +249,13 @@ export class Node {
   get lastEvent() {
     return this.end || this.episode.last;
   }
+}
+
+/** How often a plan went on in each way after failures, as `recovered 2, ignored 1`; of those that are decided. */
+export function outcomesText(failures) {
+  const counts = new Map();
+  for (const { outcome } of failures) if (outcome) counts.set(outcome, (counts.get(outcome) ?? 0) + 1);
+  return [...counts].sort(([, one], [, other]) => other - one).map(([outcome, count]) => `${count} ${outcome}`).join(", ");
 }
 
 /** Failures by reason, the most frequent first, and in each the messages that differ in more than their numbers. */

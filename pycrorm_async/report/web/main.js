@@ -61,7 +61,9 @@ class Page {
 
   #head() {
     const { episode } = this;
-    part("status").textContent = `${signOf(episode.status)} ${episode.status}`;
+    const failures = episode.nodes.filter((each) => each.kind === "action" && (each.status === "FAILED" || each.status === "ERROR")).length;
+    const all = episode.status !== "SUCCEEDED" || failures === 0 ? "" : `, ${failures} action${failures === 1 ? "" : "s"} failed`;
+    part("status").textContent = `${signOf(episode.status)} ${episode.status}${all}`;
     part("status").className = `badge is-${episode.status.toLowerCase()}`;
     const failed = episode.failedCount;
     const roots = episode.rootFailures.length;

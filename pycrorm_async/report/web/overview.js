@@ -2,19 +2,25 @@
 
 import { duration, element, recorded, replaceIn, svg } from "./dom.js";
 import { signOf } from "./episode.js";
-import { successMap } from "./success.js";
+import { interval95, rateText, successMap } from "./success.js";
 
 const BINS_MAX = 12;
 const REASONS_MAX = 20;
+const ACTIONS_MAX = 20;
 const ROWS_MAX = 2000;
 
 const part = (name) => document.getElementById(name);
 const ended = (episodes) => episodes.filter((each) => each.status !== "RUNNING");
-const rateOf = (episodes) => {
-  const all = ended(episodes);
-  return all.length === 0 ? null : all.filter((each) => each.status === "SUCCEEDED").length / all.length;
-};
+const succeeded = (episodes) => ended(episodes).filter((each) => each.status === "SUCCEEDED").length;
+const rateOf = (episodes) => (ended(episodes).length === 0 ? null : succeeded(episodes) / ended(episodes).length);
 const percent = (rate) => `${(rate * 100).toFixed(0)} %`;
+
+/** Add up counts by name, the greatest first. */
+function sumsOf(maps) {
+  const sums = new Map();
+  for (const map of maps) for (const [name, count] of Object.entries(map)) sums.set(name, (sums.get(name) ?? 0) + count);
+  return [...sums].sort(([, one], [, other]) => other - one);
+}
 
 function median(numbers) {
   const sorted = numbers.filter((each) => each !== null).sort((one, other) => one - other);
@@ -28,8 +34,8 @@ function binsOf(episodes) {
   return Array.from({ length: count }, (_, index) => episodes.slice(edge(index), edge(index + 1)));
 }
 
-/** Bars from 0 to `most`, each with the text of its value below it. */
-function bars(values, most, label, textOf) {
+/** Bars from 0 to `most`, each with the text of its value below it; a rate of [good, tries] has its interval. */
+function bars(values, most, label, textOf, rates = []) {
   const [wide, high] = [40, 60];
   const picture = svg("svg", { viewBox: `0 0 ${values.length * wide} ${high + 16}`, class: "bars", role: "img", "aria-label": label });
   values.forEach((value, index) => {
@@ -38,6 +44,11 @@ function bars(values, most, label, textOf) {
     const text = svg("text", { x: index * wide + wide / 2, y: high + 12, "text-anchor": "middle", "font-size": 11 });
     text.textContent = value === null ? "–" : textOf(value);
     picture.append(text);
+    if (rates[index]?.[1] > 0) {
+      const [low, up] = interval95(...rates[index]).map((each) => high - each * high);
+      const middle = index * wide + wide / 2;
+      picture.append(svg("line", { x1: middle, x2: middle, y1: low, y2: up, class: "interval" }, svg("title", {}, rateText(...rates[index]))));
+    }
   });
   return picture;
 }
@@ -47,13 +58,19 @@ function mapsOf(of, tables) {
   const { succeeded, rows } = tables[0];
   const name = of === "PickUpWithContextView" ? "Pick-ups" : of;
   const axes = tables.map(({ x, y }) => `${x.name} and ${y.name}`).join(", and by ");
-  const title = element("h2", {}, recorded(name), `: ${percent(succeeded / rows)} of ${rows} succeeded`);
+  const title = element("h2", {}, recorded(name), `: ${rateText(succeeded, rows)} succeeded`);
   const note = element("p", { class: "quiet" }, "The share of successes in per cent, by ", recorded(axes), ".");
   return [title, note, element("div", { class: "maps" }, ...tables.map(successMap))];
 }
 
 /** Says why an episode has no page. */
 const unreadable = (reason) => element("p", { class: "reason" }, "✗ No page: ", recorded(reason));
+
+/** How many actions failed in an episode that succeeded. */
+function failedActions({ status, failed_actions: failed = 0 }) {
+  if (status !== "SUCCEEDED" || failed === 0) return null;
+  return element("span", { class: "quiet" }, `, ${failed} action${failed === 1 ? "" : "s"} failed`);
+}
 
 class Overview {
   constructor({ title, total, episodes, successes = [] }) {
@@ -80,7 +97,7 @@ class Overview {
     const middle = median(episodes.map((each) => each.seconds));
     const facts = [
       `${episodes.length} episode${episodes.length === 1 ? "" : "s"}`,
-      ended(episodes).length > 0 ? `${percent(rateOf(episodes))} succeeded` : null,
+      ended(episodes).length > 0 ? `${rateText(succeeded(episodes), ended(episodes).length)} succeeded` : null,
       middle === null ? null : `median ${duration(middle)}`,
       total > episodes.length ? `the newest of ${total}` : null,
     ];
@@ -88,6 +105,7 @@ class Overview {
     this.bins = binsOf(episodes);
     this.#running();
     this.#trend();
+    this.#actions();
     this.#reasons();
     this.#table();
   }
@@ -115,20 +133,33 @@ class Overview {
   #trend() {
     const rates = this.bins.map(rateOf);
     if (rates.length < 2 || rates.every((each) => each === null)) return part("trend").replaceChildren();
-    const picture = bars(rates, 1, "share of successful episodes, the oldest first", percent);
+    const counts = this.bins.map((bin) => [succeeded(bin), ended(bin).length]);
+    const picture = bars(rates, 1, "share of successful episodes, the oldest first", percent, counts);
     return part("trend").replaceChildren(element("h2", {}, "Success, the oldest episodes first"), picture);
   }
 
+  /** How often the actions of each type succeeded; an episode may succeed although some of them failed. */
+  #actions() {
+    const all = this.episodes.map(({ actions = {} }) => Object.entries(actions));
+    const good = new Map(sumsOf(all.map((each) => Object.fromEntries(each.map(([type, [count]]) => [type, count])))));
+    const tries = sumsOf(all.map((each) => Object.fromEntries(each.map(([type, [, count]]) => [type, count]))));
+    const rows = tries.filter(([, count]) => count > 0).slice(0, ACTIONS_MAX).map(([type, count]) => {
+      const failed = count - good.get(type);
+      const cells = [element("td", { class: "named" }, recorded(type)), element("td", { class: "fixed" }, rateText(good.get(type), count))];
+      return element("tr", {}, ...cells, element("td", { class: "number" }, failed > 0 ? `${failed} failed` : ""));
+    });
+    part("actions").replaceChildren(...(rows.length > 0 ? [element("h2", {}, "Success of actions"), element("table", {}, ...rows)] : []));
+  }
+
   #reasons() {
-    const counts = new Map();
-    for (const { reasons } of this.episodes) {
-      for (const [reason, count] of Object.entries(reasons)) counts.set(reason, (counts.get(reason) ?? 0) + count);
-    }
-    const sorted = [...counts].sort(([, one], [, other]) => other - one);
+    const sorted = sumsOf(this.episodes.map(({ reasons }) => reasons));
     const rows = sorted.slice(0, REASONS_MAX).map(([reason, count]) => {
       const trend = this.bins.map((bin) => bin.reduce((sum, each) => sum + (each.reasons[reason] ?? 0), 0));
       const picture = this.bins.length > 1 ? bars(trend, Math.max(...trend), `${reason} over time`, String) : "";
-      const cells = [element("td", { class: "number" }, String(count)), element("td", { class: "named" }, recorded(reason, { class: "reason" }))];
+      const outcomes = sumsOf(this.episodes.map((each) => each.outcomes?.[reason] ?? {})).filter(([name]) => name !== "open");
+      const after = element("span", { class: "quiet" }, outcomes.map(([name, number]) => ` ${number} ${name}`).join(","));
+      const named = element("td", { class: "named" }, recorded(reason, { class: "reason" }), after);
+      const cells = [element("td", { class: "number" }, String(count)), named];
       return element("tr", {}, ...cells, element("td", {}, picture));
     });
     const left = sorted.length - rows.length;
@@ -169,7 +200,7 @@ class Overview {
       {},
       element("td", { class: "number" }, each.page ? element("a", { href: each.page }, name) : name, this.#missing(each)),
       element("td", { class: "fixed" }, each.started),
-      element("td", { class: `fixed is-${each.status.toLowerCase()}` }, element("span", { class: "sign" }, signOf(each.status)), ` ${each.status}`),
+      element("td", { class: `fixed is-${each.status.toLowerCase()}` }, element("span", { class: "sign" }, signOf(each.status)), ` ${each.status}`, failedActions(each)),
       element("td", { class: "number" }, each.seconds === null ? "" : duration(each.seconds)),
       element("td", { class: "number", "data-name": "nodes" }, String(each.nodes)),
       element("td", { class: "number", "data-name": "failed" }, String(each.failed)),

@@ -1,6 +1,6 @@
 // Shows what belongs to a node or to the moment: details, failures by reason, percepts, observations, states.
 
-import { extremes, failureGroups, lastUpTo, signOf } from "./episode.js";
+import { extremes, failureGroups, lastUpTo, outcomesText, signOf } from "./episode.js";
 import { duration, element, recorded, replaceIn, svg } from "./dom.js";
 import { similarTo } from "./similar.js";
 
@@ -119,6 +119,7 @@ export class Panels {
       ["took", this.#took(node)],
       ["parameters", node.parameters ? recorded(node.parameters) : null],
       ["reason", node.reason ? recorded(node.reason) : null],
+      ["then", node.outcome],
       ["message", node.message ? recorded(node.message, { class: "long" }) : null],
       ["part of", node.parent ? this.#node(node.parent.start) : null],
     ].filter(([, value]) => value !== null);
@@ -166,10 +167,12 @@ export class Panels {
         return [element("p", { class: "long" }, recorded(alike[0].message)), element("p", {}, ...links, left)];
       });
       const others = messages.length - MESSAGES_MAX;
+      const then = outcomesText(failures);
       return element(
         "div",
         { class: "failure" },
         element("p", {}, element("strong", {}, `✗ ${failures.length} × `), recorded(reason, { class: "reason" })),
+        then ? element("p", { class: "quiet" }, then) : null,
         ...shown,
         others > 0 ? element("p", { class: "quiet" }, `${others} other messages`) : null,
       );

@@ -34,6 +34,10 @@ class Stream {
     this.source = new EventSource(address);
     this.source.addEventListener("part", (message) => this.#take(JSON.parse(message.data)));
     this.source.addEventListener("state", (message) => this.#state(JSON.parse(message.data)));
+    this.source.addEventListener("outcomes", (message) => {
+      this.view.episode.judge(JSON.parse(message.data));
+      this.view.show();
+    });
     this.source.addEventListener("reload", () => location.reload());
     this.source.addEventListener("error", () => this.#lost());
   }
