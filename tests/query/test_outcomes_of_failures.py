@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.integrations.test_mcp_server import agent_in_process
 
 from pycrorm_async import Memory, Reading
 from pycrorm_async.events.types import EpisodeStatus, NodeStatus
@@ -22,6 +21,7 @@ from pycrorm_async.recall.recall import Recall
 from pycrorm_async.report.write import newest_episodes, outcomes_of, overview_document
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.world.pose import Pose
+from tests.integrations.test_mcp_server import agent_in_process
 
 pytestmark = pytest.mark.slow
 
