@@ -54,6 +54,11 @@ _EXPECTED_FIELDS: Final[dict[str, dict[str, FieldSpec]]] = {
     "CodeNode": {"function": "text", "arguments": ("dict", "text")},
 }
 """The types of fields that have no full annotation, as their usual values have them."""
+_INERTIAL_ADDED: Final = (
+    '<inertial><mass value="0.1" /><origin rpy="0 0 0" xyz="0 0 0" />'
+    '<inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01" /></inertial>'
+)
+"""The text that PyCRAM adds to each link without inertia, so that Bullet prints no warning: no link's mass."""
 _MONITOR_INTERVAL_S: Final = 0.1
 """PyCRAM's time between two evaluations of a condition."""
 
@@ -257,7 +262,11 @@ class PyCRAMValues:
             "object_type": self.object_type(world_object),
             "pose": self.pose(world_object.pose),
             "joints": {name: float(each.position) for name, each in world_object.joints.items() if each.type != fixed},
-            "urdf": path.read_text() if path is not None and path.suffix == ".urdf" and path.is_file() else None,
+            "urdf": (
+                path.read_text().replace(_INERTIAL_ADDED, "")
+                if path is not None and path.suffix == ".urdf" and path.is_file()
+                else None
+            ),
             "color": tuple(map(float, color.get_rgba())) if color is not None else None,
             "model": robot.name if robot is not None else None,
             "torso_joint": (robot.torso_joint or None) if robot is not None else None,

@@ -309,13 +309,13 @@ def object_detected(
 def _seen_value(seen: Seen, references: References) -> SeenValue:
     thing = seen.thing
     world_object = thing.world_object if isinstance(thing, ObjectDesignator) else thing
-    return SeenValue(
+    return SeenValue(  # perception often computes numbers of numpy
         clean(thing.name),
         thing.object_type.name,
         pose_value(seen.pose if seen.pose is not None else thing.pose),
         references.reference(world_object) if world_object is not None else None,
-        seen.visible,
-        float(seen.confidence) if seen.confidence is not None else None,  # perception often computes a numpy.float32
+        float(seen.visible) if seen.visible is not None else None,
+        float(seen.confidence) if seen.confidence is not None else None,
         clean(seen.source) if seen.source is not None else None,
     )
 

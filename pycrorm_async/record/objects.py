@@ -13,7 +13,8 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Collection, Hashable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Generic, NamedTuple, TypeVar
+from functools import cached_property
+from typing import Any, Generic, TypeVar
 
 from pycrorm_async.events.codec import NotEncodable
 from pycrorm_async.events.ids import EpisodeId
@@ -32,6 +33,7 @@ from pycrorm_async.events.types import (
 from pycrorm_async.record.episode_writer import Emitter
 from pycrorm_async.record.parameters import clean_texts
 from pycrorm_async.world.bounding_boxes import BoundingBox
+from pycrorm_async.world.model_boxes import shape_boxes
 from pycrorm_async.world.pose import Pose
 
 K = TypeVar("K", bound=Hashable)
@@ -127,17 +129,21 @@ class RecordedObject:
     torso_joint: str | None = None
 
 
-class _Described(NamedTuple):
-    """A description without the shapes that Bullet would compute."""
+class _Described:
+    """A description that no world has loaded; the boxes around its shapes are computed from their files."""
 
-    description_text: str
-    links: tuple[str, ...] = ()
+    def __init__(self, text: str) -> None:
+        self.description_text = text
 
-    def box_in_link(self, link: str) -> BoundingBox | None:  # noqa: ARG002  the port's signature
-        return None
+    @cached_property
+    def links(self) -> Mapping[str, BoundingBox]:
+        return shape_boxes(self.description_text, "collision")
 
-    def visual_boxes(self, links: Collection[str]) -> dict[str, BoundingBox]:  # noqa: ARG002  as above
-        return {}
+    def box_in_link(self, link: str) -> BoundingBox | None:
+        return self.links.get(link)
+
+    def visual_boxes(self, links: Collection[str]) -> Mapping[str, BoundingBox]:
+        return shape_boxes(self.description_text, "visual") if links else {}
 
 
 class RecordedObjects(ObjectRows[Hashable]):

@@ -7,12 +7,17 @@ import math
 import threading
 from collections import OrderedDict, deque
 from collections.abc import Callable, Hashable, Mapping, Sequence
+from contextlib import suppress
 from enum import Enum
 from functools import partial
+from os import PathLike
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Concatenate, Literal, ParamSpec, Protocol, Self, TypeAlias, TypeVar, get_args
+from xml.etree.ElementTree import ParseError
 
 import msgspec
+import numpy as np
 from msgspec.structs import replace
 
 from pycrorm_async.errors import CallerError
@@ -58,7 +63,9 @@ from pycrorm_async.record.values import (
     missing_value,
     reading_fault,
 )
-from pycrorm_async.world.pose import Pose
+from pycrorm_async.world.model_boxes import described_mass_kg
+from pycrorm_async.world.pose import DescriptionNotLoadable, Pose
+from pycrorm_async.world.urdf import urdf_text
 
 # === ordered calls ============================================================================================
 #
@@ -535,6 +542,8 @@ def _is_below(node: _Node, ancestor: _Node) -> bool:
 
 END_STATUSES = tuple(each for each in get_args(NodeStatus) if each != "RUNNING")
 _INTEGERS = range(-(2**63), 2**63)
+_UNIT_TOLERANCE = 1e-6
+"""A quaternion whose length differs from 1 by less keeps its bits: it is that of an executive in single precision."""
 
 S = TypeVar("S", bound=msgspec.Struct)
 
@@ -544,9 +553,27 @@ def struct_of(value: object, kind: type[S]) -> S:
     if not isinstance(value, kind):
         raise CallerError(f"expected a {kind.__name__}, got {clean_repr(value)}")
     try:
-        return msgspec.convert(msgspec.to_builtins(value), kind)
+        return _with_unit_turn(msgspec.convert(msgspec.to_builtins(value, enc_hook=_numbers_of), kind))
     except Exception as error:
         raise CallerError(f"not a whole {kind.__name__}: {message_of(error)}") from error
+
+
+def _with_unit_turn(value: S) -> S:
+    """Return a pose, or a value with a pose, with a quaternion of length 1, from which a rotation is computed."""
+    if isinstance(value, PoseValue):
+        length = math.hypot(*value.orientation)
+        if 0 < length < math.inf and abs(length - 1) > _UNIT_TOLERANCE:
+            return replace(value, orientation=tuple(each / length for each in value.orientation))
+    elif isinstance(pose := getattr(value, "pose", None), PoseValue):
+        return replace(value, pose=_with_unit_turn(pose))
+    return value
+
+
+def _numbers_of(value: Any) -> Any:
+    """Return the numbers of numpy as those of Python. Raises for any other class."""
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    raise CallerError(f"values of the class {type(value).__name__} are not recorded")
 
 
 def pose_of(pose: Pose | PoseValue) -> PoseValue:
@@ -580,21 +607,41 @@ class ArgumentReader:
         self, name: str, object_type: str | Enum, pose: Pose | PoseValue, joints: Mapping[str, float], **others: Any
     ) -> RecordedObject:
         """Copy the description of an object; `others` are the further attributes of `RecordedObject`."""
-        urdf = others["urdf"]
-        if urdf is not None and not isinstance(urdf, str):
-            self._missing.note("ObjectAdded", "urdf", f"it must be a text, not {clean_repr(urdf)}")
-            urdf = None
+        urdf, kind = self._urdf_of(name, others["urdf"]), self.text_of("object_type", object_type) or "UNKNOWN"
+        mass_kg = self._number_of("mass_kg", others["mass_kg"])
+        if mass_kg is None and urdf is not None and kind not in ("ROBOT", "ENVIRONMENT"):  # as `Object.mass_kg`
+            with suppress(ParseError):  # declaring the description counts it
+                mass_kg = described_mass_kg(urdf)
         texts = {each: self.text_of(each, others[each]) for each in ("model", "serial", "base_link", "torso_joint")}
         return RecordedObject(
             self.text_of("name", name) or "an object",
-            self.text_of("object_type", object_type) or "UNKNOWN",
+            kind,
             pose_of(pose),
             self.joints_of(joints),
             urdf=urdf,
             color=self._color_of(others["color"]),
-            mass_kg=self._number_of("mass_kg", others["mass_kg"]),
+            mass_kg=mass_kg,
             **texts,
         )
+
+    def _urdf_of(self, name: str, urdf: object) -> str | None:
+        """Return the text of a URDF with the paths of its meshes, as a world reads it; faults are counted as missing.
+
+        The text is kept where a world would refuse it, because an executive may have loaded it elsewhere.
+        """
+        if urdf is None:
+            return None
+        text = urdf if isinstance(urdf, str) and urdf.lstrip().startswith("<") else None
+        if text is not None and "<mesh" not in text:
+            return text
+        try:
+            if not isinstance(urdf, str | PathLike):
+                raise TypeError("it must be a text or a path")  # noqa: TRY301  counted below
+            return urdf_text(name, text or Path(urdf))
+        except (DescriptionNotLoadable, TypeError) as error:
+            if text is None:  # declaring a text counts the mesh that does not exist, or the fault of the XML
+                self._missing.note("ObjectAdded", "urdf", f"{clean_repr(urdf)}: {message_of(error)}")
+            return text
 
     def text_of(self, argument: str, text: object) -> str | None:
         """Copy a text; of an enum its member's name, of another value its shortened repr."""
@@ -788,7 +835,7 @@ class RecordedEpisode(RecordedNodes):
         pose: Pose | PoseValue,
         joints: Mapping[str, float] = {},
         *,
-        urdf: str | None = None,
+        urdf: str | PathLike[str] | None = None,
         color: tuple[float, float, float, float] | None = None,
         model: str | None = None,
         serial: str | None = None,
@@ -803,7 +850,9 @@ class RecordedEpisode(RecordedNodes):
             key: names the object from now on.
             object_type: `ROBOT`, `MILK`, …; a type of `world.ObjectType` where one fits.
             joints: positions by name, rad or m.
-            urdf: the text of its description, which is recorded once.
+            urdf: its description, which is recorded once: the text, or the path of a .urdf file. The names of its mesh
+                files start at the folder of that file, or for a text at the current folder; the boxes around the
+                meshes, for relations such as `on`, are computed from these files.
             color, model, serial, mass_kg, base_link: see `events.types.ObjectAdded`.
             torso_joint: of a robot with a torso that is lifted, the joint that does it.
         """

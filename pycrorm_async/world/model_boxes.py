@@ -5,13 +5,18 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from functools import lru_cache
-from pathlib import PurePath
-from typing import NamedTuple, TypeAlias
+from pathlib import Path, PurePath
+from typing import Literal, NamedTuple, TypeAlias
 from xml.etree.ElementTree import Element, SubElement, fromstring, tostring
 
-from pycrorm_async.world.bounding_boxes import BoundingBox
+import numpy as np
+
+from pycrorm_async.world.bounding_boxes import BoundingBox, Solid, box_around
+from pycrorm_async.world.meshes import mesh_points
 from pycrorm_async.world.models import numbers
+from pycrorm_async.world.pose import Quaternion, Vector
 from pycrorm_async.world.urdf import joined_link
 
 #
@@ -104,6 +109,48 @@ def _add_box(shape: Element, box: BoundingBox, material: Element | None) -> None
 
 def _parsed(urdf: str) -> Element:
     return fromstring(urdf)  # noqa: S314  `urdf_text` has checked it, now or before a memory recorded it
+
+
+# === shape boxes ==============================================================================================
+#
+# Compute the box around the shapes of each link in its own frame without Bullet, for an object that no world has.
+
+
+def shape_boxes(urdf: str, kind: Literal["collision", "visual"]) -> dict[str, BoundingBox]:
+    """Return the box around the shapes of each link, by its name, without links that have none.
+
+    A mesh has the box around its triangles. A link with a shape that cannot be read is left out.
+    """
+    boxes: dict[str, BoundingBox] = {}
+    for link in _parsed(urdf).iter("link"):
+        with suppress(ValueError, OSError):
+            solids = [_solid(each) for each in link.findall(kind)]
+            box = box_around([((Vector(0, 0, 0), Quaternion(0, 0, 0, 1)), solids)])
+            if box is not None and np.isfinite(box).all():
+                boxes[link.get("name", "")] = box
+    return boxes
+
+
+def _solid(element: Element) -> Solid:
+    """Return a shape in its link's frame. Raises `ValueError` and `OSError` if it cannot be read."""
+    frame = _origin(element)
+    rotation, position = np.array(frame.rotation), np.array(frame.position)
+    shape = next(element.iterfind("geometry/*"), None)
+    if shape is None:
+        raise ValueError("a shape has no geometry")
+    if shape.tag == "box":
+        return Solid(np.array(_CORNERS) * _numbers(shape.get("size")) @ rotation.T + position)
+    if shape.tag == "sphere":
+        return Solid(position[None, :], float(shape.get("radius", "")))
+    if shape.tag in ("cylinder", "capsule"):
+        axis = rotation[:, 2]
+        along = axis * float(shape.get("length", "")) / 2
+        ends = np.stack([position - along, position + along])
+        return Solid(ends, float(shape.get("radius", "")), axis if shape.tag == "cylinder" else None)
+    if shape.tag == "mesh":
+        points = mesh_points(Path(shape.get("filename", "").removeprefix("file://")))
+        return Solid(points * _numbers(shape.get("scale", "1 1 1")) @ rotation.T + position)
+    raise ValueError(f"the shape <{shape.tag}> is unknown")
 
 
 # === inertia ==================================================================================================
