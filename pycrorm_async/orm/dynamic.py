@@ -20,10 +20,11 @@ import itertools
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 from typing import Any, Final
+from weakref import WeakSet, ref
 
-from sqlalchemy import BigInteger, Boolean, Column, Double, ForeignKey, MetaData, Table, Text
+from sqlalchemy import BigInteger, Boolean, Column, Double, Engine, ForeignKey, MetaData, Table, Text, event
 from sqlalchemy.ext.asyncio import AsyncEngine
-from sqlalchemy.orm import registry, synonym
+from sqlalchemy.orm import ORMExecuteState, Session, registry, synonym
 from sqlalchemy.types import TypeEngine
 
 from pycrorm_async.errors import CallerError
@@ -43,6 +44,8 @@ _TYPES: dict[FieldType, TypeEngine[Any]] = {
     "boolean": Boolean(),
     "datetime": Moment(),
 }
+_OWNER: Final = "pycrorm_classes"
+"""The key of a reference to the `DynamicClasses` in the metadata of its tables."""
 _numbers: Final = itertools.count(1)
 """Numbers the memories of this process, so that their classes of one name have different identities."""
 
@@ -53,14 +56,16 @@ class DynamicClasses:
     def __init__(self) -> None:
         # Not `id(self)`: it is used again when a memory that was never closed, and unmapped no class, is collected.
         self._number = next(_numbers)
-        self._registry = registry()
-        self._metadata = MetaData()
+        self._metadata = MetaData(info={_OWNER: ref(self)})
+        self._registry = registry(metadata=self._metadata)
         self._classes: dict[str, type[Designator]] = {}
         self._fields: dict[str, set[str]] = {}
-        self._engines: list[AsyncEngine] = []
+        self._engines: WeakSet[Engine] = WeakSet()
         self._declared: dict[str, list[DesignatorTypeDeclared]] = {}
         self._renamed: dict[str, str] = {}
         self._unmapped: tuple[list[DesignatorTypeDeclared], dict[str, str]] | None = None
+        if not event.contains(Session, "do_orm_execute", _use_in_own_engine):
+            event.listen(Session, "do_orm_execute", _use_in_own_engine)
 
     def learn(
         self, declarations: Iterable[DesignatorTypeDeclared], renamed: Mapping[str, str] = MappingProxyType({})
@@ -102,10 +107,11 @@ class DynamicClasses:
         self.map()
         return {each: each for each in self._declared} | self._renamed
 
-    def use_in(self, engine: AsyncEngine) -> None:
+    def use_in(self, engine: AsyncEngine | Engine) -> None:
         """Let sessions of this engine return objects of these classes."""
-        self._engines.append(engine)
-        self._introduce(engine)
+        own = engine.sync_engine if isinstance(engine, AsyncEngine) else engine
+        self._engines.add(own)
+        self._introduce(own)
 
     def of(self, name: str | type) -> type[Designator]:
         """Return the mapped class of a dtype, a table or a designator class, also built-in. Raises `CallerError`."""
@@ -127,7 +133,7 @@ class DynamicClasses:
         self._unmapped = None
         for engine in self._engines:
             known_classes(engine.dialect).adopt({})
-            engine.sync_engine.clear_compiled_cache()
+            engine.clear_compiled_cache()
         self._engines.clear()
         identities = Designator.__mapper__.polymorphic_map
         for class_ in self._classes.values():
@@ -221,7 +227,7 @@ class DynamicClasses:
         grown = len(present) > before
         if grown:
             for engine in self._engines:
-                engine.sync_engine.clear_compiled_cache()
+                engine.clear_compiled_cache()
         return grown
 
     def _add_field(self, class_: type[Designator], field: FieldDeclared) -> None:
@@ -247,9 +253,20 @@ class DynamicClasses:
             if not mapper.has_property(name):  # the first pose is also `pose`, the first object also `object`
                 mapper.add_property(name, synonym(own))
 
-    def _introduce(self, engine: AsyncEngine) -> None:
+    def _introduce(self, engine: Engine) -> None:
         identities = {dtype: str(class_.__mapper__.polymorphic_identity) for dtype, class_ in self._classes.items()}
         known_classes(engine.dialect).adopt(identities)
+
+
+def _use_in_own_engine(state: ORMExecuteState) -> None:
+    """Let an engine of the caller's own return objects of the memory whose generated class a session selects."""
+    for mapper in state.all_mappers:
+        owner = mapper.registry.metadata.info.get(_OWNER)
+        classes: DynamicClasses | None = owner() if owner is not None else None
+        if classes is not None:
+            engine = state.session.get_bind(mapper).engine
+            if not known_classes(engine.dialect).own:  # else it is the engine of a memory, or known already
+                classes.use_in(engine)
 
 
 def _entries(field: FieldDeclared) -> property:

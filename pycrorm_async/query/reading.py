@@ -9,6 +9,7 @@ async with Reading.open("sqlite:///memory.db") as reading:
 from __future__ import annotations
 
 import asyncio
+import re
 from collections.abc import AsyncGenerator, AsyncIterator, Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractAsyncContextManager, AbstractContextManager, aclosing, asynccontextmanager
@@ -16,11 +17,22 @@ from contextvars import ContextVar
 from dataclasses import replace
 from datetime import datetime
 from functools import partial
+from shlex import quote
 from threading import Lock
 from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar, overload
 from weakref import ref
 
-from sqlalchemy import BinaryExpression, ColumnElement, Connection, Dialect, Result, Row, Select, event
+from sqlalchemy import (
+    BinaryExpression,
+    ColumnElement,
+    Connection,
+    Dialect,
+    ExceptionContext,
+    Result,
+    Row,
+    Select,
+    event,
+)
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine, AsyncSession, async_sessionmaker
 from sqlalchemy.orm import ORMExecuteState, Session
@@ -30,10 +42,10 @@ from sqlalchemy.sql.operators import in_op
 from sqlalchemy.util.concurrency import in_greenlet
 
 from pycrorm_async.bulk_records import collecting_seldom
-from pycrorm_async.errors import CallerError, DatabaseUnavailable, UnknownEpisode
+from pycrorm_async.errors import CallerError, DatabaseUnavailable, TablesOutdated, UnknownEpisode
 from pycrorm_async.events.ids import parse_episode_id, row_key
 from pycrorm_async.events.types import Blob
-from pycrorm_async.orm.base import EPISODE, KEYS, load_related
+from pycrorm_async.orm.base import EPISODE, KEYS, Base, load_related
 from pycrorm_async.orm.dynamic import DynamicClasses
 from pycrorm_async.orm.rows import Designator
 from pycrorm_async.projections.columns import unite
@@ -53,6 +65,11 @@ from pycrorm_async.store.log import EventLog
 if TYPE_CHECKING:
     import pandas as pd
     import pyarrow as pa
+
+_ABSENT = re.compile(
+    r'no such (?:table|column): (?:main\.)?"?(\w+)|relation "(\w+)" does not exist|column "?(\w+)"?\.\S+ does not exist'
+)
+"""The messages of SQLite and PostgreSQL about what does not exist, with the name of the table."""
 
 
 class Reading:
@@ -370,6 +387,9 @@ class Reading:
         self._classes.use_in(log.engine)
         on_access = LoadOnAccess(log.address.engine(read_only=True), log.translated)
         self._classes.use_in(on_access.engine)
+        explain = partial(_explain_absent, log.address)
+        for engine in (log.engine, on_access.engine):
+            event.listen(engine.sync_engine, "handle_error", explain)
         self._sessions = async_sessionmaker(
             log.engine, expire_on_commit=False, sync_session_class=EpisodeSession, on_access=on_access
         )
@@ -391,6 +411,19 @@ class Reading:
                 self._all_views = generation.revision, await all_views(connection, generation)
         async with with_views(self._log.engine, self._all_views[1]) as connection:
             yield connection
+
+
+def _explain_absent(memory: DatabaseAddress, context: ExceptionContext) -> None:
+    """Raise `TablesOutdated` for an error about the table or a column of a mapped class that this memory lacks."""
+    absent = _ABSENT.search(str(context.original_exception))
+    name = next(filter(None, absent.groups()), "") if absent is not None else ""
+    class_ = next((each.class_ for each in Base.registry.mappers if each.local_table.description == name), None)
+    if class_ is None:
+        return
+    remedy = "open it with `Memory.open` in a program that has this class"
+    if class_.__module__.startswith("pycrorm_async."):
+        remedy = f"run `pycrorm rebuild --url {quote(memory.to_type)}`"
+    raise TablesOutdated(f"{memory} is older than the class {class_.__name__} and has no table for it: {remedy}")
 
 
 async def _generation(log: EventLog) -> Generation:
