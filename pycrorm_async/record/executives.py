@@ -324,6 +324,12 @@ class Runs(EpisodeBlock):
         episode: its keys of nodes are the ids of runs.
     """
 
+    def __init__(self, recording: Recording, executive: str, **episode: Any) -> None:
+        super().__init__(recording, executive, **{"convert": self._plain, **episode})
+
+    def _plain(self, value: Any) -> Any:
+        return plain_value(value, self.simplified)
+
     def start(
         self,
         run_id: Hashable,
@@ -357,12 +363,12 @@ class Runs(EpisodeBlock):
     ) -> None:
         """Record that a run ended, as `RecordedEpisode.end` does, if it is open."""
         if self.episode.is_open(run_id):
-            self.episode.end(run_id, status, failure, plain_value(result, self.simplified))
+            self.episode.end(run_id, status, failure, result)
 
     def observe(self, name: str, values: Any, run_id: Hashable | None = None) -> None:
         """Record an observation of a run; of the episode if the run is not open."""
         node = run_id if self.episode.is_open(run_id) else None
-        self.episode.observe(name, plain_value(values, self.simplified), node=node)
+        self.episode.observe(name, values, node=node)
 
     def simplified(self, value: Any) -> Any:
         """Return the scalar, dict or list that is recorded for a value; override it for classes with parts of no use.

@@ -773,7 +773,7 @@ class RecordedValues:
         """Copy a `FailureCause`; a text is of the type `UNNAMED`. Raises `CallerError` for anything else."""
         match failure:
             case BaseException():
-                return failure_value(failure, self._references)
+                return failure_value(failure, self._references, self.converted)
             case (str(), str()) | str():
                 reason, message = (UNNAMED, failure) if isinstance(failure, str) else failure
                 return FailureValue(clean(reason), clean(message))

@@ -456,12 +456,14 @@ _GROUP_MAX = 100
 """Bounds the recorded exceptions of one exception group."""
 
 
-def failure_value(failure: BaseException, references: References) -> FailureValue:
-    """Copy class, message and arguments of an exception. Raises no `Exception`."""
+def failure_value(
+    failure: BaseException, references: References, convert: Callable[[Any], Any] = lambda each: each
+) -> FailureValue:
+    """Copy class, message and arguments, each as `convert` returns it, of an exception. Raises no `Exception`."""
     return FailureValue(
         type=cut(_path_of(type(failure)), _FAILURE_NAME_MAX),
         message=cut(clean(message_of(failure)), _MESSAGE_MAX),
-        arguments=_arguments_or_missing(failure, references),
+        arguments=_arguments_or_missing(failure, references, convert),
     )
 
 
@@ -472,24 +474,24 @@ def _path_of(kind: type) -> str:
         return f"<an exception whose class has no name: {type(error).__name__}>"
 
 
-def _arguments_or_missing(failure: BaseException, references: References) -> list[Any]:
+def _arguments_or_missing(failure: BaseException, references: References, convert: Callable[[Any], Any]) -> list[Any]:
     try:
-        return _arguments(failure, references, 0)
+        return _arguments(failure, references, convert, 0)
     except Exception as error:  # noqa: BLE001  `args` may be a property that raises anything
         return [MissingValue(reading_fault(error))]
 
 
-def _arguments(failure: BaseException, references: References, depth: int) -> list[Any]:
+def _arguments(failure: BaseException, references: References, convert: Callable[[Any], Any], depth: int) -> list[Any]:
     """Encode the arguments of an exception; for a group, its message and the encoded exceptions inside it."""
     if not isinstance(failure, BaseExceptionGroup):
-        return [encode_or_missing(each, references) for each in failure.args]
+        return [encode_or_missing(convert(each), references) for each in failure.args]
     if depth > DEPTH_MAX:
         return [missing_value(f"it is nested more than {DEPTH_MAX} deep", failure)]
     inside = [
         {
             "type": cut(_path_of(type(each)).rpartition(".")[2], _FAILURE_NAME_MAX),
             "message": cut(clean(message_of(each)), REASON_MAX),
-            "arguments": _arguments(each, references, depth + 1),
+            "arguments": _arguments(each, references, convert, depth + 1),
         }
         for each in failure.exceptions[:_GROUP_MAX]
     ]
