@@ -166,12 +166,16 @@ class PartsHolder:
     """A memory as its methods see it: with parts while it is open."""
 
     _parts: Parts | None
+    _forked_parts: Parts | None = None
+    _last_status: Callable[[], MemoryStatus] | None = None
     _clock: Clock
     _address: DatabaseAddress
     _located: DatabaseAddress
 
     @property
     def _open_parts(self) -> Parts:
+        if self._forked_parts is not None:
+            raise CallerError("this memory is open in the process that forked this one: open another one here")
         if self._parts is None:
             raise CallerError("this memory is not open: use `async with Memory.open(url) as memory`")
         return self._parts
@@ -207,6 +211,8 @@ class MemoryStatus(NamedTuple):
         spool_lost: the records lost with deleted files, one line for each run of positions.
         declarations_unrepeated: the number of declarations that one segment contains and the later ones had no space
             to repeat: if the log goes back, their episodes can be healed only while that segment is kept.
+        unrecorded: the number of nodes, episodes and other reports that came after the memory was closed, or in a
+            forked child.
     """
 
     written: int
@@ -225,6 +231,7 @@ class MemoryStatus(NamedTuple):
     spool_fault: str | None
     spool_lost: tuple[str, ...]
     declarations_unrepeated: int
+    unrecorded: int = 0
 
     def __repr__(self) -> str:
         """Leave out the fields that report nothing, so that a fault is seen."""
@@ -252,6 +259,7 @@ class MemoryStatus(NamedTuple):
             spool_fault=queue.setback,
             spool_lost=queue.lost,
             declarations_unrepeated=queue.declarations_unrepeated,
+            unrecorded=emitter.unrecorded,
         )
 
 
@@ -530,7 +538,9 @@ class RecordingMemory(ReadableMemory, ABC):
 
     @property
     def status(self) -> MemoryStatus:
-        """The present state of the memory."""
+        """The present state of the memory; after it was closed, the last one."""
+        if self._parts is None and self._last_status is not None:
+            return self._last_status()
         return MemoryStatus.of(self._open_parts, self._unadopted)
 
     @property
@@ -628,8 +638,11 @@ class RecordingMemory(ReadableMemory, ABC):
 
     @property
     def recording(self) -> Recording:
-        """Writes episodes of an executive that is not ours, from any thread and without asyncio."""
-        return self._open_parts.recording
+        """Writes episodes of an executive that is not ours, from any thread and without asyncio.
+
+        In a forked child it records nothing, so that an executive continues there.
+        """
+        return (self._forked_parts or self._open_parts).recording
 
     @property
     def recent_episodes(self) -> tuple[str, ...]:
@@ -658,7 +671,7 @@ class RecordingMemory(ReadableMemory, ABC):
 
         Raises `Unrecordable` with `on_unrecordable="refuse"` only.
         """
-        self._open_parts.observations.observe(name, values, node=node)
+        (self._forked_parts or self._open_parts).observations.observe(name, values, node=node)
 
     # --- subscribing ------------------------------------------------------------------------------------------
 
@@ -876,7 +889,8 @@ class Memory(RecordingMemory):
         recorder.episodes.refuse_new()
         for episode in recorder.episodes.all:
             recorder.close_episode(episode, error or asyncio.CancelledError("the memory was closed"))
-        self._parts.emitter.is_closed = self._parts.experience.is_closed = True
+        self._parts.emitter.close()
+        self._parts.experience.is_closed = True
         recorder.close()
         await self._parts.emitter.feed.close()
         await self._stack.__aexit__(kind, error, traceback)
@@ -893,7 +907,7 @@ class Memory(RecordingMemory):
 
         A parked episode is logged and does not make closing fail; `pycrorm status` lists it, and `flush` raises for it.
         """
-        self._parts = None
+        parts, self._parts = self._parts, None
         queue.close()
         try:
             await writer.close()
@@ -903,12 +917,18 @@ class Memory(RecordingMemory):
                 raise unreported from fault
             if unreported is not None:
                 _log.error("when closing the memory: %s", unreported)
+        finally:
+            if parts is not None:  # else it could not be opened
+                status, emitter = MemoryStatus.of(parts, self._unadopted), parts.emitter
+                self._last_status = lambda: status._replace(unrecorded=emitter.unrecorded)
 
     def _forked(self) -> None:
         """Disconnect a forked child: the memory belongs to its parent, and plans of the child are not recorded."""
-        if self._parts is not None:
-            self._parts.emitter.is_closed = self._parts.experience.is_closed = True
-            self._parts = None
+        if (parts := self._parts) is not None:
+            parts.emitter.close("this process was forked from the one that opened the memory: open a memory in it")
+            parts.experience.is_closed = True
+            self._parts, self._forked_parts = None, parts
+            self._last_status = lambda: MemoryStatus.of(parts, self._unadopted)
 
 
 # === memory view ==============================================================================================
@@ -942,7 +962,8 @@ async def _read(address: DatabaseAddress) -> str:
         async with Reading.open_address(address) as reading, reading.session() as session:
             total = await session.scalar(select(func.count()).select_from(ProcessMetaData))
             newest = await episodes(await session.connection(), EpisodeChoice(limit=EPISODES_MAX))
-            return episodes_html(newest, total or 0)
+            folding = len(await (await reading.log()).behind())
+            return episodes_html(newest, total or 0, folding=folding)
     except PycrormError as error:
         return html.escape(str(error))
 

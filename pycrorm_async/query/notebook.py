@@ -14,7 +14,7 @@ from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary
 from pycrorm_async.query.question import Question, SyncQuestion
 from pycrorm_async.query.snapshot import Moment, WorldThen
 from pycrorm_async.query.sql import SqlResult
-from pycrorm_async.query.text import duration, one_line, parameters_text, value_html
+from pycrorm_async.query.text import duration, folding_text, one_line, parameters_text, value_html
 
 if TYPE_CHECKING:
     from pycrorm_async.query.notebook_html import Axis
@@ -51,7 +51,13 @@ def _text(lines: Iterable[str], count: int) -> str:
 
 
 class Episodes(_Listing[EpisodeSummary]):
-    """The episodes of a memory, the oldest first. A list that a notebook draws as a table."""
+    """The episodes of a memory, the oldest first. A list that a notebook draws as a table.
+
+    Attributes:
+        folding: the number of episodes with stored events that the tables do not show yet.
+    """
+
+    folding = 0
 
     def __repr__(self) -> str:
         lines = (
@@ -59,12 +65,13 @@ class Episodes(_Listing[EpisodeSummary]):
             f" ({each.nodes} nodes, {each.failed} failed)"
             for each in self
         )
-        return _text(lines, len(self))
+        text = _text(lines, len(self))
+        return f"{text}\n{folding_text(self.folding)}" if self.folding else text
 
     def _repr_html_(self) -> str:
         from pycrorm_async.query.notebook_html import episodes_html
 
-        return episodes_html(self)
+        return episodes_html(self, folding=self.folding)
 
 
 class TaskTree(_Listing[NodeSummary]):

@@ -27,6 +27,7 @@ from pycrorm_async.query.text import (
     color_of,
     duration,
     facts,
+    folding_text,
     left_out,
     moment,
     one_line,
@@ -44,13 +45,17 @@ EPISODES_MAX = 100
 _COLUMNS = ("episode", "started, UTC", "took", "status", "nodes", "failed", "description", "robots", "tags")
 
 
-def episodes_html(episodes: Sequence[EpisodeSummary], total: int | None = None) -> str:
-    """Return a table of the newest episodes, the oldest of them first; `total` is the number of all in the memory."""
+def episodes_html(episodes: Sequence[EpisodeSummary], total: int | None = None, *, folding: int = 0) -> str:
+    """Return a table of the newest episodes, the oldest of them first.
+
+    `total` is the number of all in the memory, `folding` that of those that the tables do not show as they are yet.
+    """
+    lagging = f"<div>{quiet(folding_text(folding))}</div>" if folding else ""
     if not episodes:
-        return view("No episodes")
+        return view("No episodes", lagging)
     count, shown = len(episodes) if total is None else total, episodes[-EPISODES_MAX:]
     more = f"<div>{left_out(count - len(shown), 'before these')}</div>" if len(shown) < count else ""
-    return view(f"<b>{count:,} episode{'s' * (count > 1)}</b>", more, table(_COLUMNS, map(_row, shown)))
+    return view(f"<b>{count:,} episode{'s' * (count > 1)}</b>", more, table(_COLUMNS, map(_row, shown)), lagging)
 
 
 def _row(each: EpisodeSummary) -> tuple[str, ...]:

@@ -283,12 +283,15 @@ class Reading:
             async with self._connection(simulated=simulated) as connection:
                 summaries = await named_queries.episodes(connection, choice)
             digests = await self._log.last_digests(summaries[0].number, summaries[-1].number) if summaries else {}
-        return Episodes(
+            folding = len(await self._log.behind()) if choice is None else 0
+        listed = Episodes(
             replace(each, digest_sequence=digest.sequence, digest=digest.digest)
             if (digest := digests.get(each.number)) is not None
             else each
             for each in summaries
         )
+        listed.folding = folding
+        return listed
 
     async def diff(self, first: AskedEpisode, second: AskedEpisode) -> EpisodeDiff:
         """Compare two episodes: facts, task trees, and the last places of objects. Raises `UnknownEpisode`."""

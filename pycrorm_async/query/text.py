@@ -150,6 +150,11 @@ def recorded(text: object, characters_max: int = _RECORDED_TEXT_MAX) -> str:
     return f"<bdi>{html.escape(one_line(text, characters_max))}</bdi>"
 
 
+def folding_text(count: int) -> str:
+    """Return the sentence about episodes that a list does not show, or not as they are."""
+    return f"{count:,} episode{'s are' if count > 1 else ' is'} being folded: `await memory.flush()` waits for that"
+
+
 def quiet(content: str) -> str:
     """Return content that is less important."""
     return f'<span style="opacity:.7">{content}</span>'

@@ -414,7 +414,8 @@ class Emitter:
     as well, `put` blocks the calling thread until a record was stored. It drops no event.
 
     Attributes:
-        is_closed: whether the memory is closed, or belongs to the process that forked this one; hooks then do nothing.
+        is_closed: whether the memory is closed, or belongs to the process that forked this one; hooks then only count.
+        unrecorded: the number of nodes, episodes and other reports that came after it was closed.
         feed: the observers of this memory, to which recorded events are published.
         missing: counts the values that could not be recorded.
         descriptions: declares the descriptions of objects.
@@ -425,6 +426,8 @@ class Emitter:
         self.sink = sink
         self.settings = settings
         self.is_closed = False
+        self.unrecorded = 0
+        self._closed_because = "the memory is closed"
         self.feed = EventFeed()
         self.missing = MissingValues()
         self.descriptions = Descriptions(self, settings, self.missing)
@@ -514,6 +517,21 @@ class Emitter:
                 self._headings.clear()
             heading = self._headings[key] = Heading(episode, kind.__name__, kind.version)
         return heading
+
+    def close(self, because: str | None = None) -> None:
+        """Record nothing from now on; `because` names another reason than that the memory is closed."""
+        self.is_closed = True
+        self._closed_because = because or self._closed_because
+
+    def note_unrecorded(self, what: str) -> None:
+        """Count a report that came after `close`, and log a warning for the first."""
+        self.unrecorded += 1
+        if self.unrecorded == 1:
+            _log.warning(
+                "%s is not recorded, because %s (all further ones are only counted, in `status.unrecorded`)",
+                cut(clean(what), _REASON_MAX),
+                self._closed_because,
+            )
 
     def note_unawaited(self, dtype: str) -> None:
         """Count a perform that was called and never awaited as a fault, and log a warning for the first of a type."""

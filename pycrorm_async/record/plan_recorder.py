@@ -181,9 +181,10 @@ class Recorder:
         return self._emitter.sink.room()
 
     def node_started(self, node: TaskTreeNode) -> None:
-        if self._emitter.is_closed:
-            return
         assert node.designator is not None
+        if self._emitter.is_closed:
+            self._emitter.note_unrecorded(node.designator.dtype)
+            return
         outer_episode = current_episode.get()
         implicit: Episode | None = None
         try:
@@ -546,6 +547,7 @@ class Observations:
     def observe(self, name: str, values: object, *, node: TaskTreeNode | None) -> None:
         """Record values under this name. Raises `Unrecordable` with `on_unrecordable="refuse"` only."""
         if self.is_closed:
+            self._emitter.note_unrecorded(f"the observation {name_of(name)}")
             return
         try:
             self._observe(name, values, node)

@@ -169,13 +169,18 @@ E = TypeVar("E", bound=CountingEpisode)
 
 
 def counted(event_type: str) -> Callable[[Callable[Concatenate[E, P], R]], Callable[Concatenate[E, P], R | None]]:
-    """Count the exceptions of a method; do nothing if the memory is closed or belongs to a parent process."""
+    """Count the exceptions of a method; only count it if the memory is closed or belongs to a parent process.
+
+    The memory has ended what was open then, so an end is not missed.
+    """
 
     def wrap(method: Callable[Concatenate[E, P], R]) -> Callable[Concatenate[E, P], R | None]:
         @functools.wraps(method)
         def run(self: E, /, *args: P.args, **kwargs: P.kwargs) -> R | None:
             emitter = self.emitter
             if emitter.is_closed:
+                if event_type not in ("NodeEnded", "EpisodeEnded", "EpisodeStarted"):
+                    emitter.note_unrecorded(f"a call of `{method.__name__}`")
                 return None
             try:
                 return method(self, *args, **kwargs)

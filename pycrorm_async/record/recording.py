@@ -216,7 +216,9 @@ class Recording:
             labels=read_labels(tags, metadata, self._emitter),
         )
         episode = RecordedEpisode(self._emitter, self._episodes, opening, convert, failures)
-        if not self._emitter.is_closed:
+        if self._emitter.is_closed:
+            self._emitter.note_unrecorded(f"the episode {text!r}")
+        else:
             episode.open()
         return episode
 
