@@ -44,7 +44,7 @@ from functools import partial, wraps
 from os import PathLike
 from pathlib import Path
 from types import MappingProxyType, TracebackType
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, ParamSpec, Self, TypeVar, overload
+from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, ParamSpec, Self, TypeVar, overload
 
 from sqlalchemy import Select, func, select
 from sqlalchemy.ext.asyncio import AsyncSession
@@ -58,7 +58,7 @@ from pycrorm_async.events.fields import checked_tags
 from pycrorm_async.events.ids import episode_id
 from pycrorm_async.events.types import Blob
 from pycrorm_async.operations.copy import tag_episode
-from pycrorm_async.operations.destination import expected_log, open_destination
+from pycrorm_async.operations.destination import expected_log, open_destination, rebuild_outdated
 from pycrorm_async.operations.recovery import dead_queues
 from pycrorm_async.orm import ProcessMetaData
 from pycrorm_async.plan.execution import called_performs, recorder
@@ -520,6 +520,10 @@ class ReadableMemory(PartsHolder):
 # `RecordingMemory` is an open memory as plans and programs use it: episodes, observations, flushes, subscriptions.
 
 
+_TABLES: Final = "tables"
+"""Stands for the tables among the faults that a flush has reported."""
+
+
 class RecordingMemory(ReadableMemory, ABC):
     """The recording methods of a memory. Each raises `CallerError` while the memory is not open."""
 
@@ -614,12 +618,14 @@ class RecordingMemory(ReadableMemory, ABC):
 
         Raises:
             EpisodeParked: an episode could not be stored or folded, with the reason; each episode is reported once.
+            TablesForeign: all is stored, but this process cannot use the tables, for example because an older version
+                made them; reported once.
             FlushTimeout: nothing was stored or folded for `flush_timeout_s`. The events are safe in the spool.
         """
         parts = self._open_parts
         try:
             await parts.flush()
-        except EpisodeParked as fault:
+        except (EpisodeParked, TablesForeign) as fault:
             unreported = self._unreported(fault)
             if unreported is not None:
                 raise unreported from fault
@@ -627,7 +633,11 @@ class RecordingMemory(ReadableMemory, ABC):
             await parts.reading.refresh(maps=False)
 
     def _unreported(self, fault: PycrormError) -> PycrormError | None:
-        """Return the fault without parked episodes that a flush has reported; None if no other is left."""
+        """Return the fault without the parked episodes and the tables that a flush has reported; None if it has all."""
+        if isinstance(fault, TablesForeign):
+            is_reported = _TABLES in self._reported
+            self._reported.add(_TABLES)
+            return None if is_reported else fault
         if not isinstance(fault, EpisodeParked):
             return fault
         reasons = {episode: reason for episode, reason in fault.reasons.items() if episode not in self._reported}
@@ -830,6 +840,7 @@ class Memory(RecordingMemory):
         by_daemon, declared = self._settings.writer == "daemon", []
         spool = Spool(self._spool or address.default_spool, self._settings.file_access)
         if not by_daemon:
+            await rebuild_outdated(address, clock=self._clock)
             # Open the database before making a spool, and bind the spool before this recorder adds its folder to it.
             access, expected = spool.access, expected_log(address, spool)
             log = await EventLog.open(address, create=True, clock=self._clock, file_access=access, belongs_to=expected)
@@ -906,6 +917,7 @@ class Memory(RecordingMemory):
         """Store and fold all recorded events. An error in doing so is logged, not raised, if the plan failed itself.
 
         A parked episode is logged and does not make closing fail; `pycrorm status` lists it, and `flush` raises for it.
+        Nor do tables that this process cannot use, such as those of an older version: all events are stored.
         """
         parts, self._parts = self._parts, None
         queue.close()
@@ -913,9 +925,9 @@ class Memory(RecordingMemory):
             await writer.close()
         except PycrormError as fault:
             unreported = self._unreported(fault)
-            if unreported is not None and error is None and not isinstance(unreported, EpisodeParked):
+            if unreported is not None and error is None and not isinstance(unreported, EpisodeParked | TablesForeign):
                 raise unreported from fault
-            if unreported is not None:
+            if unreported is not None and not isinstance(unreported, TablesForeign):  # opening them logged that
                 _log.error("when closing the memory: %s", unreported)
         finally:
             if parts is not None:  # else it could not be opened

@@ -34,7 +34,7 @@ from pycrorm_async.cli.output import (
     print_table,
     problem,
 )
-from pycrorm_async.errors import CallerError, EpisodeParked
+from pycrorm_async.errors import CallerError, EpisodeParked, TablesForeign
 from pycrorm_async.events.fields import checked_tags
 from pycrorm_async.memory import Memory
 from pycrorm_async.progress_bar import stderr
@@ -198,7 +198,8 @@ class _Outcome:
         left: the `SystemExit` of a plan that called `sys.exit()` with code 0.
         unawaited: a sentence for each type of perform that was never awaited.
         episodes: the plan's episodes, read from the database after the last flush.
-        is_written: whether a writer drained the recorder, so that `episodes` could be read.
+        is_written: whether a writer drained the recorder and its tables are of this version, so that `episodes` could
+            be read.
     """
 
     failure: BaseException | None = None
@@ -257,6 +258,9 @@ async def _summarise(memory: Memory, outcome: _Outcome) -> None:
         await memory.flush()
     except EpisodeParked as parked:
         note(str(parked))
+    except TablesForeign:  # opening the memory has warned of them
+        outcome.is_written = False
+        return
     recent = memory.recent_episodes
     if memory.opened_count > len(recent):
         note(f"showing the last {len(recent)} of {memory.opened_count} episodes; `pycrorm episodes` lists all")

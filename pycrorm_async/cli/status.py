@@ -24,7 +24,7 @@ from pycrorm_async.cli.output import (
 )
 from pycrorm_async.cli.reading import note_pending_events
 from pycrorm_async.clock import SYSTEM_CLOCK
-from pycrorm_async.errors import DatabaseError
+from pycrorm_async.errors import DatabaseError, DatabaseForeign
 from pycrorm_async.operations.destination import shared_address
 from pycrorm_async.operations.workers import DaemonNote, FoldWorkerState
 from pycrorm_async.projections.custom import ProjectionState, installed_projections, states
@@ -33,6 +33,7 @@ from pycrorm_async.projections.generations import (
     PROJECTION_VERSION,
     SHOWN,
     contradictions,
+    current_generation,
     failed_views,
     read_generation,
     unmade_types,
@@ -214,6 +215,7 @@ class DatabaseState:
     unmade: Mapping[str, str] = field(default_factory=dict)
     failed_views: Mapping[str, str] = field(default_factory=dict)
     durability: Durability | None = None
+    are_tables_outdated: bool = False
 
 
 def status(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None, as_json: JsonOption = False) -> int:
@@ -263,7 +265,8 @@ def status(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None, as_json: Jso
             }
         )
     else:
-        _print(place, recorders, state.episodes, has_daemon=has_daemon, database_answered=fault is None)
+        is_shown = fault is None and not state.are_tables_outdated
+        _print(place, recorders, state.episodes, has_daemon=has_daemon, is_shown=is_shown)
         _print_running(state.running, state.running_total)
         _print_workers(workers)
         print_durability(kept, state.durability)
@@ -382,18 +385,33 @@ async def _query(address: DatabaseAddress) -> DatabaseState:
                 EpisodeState(row.number, row.id, row.head, row.folded, lag_events, lag_s, row.refused, row.parked)
             )
         running, running_total = await _running(log)
+        outdated = await _outdated(log)
         return DatabaseState(
             episode_states,
             running,
             running_total,
             await states(log, installed_projections(())),
-            [*await log.limits_near(), *await _left_out_of_recall(log), *await contradictions(log)],
+            [*outdated, *await log.limits_near(), *await _left_out_of_recall(log), *await contradictions(log)],
             await unmade_types(log),
             await failed_views(log),
             await durability(log),
+            bool(outdated),
         )
     finally:
         await log.close()
+
+
+async def _outdated(log: EventLog) -> list[str]:
+    """Return a line if the tables are those of another version."""
+    try:
+        async with log.reading() as connection:
+            await current_generation(connection)
+    except DatabaseForeign as fault:
+        heads = [each.head for each in await log.episodes()]
+        return [
+            f"all {sum(heads):,} events of {len(heads):,} episodes are stored, but queries cannot show them: {fault}"
+        ]
+    return []
 
 
 async def _left_out_of_recall(log: EventLog) -> list[str]:
@@ -421,7 +439,7 @@ def _print(
     episodes: Sequence[EpisodeState],
     *,
     has_daemon: bool,
-    database_answered: bool,
+    is_shown: bool,
 ) -> None:
     if recorders:
         print_table(
@@ -451,5 +469,5 @@ def _print(
             ("episode", "id", "stored", "folded", "behind", "by s", "stopped"),
             [(e.number, e.id, e.head, e.folded, e.lag_events, e.lag_s, e.refused or e.parked) for e in episodes],
         )
-    elif database_answered:
+    elif is_shown:
         stdout.print("The tables show all stored events.")

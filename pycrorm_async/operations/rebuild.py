@@ -60,7 +60,7 @@ class RebuildSummary(NamedTuple):
 
 
 async def rebuild_memory(
-    url: str,
+    url: str | DatabaseAddress,
     *,
     workers: int | None = 1,
     views: Sequence[UserView] = (),
@@ -107,7 +107,7 @@ async def projections_of(url: str) -> list[str]:
 
 
 async def _run(
-    url: str,
+    url: str | DatabaseAddress,
     begin: Callable[[EventLog], Awaitable[Rebuild]],
     workers: int | None,
     report_progress: ProgressCallback,
@@ -147,7 +147,11 @@ def _busy_timeout_s(address: DatabaseAddress) -> float:
 
 
 async def _fold(
-    log: EventLog, url: str, rebuild: Rebuild, workers: int | None, report_progress: ProgressCallback
+    log: EventLog,
+    url: str | DatabaseAddress,
+    rebuild: Rebuild,
+    workers: int | None,
+    report_progress: ProgressCallback,
 ) -> None:
     _, total = await recorded(log)
     left = await rebuild.left()

@@ -330,7 +330,7 @@ class Assignment(NamedTuple):
     """The database to fold, the id of its log, the custom projections to fold, the wait for SQLite's lock, and whether
     to make cases."""
 
-    url: str
+    url: str | DatabaseAddress
     log_id: str
     projections: Sequence[Projection] = ()
     busy_timeout_s: float = BUSY_TIMEOUT_S
@@ -430,7 +430,7 @@ class _RequestHandler:
     async def _open_same_log(self) -> EventLog:
         """Open the parent's log. A SQLite file that replaced it is refused and not written."""
         assignment = self._assignment
-        address = DatabaseAddress.parse(assignment.url)
+        address = shared_address(assignment.url)
         await (await EventLog.open(address, create=False)).close()
         log = await EventLog.open(address, create=True, busy_timeout_s=assignment.busy_timeout_s)
         if log.log_id != assignment.log_id:

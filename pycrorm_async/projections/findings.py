@@ -412,7 +412,7 @@ class EpisodeRange(NamedTuple):
                 comparison = await check.comparison(connection)
                 if comparison is None:
                     return None
-                if await dialect_of(connection).keep(connection, comparison.tables):
+                if not comparison.tables or await dialect_of(connection).keep(connection, comparison.tables):
                     return await check.check(connection, comparison, at, self, limit)
             # A rebuild replaced and dropped the tables between two statements: read the generation again.
         raise DatabaseForeign(f"{log.address}: {check.missing_table}")

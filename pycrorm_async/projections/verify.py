@@ -16,7 +16,7 @@ from pycrorm_async.events.ids import row_id, row_id_min, row_key
 from pycrorm_async.events.order import OrderCheck
 from pycrorm_async.events.types import EpisodeEnded, ObjectAdded, references_in
 from pycrorm_async.projections import pipeline
-from pycrorm_async.projections.columns import OWN, unite
+from pycrorm_async.projections.columns import OWN, Layout, unite
 from pycrorm_async.projections.custom import (
     CustomFoldDefinition,
     CustomRows,
@@ -422,12 +422,9 @@ async def verify(
             result.unmade = await unmade_types(log)
             result.failed_views = await failed_views(log)
         result.stopped = await _stopped(log, episode)
-        try:
-            await check_outside(log, digests, result, episode)
-            total = await _check_heads(log, within, result)
-            await within.check(log, _TablesCheck(log, result, total, report_progress))
-        except TablesOutdated as fault:
-            result.outdated = str(fault)
+        await check_outside(log, digests, result, episode)
+        total = await _check_heads(log, within, result)
+        await within.check(log, _TablesCheck(log, result, total, report_progress))
         await _check_blobs(log, result)
         result.not_compared = await uncompared_projections(log, projections)
         for each in projections:
@@ -527,11 +524,17 @@ class _TablesCheck:
         self._comparison: Comparison | None = None
 
     async def comparison(self, connection: AsyncConnection) -> Comparison:
-        generation = await current_generation(connection)
+        try:
+            generation = await current_generation(connection)
+        except TablesOutdated as fault:  # check the log alone
+            self.result.outdated = str(fault)
+            generation = Generation(0, 0, Layout(), {})
         if generation is None:
             raise DatabaseUnavailable(no_tables(self._log.address))
         if self._comparison is None or self._comparison.generation != generation:
             self._comparison = Comparison(generation, self._dialect.stored_column)
+            if self.result.outdated is not None:
+                self._comparison.tables.clear()
         return self._comparison
 
     async def check(
@@ -611,6 +614,8 @@ class _TablesCheck:
         settled: Collection[int],
         read: Mapping[int, EpisodeCheck],
     ) -> None:
+        if self.result.outdated is not None:
+            return
         try:
             with self._log.translated():
                 differences = await comparison.differences(connection, rows, within, carried=carried, settled=settled)

@@ -19,6 +19,7 @@ from pycrorm_async import Memory, Reading
 from pycrorm_async.errors import DatabaseForeign, TablesOutdated
 from pycrorm_async.events.codec import Decoder, Upcaster
 from pycrorm_async.events.types import EVENT_TYPES, ObjectAdded
+from pycrorm_async.operations import destination
 from pycrorm_async.operations.copy import copy_episodes
 from pycrorm_async.operations.rebuild import rebuild_memory
 from pycrorm_async.operations.recovery import recover
@@ -353,17 +354,17 @@ REBUILD = (
 
 
 async def test_events_are_recorded_beside_tables_of_an_older_fold_and_visible_after_a_rebuild(
-    golden: str,
+    golden: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(destination, "SMALL_EVENTS_MAX", 0)
     before = tables_of(golden)
     ask_to_change(golden, f"UPDATE pycrorm_generation SET version = {PROJECTION_VERSION - 1}")
     greet = greeting(whom=str)
-    with pytest.raises(TablesOutdated, match=REBUILD):  # when the memory is closed
-        async with Memory.open(golden) as memory:
-            await greet("Eve").perform()
-            for asked in (memory.flush, memory.reading.refresh, memory.reading.episodes):
-                with pytest.raises(TablesOutdated, match=REBUILD):
-                    await asked()
+    async with Memory.open(golden) as memory:
+        await greet("Eve").perform()
+        for asked in (memory.flush, memory.reading.refresh, memory.reading.episodes):
+            with pytest.raises(TablesOutdated, match=REBUILD):
+                await asked()
     with pytest.raises(TablesOutdated, match=REBUILD):
         await designators_of(golden, "GreetAction")
     assert ask(golden, "SELECT head, folded FROM episode ORDER BY number") == [(18, 18), (4, 4), (6, 0), (6, 0)]
