@@ -44,7 +44,7 @@ from functools import partial, wraps
 from os import PathLike
 from pathlib import Path
 from types import MappingProxyType, TracebackType
-from typing import TYPE_CHECKING, Any, Final, Literal, NamedTuple, ParamSpec, Self, TypeVar, overload
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, ParamSpec, Self, TypeVar, overload
 
 from sqlalchemy import Select, func, select
 from sqlalchemy.ext.asyncio import AsyncSession
@@ -52,18 +52,19 @@ from sqlalchemy.ext.asyncio import AsyncSession
 from pycrorm_async import __version__
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
 from pycrorm_async.connected_var import ConnectedVar, set_inside
-from pycrorm_async.errors import CallerError, EpisodeParked, FlushTimeout, PycrormError, TablesForeign
+from pycrorm_async.errors import CallerError, EpisodeParked, FlushTimeout, PycrormError, TablesForeign, TablesOutdated
 from pycrorm_async.events.codec import declaration_of
 from pycrorm_async.events.fields import checked_tags
 from pycrorm_async.events.ids import episode_id
 from pycrorm_async.events.types import Blob
 from pycrorm_async.operations.copy import tag_episode
-from pycrorm_async.operations.destination import expected_log, open_destination, rebuild_outdated
+from pycrorm_async.operations.destination import expected_log, open_destination
 from pycrorm_async.operations.recovery import dead_queues
 from pycrorm_async.orm import ProcessMetaData
 from pycrorm_async.plan.execution import called_performs, recorder
 from pycrorm_async.plan.task import TaskTreeNode, experience
 from pycrorm_async.projections.custom import Projection, validate_projections
+from pycrorm_async.projections.generations import current_generation
 from pycrorm_async.projections.mapped_tables import UserView
 from pycrorm_async.query.episode_diff import EpisodeDiff
 from pycrorm_async.query.frames import BATCH_ROWS, Library
@@ -520,10 +521,6 @@ class ReadableMemory(PartsHolder):
 # `RecordingMemory` is an open memory as plans and programs use it: episodes, observations, flushes, subscriptions.
 
 
-_TABLES: Final = "tables"
-"""Stands for the tables among the faults that a flush has reported."""
-
-
 class RecordingMemory(ReadableMemory, ABC):
     """The recording methods of a memory. Each raises `CallerError` while the memory is not open."""
 
@@ -635,8 +632,8 @@ class RecordingMemory(ReadableMemory, ABC):
     def _unreported(self, fault: PycrormError) -> PycrormError | None:
         """Return the fault without the parked episodes and the tables that a flush has reported; None if it has all."""
         if isinstance(fault, TablesForeign):
-            is_reported = _TABLES in self._reported
-            self._reported.add(_TABLES)
+            is_reported = "tables" in self._reported
+            self._reported.add("tables")
             return None if is_reported else fault
         if not isinstance(fault, EpisodeParked):
             return fault
@@ -840,12 +837,17 @@ class Memory(RecordingMemory):
         by_daemon, declared = self._settings.writer == "daemon", []
         spool = Spool(self._spool or address.default_spool, self._settings.file_access)
         if not by_daemon:
-            await rebuild_outdated(address, clock=self._clock)
             # Open the database before making a spool, and bind the spool before this recorder adds its folder to it.
             access, expected = spool.access, expected_log(address, spool)
             log = await EventLog.open(address, create=True, clock=self._clock, file_access=access, belongs_to=expected)
             try:
                 declared = [declaration_of(each) for each in await log.declarations()]
+                async with log.reading() as connection:
+                    await current_generation(connection)
+            except TablesOutdated:
+                from pycrorm_async.operations.rebuild import rebuild_outdated  # here, because few programs rebuild
+
+                await rebuild_outdated(address, clock=self._clock)
             finally:
                 await log.close()
             spool.bind(log.log_id)

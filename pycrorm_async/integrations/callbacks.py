@@ -16,7 +16,6 @@ from types import FrameType
 from typing import Any, Final
 from uuid import UUID
 
-from pycrorm_async.events.types import NodeStatus
 from pycrorm_async.integrations.foreign_package import ForeignPackage
 from pycrorm_async.record.executives import Runs
 from pycrorm_async.record.recording import Recording
@@ -115,12 +114,9 @@ class RememberedRuns(Runs, BaseCallbackHandler):
 
     def on_chain_error(self, error: BaseException, *, run_id: UUID, **run: Any) -> None:
         self._note_inputs(run_id, run)
-        status: NodeStatus | None = None
-        if any(each.__name__ == "GraphBubbleUp" for each in type(error).__mro__):  # LangGraph asks a human
-            status = "INTERRUPTED"
-        elif isinstance(error, GeneratorExit):  # the caller reads no more of the stream
-            status = "CANCELLED"
-        self.end(run_id, status, error, run.get("response"))
+        is_paused = any(each.__name__ == "GraphBubbleUp" for each in type(error).__mro__)  # LangGraph asks a human
+        is_left = isinstance(error, GeneratorExit)  # the caller reads no more of the stream
+        self.end(run_id, "INTERRUPTED" if is_paused else "CANCELLED" if is_left else None, error, run.get("response"))
 
     def _note_inputs(self, run_id: UUID, run: Mapping[str, Any]) -> None:
         """Record as an observation the inputs that came in chunks, which are known with the end only."""

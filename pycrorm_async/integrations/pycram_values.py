@@ -54,7 +54,7 @@ _EXPECTED_FIELDS: Final[dict[str, dict[str, FieldSpec]]] = {
     "CodeNode": {"function": "text", "arguments": ("dict", "text")},
 }
 """The types of fields that have no full annotation, as their usual values have them."""
-_INERTIAL_ADDED: Final = (
+_NO_INERTIAL: Final = (
     '<inertial><mass value="0.1" /><origin rpy="0 0 0" xyz="0 0 0" />'
     '<inertia ixx="0.01" ixy="0" ixz="0" iyy="0.01" iyz="0" izz="0.01" /></inertial>'
 )
@@ -255,18 +255,14 @@ class PyCRAMValues:
             self.pycram.RobotDescription.current_robot_description if self._original(world_object).is_a_robot else None
         )
         fixed = self.pycram.JointType.FIXED
-        path = Path(world_object.path) if world_object.path is not None else None
+        path = Path(world_object.path or "")
         color = world_object.color if world_object.has_one_link else None
         return {
             "name": world_object.name,
             "object_type": self.object_type(world_object),
             "pose": self.pose(world_object.pose),
             "joints": {name: float(each.position) for name, each in world_object.joints.items() if each.type != fixed},
-            "urdf": (
-                path.read_text().replace(_INERTIAL_ADDED, "")
-                if path is not None and path.suffix == ".urdf" and path.is_file()
-                else None
-            ),
+            "urdf": path.read_text().replace(_NO_INERTIAL, "") if path.suffix == ".urdf" and path.is_file() else None,
             "color": tuple(map(float, color.get_rgba())) if color is not None else None,
             "model": robot.name if robot is not None else None,
             "torso_joint": (robot.torso_joint or None) if robot is not None else None,

@@ -25,7 +25,8 @@ import msgspec
 
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import DatabaseForeign, SpoolTaken
-from pycrorm_async.operations.destination import open_destination, rebuild_outdated, shared_address
+from pycrorm_async.operations.destination import open_destination, shared_address
+from pycrorm_async.operations.rebuild import rebuild_outdated
 from pycrorm_async.operations.workers import (
     Assignment,
     ChildProcess,
@@ -77,7 +78,7 @@ async def serve(
     async with AsyncExitStack() as stack:
         stack.callback(lock.release)
         projections = validate_projections(projections)
-        await rebuild_outdated(address, clock=SYSTEM_CLOCK)
+        await rebuild_outdated(address)
         destination = await stack.enter_async_context(
             open_destination(address, place, clock=SYSTEM_CLOCK, projections=projections, settings=settings)
         )

@@ -44,15 +44,12 @@ from pycrorm_async.errors import (
     FilesError,
     LogDamaged,
     LogWentBack,
-    PycrormError,
     SpoolDamaged,
     TablesForeign,
-    TablesOutdated,
 )
 from pycrorm_async.events.codec import Record
 from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.projections.custom import Projection, installed_projections
-from pycrorm_async.projections.generations import current_generation
 from pycrorm_async.projections.mapped_tables import UserView
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.queue.blobs import read_blob
@@ -69,9 +66,6 @@ from pycrorm_async.store.stored import Basis, EpisodeRow
 _APPENDS_AT_ONCE = 4
 """Bounds the concurrent appends to a server, for any number of recorders: the pool's connections less one for folding.
 """
-
-SMALL_EVENTS_MAX = 50_000
-"""The largest log whose outdated tables are rebuilt at open: it takes one process about two seconds."""
 
 _WATCH_S = 1.0
 """The interval between two checks that a SQLite file still exists; a check takes two microseconds."""
@@ -162,39 +156,6 @@ class LogAndTables:
 
     async def stopped(self) -> Mapping[str, str]:
         return {each.id: each.refused or each.parked or "" for each in await self.log.stopped()}
-
-
-async def rebuild_outdated(address: DatabaseAddress, *, clock: Clock) -> None:
-    """Rebuild the tables of a small memory that an older fold made; do nothing for any other memory.
-
-    Opening a larger one logs a warning instead, because a plan must not wait for a rebuild of unknown length.
-    """
-    try:
-        log = await EventLog.open(address, create=False)
-    except DatabaseError:  # there is none yet, or opening it for writing raises the reason
-        return
-    try:
-        async with log.reading() as connection:
-            await current_generation(connection)
-    except TablesOutdated as outdated:
-        events = sum(each.head for each in await log.episodes())
-        if events > SMALL_EVENTS_MAX:
-            return
-        _log.warning("%s: rebuilding them from %s events", str(outdated).rpartition(": ")[0], f"{events:,}")
-    except DatabaseError:
-        return
-    else:
-        return
-    finally:
-        await log.close()
-    from pycrorm_async.operations.rebuild import rebuild_memory  # here, because few programs rebuild
-    from pycrorm_async.progress_bar import progress_bar
-
-    try:
-        with progress_bar("rebuilding") as report_progress:
-            await rebuild_memory(address, report_progress=report_progress, clock=clock)
-    except PycrormError as error:
-        _log.warning("the tables could not be rebuilt: %s", error)
 
 
 @asynccontextmanager

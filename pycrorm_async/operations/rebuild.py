@@ -8,14 +8,15 @@ import multiprocessing
 import os
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from contextlib import suppress
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
-from pycrorm_async.errors import DatabaseError
+from pycrorm_async.errors import DatabaseError, DatabaseForeign, DatabaseUnavailable, PycrormError
 from pycrorm_async.operations.destination import shared_address
 from pycrorm_async.operations.workers import Assignment, FoldWorker, FoldWorkerLost, FoldWorkers
+from pycrorm_async.progress_bar import ProgressCallback, progress_bar
 from pycrorm_async.projections.custom import Projection
-from pycrorm_async.projections.generations import projections_in, read_generations
+from pycrorm_async.projections.generations import PROJECTION_VERSION, SHOWN, projections_in, read_generations
 from pycrorm_async.projections.mapped_tables import UserView
 from pycrorm_async.projections.pipeline import Share
 from pycrorm_async.projections.rebuild import Rebuild, claimed, clear, recorded
@@ -23,13 +24,12 @@ from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import BUSY_TIMEOUT_S, DatabaseAddress
 from pycrorm_async.store.log import EventLog
 
-if TYPE_CHECKING:
-    from pycrorm_async.progress_bar import ProgressCallback
-
 _log = logging.getLogger("pycrorm_async")
 
 _RESTARTS_MAX = 2
 """Bounds the restarts of a worker that dies again and again, such as for want of memory."""
+SMALL_EVENTS_MAX = 50_000
+"""The largest log whose outdated tables are rebuilt at open: it takes one process about two seconds."""
 _ALONE_EVENTS_MAX = 500_000
 """The largest log that one process folds by default. For 400,000 events two processes took 0.8 times as long as one on
 SQLite, and as long on PostgreSQL."""
@@ -85,6 +85,31 @@ async def rebuild_memory(
     return await _run(url, lambda log: Rebuild.begin(log, views=views), workers, report_progress, clock)
 
 
+async def rebuild_outdated(address: DatabaseAddress, *, clock: Clock = SYSTEM_CLOCK) -> None:
+    """Rebuild the tables of a small memory that an older fold made; do nothing for any other memory.
+
+    Opening a larger one logs a warning instead, because a plan must not wait for a rebuild of unknown length.
+    """
+    try:
+        log = await EventLog.open(address, create=False)
+        try:
+            async with log.reading() as connection:
+                made = (await read_generations(connection)).get(SHOWN)
+            _, events = await recorded(log)
+            if made is None or made.version >= PROJECTION_VERSION or events > SMALL_EVENTS_MAX:
+                return
+            versions = f"version {made.version} of the fold, this is version {PROJECTION_VERSION}"
+            _log.warning("the tables were made by %s: rebuilding them from %s events", versions, f"{events:,}")
+        finally:
+            await log.close()
+        with progress_bar("rebuilding") as report_progress:
+            await rebuild_memory(address, report_progress=report_progress, clock=clock)
+    except (DatabaseUnavailable, DatabaseForeign):
+        return  # there is no memory yet, or opening it for writing raises the reason
+    except PycrormError as error:
+        _log.warning("the tables could not be rebuilt: %s", error)
+
+
 async def rebuild_projection(
     url: str,
     projection: Projection,
@@ -121,7 +146,7 @@ async def _run(
             began = clock.monotonic_ns()
             await clear(log)
             rebuild = await begin(log)
-            await _fold(log, url, rebuild, workers, report_progress)
+            await _fold(log, rebuild, workers, report_progress)
             report_progress(1, 1, "showing")
             await rebuild.show()
             seconds = (clock.monotonic_ns() - began) / 1e9
@@ -146,13 +171,7 @@ def _busy_timeout_s(address: DatabaseAddress) -> float:
     return _BUSY_TIMEOUT_S if address.is_sqlite else BUSY_TIMEOUT_S
 
 
-async def _fold(
-    log: EventLog,
-    url: str | DatabaseAddress,
-    rebuild: Rebuild,
-    workers: int | None,
-    report_progress: ProgressCallback,
-) -> None:
+async def _fold(log: EventLog, rebuild: Rebuild, workers: int | None, report_progress: ProgressCallback) -> None:
     _, total = await recorded(log)
     left = await rebuild.left()
     if workers is None:
@@ -169,7 +188,7 @@ async def _fold(
         _log.warning("a daemonic process of multiprocessing cannot start fold workers; it folds without them")
         workers = 1
     if workers > 1:
-        assignment = Assignment(url, log.log_id, busy_timeout_s=_busy_timeout_s(log.address))
+        assignment = Assignment(log.address, log.log_id, busy_timeout_s=_busy_timeout_s(log.address))
         await _run_workers(assignment, workers, report)
     # Fold the events that are left: all without workers, otherwise new ones and those of a worker that failed. Its
     # fault is raised here, in the process that reports it.

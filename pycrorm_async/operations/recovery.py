@@ -17,7 +17,7 @@ from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import PycrormError
 from pycrorm_async.events.codec import Record
 from pycrorm_async.events.ids import EpisodeId, episode_text
-from pycrorm_async.operations.destination import open_destination, rebuild_outdated, shared_address
+from pycrorm_async.operations.destination import open_destination, shared_address
 from pycrorm_async.projections.custom import Projection, validate_projections
 from pycrorm_async.queue.maintenance import inspect_spool
 from pycrorm_async.queue.sources import DeadSource, LiveSource, open_dead
@@ -104,7 +104,9 @@ async def recover(
         if source.name in episodes:
             episodes[source.name].update(each.episode for each in batch if each.episode is not None)
 
-    await rebuild_outdated(address, clock=SYSTEM_CLOCK)
+    from pycrorm_async.operations.rebuild import rebuild_outdated  # here, because every memory imports this module
+
+    await rebuild_outdated(address)
     async with open_destination(
         address, place, clock=SYSTEM_CLOCK, projections=validate_projections(projections), settings=settings
     ) as destination:

@@ -22,18 +22,9 @@ from threading import Lock
 from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar, overload
 from weakref import ref
 
-from sqlalchemy import (
-    BinaryExpression,
-    ColumnElement,
-    Connection,
-    Dialect,
-    ExceptionContext,
-    Result,
-    Row,
-    Select,
-    event,
-)
+from sqlalchemy import BinaryExpression, ColumnElement, Connection, Dialect, Result, Row, Select, event
 from sqlalchemy.dialects import postgresql, sqlite
+from sqlalchemy.engine import ExceptionContext
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine, AsyncSession, async_sessionmaker
 from sqlalchemy.orm import ORMExecuteState, Session
 from sqlalchemy.orm.identity import IdentityMap

@@ -55,7 +55,7 @@ from pycrorm_async.store.log import EventLog, episode_named
 from pycrorm_async.store.stored import StoredEvent
 from pycrorm_async.visible_text import visible
 from pycrorm_async.world.bullet_body import ObjectState, WorldState
-from pycrorm_async.world.meshes import triangles_of
+from pycrorm_async.world.model_boxes import triangles_of
 from pycrorm_async.world.pose import MalformedPose, Pose
 from pycrorm_async.world.urdf import robot_description
 

@@ -427,7 +427,6 @@ class Emitter:
         self.settings = settings
         self.is_closed = False
         self.unrecorded = 0
-        self._closed_because = "the memory is closed"
         self.feed = EventFeed()
         self.missing = MissingValues()
         self.descriptions = Descriptions(self, settings, self.missing)
@@ -518,20 +517,16 @@ class Emitter:
             heading = self._headings[key] = Heading(episode, kind.__name__, kind.version)
         return heading
 
-    def close(self, because: str | None = None) -> None:
-        """Record nothing from now on; `because` names another reason than that the memory is closed."""
-        self.is_closed = True
-        self._closed_because = because or self._closed_because
+    def close(self, because: str = "the memory is closed") -> None:
+        """Record nothing from now on; further reports are counted."""
+        self._closed_because, self.is_closed = because, True
 
     def note_unrecorded(self, what: str) -> None:
         """Count a report that came after `close`, and log a warning for the first."""
         self.unrecorded += 1
         if self.unrecorded == 1:
-            _log.warning(
-                "%s is not recorded, because %s (all further ones are only counted, in `status.unrecorded`)",
-                cut(clean(what), _REASON_MAX),
-                self._closed_because,
-            )
+            why = f"{self._closed_because} (all further ones are only counted, in `status.unrecorded`)"
+            _log.warning("%s leaves no record, because %s", cut(clean(what), _REASON_MAX), why)
 
     def note_unawaited(self, dtype: str) -> None:
         """Count a perform that was called and never awaited as a fault, and log a warning for the first of a type."""

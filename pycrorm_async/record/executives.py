@@ -325,10 +325,8 @@ class Runs(EpisodeBlock):
     """
 
     def __init__(self, recording: Recording, executive: str, **episode: Any) -> None:
-        super().__init__(recording, executive, **{"convert": self._plain, **episode})
-
-    def _plain(self, value: Any) -> Any:
-        return plain_value(value, self.simplified)
+        converted = {"convert": lambda value: plain_value(value, self.simplified), **episode}
+        super().__init__(recording, executive, **converted)
 
     def start(
         self,

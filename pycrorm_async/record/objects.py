@@ -143,7 +143,7 @@ class _Described:
         return self.links.get(link)
 
     def visual_boxes(self, links: Collection[str]) -> Mapping[str, BoundingBox]:
-        return shape_boxes(self.description_text, "visual") if links else {}
+        return shape_boxes(self.description_text, "visual", links)
 
 
 class RecordedObjects(ObjectRows[Hashable]):

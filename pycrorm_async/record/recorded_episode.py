@@ -7,17 +7,14 @@ import math
 import threading
 from collections import OrderedDict, deque
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from contextlib import suppress
 from enum import Enum
 from functools import partial
 from os import PathLike
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Concatenate, Literal, ParamSpec, Protocol, Self, TypeAlias, TypeVar, get_args
-from xml.etree.ElementTree import ParseError
 
 import msgspec
-import numpy as np
 from msgspec.structs import replace
 
 from pycrorm_async.errors import CallerError
@@ -554,11 +551,12 @@ S = TypeVar("S", bound=msgspec.Struct)
 
 
 def struct_of(value: object, kind: type[S]) -> S:
-    """Return a value of this class whose parts have the declared types. Raises `CallerError`."""
+    """Return a value of this class whose parts, or numbers of numpy, have the declared types. Raises `CallerError`."""
     if not isinstance(value, kind):
         raise CallerError(f"expected a {kind.__name__}, got {clean_repr(value)}")
     try:
-        return _with_unit_turn(msgspec.convert(msgspec.to_builtins(value, enc_hook=_numbers_of), kind))
+        parts = msgspec.to_builtins(value, enc_hook=lambda number: number.tolist())
+        return _with_unit_turn(msgspec.convert(parts, kind))
     except Exception as error:
         raise CallerError(f"not a whole {kind.__name__}: {message_of(error)}") from error
 
@@ -572,13 +570,6 @@ def _with_unit_turn(value: S) -> S:
     elif isinstance(pose := getattr(value, "pose", None), PoseValue):
         return replace(value, pose=_with_unit_turn(pose))
     return value
-
-
-def _numbers_of(value: Any) -> Any:
-    """Return the numbers of numpy as those of Python. Raises for any other class."""
-    if isinstance(value, np.generic | np.ndarray):
-        return value.tolist()
-    raise CallerError(f"values of the class {type(value).__name__} are not recorded")
 
 
 def pose_of(pose: Pose | PoseValue) -> PoseValue:
@@ -615,8 +606,7 @@ class ArgumentReader:
         urdf, kind = self._urdf_of(name, others["urdf"]), self.text_of("object_type", object_type) or "UNKNOWN"
         mass_kg = self._number_of("mass_kg", others["mass_kg"])
         if mass_kg is None and urdf is not None and kind not in ("ROBOT", "ENVIRONMENT"):  # as `Object.mass_kg`
-            with suppress(ParseError):  # declaring the description counts it
-                mass_kg = described_mass_kg(urdf)
+            mass_kg = described_mass_kg(urdf)
         texts = {each: self.text_of(each, others[each]) for each in ("model", "serial", "base_link", "torso_joint")}
         return RecordedObject(
             self.text_of("name", name) or "an object",
@@ -629,19 +619,15 @@ class ArgumentReader:
             **texts,
         )
 
-    def _urdf_of(self, name: str, urdf: object) -> str | None:
+    def _urdf_of(self, name: str, urdf: Any) -> str | None:
         """Return the text of a URDF with the paths of its meshes, as a world reads it; faults are counted as missing.
 
         The text is kept where a world would refuse it, because an executive may have loaded it elsewhere.
         """
-        if urdf is None:
-            return None
         text = urdf if isinstance(urdf, str) and urdf.lstrip().startswith("<") else None
-        if text is not None and "<mesh" not in text:
+        if urdf is None or (text is not None and "<mesh" not in text):
             return text
         try:
-            if not isinstance(urdf, str | PathLike):
-                raise TypeError("it must be a text or a path")  # noqa: TRY301  counted below
             return urdf_text(name, text or Path(urdf))
         except (DescriptionNotLoadable, TypeError) as error:
             if text is None:  # declaring a text counts the mesh that does not exist, or the fault of the XML

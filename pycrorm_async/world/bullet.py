@@ -34,9 +34,8 @@ from pycrorm_async.world.bullet_body import (
     check_state,
     engine,
     set_state,
-    visual_boxes,
 )
-from pycrorm_async.world.model_boxes import described_mass_kg, visuals_as_collisions
+from pycrorm_async.world.model_boxes import described_mass_kg, shape_boxes
 from pycrorm_async.world.models import built_in_urdf
 from pycrorm_async.world.pose import (
     COORDINATE_MAX,
@@ -615,8 +614,8 @@ class Object:
         return self.body.box_in_link(self._check_link(link))
 
     def visual_boxes(self, links: Collection[str]) -> dict[str, BoundingBox]:
-        """Return the boxes around the visual shapes of links, in their frames, where Bullet can load the shapes."""
-        return visual_boxes(visuals_as_collisions(self.description_text, links), self.body.client)
+        """Return the boxes around the visual shapes of links, in their frames, where the shapes can be read."""
+        return shape_boxes(self.description_text, "visual", links)
 
     @property
     def mass_kg(self) -> float | None:

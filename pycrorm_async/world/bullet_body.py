@@ -15,7 +15,7 @@ import ctypes
 import math
 import tempfile
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
@@ -226,21 +226,6 @@ class Body:
     def _paint(self, color: Color) -> None:
         for number in self._link_numbers.values():
             engine().changeVisualShape(self.number, number, rgbaColor=color, physicsClientId=self.client)
-
-
-def visual_boxes(urdfs: Mapping[str, str], client: int) -> dict[str, BoundingBox]:
-    """Return the box around the shapes of each link, by its name; each URDF describes one link.
-
-    Each is loaded into Bullet and removed again. Links that Bullet cannot load or that have no shape are left out.
-    """
-    boxes: dict[str, BoundingBox] = {}
-    for link, urdf in urdfs.items():
-        with suppress(DescriptionNotLoadable):
-            body = Body(link, urdf, client, None, None)
-            body.unload()
-            if (box := body.box_in_link(link)) is not None:
-                boxes[link] = box
-    return boxes
 
 
 def _load(name: str, urdf: str, client: int) -> int:

@@ -148,7 +148,7 @@ async def test_a_forked_child_does_not_affect_the_memory_of_its_parent(tmp_path:
     )
     done = await asyncio.to_thread(run_script, script, url_of(tmp_path), timeout_s=60)
     assert done.returncode == 0
-    assert done.stderr.startswith("NoteAction is not recorded, because this process was forked"), done.stderr
+    assert done.stderr.startswith("NoteAction leaves no record, because this process was forked"), done.stderr
     assert done.stderr.count("\n") == 1
     async with Reading.open(url_of(tmp_path)) as reading:
         assert await texts(reading) == ["before", "after"]

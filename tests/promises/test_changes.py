@@ -19,7 +19,7 @@ from pycrorm_async import Memory, Reading
 from pycrorm_async.errors import DatabaseForeign, TablesOutdated
 from pycrorm_async.events.codec import Decoder, Upcaster
 from pycrorm_async.events.types import EVENT_TYPES, ObjectAdded
-from pycrorm_async.operations import destination
+from pycrorm_async.operations import rebuild
 from pycrorm_async.operations.copy import copy_episodes
 from pycrorm_async.operations.rebuild import rebuild_memory
 from pycrorm_async.operations.recovery import recover
@@ -356,7 +356,7 @@ REBUILD = (
 async def test_events_are_recorded_beside_tables_of_an_older_fold_and_visible_after_a_rebuild(
     golden: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(destination, "SMALL_EVENTS_MAX", 0)
+    monkeypatch.setattr(rebuild, "SMALL_EVENTS_MAX", 0)
     before = tables_of(golden)
     ask_to_change(golden, f"UPDATE pycrorm_generation SET version = {PROJECTION_VERSION - 1}")
     greet = greeting(whom=str)

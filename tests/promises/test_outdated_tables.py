@@ -14,7 +14,7 @@ import pytest
 
 from pycrorm_async import Memory
 from pycrorm_async.errors import TablesOutdated
-from pycrorm_async.operations import destination
+from pycrorm_async.operations import rebuild
 from pycrorm_async.operations.recovery import recover
 from pycrorm_async.plan import ActionAbstract
 from pycrorm_async.projections.generations import PROJECTION_VERSION
@@ -98,8 +98,8 @@ async def test_a_plan_in_a_large_outdated_memory_is_stored_and_raises_nothing(
     database_url: str, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     await outdated(database_url)
-    small = destination.SMALL_EVENTS_MAX
-    monkeypatch.setattr(destination, "SMALL_EVENTS_MAX", 5)
+    small = rebuild.SMALL_EVENTS_MAX
+    monkeypatch.setattr(rebuild, "SMALL_EVENTS_MAX", 5)
     await recorded(database_url, 3)
     [warning] = warnings_in(caplog)
     assert "run `pycrorm rebuild`; events are stored in the log but not folded until then" in warning
@@ -109,7 +109,7 @@ async def test_a_plan_in_a_large_outdated_memory_is_stored_and_raises_nothing(
             await memory.flush()
         await memory.flush()  # reported once, as a parked episode
         assert memory.status.stored == memory.status.written
-    monkeypatch.setattr(destination, "SMALL_EVENTS_MAX", small)
+    monkeypatch.setattr(rebuild, "SMALL_EVENTS_MAX", small)
     await recorded(database_url, 5)
     assert numbers_in(database_url) == [1, 2, 3, 4, 5]
 
@@ -164,7 +164,7 @@ async def test_every_command_says_that_the_tables_are_outdated_and_run_succeeds(
 def pycrorm(*arguments: str, small: int = 5) -> subprocess.CompletedProcess[str]:
     """Run a command for which a memory of more events than this is large."""
     program = (
-        f"from pycrorm_async.operations import destination; destination.SMALL_EVENTS_MAX = {small}\n"
+        f"from pycrorm_async.operations import rebuild; rebuild.SMALL_EVENTS_MAX = {small}\n"
         "from pycrorm_async.__main__ import main; main()"
     )
     return subprocess.run(

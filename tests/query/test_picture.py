@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from matplotlib import image
 from numpy.typing import NDArray
+from pycrorm_async.world.meshes import triangles_of
 from typer.testing import CliRunner
 
 from pycrorm_async import Memory
@@ -20,8 +21,8 @@ from pycrorm_async.cli.main import app
 from pycrorm_async.errors import CallerError, UnknownEpisode
 from pycrorm_async.plan import NavigateAction, simulated_robot
 from pycrorm_async.settings import Settings
-from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose, meshes
-from pycrorm_async.world.meshes import triangles_of
+from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose, model_boxes
+from pycrorm_async.world.model_boxes import triangles_of
 from pycrorm_async.world.models import box_urdf
 from tests import mesh_files
 
@@ -215,6 +216,6 @@ def test_a_file_without_triangles_has_a_reason(name: str, content: bytes, reason
 
 
 def test_a_file_with_too_many_triangles_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(meshes, "TRIANGLES_MAX", 5)
+    monkeypatch.setattr(model_boxes, "TRIANGLES_MAX", 5)
     with pytest.raises(ValueError, match="it has 6 triangles, more than 5"):
         triangles_of("a.obj", mesh_files.obj())

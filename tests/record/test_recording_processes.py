@@ -151,7 +151,7 @@ def test_a_forked_child_records_nothing_and_does_not_hang(tmp_path: Path) -> Non
         env=environment(), capture_output=True, text=True, timeout=60, check=False,
     )  # fmt: skip
     assert done.returncode == 0
-    assert done.stderr.startswith("a call of `start` is not recorded, because this process was forked"), done.stderr
+    assert done.stderr.startswith("a call of `start` leaves no record, because this process was forked"), done.stderr
     assert done.stderr.count("\n") == 1
     assert nodes(tmp_path) == [("Step", None, "SUCCEEDED", None)]
 

@@ -52,7 +52,7 @@ async def test_performs_after_the_memory_has_closed_are_counted_with_one_warning
     await asyncio.to_thread(late.join)
     assert memory.status.unrecorded == 3
     [warning] = warnings_in(caplog)
-    assert warning.startswith("StepAction is not recorded, because the memory is closed (")
+    assert warning.startswith("StepAction leaves no record, because the memory is closed (")
     assert ask(tmp_path / "memory.db", "SELECT * FROM action") == []
 
 
@@ -73,7 +73,7 @@ def test_an_executive_that_goes_on_after_the_memory_has_closed_is_counted(
     recording.episode(description="late").start(3, step)
     assert memory.status.unrecorded == 4
     [warning] = warnings_in(caplog)
-    assert warning.startswith("a call of `start` is not recorded, because the memory is closed (")
+    assert warning.startswith("a call of `start` leaves no record, because the memory is closed (")
 
 
 @pytest.mark.parametrize("writer", ["thread", "daemon"])
