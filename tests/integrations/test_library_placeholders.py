@@ -16,11 +16,11 @@ from langchain_core.tools import tool
 from langgraph.checkpoint.memory import InMemorySaver
 from langgraph.graph import START, StateGraph
 from langgraph.types import Command, Send, interrupt
-from tests.recording.recorded_memory import url_of
 
 from pycrorm_async import Memory, Settings
 from pycrorm_async.integrations.callbacks import RememberedRuns
 from tests.databases import ask
+from tests.record.recordings import url_of
 
 pytestmark = pytest.mark.slow
 Config = Any

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from matplotlib import image
 from numpy.typing import NDArray
-from pycrorm_async.world.meshes import triangles_of
 from typer.testing import CliRunner
 
 from pycrorm_async import Memory
