@@ -34,11 +34,17 @@ def collada(*, up: str = "Z_UP", primitive: str = "triangles") -> bytes:
 <asset><unit name="centimeter" meter="0.01"/><up_axis>{up}</up_axis></asset>
 <library_geometries><geometry id="g"><mesh>
 <source id="p"><float_array id="a" count="15">{numbers}</float_array>
-<technique_common><accessor source="#a" count="5" stride="3"/></technique_common></source>
+<technique_common><accessor source="#a" count="5" stride="3"><param name="X" type="float"/>
+<param name="Y" type="float"/><param name="Z" type="float"/></accessor></technique_common></source>
+<source id="n"><float_array id="b" count="3">0 0 1</float_array>
+<technique_common><accessor source="#b" count="1" stride="3"><param name="X" type="float"/>
+<param name="Y" type="float"/>
+<param name="Z" type="float"/></accessor></technique_common></source>
 <vertices id="v"><input semantic="POSITION" source="#p"/></vertices>
 <{primitive} count="6"><input semantic="VERTEX" source="#v" offset="0"/>
 <input semantic="NORMAL" source="#n" offset="1"/>{count}<p>{indices}</p></{primitive}>
 </mesh></geometry></library_geometries>
 <library_visual_scenes><visual_scene id="s"><node><translate>5 0 0</translate><rotate>0 0 1 90</rotate>
 <node><rotate>0 0 1 -90</rotate><matrix>1 0 0 -5  0 1 0 0  0 0 1 0  0 0 0 1</matrix><scale>1 1 1</scale>
-<instance_geometry url="#g"/></node></node></visual_scene></library_visual_scenes></COLLADA>""".encode()
+<instance_geometry url="#g"/></node></node></visual_scene></library_visual_scenes>
+<scene><instance_visual_scene url="#s"/></scene></COLLADA>""".encode()

@@ -144,7 +144,7 @@ def _turned(robot: CurrentRobot, target: Pose) -> dict[str, float]:
     if description.camera_link is None:
         raise robot.absence("camera")
     head = Chain(
-        body.description_text,
+        body.model,
         base_link="",
         tool_link=description.camera_link,
         tool_in_link=description.camera_in_link,

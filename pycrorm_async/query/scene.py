@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, TypeAlias
-from xml.etree.ElementTree import Element, ParseError, fromstring
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple, TypeAlias
+from xml.etree.ElementTree import ParseError
 
 import numpy as np
+import numpy.typing as npt
 from numpy.typing import NDArray
 
+from pycrorm_async.errors import MissingExtra
 from pycrorm_async.events.types import DescriptionDeclared
 from pycrorm_async.world.bounding_boxes import BoundingBox, rotation_matrix
+from pycrorm_async.world.meshes import read_mesh
 from pycrorm_async.world.model_boxes import with_boxes
 from pycrorm_async.world.models import built_in_that_fits
-from pycrorm_async.world.pose import ObjectType, Pose, Vector
+from pycrorm_async.world.pose import JointType, ObjectType, Pose, Vector
+from pycrorm_async.world.urdf_model import ENDLESS, Joint, Mimic, Model, Shape, along, origin, read_model
 
 # === link frames ==============================================================================================
 #
@@ -28,49 +32,67 @@ def link_frames(
     model: Mapping[str, Any], pose: Pose, joints: Mapping[str, float], base_link: str | None = None
 ) -> dict[str, Frame]:
     """Return the frame of each link of a model from `object_model`; `pose` is that of `base_link`, or of the root."""
-    frames = {model["root"]: np.eye(4)}
-    for joint in model["joints"]:
-        _, _, parent, child, *_ = joint
-        frames[child] = frames[parent] @ joint_frame(joint, joints)
-    root = _frame(pose.position, pose.orientation)
-    if base_link in frames:
-        root = root @ np.linalg.inv(frames[base_link])
-    return {link: root @ frame for link, frame in frames.items()}
+    frames = {model["root"]: Pose()}
+    for row in model["joints"]:
+        joint = _joint_of(row)
+        frames[joint.child] = frames[joint.parent] @ along([joint], joints)
+    root = pose @ frames[base_link].inverse() if base_link in frames else pose
+    return {link: _frame(root @ frame) for link, frame in frames.items()}
 
 
 def joint_frame(joint: Sequence[Any], joints: Mapping[str, float]) -> Frame:
     """Return the frame of a joint's child link in that of its parent, at these positions."""
-    name, kind, _, _, xyz, rpy, axis, mimic = joint
-    source, multiplier, offset = (name, 1.0, 0.0) if name in joints or mimic is None else mimic
-    return placed(xyz, rpy) @ _motion(kind, axis, joints.get(source, 0.0) * multiplier + offset)
+    return _frame(along([_joint_of(joint)], joints))
 
 
 def placed(xyz: Sequence[float], rpy: Sequence[float]) -> Frame:
     """Return the frame at a position, turned by roll, pitch and yaw as in URDF."""
-    roll, pitch, yaw = rpy
-    turn = _frame((0, 0, 0), _about((0, 0, 1), yaw)) @ _frame((0, 0, 0), _about((0, 1, 0), pitch))
-    return _frame(xyz, (0, 0, 0, 1)) @ turn @ _frame((0, 0, 0), _about((1, 0, 0), roll))
+    return _frame(origin(xyz, rpy))
 
 
-def _motion(kind: str, axis: Sequence[float], position: float) -> Frame:
+def _joint_of(row: Sequence[Any]) -> Joint:
+    name, kind, parent, child, xyz, rpy, axis, mimic = row
     length = math.hypot(*axis) or 1.0
-    along = [each / length for each in axis]
-    if kind == "fixed":
-        return np.eye(4)
-    if kind == "prismatic":
-        return _frame([each * position for each in along], (0, 0, 0, 1))
-    return _frame((0, 0, 0), _about(along, position))
+    unit = Vector(*(each / length for each in axis))
+    follows = None if mimic is None or kind == "fixed" else Mimic(*mimic)
+    return Joint(name, JointType[kind.upper()], parent, child, origin(xyz, rpy), tuple(rpy), unit, ENDLESS, follows)
 
 
-def _about(axis: Sequence[float], angle: float) -> tuple[float, ...]:
-    sine = math.sin(angle / 2)
-    return (*(each * sine for each in axis), math.cos(angle / 2))
-
-
-def _frame(position: Sequence[float], orientation: Sequence[float]) -> Frame:
+def _frame(pose: Pose) -> Frame:
     frame = np.eye(4)
-    frame[:3, :3], frame[:3, 3] = rotation_matrix(orientation), position
+    frame[:3, :3], frame[:3, 3] = rotation_matrix(pose.orientation), pose.position
     return frame
+
+
+# === mesh triangles ===========================================================================================
+
+TRIANGLES_MAX = 50_000
+"""Bounds the triangles of a file: a drawing of a few hundred pixels shows no more."""
+_DECIMALS = 5
+"""Rounds vertices to 0.01 mm, so that those of neighbouring triangles are one."""
+
+
+class Triangles(NamedTuple):
+    """The vertices of a mesh, m, and for each triangle the indices of its three vertices."""
+
+    vertices: npt.NDArray[np.float32]
+    faces: npt.NDArray[np.uint32]
+
+
+def triangles_of(name: str, content: bytes) -> Triangles:
+    """Return the triangles of a mesh file; the suffix of its name decides its format. Raises `ValueError`.
+
+    Materials and normals are left out: a drawing has the colour of the description and flat faces. A drawing has the
+    box around its link in the place of a file that cannot be read.
+    """
+    try:
+        mesh = read_mesh(name, content)
+    except MissingExtra as missing:
+        raise ValueError(str(missing)) from missing
+    if len(mesh.faces) > TRIANGLES_MAX:
+        raise ValueError(f"it has {len(mesh.faces):,} triangles, more than {TRIANGLES_MAX:,}")
+    vertices, places = np.unique(mesh.vertices.round(_DECIMALS), axis=0, return_inverse=True)
+    return Triangles(vertices.astype(np.float32), places.reshape(-1)[mesh.faces].astype(np.uint32))
 
 
 # === object model =============================================================================================
@@ -98,7 +120,7 @@ def object_model(description: DescriptionDeclared, *, drawn: frozenset[str] = fr
     if description.missing is not None:
         return point_model(f"its description is missing: {description.missing}")
     try:
-        return _model(fromstring(_without_meshes(description, drawn)))  # noqa: S314  a memory has recorded it
+        return _document(read_model(_without_meshes(description, drawn)))
     except (ValueError, ParseError) as error:
         return point_model(f"its description cannot be read: {error}")
 
@@ -109,7 +131,7 @@ def assumed_model(name: str, object_type: str, joints: set[str]) -> dict[str, An
     if object_type in ObjectType.__members__:
         urdf = built_in_that_fits(name, ObjectType[object_type], joints=joints, links=set())
         if urdf is not None:
-            return {**_model(fromstring(urdf)), "assumed": f"the built-in shape, because {reason}"}  # noqa: S314  our own
+            return {**_document(read_model(urdf)), "assumed": f"the built-in shape, because {reason}"}
     return point_model(reason)
 
 
@@ -120,93 +142,32 @@ def _without_meshes(description: DescriptionDeclared, drawn: frozenset[str]) -> 
     return with_boxes(description.text, boxes, kept=drawn)
 
 
-def _model(robot: Element) -> dict[str, Any]:
-    colors = {each.get("name"): color for each in robot.findall("material") if (color := _rgba(each)) is not None}
-    shapes = {link.get("name", ""): list(_shapes(link, colors)) for link in robot.findall("link")}
-    joints = [_joint(each) for each in robot.findall("joint")]
-    children = {joint[3] for joint in joints}
-    root = next((link for link in shapes if link not in children), None)
-    if root is None:
-        raise ValueError("it has no root link")
-    ordered, reached = [], {root}
-    while rest := [each for each in joints if each[2] in reached and each[3] not in reached]:
-        ordered += rest
-        reached |= {each[3] for each in rest}
-    return {"root": root, "shapes": {name: each for name, each in shapes.items() if each}, "joints": ordered}
+def _document(model: Model) -> dict[str, Any]:
+    shapes = {name: [_shape(each) for each in link.visuals or link.collisions] for name, link in model.links.items()}
+    return {
+        "root": model.root,
+        "shapes": {name: each for name, each in shapes.items() if each},
+        "joints": [_row(path[-1]) for path in model.paths.values() if path],
+    }
 
 
-def _joint(joint: Element) -> list[Any]:
-    xyz, rpy = _origin(joint)
-    axis, mimic = joint.find("axis"), joint.find("mimic")
-    copied = None
-    if mimic is not None:
-        copied = [mimic.get("joint", ""), _number(mimic.get("multiplier", "1")), _number(mimic.get("offset", "0"))]
+def _row(joint: Joint) -> list[Any]:
     return [
-        joint.get("name", ""),
-        joint.get("type", "fixed"),
-        _link(joint, "parent"),
-        _link(joint, "child"),
-        xyz,
-        rpy,
-        _numbers(axis.get("xyz", "1 0 0"), 3) if axis is not None else [1.0, 0.0, 0.0],
-        copied,
+        joint.name,
+        joint.kind.name.lower(),
+        joint.parent,
+        joint.child,
+        _rounded(joint.origin.position),
+        _rounded(joint.rpy),
+        _rounded(joint.axis),
+        None if joint.mimic is None else list(joint.mimic),
     ]
 
 
-def _link(joint: Element, end: str) -> str:
-    element = joint.find(end)
-    return element.get("link", "") if element is not None else ""
+def _shape(shape: Shape) -> list[Any]:
+    sizes = [shape.file, *shape.sizes] if shape.kind == "mesh" else _rounded(shape.sizes)
+    return [shape.kind, sizes, _rounded(shape.xyz), _rounded(shape.rpy), shape.color and list(shape.color)]
 
 
-def _shapes(link: Element, colors: dict[str | None, list[float]]) -> Iterator[list[Any]]:
-    visuals = link.findall("visual") or link.findall("collision")
-    for visual in visuals:
-        geometry = visual.find("geometry")
-        if geometry is None:
-            continue
-        xyz, rpy = _origin(visual)
-        material = visual.find("material")
-        color = None if material is None else _rgba(material) or colors.get(material.get("name"))
-        for shape in geometry:
-            sizes = _sizes(shape)
-            if sizes is not None:
-                yield [shape.tag, sizes, xyz, rpy, color]
-
-
-def _sizes(shape: Element) -> list[Any] | None:
-    match shape.tag:
-        case "mesh":
-            return [shape.get("filename", ""), *_numbers(shape.get("scale", "1 1 1"), 3)]
-        case "box":
-            return _numbers(shape.get("size", ""), 3)
-        case "cylinder" | "capsule":
-            return [_number(shape.get("radius", "")), _number(shape.get("length", ""))]
-        case "sphere":
-            return [_number(shape.get("radius", ""))]
-    return None
-
-
-def _rgba(material: Element) -> list[float] | None:
-    color = material.find("color")
-    return None if color is None else _numbers(color.get("rgba", ""), 4)
-
-
-def _origin(element: Element) -> tuple[list[float], list[float]]:
-    origin = element.find("origin")
-    if origin is None:
-        return [0.0] * 3, [0.0] * 3
-    return _numbers(origin.get("xyz", "0 0 0"), 3), _numbers(origin.get("rpy", "0 0 0"), 3)
-
-
-def _numbers(text: str, count: int) -> list[float]:
-    numbers = [_number(each) for each in text.split()]
-    if len(numbers) != count:
-        raise ValueError(f"{text!r} has {len(numbers)} numbers instead of {count}")
-    return numbers
-
-
-def _number(text: str) -> float:
-    number = float(text)
-    if not math.isfinite(number):
-        raise ValueError(f"{text!r} is not a finite number")
-    return round(number, 5)
+def _rounded(numbers: Iterable[float]) -> list[float]:
+    return [round(each, 9) for each in numbers]

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from pycrorm_async.errors import MissingExtra
 from pycrorm_async.world.pose import JointType, Pose, Quaternion, Vector, product, rotated, yaw_quaternion
-from pycrorm_async.world.urdf import Bounds, Joint, PR2Arm, along, divided
+from pycrorm_async.world.urdf import PR2Arm
+from pycrorm_async.world.urdf_model import Bounds, Joint, Model, along
 
 if TYPE_CHECKING:
     import optik
@@ -242,7 +243,7 @@ class Chain:
     """The joints from a robot's root link to the tool of one arm.
 
     Args:
-        urdf: the robot's model.
+        model: the robot's model.
         base_link: the link at which the arm begins; empty for the root link.
         tool_link: the link that carries the tool.
         tool_in_link: the tool's frame in that link; None: the link's own.
@@ -250,8 +251,8 @@ class Chain:
     Raises `CallerError` if the model has no such links, or the tool link is not below the base link.
     """
 
-    def __init__(self, urdf: str, *, base_link: str, tool_link: str, tool_in_link: Pose | None) -> None:
-        self._above, self._arm = divided(urdf, base_link, tool_link)
+    def __init__(self, model: Model, *, base_link: str, tool_link: str, tool_in_link: Pose | None) -> None:
+        self._above, self._arm = model.divided(base_link, tool_link)
         self._tool = tool_in_link
         self._solvers: dict[tuple[Bounds, ...], optik.Robot] = {}
         self.joints = tuple(each.name for each in self._arm if each.kind is not JointType.FIXED)

@@ -1,21 +1,24 @@
 """Compute axis-aligned bounding boxes from collision shapes, without the margin that Bullet adds to its own.
 
-They are exact for boxes, spheres, cylinders and capsules; a mesh has the box of the convex hull that Bullet makes of
-it.
+They are exact; a mesh has the box around its vertices.
 """
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pycrorm_async.world.pose import Quaternion, Vector
+from pycrorm_async.errors import MissingExtra
+from pycrorm_async.world.meshes import mesh_points
+from pycrorm_async.world.pose import IDENTITY, Quaternion, Vector
+from pycrorm_async.world.urdf_model import Link, Shape, origin
 
 Array = NDArray[np.float64]
 Frame = tuple[Vector, Quaternion]
@@ -84,52 +87,37 @@ _BALL = _GRID[np.linalg.norm(_GRID, axis=1) < 1]
 _CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 
 
-def solids_of(
-    bullet: Any, client: int, body: int, link: int, inertial: Frame, placed: Frame | None = None
-) -> tuple[Solid, ...]:
-    """Return the collision shapes of one link in the link's frame; `inertial` is Bullet's frame relative to it.
+def solids_of(shapes: Iterable[Shape]) -> tuple[Solid, ...]:
+    """Return the solids of a link's shapes in the link's frame. Raises `ValueError`, `MissingExtra` for a mesh file."""
+    return tuple(map(_solid, shapes))
 
-    `placed` is that frame in "map", for a body whose links have no frames in Bullet's answers. Call this function
-    before the body is moved from the pose at which it was loaded.
+
+def _solid(shape: Shape) -> Solid:
+    at = origin(shape.xyz, shape.rpy)
+    rotation, centre = rotation_matrix(at.orientation), np.array(at.position)
+    match shape.kind:
+        case "mesh":
+            return Solid(mesh_points(shape.file) * shape.sizes @ rotation.T + centre)
+        case "box":
+            return Solid(_CORNERS * np.array(shape.sizes) / 2 @ rotation.T + centre, is_box=True)
+        case "sphere":
+            return Solid(centre[None, :], shape.sizes[0])
+    radius, length = shape.sizes
+    axis = rotation[:, 2]
+    ends = np.stack([centre - axis * length / 2, centre + axis * length / 2])
+    return Solid(ends, radius, axis if shape.kind == "cylinder" else None)
+
+
+def box_of(link: Link, *, visual: bool = True) -> BoundingBox | None:
+    """Return the box around a link's collision shapes in its frame, without any around its visual shapes.
+
+    Shapes whose mesh cannot be read are left out. None without shapes.
     """
-    shapes = bullet.getCollisionShapeData(body, link, physicsClientId=client)
-    rotation, position = rotation_matrix(inertial[1]), np.array(inertial[0])
-    solids = []
-    for index, shape in enumerate(shapes):
-        kind, size, centre, turn = shape[2], shape[3], np.array(shape[5]), rotation_matrix(shape[6])
-        if kind == bullet.GEOM_MESH:
-            # Bullet returns the vertices of a link's first convex shape only, in the link's inertial frame.
-            vertices = bullet.getMeshData(body, link, physicsClientId=client)[1] if index == 0 else ()
-            if not vertices:
-                return (_bullet_box(bullet, client, body, link, inertial, placed),)
-            solids.append(Solid(np.array(vertices) @ rotation.T + position))
-        else:
-            solids += _primitive(bullet, kind, size, rotation @ centre + position, rotation @ turn)
-    return tuple(solids)
-
-
-def _primitive(bullet: Any, kind: int, size: Sequence[float], centre: Array, rotation: Array) -> list[Solid]:
-    if kind == bullet.GEOM_BOX:
-        return [Solid(_CORNERS * np.array(size) / 2 @ rotation.T + centre, is_box=True)]
-    if kind == bullet.GEOM_SPHERE:
-        return [Solid(centre[None, :], size[0])]
-    if kind in (bullet.GEOM_CYLINDER, bullet.GEOM_CAPSULE):
-        axis = rotation[:, 2]
-        ends = np.stack([centre - axis * size[0] / 2, centre + axis * size[0] / 2])
-        return [Solid(ends, size[1], axis if kind == bullet.GEOM_CYLINDER else None)]
-    return []
-
-
-def _bullet_box(bullet: Any, client: int, body: int, link: int, inertial: Frame, placed: Sequence[Any] | None) -> Solid:
-    """Return Bullet's own box around a link, a few millimetres too large, for meshes without accessible vertices."""
-    low, high = bullet.getAABB(body, link, physicsClientId=client)
-    if placed is None and link < 0:
-        placed = bullet.getBasePositionAndOrientation(body, physicsClientId=client)
-    elif placed is None:
-        placed = bullet.getLinkState(body, link, physicsClientId=client)
-    corners = (np.array(low) + np.array(high)) / 2 + _CORNERS * (np.array(high) - np.array(low)) / 2
-    in_inertial = (corners - np.array(placed[0])) @ rotation_matrix(placed[1])
-    return Solid(in_inertial @ rotation_matrix(inertial[1]).T + np.array(inertial[0]), is_box=True)
+    solids: list[Solid] = []
+    for shape in link.collisions or (link.visuals if visual else ()):
+        with suppress(ValueError, MissingExtra):
+            solids.append(_solid(shape))
+    return box_around([((Vector(0.0, 0.0, 0.0), IDENTITY), solids)])
 
 
 def box_around(placed: Iterable[tuple[Frame, Iterable[Solid]]]) -> BoundingBox | None:

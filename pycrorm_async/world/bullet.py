@@ -15,6 +15,7 @@ object.
 
 from __future__ import annotations
 
+import logging
 import math
 import os
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -25,7 +26,7 @@ from typing import TYPE_CHECKING, Protocol, Self
 
 from pycrorm_async.connected_var import ConnectedVar
 from pycrorm_async.world import bullet_body
-from pycrorm_async.world.bounding_boxes import BoundingBox
+from pycrorm_async.world.bounding_boxes import BoundingBox, box_of
 from pycrorm_async.world.bullet_body import (
     Body,
     Color,
@@ -35,13 +36,13 @@ from pycrorm_async.world.bullet_body import (
     engine,
     set_state,
 )
-from pycrorm_async.world.model_boxes import described_mass_kg, shape_boxes
 from pycrorm_async.world.models import built_in_urdf
 from pycrorm_async.world.pose import (
     COORDINATE_MAX,
     Arms,
     AttachmentRefused,
     DuplicateName,
+    JointFollows,
     JointLimitExceeded,
     JointType,
     NoWorld,
@@ -56,12 +57,14 @@ from pycrorm_async.world.pose import (
     WorldMode,
     WorldUnavailable,
 )
-from pycrorm_async.world.urdf import RobotDescription, robot_description, urdf_text
+from pycrorm_async.world.urdf import RobotDescription, robot_description
+from pycrorm_async.world.urdf_model import Model, read_model, urdf_text
 
 if TYPE_CHECKING:
     from pycrorm_async.world.arms import Chain
 
 
+_log = logging.getLogger("pycrorm_async")
 _GRAVITY_M_PER_S2 = -9.8
 
 
@@ -235,7 +238,7 @@ class BulletWorld:
     # --- resetting and restoring ------------------------------------------------------------------------------
 
     def reset(self) -> None:
-        """Detach every object, set its joints to 0, and move it to its original pose.
+        """Detach every object, set its joints to their start, and move it to its original pose.
 
         Objects that are in that state already are not moved, and observers get no call for them.
         """
@@ -466,7 +469,8 @@ class Object:
     Args:
         name: unique in its world.
         object_type: the kind of object; the first one of type ROBOT becomes `world.robot`.
-        description: URDF text, or the path of a .urdf file; None means the built-in shape for that name and type.
+        description: URDF text, or the path of a .urdf file or of a mesh file; None means the built-in shape for that
+            name and type.
         pose: pose of the base link's frame, in "map"; None means the root link's at the origin. `reset` restores it.
         world: the world to add it to; None means the current world of this context.
         color: red, green, blue, opacity, 0 to 1.
@@ -475,6 +479,10 @@ class Object:
             `description` the model is that of the robot's description, or the built-in one of its name.
         base_link: the link whose pose is the robot's pose, empty for the root link; None means that of the robot's
             description. The base link of any other object is its root link.
+        packages: folders of ROS packages by their names, for `package://` in the URDF; those of the robot's description
+            count too. See `urdf_model.urdf_text`.
+
+    Elements of the URDF without effect, and what Bullet remarks about it, are logged once, not for copies of an object.
 
     Raises:
         ObjectRefused, NoWorld, WorldClosed, DuplicateName, DescriptionNotLoadable, PoseRefused, UnknownLink.
@@ -485,6 +493,8 @@ class Object:
     world: BulletWorld
     original_pose: Pose
     description_text: str
+    model: Model
+    """What was understood of the description."""
     color: Color | None
     robot_description: RobotDescription | None
     chains: dict[Arms, Chain]
@@ -506,6 +516,7 @@ class Object:
         mass_kg: float | None = None,
         robot: RobotDescription | None = None,
         base_link: str | None = None,
+        packages: Mapping[str, str | Path] = MappingProxyType({}),
     ) -> None:
         _check_identity(name, object_type)
         _check_mass(name, mass_kg)
@@ -532,17 +543,30 @@ class Object:
             description = robot.urdf
         if description is None:
             description = built_in_urdf(name if robot is None else robot.name, object_type)
-        self.description_text = urdf_text(name, description)
+        if robot is not None:
+            packages = {**robot.packages, **packages}
+        self.description_text = urdf_text(name, description, packages)
+        self.model = read_model(self.description_text)
         self.robot_description = robot
         self.color = color
         self._mass_kg = mass_kg
         self.chains = {}
-        self.body = Body(name, self.description_text, client, pose, color, base_link or "")
+        self.body = Body(name, self.model, client, pose, color, base_link or "")
+        if world.copy_of is None:
+            self._log_left_out()
         self.original_pose = self.body.pose
         world.add(self)
 
     def __repr__(self) -> str:
         return f"Object({self.name!r}, {self.object_type.name}, {self.pose!r})"
+
+    def _log_left_out(self) -> None:
+        remarks = [*self.model.left_out, *self.body.remarks]
+        if remarks:
+            _log.warning("the description of %r: %s", self.name, "; ".join(remarks))
+        if self.model.unapplied:
+            unapplied = ", ".join(f"<{tag}> {count}" for tag, count in self.model.unapplied.items())
+            _log.info("the description of %r: a kinematic world does not use: %s", self.name, unapplied)
 
     # --- pose and extent --------------------------------------------------------------------------------------
 
@@ -615,7 +639,8 @@ class Object:
 
     def visual_boxes(self, links: Collection[str]) -> dict[str, BoundingBox]:
         """Return the boxes around the visual shapes of links, in their frames, where the shapes can be read."""
-        return shape_boxes(self.description_text, "visual", links)
+        visuals = {link: self.model.links[link]._replace(collisions=()) for link in links}
+        return {link: box for link, each in visuals.items() if (box := box_of(each)) is not None}
 
     @property
     def mass_kg(self) -> float | None:
@@ -626,7 +651,7 @@ class Object:
         """
         if self._mass_kg is not None or self.object_type in (ObjectType.ROBOT, ObjectType.ENVIRONMENT):
             return self._mass_kg
-        return described_mass_kg(self.description_text)
+        return self.model.mass_kg
 
     def label(self, text: str) -> None:
         """Show a text at the object, if the world has a window."""
@@ -684,19 +709,28 @@ class Object:
     def set_joint_positions(self, positions: Mapping[str, float]) -> None:
         """Set joints, rad or m, in one motion, and carry along the objects attached to the links they move.
 
-        A joint above the base link moves the base too. All errors are raised before anything is moved.
+        A joint above the base link moves the base too. A joint with <mimic> follows its leader, also where its own
+        position is passed with that of its leader. All errors are raised before anything is moved.
 
         Raises:
-            JointLimitExceeded: a position is outside its hard limits (by more than 1e-6) or not finite.
+            JointLimitExceeded: a position is outside its hard limits (by more than 1e-6) or not finite, and is not the
+                joint's present one.
+            JointFollows: a joint that follows another would have to leave it.
             UnknownJoint, WorldClosed, ObjectNotInWorld.
         """
         self.check_present()
         targets = {joint: float(position) for joint, position in positions.items()}
         for joint, position in targets.items():
             lower, upper = self.joint_limits(joint)
+            leader = self.body.leader(joint)
+            if position == self.body.positions[joint] or (leader in targets and math.isfinite(position)):
+                continue
+            if leader is not None:
+                raise JointFollows(self.name, joint, leader)
             within = lower - _PAST_LIMIT_MAX <= position <= upper + _PAST_LIMIT_MAX
             if not (within and abs(position) <= COORDINATE_MAX):
                 raise JointLimitExceeded(self.name, joint, position, (lower, upper))
+        targets = self.body.followed(targets)
         if targets:
             before = self.body.pose
             self.body.turn(targets)
@@ -754,10 +788,13 @@ class Object:
     # --- reset and removal ------------------------------------------------------------------------------------
 
     def reset(self) -> None:
-        """Detach the object, set its joints to 0, and move it to its original pose; notify of differences only."""
+        """Detach the object, set its joints to their start, and move it to its original pose.
+
+        A joint starts at 0 or, where its limits exclude that, at the nearest of them. Only differences are notified.
+        """
         self.check_present()
         self.detach_all()
-        joints = {joint: 0.0 for joint, position in self.body.positions.items() if position != 0.0}
+        joints = {joint: start for joint, start in self.body.start.items() if self.body.positions[joint] != start}
         before = self.body.pose
         if joints:
             self.body.turn(joints)

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import ctypes
 import math
+import re
 import tempfile
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -20,13 +21,17 @@ from dataclasses import dataclass
 from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
+from pathlib import Path
 from threading import Lock
 from typing import Any, NamedTuple
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
 from pycrorm_async.world.bounding_boxes import BoundingBox, Frame, Solid, box_around, rotation_matrix, solids_of
+from pycrorm_async.world.meshes import is_read_by_bullet, mesh_points, points_as_stl
 from pycrorm_async.world.pose import (
+    COORDINATE_MAX,
     IDENTITY,
     BulletMissing,
     DescriptionNotLoadable,
@@ -38,17 +43,13 @@ from pycrorm_async.world.pose import (
     UnknownJoint,
     UnknownLink,
     Vector,
-    product,
-    rotated,
 )
-from pycrorm_async.world.urdf import Joint, along, chains, divided
+from pycrorm_async.world.urdf_model import Joint, Model, Shape, along
 
 Color = tuple[float, float, float, float]
 """Red, green, blue, opacity, each 0 to 1."""
 
 _ROOT = -1  # Bullet's number of a body's first link
-_MOVABLE = (JointType.REVOLUTE, JointType.CONTINUOUS, JointType.PRISMATIC)
-_ENDLESS = (-math.inf, math.inf)
 _STATES_MAX = 127
 """Bullet returns no frames of links for a body with more joints than this, but it moves the links."""
 _AT_ORIGIN: Frame = (Vector(0.0, 0.0, 0.0), IDENTITY)
@@ -58,44 +59,65 @@ class Body:
     """One body: its links and joints by name, its pose, its joint positions.
 
     Args:
+        model: of the URDF; the mesh files of its collision shapes exist.
         pose: of the base link's frame; None means that the root link's frame is at the origin.
         base: the base link; empty for the root link.
+
+    Attributes:
+        start: for each joint the position nearest to 0 within its limits; followers follow.
+        remarks: what Bullet printed about the description, and the visual meshes that it does not draw.
     """
 
     def __init__(
-        self, name: str, urdf: str, client: int, pose: Pose | None, color: Color | None, base: str = ""
+        self, name: str, model: Model, client: int, pose: Pose | None, color: Color | None, base: str = ""
     ) -> None:
         self.client = client
-        self.number = _load(name, urdf, client)
-        self.positions: dict[str, float] = {}
-        self.limits: dict[str, tuple[float, float]] = {}
-        self.joint_types: dict[str, JointType] = {}
-        self.movable_above: dict[str, tuple[str, ...]] = {}
-        self._joint_numbers: dict[str, int] = {}
-        self._link_numbers: dict[str, int] = {}
-        self._inertial: dict[int, Frame] = {}  # Bullet places a link by its centre of mass, in the link's frame
-        self._inertial_back: dict[int, Frame] = {}
-        self._read()
-        self._chains = chains(urdf) if len(self._joint_numbers) > _STATES_MAX else {}
-        self.base = base or self.root
+        self.base = base or model.root
         """The link whose frame is the body's pose."""
-        if self.base not in self._link_numbers:
-            self.unload()
-            raise UnknownLink(name, self.base, self.links)
-        self._to_base: tuple[Joint, ...] = divided(urdf, "", base)[1] if self.base != self.root else ()
-        self.pose = self.root_pose = Pose()
-        self.solids: dict[str, tuple[Solid, ...]] = {
-            link: solids_of(engine(), client, self.number, number, self._inertial[number], self._placed_at_load(link))
-            for link, number in self._link_numbers.items()
+        if self.base not in model.paths:
+            raise UnknownLink(name, self.base, tuple(model.paths))
+        try:
+            self.solids: dict[str, tuple[Solid, ...]] = {
+                link: solids_of(each.collisions) for link, each in model.links.items()
+            }
+        except ValueError as fault:
+            raise DescriptionNotLoadable(name, _unreadable_mesh(model, fault)) from fault
+        self.number, self.remarks = _load(name, model, client)
+        self._model = model
+        self._joint_numbers: dict[str, int] = {}
+        self._link_numbers: dict[str, int] = {model.root: _ROOT}
+        bullet = engine()
+        for number in range(bullet.getNumJoints(self.number, physicsClientId=client)):
+            joint = bullet.getJointInfo(self.number, number, physicsClientId=client)
+            self._joint_numbers[joint[1].decode()], self._link_numbers[joint[12].decode()] = number, number
+        self.joint_types = {joint: model.joints[joint].kind for joint in self._joint_numbers}
+        self.limits: dict[str, tuple[float, float]] = {
+            joint: model.joints[joint].bounds for joint, kind in self.joint_types.items() if kind is not JointType.FIXED
         }
+        self.movable_above = {
+            link: tuple(each.name for each in reversed(model.paths[link]) if each.kind is not JointType.FIXED)
+            for link in self._link_numbers
+        }
+        self._followers: dict[str, list[Joint]] = {}
+        for each in model.joints.values():
+            if each.mimic is not None and each.kind is not JointType.FIXED:
+                self._followers.setdefault(each.mimic.joint, []).append(each)
+        self._by_chain = len(self._joint_numbers) > _STATES_MAX
+        nearest = {joint: min(max(0.0, lower), upper) for joint, (lower, upper) in self.limits.items()}
+        self.start = {joint: model.joints[joint].position(nearest) for joint in nearest}
+        self.positions = dict(self.start)
+        self._to_base = model.paths[self.base]
+        self.pose = self.root_pose = Pose()
         if color is not None:
             self._paint(color)
+        if moved := {joint: position for joint, position in self.start.items() if position}:
+            self._turn_in_bullet(moved)
         self.place(along(self._to_base, self.positions) if pose is None else pose)
 
     @property
     def root(self) -> str:
         """The name of the description's root link."""
-        return next(iter(self._link_numbers))
+        return self._model.root
 
     @property
     def links(self) -> tuple[str, ...]:
@@ -106,11 +128,25 @@ class Body:
         """Return Bullet's number of the link."""
         return self._link_numbers[link]
 
+    def leader(self, joint: str) -> str | None:
+        """Return the joint that this one follows; None if it moves freely."""
+        mimic = self._model.joints[joint].mimic
+        return None if mimic is None else mimic.joint
+
+    def followed(self, positions: Mapping[str, float]) -> dict[str, float]:
+        """Return the positions of these joints and of those that follow them; of a follower alone, nothing."""
+        free = {joint: position for joint, position in positions.items() if self.leader(joint) is None}
+        following = {
+            each.name: each.position(free) for joint in free for each in self._followers.get(joint, ()) if joint in free
+        }
+        return {**free, **following}
+
     def place(self, pose: Pose) -> None:
         """Move the base link's frame to this pose."""
         root = self.root_at(pose)
-        position, orientation = _compose((root.position, root.orientation), self._inertial[_ROOT])
-        engine().resetBasePositionAndOrientation(self.number, position, orientation, physicsClientId=self.client)
+        engine().resetBasePositionAndOrientation(
+            self.number, root.position, root.orientation, physicsClientId=self.client
+        )
         self.pose, self.root_pose = pose, root
 
     def root_at(self, pose: Pose) -> Pose:
@@ -118,7 +154,8 @@ class Body:
         return pose @ along(self._to_base, self.positions).inverse() if self._to_base else pose
 
     def turn(self, positions: Mapping[str, float]) -> None:
-        """Set these joints together, rad or m; the root link keeps its pose."""
+        """Set these joints together with their followers, rad or m; the root link keeps its pose."""
+        positions = self.followed(positions)
         above = [joint for joint in self.movable_above[self.base] if joint in positions]
         moves_base = any(positions[joint] != self.positions[joint] for joint in above)
         self._turn_in_bullet(positions)
@@ -134,7 +171,8 @@ class Body:
 
     def link_frame_at(self, link: str, positions: Mapping[str, float]) -> Frame:
         """Return the link's frame in "map" at these joint positions; sets the joints in Bullet and restores them."""
-        if self._chains:
+        positions = self.followed(positions)
+        if self._by_chain:
             return self._frame_by_chain(link, {**self.positions, **positions})
         current = {joint: self.positions[joint] for joint in positions}
         try:
@@ -146,7 +184,7 @@ class Body:
     def box(self, links: Iterable[str]) -> BoundingBox | None:
         """Return the box around the shapes of these links; None if they have no shapes."""
         shaped = [link for link in links if self.solids[link]]
-        if self._chains:
+        if self._by_chain:
             return box_around((self._frame_by_chain(link, self.positions), self.solids[link]) for link in shaped)
         numbers = [number for link in shaped if (number := self._link_numbers[link]) != _ROOT]
         states: Sequence[Any] = ()
@@ -154,9 +192,9 @@ class Body:
             states = engine().getLinkStates(
                 self.number, numbers, computeForwardKinematics=True, physicsClientId=self.client
             )
-        frames = {_ROOT: (self.root_pose.position, self.root_pose.orientation)}
+        frames: dict[int, Frame] = {_ROOT: (self.root_pose.position, self.root_pose.orientation)}
         for number, state in zip(numbers, states, strict=True):
-            frames[number] = self._link_frame(number, state)
+            frames[number] = _frame(state)
         return box_around((frames[self._link_numbers[link]], self.solids[link]) for link in shaped)
 
     def box_in_link(self, link: str) -> BoundingBox | None:
@@ -164,7 +202,7 @@ class Body:
         return box_around([(_AT_ORIGIN, self.solids[link])])
 
     def label(self, text: str) -> None:
-        """Show a text above the origin of the root link, in a window only."""
+        """Show a text at the origin of the root link, in a window only."""
         engine().addUserDebugText(text, (0.0, 0.0, 0.03), parentObjectUniqueId=self.number, physicsClientId=self.client)
 
     def unload(self) -> None:
@@ -177,104 +215,143 @@ class Body:
         engine().resetJointStatesMultiDof(self.number, numbers, values, physicsClientId=self.client)
 
     def _frame_in_bullet(self, link: str) -> Frame:
-        if self._chains:
+        if self._by_chain:
             return self._frame_by_chain(link, self.positions)
         number = self._link_numbers[link]
         if number == _ROOT:
             return self.root_pose.position, self.root_pose.orientation
-        state = engine().getLinkState(self.number, number, computeForwardKinematics=True, physicsClientId=self.client)
-        return self._link_frame(number, state)
+        return _frame(
+            engine().getLinkState(self.number, number, computeForwardKinematics=True, physicsClientId=self.client)
+        )
 
     def _frame_by_chain(self, link: str, positions: Mapping[str, float]) -> Frame:
-        placed = self.root_pose @ along(self._chains[link], positions)
+        placed = self.root_pose @ along(self._model.paths[link], positions)
         return placed.position, placed.orientation
-
-    def _placed_at_load(self, link: str) -> Frame | None:
-        """Compute the frame of a link after loading, with the root link at the origin; None if Bullet returns it."""
-        if not self._chains:
-            return None
-        frame = along(self._chains[link], {})
-        return _compose((frame.position, frame.orientation), self._inertial[self._link_numbers[link]])
-
-    def _link_frame(self, number: int, state: Sequence[Any]) -> Frame:
-        # Bullet returns the link's own frame in single precision; its inertial frame has double precision.
-        return _compose((state[0], state[1]), self._inertial_back[number])
-
-    def _read(self) -> None:
-        """Read names, limits and inertial frames from Bullet, parents before their children."""
-        bullet, client = engine(), self.client
-        root = bullet.getBodyInfo(self.number, physicsClientId=client)[0].decode()
-        names = {_ROOT: root}
-        self.movable_above[root] = ()
-        for number in range(bullet.getNumJoints(self.number, physicsClientId=client)):
-            joint = bullet.getJointInfo(self.number, number, physicsClientId=client)
-            name, link, above = joint[1].decode(), joint[12].decode(), self.movable_above[names[joint[16]]]
-            names[number] = link
-            self._joint_numbers[name] = number
-            self.joint_types[name] = kind = _joint_type(joint[2], lower=joint[8], upper=joint[9])
-            if kind in _MOVABLE:
-                above = (name, *above)
-                self.limits[name] = (joint[8], joint[9]) if kind is not JointType.CONTINUOUS else _ENDLESS
-                self.positions[name] = 0.0
-            self.movable_above[link] = above
-        self._link_numbers = {link: number for number, link in names.items()}
-        for number in names:
-            dynamics = bullet.getDynamicsInfo(self.number, number, physicsClientId=client)
-            self._inertial[number] = Vector(*dynamics[3]), Quaternion(*dynamics[4])
-            self._inertial_back[number] = _invert(self._inertial[number])
 
     def _paint(self, color: Color) -> None:
         for number in self._link_numbers.values():
             engine().changeVisualShape(self.number, number, rgbaColor=color, physicsClientId=self.client)
 
 
-def _load(name: str, urdf: str, client: int) -> int:
-    """Load URDF text with all its links and a fixed base, and return Bullet's number of the body."""
+def _frame(state: Sequence[Any]) -> Frame:
+    """Return the frame of a link's centre of mass, which is in the link's own frame, but in double precision."""
+    return Vector(*state[0]), Quaternion(*state[1])
+
+
+def _unreadable_mesh(model: Model, fault: ValueError) -> str:
+    """Name the first collision mesh that cannot be read."""
+    for name, link in model.links.items():
+        for shape in link.collisions:
+            try:
+                solids_of([shape])
+            except ValueError as reason:
+                return f"collision of link {name!r}: mesh {shape.file}: {reason}"
+    return str(fault)
+
+
+def _load(name: str, model: Model, client: int) -> tuple[int, tuple[str, ...]]:
+    """Load a model with all its links and a fixed base; return Bullet's number of the body, and its remarks."""
     bullet = engine()
-    with tempfile.NamedTemporaryFile("w", suffix=".urdf", encoding="utf-8") as file:
-        file.write(urdf.replace("><", ">\n<"))  # Bullet reads no line of more than 1,023 characters
-        file.flush()
+    with tempfile.TemporaryDirectory(prefix="pycrorm-urdf-") as folder:
+        urdf, remarks = _written(model, Path(folder))
+        path = Path(folder, "model.urdf")
+        path.write_text(urdf, encoding="utf-8")
         with captured() as output:
             try:
                 number: int | None = bullet.loadURDF(
-                    file.name,
+                    str(path),
                     useFixedBase=True,
                     flags=bullet.URDF_USE_IMPLICIT_CYLINDER,
                     physicsClientId=client,
                 )
             except bullet.error:
                 number = None
+    printed = "".join(output)
     if number is None:
-        raise DescriptionNotLoadable(name, _reason("".join(output)))
-    return number
+        raise DescriptionNotLoadable(name, " ".join(_messages(printed, "Error")) or "Bullet printed no reason")
+    return number, (*remarks, *_messages(printed, "Warning"), *_messages(printed, "Error"))
 
 
-def _reason(output: str) -> str:
-    """Extract the errors from Bullet's output, without its file names and line numbers."""
-    errors = [part.partition("]:\n")[2].strip() for part in output.split("b3Error[")[1:]]
-    return " ".join(part.split("b3Warning[")[0] for part in errors) or "Bullet printed no reason"
+def _written(model: Model, folder: Path) -> tuple[str, tuple[str, ...]]:
+    """Return a URDF of what the reader understood, with one element a line, and what Bullet does not draw.
+
+    Bullet reads no line of more than 1,023 characters. The links have their centres of mass in their origins, because
+    nothing falls, and Bullet computes the frames of these centres in double precision. Collision meshes that Bullet
+    does not read are written to the folder as the points of their hulls.
+    """
+    lines, remarks = ["<robot name='model'>"], []
+    copies: dict[str, str] = {}
+    for name, link in model.links.items():
+        lines.append(f"<link name={quoteattr(name)}>\n{_INERTIAL}")
+        for kind, shapes in (("collision", link.collisions), ("visual", link.visuals)):
+            for shape in shapes:
+                file = shape.file
+                if shape.kind == "mesh" and not is_read_by_bullet(file, collision=kind == "collision"):
+                    if kind == "visual":
+                        fault = "Bullet does not draw" if Path(file).is_file() else "there is no file"
+                        remarks.append(f"visual of link {name!r}: {fault} {file}")
+                        continue
+                    if file not in copies:
+                        copies[file] = str(folder / f"{len(copies)}.stl")
+                        Path(copies[file]).write_bytes(points_as_stl(mesh_points(file)))
+                    file = copies[file]
+                lines += [
+                    f"<{kind}>",
+                    _origin_tag(shape.xyz, shape.rpy),
+                    "<geometry>",
+                    _geometry(shape, file),
+                    "</geometry>",
+                ]
+                if shape.color is not None and kind == "visual":
+                    rgba = _text(shape.color)
+                    lines.append(f"<material name='{rgba}'>\n<color rgba='{rgba}'/>\n</material>")
+                lines.append(f"</{kind}>")
+        lines.append("</link>")
+    for joint in model.joints.values():
+        lower, upper = (min(max(each, -COORDINATE_MAX), COORDINATE_MAX) for each in joint.bounds)
+        endless = joint.kind is JointType.REVOLUTE and math.isinf(joint.bounds.upper - joint.bounds.lower)
+        lines += [
+            f"<joint name={quoteattr(joint.name)} type='{'continuous' if endless else joint.kind.name.lower()}'>",
+            f"<parent link={quoteattr(joint.parent)}/>",
+            f"<child link={quoteattr(joint.child)}/>",
+            _origin_tag(joint.origin.position, joint.rpy),
+            f"<axis xyz='{_text(joint.axis)}'/>",
+            f"<limit lower='{lower!r}' upper='{upper!r}' effort='100' velocity='3'/>",
+            "</joint>",
+        ]
+    return "\n".join([*lines, "</robot>"]), tuple(remarks)
 
 
-def _joint_type(number: int, *, lower: float, upper: float) -> JointType:
-    """Return the joint's type; Bullet reports a continuous joint as a revolute one with an empty range."""
-    kind = JointType(number) if number <= JointType.FIXED else JointType.UNKNOWN
-    return JointType.CONTINUOUS if kind is JointType.REVOLUTE and lower > upper else kind
+_INERTIAL = "<inertial>\n<mass value='1'/>\n<inertia ixx='1' ixy='0' ixz='0' iyy='1' iyz='0' izz='1'/>\n</inertial>"
 
 
-def _compose(outer: Frame | tuple[Sequence[float], Sequence[float]], inner: Frame) -> Frame:
-    """Convert `inner`, a frame relative to `outer`, to the frame that `outer` is in."""
-    (x, y, z), turn = outer
-    if inner == _AT_ORIGIN:
-        return Vector(x, y, z), Quaternion(*turn)
-    moved = rotated(turn, inner[0])
-    return Vector(x + moved.x, y + moved.y, z + moved.z), product(turn, inner[1])
+def _origin_tag(xyz: Sequence[float], rpy: Sequence[float]) -> str:
+    return f"<origin xyz='{_text(xyz)}' rpy='{_text(rpy)}'/>"
 
 
-def _invert(frame: Frame) -> Frame:
-    position, (x, y, z, w) = frame
-    back = Quaternion(-x, -y, -z, w)
-    moved = rotated(back, position)
-    return Vector(-moved.x, -moved.y, -moved.z), back
+def _geometry(shape: Shape, file: str) -> str:
+    match shape.kind:
+        case "mesh":
+            return f"<mesh filename={quoteattr(file)} scale='{_text(shape.sizes)}'/>"
+        case "box":
+            return f"<box size='{_text(shape.sizes)}'/>"
+        case "sphere":
+            return f"<sphere radius='{shape.sizes[0]!r}'/>"
+    return f"<{shape.kind} radius='{shape.sizes[0]!r}' length='{shape.sizes[1]!r}'/>"
+
+
+def _text(numbers: Sequence[float]) -> str:
+    return " ".join(map(repr, numbers))
+
+
+def _messages(output: str, kind: str) -> list[str]:
+    """Extract the errors or the warnings from Bullet's output, without its file names and line numbers."""
+    parts = re.split(r"b3(Error|Warning|Printf)\[[^\]]*\]:\n?", output)
+    return list(
+        dict.fromkeys(
+            text.strip() for of, text in zip(parts[1::2], parts[2::2], strict=True) if of == kind and text.strip()
+        )
+    )
 
 
 # === bullet loader ============================================================================================
@@ -450,9 +527,9 @@ def check_state(name: str, body: Body, state: ObjectState) -> None:
 
 
 def set_state(body: Body, state: ObjectState) -> StateChange:
-    """Set pose and joint positions of a body, and return what has changed."""
+    """Set pose and joint positions of a body, and return what has changed; followers follow, whatever was saved."""
     before = body.pose
-    joints = {joint: value for joint, value in state.joints.items() if body.positions[joint] != value}
+    joints = {joint: value for joint, value in body.followed(state.joints).items() if body.positions[joint] != value}
     if joints:
         body.turn(joints)
     if body.pose != state.pose:

@@ -22,7 +22,8 @@ from pycrorm_async.errors import CallerError
 from pycrorm_async.world import arms as arm_ik
 from pycrorm_async.world.arms import Chain, Floats, Reach
 from pycrorm_async.world.pose import Arms, Pose, Quaternion, Vector, product, rotated
-from pycrorm_async.world.urdf import ArmDescription, Bounds, Limits, PR2Arm, PR2Description, RobotDescription
+from pycrorm_async.world.urdf import ArmDescription, Limits, PR2Arm, PR2Description, RobotDescription
+from pycrorm_async.world.urdf_model import Bounds
 
 if TYPE_CHECKING:
     from pycrorm_async.world.bullet import Object
@@ -166,7 +167,7 @@ def chain_of(robot: Object, arm: Arms) -> Chain:
         assert robot.robot_description is not None
         described = robot.robot_description.arms[arm]
         chain = Chain(
-            robot.description_text,
+            robot.model,
             base_link=described.base_link,
             tool_link=described.tool_frame,
             tool_in_link=described.tool_in_link,

@@ -364,6 +364,16 @@ class JointLimitExceeded(WorldError):
         self.limits = limits
 
 
+class JointFollows(WorldError):
+    """A joint follows another (<mimic>) and cannot be set to another position; no joint was moved."""
+
+    def __init__(self, object_name: str, joint: str, leader: str) -> None:
+        super().__init__(f"{object_name!r}: {joint} follows {leader}: set that joint instead")
+        self.object_name = object_name
+        self.joint = joint
+        self.leader = leader
+
+
 class PoseRefused(WorldError):
     """An object's new pose is not a `Pose`, is not in the frame "map", or has a number that is NaN or too large."""
 

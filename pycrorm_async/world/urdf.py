@@ -1,4 +1,4 @@
-"""Check and read URDF files, and describe robots.
+"""Describe robots.
 
 **Robot description.** Describe robots for plans: arms, grippers, torso, head, camera, limits and named postures.
 
@@ -9,11 +9,6 @@ its description, and an action that needs it fails with `CapabilityAbsenceFailur
 >>> PR2.arms[Arms.LEFT].tool_frame
 'l_gripper_tool_frame'
 
-**Joint chain.** Read the joints of a robot's model (URDF), and compute the frame to which they lead.
-
->>> above, arm = divided(urdf, "torso_lift_link", "l_gripper_tool_frame")
->>> along((*above, *arm), {"torso_lift_joint": 0.1})  # the tool in the root link
-
 **Urdf description.** Describe a robot from its model (URDF) and, if there is one, its semantic description (SRDF).
 
 >>> TIAGO = describe_robot("tiago", path, arms={Arms.RIGHT: describe_arm(path, "torso_lift_link", "arm_tool_link")},
@@ -23,151 +18,33 @@ its description, and an action that needs it fails with `CapabilityAbsenceFailur
 
 from __future__ import annotations
 
+import itertools
+import logging
 import math
-from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import re
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
-from xml.etree.ElementTree import Element, ParseError, fromstring, tostring
+from xml.etree.ElementTree import Element
 
 from pycrorm_async.errors import CallerError
-from pycrorm_async.world.pose import (
-    COORDINATE_MAX,
-    Arms,
-    DescriptionNotLoadable,
-    Grasp,
-    GripperState,
-    JointType,
-    Pose,
-    Quaternion,
-    Vector,
-    product,
-    rotated,
+from pycrorm_async.world.pose import Arms, Grasp, GripperState, JointType, Pose, Quaternion, Vector
+from pycrorm_async.world.urdf_model import (
+    ENDLESS,
+    Joint,
+    Model,
+    along,
+    check_expanded,
+    decoded,
+    number_of,
+    parsed_urdf,
+    read_model,
+    urdf_text,
 )
-
-#
-# Check a URDF before Bullet loads it, because some faults crash Bullet instead of raising an error.
-#
-# Two roots or two joints of one name end the process inside Bullet. Bullet reports a missing mesh only on stdout. An
-# origin that is not finite gives links poses that are not finite. This module checks the tree of links, the names, the
-# mesh files and the origins; Bullet checks the rest.
-
-
-def urdf_text(name: str, description: str | Path) -> str:
-    """Read and check a URDF and return its text with the absolute path of every mesh.
-
-    Args:
-        name: the object's name, used in the error message only.
-        description: URDF text (it begins with "<"), or the path of a .urdf file. `package://x/y` is searched as `x/y`
-            in the file's folder and those above it; other relative names start at the file's folder. For URDF text,
-            which has no file, the current folder takes that place.
-
-    Raises:
-        DescriptionNotLoadable: the URDF has a fault, which the message names.
-    """
-    if isinstance(description, str) and description.lstrip().startswith("<"):
-        text, folder = description, Path.cwd()
-    else:
-        path = Path(description)
-        try:
-            text, folder = path.read_text(encoding="utf-8"), path.resolve().parent
-        except (OSError, UnicodeDecodeError, ValueError) as reason:
-            raise DescriptionNotLoadable(name, f"{path} cannot be read: {reason}") from reason
-    try:
-        robot = fromstring(text)  # noqa: S314 the caller's own file, read in the caller's process
-        _check(robot)
-        meshes = list(robot.iter("mesh"))
-        for mesh in meshes:
-            mesh.set("filename", str(_find_mesh(mesh.get("filename", ""), folder)))
-    except (ParseError, _Fault) as fault:
-        raise DescriptionNotLoadable(name, str(fault)) from fault
-    return tostring(robot, encoding="unicode") if meshes else text
-
-
-class _Fault(Exception):
-    """A fault of a URDF; `urdf_text` converts it to a `DescriptionNotLoadable`."""
-
-
-def _find_mesh(reference: str, folder: Path) -> Path:
-    """Return the path of a mesh file. Raises `_Fault` if it does not exist."""
-    if reference.startswith("package://"):
-        relative = reference.removeprefix("package://").lstrip("/")
-        candidates = [above / relative for above in (folder, *folder.parents)]
-    else:
-        candidates = [folder / reference.removeprefix("file://")]
-    for candidate in candidates:
-        if candidate.is_file():
-            return candidate
-    raise _Fault(f"mesh {reference} is not at {' nor at '.join(map(str, candidates[:3]))}")
-
-
-def _check(robot: Element) -> None:
-    """Raise `_Fault` unless <robot> holds one tree of links, unique names and finite origins."""
-    if robot.tag != "robot":
-        raise _Fault(f"its root element is <{robot.tag}>, not <robot>")
-    links = [link.get("name", "") for link in robot.findall("link")]
-    joints = robot.findall("joint")
-    if not links:
-        raise _Fault("it has no link")
-    _unique("link", links)
-    _unique("joint", [joint.get("name", "") for joint in joints])
-    above: dict[str, str] = {}
-    for joint in joints:
-        parent, child = joined_link(joint, "parent"), joined_link(joint, "child")
-        for end in (parent, child):
-            if end not in links:
-                raise _Fault(f"joint {joint.get('name')!r} names a link {end!r} that does not exist")
-        if child in above:
-            raise _Fault(f"link {child!r} has two parents")
-        above[child] = parent
-    roots = [link for link in links if link not in above]
-    if len(roots) != 1:
-        raise _Fault(f"it must have one root link, and has {len(roots)}: {', '.join(roots) or 'a cycle'}")
-    for link in links:
-        _climb(link, above)
-    for element in robot.iter():
-        for value in _numbers(element):
-            if not abs(value) <= COORDINATE_MAX:
-                raise _Fault(
-                    f"<{element.tag}> holds {value:g}; numbers must be finite, and none above {COORDINATE_MAX:g}"
-                )
-
-
-def _numbers(element: Element) -> Iterator[float]:
-    """Yield the numbers of the element's origin; Bullet checks words that are not numbers."""
-    for word in f"{element.get('xyz', '')} {element.get('rpy', '')}".split():
-        try:
-            yield float(word)
-        except ValueError:
-            continue
-
-
-def _climb(link: str, above: dict[str, str]) -> None:
-    """Raise `_Fault` if the links above this one form a cycle."""
-    passed = {link}
-    while link in above:
-        link = above[link]
-        if link in passed:
-            raise _Fault(f"links are joined in a cycle at {link!r}")
-        passed.add(link)
-
-
-def _unique(kind: str, names: Iterable[str]) -> None:
-    for each, count in Counter(names).items():
-        if not each:
-            raise _Fault(f"a {kind} has no name")
-        if count > 1:
-            raise _Fault(f"{count} {kind}s are named {each!r}")
-
-
-def joined_link(joint: Element, end: str) -> str:
-    """Return the name of the link at an end of a joint, `parent` or `child`; empty if the joint names none."""
-    element = joint.find(end)
-    return "" if element is None else element.get("link", "")
-
+from pycrorm_async.world.urdf_model import Bounds as Bounds  # one of the names of this module
 
 # === robot description ========================================================================================
 
@@ -179,13 +56,6 @@ class Limits(Enum):
     """The range that the robot's own controllers and arm services use, inside the mechanical stops."""
     HARD = "HARD"
     """The range up to the mechanical stops, as declared in the model (URDF)."""
-
-
-class Bounds(NamedTuple):
-    """The closed range of a joint; infinite for a continuous one."""
-
-    lower: float
-    upper: float
 
 
 class Drive(Enum):
@@ -285,6 +155,8 @@ class RobotDescription:
     """Distinguishes robots of one model; None if there is no need."""
     urdf: str | Path | None = None
     """The model that an `Object` of this robot loads; None for a built-in one. See `Object`."""
+    packages: Mapping[str, str | Path] = field(default_factory=dict)
+    """Folders of ROS packages by their names, for `package://` in the URDF."""
     base_link: str = ""
     """The link whose pose is the robot's pose, x ahead and z up; empty for the model's root link. It may be above the
     floor, and joints above it may move it."""
@@ -326,7 +198,6 @@ class PR2Description(RobotDescription):
 
 FINGER_OPEN_RAD = 0.548
 """The position in rad of each finger joint of an open gripper of the PR2."""
-_TURN_FREE = Bounds(-math.inf, math.inf)
 
 
 def _unit(x: float, y: float, z: float, w: float) -> Quaternion:
@@ -368,18 +239,18 @@ def _pr2_arm(prefix: str, side: float, park: tuple[float, ...]) -> PR2Arm:
         Bounds(-0.3536, 1.2963),
         mirrored(-0.65, 3.75),
         Bounds(-2.1213, -0.15),
-        _TURN_FREE,
+        ENDLESS,
         Bounds(-1.994, -0.1),
-        _TURN_FREE,
+        ENDLESS,
     )
     hard = (
         mirrored(-0.7146, 2.2854),
         Bounds(-0.5236, 1.3963),
         mirrored(-0.8, 3.9),
         Bounds(-2.3213, 0.0),
-        _TURN_FREE,
+        ENDLESS,
         Bounds(-2.18, 0.0),
-        _TURN_FREE,
+        ENDLESS,
     )
     fingers = (f"{prefix}_gripper_l_finger_joint", f"{prefix}_gripper_r_finger_joint")
     return PR2Arm(
@@ -496,124 +367,9 @@ def robot_description(name: str) -> RobotDescription | None:
     return _registered.get(name)
 
 
-# === joint chain ==============================================================================================
-
-_ENDLESS = Bounds(-math.inf, math.inf)
-_MOVABLE = {"revolute": JointType.REVOLUTE, "continuous": JointType.CONTINUOUS, "prismatic": JointType.PRISMATIC}
-
-
-class Joint(NamedTuple):
-    """One joint of a chain; `kind` is FIXED if it cannot move."""
-
-    name: str
-    kind: JointType
-    child: str
-    origin: Pose
-    rpy: tuple[float, float, float]
-    """The rotation of `origin` as the model has it, which no conversion rounds."""
-    axis: Vector
-    bounds: Bounds
-
-
-def joints_between(urdf: str, base_link: str, tool_link: str) -> tuple[str, ...]:
-    """Return the movable joints between two links, from the base to the tool. Raises as `divided`."""
-    return tuple(each.name for each in divided(urdf, base_link, tool_link)[1] if each.kind is not JointType.FIXED)
-
-
-def divided(urdf: str, base_link: str, tool_link: str) -> tuple[tuple[Joint, ...], tuple[Joint, ...]]:
-    """Return the joints from the root to the base link (empty: the root), and those from there to the tool.
-
-    Raises `CallerError` if the model has no such links, or the tool link is not below the base link.
-    """
-    robot = fromstring(urdf)  # noqa: S314  loaded by the caller's own process, and checked before
-    links = {each.get("name", "") for each in robot.findall("link")}
-    for link in (base_link, tool_link):
-        if link and link not in links:
-            raise CallerError(f"the model {robot.get('name')!r} has no link {link!r}: correct the robot's description")
-    above = {joined_link(each, "child"): each for each in robot.findall("joint")}
-    path: list[Joint] = []
-    link = tool_link
-    while link in above:
-        path.insert(0, _joint(above[link]))
-        link = joined_link(above[link], "parent")
-    passed = [link, *(each.child for each in path)]  # from the root to the tool
-    if base_link and base_link not in passed:
-        raise CallerError(f"{tool_link!r} is not below {base_link!r}: correct the robot's description")
-    begin = passed.index(base_link) if base_link else 0
-    return tuple(path[:begin]), tuple(path[begin:])
-
-
-def chains(urdf: str) -> dict[str, tuple[Joint, ...]]:
-    """Return for each link the joints from the root to it."""
-    robot = fromstring(urdf)  # noqa: S314  loaded by the caller's own process, and checked before
-    below: dict[str, list[Element]] = {}
-    for each in robot.findall("joint"):
-        below.setdefault(joined_link(each, "parent"), []).append(each)
-    children = {joined_link(each, "child") for joints in below.values() for each in joints}
-    names = (link.get("name", "") for link in robot.findall("link"))
-    paths: dict[str, tuple[Joint, ...]] = {name: () for name in names if name not in children}
-    pending = [*paths]
-    for link in pending:
-        for each in below.get(link, ()):
-            joint = _joint(each)
-            paths[joint.child] = (*paths[link], joint)
-            pending.append(joint.child)
-    return paths
-
-
-def _joint(element: Element) -> Joint:
-    kind = _MOVABLE.get(element.get("type", ""), JointType.FIXED)
-    axis, limit = element.find("axis"), element.find("limit")
-    x, y, z = _three_numbers(None if axis is None else axis.get("xyz"), (1.0, 0.0, 0.0))
-    length = math.hypot(x, y, z) or 1.0
-    bounds = _ENDLESS
-    if kind is not JointType.CONTINUOUS and limit is not None:
-        bounds = Bounds(float(limit.get("lower", 0.0)), float(limit.get("upper", 0.0)))
-    origin = element.find("origin")
-    at, rpy = (None, None) if origin is None else (origin.get("xyz"), origin.get("rpy"))
-    roll, pitch, yaw = _three_numbers(rpy, (0.0, 0.0, 0.0))
-    turn = product(product(_about((0, 0, 1), yaw), _about((0, 1, 0), pitch)), _about((1, 0, 0), roll))
-    return Joint(
-        element.get("name", ""),
-        kind,
-        joined_link(element, "child"),
-        Pose(_three_numbers(at, (0.0, 0.0, 0.0)), turn),
-        (roll, pitch, yaw),
-        Vector(x / length, y / length, z / length),
-        bounds,
-    )
-
-
-def _three_numbers(text: str | None, default: tuple[float, float, float]) -> tuple[float, float, float]:
-    if text is None:
-        return default
-    x, y, z = map(float, text.split())
-    return x, y, z
-
-
-def along(joints: Sequence[Joint], positions: Mapping[str, float]) -> Pose:
-    """Return the frame of the last joint's child link in the first joint's parent link, at these positions."""
-    x = y = z = 0.0
-    turn = Quaternion(0.0, 0.0, 0.0, 1.0)
-    for each in joints:
-        step = rotated(turn, each.origin.position)
-        x, y, z, turn = x + step.x, y + step.y, z + step.z, product(turn, each.origin.orientation)
-        position = 0.0 if each.kind is JointType.FIXED else positions.get(each.name, 0.0)
-        if each.kind is JointType.PRISMATIC:
-            step = rotated(turn, [position * along for along in each.axis])
-            x, y, z = x + step.x, y + step.y, z + step.z
-        elif position:
-            turn = product(turn, _about(each.axis, position))
-    return Pose((x, y, z), turn)
-
-
-def _about(axis: Sequence[float], angle: float) -> Quaternion:
-    x, y, z = axis
-    sine = math.sin(angle / 2)
-    return Quaternion(x * sine, y * sine, z * sine, math.cos(angle / 2))
-
-
 # === urdf description =========================================================================================
+
+_log = logging.getLogger("pycrorm_async")
 
 
 def describe_robot(
@@ -625,37 +381,40 @@ def describe_robot(
     park: str = "park",
     payload_kg: float | Mapping[Arms, float] | None = None,
     base_link: str = "",
+    packages: Mapping[str, str | Path] = MappingProxyType({}),
     **facts: Any,
 ) -> RobotDescription:
     """Return the description of a robot whose model is this URDF (text, or the path of a file).
 
-    Without `arms` they come from the SRDF: an arm for each end effector. An arm whose group has "left" or "right" in
-    its name is that one; the only arm of a robot is RIGHT; each further one has the name of its group in capitals
-    (`Arms.named`). The named states become `postures`, and the state `park` the arms' park posture.
+    Without `arms` they come from the SRDF: an arm for each end effector that is no leg. An arm whose group has "left"
+    or "right" (or the word "l" or "r") in its name is that one; the only arm of a robot is RIGHT; each further one has
+    the name of its group in capitals (`Arms.named`). The named states become `postures`, without the joints that the
+    URDF lacks, such as that of a floating base, and the state `park` the arms' park posture.
 
     Args:
         payload_kg: the greatest mass that each arm lifts, or by arm; a URDF does not have it.
         base_link: see `RobotDescription`.
+        packages: folders of ROS packages by their names, for `package://` in the URDF.
         facts: further attributes of `RobotDescription`, such as `drive`, `torso_joint`, `camera_link`.
 
     Raises:
-        CallerError: the SRDF cannot be parsed or does not fit the URDF, `payload_kg` names an arm that the robot lacks,
+        CallerError: the SRDF cannot be read or does not fit the URDF, `payload_kg` names an arm that the robot lacks,
             or the model has no such base link.
         DescriptionNotLoadable: the URDF has a fault.
     """
-    if base_link:
-        joints_between(urdf_text(name, urdf), "", base_link)
+    model = read_model(urdf_text(name, urdf, packages)) if base_link or srdf is not None else None
     postures: dict[str, dict[str, float]] = {}
-    if srdf is not None:
+    if model is not None:
+        model.path(base_link)
+    if srdf is not None and model is not None:
         semantics = _parsed(name, srdf)
         for state in semantics.findall("group_state"):
-            joints = postures.setdefault(state.get("name", ""), {})
-            joints |= {each.get("name", ""): float(each.get("value", "0")) for each in state.findall("joint")}
+            postures.setdefault(state.get("name", ""), {}).update(_positions(name, state, model))
         if arms is None:
-            arms = _arms(name, urdf_text(name, urdf), semantics, postures.get(park, {}))
+            arms = _arms(name, model, semantics, postures.get(park, {}))
     facts.setdefault("postures", postures)
     arms = dict(arms or {}) if payload_kg is None else with_payload(arms or {}, payload_kg)
-    return RobotDescription(name=name, urdf=urdf, base_link=base_link, arms=arms, **facts)
+    return RobotDescription(name=name, urdf=urdf, base_link=base_link, arms=arms, packages=dict(packages), **facts)
 
 
 def describe_arm(
@@ -666,91 +425,216 @@ def describe_arm(
     park: Mapping[str, float] | None = None,
     tool_in_link: Pose | None = None,
     payload_kg: float | None = None,
+    packages: Mapping[str, str | Path] = MappingProxyType({}),
 ) -> ArmDescription:
-    """Return the arm between two links of the model, with its gripper, if that has fingers that slide.
+    """Return the arm between two links of the model, with its soft limits and its gripper, if it has one.
 
-    The gripper's joints are those that the arm carries and that are none of its own: open at their upper limits, closed
-    at the lower ones. For a hand of another kind set `gripper_joints` and `opening_m` with `dataclasses.replace`.
+    The gripper's joints are those that the arm carries and that are none of its own. Fingers that slide are open at
+    their upper limits, closed at the lower ones. Fingers that turn are open where their tips are farthest from each
+    other and from the arm's last link, and `opening_m` is not known. For a hand of another kind set `gripper_joints`
+    and `opening_m` with `dataclasses.replace`.
 
     Raises:
         CallerError: the model has no such links, or no movable joint between them.
         DescriptionNotLoadable: the URDF has a fault.
     """
-    text = urdf_text(tool_frame, urdf)
-    joints = joints_between(text, base_link, tool_frame)
-    if not joints:
+    model = read_model(urdf_text(tool_frame, urdf, packages))
+    return _arm_between(model, base_link, tool_frame, park or {}, tool_in_link, payload_kg)
+
+
+def _arm_between(
+    model: Model,
+    base_link: str,
+    tool_frame: str,
+    park: Mapping[str, float],
+    tool_in_link: Pose | None = None,
+    payload_kg: float | None = None,
+) -> ArmDescription:
+    path = [each for each in model.divided(base_link, tool_frame)[1] if each.moves_freely]
+    if not path:
         raise CallerError(f"no joint moves {tool_frame!r} against {base_link!r}: name the ends of an arm")
-    fingers = dict(_sliding(fromstring(text), joints[-1]))  # noqa: S314  the caller's own file
-    grip = {
-        GripperState.OPEN: {joint: upper for joint, (_, upper) in fingers.items()},
-        GripperState.CLOSE: {joint: lower for joint, (lower, _) in fingers.items()},
-    }
+    joints = tuple(each.name for each in path)
+    grip, opening_m = _gripper(model, path[-1].child, {each.name for each in model.path(tool_frame)})
     return ArmDescription(
         joints=joints,
         base_link=base_link,
         tool_frame=tool_frame,
         tool_in_link=tool_in_link,
         payload_kg=payload_kg,
-        gripper_joints=grip if fingers else {},
-        opening_m=sum(upper - lower for lower, upper in fingers.values()) if fingers else None,
-        park={joint: position for joint, position in (park or {}).items() if joint in joints},
+        soft_limits={each.name: each.soft for each in path if each.soft is not None},
+        gripper_joints=grip,
+        opening_m=opening_m,
+        park={joint: position for joint, position in park.items() if joint in joints},
     )
 
 
+def _gripper(
+    model: Model, palm: str, arm: Collection[str]
+) -> tuple[Mapping[GripperState, Mapping[str, float]], float | None]:
+    """Return the open and the closed positions of the fingers below a link, and the width of the open gripper."""
+    fingers = [each for each in model.below(palm) if each.kind is not JointType.FIXED and each.name not in arm]
+    free = {each.name: each.bounds for each in fingers if each.moves_freely}
+    if leading := {each.mimic.joint for each in fingers if each.mimic is not None} & free.keys():
+        free = {name: free[name] for name in free if name in leading}  # the others are no drives of the gripper
+    lowest = {name: bounds.lower for name, bounds in free.items()}
+    highest = {name: bounds.upper for name, bounds in free.items()}
+    slide = all(each.kind is JointType.PRISMATIC for each in fingers if each.name in free or each.mimic is not None)
+    closed, opened = dict(lowest), dict(highest)
+    if not slide:
+        spread = _spread(model, palm, fingers)
+        start = {name: min(max(0.0, bounds.lower), bounds.upper) for name, bounds in free.items()}
+        for name in free:
+            low, high = (spread({**start, name: ends[name]}) for ends in (lowest, highest))
+            if not abs(high - low) > _SPREAD_MIN_M:  # also without limits, where it is not a number
+                del closed[name], opened[name]
+            elif high < low:
+                closed[name], opened[name] = opened[name], closed[name]
+    followed = [each for each in fingers if each.name in closed or (each.mimic and each.mimic.joint in closed)]
+    if not followed or not all(map(math.isfinite, (*closed.values(), *opened.values()))):
+        return {}, None
+    positions = [{each.name: each.position(state) for each in followed} for state in (opened, closed)]
+    opening_m = sum(abs(positions[0][each.name] - positions[1][each.name]) for each in followed) if slide else None
+    return {GripperState.OPEN: positions[0], GripperState.CLOSE: positions[1]}, opening_m
+
+
+_SPREAD_MIN_M = 1e-4
+"""A joint that changes the distances of the finger tips by less does not open a hand."""
+
+
+def _spread(model: Model, palm: str, fingers: Sequence[Joint]) -> Callable[[Mapping[str, float]], float]:
+    """Return the sum of the distances of the finger tips from each other and from the palm, by joint positions."""
+    from pycrorm_async.world.bounding_boxes import box_of
+
+    above = len(model.path(palm))
+    tips: list[tuple[tuple[Joint, ...], Pose]] = []
+    for each in fingers:
+        if not any(joint in fingers for joint in model.below(each.child)):
+            last = max((path for path in model.paths.values() if each in path), key=len)
+            box = box_of(model.links[last[-1].child])
+            tips.append((last[above:], Pose() if box is None else Pose(box.centre)))
+
+    def spread(positions: Mapping[str, float]) -> float:
+        if not all(map(math.isfinite, positions.values())):
+            return math.nan
+        points = [(along(path, positions) @ middle).position for path, middle in tips]
+        pairs = sum(math.dist(one, other) for one, other in itertools.combinations(points, 2))
+        return pairs + sum(math.hypot(*point) for point in points)
+
+    return spread
+
+
+# --- SRDF ------------------------------------------------------------------------------------------------------
+
+_LEG = re.compile(r"(?<![a-z])(?:[lr]|[lr][fhr]|[fhr][lr])?(?:leg|foot|feet|sole|ankle|toe|wheel)s?(?![a-z])")
+_SIDES = (
+    (re.compile(r"left|(?<![a-z])l(?![a-z])"), Arms.LEFT),
+    (re.compile(r"right|(?<![a-z])r(?![a-z])"), Arms.RIGHT),
+)
+_STATES = {GripperState.OPEN: ("open", "opened"), GripperState.CLOSE: ("close", "closed")}
+
+
 def _parsed(name: str, srdf: str | Path) -> Element:
-    text = srdf if isinstance(srdf, str) and srdf.lstrip().startswith("<") else Path(srdf).read_text(encoding="utf-8")
     try:
-        return fromstring(text)  # noqa: S314  the caller's own file
-    except SyntaxError as fault:
+        is_text = isinstance(srdf, str) and srdf.lstrip("\ufeff \t\r\n").startswith("<")
+        robot = parsed_urdf(str(srdf) if is_text else decoded(Path(srdf).read_bytes()))
+        check_expanded(robot)
+    except (OSError, SyntaxError, ValueError) as fault:
         raise CallerError(f"the SRDF of {name!r} cannot be read: {fault}") from fault
+    return robot
 
 
-def _arms(name: str, urdf: str, semantics: Element, park: Mapping[str, float]) -> dict[Arms, ArmDescription]:
+def _positions(name: str, state: Element, model: Model) -> dict[str, float]:
+    """Return the positions of a state for the joints of the URDF that move. Raises `CallerError` for other words."""
+    positions: dict[str, float] = {}
+    for each in state.findall("joint"):
+        joint = model.joints.get(each.get("name", ""))
+        if joint is None or joint.kind is JointType.FIXED:
+            _log.info("the SRDF of %r: the URDF has no movable joint %r", name, each.get("name"))
+            continue
+        try:
+            positions[joint.name] = number_of(each.get("value", "0"))
+        except ValueError as fault:
+            raise CallerError(
+                f"the SRDF of {name!r}: <group_state name={state.get('name', '')!r}>, joint {joint.name!r}: {fault}"
+            ) from None
+    return positions
+
+
+def _arms(name: str, model: Model, semantics: Element, park: Mapping[str, float]) -> dict[Arms, ArmDescription]:
     """Return the arms that end in the SRDF's end effectors."""
     groups = {each.get("name", ""): each for each in semantics.findall("group")}
-    ends = [(each.get("parent_group", each.get("group", "")), each) for each in semantics.findall("end_effector")]
-    arms: dict[Arms, ArmDescription] = {}
-    for group, end in ends:
-        chain = groups[group].find("chain") if group in groups else None
+    ends: list[tuple[str, Element, str]] = []
+    for end in semantics.findall("end_effector"):
+        group = end.get("parent_group") or end.get("group") or ""
         tool = end.get("parent_link", "")
-        base = chain.get("base_link", "") if chain is not None else _first_link(name, urdf, groups.get(group))
-        arms[_arm(group, only=len(ends) == 1)] = describe_arm(urdf, base, tool, park=park)
+        if any(_LEG.search(word.lower()) for word in (group, tool, end.get("name", ""), end.get("group", ""))):
+            continue
+        if tool not in model.paths:
+            raise CallerError(f"the SRDF of {name!r} names an end effector at a link {tool!r} that the URDF lacks")
+        base = _first_link(groups, group, model, tool)
+        if base is None:  # the group is that of the hand
+            others = (each for each in groups if _first_link(groups, each, model, tool, ends=True) is not None)
+            group = next(others, group)
+            base = _first_link(groups, group, model, tool)
+        if base is None:
+            raise CallerError(
+                f"the SRDF of {name!r} names an end effector of a group {group!r} without a joint of the URDF above"
+                f" {tool!r}"
+            )
+        ends.append((group, end, base))
+    arms: dict[Arms, ArmDescription] = {}
+    for group, end, base in ends:
+        described = _arm_between(model, base, end.get("parent_link", ""), park)
+        states = {
+            kind: _positions(name, state, model)
+            for kind, words in _STATES.items()
+            for state in semantics.findall("group_state")
+            if state.get("group") == end.get("group") != group and state.get("name", "").lower() in words
+        }
+        arm = _arm(group, taken=arms, only=len(ends) == 1)
+        arms[arm] = replace(described, gripper_joints=states) if len(states) == len(_STATES) else described
     return arms
 
 
-def _arm(group: str, *, only: bool) -> Arms:
-    for side, arm in (("left", Arms.LEFT), ("right", Arms.RIGHT)):
-        if side in group.lower():
+def _arm(group: str, *, taken: Collection[Arms], only: bool) -> Arms:
+    for side, arm in _SIDES:
+        if side.search(group.lower()) and arm not in taken:
             return arm
-    return Arms.RIGHT if only else Arms.named(group.upper())
+    return Arms.RIGHT if only else Arms.named(re.sub(r"\W|^(?=\d)", "_", group.upper()) or "_")
 
 
-def _first_link(name: str, urdf: str, group: Element | None) -> str:
-    """Return the link that carries the first joint of a group of joints."""
-    joint = None if group is None else group.find("joint")
-    for each in fromstring(urdf).findall("joint"):  # noqa: S314  the caller's own file
-        if joint is not None and each.get("name") == joint.get("name"):
-            return joined_link(each, "parent")
-    raise CallerError(f"the SRDF of {name!r} names an end effector of a group without a chain or a joint of the URDF")
+def _first_link(
+    groups: Mapping[str, Element], group: str, model: Model, tool: str, *, ends: bool = False
+) -> str | None:
+    """Return the link above the first joint of a group on the way to the tool, or that at which its chain begins.
+
+    None if no joint of the group moves the tool; with `ends` also if a joint outside the group is the last that does.
+    """
+    joints = _joints_of(groups, group, model)
+    path = [each for each in model.path(tool) if each.moves_freely]
+    first = next((each for each in path if each.name in joints), None)
+    if first is None or (ends and path[-1].name not in joints):
+        return None
+    for chain in groups[group].findall("chain"):
+        base = chain.get("base_link", "")
+        if base in model.paths and model.path(tool)[: len(model.path(base))] == model.path(base):
+            return base
+    return first.parent
 
 
-def _sliding(robot: Element, last: str) -> Iterator[tuple[str, tuple[float, float]]]:
-    """Yield the joints that the joint `last` carries, with their limits; none at all if one of them turns."""
-    carried = {joined_link(each, "child") for each in robot.findall("joint") if each.get("name") == last}
-    joints: list[tuple[str, tuple[float, float]]] = []
-    added = True
-    while added:
-        below = [
-            each
-            for each in robot.findall("joint")
-            if joined_link(each, "parent") in carried and joined_link(each, "child") not in carried
-        ]
-        added = bool(below)
-        for each in below:
-            carried.add(joined_link(each, "child"))
-            limit = each.find("limit")
-            if each.get("type") == "prismatic" and limit is not None:
-                joints.append((each.get("name", ""), (float(limit.get("lower", "0")), float(limit.get("upper", "0")))))
-            elif each.get("type") != "fixed":
-                return
-    yield from joints
+def _joints_of(
+    groups: Mapping[str, Element], group: str, model: Model, passed: frozenset[str] = frozenset()
+) -> set[str]:
+    """Return the joints of a group: those that it names, above its links, of its chains, and of its subgroups."""
+    if group not in groups or group in passed:
+        return set()
+    element = groups[group]
+    links = {each.get("name") for each in element.findall("link")}
+    joints = {each.get("name", "") for each in element.findall("joint")}
+    joints |= {each.name for each in model.joints.values() if each.child in links}
+    for chain in element.findall("chain"):
+        base, tip = (model.paths.get(chain.get(end, ""), ()) for end in ("base_link", "tip_link"))
+        joints |= {each.name for each in tip if each not in base}
+    for each in element.findall("group"):
+        joints |= _joints_of(groups, each.get("name", ""), model, passed | {group})
+    return joints

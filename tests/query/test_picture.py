@@ -192,9 +192,10 @@ def test_a_collada_file_whose_y_axis_is_up_is_turned() -> None:
 @pytest.mark.parametrize(
     ("name", "content", "reason"),
     [
-        ("a.ply", b"", "the format 'ply' is not read"),
+        ("a.ply", b"", "not a readable ply file"),
+        ("a.3ds", b"", "the format '3ds' is not read"),
         ("mesh", b"", "the format 'mesh' is not read"),
-        ("a.stl", b"", "its length does not fit"),
+        ("a.stl", b"", "it has no triangles"),
         ("a.stl", mesh_files.binary_stl()[:-1], "vertex|no triangles"),
         ("a.stl", b"solid x\nvertex a b c", "not a readable stl file"),
         ("a.stl", b"solid x\nvertex 1 1 1\nvertex 1 1 1", "not a readable stl|reshape"),
@@ -204,7 +205,7 @@ def test_a_collada_file_whose_y_axis_is_up_is_turned() -> None:
         ("a.obj", b"v 1 2 3\n", "it has no triangles"),
         ("a.obj", b"\xff\xfe", "not a readable obj file"),
         ("a.dae", b"<COLLADA", "not a readable dae file"),
-        ("a.dae", b"<COLLADA/>", "it has no triangles"),
+        ("a.dae", b"<COLLADA/>", "not a readable dae file"),
         ("a.dae", mesh_files.collada().replace(b'url="#g"', b'url="#other"'), "not a readable dae file"),
         ("a.dae", mesh_files.collada().replace(b"VERTEX", b"OTHER"), "not a readable dae file"),
     ],

@@ -386,12 +386,12 @@ def test_nothing_of_bullet_reaches_stdout_or_stderr() -> None:
         "    Object('pr2', ObjectType.ROBOT)\n"
         "    Object('kitchen', ObjectType.ENVIRONMENT)\n"
         "    Object('bare', ObjectType.GENERIC_OBJECT, link.format('<box size=\"1 1 1\"/>'))\n"
-        "    Object('empty', ObjectType.GENERIC_OBJECT, link.format(f'<mesh filename=\"{empty.name}\"/>'))\n"
-        "    try:\n        Object('bad', ObjectType.GENERIC_OBJECT, link.format('<box/>'))\n"
-        "    except DescriptionNotLoadable:\n        print('refused')\n"
+        "    for shape in (f'<mesh filename=\"{empty.name}\"/>', '<box/>'):\n"
+        "        try:\n            Object('bad', ObjectType.GENERIC_OBJECT, link.format(shape))\n"
+        "        except DescriptionNotLoadable:\n            print('refused')\n"
         "print('after')\n"
     )
-    assert (done.stdout, done.stderr, done.returncode) == (b"before\nrefused\nafter\n", b"", 0)
+    assert (done.stdout, done.stderr, done.returncode) == (b"before\nrefused\nrefused\nafter\n", b"", 0)
 
 
 def test_output_of_other_threads_meanwhile_is_not_swallowed() -> None:

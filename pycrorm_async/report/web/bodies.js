@@ -41,7 +41,8 @@ export class Body {
   update(event) {
     const { joints, poses } = this.object;
     for (const each of this.movable) {
-      const [source, multiplier, offset] = joints.has(each.name) ? [each.name, 1, 0] : each.mimic ?? [each.name, 1, 0];
+      const follows = each.mimic && (joints.has(each.mimic[0]) || !joints.has(each.name));
+      const [source, multiplier, offset] = follows ? each.mimic : [each.name, 1, 0];
       const track = joints.get(source);
       const position = (track === undefined ? 0 : track.valueAt(event)) * multiplier + offset;
       if (each.type === "prismatic") each.moved.position.copy(each.axis).multiplyScalar(position);
