@@ -20,6 +20,7 @@ from pycrorm_async.record.values import MissingValues, clean, cut, message_of
 from pycrorm_async.settings import Settings
 from pycrorm_async.world.bounding_boxes import BoundingBox
 from pycrorm_async.world.model_boxes import link_boxes, mesh_files, meshed_links, with_mesh_files, without_textures
+from pycrorm_async.world.urdf_model import UrdfFault, read_model
 
 _KNOWN_MAX = 1_000
 """Bounds the descriptions kept, because a program may generate any number. When it is reached all are dropped."""
@@ -30,7 +31,13 @@ _REASON_MAX = 500
 _HEADING = Heading(None, DescriptionDeclared.__name__, DescriptionDeclared.version)
 _OWNER = DescriptionDeclared.__name__
 
-_MEDIA_TYPES = {".stl": "model/stl", ".obj": "model/obj", ".dae": "model/vnd.collada+xml"}
+_MEDIA_TYPES = {
+    ".stl": "model/stl",
+    ".obj": "model/obj",
+    ".dae": "model/vnd.collada+xml",
+    ".glb": "model/gltf-binary",
+    ".ply": "model/ply",
+}
 
 _Stats = tuple[tuple[int, int, int, int] | None, ...]
 
@@ -136,13 +143,19 @@ class Descriptions:
         solid = {link: box for link in described.links if (box := described.box_in_link(link)) is not None}
         seen = described.visual_boxes([link for link in meshed if link not in solid])
         boxes = {link: _box_value(box) for link in meshed if (box := solid.get(link) or seen.get(link)) is not None}
-        placed = tuple(LinkBoxValue(*each) for each in link_boxes(text, solid))
+        try:
+            left_out = read_model(text).left_out
+            placed = tuple(LinkBoxValue(*each) for each in link_boxes(text, solid))
+        except UrdfFault as fault:  # the text is recorded nevertheless
+            left_out, placed = (str(fault),), ()
         text, textures = without_textures(text)
         if meshes:
             text = with_mesh_files(text, {file: mesh.reference for file, mesh in meshes.items()})
         packed = base64.b64encode(zlib.compress(text.encode())).decode()
         event = DescriptionDeclared(packed, tuple(dict.fromkeys(meshes.values())), boxes, placed)
         missing = [("meshes", f"{mesh.name}: {mesh.missing}") for mesh in event.meshes if mesh.missing is not None]
+        if left_out:
+            missing.append(("urdf", cut(clean("; ".join(left_out)), _REASON_MAX)))
         bare = [clean(link) for link in meshed if link not in boxes]
         if bare and not self._with_files:
             missing.append(("boxes", cut(f"the meshes of these links have none: {', '.join(bare)}", _REASON_MAX)))

@@ -409,7 +409,9 @@ def describe_robot(
     if srdf is not None and model is not None:
         semantics = _parsed(name, srdf)
         for state in semantics.findall("group_state"):
-            postures.setdefault(state.get("name", ""), {}).update(_positions(name, state, model))
+            if positions := _positions(name, state, model):
+                postures.setdefault(state.get("name", ""), {}).update(positions)
+        _log_unknown(name, semantics, model)
         if arms is None:
             arms = _arms(name, model, semantics, postures.get(park, {}))
     facts.setdefault("postures", postures)
@@ -549,7 +551,6 @@ def _positions(name: str, state: Element, model: Model) -> dict[str, float]:
     for each in state.findall("joint"):
         joint = model.joints.get(each.get("name", ""))
         if joint is None or joint.kind is JointType.FIXED:
-            _log.info("the SRDF of %r: the URDF has no movable joint %r", name, each.get("name"))
             continue
         try:
             positions[joint.name] = number_of(each.get("value", "0"))
@@ -560,15 +561,24 @@ def _positions(name: str, state: Element, model: Model) -> dict[str, float]:
     return positions
 
 
+def _log_unknown(name: str, semantics: Element, model: Model) -> None:
+    """Log the joints of states that the URDF lacks, but for those of a floating base, which have several numbers."""
+    states = semantics.iterfind("group_state/joint")
+    named = dict.fromkeys(each.get("name", "") for each in states if len(each.get("value", "").split()) < 2)
+    if unknown := [each for each in named if each not in model.joints]:
+        _log.warning("the SRDF of %r has states of joints that the URDF lacks: %s", name, ", ".join(unknown))
+
+
 def _arms(name: str, model: Model, semantics: Element, park: Mapping[str, float]) -> dict[Arms, ArmDescription]:
     """Return the arms that end in the SRDF's end effectors."""
     groups = {each.get("name", ""): each for each in semantics.findall("group")}
-    ends: list[tuple[str, Element, str]] = []
+    ends: list[tuple[str, Element, str, str]] = []
     for end in semantics.findall("end_effector"):
         group = end.get("parent_group") or end.get("group") or ""
         tool = end.get("parent_link", "")
         if any(_LEG.search(word.lower()) for word in (group, tool, end.get("name", ""), end.get("group", ""))):
             continue
+        tool = model.joints[tool].child if tool in model.joints and tool not in model.links else tool
         if tool not in model.paths:
             raise CallerError(f"the SRDF of {name!r} names an end effector at a link {tool!r} that the URDF lacks")
         base = _first_link(groups, group, model, tool)
@@ -578,13 +588,13 @@ def _arms(name: str, model: Model, semantics: Element, park: Mapping[str, float]
             base = _first_link(groups, group, model, tool)
         if base is None:
             raise CallerError(
-                f"the SRDF of {name!r} names an end effector of a group {group!r} without a joint of the URDF above"
-                f" {tool!r}"
+                f"the SRDF of {name!r} names an end effector of a group without a chain or a joint of the URDF:"
+                f" {group!r}"
             )
-        ends.append((group, end, base))
+        ends.append((group, end, base, tool))
     arms: dict[Arms, ArmDescription] = {}
-    for group, end, base in ends:
-        described = _arm_between(model, base, end.get("parent_link", ""), park)
+    for group, end, base, tool in ends:
+        described = _arm_between(model, base, tool, park)
         states = {
             kind: _positions(name, state, model)
             for kind, words in _STATES.items()
