@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import heapq
-import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -33,11 +32,12 @@ from pycrorm_async.export.selection import CoveredEpisode
 from pycrorm_async.projections.fold import happening_of
 from pycrorm_async.projections.row_batch import CannotFold
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.query.scene import Frame, assumed_model, joint_frame, link_frames, object_model, placed, point_model
+from pycrorm_async.query.scene import assumed_model, joint_pose, link_poses, object_model, point_model
 from pycrorm_async.query.snapshot import unreadable
 from pycrorm_async.query.text import parameters_text, with_object_names
 from pycrorm_async.store.stored import StoredEvent
 from pycrorm_async.world.pose import Pose
+from pycrorm_async.world.urdf_model import origin
 
 #
 # Read an episode's events into objects, their changes, and nodes of the plan, which all formats of robots share.
@@ -717,13 +717,13 @@ class SceneObject:
         if change.pose is not None:
             self._pose = Pose(change.pose[:3], change.pose[3:])
         if change.pose is not None or (self._base_link is not None and change.joints):
-            root = link_frames(self._model, self._pose, self._joints, self._base_link)[self._model["root"]]
+            root = link_poses(self._model, self._pose, self._joints, self._base_link)[self._model["root"]]
             yield FrameChange(change.when, MAP, self.name, *_parts(root))
         for joint in self._model["joints"]:
             name, _, parent, child, *_, mimic = joint
             moves = name in change.joints or (mimic is not None and mimic[0] in change.joints)
             if is_first or moves:
-                frame = joint_frame(joint, self._joints)
+                frame = joint_pose(joint, self._joints)
                 yield FrameChange(change.when, self.frame(parent), self.frame(child), *_parts(frame))
 
 
@@ -762,31 +762,12 @@ def frame_changes(episode: RecordedEpisode, objects: Mapping[int, SceneObject]) 
 
 def _shape(shape: Sequence[Any], color: Sequence[float] | None) -> Shape:
     kind, sizes, xyz, rpy, own = shape
-    translation, rotation = _parts(placed(xyz, rpy))
+    translation, rotation = _parts(origin(xyz, rpy))
     red, green, blue, opacity = color or own or _GREY
     return Shape(kind, tuple(sizes), translation, rotation, (red, green, blue, opacity))
 
 
-def _parts(frame: Frame) -> tuple[tuple[float, float, float], tuple[float, float, float, float]]:
-    """Return translation and quaternion xyzw of a frame."""
-    x, y, z = (float(each) for each in frame[:3, 3])
-    return (x, y, z), _quaternion(frame)
-
-
-def _quaternion(frame: Frame) -> tuple[float, float, float, float]:
-    turn = frame[:3, :3]
-    # The largest of the four is computed first, because dividing by a small one would lose digits.
-    squares = [1 + np.trace(turn), *(1 + 2 * turn[each, each] - np.trace(turn) for each in range(3))]
-    largest = int(np.argmax(squares))
-    twice = math.sqrt(squares[largest])
-    if largest == 0:
-        parts = [turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]]
-        x, y, z = (float(each) / twice / 2 for each in parts)
-        return x, y, z, twice / 2
-    first = largest - 1
-    second, third = (first + 1) % 3, (first + 2) % 3
-    vector = [0.0, 0.0, 0.0]
-    vector[first] = twice / 2
-    vector[second] = float(turn[second, first] + turn[first, second]) / twice / 2
-    vector[third] = float(turn[third, first] + turn[first, third]) / twice / 2
-    return vector[0], vector[1], vector[2], float(turn[third, second] - turn[second, third]) / twice / 2
+def _parts(pose: Pose) -> tuple[tuple[float, float, float], tuple[float, float, float, float]]:
+    """Return translation and quaternion xyzw of a pose, with w >= 0."""
+    x, y, z, w = pose.orientation
+    return pose.position, (x, y, z, w) if w >= 0 else (-x, -y, -z, -w)

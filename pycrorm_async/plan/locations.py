@@ -58,7 +58,7 @@ from pycrorm_async.plan.geometry import (
     place_pose,
     retract,
 )
-from pycrorm_async.plan.motions import chosen_limits, collisions_count
+from pycrorm_async.plan.motions import arm_collision, chosen_limits, collisions_count
 from pycrorm_async.plan.objects import (
     CurrentRobot,
     ObjectDesignator,
@@ -74,7 +74,7 @@ from pycrorm_async.plan.objects import (
 from pycrorm_async.plan.task import Experience, PastSuccess, current_node, experience
 from pycrorm_async.world.bounding_boxes import BoundingBox, box_around
 from pycrorm_async.world.bullet import Object, current_world
-from pycrorm_async.world.kinematics import Unreachable, solve
+from pycrorm_async.world.kinematics import Unreachable, chain_of, solve
 from pycrorm_async.world.pose import Arms, Grasp, Pose, Quaternion, Vector, rotated, yaw_quaternion
 from pycrorm_async.world.queries import (
     Costmap,
@@ -164,8 +164,9 @@ def base_poses(
     costmap, cells = _costmap(target, goal, robots, viewer, clearance)
     yield cells
     clear, height_m = 0, base_height_m(reacher or viewer)
+    turned = 0.0 if reacher is None else -_telescope_yaw(reacher, arms)
     for cell in _cells(costmap, robots, every=clearance is not None):
-        base_pose = face(cell, goal, height_m=height_m)
+        base_pose = face(cell, goal, height_m=height_m, turned=turned)
         if clearance is not None and (collision := clearance.refusal(base_pose)) is not None:
             yield base_pose, Reach(refusal=collision)
             continue
@@ -180,6 +181,19 @@ def _arms(robot: CurrentRobot, arm: Arms | None, target: Pose | ObjectLike) -> A
         return arm
     candidates = tuple(robot.description.arms)
     return candidates if isinstance(target, Pose) else lifting_arms(robot, candidates, target)
+
+
+def _telescope_yaw(robot: CurrentRobot, arms: Arms | tuple[Arms, ...] | None) -> float:
+    """Return the direction, rad from ahead, in which the first arm reaches by sliding; 0 for other arms."""
+    among = arms if isinstance(arms, tuple) else robot.each_arm(arms) if arms else tuple(robot.description.arms)
+    if not among or isinstance(robot.description, PR2Description):
+        return 0.0
+    x, y = chain_of(robot.body, among[0]).telescope()
+    return math.atan2(y, x) if math.hypot(x, y) > _TELESCOPE_MIN else 0.0
+
+
+_TELESCOPE_MIN = 0.5
+"""The least horizontal part of the axes of sliding joints at which they are a telescope, and not a lift."""
 
 
 def _cells(costmap: Costmap, robots: list[CurrentRobot], *, every: bool) -> Iterator[Pose]:
@@ -206,7 +220,8 @@ def _checked(
         return base_pose, Reach(refusal="the target is not visible from here")
     if reacher is None:
         return base_pose, Reach()
-    return base_pose, reaching_arms(reacher, arms, base_pose, partial(_goals, reacher, base_pose, target, goal))
+    goals = partial(_goals, reacher, base_pose, target, goal)
+    return base_pose, reaching_arms(reacher, arms, base_pose, goals, grasps=not isinstance(target, Pose))
 
 
 def resolve_robot(meant: ObjectLike) -> CurrentRobot:
@@ -240,16 +255,19 @@ def reaching_arms(
     goals: Callable[[Arms], Iterable[Pose]],
     *,
     torso_height: float | None = None,
+    grasps: bool | None = None,
 ) -> Reach:
     """Return the arms that reach all their goals from this base pose, or a refusal if the required ones do not.
 
     Args:
         arm: the required arm; BOTH requires both, several any of these, None any.
         torso_height: m; None means the current height.
+        grasps: where collisions count, refuse an arm that would be in an object at one of the goals, and if False, also
+            one whose gripper would be, or whose held objects at the first goal; None: check no collisions.
 
     Raises `CapabilityAbsenceFailure` for an arm that the robot lacks.
     """
-    limits = chosen_limits()
+    limits, collides = chosen_limits(), grasps is not None and collisions_count()
     if isinstance(arm, tuple):
         candidates = arm
     else:
@@ -258,14 +276,35 @@ def reaching_arms(
     refusals: list[str] = []
     for candidate in candidates:
         try:
-            for each in goals(candidate):
+            postures = [
                 solve(robot.body, candidate, each, base=base_pose, torso_height=torso_height, limits=limits)
+                for each in goals(candidate)
+            ]
         except Unreachable as unreachable:
             refusals.append(f"{candidate.name}: {unreachable.reason}")
-        else:
-            reaching.append(candidate)
+            continue
+        if torso_height is not None and robot.description.torso_joint is not None:
+            postures = [{**each, robot.description.torso_joint: torso_height} for each in postures]
+        if collides and (collision := _collision(robot, candidate, postures, base_pose, grasps=bool(grasps))):
+            refusals.append(f"{candidate.name}: " + "it would be in {1.name} with {0}".format(*collision))
+            continue
+        reaching.append(candidate)
     enough = not refusals if arm is Arms.BOTH else bool(reaching)
     return Reach(tuple(reaching)) if enough else Reach(refusal="; ".join(refusals))
+
+
+def _collision(
+    robot: CurrentRobot, arm: Arms, postures: Iterable[dict[str, float]], base: Pose, *, grasps: bool
+) -> tuple[str, Object] | None:
+    """Return the first collision of the arm at these postures, as its motions will find it."""
+    tool_frame = robot.description.arms[arm].tool_frame
+    held = [] if grasps else [each for each, link in robot.body.attachments.items() if link == tool_frame]
+    for joints in postures:
+        collision = arm_collision(robot, arm, joints, gripper_may_touch=grasps, held=held, base=base)
+        if collision is not None:
+            return collision
+        held = []  # it is released at the first goal
+    return None
 
 
 def _costmap(
@@ -889,4 +928,4 @@ def _reach(robot: CurrentRobot, base_pose: Pose, target_pose: Pose, past: PastSu
         tool = robot.tool_pose(arm)
         return pick_up_poses(target_pose, past.grasp, base_pose @ tool.relative_to(body.pose))
 
-    return reaching_arms(robot, past.arm, base_pose, goals, torso_height=past.torso_height)
+    return reaching_arms(robot, past.arm, base_pose, goals, torso_height=past.torso_height, grasps=True)

@@ -67,6 +67,7 @@ from pycrorm_async.world.kinematics import Unreachable, solve
 from pycrorm_async.world.pose import (
     Arms,
     GripperState,
+    JointFollows,
     JointLimitExceeded,
     ObjectType,
     Pose,
@@ -676,19 +677,32 @@ class SimulatedModules:
 
     def _check_clear(self, robot: CurrentRobot, motion: MoveTCPMotion, joints: dict[str, float]) -> None:
         """Raise `ManipulationGoalInCollision` if the arm or the held object collides at these joint angles."""
-        arm = robot.one_arm(motion.arm)
-        last = arm.joints[-1] if motion.allow_gripper_collision else None
-        body = robot.body
-        above = {link: body.joints_above(link) for link in body.links if body.body.solids[link]}
-        links = [
-            link for link, joints_above in above.items() if arm.joints[0] in joints_above and last not in joints_above
-        ]
-        held = [obj for obj, link in body.attachments.items() if link == arm.tool_frame]
-        collisions = collisions_at(body, joints, links=links, carried=held)
-        if collisions:
-            part, obj = collisions[0]
+        held = [obj for obj, link in robot.body.attachments.items() if link == robot.one_arm(motion.arm).tool_frame]
+        may_touch = bool(motion.allow_gripper_collision)
+        if (collision := arm_collision(robot, motion.arm, joints, gripper_may_touch=may_touch, held=held)) is not None:
+            part, obj = collision
             message = f"at its goal the {motion.arm.name} arm would be in {obj.name} with {part}"
             raise ManipulationGoalInCollision(message, part, obj.name)
+
+
+def arm_collision(
+    robot: CurrentRobot,
+    arm: Arms,
+    joints: Mapping[str, float],
+    *,
+    gripper_may_touch: bool,
+    held: Sequence[Object] = (),
+    base: Pose | None = None,
+) -> tuple[str, Object] | None:
+    """Return the first link of an arm, or held object, that would be in another object, and that object.
+
+    The robot is taken at its pose unless `base` is passed. Nothing is moved.
+    """
+    body, described = robot.body, robot.one_arm(arm)
+    last = described.joints[-1] if gripper_may_touch else None
+    above = {link: body.joints_above(link) for link in body.links if body.body.solids[link]}
+    links = [link for link, joints in above.items() if described.joints[0] in joints and last not in joints]
+    return next(iter(collisions_at(body, joints, links=links, carried=held, base=base)), None)
 
 
 def _check_base_clear(robot: CurrentRobot, goal: Pose) -> None:
@@ -707,7 +721,7 @@ def _set_joints(robot: CurrentRobot, positions: Mapping[str, float]) -> None:
     body, description = robot
     try:
         body.set_joint_positions(positions)
-    except JointLimitExceeded as exceeded:
+    except (JointLimitExceeded, JointFollows) as exceeded:
         if description.torso_joint is not None and [*positions] == [description.torso_joint]:
             raise TorsoGoalUnreachable(str(exceeded), positions[description.torso_joint]) from exceeded
         raise ConfigurationNotReached(str(exceeded), dict(positions)) from exceeded

@@ -28,21 +28,28 @@ Frame: TypeAlias = NDArray[np.float64]
 """A pose as a matrix of 4 rows and 4 columns."""
 
 
+def link_poses(
+    model: Mapping[str, Any], pose: Pose, joints: Mapping[str, float], base_link: str | None = None
+) -> dict[str, Pose]:
+    """Return the pose of each link of a model from `object_model`; `pose` is that of `base_link`, or of the root."""
+    poses = {model["root"]: Pose()}
+    for row in model["joints"]:
+        _, _, parent, child, *_ = row
+        poses[child] = poses[parent] @ joint_pose(row, joints)
+    root = pose @ poses[base_link].inverse() if base_link in poses else pose
+    return {link: root @ each for link, each in poses.items()}
+
+
 def link_frames(
     model: Mapping[str, Any], pose: Pose, joints: Mapping[str, float], base_link: str | None = None
 ) -> dict[str, Frame]:
-    """Return the frame of each link of a model from `object_model`; `pose` is that of `base_link`, or of the root."""
-    frames = {model["root"]: Pose()}
-    for row in model["joints"]:
-        joint = _joint_of(row)
-        frames[joint.child] = frames[joint.parent] @ along([joint], joints)
-    root = pose @ frames[base_link].inverse() if base_link in frames else pose
-    return {link: _frame(root @ frame) for link, frame in frames.items()}
+    """Return the poses of `link_poses` as matrices."""
+    return {link: _frame(each) for link, each in link_poses(model, pose, joints, base_link).items()}
 
 
-def joint_frame(joint: Sequence[Any], joints: Mapping[str, float]) -> Frame:
-    """Return the frame of a joint's child link in that of its parent, at these positions."""
-    return _frame(along([_joint_of(joint)], joints))
+def joint_pose(joint: Sequence[Any], joints: Mapping[str, float]) -> Pose:
+    """Return the pose of a joint's child link in its parent link, at these positions."""
+    return along([_joint_of(joint)], joints)
 
 
 def placed(xyz: Sequence[float], rpy: Sequence[float]) -> Frame:

@@ -31,13 +31,7 @@ _REASON_MAX = 500
 _HEADING = Heading(None, DescriptionDeclared.__name__, DescriptionDeclared.version)
 _OWNER = DescriptionDeclared.__name__
 
-_MEDIA_TYPES = {
-    ".stl": "model/stl",
-    ".obj": "model/obj",
-    ".dae": "model/vnd.collada+xml",
-    ".glb": "model/gltf-binary",
-    ".ply": "model/ply",
-}
+_MEDIA_TYPES = {".stl": "model/stl", ".obj": "model/obj", ".dae": "model/vnd.collada+xml"}
 
 _Stats = tuple[tuple[int, int, int, int] | None, ...]
 

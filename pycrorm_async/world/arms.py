@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 import tempfile
 from collections.abc import Mapping, Sequence
+from enum import Enum
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 from xml.etree.ElementTree import Element, SubElement, tostring
 
@@ -221,6 +223,9 @@ def _about_y(angle: float) -> Quaternion:
 # damped least squares, which is slower and refuses more: of 100 reachable poses of a TIAGo whose torso counts as a
 # joint of its arm it refused 8, in 0.15 s each. A torso that is the description's `torso_joint` belongs to no arm.
 #
+# An arm of fewer joints than a pose has coordinates, or with parallel ones, such as a lift and a telescope, is solved
+# here too, for the part of the orientation that it can hold (`Held`).
+#
 # The library refused none of 2,000 random reachable poses, neither for the arm of a Panda nor for that of a TIAGo (with
 # 20 starts 1 and 2), in 0.3 ms each; a refusal takes some 10 ms. Bullet's solver, with 10 starts, reached two thirds of
 # the Panda's poses to 1 mm, in 5 ms.
@@ -235,8 +240,21 @@ _ERROR_MAX = 1e-14
 DESCENTS_MAX, STEPS_MAX = 20, 60
 """Bound the damped least squares: 20 starts of 60 steps take half a second when the target is out of reach."""
 _EXACT, _DAMPING_MAX = 1e-9, 1e6
+_STALLED, _STALLED_DAMPING = 0.999, 1e-3
+"""A step with this damping or less that leaves more than this part of the squared way ends a descent."""
 _PARALLEL = 1e-9
 _GOLDEN = (math.sqrt(5) - 1) / 2
+
+
+class Held(Enum):
+    """The part of a target's orientation that an arm brings its tool to."""
+
+    ALL = "ALL"
+    """All of it: the arm moves and turns its tool in six directions."""
+    AHEAD = "AHEAD"
+    """The direction of the fingers, about which the tool may be turned: five directions, as with five joints."""
+    NONE = "NONE"
+    """Nothing but the position: four directions or fewer."""
 
 
 class Chain:
@@ -255,9 +273,9 @@ class Chain:
         self._above, self._arm = model.divided(base_link, tool_link)
         self._tool = tool_in_link
         self._solvers: dict[tuple[Bounds, ...], optik.Robot] = {}
-        self.joints = tuple(each.name for each in self._arm if each.kind is not JointType.FIXED)
-        """The movable joints of the arm, from the base to the tool."""
-        self.bounds = {each.name: each.bounds for each in self._arm if each.kind is not JointType.FIXED}
+        self.joints = tuple(each.name for each in self._arm if each.moves_freely)
+        """The movable joints of the arm that follow no other, from the base to the tool."""
+        self.bounds = {each.name: each.bounds for each in self._arm if each.moves_freely}
         """The limits of the model."""
         last = max((number for number, each in enumerate(self._arm) if each.kind is not JointType.FIXED), default=-1)
         self._fixed_behind = len(self._arm) - last - 1
@@ -271,6 +289,18 @@ class Chain:
         self.reach_m = sum(lengths) + sum(slides) + (_norm(tool_in_link) if tool_in_link else 0.0)
         """The greatest distance of the tool from the first joint, in any posture."""
 
+    @cached_property
+    def held(self) -> Held:
+        """The part of a target's orientation that the arm holds, by the directions in which it moves and turns."""
+        start = _start([_within_a_turn(bounds) for bounds in self.bounds.values()], 0)
+        _, jacobian = _miss(self._arm, start, {}, self._behind, Pose(), Held.ALL)
+        directions = int(np.linalg.matrix_rank(jacobian, tol=_EXACT))
+        return Held.ALL if directions == 6 else Held.AHEAD if directions == 5 else Held.NONE
+
+    def angle_rad(self, reached: Pose, target: Pose) -> float:
+        """Return the angle between two orientations of the tool, as far as the arm brings them to a target."""
+        return math.hypot(*_difference(reached, target, self.held)[3:])
+
     def forward(self, positions: Mapping[str, float]) -> Pose:
         """Return the tool's frame in the root link at these joint positions; joints that are left out are at 0."""
         tool = along((*self._above, *self._arm), positions)
@@ -283,6 +313,15 @@ class Chain:
             for number, each in enumerate(self._arm)
             if each.kind in (JointType.REVOLUTE, JointType.CONTINUOUS)
         }
+
+    def telescope(self) -> tuple[float, float]:
+        """Return the horizontal direction of the arm's sliding joints, in the root link with all joints at 0."""
+        slides = [
+            rotated(along((*self._above, *self._arm[: number + 1]), {}).orientation, each.axis)
+            for number, each in enumerate(self._arm)
+            if each.kind is JointType.PRISMATIC
+        ]
+        return sum(axis.x for axis in slides), sum(axis.y for axis in slides)
 
     def distance_m(self, target: Pose, positions: Mapping[str, float]) -> float:
         """Return the distance of a target in the root link from the first joint of the arm, with that joint at 0."""
@@ -301,17 +340,17 @@ class Chain:
         ranges = tuple(_within_a_turn(bounds[name]) for name in self.joints)
         if any(lower > upper for lower, upper in ranges):
             return None
-        # The last link that a joint moves, in the link at which the arm begins.
-        goal = (target @ self._behind.inverse()).relative_to(along(self._above, positions))
+        goal = target.relative_to(along(self._above, positions))
         moving = self._arm[: len(self._arm) - self._fixed_behind]
-        if any(each.kind is JointType.PRISMATIC for each in moving):
-            angles = _descend(moving, ranges, goal)
+        slides = any(each.kind is JointType.PRISMATIC or each.mimic is not None for each in moving)
+        if slides or self.held is not Held.ALL:
+            angles = _descend(moving, ranges, positions, self._behind, goal, self.held)
         else:
             solver = self._solvers.get(ranges)
             if solver is None:
                 self._solvers[ranges] = solver = _solver(moving, ranges)
             config = _optik().SolverConfig(max_time=TIME_MAX_S, max_restarts=STARTS_MAX, tol_f=_ERROR_MAX)
-            answer = solver.ik(config, _matrix(goal), _start(ranges, 0))
+            answer = solver.ik(config, _matrix(goal @ self._behind.inverse()), _start(ranges, 0))
             angles = None if answer is None else answer[0]
         if angles is None:
             return None
@@ -333,51 +372,85 @@ def _start(ranges: Sequence[Bounds], start: int) -> list[float]:
     ]
 
 
-def _descend(joints: Sequence[Joint], ranges: Sequence[Bounds], goal: Pose) -> list[float] | None:
-    """Solve by damped least squares from `DESCENTS_MAX` starts."""
+def _descend(
+    joints: Sequence[Joint],
+    ranges: Sequence[Bounds],
+    given: Mapping[str, float],
+    behind: Pose,
+    goal: Pose,
+    held: Held,
+) -> list[float] | None:
+    """Solve by damped least squares from `DESCENTS_MAX` starts; `given` has the joints that others follow."""
     lower, upper = np.array(ranges).T
     for start in range(DESCENTS_MAX):
         angles = np.array(_start(ranges, start))
-        miss, jacobian = _miss(joints, angles, goal)
+        miss, jacobian = _miss(joints, angles, given, behind, goal, held)
         damping = 1e-2
         for _ in range(STEPS_MAX):
             if np.abs(miss).max() < _EXACT:
                 return [float(angle) for angle in angles]
             step = jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + damping * np.eye(6), miss)
             tried = np.clip(angles + step, lower, upper)
-            tried_miss, tried_jacobian = _miss(joints, tried, goal)
+            tried_miss, tried_jacobian = _miss(joints, tried, given, behind, goal, held)
             if tried_miss @ tried_miss < miss @ miss:
+                stalls = tried_miss @ tried_miss > _STALLED * (miss @ miss) and damping < _STALLED_DAMPING
                 angles, miss, jacobian, damping = tried, tried_miss, tried_jacobian, damping / 4
+                if stalls:  # a local minimum, not the goal
+                    break
             elif (damping := damping * 4) > _DAMPING_MAX:
                 break
     return None
 
 
 def _miss(
-    joints: Sequence[Joint], angles: NDArray[np.float64], goal: Pose
+    joints: Sequence[Joint],
+    angles: Sequence[float] | NDArray[np.float64],
+    given: Mapping[str, float],
+    behind: Pose,
+    goal: Pose,
+    held: Held,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the way from the last joint's frame to the goal (m and rad), and its derivative by the joints."""
-    frames: list[tuple[Joint, Pose]] = []
-    frame, left = Pose(), iter(angles)
+    """Return the way from the tool to the goal (m and rad), and its derivative by the joints that follow no other."""
+    free = {each.name: number for number, each in enumerate(each for each in joints if each.moves_freely)}
+    positions = {**given, **{name: float(angles[number]) for name, number in free.items()}}
+    frame = Pose()
+    frames: list[Pose] = []
     for each in joints:
-        position = 0.0 if each.kind is JointType.FIXED else float(next(left))
-        frame = frame @ along([each], {each.name: position})
-        if each.kind is not JointType.FIXED:
-            frames.append((each, frame))
-    (x, y, z), turn = frame.position, frame.orientation
-    qx, qy, qz, qw = product(goal.orientation, (-turn.x, -turn.y, -turn.z, turn.w))
+        frame = frame @ along([each], positions)
+        frames.append(frame)
+    tool = frame @ behind
+    ahead = np.array(rotated(tool.orientation, (1.0, 0.0, 0.0)))
+    jacobian = np.zeros((6, len(free)))
+    for each, at in zip(joints, frames, strict=True):
+        leader, factor = (each.name, 1.0) if each.mimic is None else each.mimic[:2]
+        if each.kind is JointType.FIXED or leader not in free:
+            continue
+        axis = np.array(rotated(at.orientation, each.axis))
+        if each.kind is JointType.PRISMATIC:
+            jacobian[:3, free[leader]] += factor * axis
+        else:
+            arm = [to - start for to, start in zip(tool.position, at.position, strict=True)]
+            turn = {Held.ALL: axis, Held.AHEAD: axis - ahead * (ahead @ axis), Held.NONE: 0.0 * axis}[held]
+            jacobian[:, free[leader]] += factor * np.concatenate([np.cross(axis, arm), turn])
+    return np.array(_difference(tool, goal, held)), jacobian
+
+
+def _difference(tool: Pose, goal: Pose, held: Held) -> list[float]:
+    """Return the way between two frames, m, and the rotation vector between what is held of their orientations, rad."""
+    way = [to - at for to, at in zip(goal.position, tool.position, strict=True)]
+    if held is Held.NONE:
+        return [*way, 0.0, 0.0, 0.0]
+    if held is Held.AHEAD:
+        one, other = (np.array(rotated(each.orientation, (1.0, 0.0, 0.0))) for each in (tool, goal))
+        turn = np.cross(one, other)
+        sine = math.hypot(*turn)
+        scale = math.atan2(sine, float(one @ other)) / sine if sine else 0.0
+        return [*way, *(float(each) * scale for each in turn)]
+    x, y, z, w = tool.orientation
+    qx, qy, qz, qw = product(goal.orientation, (-x, -y, -z, w))
     sine = math.copysign(math.hypot(qx, qy, qz), qw)
     scale = 2 * math.atan2(abs(sine), abs(qw)) / sine if sine else 0.0
-    miss = [*(to - at for to, at in zip(goal.position, (x, y, z), strict=True)), qx * scale, qy * scale, qz * scale]
-    columns = []
-    for each, at in frames:
-        axis = rotated(at.orientation, each.axis)
-        if each.kind is JointType.PRISMATIC:
-            columns.append([*axis, 0.0, 0.0, 0.0])
-        else:
-            arm = [to - start for to, start in zip((x, y, z), at.position, strict=True)]
-            columns.append([*np.cross(axis, arm), *axis])
-    return np.array(miss), np.array(columns).T
+    return [*way, qx * scale, qy * scale, qz * scale]
 
 
 def _within_a_turn(bounds: Bounds) -> Bounds:

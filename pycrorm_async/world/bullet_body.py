@@ -76,20 +76,20 @@ class Body:
         """The link whose frame is the body's pose."""
         if self.base not in model.paths:
             raise UnknownLink(name, self.base, tuple(model.paths))
-        try:
-            self.solids: dict[str, tuple[Solid, ...]] = {
-                link: solids_of(each.collisions) for link, each in model.links.items()
-            }
-        except ValueError as fault:
-            raise DescriptionNotLoadable(name, _unreadable_mesh(model, fault)) from fault
+        self.solids: dict[str, tuple[Solid, ...]] = {}
+        for link, each in model.links.items():
+            try:
+                self.solids[link] = solids_of(each.collisions)
+            except ValueError as fault:
+                raise DescriptionNotLoadable(name, f"collision of link {link!r}: {fault}") from fault
         self.number, self.remarks = _load(name, model, client)
         self._model = model
         self._joint_numbers: dict[str, int] = {}
         self._link_numbers: dict[str, int] = {model.root: _ROOT}
         bullet = engine()
         for number in range(bullet.getNumJoints(self.number, physicsClientId=client)):
-            joint = bullet.getJointInfo(self.number, number, physicsClientId=client)
-            self._joint_numbers[joint[1].decode()], self._link_numbers[joint[12].decode()] = number, number
+            info = bullet.getJointInfo(self.number, number, physicsClientId=client)
+            self._joint_numbers[info[1].decode()] = self._link_numbers[info[12].decode()] = number
         self.joint_types = {joint: model.joints[joint].kind for joint in self._joint_numbers}
         self.limits: dict[str, tuple[float, float]] = {
             joint: model.joints[joint].bounds for joint, kind in self.joint_types.items() if kind is not JointType.FIXED
@@ -99,9 +99,9 @@ class Body:
             for link in self._link_numbers
         }
         self._followers: dict[str, list[Joint]] = {}
-        for each in model.joints.values():
-            if each.mimic is not None and each.kind is not JointType.FIXED:
-                self._followers.setdefault(each.mimic.joint, []).append(each)
+        for joint in model.joints.values():
+            if joint.mimic is not None and joint.kind is not JointType.FIXED:
+                self._followers.setdefault(joint.mimic.joint, []).append(joint)
         self._by_chain = len(self._joint_numbers) > _STATES_MAX
         nearest = {joint: min(max(0.0, lower), upper) for joint, (lower, upper) in self.limits.items()}
         self.start = {joint: model.joints[joint].position(nearest) for joint in nearest}
@@ -136,10 +136,8 @@ class Body:
     def followed(self, positions: Mapping[str, float]) -> dict[str, float]:
         """Return the positions of these joints and of those that follow them; of a follower alone, nothing."""
         free = {joint: position for joint, position in positions.items() if self.leader(joint) is None}
-        following = {
-            each.name: each.position(free) for joint in free for each in self._followers.get(joint, ()) if joint in free
-        }
-        return {**free, **following}
+        following = [each for joint in free for each in self._followers.get(joint, ())]
+        return {**free, **{each.name: each.position(free) for each in following}}
 
     def place(self, pose: Pose) -> None:
         """Move the base link's frame to this pose."""
@@ -236,17 +234,6 @@ class Body:
 def _frame(state: Sequence[Any]) -> Frame:
     """Return the frame of a link's centre of mass, which is in the link's own frame, but in double precision."""
     return Vector(*state[0]), Quaternion(*state[1])
-
-
-def _unreadable_mesh(model: Model, fault: ValueError) -> str:
-    """Name the first collision mesh that cannot be read."""
-    for name, link in model.links.items():
-        for shape in link.collisions:
-            try:
-                solids_of([shape])
-            except ValueError as reason:
-                return f"collision of link {name!r}: mesh {shape.file}: {reason}"
-    return str(fault)
 
 
 def _load(name: str, model: Model, client: int) -> tuple[int, tuple[str, ...]]:

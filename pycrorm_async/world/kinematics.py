@@ -4,7 +4,9 @@ For an arm of the PR2's build there is a closed form: a reachable pose has a cur
 (`world.arms`), which is sampled, both ends included, in steps of at most 0.01 rad, finer where it misses narrowly; the
 result is the posture that stays farthest from every limit. Continuous joints have no limits. A refused target is out of
 reach, except for rare ones at the rim of the workspace (about 1 in 10,000 of the reachable ones there) whose only
-postures lie in a narrow range between limits. Any other arm is solved numerically (`world.arms`).
+postures lie in a narrow range between limits. Any other arm is solved numerically (`world.arms`). An arm that cannot
+turn its tool freely, such as one of four or five joints, brings it to the position and, with five directions of motion,
+to the direction of the fingers; the rest of the orientation stays free.
 
 The result is deterministic: on one machine the same arguments yield the same result, to the bit. `solve` verifies it by
 forward kinematics to 1e-6 m and 1e-6 rad. Collisions, with the robot itself or with objects, are not checked.
@@ -152,7 +154,7 @@ def _solve_chain(
     joints = chain.solve(goal, positions, _chain_bounds(chain, arm_description, limits))
     if joints is not None:
         reached = chain.forward(positions | joints)
-        if reached.distance(goal) <= EXACT_M and _angle_between(reached.orientation, goal.orientation) <= EXACT_RAD:
+        if reached.distance(goal) <= EXACT_M and chain.angle_rad(reached, goal) <= EXACT_RAD:
             return joints
     raise Unreachable(target, arm, f"no posture within its {limits.name.lower()} limits was found")
 
@@ -172,7 +174,8 @@ def chain_of(robot: Object, arm: Arms) -> Chain:
             tool_link=described.tool_frame,
             tool_in_link=described.tool_in_link,
         )
-        if chain.joints != described.joints:
+        joints = robot.model.joints
+        if chain.joints != tuple(each for each in described.joints if each not in joints or joints[each].moves_freely):
             between = f"between {described.base_link or 'the root link'!r} and {described.tool_frame!r}"
             raise CallerError(
                 f"the joints of {robot.name!r} {between} are {', '.join(chain.joints) or 'none'}, but its description"

@@ -81,15 +81,9 @@ def mesh_points(path: str) -> NDArray[np.float64]:
     """
     try:
         status = os.stat(path)  # noqa: PTH116  a fifth of the time of Path.stat
-    except OSError as error:
-        raise ValueError(error.strerror) from error
-    return _points(path, (status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns))
-
-
-def mesh_box(path: str) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the lowest and the highest corner of the box around a mesh file, m. Raises as `mesh_points`."""
-    points = mesh_points(path)
-    return points.min(axis=0), points.max(axis=0)
+        return _points(path, (status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns))
+    except (OSError, ValueError) as error:
+        raise ValueError(f"mesh {path}: {error}") from error
 
 
 @lru_cache(maxsize=512)

@@ -123,7 +123,8 @@ def link_boxes(urdf: str, boxes: Mapping[str, BoundingBox] | None = None) -> Ite
         box = box_of(model.links[name], visual=False) if boxes is None else boxes.get(name)
         path = tuple(each._replace(mimic=None) for each in path)  # a recorded position is that of the joint itself
         frame = along(path, {})
-        if corners := [(frame @ Pose(corner)).position for corner in _box_corners(box)]:
+        if box is not None:
+            corners = [(frame @ Pose(each)).position for each in itertools.product(*zip(box.min, box.max, strict=True))]
             ranges = [(min(each), max(each)) for each in zip(*corners, strict=True)]
             center = _rounded([(low + high) / 2 for low, high in ranges])
             half = _rounded([(high - low) / 2 for low, high in ranges])
@@ -133,11 +134,6 @@ def link_boxes(urdf: str, boxes: Mapping[str, BoundingBox] | None = None) -> Ite
             else:
                 axis = rotated(along(path[: slide + 1], {}).orientation, path[slide].axis)
                 yield LinkBox(name, center, half, path[slide].name, _rounded(axis))
-
-
-def _box_corners(box: BoundingBox | None) -> Iterator[_Vector]:
-    if box is not None:
-        yield from itertools.product(*zip(box.min, box.max, strict=True))
 
 
 def _rounded(values: Sequence[float]) -> _Vector:

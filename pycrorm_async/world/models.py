@@ -27,8 +27,9 @@ from xml.etree.ElementTree import Element, SubElement, fromstring, indent, tostr
 from xml.sax.saxutils import quoteattr
 
 from pycrorm_async.errors import MissingExtra
-from pycrorm_async.world.pose import Arms, DescriptionNotLoadable, ObjectType
+from pycrorm_async.world.pose import Arms, DescriptionNotLoadable, JointType, ObjectType
 from pycrorm_async.world.urdf import COURIER, FINGER_OPEN_RAD, PR2, Bounds, PR2Arm
+from pycrorm_async.world.urdf_model import read_model
 
 # === primitives ===============================================================================================
 #
@@ -163,10 +164,9 @@ def built_in_that_fits(name: str, object_type: ObjectType, *, joints: set[str], 
         urdf = built_in_urdf(name, object_type)
     except DescriptionNotLoadable:  # no robot or environment of that name is built in
         return None
-    robot = fromstring(urdf)  # noqa: S314  our own text
-    movable = {each.get("name") for each in robot.iter("joint") if each.get("type") != "fixed"}
-    fits = joints <= movable and links <= {each.get("name") for each in robot.iter("link")}
-    return urdf if fits else None
+    model = read_model(urdf)
+    movable = {name for name, each in model.joints.items() if each.kind is not JointType.FIXED}
+    return urdf if joints <= movable and links <= model.links.keys() else None
 
 
 def _by_name(name: str, object_type: ObjectType) -> str:

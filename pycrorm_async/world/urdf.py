@@ -433,7 +433,7 @@ def describe_arm(
 
     The gripper's joints are those that the arm carries and that are none of its own. Fingers that slide are open at
     their upper limits, closed at the lower ones. Fingers that turn are open where their tips are farthest from each
-    other and from the arm's last link, and `opening_m` is not known. For a hand of another kind set `gripper_joints`
+    other and from the tool frame, and `opening_m` is not known. For a hand of another kind set `gripper_joints`
     and `opening_m` with `dataclasses.replace`.
 
     Raises:
@@ -456,7 +456,7 @@ def _arm_between(
     if not path:
         raise CallerError(f"no joint moves {tool_frame!r} against {base_link!r}: name the ends of an arm")
     joints = tuple(each.name for each in path)
-    grip, opening_m = _gripper(model, path[-1].child, {each.name for each in model.path(tool_frame)})
+    grip, opening_m = _gripper(model, path[-1].child, tool_frame)
     return ArmDescription(
         joints=joints,
         base_link=base_link,
@@ -470,11 +470,10 @@ def _arm_between(
     )
 
 
-def _gripper(
-    model: Model, palm: str, arm: Collection[str]
-) -> tuple[Mapping[GripperState, Mapping[str, float]], float | None]:
+def _gripper(model: Model, palm: str, tool: str) -> tuple[Mapping[GripperState, Mapping[str, float]], float | None]:
     """Return the open and the closed positions of the fingers below a link, and the width of the open gripper."""
-    fingers = [each for each in model.below(palm) if each.kind is not JointType.FIXED and each.name not in arm]
+    arm = model.path(tool)
+    fingers = [each for each in model.below(palm) if each.kind is not JointType.FIXED and each not in arm]
     free = {each.name: each.bounds for each in fingers if each.moves_freely}
     if leading := {each.mimic.joint for each in fingers if each.mimic is not None} & free.keys():
         free = {name: free[name] for name in free if name in leading}  # the others are no drives of the gripper
@@ -483,7 +482,7 @@ def _gripper(
     slide = all(each.kind is JointType.PRISMATIC for each in fingers if each.name in free or each.mimic is not None)
     closed, opened = dict(lowest), dict(highest)
     if not slide:
-        spread = _spread(model, palm, fingers)
+        spread = _spread(model, palm, tool, fingers)
         start = {name: min(max(0.0, bounds.lower), bounds.upper) for name, bounds in free.items()}
         for name in free:
             low, high = (spread({**start, name: ends[name]}) for ends in (lowest, highest))
@@ -503,11 +502,12 @@ _SPREAD_MIN_M = 1e-4
 """A joint that changes the distances of the finger tips by less does not open a hand."""
 
 
-def _spread(model: Model, palm: str, fingers: Sequence[Joint]) -> Callable[[Mapping[str, float]], float]:
-    """Return the sum of the distances of the finger tips from each other and from the palm, by joint positions."""
+def _spread(model: Model, palm: str, tool: str, fingers: Sequence[Joint]) -> Callable[[Mapping[str, float]], float]:
+    """Return the sum of the distances of the finger tips from each other and from the tool, by joint positions."""
     from pycrorm_async.world.bounding_boxes import box_of
 
     above = len(model.path(palm))
+    middle = along(model.path(tool)[above:], {}).position
     tips: list[tuple[tuple[Joint, ...], Pose]] = []
     for each in fingers:
         if not any(joint in fingers for joint in model.below(each.child)):
@@ -518,9 +518,9 @@ def _spread(model: Model, palm: str, fingers: Sequence[Joint]) -> Callable[[Mapp
     def spread(positions: Mapping[str, float]) -> float:
         if not all(map(math.isfinite, positions.values())):
             return math.nan
-        points = [(along(path, positions) @ middle).position for path, middle in tips]
+        points = [(along(path, positions) @ tip).position for path, tip in tips]
         pairs = sum(math.dist(one, other) for one, other in itertools.combinations(points, 2))
-        return pairs + sum(math.hypot(*point) for point in points)
+        return pairs + sum(math.dist(point, middle) for point in points)
 
     return spread
 

@@ -27,6 +27,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
 from xml.etree.ElementTree import Element, ParseError, fromstring, tostring
+from xml.sax.saxutils import quoteattr
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.world.pose import (
@@ -166,10 +167,6 @@ class Model:
             raise CallerError(f"{tool_link!r} is not below {base_link!r}: correct the robot's description")
         return above, path[len(above) :]
 
-    def movable_between(self, base_link: str, tool_link: str) -> tuple[str, ...]:
-        """Return the movable joints between two links, from the base to the tool. Raises as `divided`."""
-        return tuple(each.name for each in self.divided(base_link, tool_link)[1] if each.kind is not JointType.FIXED)
-
     def below(self, link: str) -> tuple[Joint, ...]:
         """Return the joints that a link carries, parents first."""
         above = self.path(link)
@@ -268,15 +265,9 @@ MESH_SUFFIXES = (".stl", ".obj", ".dae", ".glb", ".ply", ".off")
 
 
 def _around_mesh(name: str, path: Path) -> str:
-    robot = Element("robot", name=name)
-    link = Element("link", name=name)
-    robot.append(link)
-    for kind in ("visual", "collision"):
-        shape, geometry = Element(kind), Element("geometry")
-        geometry.append(Element("mesh", filename=str(path)))
-        shape.append(geometry)
-        link.append(shape)
-    return tostring(robot, encoding="unicode")
+    shape = f"<geometry><mesh filename={quoteattr(str(path))}/></geometry>"
+    link = f"<visual>{shape}</visual><collision>{shape}</collision>"
+    return f"<robot name={quoteattr(name)}><link name={quoteattr(name)}>{link}</link></robot>"
 
 
 def decoded(content: bytes) -> str:
@@ -386,7 +377,11 @@ def _check_tree(robot: Element) -> None:
     if len(roots) != 1:
         raise UrdfFault(f"it must have one root link, and has {len(roots)}: {', '.join(roots) or 'a cycle'}")
     for link in links:
-        _climb(link, above)
+        passed = [link]
+        while passed[-1] in above:
+            passed.append(above[passed[-1]])
+            if len(passed) > len(links):
+                raise UrdfFault(f"links are joined in a cycle at {link!r}")
 
 
 def check_expanded(robot: Element) -> None:
@@ -398,16 +393,6 @@ def check_expanded(robot: Element) -> None:
         namespace, mark, tag = str(each.tag).rpartition("}")
         if mark and "xacro" in namespace and not namespace[1:].startswith(_STRAY) and tag not in ("property", "arg"):
             raise UrdfFault(f"it holds <xacro:{tag}>: expand it with xacro")
-
-
-def _climb(link: str, above: dict[str, str]) -> None:
-    """Raise `UrdfFault` if the links above this one form a cycle."""
-    passed = {link}
-    while link in above:
-        link = above[link]
-        if link in passed:
-            raise UrdfFault(f"links are joined in a cycle at {link!r}")
-        passed.add(link)
 
 
 def _unique(kind: str, names: Iterable[str]) -> None:
@@ -471,27 +456,21 @@ def read_model(text: str) -> Model:
     root = next((link for link in links if link not in children), None)
     if root is None:
         raise UrdfFault("it has no root link")
-    foreign = Counter(
-        f"{tag.partition('}')[0].removeprefix('{' + _STRAY)}:{tag.rpartition('}')[2]}"
-        for each in robot.iter()
-        if (tag := str(each.tag)).startswith("{" + _STRAY)
-    )
-    unapplied = Counter(each.tag for each in robot.iter() if each.tag in _UNAPPLIED)
-    return Model(
-        robot.get("name", ""), root, links, joints, tuple(left_out), dict(unapplied + foreign), tuple(unlimited)
-    )
+    tags = [str(each.tag).removeprefix("{" + _STRAY).replace("}", ":") for each in robot.iter()]
+    unapplied = Counter(tag for tag in tags if tag in _UNAPPLIED or ":" in tag)
+    return Model(robot.get("name", ""), root, links, joints, tuple(left_out), unapplied, tuple(unlimited))
 
 
 def _link(link: Element, colors: Mapping[str, tuple[float, ...]], left_out: list[str]) -> Link:
     owner = f"link {link.get('name', '')!r}"
-    inertial = link.find("inertial")
     mass = None
-    if inertial is not None:
+    for inertial in link.findall("inertial"):
         _origin(inertial, f"{owner} inertial")
-        for tag, names in (("mass", ("value",)), ("inertia", ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"))):
-            if (each := inertial.find(tag)) is not None:
-                values = [_number(each, name, owner, 0.0) for name in names]
-                mass = values[0] if tag == "mass" else mass
+        for each in inertial.findall("inertia"):
+            for name in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"):
+                _number(each, name, owner, 0.0)
+        for each in inertial.findall("mass"):
+            mass = _number(each, "value", owner, 0.0)
     shapes = {
         kind: tuple(
             shape
