@@ -185,7 +185,7 @@ def _arms(robot: CurrentRobot, arm: Arms | None, target: Pose | ObjectLike) -> A
 
 def _telescope_yaw(robot: CurrentRobot, arms: Arms | tuple[Arms, ...] | None) -> float:
     """Return the direction, rad from ahead, in which the first arm reaches by sliding; 0 for other arms."""
-    among = arms if isinstance(arms, tuple) else robot.each_arm(arms) if arms else tuple(robot.description.arms)
+    among = arms if isinstance(arms, tuple) else tuple(robot.each_arm(arms) if arms else robot.description.arms)
     if not among or isinstance(robot.description, PR2Description):
         return 0.0
     x, y = chain_of(robot.body, among[0]).telescope()

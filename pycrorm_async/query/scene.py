@@ -11,7 +11,6 @@ import numpy as np
 import numpy.typing as npt
 from numpy.typing import NDArray
 
-from pycrorm_async.errors import MissingExtra
 from pycrorm_async.events.types import DescriptionDeclared
 from pycrorm_async.world.bounding_boxes import BoundingBox, rotation_matrix
 from pycrorm_async.world.meshes import read_mesh
@@ -92,10 +91,7 @@ def triangles_of(name: str, content: bytes) -> Triangles:
     Materials and normals are left out: a drawing has the colour of the description and flat faces. A drawing has the
     box around its link in the place of a file that cannot be read.
     """
-    try:
-        mesh = read_mesh(name, content)
-    except MissingExtra as missing:
-        raise ValueError(str(missing)) from missing
+    mesh = read_mesh(name, content)
     if len(mesh.faces) > TRIANGLES_MAX:
         raise ValueError(f"it has {len(mesh.faces):,} triangles, more than {TRIANGLES_MAX:,}")
     vertices, places = np.unique(mesh.vertices.round(_DECIMALS), axis=0, return_inverse=True)

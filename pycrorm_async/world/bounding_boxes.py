@@ -15,7 +15,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pycrorm_async.errors import MissingExtra
 from pycrorm_async.world.meshes import mesh_points
 from pycrorm_async.world.pose import IDENTITY, Quaternion, Vector
 from pycrorm_async.world.urdf_model import Link, Shape, origin
@@ -88,7 +87,7 @@ _CORNERS = np.array(list(itertools.product((-1.0, 1.0), repeat=3)))
 
 
 def solids_of(shapes: Iterable[Shape]) -> tuple[Solid, ...]:
-    """Return the solids of a link's shapes in the link's frame. Raises `ValueError`, `MissingExtra` for a mesh file."""
+    """Return the solids of a link's shapes in the link's frame. Raises `ValueError` for a mesh file."""
     return tuple(map(_solid, shapes))
 
 
@@ -115,7 +114,7 @@ def box_of(link: Link, *, visual: bool = True) -> BoundingBox | None:
     """
     solids: list[Solid] = []
     for shape in link.collisions or (link.visuals if visual else ()):
-        with suppress(ValueError, MissingExtra):
+        with suppress(ValueError):
             solids.append(_solid(shape))
     return box_around([((Vector(0.0, 0.0, 0.0), IDENTITY), solids)])
 

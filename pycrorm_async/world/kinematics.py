@@ -24,8 +24,7 @@ from pycrorm_async.errors import CallerError
 from pycrorm_async.world import arms as arm_ik
 from pycrorm_async.world.arms import Chain, Floats, Reach
 from pycrorm_async.world.pose import Arms, Pose, Quaternion, Vector, product, rotated
-from pycrorm_async.world.urdf import ArmDescription, Limits, PR2Arm, PR2Description, RobotDescription
-from pycrorm_async.world.urdf_model import Bounds
+from pycrorm_async.world.urdf import ArmDescription, Bounds, Limits, PR2Arm, PR2Description, RobotDescription
 
 if TYPE_CHECKING:
     from pycrorm_async.world.bullet import Object

@@ -16,8 +16,6 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pycrorm_async.errors import MissingExtra
-
 _SUFFIXES = ("stl", "obj", "dae", "glb", "ply", "off")
 _UNIT = re.compile(rb"<unit\b[^>]*\bmeter\s*=\s*[\"']\s*([0-9.eE+-]+)")
 _STL_HEADER, _STL_TRIANGLE = 84, 50
@@ -34,8 +32,8 @@ def read_mesh(name: str, content: bytes) -> Mesh:
     """Return the triangles of a mesh file; the suffix of its name decides its format.
 
     Raises:
-        ValueError: the file cannot be read, or has no triangle or a number that is not finite.
-        MissingExtra: trimesh is not installed.
+        ValueError: the file cannot be read, or has no triangle or a number that is not finite; or trimesh is not
+            installed.
     """
     suffix = name.rpartition(".")[2].lower()
     if suffix not in _SUFFIXES:
@@ -77,7 +75,7 @@ def _in_metres(vertices: NDArray[np.float64], content: bytes) -> NDArray[np.floa
 def mesh_points(path: str) -> NDArray[np.float64]:
     """Return the vertices of a mesh file, each once; read again only when the file has changed.
 
-    Raises `ValueError`, `MissingExtra`.
+    Raises `ValueError` as `read_mesh` does.
     """
     try:
         status = os.stat(path)  # noqa: PTH116  a fifth of the time of Path.stat
@@ -116,9 +114,9 @@ def _is_binary(path: str) -> bool:
 
 
 def _trimesh() -> Any:
-    """Import the library when the first mesh is read. Raises `MissingExtra`."""
+    """Import the library when the first mesh is read. Raises `ValueError` with the command that installs it."""
     try:
         import trimesh
     except ImportError:
-        raise MissingExtra("reading a mesh file needs trimesh: pip install 'pycrorm-async[world]'") from None
+        raise ValueError("reading a mesh file needs trimesh: pip install 'pycrorm-async[world]'") from None
     return trimesh

@@ -32,18 +32,7 @@ from xml.etree.ElementTree import Element
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.world.pose import Arms, Grasp, GripperState, JointType, Pose, Quaternion, Vector
-from pycrorm_async.world.urdf_model import (
-    ENDLESS,
-    Joint,
-    Model,
-    along,
-    check_expanded,
-    decoded,
-    number_of,
-    parsed_urdf,
-    read_model,
-    urdf_text,
-)
+from pycrorm_async.world.urdf_model import ENDLESS, Joint, Model, along, number_of, parsed_srdf, read_model, urdf_text
 from pycrorm_async.world.urdf_model import Bounds as Bounds  # one of the names of this module
 
 # === robot description ========================================================================================
@@ -407,7 +396,7 @@ def describe_robot(
     if model is not None:
         model.path(base_link)
     if srdf is not None and model is not None:
-        semantics = _parsed(name, srdf)
+        semantics = parsed_srdf(name, srdf)
         for state in semantics.findall("group_state"):
             if positions := _positions(name, state, model):
                 postures.setdefault(state.get("name", ""), {}).update(positions)
@@ -533,16 +522,6 @@ _SIDES = (
     (re.compile(r"right|(?<![a-z])r(?![a-z])"), Arms.RIGHT),
 )
 _STATES = {GripperState.OPEN: ("open", "opened"), GripperState.CLOSE: ("close", "closed")}
-
-
-def _parsed(name: str, srdf: str | Path) -> Element:
-    try:
-        is_text = isinstance(srdf, str) and srdf.lstrip("\ufeff \t\r\n").startswith("<")
-        robot = parsed_urdf(str(srdf) if is_text else decoded(Path(srdf).read_bytes()))
-        check_expanded(robot)
-    except (OSError, SyntaxError, ValueError) as fault:
-        raise CallerError(f"the SRDF of {name!r} cannot be read: {fault}") from fault
-    return robot
 
 
 def _positions(name: str, state: Element, model: Model) -> dict[str, float]:

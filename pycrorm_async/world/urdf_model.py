@@ -14,7 +14,6 @@ has length one. A floating or planar joint does not move.
 
 from __future__ import annotations
 
-import codecs
 import math
 import os
 import re
@@ -228,7 +227,7 @@ def urdf_text(name: str, description: str | Path, packages: Mapping[str, str | P
         DescriptionNotLoadable: the URDF has a fault, which the message names. Two roots or two joints of one name would
             end the process inside Bullet.
     """
-    is_text = isinstance(description, str) and description.lstrip("\ufeff \t\r\n").startswith("<")
+    is_text = isinstance(description, str) and description.lstrip(_BEFORE).startswith("<")
     path, place = Path() if is_text else Path(description), "" if is_text else f"{description}: "
     try:
         if is_text:
@@ -236,7 +235,7 @@ def urdf_text(name: str, description: str | Path, packages: Mapping[str, str | P
         elif path.suffix.lower() in MESH_SUFFIXES:
             text, folder = _around_mesh(name, path.resolve()), path.resolve().parent
         else:
-            text, folder = decoded(path.read_bytes()), path.resolve().parent
+            text, folder = _decoded(path.read_bytes()), path.resolve().parent
     except (OSError, ValueError) as reason:
         raise DescriptionNotLoadable(name, f"{path} cannot be read: {reason}") from reason
     try:
@@ -270,11 +269,10 @@ def _around_mesh(name: str, path: Path) -> str:
     return f"<robot name={quoteattr(name)}><link name={quoteattr(name)}>{link}</link></robot>"
 
 
-def decoded(content: bytes) -> str:
+def _decoded(content: bytes) -> str:
     """Return the text of a file, in UTF-8 unless it is not, whatever its header declares, as URDF parsers read it."""
-    for mark, encoding in ((codecs.BOM_UTF16_LE, "utf-16"), (codecs.BOM_UTF16_BE, "utf-16")):
-        if content.startswith(mark):
-            return content.decode(encoding)
+    if content[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        return content.decode("utf-16")
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -331,9 +329,24 @@ def parsed_urdf(text: str) -> Element:
     return _parsed(text)[0]
 
 
+def parsed_srdf(name: str, srdf: str | Path) -> Element:
+    """Parse an SRDF, its text or the path of its file. Raises `CallerError`."""
+    try:
+        is_text = isinstance(srdf, str) and srdf.lstrip(_BEFORE).startswith("<")
+        robot = parsed_urdf(str(srdf) if is_text else _decoded(Path(srdf).read_bytes()))
+        _check_expanded(robot)
+    except (OSError, SyntaxError, ValueError) as fault:
+        raise CallerError(f"the SRDF of {name!r} cannot be read: {fault}") from fault
+    return robot
+
+
+_BEFORE = "\ufeff \t\r\n"
+"""What may stand before the first element."""
+
+
 def _parsed(text: str) -> tuple[Element, bool]:
     """Return the root element, and whether a plain parser refuses the text or reads other elements."""
-    stripped = text.strip("\ufeff\x00 \t\r\n")
+    stripped = text.strip(_BEFORE + "\x00")
     try:
         robot, is_repaired = fromstring(stripped), stripped != text.rstrip()  # noqa: S314  the caller's own file, or recorded
     except ParseError:
@@ -356,7 +369,7 @@ def _check_tree(robot: Element) -> None:
     """Raise `UrdfFault` unless <robot> holds one tree of links with unique names."""
     if robot.tag != "robot":
         raise UrdfFault(f"its root element is <{robot.tag}>, not <robot>")
-    check_expanded(robot)
+    _check_expanded(robot)
     links = [link.get("name", "") for link in robot.findall("link")]
     joints = robot.findall("joint")
     if not links:
@@ -384,7 +397,7 @@ def _check_tree(robot: Element) -> None:
                 raise UrdfFault(f"links are joined in a cycle at {link!r}")
 
 
-def check_expanded(robot: Element) -> None:
+def _check_expanded(robot: Element) -> None:
     """Raise `UrdfFault` if this is the source of a URDF, in which xacro has elements to expand.
 
     Without the namespace xacro could not read the file either, so that a stray element is only left out.
