@@ -74,7 +74,7 @@ from pycrorm_async.plan.objects import (
 from pycrorm_async.plan.task import Experience, PastSuccess, current_node, experience
 from pycrorm_async.world.bounding_boxes import BoundingBox, box_around
 from pycrorm_async.world.bullet import Object, current_world
-from pycrorm_async.world.kinematics import Unreachable, chain_of, solve
+from pycrorm_async.world.kinematics import Unreachable, solve
 from pycrorm_async.world.pose import Arms, Grasp, Pose, Quaternion, Vector, rotated, yaw_quaternion
 from pycrorm_async.world.queries import (
     Costmap,
@@ -164,9 +164,8 @@ def base_poses(
     costmap, cells = _costmap(target, goal, robots, viewer, clearance)
     yield cells
     clear, height_m = 0, base_height_m(reacher or viewer)
-    turned = 0.0 if reacher is None else -_telescope_yaw(reacher, arms)
     for cell in _cells(costmap, robots, every=clearance is not None):
-        base_pose = face(cell, goal, height_m=height_m, turned=turned)
+        base_pose = face(cell, goal, height_m=height_m)
         if clearance is not None and (collision := clearance.refusal(base_pose)) is not None:
             yield base_pose, Reach(refusal=collision)
             continue
@@ -181,19 +180,6 @@ def _arms(robot: CurrentRobot, arm: Arms | None, target: Pose | ObjectLike) -> A
         return arm
     candidates = tuple(robot.description.arms)
     return candidates if isinstance(target, Pose) else lifting_arms(robot, candidates, target)
-
-
-def _telescope_yaw(robot: CurrentRobot, arms: Arms | tuple[Arms, ...] | None) -> float:
-    """Return the direction, rad from ahead, in which the first arm reaches by sliding; 0 for other arms."""
-    among = arms if isinstance(arms, tuple) else tuple(robot.each_arm(arms) if arms else robot.description.arms)
-    if not among or isinstance(robot.description, PR2Description):
-        return 0.0
-    x, y = chain_of(robot.body, among[0]).telescope()
-    return math.atan2(y, x) if math.hypot(x, y) > _TELESCOPE_MIN else 0.0
-
-
-_TELESCOPE_MIN = 0.5
-"""The least horizontal part of the axes of sliding joints at which they are a telescope, and not a lift."""
 
 
 def _cells(costmap: Costmap, robots: list[CurrentRobot], *, every: bool) -> Iterator[Pose]:

@@ -314,15 +314,6 @@ class Chain:
             if each.kind in (JointType.REVOLUTE, JointType.CONTINUOUS)
         }
 
-    def telescope(self) -> tuple[float, float]:
-        """Return the horizontal direction of the arm's sliding joints, in the root link with all joints at 0."""
-        slides = [
-            rotated(along((*self._above, *self._arm[: number + 1]), {}).orientation, each.axis)
-            for number, each in enumerate(self._arm)
-            if each.kind is JointType.PRISMATIC
-        ]
-        return sum(axis.x for axis in slides), sum(axis.y for axis in slides)
-
     def distance_m(self, target: Pose, positions: Mapping[str, float]) -> float:
         """Return the distance of a target in the root link from the first joint of the arm, with that joint at 0."""
         first = along((*self._above, *self._to_first), {**positions, **dict.fromkeys(self.joints, 0.0)})

@@ -21,7 +21,6 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
 from typing import NamedTuple
@@ -288,8 +287,8 @@ def _find_mesh(reference: str, folder: Path, packages: Mapping[str, str | Path])
     hint = ""
     if mark and scheme in ("package", "model"):
         folders = [folder, *folder.parents]
-        places = ([Path(packages[package])] if package in packages else [above / package for above in folders],)
-        candidates: Iterator[Path] = (place / inside for place in chain(*places, _ros_packages(package)))
+        places = [Path(packages[package])] if package in packages else [above / package for above in folders]
+        candidates: Iterator[Path] = (each / inside for group in (places, _ros_packages(package)) for each in group)
         hint = "" if package in packages else f"; name its folder with packages={{{package!r}: …}}"
     else:
         candidates = iter([folder / (rest if mark and scheme == "file" else reference)])
