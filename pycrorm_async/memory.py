@@ -21,7 +21,6 @@ of that database stores them.
 from __future__ import annotations
 
 import asyncio
-import html
 import inspect
 import logging
 import os
@@ -46,7 +45,7 @@ from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, ParamSpec, Self, TypeVar, overload
 
-from sqlalchemy import Select, func, select
+from sqlalchemy import Select
 from sqlalchemy.ext.asyncio import AsyncSession
 
 from pycrorm_async import __version__
@@ -60,7 +59,6 @@ from pycrorm_async.events.types import Blob
 from pycrorm_async.operations.copy import tag_episode
 from pycrorm_async.operations.destination import expected_log, open_destination
 from pycrorm_async.operations.recovery import dead_queues
-from pycrorm_async.orm import ProcessMetaData
 from pycrorm_async.plan.execution import called_performs, recorder
 from pycrorm_async.plan.task import TaskTreeNode, experience
 from pycrorm_async.projections.custom import Projection, validate_projections
@@ -68,16 +66,14 @@ from pycrorm_async.projections.generations import current_generation
 from pycrorm_async.projections.mapped_tables import UserView
 from pycrorm_async.query.episode_diff import EpisodeDiff
 from pycrorm_async.query.frames import BATCH_ROWS, Library
-from pycrorm_async.query.named_queries import EpisodeChoice, EpisodeSummary, episodes
+from pycrorm_async.query.named_queries import EpisodeSummary
 from pycrorm_async.query.notebook import Episodes, TaskTree
-from pycrorm_async.query.notebook_html import EPISODES_MAX, episodes_html
 from pycrorm_async.query.question import AskedEpisode, FrameQuery, Question, SyncQuestion
 from pycrorm_async.query.questions import Ask
-from pycrorm_async.query.reading import Reading
+from pycrorm_async.query.reading import Reading, memory_html
 from pycrorm_async.query.snapshot import AnyEpisode, Moment
 from pycrorm_async.query.sql import DEFAULT_LIMITS, SqlLimits, SqlResult
 from pycrorm_async.query.success import Kind, Source, success_figure, success_samples
-from pycrorm_async.query.text import quiet, view
 from pycrorm_async.queue.locks import call_in_forked_child
 from pycrorm_async.queue.recorder_queue import RecorderQueue
 from pycrorm_async.queue.spool import Spool
@@ -943,43 +939,6 @@ class Memory(RecordingMemory):
             parts.experience.is_closed = True
             self._parts, self._forked_parts = None, parts
             self._last_status = lambda: MemoryStatus.of(parts, self._unadopted)
-
-
-# === memory view ==============================================================================================
-#
-# Draw a memory: its address and the table of its newest episodes.
-#
-# A notebook asks for a view while its event loop waits for the answer, so a thread with a loop of its own reads.
-
-_ANSWER_S_MAX = 10.0
-"""Bounds the wait for a database, so that a cell ends although the server does not answer."""
-
-
-def memory_html(address: DatabaseAddress, located: DatabaseAddress | None) -> str:
-    """Return the view of the memory at an address; it is not open if it is not `located`."""
-    title = f"<b>Memory {html.escape(str(address))}</b>"
-    if located is None:
-        return view(f"{title} · not open", quiet("it is closed, or was never entered: await Memory.connect(url)"))
-    return view(f"{title} · open", _episodes(located))
-
-
-def _episodes(address: DatabaseAddress) -> str:
-    answers: list[str] = []
-    reader = threading.Thread(target=lambda: answers.append(asyncio.run(_read(address))), daemon=True)
-    reader.start()
-    reader.join(_ANSWER_S_MAX)
-    return answers[0] if answers else quiet(f"the database did not answer within {_ANSWER_S_MAX:g} s")
-
-
-async def _read(address: DatabaseAddress) -> str:
-    try:
-        async with Reading.open_address(address) as reading, reading.session() as session:
-            total = await session.scalar(select(func.count()).select_from(ProcessMetaData))
-            newest = await episodes(await session.connection(), EpisodeChoice(limit=EPISODES_MAX))
-            folding = len(await (await reading.log()).behind())
-            return episodes_html(newest, total or 0, folding=folding)
-    except PycrormError as error:
-        return html.escape(str(error))
 
 
 # === sync memory ==============================================================================================

@@ -9,7 +9,9 @@ async with Reading.open("sqlite:///memory.db") as reading:
 from __future__ import annotations
 
 import asyncio
+import html
 import re
+import threading
 from collections.abc import AsyncGenerator, AsyncIterator, Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractAsyncContextManager, AbstractContextManager, aclosing, asynccontextmanager
@@ -22,7 +24,7 @@ from threading import Lock
 from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar, overload
 from weakref import ref
 
-from sqlalchemy import BinaryExpression, ColumnElement, Connection, Dialect, Result, Row, Select, event
+from sqlalchemy import BinaryExpression, ColumnElement, Connection, Dialect, Result, Row, Select, event, func, select
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.engine import ExceptionContext
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine, AsyncSession, async_sessionmaker
@@ -33,9 +35,10 @@ from sqlalchemy.sql.operators import in_op
 from sqlalchemy.util.concurrency import in_greenlet
 
 from pycrorm_async.bulk_records import collecting_seldom
-from pycrorm_async.errors import CallerError, DatabaseUnavailable, TablesOutdated, UnknownEpisode
+from pycrorm_async.errors import CallerError, DatabaseUnavailable, PycrormError, TablesOutdated, UnknownEpisode
 from pycrorm_async.events.ids import parse_episode_id, row_key
 from pycrorm_async.events.types import Blob
+from pycrorm_async.orm import ProcessMetaData
 from pycrorm_async.orm.base import EPISODE, KEYS, Base, load_related
 from pycrorm_async.orm.dynamic import DynamicClasses
 from pycrorm_async.orm.rows import Designator
@@ -50,6 +53,7 @@ from pycrorm_async.query.question import AskedEpisode, FrameQuery, Question, tra
 from pycrorm_async.query.questions import Ask
 from pycrorm_async.query.snapshot import AnyEpisode, Moment, as_of
 from pycrorm_async.query.sql import DEFAULT_LIMITS, ReadOnlySql, SqlLimits, SqlResult, SqlRows
+from pycrorm_async.query.text import quiet, view
 from pycrorm_async.store.address import DatabaseAddress, no_tables
 from pycrorm_async.store.log import EventLog
 
@@ -580,3 +584,42 @@ class LoadOnAccess:
 
         with self._lock, self._translated(), ThreadPoolExecutor(1, thread_name_prefix="pycrorm-load") as thread:
             return thread.submit(asyncio.run, in_own_loop()).result()
+
+
+# === memory view ==============================================================================================
+#
+# Draw a memory: its address and the table of its newest episodes.
+#
+# A notebook asks for a view while its event loop waits for the answer, so a thread with a loop of its own reads.
+
+_ANSWER_S_MAX = 10.0
+"""Bounds the wait for a database, so that a cell ends although the server does not answer."""
+
+
+def memory_html(address: DatabaseAddress, located: DatabaseAddress | None) -> str:
+    """Return the view of the memory at an address; it is not open if it is not `located`."""
+    title = f"<b>Memory {html.escape(str(address))}</b>"
+    if located is None:
+        return view(f"{title} · not open", quiet("it is closed, or was never entered: await Memory.connect(url)"))
+    return view(f"{title} · open", _episodes(located))
+
+
+def _episodes(address: DatabaseAddress) -> str:
+    answers: list[str] = []
+    reader = threading.Thread(target=lambda: answers.append(asyncio.run(_read(address))), daemon=True)
+    reader.start()
+    reader.join(_ANSWER_S_MAX)
+    return answers[0] if answers else quiet(f"the database did not answer within {_ANSWER_S_MAX:g} s")
+
+
+async def _read(address: DatabaseAddress) -> str:
+    from pycrorm_async.query.notebook_html import EPISODES_MAX, episodes_html  # imported when a notebook draws
+
+    try:
+        async with Reading.open_address(address) as reading, reading.session() as session:
+            total = await session.scalar(select(func.count()).select_from(ProcessMetaData))
+            newest = await named_queries.episodes(await session.connection(), EpisodeChoice(limit=EPISODES_MAX))
+            folding = len(await (await reading.log()).behind())
+            return episodes_html(newest, total or 0, folding=folding)
+    except PycrormError as error:
+        return html.escape(str(error))

@@ -49,13 +49,12 @@ from pycrorm_async.events.types import (
 from pycrorm_async.projections.fold import WorldFold, WorldObject, happening_of
 from pycrorm_async.projections.row_batch import CannotFold
 from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary, Percept, PlaceSearch, percepts_in, search_in
-from pycrorm_async.query.scene import Frame, assumed_model, link_frames, object_model, placed
+from pycrorm_async.query.scene import Frame, assumed_model, link_frames, object_model, placed, triangles_of
 from pycrorm_async.query.text import Drawing, NotebookValue, one_line, with_object_names
 from pycrorm_async.store.log import EventLog, episode_named
 from pycrorm_async.store.stored import StoredEvent
 from pycrorm_async.visible_text import visible
 from pycrorm_async.world.bullet_body import ObjectState, WorldState
-from pycrorm_async.world.model_boxes import triangles_of
 from pycrorm_async.world.pose import MalformedPose, Pose
 from pycrorm_async.world.urdf import robot_description
 

@@ -137,13 +137,13 @@ class _Described:
 
     @cached_property
     def links(self) -> Mapping[str, BoundingBox]:
-        return shape_boxes(self.description_text, "collision")
+        return shape_boxes(self.description_text, visual=False)
 
     def box_in_link(self, link: str) -> BoundingBox | None:
         return self.links.get(link)
 
     def visual_boxes(self, links: Collection[str]) -> Mapping[str, BoundingBox]:
-        return shape_boxes(self.description_text, "visual", links)
+        return shape_boxes(self.description_text, visual=True, links=links)
 
 
 class RecordedObjects(ObjectRows[Hashable]):

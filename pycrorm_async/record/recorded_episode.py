@@ -62,7 +62,7 @@ from pycrorm_async.record.values import (
 )
 from pycrorm_async.world.model_boxes import described_mass_kg
 from pycrorm_async.world.pose import DescriptionNotLoadable, Pose
-from pycrorm_async.world.urdf import urdf_text
+from pycrorm_async.world.urdf_model import urdf_text
 
 # === ordered calls ============================================================================================
 #

@@ -48,12 +48,11 @@ from pycrorm_async.events.types import (
 from pycrorm_async.projections.fold import happening_of
 from pycrorm_async.projections.row_batch import CannotFold
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.query.scene import assumed_model, object_model, point_model
+from pycrorm_async.query.scene import Triangles, assumed_model, object_model, point_model, triangles_of
 from pycrorm_async.query.snapshot import unreadable
 from pycrorm_async.query.text import parameters_text, with_object_names
 from pycrorm_async.store.log import EventLog, episode_named
 from pycrorm_async.store.stored import EpisodeRow, StoredEvent
-from pycrorm_async.world.model_boxes import Triangles, triangles_of
 
 _TEXTS_CHARACTERS = 6_000_000
 """Bounds the characters of all texts of a page together, so that it stays below 20 MB."""

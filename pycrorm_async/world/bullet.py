@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, Protocol, Self
 
 from pycrorm_async.connected_var import ConnectedVar
 from pycrorm_async.world import bullet_body
-from pycrorm_async.world.bounding_boxes import BoundingBox, box_of
+from pycrorm_async.world.bounding_boxes import BoundingBox
 from pycrorm_async.world.bullet_body import (
     Body,
     Color,
@@ -36,6 +36,7 @@ from pycrorm_async.world.bullet_body import (
     engine,
     set_state,
 )
+from pycrorm_async.world.model_boxes import shape_boxes
 from pycrorm_async.world.models import built_in_urdf
 from pycrorm_async.world.pose import (
     COORDINATE_MAX,
@@ -639,8 +640,7 @@ class Object:
 
     def visual_boxes(self, links: Collection[str]) -> dict[str, BoundingBox]:
         """Return the boxes around the visual shapes of links, in their frames, where the shapes can be read."""
-        visuals = {link: self.model.links[link]._replace(collisions=()) for link in links}
-        return {link: box for link, each in visuals.items() if (box := box_of(each)) is not None}
+        return shape_boxes(self.description_text, visual=True, links=links)
 
     @property
     def mass_kg(self) -> float | None:

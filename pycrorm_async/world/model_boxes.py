@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import PurePath
 from typing import NamedTuple, TypeAlias
-from xml.etree.ElementTree import Element, SubElement, tostring
+from xml.etree.ElementTree import Element, ParseError, SubElement, tostring
 
 from pycrorm_async.world.bounding_boxes import BoundingBox, box_of
 from pycrorm_async.world.models import numbers
 from pycrorm_async.world.pose import JointType, Pose, rotated
-from pycrorm_async.world.urdf_model import along, parsed_urdf, read_model
+from pycrorm_async.world.urdf_model import UrdfFault, along, parsed_urdf, read_model
 
 #
 # Replace the mesh files of a URDF: by other names, or by the boxes around the collision shapes of their links.
@@ -84,6 +84,37 @@ def _add_box(shape: Element, box: BoundingBox, material: Element | None) -> None
     SubElement(SubElement(shape, "geometry"), "box", size=numbers(size))
     if material is not None:
         shape.append(material)
+
+
+# === shape boxes ==============================================================================================
+#
+# Compute the box around the shapes of each link in its own frame, and the mass, of an object that no world has.
+
+
+def shape_boxes(urdf: str, *, visual: bool, links: Collection[str] | None = None) -> dict[str, BoundingBox]:
+    """Return the box around the collision or the visual shapes of each link, or of each of `links`, by its name.
+
+    Links without a shape that can be read are left out, and so are all links of a text that is no URDF.
+    """
+    try:
+        model = read_model(urdf)
+    except (UrdfFault, ParseError):
+        return {}
+    shapes = {
+        name: link._replace(collisions=link.visuals if visual else link.collisions)
+        for name, link in model.links.items()
+        if links is None or name in links
+    }
+    boxes = {name: box_of(link, visual=False) for name, link in shapes.items()}
+    return {name: box for name, box in boxes.items() if box is not None}
+
+
+def described_mass_kg(urdf: str) -> float | None:
+    """Return the sum of the masses of all links, kg; None if it is not above zero, and for a text that is no URDF."""
+    try:
+        return read_model(urdf).mass_kg
+    except (UrdfFault, ParseError):
+        return None
 
 
 # === link boxes ===============================================================================================

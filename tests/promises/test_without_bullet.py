@@ -197,7 +197,7 @@ IMPORTS = """
 import importlib, json, pkgutil
 import pycrorm_async.errors
 
-EXTRAS |= set("foxglove langchain_core langgraph mcap mcp polars pyarrow py_trees rerun starlette uvicorn".split())
+EXTRAS |= set("collada foxglove langchain_core langgraph mcap mcp polars pyarrow py_trees rerun starlette trimesh uvicorn".split())
 needing = []
 for module in pkgutil.walk_packages(pycrorm_async.__path__, "pycrorm_async."):
     if module.name.endswith("__main__") or module.name == "pycrorm_async.testing.fixtures":

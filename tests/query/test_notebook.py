@@ -20,12 +20,12 @@ import pytest
 from pycrorm_async import Memory, world_of
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.types import BlobReference, BoxValue, DescriptionDeclared, MeshValue
-from pycrorm_async.memory import memory_html
 from pycrorm_async.plan import NavigateAction, simulated_robot
 from pycrorm_async.query.episode_diff import Difference, EpisodeDiff
 from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary
 from pycrorm_async.query.notebook import Episodes, TaskTree
 from pycrorm_async.query.notebook_html import cases_html
+from pycrorm_async.query.reading import memory_html
 from pycrorm_async.query.running_episodes import RobotSummary
 from pycrorm_async.query.scene import link_frames, object_model
 from pycrorm_async.query.snapshot import Moment, ObjectThen, ObservationThen, WorldThen, outlines

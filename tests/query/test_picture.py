@@ -19,9 +19,10 @@ from pycrorm_async import Memory
 from pycrorm_async.cli.main import app
 from pycrorm_async.errors import CallerError, UnknownEpisode
 from pycrorm_async.plan import NavigateAction, simulated_robot
+from pycrorm_async.query import scene
+from pycrorm_async.query.scene import triangles_of
 from pycrorm_async.settings import Settings
-from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose, model_boxes
-from pycrorm_async.world.model_boxes import triangles_of
+from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
 from pycrorm_async.world.models import box_urdf
 from tests import mesh_files
 
@@ -216,6 +217,6 @@ def test_a_file_without_triangles_has_a_reason(name: str, content: bytes, reason
 
 
 def test_a_file_with_too_many_triangles_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(model_boxes, "TRIANGLES_MAX", 5)
+    monkeypatch.setattr(scene, "TRIANGLES_MAX", 5)
     with pytest.raises(ValueError, match="it has 6 triangles, more than 5"):
         triangles_of("a.obj", mesh_files.obj())
