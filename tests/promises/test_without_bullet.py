@@ -197,7 +197,8 @@ IMPORTS = """
 import importlib, json, pkgutil
 import pycrorm_async.errors
 
-EXTRAS |= set("collada foxglove langchain_core langgraph mcap mcp polars pyarrow py_trees rerun starlette trimesh uvicorn".split())
+EXTRAS |= set("collada foxglove langchain_core langgraph mcap mcp polars pyarrow py_trees rerun".split())
+EXTRAS |= {"starlette", "trimesh", "uvicorn"}
 needing = []
 for module in pkgutil.walk_packages(pycrorm_async.__path__, "pycrorm_async."):
     if module.name.endswith("__main__") or module.name == "pycrorm_async.testing.fixtures":
