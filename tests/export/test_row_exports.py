@@ -395,7 +395,7 @@ async def test_internal_tables_are_hidden_and_views_are_described_sorted_and_fac
     assert {name for name in names if names[name] == "view"} - shown == WITH_BYTES
     columns = tables["root_failure"].pop("columns")
     assert columns["message"] == "its message"
-    assert columns["start_time"] == "µs since 1970-01-01 00:00 UTC"
+    assert columns["start_time"] == "when the node started; µs since 1970-01-01 00:00 UTC"
     assert tables["root_failure"] == {
         "description": " ".join((RootFailure.__doc__ or "").partition("\n\n")[0].split()),
         "sort_desc": "id",

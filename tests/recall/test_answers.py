@@ -161,7 +161,7 @@ def test_an_answer_without_cases_states_that() -> None:
     assert list(empty) == []
     assert empty.success is None
     assert empty.reasons == []
-    assert empty.why() == "0 of 0 cases for FlyAction"
+    assert empty.why() == "0 of 0 cases for FlyAction\n  never seen: type FlyAction; there are PickUpAction"
     assert "<bdi>0 of 0 cases for FlyAction</bdi>" in empty._repr_html_()
 
 
