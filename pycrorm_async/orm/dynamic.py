@@ -116,7 +116,9 @@ class DynamicClasses:
     def of(self, name: str | type) -> type[Designator]:
         """Return the mapped class of a dtype, a table or a designator class, also built-in. Raises `CallerError`."""
         self.map()
-        wanted = getattr(name, "__dtype__", name.__name__) if isinstance(name, type) else name
+        wanted = name
+        if isinstance(name, type):
+            wanted = getattr(name, "__dtype__", None) or getattr(name, "dtype", name.__name__)
         of_table = (
             dtype
             for dtype, declarations in self._declared.items()

@@ -385,7 +385,7 @@ async def unknown_name(reading: EpisodeReader, names: Mapping[str, str], episode
 
 async def absence_of_episodes(reading: EpisodeReader, choice: EpisodeChoice) -> str:
     """Return the line that a verb prints when no episode fulfils a choice, with the nearest tag or robot."""
-    if not str(replace(choice, limit=None)):
+    if replace(choice, limit=None) == EpisodeChoice():
         return "no episode yet: record one with `pycrorm run` or `pycrorm demo`"
     names = [*([] if choice.robot is None else [("robot", choice.robot)]), *(("tag", each) for each in choice.tags)]
     for argument, name in names:

@@ -111,8 +111,8 @@ async def test_the_episode_has_its_author_and_its_outcome(breakfast: EventLog) -
         "ProcessMetaData(id=1, uuid='00000000-0000-7000-8000-000000000001',"
         f" created_at={moment(1)!r}, created_by='me', description='Tutorial', version='1.0', host='host',"
         f" python='3.11', plan='breakfast', world='pr2 (ROBOT), fridge (ENVIRONMENT)', status='LOST',"
-        f" ended_at={moment(19)!r},"
-        " end_sequence=19, simulated=False)"
+        f" start_ns=1000000005, end_ns=19000000005, end_sequence=19, simulated=False, ended_at={moment(19)!r},"
+        " duration_s=18.0)"
     )
 
 

@@ -111,8 +111,8 @@ def test_what_happened_is_in_the_tables_and_in_show(tmp_path: Path) -> None:
             world="flat",
         ) as episode:
             episode.object_added(
-                7, "pr2", "ROBOT", HERE, {"torso": 0.2}, torso_joint="torso", model="PR2", urdf="<robot name='r'/>",
-                base_link="base_link",
+                7, "pr2", "ROBOT", HERE, {"torso": 0.2}, torso_joint="torso", model="PR2",
+                urdf="<robot name='r'><link name='base_link'/></robot>", base_link="base_link",
             )  # fmt: skip
             episode.object_added("m", "milk", "MILK", Pose([1, 0, 1]), color=(1, 1, 1, 1), mass_kg=1.0)
             episode.start("p", pick_up, {"object_designator": "m", "arm": Side.LEFT, "grasp": "FRONT"}, robot=7)
