@@ -134,6 +134,7 @@ async def test_verify_checks_the_log_of_an_outdated_memory(database_url: str) ->
         await log.close()
 
 
+@pytest.mark.soak
 async def test_every_command_says_that_the_tables_are_outdated_and_run_succeeds(tmp_path: Path) -> None:
     url = put_memory(tmp_path / "memory.db")
     await outdated(url)

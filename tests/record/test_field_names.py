@@ -179,7 +179,7 @@ async def test_a_field_with_a_name_of_ours_has_its_value_in_node_view_class_fram
     await assert_clean(database_url)
 
 
-@pytest.mark.slow
+@pytest.mark.soak
 async def test_fields_with_names_of_ours_are_copied_to_the_other_database_and_rebuilt(
     server: Server, tmp_path: Path
 ) -> None:

@@ -156,7 +156,8 @@ def test_both_databases_have_the_same_tables_of_an_episode(database_url: str, tm
         fields: dict[str, FieldSpec] = {"object_designator": "object", "at": Pose, "words": ("list", "text")}
         kind = memory.recording.type("action", "GripAction", fields)
         with memory.recording.episode(description="d") as episode:
-            episode.object_added("m", "milk", "MILK", Pose([1, 2, 3]), {"lid": 0.5}, urdf="<robot name='milk'><link name='box'/></robot>")
+            urdf = "<robot name='milk'><link name='box'/></robot>"
+            episode.object_added("m", "milk", "MILK", Pose([1, 2, 3]), {"lid": 0.5}, urdf=urdf)
             episode.start("a", kind, {"object_designator": "m", "at": Pose([1, 0, 0]), "words": ["x", "y"]}, robot="m")
             episode.observe("force", {"x": 1.5}, node="a")
             episode.end("a", "FAILED", "slipped")
