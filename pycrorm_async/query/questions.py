@@ -44,7 +44,7 @@ from pycrorm_async.orm import (
     TaskTreeNode,
 )
 from pycrorm_async.orm.base import same_row
-from pycrorm_async.projections.derived_views import OUTCOMES, RECOVERED
+from pycrorm_async.projections.derived_views import OUTCOMES, RECOVERED, sql_of
 from pycrorm_async.query import named_queries
 from pycrorm_async.query.frames import (
     FAILED,
@@ -319,8 +319,9 @@ def root_failures(episode: EpisodeNumber | None, limit: int | None, **search: An
 def failures_by_cause(episode: EpisodeNumber | None, limit: int | None, **search: Any) -> Select[*tuple[Any, ...]]:
     names = "reason dtype object process_metadata_id start_time message outcome".split()
     chosen = select(*(getattr(RootFailure, each) for each in names)).where(*matching(episode, **search))
-    # With a limit no database replaces the columns by their expressions, and computes an outcome for each of them.
-    failed = chosen.limit(literal_column(str(2**62))).subquery("failed").c
+    # With a limit no database replaces the columns by their expressions, and computes an outcome for each of them. For
+    # one with a number PostgreSQL would rather have the first row early than read fewer nodes, and read all of them.
+    failed = chosen.limit(sql_of(BigInteger(), "-1", "ALL")).subquery("failed").c
     causes = failed.reason, failed.dtype, failed.object
     statement = (
         select(
