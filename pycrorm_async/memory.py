@@ -611,14 +611,14 @@ class RecordingMemory(ReadableMemory, ABC):
 
         Raises:
             EpisodeParked: an episode could not be stored or folded, with the reason; each episode is reported once.
-            TablesForeign: all is stored, but this process cannot use the tables, for example because an older version
-                made them; reported once.
+            TablesOutdated: all is stored, but an older version made the tables; reported once.
+            TablesUntrusted: all is stored, but the tables belong to a role with fewer rights than this login.
             FlushTimeout: nothing was stored or folded for `flush_timeout_s`. The events are safe in the spool.
         """
         parts = self._open_parts
         try:
             await parts.flush()
-        except (EpisodeParked, TablesForeign) as fault:
+        except (EpisodeParked, TablesOutdated) as fault:
             unreported = self._unreported(fault)
             if unreported is not None:
                 raise unreported from fault
@@ -626,8 +626,8 @@ class RecordingMemory(ReadableMemory, ABC):
             await parts.reading.refresh(maps=False)
 
     def _unreported(self, fault: PycrormError) -> PycrormError | None:
-        """Return the fault without the parked episodes and the tables that a flush has reported; None if it has all."""
-        if isinstance(fault, TablesForeign):
+        """Return the fault less the parked episodes or outdated tables that a flush reported; None if that is all."""
+        if isinstance(fault, TablesOutdated):
             is_reported = "tables" in self._reported
             self._reported.add("tables")
             return None if is_reported else fault
@@ -840,7 +840,7 @@ class Memory(RecordingMemory):
                 declared = [declaration_of(each) for each in await log.declarations()]
                 async with log.reading() as connection:
                     await current_generation(connection)
-            except TablesOutdated:
+            except TablesForeign:  # recording works without tables; those that cannot be rebuilt are left as they are
                 from pycrorm_async.operations.rebuild import rebuild_outdated  # here, because few programs rebuild
 
                 await rebuild_outdated(address, clock=self._clock)
@@ -915,7 +915,7 @@ class Memory(RecordingMemory):
         """Store and fold all recorded events. An error in doing so is logged, not raised, if the plan failed itself.
 
         A parked episode is logged and does not make closing fail; `pycrorm status` lists it, and `flush` raises for it.
-        Nor do tables that this process cannot use, such as those of an older version: all events are stored.
+        Nor do tables that an older version made: all events are stored.
         """
         parts, self._parts = self._parts, None
         queue.close()
@@ -923,9 +923,9 @@ class Memory(RecordingMemory):
             await writer.close()
         except PycrormError as fault:
             unreported = self._unreported(fault)
-            if unreported is not None and error is None and not isinstance(unreported, EpisodeParked | TablesForeign):
+            if unreported is not None and error is None and not isinstance(unreported, EpisodeParked | TablesOutdated):
                 raise unreported from fault
-            if unreported is not None and not isinstance(unreported, TablesForeign):  # opening them logged that
+            if unreported is not None and not isinstance(unreported, TablesOutdated):  # opening them logged that
                 _log.error("when closing the memory: %s", unreported)
         finally:
             if parts is not None:  # else it could not be opened

@@ -21,6 +21,7 @@ from pycrorm_async.query.reading import Reading
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.postgresql import GRANTS
+from tests.commands import NOTES_PLAN, pycrorm
 from tests.crash.step_robot import SETTINGS, StepActionPerformable
 from tests.databases import Server, ask, change_each, server_in_memory
 from tests.store.factories import episode, run_of
@@ -322,3 +323,9 @@ async def test_the_owner_is_refused_at_the_tables_and_another_login_folds_what_t
     with pytest.raises(TablesUntrusted, match="read with one of pycrorm_reader"):
         async with Reading.open(owner):
             pass
+    (tmp_path / "notes.py").write_text(NOTES_PLAN)
+    for words in (("run", "notes.py"), ("writer", "--once")):  # the plan's events are stored, and the command says so
+        done = pycrorm(*words, "--url", owner, "--spool", tmp_path / "spool", cwd=tmp_path)
+        assert (done.returncode, "fold with a login that is a member of pycrorm_folder" in done.stderr) == (3, True)
+    notes = "SELECT count(*) FROM pycrorm.event WHERE type = 'NodeEnded' AND episode > 2"
+    assert ask(owner, notes) == [(4,)]
