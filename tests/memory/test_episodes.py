@@ -21,7 +21,7 @@ from sqlalchemy import select
 from pycrorm_async import Memory, Reading, Settings, recover
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock, clock_quality
 from pycrorm_async.errors import CallerError, DatabaseUnavailable, EpisodeParked, LogDamaged, UnknownEpisode
-from pycrorm_async.events.ids import EPISODE_NUMBER_MAX
+from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, episode_text
 from pycrorm_async.operations import copy as operation
 from pycrorm_async.operations.copy import copy_episodes, tag_episode
 from pycrorm_async.operations.rebuild import rebuild_memory
@@ -337,7 +337,8 @@ async def assert_log_has(url: str, *tags: str) -> None:
 
 def take_numbers_up_to(url: str, last: int) -> None:
     """Make the database assign episode numbers up to this one."""
-    ask_to_change(url, f"INSERT INTO episode (number, id, head, started_wall_ns) VALUES ({last}, 'x', 0, 0)")
+    row = f"{last}, '{episode_text(episode(99))}', 0, 0"
+    ask_to_change(url, f"INSERT INTO episode (number, id, head, started_wall_ns) VALUES ({row})")
     if url.startswith("postgresql"):  # PostgreSQL takes the numbers from a sequence
         ask_to_change(url, f"SELECT setval('pycrorm.episode_number', {last})")
 

@@ -160,16 +160,18 @@ async def test_a_changed_value_in_a_payload_is_a_difference_of_the_tables(
 ) -> None:
     # The log is the truth: its events can be folded and are in order, and an earlier version stored no digests.
     ask_to_change(database_url, "DELETE FROM pycrorm_digest")
-    ask_to_change(database_url, f"UPDATE event SET wall_ns = wall_ns + 5000000 {OF_2} 8")
+    ask_to_change(database_url, f"UPDATE event SET wall_ns = wall_ns + 5000000 {OF_2} 5")
+    ask_to_change(database_url, f"UPDATE event SET monotonic_ns = monotonic_ns + 1 {OF_2} 8")
     ask_to_change(database_url, f"UPDATE event SET payload = replace(payload, 'camera', 'world_state') {OF_2} 9")
     result = await findings_for_any_parts(log, database_url, monkeypatch)
     assert (result.damage, result.without_digest) == (0, 3)
     assert [(each.sequence, each.table, each.column) for each in result.differences] == [
-        (5, "task_tree_node", "end_time"),
+        (5, "task_tree_node", "start_time"),
+        (5, "task_tree_node", "end_ns"),
         (9, "detection", "source"),
         (9, "detection", "source"),
     ]
-    assert result.differences[1][4:] == ("camera", "world_state")
+    assert result.differences[2][4:] == ("camera", "world_state")
 
 
 async def test_swapped_or_changed_declarations_are_reported(
