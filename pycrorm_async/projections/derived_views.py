@@ -532,9 +532,9 @@ _OUTCOME = f"""CASE WHEN {{node}}.status IN ({_FAILED_SQL}) THEN coalesce((
  SELECT judged.outcome FROM (SELECT up.depth, CASE
    WHEN up.status = '{_SUCCEEDED}' AND up.kind <> 'language' THEN 'ignored'
    WHEN up.status = '{_SUCCEEDED}' AND ({{offers}}) THEN '{RECOVERED}'
-   WHEN up.status = '{_SUCCEEDED}' THEN 'tolerated'
-   WHEN up.status = '{TaskStatus.RUNNING.name}' THEN 'open'
-   WHEN {_AGAIN} THEN '{RECOVERED}' END AS outcome FROM (SELECT up.*, {{about}} AS about FROM up) AS up) AS judged
+   WHEN up.status = '{_SUCCEEDED}' THEN 'tolerated' WHEN up.status = '{TaskStatus.RUNNING.name}' THEN 'open'
+   WHEN {_AGAIN} THEN '{RECOVERED}' END AS outcome
+  FROM (SELECT up.*, {{about}} AS about FROM (SELECT * FROM up ORDER BY depth) AS up) AS up) AS judged
  WHERE judged.outcome IS NOT NULL ORDER BY judged.depth LIMIT 1), 'failed') END"""  # noqa: S608
 
 
@@ -542,7 +542,9 @@ def outcome_of(nodes: Table) -> ColumnElement[str]:
     """Return the outcome of a node that FAILED or ended in ERROR, one of `OUTCOMES`; null for any other node.
 
     On PostgreSQL no index fits the expression of a later node's type, so that later nodes are read in their order by
-    id up to the limit. By the index on the type it would sort all of them for each failure.
+    id up to the limit. By the index on the type it would sort all of them for each failure. The ancestors are in order
+    before one is judged, so that it judges none above the decisive one and does not estimate the outcome so costly that
+    reading all nodes would not count beside it.
     """
 
     def sql(above: str, about: str, offers: str, later_dtype: str) -> str:
