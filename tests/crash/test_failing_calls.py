@@ -35,7 +35,9 @@ def check_queue(process: DiskProcess, place: Path, n: int, number: int) -> bool:
     return ended.calls >= n
 
 
-@pytest.mark.parametrize("number", [EIO, ENOSPC], ids=["EIO", "ENOSPC"])
+@pytest.mark.parametrize(
+    "number", [pytest.param(EIO, marks=pytest.mark.soak, id="EIO"), pytest.param(ENOSPC, id="ENOSPC")]
+)
 def test_no_failing_call_of_a_queue_stops_its_recorder_or_takes_a_record_that_was_put(
     process: DiskProcess, tmp_path: Path, number: int
 ) -> None:

@@ -9,6 +9,7 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+import pytest
 from mcap.reader import make_reader
 
 from pycrorm_async import Memory, Reading
@@ -123,6 +124,7 @@ async def test_every_view_has_the_durations_of_the_monotonic_clock(database_url:
         assert_alike(rows)
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_every_answer_about_an_episode_has_the_times_of_the_monotonic_clock(
     database_url: str, tmp_path: Path
 ) -> None:

@@ -133,6 +133,7 @@ def test_a_failure_is_open_while_nothing_around_it_has_ended(database_url: str, 
             assert [each.outcome for each in memory.ask.root_failures().rows()] == ["recovered"]
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_questions_pages_agents_and_recall_give_the_same_outcomes_and_rates(
     database_url: str, tmp_path: Path
 ) -> None:
