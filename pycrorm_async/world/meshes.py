@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 import os
 import re
+import warnings
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -40,7 +41,9 @@ def read_mesh(name: str, content: bytes) -> Mesh:
         raise ValueError(f"the format {suffix!r} is not read")
     load = _trimesh().load_scene
     try:
-        scene = load(io.BytesIO(content), file_type=suffix, process=False)
+        with warnings.catch_warnings():  # the reader of DAE calls what the newest NumPy deprecates
+            warnings.simplefilter("ignore", DeprecationWarning)
+            scene = load(io.BytesIO(content), file_type=suffix, process=False)
         parts: list[NDArray[np.float64]] = []
         faces: list[NDArray[np.int64]] = []
         count = 0
