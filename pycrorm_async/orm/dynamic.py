@@ -116,9 +116,9 @@ class DynamicClasses:
     def of(self, name: str | type) -> type[Designator]:
         """Return the mapped class of a dtype, a table or a designator class, also built-in. Raises `CallerError`."""
         self.map()
-        wanted = name
-        if isinstance(name, type):
-            wanted = getattr(name, "__dtype__", None) or getattr(name, "dtype", name.__name__)
+        wanted: str = name if isinstance(name, str) else name.__name__
+        for attribute in ("dtype", "__dtype__") if isinstance(name, type) else ():
+            wanted = getattr(name, attribute, wanted)
         of_table = (
             dtype
             for dtype, declarations in self._declared.items()
