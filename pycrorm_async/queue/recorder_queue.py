@@ -76,7 +76,8 @@ from pycrorm_async.settings import Settings
 # write. The queue *fails*: it refuses every later put with the disk's error, and supplies the records synced before.
 
 PROGRESS_INTERVAL_S = 0.05
-"""Interval at which the sync thread reads `progress` while segments or producers wait for another process."""
+"""Interval at which the sync thread reads `progress` while segments or producers wait for another process, and the
+longest pause before it asks a full disk for space again."""
 _MOVE_RETRY_S_MAX = 5.0
 """Bounds the pause before a displaced queue tries again to create a folder."""
 
@@ -98,6 +99,7 @@ class QueueFiles:
         self._synced = 0
         self._stored = 0
         self._failure: PycrormError | None = None
+        self._has_refused = False  # a record, because of the failure
         self._displaced: SpoolUnavailable | None = None  # set until the queue has moved
         self._setback: SpoolUnavailable | None = None
         self._setbacks = 0
@@ -119,7 +121,8 @@ class QueueFiles:
         self._sync_thread = SyncThread(name=folder.name, interval_s=self._sync_interval_s, turn=self._turn)
         with wrap_os_errors(folder):
             self._appender = self._appender_in(folder, recorder)
-            self._disk_was_full = self._appender.prepare()
+            if self._appender.prepare():
+                self._sync_thread.call_in(PROGRESS_INTERVAL_S)
             self._drain_status = DrainStatusReader(folder) if offered else None
             place = Place(folder, recorder, Cursor(1, header_bytes(0), 0))
             self._home = Home(place, alive, FileIdentity.of(folder.stat()), self._appender, self._drain_status)
@@ -220,7 +223,7 @@ class QueueFiles:
             self._fail(InternalError(f"the sync thread of {self.folder} failed: {error!r}"))
             raise
         if full:
-            return self._sync_interval_s
+            return min(self._sync_interval_s, PROGRESS_INTERVAL_S)  # plans may wait for the space
         waiting = self._drain_status is not None and (self._room_notifier.awaited or len(self._appender.begun) > 1)
         return PROGRESS_INTERVAL_S if waiting or not published else None
 
@@ -376,18 +379,21 @@ class QueueFiles:
     def _prepare(self) -> bool:
         if self._closed:
             return False
-        refused = self._appender.prepare()
-        if not refused and self._disk_was_full:
-            self._room_notifier.notify_all()
-        self._disk_was_full = refused
-        return refused
+        if self._appender.prepare():
+            return True
+        self._room_notifier.notify_all()  # plans that wait since a put met a full disk
+        return False
 
     def _fail(self, error: PycrormError) -> None:
         _log.error("recording has stopped: %s", error)
         self._failure = error
-        self._appender.refuse(lambda: error)
+        self._appender.refuse(partial(self._refused_after, error))
         self._notifier.notify_all()
         self._room_notifier.notify_all()
+
+    def _refused_after(self, error: PycrormError) -> PycrormError:
+        self._has_refused = True
+        return error
 
 
 # === recorder queue ===========================================================================================
@@ -559,9 +565,9 @@ class RecorderQueue(QueueFiles):
         May be called from any event loop; concurrent calls share one sync.
 
         Raises:
-            SpoolUnavailable: the disk failed before they were synced; or the files were deleted or replaced, and a
-                later call succeeds once the queue has moved. If the move lost records, one call raises an error that
-                names them.
+            SpoolUnavailable: the disk failed before they were synced, or a record was refused since; or the files were
+                deleted or replaced, and a later call succeeds once the queue has moved. If the move lost records, one
+                call raises an error that names them.
             SpoolClosed: in a forked child, for records that were not synced before the fork.
         """
         target = self.written if position is None else position
@@ -580,7 +586,7 @@ class RecorderQueue(QueueFiles):
                     or (self._synced >= target and (not must_check or self._checks > checks))
                 )
             )
-        if self._synced < target and self._failure is not None:
+        if self._failure is not None and (self._synced < target or self._has_refused):
             raise self._failure
         if self._setbacks != setbacks and self._setback is not None:
             raise self._setback

@@ -440,20 +440,21 @@ def make_file(path: Path, name: str, access: FileAccess, *, belongs_to: str | No
     """
     if sqlite3.sqlite_version_info < (3, 38):
         raise DatabaseUnavailable(f"SQLite 3.38 or newer is needed, this is {sqlite3.sqlite_version}")
-    if belongs_to is not None and not path.exists():
-        raise DatabaseUnavailable(f"{name} {_missing_log(belongs_to)}")
     try:
+        if belongs_to is not None and not path.exists():
+            raise DatabaseUnavailable(f"{name} {_missing_log(belongs_to)}")
         real = Path(os.path.realpath(path))
         if not real.exists():
             move_leftovers(real)
-        os.mknod(real, 0o600 | stat.S_IFREG)
-        real.chmod(FILE_MODES[access])  # independent of the umask
-    except FileExistsError:
-        if path.is_dir():
-            raise DatabaseUnavailable(f"{name} cannot be opened: Is a directory ({path})") from None
-        if not os.access(real, os.W_OK):
-            reason = "this user may only read it: record with a user who may write it, or name another file"
-            raise DatabaseUnavailable(f"{name} cannot be written: {reason}") from None
+        try:
+            os.mknod(real, 0o600 | stat.S_IFREG)
+            real.chmod(FILE_MODES[access])  # independent of the umask
+        except FileExistsError:
+            if path.is_dir():
+                raise DatabaseUnavailable(f"{name} cannot be opened: Is a directory ({path})") from None
+            if not os.access(real, os.W_OK):
+                reason = "this user may only read it: record with a user who may write it, or name another file"
+                raise DatabaseUnavailable(f"{name} cannot be written: {reason}") from None
     except FileNotFoundError as error:
         reason = f"{error.strerror} ({path}): create the folder {path.parent} first"
         raise DatabaseUnavailable(f"{name} cannot be opened: {reason}") from error

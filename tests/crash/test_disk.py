@@ -121,6 +121,29 @@ async def test_a_sync_that_would_succeed_after_a_failed_one_does_not_hide_it(
     assert (queue.written, queue.synced) == (3, 1)
 
 
+async def test_a_record_refused_by_a_disk_that_failed_after_a_sync_is_not_reported_as_synced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object, **__: object) -> Segment:
+        raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    queue = make(tmp_path, settings=SLOW)
+    queue.put_nowait(started(), b"{}")
+    monkeypatch.setattr(Segment, "allocate", fail)
+    with contextlib.suppress(SpoolUnavailable):
+        while queue.failure is None:  # the sync thread prepares a segment when the last one was taken
+            queue.put_nowait(node(), b"x" * 500, reserved=True)
+            await queue.synced_to()
+    assert queue.synced == queue.written
+    await queue.synced_to()  # all that was put is there
+    with pytest.raises(SpoolUnavailable, match="Input/output error"):
+        queue.put_nowait(node(), b"{}")
+    for _ in range(2):
+        with pytest.raises(SpoolUnavailable, match="Input/output error"):
+            await queue.synced_to()
+    queue.release()
+
+
 async def test_a_failed_sync_ends_the_wait_of_the_writer(tmp_path: Path) -> None:
     queue = make(tmp_path, settings=SLOW)
     waiting = asyncio.ensure_future(queue.get_batch(events_max=10, bytes_max=2**20, age_s_max=1000.0))

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import CallerError, SpoolClosed, SpoolFull, SpoolStuck
 from pycrorm_async.queue import RecorderQueue
-from pycrorm_async.queue.appender import Capacity, GcSafeLock
+from pycrorm_async.queue.appender import Capacity, GcSafeLock, RelocatableAppender
 from pycrorm_async.queue.format import Segment
 from pycrorm_async.settings import Settings
 from tests.queue.factories import (
@@ -193,6 +193,38 @@ def test_a_disk_that_filled_up_while_a_segment_was_prepared_stays_full(
     monkeypatch.setattr(GcSafeLock, "resume_gc", fill_and_resume)
     appender.prepare()
     assert not appender.admits_again(reserved=True)
+
+
+@pytest.mark.parametrize("full_times", [1, 5])
+@pytest.mark.parametrize("since", ["the queue is made", "a record is put"])
+async def test_a_wait_for_a_full_disk_ends_soon_after_the_disk_has_space(
+    spool: Path, monkeypatch: pytest.MonkeyPatch, since: str, full_times: int
+) -> None:
+    allocate, tries = Segment.allocate, [0]
+
+    def allocate_when_there_is_space(*arguments: object, number: int, **others: object) -> Segment:
+        tries[0] += number == 2
+        if number == 2 and tries[0] <= full_times:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        return allocate(*arguments, number=number, **others)  # type: ignore[arg-type]
+
+    def make_queue() -> RecorderQueue:
+        return make(spool, settings=replace(SMALL, sync_interval_ms=3_600_000), clock=SYSTEM_CLOCK)
+
+    if since == "the queue is made":
+        monkeypatch.setattr(Segment, "allocate", allocate_when_there_is_space)
+        queue = make_queue()
+    else:
+        with monkeypatch.context() as patch:  # nothing is prepared, so that a put allocates the segment
+            patch.setattr(RelocatableAppender, "prepare", lambda _: False)
+            queue = make_queue()
+        monkeypatch.setattr(Segment, "allocate", allocate_when_there_is_space)
+    queue.put_nowait(started(), b"{}", reserved=True)
+    fill(queue)
+    await asyncio.wait_for(queue.room(), 20)
+    assert tries[0] > full_times
+    queue.put_nowait(node(), PAYLOAD)
+    queue.release()
 
 
 # === capacity =================================================================================================
