@@ -497,7 +497,8 @@ async def test_at_no_offered_place_is_the_base_in_collision_in_two_hundred_table
             for pose in (each.pose for each in surfaces):
                 bowl.set_pose(pose)
                 assert not collisions(bowl), (seed, pose)
-    assert all(count > SCENES / 8 * 0.6 for count in offering.values()), offering
+    least = dict.fromkeys(offering, 0.6) | {"costmap": 0.5}  # where the arm reaches past the tables as well
+    assert all(count > SCENES / 8 * least[kind] for kind, count in offering.items()), offering
 
 
 @pytest.mark.slow
