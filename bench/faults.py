@@ -86,7 +86,6 @@ def faults_on(server: Server) -> list[Fault]:
         Fault("disk full, ext4", disks.FullDisksOn("ext4"), 2, 200, 50),
         Fault("disk full, XFS", disks.FullDisksOn("xfs"), 2, 200, 50),
         Fault("disk full, btrfs", disks.FullDisksOn("btrfs"), 2, 200, 50),
-        Fault("deleted spool", disks.deleted_spools, 6, 300, 50),
         Fault("crafted frames", crafted_frames.crafted_folders, 2, 300, 50),
         Fault("deleted database", deletions.deleted_databases, 3, 200, 20),
         Fault("disk full, database", databases.full_disks, 5, 500, 100),

@@ -203,9 +203,9 @@ class MemoryStatus(NamedTuple):
         drained: whether a process drains the queue now.
         writer: the state of the writer thread; None with a daemon.
         unadopted: by folder of a dead recorder that could not be recovered, the error.
-        spool_fault: the last fault of the queue's files (a failed sync; deleted or replaced files, and the folder in
-            which recording continues); None without one.
-        spool_lost: the records lost with deleted files, one line for each run of positions.
+        spool_fault: the fault of the queue's files that ended the recording (a failed sync, or deleted or replaced
+            files); None without one.
+        spool_lost: the positions of the records that deleted or replaced files took before they were stored, one line.
         declarations_unrepeated: the number of declarations that one segment contains and the later ones had no space
             to repeat: if the log goes back, their episodes can be healed only while that segment is kept.
         unrecorded: the number of nodes, episodes and other reports that came after the memory was closed, or in a
@@ -253,7 +253,7 @@ class MemoryStatus(NamedTuple):
             episodes_continued=recorder.episodes.continued_count,
             writer=parts.writer.state if isinstance(parts.writer, WriterThread) else None,
             unadopted=dict(unadopted),
-            spool_fault=queue.setback,
+            spool_fault=None if queue.failure is None else str(queue.failure),
             spool_lost=queue.lost,
             declarations_unrepeated=queue.declarations_unrepeated,
             unrecorded=emitter.unrecorded,
@@ -601,8 +601,8 @@ class RecordingMemory(ReadableMemory, ABC):
     async def synced(self) -> None:
         """Wait until all events recorded so far survive a power loss.
 
-        Raises `SpoolUnavailable` if the disk fails, or if files of the spool were deleted or replaced. Recording then
-        continues in a new folder if one can be created, and `status` lists the lost records.
+        Raises `SpoolUnavailable` if the disk failed, or files of the spool were deleted or replaced. Since then nothing
+        is recorded, and `status` has the reason.
         """
         await self._open_parts.queue.synced_to(self._open_parts.queue.written)
 

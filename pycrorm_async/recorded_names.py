@@ -24,7 +24,6 @@ _MOVED: Final = {
     ("projections.schema.materialised_views", "projections.generations"): "ViewRefused",
     ("projections.verify.parts", "projections.findings"): "Unreadable",
     ("query.recorded_designator", "query.again"): "NotPerformable",
-    ("queue.live.relocatable_appender", "queue.appender"): "AppenderRelocated",
     ("recall.following", "recall.answer"): "Relation",
     ("recording.values.value_snapshot", "record.values"): "UnrecordableValue",
     ("recording.writing.emitter", "record.episode_writer"): "BlobRefused",

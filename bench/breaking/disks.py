@@ -1,4 +1,4 @@
-"""Fill the disk of a recorder, delete its spool, and cut the power of a real disk, on file systems in images."""
+"""Fill the disk of a recorder, and cut the power of a real disk, on file systems in images."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ import shutil
 import struct
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -23,18 +22,17 @@ from bench.breaking.files import events_of, put
 from bench.breaking.outcome import Event, Outcome, Step
 from bench.breaking.processes import ChildProcess, RecordedSteps, compare_steps, walk
 from pycrorm_async.clock import SYSTEM_CLOCK
-from pycrorm_async.errors import SpoolDamaged, SpoolFull, SpoolUnavailable
+from pycrorm_async.errors import SpoolFull, SpoolUnavailable
 from pycrorm_async.events.codec import Record
 from pycrorm_async.events.ids import episode_id, episode_text
 from pycrorm_async.operations.recovery import recover
 from pycrorm_async.queue import RecorderQueue, Spool, open_dead
 from pycrorm_async.settings import Settings
-from tests.queue.factories import drain, episode, node, started
-from tests.queue.test_deleted_files import DELETIONS
+from tests.queue.factories import drain, episode
 
 # === disks ====================================================================================================
 #
-# Fill the disk of a recorder, on each kind of file system, and delete the spool of a running recorder.
+# Fill the disk of a recorder, on each kind of file system.
 
 _SIZE: Final = {"ext4": "64M", "xfs": "320M", "btrfs": "128M"}
 """The smallest size that each mkfs accepts."""
@@ -42,10 +40,6 @@ _SETTINGS: Final = Settings(
     sync_interval_ms=1, segment_bytes=2**17, spool_bytes_max=2**24, spool_reserve_bytes=2**18, record_bytes_max=2**12
 )
 _LONGEST_LIFE_S: Final = 0.2
-_EVENTS_BEFORE_DELETION: Final = 25
-"""Events that are synced before the first deletion."""
-_PUTS_PER_DELETION: Final = 40
-"""Mean number of puts between two deletions."""
 
 
 # --- a full disk ---------------------------------------------------------------------------------------------------
@@ -155,119 +149,7 @@ def _print_put(event: Event) -> None:
     print("put", event[1], event[2], flush=True)
 
 
-# --- a deleted spool -----------------------------------------------------------------------------------------------
-
-
-def deleted_spools(rounds: int, rng: random.Random, folder: Path, step: Step) -> Outcome:
-    """Delete files at random under a recorder and kill it: synced events exist or are reported as lost."""
-    outcome = Outcome(note="folder, segment, lock or spool deleted, replaced or renamed")
-    for _ in range(rounds):
-        place = Path(tempfile.mkdtemp(dir=folder))
-        recorder = ChildProcess(_record_during_deletions, str(place / "spool"), rng.randrange(2**31))
-        try:
-            recorder.wait_for("synced")
-            time.sleep(rng.random() * _LONGEST_LIFE_S)
-            lines = recorder.kill()
-        finally:
-            recorder.stop()
-        is_unnoticed = lines[-1][0] == "deleting"
-        _compare(outcome, lines, asyncio.run(_folders(place / "spool", unnoticed=is_unnoticed)))
-        shutil.rmtree(place)
-        step()
-    return outcome
-
-
-def _compare(outcome: Outcome, lines: list[list[str]], folders: list[tuple[list[Record], bool]]) -> None:
-    """Count one round. `folders` holds, in order of recovery, the records of each and if an episode is open in it."""
-    synced, lost, deleting = 0, set[int](), False
-    for word, *numbers in lines:
-        if word == "synced":
-            synced, deleting = int(numbers[0]), False
-        elif word == "lost":
-            lost |= set(range(int(numbers[0]), int(numbers[1]) + 1))
-        else:
-            deleting = True
-    if deleting:  # killed before it could notice the deletion and report it
-        synced = 0
-    by_sequence: dict[int, Event] = {}
-    for number, (records, is_open) in enumerate(folders):
-        by_sequence |= {each[1]: each for each in events_of(records)}
-        # A later folder continues an episode that recovery closed.
-        outcome.corrupted += is_open and any(later for later, _ in folders[number + 1 :])
-    expected = [_event(sequence) for sequence in range(1, synced + 1)]
-    last = max(by_sequence, default=0)
-    missing = [
-        each for each in range(1, max(last, synced) + 1) if each not in by_sequence and (deleting or each in lost)
-    ]
-    outcome.reported += sum(each <= synced for each in missing)
-    # Insert the reported events at their positions, so that the order of the others can be compared.
-    events = by_sequence | {each: _event(each) for each in missing}
-    outcome.compare(
-        expected, [events[each] for each in sorted(events)], put=[_event(each) for each in range(1, last + 1)]
-    )
-
-
-def _event(sequence: int) -> Event:
-    return episode_text(_EPISODE), sequence, _payload(sequence).hex()
-
-
-async def _folders(spool: Path, *, unnoticed: bool = False) -> list[tuple[list[Record], bool]]:
-    recovered = []
-    for folder in Spool(spool).recorders():
-        try:
-            queue = open_dead(folder.path)
-            assert queue is not None, "its process is dead"
-            records = await drain(queue)
-        except SpoolDamaged:
-            if not unnoticed:
-                raise
-            continue  # some files are missing, and no process noticed it before; the damage is reported, not silent
-        recovered.append((records, bool(queue.lost)))
-        queue.release()
-    return recovered
-
-
-def _record_during_deletions(spool: str, seed: int) -> None:
-    rng = random.Random(seed)
-    settings = Settings(
-        sync_interval_ms=rng.choice((1, 1000)),
-        segment_bytes=rng.choice((2**13, 2**20)),
-        spool_bytes_max=2**26,
-        spool_reserve_bytes=2**14,
-        record_bytes_max=2**11,
-    )
-    queue = _queue(Path(spool), settings)
-    queue.put_nowait(started(), _payload(1))
-    asyncio.run(_put_and_delete(queue, rng))
-
-
-async def _put_and_delete(queue: RecorderQueue, rng: random.Random) -> None:
-    reported = 0
-    for sequence in count(2):
-        while True:
-            try:
-                queue.put_nowait(node(), _payload(sequence))
-                break
-            except SpoolUnavailable:  # its segments are full, and the new folder does not exist yet
-                await asyncio.sleep(0.001)
-        if sequence > _EVENTS_BEFORE_DELETION and rng.random() < 1 / _PUTS_PER_DELETION:
-            print("deleting", flush=True)
-            with suppress(OSError):  # the recorder moves to a new folder at this moment
-                rng.choice(DELETIONS)(queue)
-        if sequence == _EVENTS_BEFORE_DELETION or (sequence > _EVENTS_BEFORE_DELETION and rng.random() < 0.2):
-            with suppress(SpoolUnavailable):
-                await queue.synced_to()
-                for line in queue.lost[reported:]:
-                    print("lost", line.split()[1], line.split()[3].rstrip(":"), flush=True)
-                reported = len(queue.lost)
-                print("synced", sequence, flush=True)
-
-
 _EPISODE: Final = episode(1)
-
-
-def _payload(sequence: int) -> bytes:
-    return b"%d " % sequence * 8
 
 
 def _queue(spool: Path, settings: Settings = _SETTINGS) -> RecorderQueue:
@@ -277,7 +159,11 @@ def _queue(spool: Path, settings: Settings = _SETTINGS) -> RecorderQueue:
 
 async def _recover_only(folder: Path) -> list[Record]:
     """Recover the only recorder of the spool, and return its records."""
-    [(records, _)] = await _folders(folder.parent)
+    [recorder] = Spool(folder.parent).recorders()
+    queue = open_dead(recorder.path)
+    assert queue is not None, "its process is dead"
+    records = await drain(queue)
+    queue.release()
     return records
 
 

@@ -1,21 +1,20 @@
 """Append records to mapped segments: assign position, sequence and times, and write the frame.
 
 **Theory of operation.** Two kinds of actors use an appender. *Producers*, any threads, call `put`. The *sync thread*
-(`sync_thread.py`) syncs, preallocates and trims segments (`appender.py`). No consumer touches it: the consumer
-reads the files.
+(`sync_thread.py`) syncs, preallocates and trims segments. No consumer touches it: the consumer reads the files.
 
 A segment is first *prepared* (allocated ahead, all zero), then *current* (producers write into it), then *sealed*
 (full, but not covered by a sync yet), and finally closed. `begun` lists the segments with records that are not deleted,
 `open` the open episodes with their last sequence and times.
 
-One lock, `_gc_lock`, protects all of this state; `appender.py` explains why the garbage collector is off while it
-is held. Under the lock a producer takes the next position and sequence, reads the clocks and copies the frame into the
-mapping, so that positions, sequences and times increase together and a refused event leaves no gap. A producer makes no
-system call under the lock, with one exception: when it fills the current segment before the sync thread has prepared
-the next one, it allocates that segment itself, or waits for the sync thread's allocation. `_making` keeps both from
-allocating the same segment. The order is `_gc_lock`, then `_making`; the sync thread takes only `_making` for its
-allocation, so that producers can go on, and pauses the garbage collector meanwhile, because a finalizer that records
-would wait for `_making` in the same thread.
+One lock, `_gc_lock`, protects all of this state; `GcSafeLock` explains why the garbage collector is off while it is
+held. Methods marked `locked` take it. Under the lock a producer takes the next position and sequence, reads the clocks
+and copies the frame into the mapping, so that positions, sequences and times increase together and a refused event
+leaves no gap. A producer makes no system call under the lock, with one exception: when it fills the current segment
+before the sync thread has prepared the next one, it allocates that segment itself, or waits for the sync thread's
+allocation. `_making` keeps both from allocating the same segment. The order is `_gc_lock`, then `_making`; the sync
+thread takes only `_making` for its allocation, so that producers can go on, and pauses the garbage collector meanwhile,
+because a finalizer that records would wait for `_making` in the same thread.
 
 A KeyboardInterrupt can arrive at any call. The steps that write a record and update the bookkeeping make no calls, so
 either all or none of them happen. The header is written after the body: a body without a header does not decode. A kill
@@ -30,17 +29,14 @@ that header lists the episodes open before it.
 from __future__ import annotations
 
 import errno
-import gc
 import mmap
 import threading
 from collections.abc import Callable, Mapping
-from functools import partial
 from gc import disable, enable, isenabled
 from itertools import pairwise
 from pathlib import Path
 from threading import get_ident
-from types import MappingProxyType
-from typing import Final, NamedTuple, TypeVar
+from typing import Final, NamedTuple
 from zlib import crc32
 
 from pycrorm_async.clock import Clock
@@ -57,7 +53,6 @@ from pycrorm_async.events.codec import Heading, Receipt
 from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.queue.format import (
     CHECKSUM_START,
-    COMMIT,
     COMMIT_BYTES,
     DECLARATION,
     EPISODE_ENDED,
@@ -67,12 +62,10 @@ from pycrorm_async.queue.format import (
     NO_EPISODE,
     SEGMENT_BYTES_MAX,
     TYPE_BYTES_MAX,
-    Fields,
     Frame,
     LastRecord,
     Segment,
     SegmentHeader,
-    decode_each,
     encode,
     encode_body,
     encode_commit,
@@ -81,13 +74,18 @@ from pycrorm_async.queue.format import (
     header_bytes,
     salt_of,
 )
+from pycrorm_async.queue.gc_safe_lock import GcSafeLock, locked
 from pycrorm_async.settings import Settings
 
-NOTHING_OPEN: Final[Mapping[EpisodeId, LastRecord]] = MappingProxyType({})
 FULL: Final = frozenset({errno.ENOSPC, errno.EDQUOT})
 """Errors of a full disk."""
 OUT_OF_RESOURCES: Final = FULL | frozenset({errno.EMFILE, errno.ENFILE, errno.ENOMEM})
 """Errors that may pass: a put that meets one is refused as if the spool were full, and the sync thread retries."""
+_TOUCHED_BYTES_MAX: Final = 2**18
+"""Bounds the bytes made writable ahead, during which the interpreter lock is held: 64 pages take 0.4 ms."""
+
+
+# === appender ===============================================================================================
 
 
 class SegmentStart(NamedTuple):
@@ -99,11 +97,19 @@ class SegmentStart(NamedTuple):
     opened: Mapping[EpisodeId, LastRecord]
 
 
+class Span(NamedTuple):
+    """The records of one sync: those up to `position`, `records` of them new, and the files that hold them."""
+
+    position: int
+    records: int
+    checksum: int
+    segments: tuple[Segment, ...]
+
+
 class Appender:
     """An appender for any thread. Calls `wake` at the first record of a span and `hurry` after it began a segment.
 
-    `make_room` frees a number of bytes on a full disk; it returns False if it has none to free. The first record gets
-    position `after` + 1; `opened` are the episodes open before it.
+    `make_room` frees a number of bytes on a full disk; it returns False if it has none to free.
     """
 
     def __init__(
@@ -116,8 +122,6 @@ class Appender:
         wake: Callable[[], None],
         hurry: Callable[[], None],
         make_room: Callable[[int], bool],
-        after: int = 0,
-        opened: Mapping[EpisodeId, LastRecord] = NOTHING_OPEN,
     ) -> None:
         self._folder = folder
         self._recorder = recorder
@@ -131,15 +135,16 @@ class Appender:
         self._making = threading.Lock()
         self._type_names: dict[str, bytes] = {}
 
-        self.position = after
+        self.position = 0
         self.declarations = Declarations(capacity.descriptions_bytes_max)
-        self.open: dict[EpisodeId, tuple[int, int, int]] = dict(opened)
+        self.open: dict[EpisodeId, tuple[int, int, int]] = {}
         self.begun: list[SegmentStart] = []
         self._refusal: Callable[[], PycrormError] | None = None
         self.stuck: str | None = None  # why no segment will be deleted any more
         self._span_count = 0
         self._span_checksum = 0
         self._quiet = True
+        self._touched_from = 0
         self._refused_bytes = 0
         self.blob_bytes = 0
         """Bytes of the blobs beside the segments, which share their limit."""
@@ -295,7 +300,7 @@ class Appender:
         frame_bytes = max(self._refused_bytes, HEADER_BYTES)
         if self._offset + frame_bytes <= (self._end if reserved else self._ordinary_end):
             return True
-        return self._gc_lock.run(partial(self._admits, frame_bytes, reserved=reserved))
+        return self._admits_now(frame_bytes, reserved=reserved)
 
     @property
     def end(self) -> int:
@@ -303,15 +308,26 @@ class Appender:
         return self._offset
 
     @property
+    @locked
     def bytes_held(self) -> int:
         """Bytes of the segments with records; the current one counts up to its last frame."""
-        return self._gc_lock.run(lambda: (len(self.begun) - 1) * self._capacity.segment_bytes + self._offset)
+        return (len(self.begun) - 1) * self._capacity.segment_bytes + self._offset
+
+    @property
+    @locked
+    def segments(self) -> tuple[Segment, ...]:
+        """The mapped segments: full ones that no sync covers yet, and the current one."""
+        return (*self._sealed, self._current)
 
     def full_error(self, reason: str) -> PycrormError:
         """Return the error that a put into a full spool raises."""
         if self.stuck is None:
             return SpoolFull(f"spool {self._folder} is full: {reason}")
         return SpoolStuck(f"spool {self._folder} is full ({reason}) and cannot be emptied: {self.stuck}")
+
+    @locked
+    def _admits_now(self, frame_bytes: int, *, reserved: bool) -> bool:
+        return self._admits(frame_bytes, reserved=reserved)
 
     def _admits(self, frame_bytes: int, *, reserved: bool) -> bool:
         return self._capacity.admits(
@@ -336,11 +352,9 @@ class Appender:
         blobs = -(-self.blob_bytes // self._capacity.segment_bytes)
         return max(0, self._capacity.segments_max - len(self.begun) - blobs)
 
+    @locked
     def reserve_blob(self, size: int) -> bool:
         """Take this many bytes for a blob, or return them if negative; False if records would find no space then."""
-        return self._gc_lock.run(partial(self._reserve_blob, size))
-
-    def _reserve_blob(self, size: int) -> bool:
         if size > 0 and self._refusal is not None:
             raise self._refusal()
         before, self.blob_bytes = self.blob_bytes, max(0, self.blob_bytes + size)
@@ -372,20 +386,113 @@ class Appender:
         self._hurry()  # the sync thread retries until the disk has space
         return self.full_error(reason)
 
+    # --- the sync thread ---------------------------------------------------------------------------------------
+
+    @locked
+    def begin_sync(self) -> Span:
+        """Return the span since the last call; the next record begins a new span and wakes the sync thread."""
+        span = Span(self.position, self._span_count, self._span_checksum, (*self._sealed, self._current))
+        self._span_count = self._span_checksum = 0
+        self._quiet = True
+        return span
+
+    @locked
+    def append_commit(self, span: Span) -> Segment:
+        """Append the commit frame of a synced span; return the segment that holds it, which the caller must sync."""
+        frame = encode_commit(
+            position=span.position,
+            count=span.records,
+            checksum=span.checksum,
+            wall_ns=self._wall_ns(),
+            monotonic_ns=self._monotonic_ns(),
+            salt=self._salt,
+        )
+        end = self._offset + COMMIT_BYTES
+        assert end <= self._capacity.segment_bytes, "space for commit frames is reserved"
+        self._buffer[self._offset : end] = frame
+        self._offset = end
+        return self._current
+
+    def touch_ahead(self) -> None:
+        """Make the pages of the next records writable, as many as the last span took; a sync made all read-only.
+
+        A page fault takes three times as long as a put. More pages than that would be written at each sync for nothing.
+        """
+        segment, offset = self._current, self._offset  # without the lock: a page too few or too many does no harm
+        taken = min(max(1, offset - self._touched_from), _TOUCHED_BYTES_MAX)
+        self._touched_from = offset
+        segment.touch(offset, offset + taken)
+
+    def end_sync(self, span: Span) -> None:
+        """Close the segments that were full when the span was taken: they are complete and on the disk."""
+        for segment in self._complete(span):
+            segment.close()
+
+    @locked
+    def _complete(self, span: Span) -> list[Segment]:
+        done = [segment for segment in self._sealed if segment in span.segments[:-1]]
+        self._sealed = [segment for segment in self._sealed if segment not in done]
+        return done
+
+    def prepare(self) -> bool:
+        """Allocate the next segment ahead if there is none; True if the disk has no space. Raises `OSError`."""
+        if self._prepared is not None or not self._segments_left():
+            return False
+        try:
+            # Holding `_gc_lock` during the allocation would block producers. Without it a finalizer could record in
+            # this thread and wait for `_making`, which the thread holds: so only pause the garbage collector.
+            self._gc_lock.pause_gc()
+            with self._making:
+                refused = self._prepare()
+        finally:
+            self._gc_lock.resume_gc()
+        self._note_preparation(refused)
+        return refused is not None
+
+    def _prepare(self) -> str | None:
+        if self._prepared is not None:
+            return None
+        try:
+            self._prepared = self._allocate(self._current.number + 1)
+        except OSError as error:
+            if error.errno not in OUT_OF_RESOURCES:
+                raise
+            return error.strerror
+        return None
+
+    @locked
+    def _note_preparation(self, refused: str | None) -> None:
+        if refused is not None or self._prepared is not None:  # else a put has used it, and may have met a full disk
+            self._disk_refused = refused
+        self._set_limits()
+        self._forget_refused()
+
+    def trimmable(self, *, stored: int, safe_number: int) -> list[SegmentStart]:
+        """List the segments that may be deleted: their records are stored, and the next header is on the disk."""
+        begun = self.begun
+        return [
+            segment
+            for segment, following in pairwise(begun)
+            if following.base - 1 <= stored and following.number <= safe_number
+        ]
+
+    @locked
+    def trimmed(self, deleted: list[SegmentStart]) -> None:
+        """Note that these segments are deleted."""
+        self.begun = [segment for segment in self.begun if segment not in deleted]
+        self._set_limits()
+        self._forget_refused()
+
     # --- ending ------------------------------------------------------------------------------------------------
 
+    @locked
     def refuse(self, refusal: Callable[[], PycrormError]) -> None:
         """Refuse every record from now on; the first refusal stays."""
-        self._gc_lock.run(partial(self._refuse, refusal))
-
-    def _refuse(self, refusal: Callable[[], PycrormError]) -> None:
         self._refusal = self._refusal or refusal
 
+    @locked
     def close(self) -> None:
         """Close mappings and files; call `refuse` first."""
-        self._gc_lock.run(self._close)
-
-    def _close(self) -> None:
         for segment in (*self._sealed, self._current, self._prepared):
             if segment is not None:
                 segment.close()
@@ -567,298 +674,3 @@ class Declarations:
             offset += len(encoded)
             checksum = crc32(encoded[CHECKSUM_START:HEADER_BYTES], checksum)
         return AppendState(offset, position, records, checksum)
-
-
-# === gc safe lock =============================================================================================
-#
-# Provide a lock that disables garbage collection while held, so that a finalizer cannot try to acquire it again.
-#
-# **Theory of operation.** The garbage collector may run at any allocation, from Python 3.12 on at the first call after
-# it, in any thread, and close a suspended plan there; the plan's `finally` records its end. In a thread that holds the
-# queue's lock, this put would write a record inside a half-written one. So the lock's holder disables the collector.
-#
-# The thread takes the lock first and disables the collector second. In the other order two threads could interleave,
-# and leave the collector off for ever, or on while one of them holds the lock. `paused` records whether this lock's
-# holder turned the collector off; only the holder reads or writes it.
-#
-# A collection that became due before may still run until `gc.disable` has returned, and the next one as soon as
-# `gc.enable` has. Nothing is half-written at these moments, so the lock is reentrant: a put from a finalizer is done
-# there, inside the other one. It leaves `paused` as it needs it itself, so the outer put assigns it once more.
-#
-# `owner` is set while a record may be half-written. The collector is one switch for the whole process, so another queue
-# or the program itself may turn it on meanwhile, and a signal handler may run at any time. A thread that meets its own
-# id raises `InternalError`. Other threads may read a stale `owner`, but never their own id.
-#
-# `pause_gc` extends the pause beyond the lock, for a thread that takes a second lock which a put may need too
-# (`Appender._making`). It hands the pause from `paused` to `_pause_extended` under the lock, so there is no moment in
-# between at which the collector is on; `resume_gc` hands it back.
-
-_T = TypeVar("_T")
-
-
-class GcSafeLock:
-    """A lock and the pause of the garbage collector that belongs to it. `Appender.put` inlines `run` for speed."""
-
-    __slots__ = ("_pause_extended", "lock", "owner", "paused")
-
-    def __init__(self) -> None:
-        self.lock = threading.RLock()
-        self.owner = 0
-        self.paused = False
-        self._pause_extended = False
-
-    def run(self, work: Callable[[], _T]) -> _T:
-        """Do the work under the lock. Raises `InternalError` if this thread is doing such work already.
-
-        Not a context manager, because a KeyboardInterrupt in our `__enter__` would leave the lock taken.
-        """
-        thread = threading.get_ident()
-        if self.owner == thread:
-            raise self.reentered()
-        with self.lock:
-            try:
-                self.paused = paused = gc.isenabled()
-                gc.disable()
-                self.paused, self.owner = paused, thread
-                return work()
-            finally:
-                self.owner = 0
-                if self.paused:
-                    self.paused = False
-                    gc.enable()
-
-    def reentered(self) -> InternalError:
-        """Return the error for a thread that would wait for itself."""
-        return InternalError("this thread is recording already: a signal handler or a finalizer cannot record now")
-
-    def pause_gc(self) -> None:
-        """Disable the collector until `resume_gc`, without the lock; for one thread that takes another lock inside."""
-        self.run(self._pause_gc)
-
-    def resume_gc(self) -> None:
-        """Undo `pause_gc`. Idempotent."""
-        self.run(self._resume_gc)
-
-    def abandon(self) -> None:
-        """Enable the collector in a forked child, which may lack the thread that would end the pause."""
-        if self._pause_extended or self.paused:
-            gc.enable()
-
-    def _pause_gc(self) -> None:
-        # `run` keeps the collector off here, so handing over the pause leaves no gap.
-        self._pause_extended, self.paused = self.paused, False
-
-    def _resume_gc(self) -> None:
-        self._pause_extended, self.paused = False, self.paused or self._pause_extended
-
-
-# === syncable appender ========================================================================================
-#
-# Let the sync thread sync, preallocate and trim the segments that an `Appender` fills.
-#
-# The theory of operation is in `appender.py`. Only the sync thread calls these methods.
-
-_TOUCHED_BYTES_MAX: Final = 2**18
-"""Bounds the bytes made writable ahead, during which the interpreter lock is held: 64 pages take 0.4 ms."""
-
-
-class Span(NamedTuple):
-    """The records of one sync: those up to `position`, `records` of them new, and the files that hold them."""
-
-    position: int
-    records: int
-    checksum: int
-    segments: tuple[Segment, ...]
-
-
-class SyncableAppender(Appender):
-    """An appender with the operations of the sync thread."""
-
-    _touched_from = 0
-
-    def begin_sync(self) -> Span:
-        """Return the span since the last call; the next record begins a new span and wakes the sync thread."""
-        return self._gc_lock.run(self._begin_sync)
-
-    def _begin_sync(self) -> Span:
-        span = Span(self.position, self._span_count, self._span_checksum, (*self._sealed, self._current))
-        self._span_count = self._span_checksum = 0
-        self._quiet = True
-        return span
-
-    def append_commit(self, span: Span) -> Segment:
-        """Append the commit frame of a synced span; return the segment that holds it, which the caller must sync."""
-        return self._gc_lock.run(partial(self._append_commit, span))
-
-    def _append_commit(self, span: Span) -> Segment:
-        frame = encode_commit(
-            position=span.position,
-            count=span.records,
-            checksum=span.checksum,
-            wall_ns=self._wall_ns(),
-            monotonic_ns=self._monotonic_ns(),
-            salt=self._salt,
-        )
-        end = self._offset + COMMIT_BYTES
-        assert end <= self._capacity.segment_bytes, "space for commit frames is reserved"
-        self._buffer[self._offset : end] = frame
-        self._offset = end
-        return self._current
-
-    def touch_ahead(self) -> None:
-        """Make the pages of the next records writable, as many as the last span took; a sync made all read-only.
-
-        A page fault takes three times as long as a put. More pages than that would be written at each sync for nothing.
-        """
-        segment, offset = self._current, self._offset  # without the lock: a page too few or too many does no harm
-        taken = min(max(1, offset - self._touched_from), _TOUCHED_BYTES_MAX)
-        self._touched_from = offset
-        segment.touch(offset, offset + taken)
-
-    def end_sync(self, span: Span) -> None:
-        """Close the segments that were full when the span was taken: they are complete and on the disk."""
-        for segment in self._gc_lock.run(partial(self._end_sync, span)):
-            segment.close()
-
-    def _end_sync(self, span: Span) -> list[Segment]:
-        done = [segment for segment in self._sealed if segment in span.segments[:-1]]
-        self._sealed = [segment for segment in self._sealed if segment not in done]
-        return done
-
-    def prepare(self) -> bool:
-        """Allocate the next segment ahead if there is none; True if the disk has no space. Raises `OSError`."""
-        if self._prepared is not None or not self._segments_left():
-            return False
-        try:
-            # Holding `_gc_lock` during the allocation would block producers. Without it a finalizer could record in
-            # this thread and wait for `_making`, which the thread holds: so only pause the garbage collector.
-            self._gc_lock.pause_gc()
-            with self._making:
-                refused = self._prepare()
-        finally:
-            self._gc_lock.resume_gc()
-        self._gc_lock.run(partial(self._note_preparation, refused))
-        return refused is not None
-
-    def _prepare(self) -> str | None:
-        if self._prepared is not None:
-            return None
-        try:
-            self._prepared = self._allocate(self._current.number + 1)
-        except OSError as error:
-            if error.errno not in OUT_OF_RESOURCES:
-                raise
-            return error.strerror
-        return None
-
-    def _note_preparation(self, refused: str | None) -> None:
-        if refused is not None or self._prepared is not None:  # else a put has used it, and may have met a full disk
-            self._disk_refused = refused
-        self._set_limits()
-        self._forget_refused()
-
-    def trimmable(self, *, stored: int, safe_number: int) -> list[SegmentStart]:
-        """List the segments that may be deleted: their records are stored, and the next header is on the disk."""
-        begun = self.begun
-        return [
-            segment
-            for segment, following in pairwise(begun)
-            if following.base - 1 <= stored and following.number <= safe_number
-        ]
-
-    def trimmed(self, deleted: list[SegmentStart]) -> None:
-        """Note that these segments are deleted."""
-        self._gc_lock.run(partial(self._trimmed, deleted))
-
-    def _trimmed(self, deleted: list[SegmentStart]) -> None:
-        self.begun = [segment for segment in self.begun if segment not in deleted]
-        self._set_limits()
-        self._forget_refused()
-
-
-# === relocatable appender =====================================================================================
-#
-# Carry an appender's records to a successor in another folder, while threads keep putting.
-#
-# `relocation.py` describes the whole move.
-
-_EPISODE_ENDED: Final = EPISODE_ENDED.encode()
-_LATE_BYTES: Final = 2**16
-"""Bounds the bytes carried while the lock is held and producers wait: half a millisecond of work."""
-
-
-class AppenderRelocated(InternalError):
-    """This appender has handed over to its successor. Never leaves the queue, which retries the put there."""
-
-
-class RelocatableAppender(SyncableAppender):
-    """An appender that can succeed another one and hand over to a successor."""
-
-    @property
-    def segments(self) -> tuple[Segment, ...]:
-        """The mapped segments: full ones that no sync covers yet, and the current one."""
-        return self._gc_lock.run(lambda: (*self._sealed, self._current))
-
-    def carry(self, record: Fields) -> None:
-        """Append a record of another appender; it keeps its position, sequence and times."""
-        self._gc_lock.run(partial(self._carry, record))
-
-    def hand_over(
-        self, successor: RelocatableAppender, segment: Segment, offset: int, *, switch: Callable[[], None]
-    ) -> bool:
-        """Carry the records behind `offset` of this segment, refuse later puts (`AppenderRelocated`), call `switch`.
-
-        Holds the lock, so producers see one step. Returns False without effect if too many bytes are left for that.
-        Raises `SpoolUnavailable` if the mapping does not contain the records that were put.
-        """
-        return self._gc_lock.run(partial(self._hand_over, successor, segment, offset, switch))
-
-    def settle(self, folder: Path) -> None:
-        """Note that the folder was renamed to this path."""
-        self._gc_lock.run(partial(self._settle, folder))
-
-    def _carry(self, record: Fields) -> None:
-        kind, _, position, sequence, wall_ns, monotonic_ns, episode, name, _, _, size = record
-        if position != self.position + 1:
-            raise SpoolUnavailable(self._folder, f"position {self.position + 1} cannot be read in the old folder")
-        if self._offset + size > self._end:
-            self._roll()
-        frame = encode(Frame(*record), self._salt)
-        self._buffer[self._offset : self._offset + size] = frame
-        self._offset += size
-        self.position = position
-        self._span_count += 1
-        self._span_checksum = crc32(frame[CHECKSUM_START:HEADER_BYTES], self._span_checksum)
-        if kind == EVENT:
-            self.open[EpisodeId(episode)] = (sequence, wall_ns, monotonic_ns)
-            if name == _EPISODE_ENDED:
-                del self.open[EpisodeId(episode)]
-
-    def _hand_over(
-        self, successor: RelocatableAppender, segment: Segment, offset: int, switch: Callable[[], None]
-    ) -> bool:
-        late_bytes = self._offset - offset
-        if segment is not self._current or late_bytes > min(_LATE_BYTES, successor._end - successor._offset):
-            return False
-        for record in decode_each(self._buffer, offset, self._salt):
-            if record[0] != COMMIT:
-                successor.carry(record)
-        if successor.position != self.position:
-            raise SpoolUnavailable(
-                segment.path, f"contains records only up to position {successor.position} of {self.position}"
-            )
-        successor.stuck = self.stuck
-        # Only now: repeating declarations before would shift the positions of carried records.
-        successor.declarations = self.declarations
-        if self._refusal is not None:
-            successor.refuse(self._refusal)
-        self._refusal = lambda: AppenderRelocated("the queue has moved to another folder")
-        switch()
-        return True
-
-    def _settle(self, folder: Path) -> None:
-        self._folder = folder
-        for segment in (*self._sealed, self._current, self._prepared):
-            if segment is not None:
-                segment.path = folder / segment.path.name
-        self.begun = [each._replace(path=folder / each.path.name) for each in self.begun]

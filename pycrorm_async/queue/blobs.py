@@ -18,14 +18,14 @@ import shutil
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import partial
 from hashlib import sha256
 from pathlib import Path
 from typing import Final
 
 from pycrorm_async.errors import SpoolFull
-from pycrorm_async.queue.appender import FULL, GcSafeLock
+from pycrorm_async.queue.appender import FULL
 from pycrorm_async.queue.format import sync_folder
+from pycrorm_async.queue.gc_safe_lock import GcSafeLock, locked
 from pycrorm_async.queue.locks import BLOBS, KEPT_BLOBS, MAKING, STORED, create_folder, create_folders, open_file
 
 # === blob files ===============================================================================================
@@ -132,8 +132,7 @@ def _folders(folder: Path) -> list[Path]:
 # declaration, which every segment repeats, is never released. A released blob is taken away when all segments up to the
 # last record at its release are taken away. So a blob stays as long as any segment that refers to it.
 #
-# One lock protects the registry; no file is read or written under it, except while the queue moves to another folder. A
-# put that meets such a move finds another folder when it registers, and puts again.
+# One lock protects the registry; no file is read or written under it.
 
 _BLOCK_BYTES: Final = 4_096
 _FULL_REASON: Final = "spool_bytes_max is reached"
@@ -156,7 +155,7 @@ class LiveBlobs:
         self._folder = folder
         self._reserve = reserve
         self._make_room = make_room
-        self._lock = GcSafeLock()
+        self._gc_lock = GcSafeLock()
         self._blobs: dict[str, _Blob] = {}
         self._names = itertools.count(1)
 
@@ -165,49 +164,48 @@ class LiveBlobs:
     def put(self, content: bytes) -> str:
         """Write a blob unless it is here; hold it until `release`; return its name. Raises `SpoolFull`, `OSError`."""
         name = sha256(content).hexdigest()
-        while not self._lock.run(partial(self._hold, name)):
-            folder = self._folder
-            size = _rounded(len(content))
-            if not self._reserve(size):
-                raise SpoolFull(f"spool {folder.parent} is full: {_FULL_REASON}")
-            registered = False
-            try:
-                self._write(folder / BLOBS, name, content)
-                registered = self._lock.run(partial(self._register, folder, name, size))
-            finally:
-                if not registered:
-                    self._reserve(-size)
-            if registered:
-                break
+        if self._hold(name):
+            return name
+        size = _rounded(len(content))
+        if not self._reserve(size):
+            raise SpoolFull(f"spool {self._folder.parent} is full: {_FULL_REASON}")
+        registered = False
+        try:
+            self._write(self._folder / BLOBS, name, content)
+            registered = self._register(name, size)
+        finally:
+            if not registered:
+                self._reserve(-size)
         return name
 
-    def release(self, name: str, position: int) -> None:
-        """State that no record behind this position will refer to the blob because of one put. Ignores other names."""
-        self._lock.run(partial(self._release, name, position))
-
     @property
+    @locked
     def size(self) -> int:
         """The bytes that all blobs take on the disk."""
-        return self._lock.run(lambda: sum(each.size for each in self._blobs.values()))
+        return sum(each.size for each in self._blobs.values())
 
     def abandon(self) -> None:
         """Detach in a forked child."""
-        self._lock.abandon()
-        self._lock, self._blobs = GcSafeLock(), {}
+        self._gc_lock.abandon()
+        self._gc_lock, self._blobs = GcSafeLock(), {}
 
+    @locked
     def _hold(self, name: str) -> bool:
         blob = self._blobs.get(name)
         if blob is not None:
             blob.holders += 1
         return blob is not None
 
-    def _register(self, folder: Path, name: str, size: int) -> bool:
-        if folder != self._folder or name in self._blobs:
-            return False
-        self._blobs[name] = _Blob(size)
-        return True
+    @locked
+    def _register(self, name: str, size: int) -> bool:
+        """Note the blob; return False if another thread has put it meanwhile, and hold that one."""
+        blob = self._blobs.setdefault(name, _Blob(size, holders=0))
+        blob.holders += 1
+        return blob.holders == 1
 
-    def _release(self, name: str, position: int) -> None:
+    @locked
+    def release(self, name: str, position: int) -> None:
+        """State that no record behind this position will refer to the blob because of one put. Ignores other names."""
         blob = self._blobs.get(name)
         if blob is not None and blob.holders:
             blob.holders -= 1
@@ -233,56 +231,40 @@ class LiveBlobs:
 
     # --- the sync thread ----------------------------------------------------------------------------------------
 
-    def sync(self) -> list[str]:
-        """Write the new blobs to the disk; return the names of those whose file is missing. Raises `OSError`."""
-        new = self._lock.run(lambda: [name for name, blob in self._blobs.items() if not blob.synced])
-        if not new:
-            return []
-        missing = []
+    def sync(self) -> None:
+        """Write the new blobs to the disk. Raises `OSError`, also for one that another program has deleted."""
+        new = self._new()
         for name in new:
-            try:
-                _sync_file(self._folder / BLOBS / name)
-            except FileNotFoundError:
-                missing.append(name)
-        with suppress(FileNotFoundError):
+            _sync_file(self._folder / BLOBS / name)
+        if new:
             sync_folder(self._folder / BLOBS)
-        sync_folder(self._folder)
-        self._lock.run(partial(self._note_synced, new, missing))
-        return missing
+            sync_folder(self._folder)
+            self._note_synced(new)
 
-    def take(self, *, before: int) -> list[Path]:
-        """Forget the blobs to which no record from this position on refers, and return their files."""
-        return self._lock.run(partial(self._take, before))
+    @locked
+    def _new(self) -> list[str]:
+        return [name for name, blob in self._blobs.items() if not blob.synced]
 
-    def take_all(self) -> list[Path]:
-        """Forget all blobs and return their files; call it when no more records are put."""
-        return self._lock.run(lambda: [self._forget(name) for name in list(self._blobs)])
-
-    def move_to(self, folder: Path) -> None:
-        """Continue in another folder. Carries the blobs there unless the folder was only renamed. Raises `OSError`."""
-        self._lock.run(partial(self._move_to, folder))
-
-    def _note_synced(self, names: list[str], missing: list[str]) -> None:
-        for name in missing:
-            self._forget(name)  # so that a later put writes it again
+    @locked
+    def _note_synced(self, names: list[str]) -> None:
         for name in names:
             if name in self._blobs:
                 self._blobs[name].synced = True
 
-    def _take(self, before: int) -> list[Path]:
+    @locked
+    def take_all(self) -> list[Path]:
+        """Forget all blobs and return their files; call it when no more records are put."""
+        return [self._forget(name) for name in list(self._blobs)]
+
+    @locked
+    def take(self, *, before: int) -> list[Path]:
+        """Forget the blobs to which no record from this position on refers, and return their files."""
         free = [name for name, blob in self._blobs.items() if not blob.holders and blob.released < before]
         return [self._forget(name) for name in free]
 
     def _forget(self, name: str) -> Path:
         self._reserve(-self._blobs.pop(name).size)
         return self._folder / BLOBS / name
-
-    def _move_to(self, folder: Path) -> None:
-        if self._folder.exists():
-            carry_blobs(self._folder, folder)
-        self._folder = folder
-        for blob in self._blobs.values():
-            blob.synced = False
 
 
 def _fill(path: Path, content: bytes) -> None:

@@ -5,9 +5,22 @@ a disk. On return the event is *written*: it survives `kill -9`. The sync thread
 `get_batch` return it; `acknowledge` makes it *stored*.
 
 After a failed sync the queue refuses every new event with the disk's error (`recorder_queue.py`), and still supplies
-the events synced before. It cannot continue in a new file, because it has no second copy of the unsynced records. If
-the files were deleted or replaced instead, the mapped memory is such a copy, and the queue moves to another folder
-(`relocation.py`).
+the events synced before. It cannot continue in a new file, because it has no second copy of the unsynced records. Files
+that another program has deleted or replaced end the queue in the same way, within a sync: nothing is acknowledged any
+more, because the sync of a file without a name succeeds and keeps nothing.
+
+**Theory of operation.** Three actors share a queue. The *sync thread* alone changes the files and, in `_turn`, the
+positions. *Producers* put through `_appender` and wait for space on `_room_notifier`. The *consumer* and callers of
+`synced_to` read `_synced` and wait on `_notifier`. Each attribute is replaced in one step, so the readers need no lock:
+they test their condition again after every notification.
+
+A turn does the following, in this order. It syncs the blobs and records put so far, appends a commit frame and syncs
+that. Then it compares the files it holds with those in the folder, and only then advances `_synced`. It exchanges
+positions with the drainer of another process. It deletes the segments whose records are all stored, and prepares the
+next segment.
+
+A sync that fails is never repeated on the same files, because the kernel may have dropped the pages it could not
+write. The queue *fails*: it refuses every later put with the disk's error, and supplies the records synced before.
 """
 
 from __future__ import annotations
@@ -15,15 +28,13 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-import os
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
+from typing import Final
 
 from pycrorm_async.clock import Clock
 from pycrorm_async.errors import (
-    DamageError,
     FilesError,
     InternalError,
     PycrormError,
@@ -32,12 +43,11 @@ from pycrorm_async.errors import (
     SpoolUnavailable,
 )
 from pycrorm_async.events.codec import Heading, Receipt, Record
-from pycrorm_async.events.ids import EpisodeId, episode_id, episode_text
-from pycrorm_async.queue.appender import NOTHING_OPEN, AppenderRelocated, Capacity, RelocatableAppender
+from pycrorm_async.events.ids import EpisodeId, episode_text
+from pycrorm_async.queue.appender import Appender, Capacity
 from pycrorm_async.queue.blobs import LiveBlobs
-from pycrorm_async.queue.format import Batch, Cursor, LastRecord, Place, Reader, Segment, header_bytes
+from pycrorm_async.queue.format import Batch, Cursor, Place, Reader, Segment, header_bytes
 from pycrorm_async.queue.locks import ALIVE, DRAIN, FileIdentity, FileLock, call_in_forked_child, is_locked
-from pycrorm_async.queue.relocation import Home, move
 from pycrorm_async.queue.sources import DeadLetters
 from pycrorm_async.queue.spool import (
     DrainStatus,
@@ -52,352 +62,9 @@ from pycrorm_async.queue.stored_segments import StoredSegments
 from pycrorm_async.queue.sync_thread import Notifier, SyncThread
 from pycrorm_async.settings import Settings
 
-# === queue files ==============================================================================================
-#
-# Sync, acknowledge, trim and move the files of a live queue, in turns of the sync thread.
-#
-# **Theory of operation.** Three actors share a `QueueFiles`. The sync thread alone changes the files and, in `_turn`,
-# the positions and the state of a move. Producers put through `_appender` and wait for space on `_room_notifier`. The
-# consumer and callers of `synced_to` read `_synced`, `_setbacks`, `_checks` and wait on `_notifier`. Each attribute is
-# written by one thread, except those a producer or the consumer only sets to request work (`_check_requested`,
-# `_stored`), and each is replaced in one step, so the readers need no lock: they test their condition again after every
-# notification.
-#
-# A turn does the following, in this order. It syncs the blobs and records put so far, appends a commit frame and syncs
-# that. Then it compares the files it holds with those in the folder, because syncing a deleted file succeeds, and only
-# then advances `_synced`. It exchanges positions with the drainer of another process. It deletes the segments whose
-# records are all stored, and prepares the next segment.
-#
-# If a file was deleted or replaced, the queue is *displaced*: `_synced` stays, `synced_to` raises, and the turn moves
-# the queue to another folder (`relocation.py`). It retries with growing pauses until the move succeeds or the queue is
-# closed. Records that a move loses are noted in `_lost` and raised once by `synced_to`.
-#
-# A sync that fails is never repeated on the same files, because the kernel may have dropped the pages it could not
-# write. The queue *fails*: it refuses every later put with the disk's error, and supplies the records synced before.
-
 PROGRESS_INTERVAL_S = 0.05
 """Interval at which the sync thread reads `progress` while segments or producers wait for another process, and the
 longest pause before it asks a full disk for space again."""
-_MOVE_RETRY_S_MAX = 5.0
-"""Bounds the pause before a displaced queue tries again to create a folder."""
-
-
-class QueueFiles:
-    """The part of a queue that the sync thread maintains; `RecorderQueue` adds the producers and the consumer."""
-
-    def __init__(
-        self, *, folder: Path, recorder: bytes, settings: Settings, clock: Clock, alive: FileLock, offered: bool
-    ) -> None:
-        """Allocate the first segments; `alive` is the held lock in the folder. Raises `SpoolUnavailable`."""
-        self._spool = folder.parent
-        self._settings = settings
-        self._clock = clock
-        self._former_locks: list[FileLock] = []  # `alive` of the folders this queue has moved from
-        self._log_id: str | None = None
-        self._notifier = Notifier()
-        self._room_notifier = Notifier()
-        self._synced = 0
-        self._stored = 0
-        self._failure: PycrormError | None = None
-        self._has_refused = False  # a record, because of the failure
-        self._displaced: SpoolUnavailable | None = None  # set until the queue has moved
-        self._setback: SpoolUnavailable | None = None
-        self._setbacks = 0
-        self._lost: tuple[str, ...] = ()
-        self._lost_reported = 0
-        self._unreported_loss: SpoolUnavailable | None = None  # a loss that `synced_to` has not raised yet
-        self._check_requested = False
-        self._checks = 0
-        self._closed = False
-        self._released = False
-        self._safe_number = 0
-        self._sync_interval_s = settings.sync_interval_ms / 1000
-        self._stored_segments = StoredSegments(folder.parent, settings, wall_ns=clock.wall_ns)
-        self._blobs = LiveBlobs(
-            folder,
-            reserve=self._reserve_blob,
-            make_room=self._stored_segments.make_room,
-        )
-        self._sync_thread = SyncThread(name=folder.name, interval_s=self._sync_interval_s, turn=self._turn)
-        with wrap_os_errors(folder):
-            self._appender = self._appender_in(folder, recorder)
-            if self._appender.prepare():
-                self._sync_thread.call_in(PROGRESS_INTERVAL_S)
-            self._drain_status = DrainStatusReader(folder) if offered else None
-            place = Place(folder, recorder, Cursor(1, header_bytes(0), 0))
-            self._home = Home(place, alive, FileIdentity.of(folder.stat()), self._appender, self._drain_status)
-
-    @property
-    def place(self) -> Place:
-        """The folder the queue writes in; another one after its files were deleted or replaced (`relocation.py`)."""
-        return self._home.place
-
-    @property
-    def folder(self) -> Path:
-        return self._home.place.folder
-
-    @property
-    def name(self) -> str:
-        return self._home.place.folder.name
-
-    @property
-    def failure(self) -> PycrormError | None:
-        """The error that makes the queue refuse records; None while it accepts them, and after `close`."""
-        return self._failure
-
-    @property
-    def setback(self) -> str | None:
-        """The last loss of files or failure, with the folder where recording continues; None without one."""
-        error = self._failure or self._setback
-        return None if error is None else str(error)
-
-    @property
-    def lost(self) -> tuple[str, ...]:
-        """Descriptions of the records lost with deleted files, whether synced or not."""
-        return self._lost
-
-    @property
-    def written(self) -> int:
-        """Position of the last record put: records up to it survive the death of the process."""
-        return self._appender.position
-
-    @property
-    def synced(self) -> int:
-        """Last synced position: records up to it survive the death of the machine."""
-        return self._synced
-
-    @property
-    def stored(self) -> int:
-        """Last acknowledged position."""
-        if self._drain_status is None:
-            return self._stored
-        return max(self._stored, self._drain_status.read(synced=self._synced).stored)
-
-    @property
-    def external_drain_status(self) -> DrainStatus | None:
-        """The drain status from another process, if plausible; None if this process drains the queue."""
-        return None if self._drain_status is None else self._drain_status.read(synced=self._synced)
-
-    def ends_at(self, position: int) -> bool:
-        """Return whether no record will follow this position."""
-        return self._failure is not None or (self._closed and position == self.written)
-
-    async def check_files(self) -> None:
-        """Wait until the sync thread has compared its files with the folder, and has moved the queue if they differ."""
-        if self._released:
-            return
-        checks, self._check_requested = self._checks, True
-        self._sync_thread.hurry()
-        await self._notifier.until(
-            lambda: self._failure is not None or (self._checks > checks and self._displaced is None)
-        )
-
-    @property
-    def _over(self) -> bool:
-        return self._closed or self._failure is not None
-
-    # --- the sync thread ---------------------------------------------------------------------------------------
-
-    def _turn(self) -> float | None:
-        """Sync, trim, prepare the next segment; return the seconds until the next turn is needed, or None."""
-        if self._failure is not None:
-            return None
-        check_requested, self._check_requested = self._check_requested, False
-        try:
-            if self._displaced is None:
-                self._sync(check=check_requested)
-            if self._displaced is not None and not self._move():
-                self._report_check(check_requested=check_requested)
-                return min(_MOVE_RETRY_S_MAX, self._sync_interval_s * (1 << min(self._setbacks, 10)))
-            published = self._drain_status is None or self._exchange(self._drain_status)
-            self._trim()
-            full = self._prepare()
-            self._report_check(check_requested=check_requested)
-        except OSError as error:
-            if self._note_missing(self._appender.segments):  # the next turn moves the queue
-                self._report_check(check_requested=check_requested)
-                return 0.0
-            self._fail(SpoolUnavailable(self.folder, error.strerror or str(error)))
-            return None
-        except BaseException as error:
-            self._fail(InternalError(f"the sync thread of {self.folder} failed: {error!r}"))
-            raise
-        if full:
-            return min(self._sync_interval_s, PROGRESS_INTERVAL_S)  # plans may wait for the space
-        waiting = self._drain_status is not None and (self._room_notifier.awaited or len(self._appender.begun) > 1)
-        return PROGRESS_INTERVAL_S if waiting or not published else None
-
-    def _exchange(self, drain_status: DrainStatusReader) -> bool:
-        """Publish the synced position to the drainer and read its status; False if publishing failed."""
-        published = self._publish(drain_status)
-        status = drain_status.read(synced=self._synced)
-        self._stored = max(self._stored, status.stored)
-        if status.note.failure != self._appender.stuck:
-            self._appender.stuck = status.note.failure
-            self._room_notifier.notify_all()
-        return published
-
-    def _report_check(self, *, check_requested: bool) -> None:
-        if check_requested:
-            self._checks += 1
-            self._notifier.notify_all()
-
-    def _sync(self, *, check: bool = False) -> None:
-        span = self._appender.begin_sync()
-        if span.records == 0:
-            if check:
-                self._note_missing(span.segments)
-            return
-        for segment in span.segments:
-            segment.sync()
-        self._note_lost_blobs(self._blobs.sync())
-        # Append the commit frame only now: if it were synced together with its records, a power cut could keep the
-        # frame and lose a record, and an ordinary torn tail would look like damage.
-        committed = self._appender.append_commit(span)
-        committed.sync()
-        if self._note_missing((*span.segments, committed)):
-            return
-        self._appender.end_sync(span)
-        self._appender.touch_ahead()
-        self._safe_number = span.segments[-1].number
-        self._synced = span.position
-        if self._drain_status is not None:
-            self._publish(self._drain_status)  # before waiters of this process run
-        self._notifier.notify_all()
-
-    def _reserve_blob(self, size: int) -> bool:
-        return self._appender.reserve_blob(size)  # of the current appender, which a move replaces
-
-    def _note_lost_blobs(self, names: Sequence[str]) -> None:
-        if names:
-            self._lost += tuple(f"blob {name}" for name in names)
-            _log.error("%s: these blobs were deleted before they were stored: %s", self.folder, ", ".join(names))
-
-    # --- moving ------------------------------------------------------------------------------------------------
-
-    def _missing(self, segments: Sequence[Segment]) -> Path | None:
-        """Return the first of our files whose name is missing or names another file."""
-        if not self._home.alive.identity.is_at(self.folder / ALIVE):
-            return self.folder / ALIVE
-        return next((segment.path for segment in dict.fromkeys(segments) if not segment.is_in_place), None)
-
-    def _note_missing(self, segments: Sequence[Segment]) -> bool:
-        path = self._missing(segments)
-        if path is None:
-            return False
-        self._displaced = SpoolUnavailable(path, "was deleted or replaced while the queue wrote to it")
-        self._note_setback(self._displaced)
-        return True
-
-    def _note_setback(self, setback: SpoolUnavailable) -> None:
-        if self._setback is None or str(setback) != str(self._setback):
-            _log.error("%s", setback)
-        self._setback = setback
-        self._setbacks += 1
-        self._notifier.notify_all()
-
-    def _move(self) -> bool:
-        """Move the queue to a new folder with all readable records, and sync; False if that must be retried."""
-        displaced = self._displaced
-        assert displaced is not None
-        try:
-            with wrap_os_errors(self._spool):
-                self._stored = max(self._stored, self.stored)
-                move(
-                    self._home,
-                    spool=self._spool,
-                    access=self._settings.file_access,
-                    recorder=episode_id(self._clock.wall_ns(), os.urandom(10)),
-                    stored=self._stored,
-                    appender_in=self._appender_in,
-                    switch_home=self._switch_home,
-                )
-        except (FilesError, DamageError) as error:
-            reason = f"{displaced.reason}, and recording cannot continue in a new folder: {error}"
-            self._note_setback(SpoolUnavailable(displaced.path, reason))
-            if self._closed and self._setback is not None:
-                self._fail(self._setback)
-            return False
-        if self._log_id is not None:
-            with suppress(FilesError):  # a failed note is harmless: this process drains into the right log
-                Spool(self._spool, self._settings.file_access).bind(self._log_id)
-        losses = self._lost[self._lost_reported :]
-        lost = f"lost are {'; '.join(losses)}" if losses else "no record is lost"
-        moved = SpoolUnavailable(displaced.path, f"{displaced.reason}; recording continues in {self.folder}, {lost}")
-        # Set these before the sync, because `synced_to` returns after it.
-        self._setback, self._lost_reported = moved, len(self._lost)
-        if losses:
-            self._unreported_loss = moved
-        _log.error("%s", moved)
-        self._displaced = None
-        self._sync()
-        return self._displaced is None
-
-    def _switch_home(self, home: Home, lost: tuple[str, ...]) -> None:
-        """Switch the queue to this home; called under the old appender's lock.
-
-        Notes the lost records here, because the rest of the move may fail and be retried from the new folder.
-        """
-        self._blobs.move_to(home.place.folder)
-        home.appender.blob_bytes = self._blobs.size
-        self._lost += lost
-        if home.alive is not self._home.alive:
-            self._former_locks.append(self._home.alive)
-        self._home, self._appender, self._drain_status = home, home.appender, home.drain_status
-        self._safe_number = 0
-
-    def _appender_in(
-        self, folder: Path, recorder: bytes, after: int = 0, opened: Mapping[EpisodeId, LastRecord] = NOTHING_OPEN
-    ) -> RelocatableAppender:
-        return RelocatableAppender(
-            folder=folder,
-            recorder=recorder,
-            capacity=Capacity.of(self._settings),
-            clock=self._clock,
-            wake=self._sync_thread.wake,
-            hurry=self._sync_thread.hurry,
-            make_room=self._stored_segments.make_room,
-            after=after,
-            opened=opened,
-        )
-
-    def _publish(self, drain_status: DrainStatusReader) -> bool:
-        return drain_status.publish(synced=self._synced, closed=self._closed and self._synced == self.written)
-
-    def _trimmable(self) -> bool:
-        return bool(self._appender.trimmable(stored=self._stored, safe_number=self._safe_number))
-
-    def _trim(self) -> None:
-        segments = self._appender.trimmable(stored=self._stored, safe_number=self._safe_number)
-        for segment in segments:
-            following = self._appender.begun[self._appender.begun.index(segment) + 1]
-            self._stored_segments.keep(segment.path, blobs=self._blobs.take(before=following.base))
-        if segments:
-            self._appender.trimmed(segments)
-            self._room_notifier.notify_all()
-
-    def _prepare(self) -> bool:
-        if self._closed:
-            return False
-        if self._appender.prepare():
-            return True
-        self._room_notifier.notify_all()  # plans that wait since a put met a full disk
-        return False
-
-    def _fail(self, error: PycrormError) -> None:
-        _log.error("recording has stopped: %s", error)
-        self._failure = error
-        self._appender.refuse(partial(self._refused_after, error))
-        self._notifier.notify_all()
-        self._room_notifier.notify_all()
-
-    def _refused_after(self, error: PycrormError) -> PycrormError:
-        self._has_refused = True
-        return error
-
-
-# === recorder queue ===========================================================================================
-
 _LAST_SYNC_S = 30.0
 """Bounds the time that `release` waits for the last sync; a disk that takes longer has failed."""
 _log = logging.getLogger("pycrorm_async")
@@ -405,7 +72,7 @@ _WAIT_WARNING_S = 2.0
 """A wait for room logs one warning if it takes longer than this."""
 
 
-class RecorderQueue(QueueFiles):
+class RecorderQueue:
     """A queue whose items survive the process; `create` makes it, for one recorder in one process.
 
     Any thread or task may put. The consumer is one task of one event loop, in any thread; its first `get_batch` takes
@@ -416,9 +83,41 @@ class RecorderQueue(QueueFiles):
     def __init__(
         self, *, folder: Path, recorder: bytes, settings: Settings, clock: Clock, alive: FileLock, offered: bool
     ) -> None:
-        """Use `create`, which makes and locks the folder first. Raises `SpoolUnavailable`."""
-        super().__init__(folder=folder, recorder=recorder, settings=settings, clock=clock, alive=alive, offered=offered)
-        self._source = OwnSource(self, self._notifier)
+        """Use `create`, which makes and locks the folder first; `alive` is that lock. Raises `SpoolUnavailable`."""
+        self.folder: Final = folder
+        self.name: Final = folder.name
+        self._clock = clock
+        self._alive = alive
+        self._log_id: str | None = None
+        self._notifier = Notifier()
+        self._room_notifier = Notifier()
+        self._synced = 0
+        self._stored = 0
+        self._failure: PycrormError | None = None
+        self._has_refused = False  # a record, because of the failure
+        self._is_displaced = False
+        self._closed = False
+        self._released = False
+        self._safe_number = 0
+        self._sync_interval_s = settings.sync_interval_ms / 1000
+        self._stored_segments = StoredSegments(folder.parent, settings, wall_ns=clock.wall_ns)
+        self._sync_thread = SyncThread(name=folder.name, interval_s=self._sync_interval_s, turn=self._turn)
+        with wrap_os_errors(folder):
+            self._appender = Appender(
+                folder=folder,
+                recorder=recorder,
+                capacity=Capacity.of(settings),
+                clock=clock,
+                wake=self._sync_thread.wake,
+                hurry=self._sync_thread.hurry,
+                make_room=self._stored_segments.make_room,
+            )
+            if self._appender.prepare():
+                self._sync_thread.call_in(PROGRESS_INTERVAL_S)
+            self._drain_status = DrainStatusReader(folder) if offered else None
+            self._identity = FileIdentity.of(folder.stat())
+        self._blobs = LiveBlobs(folder, reserve=self._appender.reserve_blob, make_room=self._stored_segments.make_room)
+        self._source = OwnSource(self, self._notifier, Place(folder, recorder, Cursor(1, header_bytes(0), 0)))
         call_in_forked_child(self._abandon)
         self._sync_thread.start()
 
@@ -463,10 +162,7 @@ class RecorderQueue(QueueFiles):
             InternalError: an event before its `EpisodeStarted` or after its `EpisodeEnded`, or a record above
                 `record_bytes_max` that no segment can hold. The hooks put neither.
         """
-        try:
-            return self._appender.put(heading, payload, reserved, receipt)
-        except AppenderRelocated:  # the queue moved while this thread waited for the lock
-            return self.put_nowait(heading, payload, reserved=reserved, receipt=receipt)
+        return self._appender.put(heading, payload, reserved, receipt)
 
     def put_blob(self, content: bytes) -> str:
         """Write a blob and return its name, the SHA-256 of the content, for events put afterwards to refer to.
@@ -544,6 +240,48 @@ class RecorderQueue(QueueFiles):
     # --- positions ---------------------------------------------------------------------------------------------
 
     @property
+    def failure(self) -> PycrormError | None:
+        """The error that makes the queue refuse records; None while it accepts them, and after `close`."""
+        return self._failure
+
+    @property
+    def lost(self) -> tuple[str, ...]:
+        """A description of the records that deleted or replaced files took before they were stored; empty else."""
+        if self._is_displaced and self.stored < self.written:
+            return (f"positions {self.stored + 1} to {self.written}",)
+        return ()
+
+    @property
+    def written(self) -> int:
+        """Position of the last record put: records up to it survive the death of the process."""
+        return self._appender.position
+
+    @property
+    def synced(self) -> int:
+        """Last synced position: records up to it survive the death of the machine."""
+        return self._synced
+
+    @property
+    def stored(self) -> int:
+        """Last acknowledged position."""
+        if self._drain_status is None:
+            return self._stored
+        return max(self._stored, self._drain_status.read(synced=self._synced).stored)
+
+    @property
+    def external_drain_status(self) -> DrainStatus | None:
+        """The drain status from another process, if plausible; None if this process drains the queue."""
+        return None if self._drain_status is None else self._drain_status.read(synced=self._synced)
+
+    def ends_at(self, position: int) -> bool:
+        """Return whether no record will follow this position."""
+        return self._failure is not None or (self._closed and position == self.written)
+
+    @property
+    def _over(self) -> bool:
+        return self._closed or self._failure is not None
+
+    @property
     def is_drained(self) -> bool:
         """True if a task of this process or another process is draining the queue now."""
         with wrap_os_errors(self.folder):
@@ -565,34 +303,29 @@ class RecorderQueue(QueueFiles):
         May be called from any event loop; concurrent calls share one sync.
 
         Raises:
-            SpoolUnavailable: the disk failed before they were synced, or a record was refused since; or the files were
-                deleted or replaced, and a later call succeeds once the queue has moved. If the move lost records, one
-                call raises an error that names them.
+            SpoolUnavailable: the disk failed, or the files were deleted or replaced, before they were synced; or a
+                record was refused since.
             SpoolClosed: in a forked child, for records that were not synced before the fork.
         """
         target = self.written if position is None else position
-        setbacks, checks = self._setbacks, self._checks
-        if self._synced >= target and not self._closed:  # no sync would notice deleted files
-            must_check = self._displaced is not None or self._missing(self._appender.segments) is not None
-        else:
-            must_check = self._displaced is not None
-        if self._synced < target or must_check:
-            self._check_requested = self._check_requested or must_check
+        if self._synced < target:
             self._sync_thread.hurry()
-            await self._notifier.until(
-                lambda: (
-                    self._failure is not None
-                    or self._setbacks != setbacks
-                    or (self._synced >= target and (not must_check or self._checks > checks))
-                )
-            )
-        if self._failure is not None and (self._synced < target or self._has_refused):
+            await self._notifier.until(lambda: self._failure is not None or self._synced >= target)
+        elif not self._closed:
+            self.check_files()  # which no sync would notice
+        if self._failure is not None and (self._synced < target or self._has_refused or self._is_displaced):
             raise self._failure
-        if self._setbacks != setbacks and self._setback is not None:
-            raise self._setback
-        if self._unreported_loss is not None:
-            unreported, self._unreported_loss = self._unreported_loss, None
-            raise unreported
+
+    def check_files(self) -> bool:
+        """Return whether the files are those of this queue; if not, refuse every record from now on."""
+        if self._failure is not None or self._released:
+            return False
+        path = self._missing(self._appender.segments)
+        if path is not None:
+            self._is_displaced = True
+            reason = "was deleted or replaced while the queue wrote to it: nothing is recorded until the next start"
+            self._fail(SpoolUnavailable(path, reason))
+        return path is None
 
     # --- the consumer ------------------------------------------------------------------------------------------
 
@@ -611,7 +344,7 @@ class RecorderQueue(QueueFiles):
         assert position <= self._source.reader.cursor.position, "only supplied records can be acknowledged"
         if self._log_id is None:
             with contextlib.suppress(FilesError):
-                self._log_id = Spool(self._spool).log_id()
+                self._log_id = Spool(self.folder.parent).log_id()
         self._stored = max(self._stored, position)
         if self._trimmable():
             self._sync_thread.hurry()
@@ -631,10 +364,7 @@ class RecorderQueue(QueueFiles):
         May be called from any thread. Events that fit are still accepted; waiting for space that does not come raises
         `SpoolStuck`, now or later.
         """
-        appender = None
-        while appender is not self._appender:  # the sync thread may replace it meanwhile
-            appender = self._appender
-            appender.stuck = appender.stuck or reason
+        self._appender.stuck = self._appender.stuck or reason
         self._room_notifier.notify_all()
 
     # --- the end -----------------------------------------------------------------------------------------------
@@ -643,10 +373,7 @@ class RecorderQueue(QueueFiles):
         """Refuse further events and request the last sync; `get_batch` supplies the rest, then an empty list."""
         if self._closed:
             return
-        appender = None
-        while appender is not self._appender:  # the sync thread may replace it meanwhile
-            appender = self._appender
-            appender.refuse(lambda: SpoolClosed(f"queue {self.name} is closed"))
+        self._appender.refuse(lambda: SpoolClosed(f"queue {self.name} is closed"))
         self._closed = True
         self._sync_thread.hurry()
         self._notifier.notify_all()
@@ -668,7 +395,7 @@ class RecorderQueue(QueueFiles):
         self._appender.close()
         try:
             all_stored = self._failure is None and self.stored == self.written and not self._appender.open
-            if all_stored and self._home.is_in_place:
+            if all_stored and self._identity.is_at(self.folder):
                 with wrap_os_errors(self.folder):
                     remove_made_ahead(self.folder)
                     self._keep_last_segments()
@@ -677,8 +404,7 @@ class RecorderQueue(QueueFiles):
             if self._drain_status is not None:
                 self._drain_status.close()
             self._source.release()
-            for lock in (self._home.alive, *self._former_locks):
-                lock.release()
+            self._alive.release()
 
     def _keep_last_segments(self) -> None:
         """Keep the last segments, whose records are all stored, for a database that goes back. Needs unmapped files."""
@@ -698,28 +424,121 @@ class RecorderQueue(QueueFiles):
         self._source.reader.close()
         self._notifier, self._room_notifier = Notifier(), Notifier()
 
+    # --- the sync thread ---------------------------------------------------------------------------------------
+
+    def _turn(self) -> float | None:
+        """Sync, trim, prepare the next segment; return the seconds until the next turn is needed, or None."""
+        if self._failure is not None:
+            return None
+        try:
+            if not self._sync():
+                return None
+            published = self._drain_status is None or self._exchange(self._drain_status)
+            self._trim()
+            full = self._prepare()
+        except OSError as error:
+            if self.check_files():
+                self._fail(SpoolUnavailable(self.folder, error.strerror or str(error)))
+            return None
+        except BaseException as error:
+            self._fail(InternalError(f"the sync thread of {self.folder} failed: {error!r}"))
+            raise
+        if full:
+            return min(self._sync_interval_s, PROGRESS_INTERVAL_S)  # plans may wait for the space
+        waiting = self._drain_status is not None and (self._room_notifier.awaited or len(self._appender.begun) > 1)
+        return PROGRESS_INTERVAL_S if waiting or not published else None
+
+    def _exchange(self, drain_status: DrainStatusReader) -> bool:
+        """Publish the synced position to the drainer and read its status; False if publishing failed."""
+        published = self._publish(drain_status)
+        status = drain_status.read(synced=self._synced)
+        self._stored = max(self._stored, status.stored)
+        if status.note.failure != self._appender.stuck:
+            self._appender.stuck = status.note.failure
+            self._room_notifier.notify_all()
+        return published
+
+    def _sync(self) -> bool:
+        """Sync what was put; return False if another program has deleted or replaced the files."""
+        span = self._appender.begin_sync()
+        if span.records == 0:
+            return True
+        for segment in span.segments:
+            segment.sync()
+        self._blobs.sync()
+        # Append the commit frame only now: if it were synced together with its records, a power cut could keep the
+        # frame and lose a record, and an ordinary torn tail would look like damage.
+        committed = self._appender.append_commit(span)
+        committed.sync()
+        if not self.check_files():
+            return False
+        self._appender.end_sync(span)
+        self._appender.touch_ahead()
+        self._safe_number = span.segments[-1].number
+        self._synced = span.position
+        if self._drain_status is not None:
+            self._publish(self._drain_status)  # before waiters of this process run
+        self._notifier.notify_all()
+        return True
+
+    def _missing(self, segments: Sequence[Segment]) -> Path | None:
+        """Return the first of our files whose name is missing or names another file."""
+        if not self._alive.identity.is_at(self.folder / ALIVE):
+            return self.folder / ALIVE
+        return next((segment.path for segment in dict.fromkeys(segments) if not segment.is_in_place), None)
+
+    def _publish(self, drain_status: DrainStatusReader) -> bool:
+        return drain_status.publish(synced=self._synced, closed=self._closed and self._synced == self.written)
+
+    def _trimmable(self) -> bool:
+        return bool(self._appender.trimmable(stored=self._stored, safe_number=self._safe_number))
+
+    def _trim(self) -> None:
+        segments = self._appender.trimmable(stored=self._stored, safe_number=self._safe_number)
+        for segment in segments:
+            following = self._appender.begun[self._appender.begun.index(segment) + 1]
+            self._stored_segments.keep(segment.path, blobs=self._blobs.take(before=following.base))
+        if segments:
+            self._appender.trimmed(segments)
+            self._room_notifier.notify_all()
+
+    def _prepare(self) -> bool:
+        if self._closed:
+            return False
+        if self._appender.prepare():
+            return True
+        self._room_notifier.notify_all()  # plans that wait since a put met a full disk
+        return False
+
+    def _fail(self, error: PycrormError) -> None:
+        _log.error("recording has stopped: %s", error)
+        self._failure = error
+        self._appender.refuse(partial(self._refused_after, error))
+        self._notifier.notify_all()
+        self._room_notifier.notify_all()
+
+    def _refused_after(self, error: PycrormError) -> PycrormError:
+        self._has_refused = True
+        return error
+
 
 # === own source ===============================================================================================
 #
 # Read synced records back from the folder of a live queue, in order, for the queue's one consumer.
 #
-# The source belongs to one task of one loop. The sync thread may move the queue to another folder at any time
-# (`relocation.py`) and publishes the new `Place`. The source switches to it at its next step and continues behind its
-# position. When a read fails, the source first asks the sync thread to check its files; if the queue then has moved,
-# the source repeats the read in the new folder.
+# The source belongs to one task of one loop.
 
 
 class OwnSource:
     """The consumer's side of a queue; it holds the lock `drain` from its first batch on."""
 
-    def __init__(self, queue: QueueFiles, notifier: Notifier) -> None:
+    def __init__(self, queue: RecorderQueue, notifier: Notifier, place: Place) -> None:
         self._queue = queue
         self._notifier = notifier
-        self._place = queue.place
         self._drain: FileLock | None = None
         self._released = False
-        self._dead_letters = DeadLetters(self._place.folder)
-        self.reader = Reader(self._place)
+        self._dead_letters = DeadLetters(queue.folder)
+        self.reader = Reader(place)
 
     @property
     def drains(self) -> bool:
@@ -727,17 +546,11 @@ class OwnSource:
 
     async def get_batch(self, *, events_max: int, bytes_max: int, age_s_max: float) -> list[Record]:
         """Implement `RecorderQueue.get_batch`."""
-        while True:
-            try:
-                self._switch_folder()
-                return await self._batch(events_max=events_max, bytes_max=bytes_max, age_s_max=age_s_max)
-            except (SpoolDamaged, SpoolUnavailable) as error:
-                if error is self._queue.failure:
-                    raise
-                if self._queue.place is self._place:
-                    await self._queue.check_files()
-                if self._queue.place is self._place:
-                    raise self._queue.failure or error from None
+        try:
+            return await self._batch(events_max=events_max, bytes_max=bytes_max, age_s_max=age_s_max)
+        except (SpoolDamaged, SpoolUnavailable) as error:
+            self._queue.check_files()  # a deleted file explains the error
+            raise self._queue.failure or error from None
 
     def dead_letter(self, records: Sequence[Record]) -> None:
         """Implement `RecorderQueue.dead_letter`."""
@@ -750,21 +563,6 @@ class OwnSource:
         self._dead_letters.release()
         if self._drain is not None:
             self._drain.release()
-
-    def _switch_folder(self) -> None:
-        """Continue in the queue's current folder, behind the last position; records lost in between are skipped."""
-        place = self._queue.place
-        if place is self._place:
-            return
-        reader = Reader(place)
-        with wrap_os_errors(place.folder):
-            reader.skip_to(self.reader.cursor.position)
-        self.reader.close()
-        self._dead_letters.release()
-        if self._drain is not None:
-            self._drain.release()
-        self._drain, self._dead_letters = None, DeadLetters(place.folder)
-        self.reader, self._place = reader, place
 
     async def _batch(self, *, events_max: int, bytes_max: int, age_s_max: float) -> list[Record]:
         self._take_drain()
@@ -781,18 +579,16 @@ class OwnSource:
         return batch.records
 
     def _has_news(self, position: int) -> bool:
-        return self._queue.synced > position or self._queue.ends_at(position) or self._queue.place is not self._place
+        return self._queue.synced > position or self._queue.ends_at(position)
 
     def _read(self, partial_batch: Batch | None, events_max: int, bytes_max: int) -> Batch:
-        if self._queue.place is not self._place:
-            raise SpoolUnavailable(self._place.folder, "is no longer used: the queue has moved to another folder")
-        with wrap_os_errors(self._place.folder):
+        with wrap_os_errors(self._queue.folder):
             last = self._queue.synced
             return self.reader.read(last=last, events_max=events_max, bytes_max=bytes_max, partial=partial_batch)
 
     def _take_drain(self) -> None:
         if self._drain is None and not self._released:
-            with wrap_os_errors(self._place.folder):
-                self._drain = FileLock.take(self._place.folder / DRAIN)
+            with wrap_os_errors(self._queue.folder):
+                self._drain = FileLock.take(self._queue.folder / DRAIN)
             if self._drain is None:
-                raise SpoolUnavailable(self._place.folder, "is being drained by another process")
+                raise SpoolUnavailable(self._queue.folder, "is being drained by another process")

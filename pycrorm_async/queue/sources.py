@@ -517,7 +517,7 @@ class LiveSource:
                 except (SpoolDamaged, SpoolUnavailable):
                     if self.is_alive:
                         raise
-                    return []  # the recorder moved to another folder (`relocation.py`), or it is dead
+                    return []  # its files were deleted, or it is dead
                 self._reader.cursor = batch.after
                 return batch.records
             await asyncio.sleep(pause_s)

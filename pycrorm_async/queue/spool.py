@@ -297,13 +297,8 @@ def folder_error(folder: Path, error: Exception) -> PycrormError:
 
 def make_folder(spool: Path, name: str, access: FileAccess = "owner") -> tuple[Path, FileLock]:
     """Create a recorder's folder, and the spool if missing; return it with its `alive`. Raises `SpoolUnavailable`."""
-    unfinished, alive = begin_folder(spool, name, access)
-    return finish_folder(unfinished), alive
-
-
-def begin_folder(spool: Path, name: str, access: FileAccess = "owner") -> tuple[Path, FileLock]:
-    """Create the folder under an unfinished name, which draining processes ignore. Raises `SpoolUnavailable`."""
-    unfinished = spool / f"{name}{MAKING}"
+    folder = spool / name
+    unfinished = spool / f"{name}{MAKING}"  # draining processes ignore it
     with wrap_os_errors(spool):
         check_file_system(spool)
         create_spool(spool, access)
@@ -311,19 +306,11 @@ def begin_folder(spool: Path, name: str, access: FileAccess = "owner") -> tuple[
         alive = FileLock.take(unfinished / ALIVE)
         if alive is None:
             raise SpoolUnavailable(unfinished, "was deleted while it was being created")
-    return unfinished, alive
-
-
-def finish_folder(unfinished: Path, *, replaced: Path | None = None) -> Path:
-    """Give the folder its final name, and delete `alive` in the folder it replaces. Raises `SpoolUnavailable`."""
-    folder = unfinished.with_name(unfinished.name.removesuffix(MAKING))
     with wrap_os_errors(folder):
         unfinished.rename(folder)
-        if replaced is not None:  # immediately: recovering it would end episodes that continue in the new folder
-            (replaced / ALIVE).unlink(missing_ok=True)
-        sync_folder(folder.parent)
-        sync_folder(folder.parent.parent)
-    return folder
+        sync_folder(spool)
+        sync_folder(spool.parent)
+    return folder, alive
 
 
 def remove_folder(folder: Path) -> None:
@@ -601,7 +588,7 @@ class Progress:
         call_in_forked_child(self.close)
 
     @classmethod
-    def make(cls, folder: Path, drained: DrainStatus = _NOTHING_DRAINED) -> Progress:
+    def make(cls, folder: Path) -> Progress:
         """Create the file; it gets its name only when it is complete. Raises `OSError`."""
         path = folder / PROGRESS
         unfinished = path.with_suffix(".making")
@@ -611,7 +598,7 @@ class Progress:
             os.pwrite(descriptor, _MAGIC, 0)
             progress = cls(descriptor)
             progress.write_recorder_status(RecorderStatus())
-            progress.write_drain_status(drained)
+            progress.write_drain_status(_NOTHING_DRAINED)
             unfinished.rename(path)
         except BaseException:
             os.close(descriptor)
@@ -712,11 +699,11 @@ def _shorten(text: str | None) -> str | None:
 class DrainStatusReader:
     """The recorder's side of `progress`. Constructing one offers the folder to a drainer in another process."""
 
-    def __init__(self, folder: Path, *, before: int = 0) -> None:
-        """Create `progress` and `drain`; this folder begins after position `before`. Raises `OSError`."""
+    def __init__(self, folder: Path) -> None:
+        """Create `progress` and `drain`. Raises `OSError`."""
         # Create `drain` here: a drainer that created it could recreate a folder that is being deleted.
         os.close(open_file(folder / DRAIN, os.O_WRONLY))
-        self._progress = Progress.make(folder, DrainStatus(before, before))
+        self._progress = Progress.make(folder)
         self._published = RecorderStatus()
 
     def publish(self, *, synced: int, closed: bool) -> bool:

@@ -52,7 +52,6 @@ FAULTS = [
     "disk full, ext4",
     "disk full, XFS",
     "disk full, btrfs",
-    "deleted spool",
     "crafted frames",
     "deleted database",
     "disk full, database",

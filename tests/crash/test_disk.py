@@ -25,7 +25,7 @@ from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.events.types import references_in
 from pycrorm_async.queue import RecorderQueue, blobs, open_dead
 from pycrorm_async.queue import format as queue_format
-from pycrorm_async.queue.appender import Span, SyncableAppender
+from pycrorm_async.queue.appender import Appender, Span
 from pycrorm_async.queue.blobs import is_whole
 from pycrorm_async.queue.format import EVENT, Segment, salt_of
 from pycrorm_async.queue.sync_thread import SyncThread
@@ -36,6 +36,7 @@ from tests.queue.factories import (
     drain,
     ended,
     episode,
+    eventually,
     lost,
     make,
     node,
@@ -125,15 +126,17 @@ async def test_a_record_refused_by_a_disk_that_failed_after_a_sync_is_not_report
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(*_: object, **__: object) -> Segment:
-        raise OSError(errno.EIO, os.strerror(errno.EIO))
+        number = errno.EIO if queue.synced == queue.written else errno.ENOSPC  # which is tried again
+        raise OSError(number, os.strerror(number))
 
     queue = make(tmp_path, settings=SLOW)
     queue.put_nowait(started(), b"{}")
     monkeypatch.setattr(Segment, "allocate", fail)
-    with contextlib.suppress(SpoolUnavailable):
-        while queue.failure is None:  # the sync thread prepares a segment when the last one was taken
+    with contextlib.suppress(SpoolFull):
+        while True:  # until the segments that were prepared before are full
             queue.put_nowait(node(), b"x" * 500, reserved=True)
-            await queue.synced_to()
+    await queue.synced_to()
+    await eventually(lambda: queue.failure is not None)
     assert queue.synced == queue.written
     await queue.synced_to()  # all that was put is there
     with pytest.raises(SpoolUnavailable, match="Input/output error"):
@@ -507,15 +510,15 @@ def machine_on(place: Path, rng: random.Random) -> Iterator[Machine]:
             machine.put_meanwhile()
             machine.cut()
 
-        begin_sync = SyncableAppender.begin_sync
+        begin_sync = Appender.begin_sync
 
-        def begun(appender: SyncableAppender) -> Span:
+        def begun(appender: Appender) -> Span:
             span = begin_sync(appender)
             machine.put_meanwhile()
             return span
 
         patch.setattr(Segment, "sync", watched)
-        patch.setattr(SyncableAppender, "begin_sync", begun)
+        patch.setattr(Appender, "begin_sync", begun)
         try:
             yield machine
         finally:

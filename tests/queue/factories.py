@@ -12,7 +12,7 @@ from pycrorm_async.errors import SpoolFull
 from pycrorm_async.events.codec import Heading, Record
 from pycrorm_async.events.ids import EpisodeId, episode_id, episode_text
 from pycrorm_async.queue import DeadSource, LiveSource, RecorderQueue, open_dead
-from pycrorm_async.queue.appender import Capacity, SyncableAppender
+from pycrorm_async.queue.appender import Appender, Capacity
 from pycrorm_async.queue.format import EVENT, Frame, encode, salt_of
 from pycrorm_async.queue.locks import MAKING
 from pycrorm_async.settings import Settings
@@ -122,7 +122,7 @@ class FolderWriter:
         self.folder = spool / episode_text(recorder)
         self.folder.mkdir(parents=True)
         (self.folder / "alive").touch()
-        self.appender = SyncableAppender(
+        self.appender = Appender(
             folder=self.folder,
             recorder=recorder,
             capacity=Capacity.of(settings),

@@ -15,8 +15,9 @@ from hypothesis import strategies as st
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import CallerError, SpoolClosed, SpoolFull, SpoolStuck
 from pycrorm_async.queue import RecorderQueue
-from pycrorm_async.queue.appender import Capacity, GcSafeLock, RelocatableAppender
+from pycrorm_async.queue.appender import Appender, Capacity
 from pycrorm_async.queue.format import Segment
+from pycrorm_async.queue.gc_safe_lock import GcSafeLock
 from pycrorm_async.settings import Settings
 from tests.queue.factories import (
     ALL,
@@ -216,7 +217,7 @@ async def test_a_wait_for_a_full_disk_ends_soon_after_the_disk_has_space(
         queue = make_queue()
     else:
         with monkeypatch.context() as patch:  # nothing is prepared, so that a put allocates the segment
-            patch.setattr(RelocatableAppender, "prepare", lambda _: False)
+            patch.setattr(Appender, "prepare", lambda _: False)
             queue = make_queue()
         monkeypatch.setattr(Segment, "allocate", allocate_when_there_is_space)
     queue.put_nowait(started(), b"{}", reserved=True)
