@@ -25,11 +25,9 @@ import inspect
 import logging
 import os
 import threading
-from abc import ABC, abstractmethod
-from collections.abc import AsyncGenerator, AsyncIterator, Callable, Coroutine, Iterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from contextlib import (
-    AbstractAsyncContextManager,
     AbstractContextManager,
     AsyncExitStack,
     ExitStack,
@@ -38,15 +36,13 @@ from contextlib import (
     suppress,
 )
 from dataclasses import replace
-from datetime import datetime
 from functools import partial, wraps
 from os import PathLike
 from pathlib import Path
 from types import MappingProxyType, TracebackType
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, ParamSpec, Self, TypeVar, overload
+from typing import TYPE_CHECKING, Any, Concatenate, NamedTuple, ParamSpec, Self, TypeVar, cast
 
 from sqlalchemy import Select
-from sqlalchemy.ext.asyncio import AsyncSession
 
 from pycrorm_async import __version__
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
@@ -55,7 +51,6 @@ from pycrorm_async.errors import CallerError, EpisodeParked, FlushTimeout, Pycro
 from pycrorm_async.events.codec import declaration_of
 from pycrorm_async.events.fields import checked_tags
 from pycrorm_async.events.ids import episode_id
-from pycrorm_async.events.types import Blob
 from pycrorm_async.operations.copy import tag_episode
 from pycrorm_async.operations.destination import expected_log, open_destination
 from pycrorm_async.operations.recovery import dead_queues
@@ -64,15 +59,11 @@ from pycrorm_async.plan.task import TaskTreeNode, experience
 from pycrorm_async.projections.custom import Projection, validate_projections
 from pycrorm_async.projections.generations import current_generation
 from pycrorm_async.projections.mapped_tables import UserView
-from pycrorm_async.query.episode_diff import EpisodeDiff
-from pycrorm_async.query.frames import BATCH_ROWS, Library
 from pycrorm_async.query.named_queries import EpisodeSummary
-from pycrorm_async.query.notebook import Episodes, TaskTree
-from pycrorm_async.query.question import AskedEpisode, FrameQuery, Question, SyncQuestion
+from pycrorm_async.query.question import Question, SyncQuestion
 from pycrorm_async.query.questions import Ask
 from pycrorm_async.query.reading import Reading, memory_html
-from pycrorm_async.query.snapshot import AnyEpisode, Moment
-from pycrorm_async.query.sql import DEFAULT_LIMITS, SqlLimits, SqlResult
+from pycrorm_async.query.snapshot import AnyEpisode
 from pycrorm_async.query.success import Kind, Source, success_figure, success_samples
 from pycrorm_async.queue.locks import call_in_forked_child
 from pycrorm_async.queue.recorder_queue import RecorderQueue
@@ -95,8 +86,6 @@ from pycrorm_async.world.bullet import watcher
 from pycrorm_async.writer.plan_writer import DelegatedWriter, WriterState, WriterThread
 
 if TYPE_CHECKING:
-    import pandas as pd
-    import pyarrow as pa
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
@@ -157,25 +146,6 @@ class Parts(NamedTuple):
             (experience, self.experience),
             (observations, self.observations),
         )
-
-
-class PartsHolder:
-    """A memory as its methods see it: with parts while it is open."""
-
-    _parts: Parts | None
-    _forked_parts: Parts | None = None
-    _last_status: Callable[[], MemoryStatus] | None = None
-    _clock: Clock
-    _address: DatabaseAddress
-    _located: DatabaseAddress
-
-    @property
-    def _open_parts(self) -> Parts:
-        if self._forked_parts is not None:
-            raise CallerError("this memory is open in the process that forked this one: open another one here")
-        if self._parts is None:
-            raise CallerError("this memory is not open: use `async with Memory.open(url) as memory`")
-        return self._parts
 
 
 def _reported(state: Any) -> str:
@@ -260,18 +230,60 @@ class MemoryStatus(NamedTuple):
         )
 
 
-# === memory reading ===========================================================================================
-#
-# `ReadableMemory` holds the queries of an open memory.
+# === memory ===================================================================================================
+
+_log = logging.getLogger("pycrorm_async")
+T = TypeVar("T")
+_P = ParamSpec("_P")
 
 
-class ReadableMemory(PartsHolder):
-    """The queries of a memory. Each raises `CallerError` while the memory is not open.
+def _reading(method: Callable[Concatenate[Reading, _P], T]) -> Callable[Concatenate[Memory, _P], T]:
+    """Return a method of `Reading` as one of an open memory."""
 
-    "Up to the last flush" means that events recorded since the last `flush` may be missing from the result.
+    @wraps(method)
+    def read(memory: Memory, *arguments: _P.args, **named: _P.kwargs) -> T:
+        return method(memory.reading, *arguments, **named)
+
+    return cast("Callable[Concatenate[Memory, _P], T]", read)
+
+
+class Memory:
+    """The memory of one process in one database. Use `Memory.open` as an async context manager.
+
+    While it is open, it records every plan performed in its context: in the open episode, or in one of the plan's own.
+    Of several open memories the one whose episode is open records, or else the one opened last.
+
+    Its questions are those of `Reading`, up to the last flush: events recorded since may be missing from an answer.
+    Each method raises `CallerError` while the memory is not open.
     """
 
+    _parts: Parts | None = None
+    _forked_parts: Parts | None = None
+    _last_status: Callable[[], MemoryStatus] | None = None
     _recall: Recall | None = None
+
+    def __init__(
+        self,
+        address: DatabaseAddress,
+        *,
+        spool: Path | None,
+        views: Sequence[UserView],
+        projections: Sequence[Projection],
+        settings: Settings,
+        clock: Clock,
+        plan_source: PlanSource | None = None,
+    ) -> None:
+        self._address = self._located = address
+        self._spool = spool
+        self._views = tuple(views)
+        self._projections = tuple(projections)
+        self._settings = settings
+        self._clock = clock
+        self._plan_source = plan_source
+        self._unadopted: dict[str, PycrormError] = {}
+        self._stack = AsyncExitStack()
+        self._reported: set[str] = set()
+        call_in_forked_child(self._forked)
 
     def __repr__(self) -> str:
         return f"<Memory {self._address}, {'open' if self._parts is not None else 'not open'}>"
@@ -279,259 +291,88 @@ class ReadableMemory(PartsHolder):
     def _repr_html_(self) -> str:
         return memory_html(self._address, self._located if self._parts is not None else None)
 
-    @property
-    def reading(self) -> Reading:
-        """The reading side of this memory: named queries, sessions, data frames."""
-        return self._open_parts.reading
-
-    def session(self, *, simulated: bool = False) -> AbstractAsyncContextManager[AsyncSession]:
-        """Return an ordinary SQLAlchemy `AsyncSession` on this memory, as an async context manager.
-
-        With `simulated` it also sees simulations (`SimulatedTaskTree`).
-        """
-        return self._open_parts.reading.session(simulated=simulated)
-
-    @overload
-    async def dataframe(
-        self,
-        statement: FrameQuery,
+    @classmethod
+    def open(
+        cls,
+        url: str,
         *,
-        to: Literal["pandas"] = "pandas",
-        simulated: bool = False,
-        deferred: bool = False,
-    ) -> pd.DataFrame: ...
-
-    @overload
-    async def dataframe(
-        self,
-        statement: FrameQuery,
-        *,
-        to: Library,
-        simulated: bool = False,
-        deferred: bool = False,
-    ) -> Any: ...
-
-    async def dataframe(
-        self,
-        statement: FrameQuery,
-        *,
-        to: Library = "pandas",
-        simulated: bool = False,
-        deferred: bool = False,
-    ) -> Any:
-        """Return the rows as a frame of pandas, polars or Arrow (extra `frames`), typed as the columns are declared.
+        spool: Path | str | None = None,
+        views: Sequence[UserView] = (),
+        projections: Sequence[Projection] = (),
+        writer: Writer | None = None,
+        settings: Settings | None = None,
+        clock: Clock = SYSTEM_CLOCK,
+        plan_source: PlanSource | None = None,
+    ) -> Memory:
+        """Return a memory to enter with `async with`, once.
 
         Args:
-            statement: a select, a union of selects, a mapped class, or a question of `ask`.
-            to: the library: `pandas`, `polars` or `arrow`.
-            simulated: include the rows of simulations.
-            deferred: include the columns of mapped classes that their objects load on request.
+            url: `sqlite:///memory.db`, `sqlite:////absolute/path.db`, or `sqlite://` for one that exists in this
+                process only and is deleted when it is closed.
+            spool: folder of the write-ahead queue; by default `memory.db.spool` beside `memory.db`.
+            views: named queries to create beside the tables.
+            projections: custom projections to fold besides the installed ones. An event that one cannot fold parks the
+                episode in that projection only: `flush` does not raise, `pycrorm status` shows the reason.
+            writer: `thread` for a thread of this process that moves events to the database, or `daemon` for a
+                `pycrorm writer` with the same URL and spool; by default as in the settings. With a daemon this process
+                has no connection for writing, the database may not exist yet, and `session()`, `dataframe()` and
+                `reading` open their own connection at the first query.
+            settings, clock: limits and intervals; the time source.
+            plan_source: recorded with each episode; `pycrorm run` passes hash and commit of the plan's file.
+
+        Raises:
+            UnknownUrl: at once. `CallerError`: at once, for a private database or views of this process with a daemon.
+                On entering: `DatabaseUnavailable`, `DatabaseForeign`, `SpoolUnavailable`, `SpoolForeign`.
         """
-        return await self._open_parts.reading.dataframe(statement, to=to, simulated=simulated, deferred=deferred)
-
-    def batches(
-        self,
-        statement: FrameQuery,
-        *,
-        rows: int = BATCH_ROWS,
-        simulated: bool = False,
-        deferred: bool = False,
-        enums_as_text: bool = False,
-    ) -> AsyncGenerator[pa.RecordBatch]:
-        """Return the rows as a stream of Arrow record batches of at most `rows` rows; see `Reading.batches`."""
-        reading = self._open_parts.reading
-        return reading.batches(
-            statement, rows=rows, simulated=simulated, deferred=deferred, enums_as_text=enums_as_text
-        )
-
-    @property
-    def ask(self) -> Ask[Question]:
-        """The named questions: `await memory.ask.root_failures(object="milk")` is a frame, up to the last flush."""
-        return self._open_parts.reading.ask
-
-    async def diff(self, first: AskedEpisode, second: AskedEpisode) -> EpisodeDiff:
-        """Compare two episodes, up to the last flush; see `Reading.diff`."""
-        return await self._open_parts.reading.diff(first, second)
-
-    @property
-    def recall(self) -> Recall:
-        """The past actions most like a cue: `await memory.recall(type=PickUpAction, has={"arm": Arms.LEFT})`."""
-        parts = self._open_parts
-        if self._recall is None:
-            running = ProcessCases(
-                parts.emitter,
-                open_episodes=lambda: [*parts.recorder.episodes.by_id],
-                flush=parts.flush,
-                log=parts.reading.log,
-                clock=self._clock,
+        address, settings = DatabaseAddress.parse(url), settings or Settings()
+        keep_s = 0.0 if address.is_private else settings.keep_stored_s  # sqlite:// is never restored
+        settings = replace(settings, writer=writer or settings.writer, keep_stored_s=keep_s)
+        if settings.writer == "daemon" and address.is_private:
+            raise CallerError("sqlite:// is private to this process, so no daemon can write it: use writer='thread'")
+        if settings.writer == "daemon" and (views or projections):
+            unused = "views" if views else "projections"
+            raise CallerError(
+                f"the daemon creates the tables, without the {unused} of this process: use writer='thread'"
             )
-            reader = CaseReader(DatabaseSource(parts.reading), running)
-            self._recall = Recall(reader, parts.reading, self._clock)
-        return self._recall
-
-    async def query(self, sql: str, limits: SqlLimits = DEFAULT_LIMITS) -> SqlResult:
-        """Return the rows of one query in SQL that can only read, up to the last flush; see `Reading.query`."""
-        return await self._open_parts.reading.query(sql, limits)
-
-    def mapped(self, designator: str | type) -> Any:
-        """Return the mapped class of a designator type, by its dtype or its class.
-
-        The type is known after a flush of its first use. A memory with a daemon has no connection before its first
-        query, so query it first.
-        """
-        reading = self._open_parts.reading
-        if not reading.is_open:
-            raise CallerError("this memory has not read its types yet: open a session first")
-        return reading.mapped(designator)
-
-    async def episodes(self, *, simulated: bool = False) -> Episodes:
-        """Return every episode, the oldest first, up to the last flush, as a list that a notebook draws as a table."""
-        return await self._open_parts.reading.episodes(simulated=simulated)
-
-    async def tree(self, episode: AnyEpisode) -> TaskTree:
-        """Return the task tree of an episode up to the last flush, as a list that a notebook draws; see `Reading.tree`.
-
-        >>> tree = await memory.tree("last")
-        >>> [node.dtype for node in tree if node.status == "FAILED"]
-        """
-        return await self._open_parts.reading.tree(episode)
-
-    async def as_of(
-        self,
-        episode: AnyEpisode,
-        *,
-        time: float | datetime | None = None,
-        sequence: int | None = None,
-        meshes: bool = False,
-    ) -> Moment:
-        """Return the task tree and the world at any moment of an episode, up to the last flush; see `Reading.as_of`."""
-        return await self._open_parts.reading.as_of(episode, time=time, sequence=sequence, meshes=meshes)
-
-    async def report(
-        self,
-        episode: AnyEpisode,
-        path: str | PathLike[str] | None = None,
-        *,
-        force: bool = False,
-        first: int | None = None,
-        last: int | None = None,
-    ) -> Report:
-        """Write an episode, up to the last flush, as one HTML file; see `pycrorm_async.report.write.report`."""
-        reading = self._open_parts.reading
-        return await write_report(reading, episode, path, force=force, first=first, last=last)
-
-    async def picture(self, episode: AnyEpisode, *, at: MomentReference = None, **view: Any) -> bytes:
-        """Return the scene of an episode at a moment as PNG, up to the last flush.
-
-        >>> Path("scene.png").write_bytes(await memory.picture("last", at="e115"))
-
-        `view` are the size and the camera, see `pycrorm_async.query.picture.picture`. It needs the extra `world`.
-        """
-        from pycrorm_async.query.picture import picture  # loads a world, which most programs have no need of
-
-        return await picture(self._open_parts.reading, episode, at=at, **view)
-
-    async def export(
-        self,
-        what: Exportable,
-        path: str | PathLike[str],
-        *,
-        file_format: FileFormat | None = None,
-        episodes: Sequence[str | int] = (),
-        force: bool = False,
-        arguments: Mapping[str, Any] = MappingProxyType({}),
-        clock: StateClock | None = None,
-        fps: int | None = None,
-        images: ImageSize | None = None,
-    ) -> Exported:
-        """Write episodes or rows to a file, up to the last flush; see `pycrorm_async.export.export.export`."""
-        from pycrorm_async.export.export import export  # here, because most memories write no file
-
-        return await export(
-            self._open_parts.reading,
-            what,
-            path,
-            file_format=file_format,
-            episodes=episodes,
-            arguments=arguments,
-            force=force,
+        return cls(
+            address,
+            spool=Path(spool) if spool is not None else None,
+            views=views,
+            projections=validate_projections(projections),
+            settings=settings,
             clock=clock,
-            fps=fps,
-            images=images,
+            plan_source=plan_source,
         )
 
-    async def export_again(
-        self,
-        manifest: str | PathLike[str],
-        path: str | PathLike[str] | None = None,
+    @classmethod
+    async def connect(
+        cls,
+        url: str,
         *,
-        statement: Question | Select[*tuple[Any, ...]] | None = None,
-        force: bool = False,
-    ) -> ExportComparison:
-        """Make an export again from its manifest and compare; see `pycrorm_async.export.export.export_again`."""
-        from pycrorm_async.export.export import export_again
+        spool: Path | str | None = None,
+        views: Sequence[UserView] = (),
+        projections: Sequence[Projection] = (),
+        writer: Writer | None = None,
+        settings: Settings | None = None,
+    ) -> Memory:
+        """Open a memory for all contexts of this process that have none of their own, until `close`; as `open` does.
 
-        return await export_again(self._open_parts.reading, manifest, path, statement=statement, force=force)
-
-    async def plot_success(
-        self,
-        x: str,
-        y: str,
-        *,
-        of: Source = "PickUpWithContextView",
-        kind: Kind = "auto",
-        bins: int | None = None,
-        axes: Axes | None = None,
-    ) -> Figure:
-        """Draw how often the actions of a view succeeded over two of its columns, up to the last flush.
-
-        >>> figure = await memory.plot_success("relative_x", "relative_y")  # pick-ups, as in the thesis' figure 5.1
-        >>> figure.savefig("pick-ups.svg")
-        >>> await memory.plot_success("arm", "duration", of=PickUpAction, axes=axes)
-
-        Args:
-            x, y: names of columns: numbers, times, texts, enums or bools.
-            of: the view: a mapped class, the name of one or of a view or designator type, or a select with a column
-                `status`.
-            kind: `heatmap` of the share of successes, with the number of rows and the 95 % interval in cells that are
-                large enough; `scatter` of the rows; by default a scatter of up to 500 rows with two numbers.
-            bins: the largest number of ranges of a numeric column; by default it grows with the number of rows.
-            axes: draw into these instead of a new figure.
-
-        It needs the extra `pictures`. Raises `CallerError` for an unknown view or column, and if no row is left.
+        It is meant for notebooks, where each cell has a context of its own: actions of the following cells are
+        recorded, each in an episode of its own or in that of its cell, also in threads that the user starts. If several
+        memories are connected, the last one records. Events that are not stored when the process ends without `close`
+        stay in the spool, and the next memory of that database stores them.
         """
-        samples = await success_samples(self._open_parts.reading, x, y, of)
-        return success_figure(samples, kind=kind, bins=bins, axes=axes)
+        memory = cls.open(url, spool=spool, views=views, projections=projections, writer=writer, settings=settings)
+        return await memory._enter(Parts.in_process)  # noqa: SLF001  its own class
 
-    async def blob(self, name: str) -> Blob | None:
-        """Return the blob with this SHA-256, up to the last flush; None if it is not stored."""
-        return await self._open_parts.reading.blob(name)
+    @classmethod
+    def sync(cls, url: str, **options: Any) -> SyncMemory:
+        """Return a memory to enter with `with`, for code without asyncio; the arguments are those of `open`."""
+        return SyncMemory(cls.open(url, **options))
 
-    async def number_of(self, episode: Episode) -> int:
-        """Return the number that this database gave to the episode, after `flush`."""
-        return await self._open_parts.reading.number_of(str(episode))
-
-
-# === memory recording =========================================================================================
-#
-# `RecordingMemory` is an open memory as plans and programs use it: episodes, observations, flushes, subscriptions.
-
-
-class RecordingMemory(ReadableMemory, ABC):
-    """The recording methods of a memory. Each raises `CallerError` while the memory is not open."""
-
-    _unadopted: dict[str, PycrormError]
-    _reported: set[str]
-
-    @abstractmethod
-    async def __aenter__(self) -> Self:
-        """Open the memory, once."""
-
-    @abstractmethod
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        """Store and fold all recorded events; open episodes end as INTERRUPTED."""
+    async def close(self) -> None:
+        """Store and fold all recorded events; open episodes end as INTERRUPTED. A second call has no effect."""
+        await self.__aexit__(None, None, None)
 
     @property
     def status(self) -> MemoryStatus:
@@ -694,125 +535,140 @@ class RecordingMemory(ReadableMemory, ABC):
         """
         return self._open_parts.emitter.feed.stream(buffer=buffer)
 
+    # --- what was recorded ------------------------------------------------------------------------------------
 
-# === memory ===================================================================================================
+    @property
+    def reading(self) -> Reading:
+        """The reading side of this memory: named queries, sessions, data frames."""
+        return self._open_parts.reading
 
-_log = logging.getLogger("pycrorm_async")
+    session = _reading(Reading.session)
+    dataframe = _reading(Reading.dataframe)
+    batches = _reading(Reading.batches)
+    query = _reading(Reading.query)
+    mapped = _reading(Reading.mapped)
+    episodes = _reading(Reading.episodes)
+    tree = _reading(Reading.tree)
+    as_of = _reading(Reading.as_of)
+    diff = _reading(Reading.diff)
+    blob = _reading(Reading.blob)
+    number_of = _reading(Reading.number_of)
 
+    @property
+    def ask(self) -> Ask[Question]:
+        """The named questions: `await memory.ask.root_failures(object="milk")` is a frame."""
+        return self._open_parts.reading.ask
 
-class Memory(RecordingMemory):
-    """The memory of one process in one database. Use `Memory.open` as an async context manager.
-
-    While it is open, it records every plan performed in its context: in the open episode, or in one of the plan's own.
-    Of several open memories the one whose episode is open records, or else the one opened last.
-    """
-
-    def __init__(
-        self,
-        address: DatabaseAddress,
-        *,
-        spool: Path | None,
-        views: Sequence[UserView],
-        projections: Sequence[Projection],
-        settings: Settings,
-        clock: Clock,
-        plan_source: PlanSource | None = None,
-    ) -> None:
-        self._address = address
-        self._spool = spool
-        self._views = tuple(views)
-        self._projections = tuple(projections)
-        self._settings = settings
-        self._clock = clock
-        self._plan_source = plan_source
-        self._unadopted: dict[str, PycrormError] = {}
-        self._stack = AsyncExitStack()
-        self._parts: Parts | None = None
-        self._reported: set[str] = set()
-        call_in_forked_child(self._forked)
-
-    @classmethod
-    def open(
-        cls,
-        url: str,
-        *,
-        spool: Path | str | None = None,
-        views: Sequence[UserView] = (),
-        projections: Sequence[Projection] = (),
-        writer: Writer | None = None,
-        settings: Settings | None = None,
-        clock: Clock = SYSTEM_CLOCK,
-        plan_source: PlanSource | None = None,
-    ) -> Memory:
-        """Return a memory to enter with `async with`, once.
-
-        Args:
-            url: `sqlite:///memory.db`, `sqlite:////absolute/path.db`, or `sqlite://` for one that exists in this
-                process only and is deleted when it is closed.
-            spool: folder of the write-ahead queue; by default `memory.db.spool` beside `memory.db`.
-            views: named queries to create beside the tables.
-            projections: custom projections to fold besides the installed ones. An event that one cannot fold parks the
-                episode in that projection only: `flush` does not raise, `pycrorm status` shows the reason.
-            writer: `thread` for a thread of this process that moves events to the database, or `daemon` for a
-                `pycrorm writer` with the same URL and spool; by default as in the settings. With a daemon this process
-                has no connection for writing, the database may not exist yet, and `session()`, `dataframe()` and
-                `reading` open their own connection at the first query.
-            settings, clock: limits and intervals; the time source.
-            plan_source: recorded with each episode; `pycrorm run` passes hash and commit of the plan's file.
-
-        Raises:
-            UnknownUrl: at once. `CallerError`: at once, for a private database or views of this process with a daemon.
-                On entering: `DatabaseUnavailable`, `DatabaseForeign`, `SpoolUnavailable`, `SpoolForeign`.
-        """
-        address, settings = DatabaseAddress.parse(url), settings or Settings()
-        keep_s = 0.0 if address.is_private else settings.keep_stored_s  # sqlite:// is never restored
-        settings = replace(settings, writer=writer or settings.writer, keep_stored_s=keep_s)
-        if settings.writer == "daemon" and address.is_private:
-            raise CallerError("sqlite:// is private to this process, so no daemon can write it: use writer='thread'")
-        if settings.writer == "daemon" and (views or projections):
-            unused = "views" if views else "projections"
-            raise CallerError(
-                f"the daemon creates the tables, without the {unused} of this process: use writer='thread'"
+    @property
+    def recall(self) -> Recall:
+        """The past actions most like a cue: `await memory.recall(type=PickUpAction, has={"arm": Arms.LEFT})`."""
+        parts = self._open_parts
+        if self._recall is None:
+            running = ProcessCases(
+                parts.emitter,
+                open_episodes=lambda: [*parts.recorder.episodes.by_id],
+                flush=parts.flush,
+                log=parts.reading.log,
+                clock=self._clock,
             )
-        return cls(
-            address,
-            spool=Path(spool) if spool is not None else None,
-            views=views,
-            projections=validate_projections(projections),
-            settings=settings,
+            reader = CaseReader(DatabaseSource(parts.reading), running)
+            self._recall = Recall(reader, parts.reading, self._clock)
+        return self._recall
+
+    async def report(
+        self,
+        episode: AnyEpisode,
+        path: str | PathLike[str] | None = None,
+        *,
+        force: bool = False,
+        first: int | None = None,
+        last: int | None = None,
+    ) -> Report:
+        """Write an episode, up to the last flush, as one HTML file; see `pycrorm_async.report.write.report`."""
+        return await write_report(self.reading, episode, path, force=force, first=first, last=last)
+
+    async def picture(self, /, episode: AnyEpisode, *, at: MomentReference = None, **view: Any) -> bytes:
+        """Return the scene of an episode at a moment as PNG, up to the last flush.
+
+        >>> Path("scene.png").write_bytes(await memory.picture("last", at="e115"))
+
+        `view` are the size and the camera, see `pycrorm_async.query.picture.picture`. It needs the extra `world`.
+        """
+        from pycrorm_async.query.picture import picture  # loads a world, which most programs have no need of
+
+        return await picture(self.reading, episode, at=at, **view)
+
+    async def export(
+        self,
+        what: Exportable | SyncQuestion,
+        path: str | PathLike[str],
+        *,
+        file_format: FileFormat | None = None,
+        episodes: Sequence[str | int] = (),
+        force: bool = False,
+        arguments: Mapping[str, Any] = MappingProxyType({}),
+        clock: StateClock | None = None,
+        fps: int | None = None,
+        images: ImageSize | None = None,
+    ) -> Exported:
+        """Write episodes or rows to a file, up to the last flush; see `pycrorm_async.export.export.export`."""
+        from pycrorm_async.export.export import export  # here, because most memories write no file
+
+        return await export(
+            self.reading,
+            what.question if isinstance(what, SyncQuestion) else what,
+            path,
+            file_format=file_format,
+            episodes=episodes,
+            arguments=arguments,
+            force=force,
             clock=clock,
-            plan_source=plan_source,
+            fps=fps,
+            images=images,
         )
 
-    @classmethod
-    async def connect(
-        cls,
-        url: str,
+    async def export_again(
+        self,
+        manifest: str | PathLike[str],
+        path: str | PathLike[str] | None = None,
         *,
-        spool: Path | str | None = None,
-        views: Sequence[UserView] = (),
-        projections: Sequence[Projection] = (),
-        writer: Writer | None = None,
-        settings: Settings | None = None,
-    ) -> Memory:
-        """Open a memory for all contexts of this process that have none of their own, until `close`; as `open` does.
+        statement: Question | Select[*tuple[Any, ...]] | None = None,
+        force: bool = False,
+    ) -> ExportComparison:
+        """Make an export again from its manifest and compare; see `pycrorm_async.export.export.export_again`."""
+        from pycrorm_async.export.export import export_again
 
-        It is meant for notebooks, where each cell has a context of its own: actions of the following cells are
-        recorded, each in an episode of its own or in that of its cell, also in threads that the user starts. If several
-        memories are connected, the last one records. Events that are not stored when the process ends without `close`
-        stay in the spool, and the next memory of that database stores them.
+        return await export_again(self.reading, manifest, path, statement=statement, force=force)
+
+    async def plot_success(
+        self,
+        x: str,
+        y: str,
+        *,
+        of: Source = "PickUpWithContextView",
+        kind: Kind = "auto",
+        bins: int | None = None,
+        axes: Axes | None = None,
+    ) -> Figure:
+        """Draw how often the actions of a view succeeded over two of its columns, up to the last flush.
+
+        >>> figure = await memory.plot_success("relative_x", "relative_y")  # pick-ups, as in the thesis' figure 5.1
+        >>> figure.savefig("pick-ups.svg")
+        >>> await memory.plot_success("arm", "duration", of=PickUpAction, axes=axes)
+
+        Args:
+            x, y: names of columns: numbers, times, texts, enums or bools.
+            of: the view: a mapped class, the name of one or of a view or designator type, or a select with a column
+                `status`.
+            kind: `heatmap` of the share of successes, with the number of rows and the 95 % interval in cells that are
+                large enough; `scatter` of the rows; by default a scatter of up to 500 rows with two numbers.
+            bins: the largest number of ranges of a numeric column; by default it grows with the number of rows.
+            axes: draw into these instead of a new figure.
+
+        It needs the extra `pictures`. Raises `CallerError` for an unknown view or column, and if no row is left.
         """
-        memory = cls.open(url, spool=spool, views=views, projections=projections, writer=writer, settings=settings)
-        return await memory._enter(Parts.in_process)  # noqa: SLF001  its own class
-
-    @classmethod
-    def sync(cls, url: str, **options: Any) -> SyncMemory:
-        """Return a memory to enter with `with`, for code without asyncio; the arguments are those of `open`."""
-        return SyncMemory(cls.open(url, **options))
-
-    async def close(self) -> None:
-        """Store and fold all recorded events; open episodes end as INTERRUPTED. A second call has no effect."""
-        await self.__aexit__(None, None, None)
+        samples = await success_samples(self.reading, x, y, of)
+        return success_figure(samples, kind=kind, bins=bins, axes=axes)
 
     # --- opening and closing ----------------------------------------------------------------------------------
 
@@ -827,6 +683,14 @@ class Memory(RecordingMemory):
             await self._stack.aclose()
             raise
         return self
+
+    @property
+    def _open_parts(self) -> Parts:
+        if self._forked_parts is not None:
+            raise CallerError("this memory is open in the process that forked this one: open another one here")
+        if self._parts is None:
+            raise CallerError("this memory is not open: use `async with Memory.open(url) as memory`")
+        return self._parts
 
     async def _open(self) -> Parts:
         address = self._located = self._stack.enter_context(self._address.located())
@@ -941,15 +805,28 @@ class Memory(RecordingMemory):
             self._last_status = lambda: MemoryStatus.of(parts, self._unadopted)
 
 
+ReadableMemory = Memory  # its name in 0.1, for one release
+
+
 # === sync memory ==============================================================================================
 
-T = TypeVar("T")
+
+def _awaited(
+    method: Callable[Concatenate[Memory, _P], Coroutine[Any, Any, T]],
+) -> Callable[Concatenate[SyncMemory, _P], T]:
+    """Return the method of a memory as one of `SyncMemory`, which waits for its result."""
+
+    @wraps(method)
+    def awaited(memory: SyncMemory, *arguments: _P.args, **named: _P.kwargs) -> T:
+        return memory._await(method(memory._memory, *arguments, **named))  # noqa: SLF001  its own class
+
+    return cast("Callable[Concatenate[SyncMemory, _P], T]", awaited)
 
 
 class SyncMemory:
     """A memory to use with `with`, once; `Memory.sync` makes it. Its methods may be called from any thread."""
 
-    def __init__(self, memory: RecordingMemory) -> None:
+    def __init__(self, memory: Memory) -> None:
         self._memory = memory
         self._thread: threading.Thread | None = None
         self._opened: Future[asyncio.AbstractEventLoop] = Future()
@@ -1031,10 +908,6 @@ class SyncMemory:
         """The ids of the last hundred episodes this memory opened."""
         return self._memory.recent_episodes
 
-    def synced(self) -> None:
-        """Wait until all events recorded so far survive a power loss; raises as `Memory.synced` does."""
-        self._await(self._memory.synced())
-
     def flush(self, timeout_s: float | None = None) -> None:
         """Wait until all events recorded so far are visible in the tables; raises as `Memory.flush` does.
 
@@ -1052,85 +925,24 @@ class SyncMemory:
         reading = self._memory.reading
         return Ask(lambda plan: SyncQuestion(Question(reading, plan), self._await))
 
-    def episodes(self, *, simulated: bool = False) -> Episodes:
-        """Return every episode, the oldest first; see `Memory.episodes`."""
-        return self._await(self._memory.episodes(simulated=simulated))
-
-    def tree(self, episode: AnyEpisode) -> TaskTree:
-        """Return the task tree of an episode; see `Memory.tree`."""
-        return self._await(self._memory.tree(episode))
-
-    def as_of(
-        self, episode: AnyEpisode, *, time: float | datetime | None = None, sequence: int | None = None
-    ) -> Moment:
-        """Return the task tree and the world at any moment of an episode; see `Memory.as_of`."""
-        return self._await(self._memory.as_of(episode, time=time, sequence=sequence))
-
-    def picture(self, episode: AnyEpisode, *, at: MomentReference = None, **view: Any) -> bytes:
-        """Return the scene of an episode at a moment as PNG; see `Memory.picture`."""
-        return self._await(self._memory.picture(episode, at=at, **view))
-
-    def report(self, episode: AnyEpisode, path: str | PathLike[str] | None = None, **options: Any) -> Report:
-        """Write an episode as one HTML page that opens offline; see `Memory.report`, which has the same options."""
-        return self._await(self._memory.report(episode, path, **options))
-
-    def plot_success(self, x: str, y: str, **options: Any) -> Figure:
-        """Draw how often the actions of a view succeeded over two of its columns; see `Memory.plot_success`."""
-        return self._await(self._memory.plot_success(x, y, **options))
-
-    def diff(self, first: AskedEpisode, second: AskedEpisode) -> EpisodeDiff:
-        """Compare two episodes; see `Reading.diff`."""
-        return self._await(self._memory.diff(first, second))
-
     def recall(self, type: str | type | None = None, **cue: Any) -> Answer:  # noqa: A002  the feature's name
         """Return the past actions most like a cue; see `Recall.__call__`."""
         return self._await(self._memory.recall(type, **cue))
 
-    def query(self, sql: str, limits: SqlLimits = DEFAULT_LIMITS) -> SqlResult:
-        """Return the rows of one query in SQL that can only read; see `Reading.query`."""
-        return self._await(self._memory.query(sql, limits))
-
-    @overload
-    def dataframe(
-        self,
-        statement: FrameQuery | SyncQuestion,
-        *,
-        to: Literal["pandas"] = "pandas",
-        simulated: bool = False,
-        deferred: bool = False,
-    ) -> pd.DataFrame: ...
-
-    @overload
-    def dataframe(
-        self,
-        statement: FrameQuery | SyncQuestion,
-        *,
-        to: Library,
-        simulated: bool = False,
-        deferred: bool = False,
-    ) -> Any: ...
-
-    def dataframe(
-        self,
-        statement: FrameQuery | SyncQuestion,
-        *,
-        to: Library = "pandas",
-        simulated: bool = False,
-        deferred: bool = False,
-    ) -> Any:
-        """Return the rows as a frame of pandas, polars or Arrow; see `Memory.dataframe`."""
-        query = statement.question if isinstance(statement, SyncQuestion) else statement
-        return self._await(self._memory.reading.dataframe(query, to=to, simulated=simulated, deferred=deferred))
-
-    def export(self, what: Exportable | SyncQuestion, path: str | PathLike[str], **options: Any) -> Exported:
-        """Write episodes or rows to a file; see `Memory.export`, which has the same options."""
-        exported = what.question if isinstance(what, SyncQuestion) else what
-        return self._await(self._memory.export(exported, path, **options))
+    synced = _awaited(Memory.synced)
+    episodes = _awaited(Memory.episodes)
+    tree = _awaited(Memory.tree)
+    as_of = _awaited(Memory.as_of)
+    diff = _awaited(Memory.diff)
+    query = _awaited(Memory.query)
+    dataframe = _awaited(Memory.dataframe)
+    report = _awaited(Memory.report)
+    picture = _awaited(Memory.picture)
+    plot_success = _awaited(Memory.plot_success)
+    export = _awaited(Memory.export)
 
 
 # === with tree ================================================================================================
-
-_P = ParamSpec("_P")
 
 
 @asynccontextmanager

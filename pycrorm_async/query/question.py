@@ -29,7 +29,9 @@ T = TypeVar("T")
 
 AskedEpisode: TypeAlias = "int | str | Episode | EpisodeSummary"
 """An episode by its number, its id or the first digits of it, `last`, or as an `Episode` or `EpisodeSummary`."""
-FrameQuery: TypeAlias = "Select[*tuple[Any, ...]] | CompoundSelect[*tuple[Any, ...]] | type[Any] | Question"
+FrameQuery: TypeAlias = (
+    "Select[*tuple[Any, ...]] | CompoundSelect[*tuple[Any, ...]] | type[Any] | Question | SyncQuestion"
+)
 """A query that has a frame: a select, a union of selects, a mapped class, whose rows are all meant, or a question."""
 _DIGITS_MAX = 7
 """The largest number of an episode has seven digits."""

@@ -41,7 +41,6 @@ from pycrorm_async.events.types import Blob
 from pycrorm_async.orm import ProcessMetaData
 from pycrorm_async.orm.base import EPISODE, KEYS, Base, load_related
 from pycrorm_async.orm.dynamic import DynamicClasses
-from pycrorm_async.orm.rows import Designator
 from pycrorm_async.projections.columns import unite
 from pycrorm_async.projections.generations import Generation, all_views, current_generation, with_views
 from pycrorm_async.query import named_queries
@@ -49,7 +48,7 @@ from pycrorm_async.query.episode_diff import EpisodeDiff, diff_episodes
 from pycrorm_async.query.frames import BATCH_ROWS, Library, arrow_batches, columns_of, dataframe, select_of
 from pycrorm_async.query.named_queries import EpisodeChoice, EpisodeSummary
 from pycrorm_async.query.notebook import Episodes, TaskTree  # and registers the views of values
-from pycrorm_async.query.question import AskedEpisode, FrameQuery, Question, translated_errors
+from pycrorm_async.query.question import AskedEpisode, FrameQuery, Question, SyncQuestion, translated_errors
 from pycrorm_async.query.questions import Ask
 from pycrorm_async.query.snapshot import AnyEpisode, Moment, as_of
 from pycrorm_async.query.sql import DEFAULT_LIMITS, ReadOnlySql, SqlLimits, SqlResult, SqlRows
@@ -223,7 +222,8 @@ class Reading:
                     yield batch
 
     async def _select_of(self, query: FrameQuery) -> Select[*tuple[Any, ...]]:
-        return await query.resolved() if isinstance(query, Question) else select_of(query)
+        question = query.question if isinstance(query, SyncQuestion) else query
+        return await question.resolved() if isinstance(question, Question) else select_of(question)
 
     async def query(self, sql: str, limits: SqlLimits = DEFAULT_LIMITS) -> SqlResult:
         """Return the rows of one query in SQL that can only read; see `pycrorm_async.query.sql`.
@@ -262,11 +262,14 @@ class Reading:
             async with self._connection(simulated=simulated) as connection:
                 return list((await connection.execute(statement)).all())
 
-    def mapped(self, designator: str | type) -> type[Designator]:
+    def mapped(self, designator: str | type) -> Any:
         """Return the mapped class of a dtype, a table or a designator class, as of the last `refresh`.
 
-        Raises `CallerError` for a type that was never declared in this memory.
+        Raises `CallerError` for a type that was never declared in this memory, and before the first query, which
+        reads the types.
         """
+        if not self.is_open:
+            raise CallerError("this memory has not read its types yet: open a session first")
         return self._classes.of(designator)
 
     # --- named queries ----------------------------------------------------------------------------------------
@@ -350,10 +353,10 @@ class Reading:
         with self._log.translated():
             return await self._log.blobs.read(name)
 
-    async def number_of(self, episode: str) -> int:
-        """Return the number that this database gave to the episode with this UUID. Raises `UnknownEpisode`."""
+    async def number_of(self, episode: object) -> int:
+        """Return the number that this database gave to an episode or its UUID. Raises `UnknownEpisode`."""
         await self._ready()
-        number = await self._log.episode_number(parse_episode_id(episode))
+        number = await self._log.episode_number(parse_episode_id(str(episode)))
         if number is None:
             raise UnknownEpisode(f"this database has no event of the episode {episode} yet")
         return number
