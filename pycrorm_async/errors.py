@@ -59,6 +59,10 @@ class EpisodeRefused(CallerError):
     """An episode cannot be opened: this task has one open already, or the world belongs to another episode."""
 
 
+class EpisodeFull(CallerError):
+    """An episode has as many events as it can hold; only ends are still recorded in it."""
+
+
 class UnknownEpisode(CallerError):
     """The database holds no episode of that number or id."""
 

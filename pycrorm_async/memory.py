@@ -167,8 +167,7 @@ class MemoryStatus(NamedTuple):
         faults: events that the hooks failed to record, and performs that were never awaited.
         unawaited: one sentence for each designator type whose perform was called but never awaited.
         missing: the number of values that could not be recorded, and the reason of the last.
-        samples_left_out, episodes_continued: the number of samples dropped for lack of space, and of episodes that were
-            continued in a follow-up episode.
+        samples_left_out: the number of samples dropped for lack of space.
         folded: position up to which records are visible, as reported by the daemon; None with a writer thread.
         drained: whether a process drains the queue now.
         writer: the state of the writer thread; None with a daemon.
@@ -192,7 +191,6 @@ class MemoryStatus(NamedTuple):
     unawaited: tuple[str, ...]
     missing: Missing
     samples_left_out: int
-    episodes_continued: int
     writer: WriterState | None
     unadopted: Mapping[str, PycrormError]
     spool_fault: str | None
@@ -220,7 +218,6 @@ class MemoryStatus(NamedTuple):
             unawaited=emitter.unawaited,
             missing=emitter.missing.count,
             samples_left_out=recorder.samples_left_out,
-            episodes_continued=recorder.episodes.continued_count,
             writer=parts.writer.state if isinstance(parts.writer, WriterThread) else None,
             unadopted=dict(unadopted),
             spool_fault=None if queue.failure is None else str(queue.failure),

@@ -54,7 +54,8 @@ class Settings:
         blob_bytes_max: size of the largest blob (an image, a large array); a larger one is recorded as missing. Blobs
             that are not stored yet count as part of `spool_bytes_max`, kept ones as part of `keep_stored_bytes`.
         record_bytes_max: size of the largest event; a larger one is refused.
-        episode_events_max: an episode that reaches this many events is ended and continued in a follow-up episode.
+        episode_events_max: an episode with this many events records no more (`EpisodeFull` is counted in `faults`), but
+            for ends, for which an eighth of them is kept, at most 2**20.
         batch_events_max, batch_bytes_max, batch_age_ms: a batch closes at the limit it reaches first.
         fold_worker_restart_s: the daemon waits this long before it restarts a fold worker that died; the wait doubles
             after each further death, up to a minute.

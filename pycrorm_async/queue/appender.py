@@ -42,6 +42,7 @@ from zlib import crc32
 from pycrorm_async.clock import Clock
 from pycrorm_async.errors import (
     CallerError,
+    EpisodeFull,
     EpisodeRefused,
     InternalError,
     PycrormError,
@@ -50,7 +51,7 @@ from pycrorm_async.errors import (
     SpoolUnavailable,
 )
 from pycrorm_async.events.codec import Heading, Receipt
-from pycrorm_async.events.ids import EpisodeId, episode_text
+from pycrorm_async.events.ids import SEQUENCE_MAX, EpisodeId, episode_text
 from pycrorm_async.queue.format import (
     CHECKSUM_START,
     COMMIT_BYTES,
@@ -86,6 +87,15 @@ _TOUCHED_BYTES_MAX: Final = 2**18
 
 
 # === appender ===============================================================================================
+
+
+_ENDS: Final = frozenset({"NodeEnded", EPISODE_ENDED})
+"""The events that an episode takes beyond `events_max`, so that it can be ended."""
+
+
+_FULL_EPISODE: Final = (
+    "episode {} has {:,} events, as many as one can hold: only ends are still recorded in it; end it, and open another"
+)
 
 
 class SegmentStart(NamedTuple):
@@ -126,6 +136,7 @@ class Appender:
         self._folder = folder
         self._recorder = recorder
         self._capacity = capacity
+        self._events_max = capacity.events_max
         self._clock = clock
         self._wall_ns, self._monotonic_ns = clock
         self._wake = wake
@@ -158,7 +169,7 @@ class Appender:
 
     # --- putting -----------------------------------------------------------------------------------------------
 
-    def put(self, heading: Heading, payload: bytes, reserved: bool, receipt: Receipt | None = None) -> int:  # noqa: FBT001  # the hot path
+    def put(self, heading: Heading, payload: bytes, reserved: bool, receipt: Receipt | None = None) -> int:  # noqa: FBT001, C901  # the hot path
         """Append one event as `RecorderQueue.put_nowait` does."""
         episode, type_name, version = heading
         name = self._type_names.get(type_name) or self._encode_type(type_name)
@@ -180,6 +191,8 @@ class Appender:
                     self._declare(body, name, version, payload)
                 elif (last := self.open.get(episode)) is not None:
                     sequence = last[0] + 1
+                    if sequence > self._events_max and type_name not in _ENDS:
+                        raise EpisodeFull(_FULL_EPISODE.format(episode_text(episode), sequence - 1))
                 elif type_name == EPISODE_STARTED:
                     self._check_open_episodes()
                     sequence = 1
@@ -517,8 +530,12 @@ _EPISODES_MIN = 16
 """Open episodes that every segment's header has space for beside the largest record."""
 
 
+_ENDS_MAX = 2**20
+"""Bounds the sequences that an episode keeps for ends: more open nodes than fit into a process' memory."""
+
+
 class Capacity(NamedTuple):
-    """The limits of one recorder.
+    """The limits of one recorder; `events_max` are those of an episode beside the ends of its nodes and its own.
 
     Every segment begins with a header that lists the open episodes, and with the declarations in use. With up to
     `episodes_max` open episodes the largest record still fits into a segment; declarations use part of that space.
@@ -531,6 +548,7 @@ class Capacity(NamedTuple):
     segments_max: int
     reserve_bytes: int
     episodes_max: int
+    events_max: int = SEQUENCE_MAX
 
     @classmethod
     def of(cls, settings: Settings) -> Capacity:
@@ -554,6 +572,7 @@ class Capacity(NamedTuple):
             settings.spool_bytes_max // settings.segment_bytes,
             settings.spool_reserve_bytes,
             _EPISODES_MIN + left // (header_bytes(1) - header_bytes(0)),
+            settings.episode_events_max - min(settings.episode_events_max // 8, _ENDS_MAX),
         )
 
     @property

@@ -1,6 +1,6 @@
 """Any executive writes episodes through this package, also our own plan layer.
 
-Both write by the same code what an episode consists of: its beginning, end and follow-ups, the starts and ends of its
+Both write by the same code what an episode consists of: its beginning and end, the starts and ends of its
 nodes, its percepts and tags (`EpisodeWriter`), the rows of its objects, their joints and attachments (`ObjectRows`),
 observations (`put_observation`), the values inside these (`values`), the checks of declared types (`KnownTypes`), and
 the queue (`Emitter`, `OpenEpisodes`).

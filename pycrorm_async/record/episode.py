@@ -3,19 +3,13 @@
 Theory of operation. Starts of nodes, observations and changes of the world reach an episode in the thread of the plan,
 through `Recorder` and `WorldRecorder`. Ends of nodes do so too, except when a plan is dropped unfinished: then the
 garbage collector closes its coroutines and thereby ends its nodes, in any thread and between any two of that thread's
-bytecodes. The sampler's thread reads `id`, `world` and `continue_at`. How an episode is continued in a follow-up is
-described in `record.episode_writer`; meanwhile the sampler takes only the first and the last sample of each
-motion.
-
-`NodeRecord.episode_id` is the id under which the node's sequence counts; a node whose `episode_id` is not the episode's
-current id is never referred to in the follow-up.
+bytecodes. The sampler's thread reads `id` and `world`.
 """
 
 from __future__ import annotations
 
 import math
-import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final, Literal, NamedTuple
 
 from pycrorm_async.events.codec import NotEncodable
@@ -59,14 +53,12 @@ class NodeRecord(NamedTuple):
         sequence: sequence of the node's NodeStarted; its id.
         implicit: whether the episode was opened for this node alone and ends with it.
         outer_episode: the current episode of the context before the node started.
-        episode_id: the episode's id when the node started; `sequence` counts under this id.
     """
 
     episode: Episode
     sequence: int
     implicit: bool
     outer_episode: Episode | None
-    episode_id: EpisodeId
 
 
 class Episode(EpisodeWriter[TaskTreeNode]):
@@ -84,26 +76,20 @@ class Episode(EpisodeWriter[TaskTreeNode]):
         emitter: Emitter,
         episode: EpisodeId,
         opening: EpisodeOpening,
-        declared: Callable[[TaskTreeNode], DeclaredType],
     ) -> None:
         super().__init__(emitter, episode, opening)
         self.task = current_task()
         self.world: WorldRecorder | None = None
         self.faults: tuple[str, ...] = ()
         self.calls: Final = CalledPerforms(self._note_unawaited)
-        self._declared = declared
         self._entered_world: str | None = None
 
     # --- world ------------------------------------------------------------------------------------------------
 
-    def enter_world(self, world: BulletWorld, continue_: Callable[[], None]) -> None:
-        """Record this world from now on. A second world at the same time is not recorded, but counted as missing.
-
-        The world's recorder calls `continue_` when a change of the world has reached `continue_at`.
-        """
+    def enter_world(self, world: BulletWorld) -> None:
+        """Record this world from now on. A second world at the same time is not recorded, but counted as missing."""
         if self.world is None:
-            self.world = WorldRecorder(self.emitter, self.id, world, continue_)
-            self.world.continue_at = self.continue_at
+            self.world = WorldRecorder(self.emitter, self.id, world)
         elif self.world.world is not world:
             self.emitter.missing.note("Episode", "second world", f"{self} records only the world entered first")
 
@@ -134,7 +120,7 @@ class Episode(EpisodeWriter[TaskTreeNode]):
 
     # --- nodes ------------------------------------------------------------------------------------------------
 
-    def start_node(self, node: TaskTreeNode, declared: DeclaredType, continues: int | None = None) -> int:
+    def start_node(self, node: TaskTreeNode, declared: DeclaredType) -> int:
         """Write the start of a node and return its sequence.
 
         Raises `Unrecordable` for a parameter, with `on_unrecordable="refuse"` only.
@@ -145,7 +131,7 @@ class Episode(EpisodeWriter[TaskTreeNode]):
         parameters = read_parameters(node.designator, declared, self, missing)
         return self._put_start(
             node, declared, node.kind, parent, parameters, self._robot_state(),
-            missing=missing, continues=continues, may_refuse=continues is None,
+            missing=missing, may_refuse=True,
         )  # fmt: skip
 
     def end_node(self, node: TaskTreeNode) -> None:
@@ -187,36 +173,13 @@ class Episode(EpisodeWriter[TaskTreeNode]):
         """Write the request to perception and its result; return the sequence."""
         return self._put_detection(object_detected(source, object_type, seen, self, node=self._sequence_of(node)))
 
-    # --- the end and the follow-up ----------------------------------------------------------------------------
+    # --- the end ----------------------------------------------------------------------------------------------
 
     def end_episode(self, failure: BaseException | None) -> None:
         """Write the end of the episode, after reporting performs that were never awaited."""
         if not self.closed:
             self.calls.close()
         super().end_episode(failure)
-
-    def continue_as(self, follow_up: EpisodeId) -> dict[int, int]:
-        """End the episode and continue it under the id `follow_up`; map the old sequences of open nodes to the new."""
-        renumbered = super().continue_as(follow_up)
-        if self.world is not None:
-            self.world.continue_at = self.continue_at
-        return renumbered
-
-    def _has_ended(self, node: TaskTreeNode) -> bool:
-        return node.ended_ns is not None
-
-    def _restart_node(self, node: TaskTreeNode, sequence: int) -> int:
-        new = self.start_node(node, self._declared(node), continues=sequence)
-        node.record = node.record._replace(sequence=new, episode_id=self.id)
-        return new
-
-    def _restart_world(self) -> int:
-        former = self.world
-        if former is None:
-            return 0
-        former.stop()
-        self.world = WorldRecorder(self.emitter, self.id, former.world, former.continue_)
-        return self.world.last
 
     def _leave_world(self) -> None:
         if self.world is not None:
@@ -241,10 +204,10 @@ class Episode(EpisodeWriter[TaskTreeNode]):
         return self._sequence_of(node) or self._root
 
     def _sequence_of(self, node: TaskTreeNode | None) -> int | None:
-        """Return the sequence of the node, or of its nearest ancestor recorded under the current id; else None."""
+        """Return the sequence of the node, or of its nearest ancestor that this episode recorded; else None."""
         while node is not None:
             record: NodeRecord | None = node.record
-            if record is not None and record.episode is self and record.episode_id == self.id:
+            if record is not None and record.episode is self:
                 return record.sequence
             node = node.parent
         return None
@@ -329,10 +292,7 @@ def _seen_value(seen: Seen, references: References) -> SeenValue:
 # order of the changes. The rows of the objects, and what happens if an event cannot be written, are those of
 # `ObjectRows`.
 #
-# The recorder starts with `ObjectAdded` and `ObjectAttached` for the present state of the world. A change whose
-# sequence reaches `continue_at` calls `continue_` after it has been recorded; that replaces this recorder by one for
-# the follow-up episode. While the present state is recorded, and while `empty` removes the objects, no sequence reaches
-# `continue_at`, because the follow-up would start with the state of an incomplete world.
+# The recorder starts with `ObjectAdded` and `ObjectAttached` for the present state of the world.
 
 
 class WorldRecorder(ObjectRows[Object]):
@@ -343,10 +303,8 @@ class WorldRecorder(ObjectRows[Object]):
         sampled: for each robot, the last sampled value of each channel in this episode.
     """
 
-    def __init__(
-        self, emitter: Emitter, episode: EpisodeId, world: BulletWorld, continue_: Callable[[], None] = lambda: None
-    ) -> None:
-        super().__init__(emitter, episode, continue_)
+    def __init__(self, emitter: Emitter, episode: EpisodeId, world: BulletWorld) -> None:
+        super().__init__(emitter, episode)
         self.world = world
         self.sampled: dict[Object, dict[str, float]] = {}
         self._robots: dict[Object, tuple[Pose, PoseValue, str]] = {}
@@ -359,7 +317,6 @@ class WorldRecorder(ObjectRows[Object]):
 
     def empty(self) -> None:
         """Record that all objects were removed, because the world was closed."""
-        self.continue_at = sys.maxsize  # a follow-up would start with objects that are being removed
         for each in tuple(self._references):
             self.object_removed(each)
 
@@ -456,7 +413,7 @@ class WorldRecorder(ObjectRows[Object]):
         node = current_node.get()
         while node is not None and node.record is None:
             node = node.parent
-        if node is not None and node.record.episode_id == self._episode:
+        if node is not None and node.record.episode.id == self._episode:
             sequence: int = node.record.sequence
             return sequence
         return None

@@ -1,4 +1,4 @@
-"""An `EpisodeWriter` writes the events of one open episode and continues it in a follow-up when it gets too long.
+"""An `EpisodeWriter` writes the events of one open episode.
 
 Theory of operation. The writer does not know the executive: `N` is an executive's own record of a node. `_open_nodes`
 holds every node that started and whose end is not written. The call that removes a node writes its end, so no node has
@@ -7,19 +7,6 @@ come at any call, also after the event is written: a `Receipt` shows that, and t
 make no call. `_ending` holds a node while a thread writes its end. The ends of episodes wait, for a limited time, until
 it is empty, because the end of a node must precede the end of its episode. The end of a node never waits, because the
 garbage collector may cause it.
-
-A sequence has 26 bits, so an episode can run out of sequences. When one reaches `continue_at`, `continue_as` ends it,
-and the same `EpisodeWriter` continues under a new id, so that whatever refers to it stays valid. Every open node ends
-INTERRUPTED with the reason EpisodeContinued, innermost first, then the root and the episode itself. The follow-up
-begins with EpisodeStarted, which names the former episode, then a root, the world as it is then, and a start of each
-interrupted node, outermost first. Such a start names the sequence that it continues and holds the node's parameters
-and the robot's state as they are then. So each perform has exactly one row whose status is its outcome, and the
-duration of a node is the sum of its parts.
-
-Only a start, an observation or a change of the world triggers a follow-up, after it has been recorded itself. An end
-never does, because the garbage collector may cause it. Until the next start, events use the reserve of sequences behind
-`continue_at`. If an end cannot be written, the next event tries again; `_interrupted` then holds the nodes that have an
-end and, if they still run then, are started again in the follow-up.
 """
 
 from __future__ import annotations
@@ -35,7 +22,6 @@ import time
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Awaitable, Callable, Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any, Final, Generic, NamedTuple, Protocol, TypeAlias, TypeVar
@@ -43,7 +29,7 @@ from typing import Any, Final, Generic, NamedTuple, Protocol, TypeAlias, TypeVar
 from msgspec.structs import replace
 
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock, clock_quality
-from pycrorm_async.errors import CallerError, FilesError, SpoolFull, SpoolStuck, Unrecordable
+from pycrorm_async.errors import CallerError, EpisodeFull, FilesError, SpoolFull, SpoolStuck, Unrecordable
 from pycrorm_async.events.codec import Heading, NotEncodable, Receipt, encode, encoded_bytes
 from pycrorm_async.events.fields import changed_tags, checked_tags
 from pycrorm_async.events.ids import EpisodeId, episode_id, episode_text
@@ -92,11 +78,6 @@ from pycrorm_async.record.values import (
 from pycrorm_async.settings import Settings
 from pycrorm_async.world.bullet import Object
 
-CONTINUED: Final = "EpisodeContinued"
-"""The failure type of nodes and episodes that ended because a follow-up episode continues them."""
-
-_RESERVE_EVENTS_MAX = 2**20
-"""Bounds the sequences reserved behind `continue_at`: more open nodes than fit into a process' memory."""
 _LAST_ENDS_S = 1.0
 """Bounds the wait of an episode's end for ends of nodes in other threads; each takes microseconds."""
 _DESCRIPTION_MAX = 200
@@ -110,8 +91,7 @@ class EpisodeWriter(ABC, Generic[N]):
 
     Attributes:
         emitter: puts the events into the queue and counts faults.
-        id: 16 bytes of a UUIDv7; `str(episode)` is its text. A continued episode has the id of its latest follow-up.
-        continue_at: the first sequence that triggers a follow-up episode.
+        id: 16 bytes of a UUIDv7; `str(episode)` is its text.
         closed: whether the last event has been written, or its writing has begun.
         simulated: whether the episode is a simulation.
     """
@@ -123,11 +103,7 @@ class EpisodeWriter(ABC, Generic[N]):
         self.emitter = emitter
         self._opening = opening
         self._open_nodes: dict[int, N] = {}
-        self._interrupted: dict[int, N] = {}
         self._ending: set[N] = set()
-        events_max = emitter.settings.episode_events_max
-        self._continue_at: Final = events_max - min(events_max // 8, _RESERVE_EVENTS_MAX)
-        self.continue_at = self._continue_at
         self._is_begun = False
         self._root = 0
         self._root_ended = False
@@ -163,18 +139,6 @@ class EpisodeWriter(ABC, Generic[N]):
         """Return the sequence of this node or of its nearest recorded ancestor; None gives the root."""
 
     @abstractmethod
-    def _has_ended(self, node: N) -> bool:
-        """Return whether the executive has ended a node whose end is not written yet."""
-
-    @abstractmethod
-    def _restart_node(self, node: N, sequence: int) -> int:
-        """Write the start of a node that continues `sequence` of the former episode; return its new sequence."""
-
-    @abstractmethod
-    def _restart_world(self) -> int:
-        """Write the world as it is now; return the last sequence, 0 without a world."""
-
-    @abstractmethod
     def _leave_world(self) -> None:
         """Write no more changes of the world."""
 
@@ -185,24 +149,18 @@ class EpisodeWriter(ABC, Generic[N]):
     # --- the episode ------------------------------------------------------------------------------------------
 
     def open(self) -> None:
-        """Write the start of the episode."""
-        self._start(None, None)
-
-    def _start(self, continues: EpisodeId | None, root: int | None) -> None:
-        """Write the start of the episode and of its root node; after an interrupted call, what is missing."""
-        started = episode_started(self._opening, continues)
+        """Write the start of the episode and of its root node."""
+        started = episode_started(self._opening)
         started, shortened = fit_episode_start(started, self.emitter.settings.record_bytes_max)
         for name in shortened:
             self.emitter.missing.note("Episode", name, "its text is too long for an episode and was cut")
         begun, root_started = Receipt(), Receipt()
         try:
-            if not self._is_begun:
-                self.emitter.put(self.id, started, begun)
-            if not self._root:
-                self.emitter.put(self.id, NodeStarted("root", simulated=self.simulated, continues=root), root_started)
+            self.emitter.put(self.id, started, begun)
+            self.emitter.put(self.id, NodeStarted("root", simulated=self.simulated), root_started)
         finally:
-            self._is_begun = self._is_begun or begun.sequence > 0
-            self._root = self._root or root_started.sequence
+            self._is_begun = begun.sequence > 0
+            self._root = root_started.sequence
 
     def change_tags(self, added: Sequence[str], removed: Sequence[str]) -> None:
         """Write a change of the episode's tags. Raises `CallerError` for a removed tag that it does not have."""
@@ -258,48 +216,11 @@ class EpisodeWriter(ABC, Generic[N]):
         """Return the statuses of the episode and of its root node; a plan that exits the program has failed."""
         return ("ERROR", "ERROR") if isinstance(failure, SystemExit) else end_statuses(failure)
 
-    def continue_as(self, follow_up: EpisodeId) -> dict[int, int]:
-        """End the episode and continue it under the id `follow_up`; map the old sequences of open nodes to the new."""
-        former, root = self.id, self._root
-        self._interrupted.update(self._open_nodes)
-        open_nodes = sorted(self._interrupted.items(), key=lambda item: item[0])
-        reason = FailureValue(CONTINUED, f"the episode continues in episode {episode_text(follow_up)}")
-        for sequence, node in reversed(open_nodes):
-            interrupted = NodeEnded(sequence, "INTERRUPTED", reason)
-            self._close_node(NodeEnded(sequence, "LOST") if self._has_ended(node) else interrupted, "Episode")
-        self._wait_for_ends()
-        self._end_root("INTERRUPTED", reason)
-        ended = EpisodeEnded("INTERRUPTED", reason, episode_text(follow_up), self._described_world())
-        receipt = Receipt()
-        try:
-            self.emitter.put(former, ended, receipt)
-        finally:
-            if receipt.sequence:
-                self.id, self._is_begun, self._root, self._root_ended = follow_up, False, 0, False
-        try:
-            self._start(former, root)
-        except (KeyboardInterrupt, SystemExit):
-            self._start(former, root)  # otherwise no further event would have an episode
-            raise
-        self._interrupted.clear()
-        last = max(self._root, self._restart_world())
-        renumbered: dict[int, int] = {}
-        for sequence, node in open_nodes:
-            if self._has_ended(node):
-                continue
-            try:
-                last = renumbered[sequence] = self._restart_node(node, sequence)
-            except Exception as error:  # noqa: BLE001  the other nodes continue nevertheless
-                self.emitter.note_fault("NodeStarted", error)
-        # The world and the tree may reach the limit at once; doubling it prevents an endless chain of follow-ups.
-        self.continue_at = max(self._continue_at, 2 * last)
-        return renumbered
-
     # --- nodes and perception -----------------------------------------------------------------------------------
 
     def _put_start(
         self, node: N, declared: DeclaredType, kind: NodeKind, parent: int, parameters: dict[str, Any],
-        robot: RobotValue | None, *, missing: Mapping[str, str], continues: int | None, may_refuse: bool,
+        robot: RobotValue | None, *, missing: Mapping[str, str], may_refuse: bool,
     ) -> int:  # fmt: skip
         """Write the start of a node and return its sequence. `missing` has the reason for each missing value.
 
@@ -313,7 +234,6 @@ class EpisodeWriter(ABC, Generic[N]):
             parameters=parameters,
             robot=robot,
             simulated=self.simulated,
-            continues=continues,
         )
         if missing:
             self._note_parameters(owner, missing, may_refuse=may_refuse)
@@ -732,7 +652,7 @@ Failures: TypeAlias = tuple[type[BaseException], ...]
 
 
 class EpisodeOpening(NamedTuple):
-    """The arguments an episode is opened with; its follow-ups repeat them."""
+    """The arguments an episode is opened with."""
 
     description: str
     software: str
@@ -749,8 +669,8 @@ class EpisodeOpening(NamedTuple):
         return self._replace(labels=self.labels._replace(tags=tags))
 
 
-def episode_started(opening: EpisodeOpening, continues: EpisodeId | None) -> EpisodeStarted:
-    """Build the first event of an episode, or of a follow-up that continues another episode."""
+def episode_started(opening: EpisodeOpening) -> EpisodeStarted:
+    """Build the first event of an episode."""
     return EpisodeStarted(
         description=clean(opening.description),
         created_by=clean(_user()),
@@ -762,7 +682,6 @@ def episode_started(opening: EpisodeOpening, continues: EpisodeId | None) -> Epi
         world=clean(opening.world) if opening.world is not None else None,
         simulated=opening.simulated,
         thought_by=opening.thought_by,
-        continues=episode_text(continues) if continues is not None else None,
         tags=opening.labels.tags,
         metadata=dict(opening.labels.metadata),
         **(opening.provenance.fields() if opening.provenance is not None else {}),
@@ -813,8 +732,8 @@ def put_observation(
 ) -> int:
     """Write values under this name, observed by the node with this sequence; return the sequence of the event.
 
-    Returns 0 if the spool has no room; the observation is counted as missing then. Raises `Unrecordable` only if
-    `may_refuse` and with `on_unrecordable="refuse"`.
+    Returns 0 if the spool or the episode has no room; the observation is counted as missing then. Raises `Unrecordable`
+    only if `may_refuse` and with `on_unrecordable="refuse"`.
     """
     name = name_of(name)
     reader = ObservedReader(episode, emitter.put_blob)
@@ -823,7 +742,7 @@ def put_observation(
         if reader.missing:
             _note_missing(emitter, name, reader.missing, may_refuse=may_refuse)
         return _put(emitter, episode, event, may_refuse=may_refuse)
-    except (SpoolFull, SpoolStuck) as refusal:
+    except (EpisodeFull, SpoolFull, SpoolStuck) as refusal:
         emitter.missing.note("observation", name, str(refusal))
         return 0
     finally:
@@ -875,10 +794,6 @@ def _fit(event: Observed, error: NotEncodable, bytes_max: int) -> Observed:
 # === open episodes ============================================================================================
 #
 # `OpenEpisodes` holds the open episodes of one memory, whichever executive writes them.
-#
-# Theory of operation. `continue_episode` moves an episode to its follow-up. `_continuing` holds the former id
-# meanwhile, so that another event cannot start a second move, and `by_id` holds the episode under both ids, because it
-# is looked up by its current id, which changes during the move.
 
 RECENT_MAX = 100
 """Bounds the ids in `recent`, because a process may open any number of episodes."""
@@ -892,7 +807,7 @@ class OpenEpisodes:
 
     Attributes:
         by_id: the open episodes.
-        opened_count, continued_count: the numbers of episodes opened and of follow-ups, without simulations.
+        opened_count: the number of episodes opened, without simulations.
     """
 
     def __init__(self, emitter: Emitter, clock: Clock, randomness: Callable[[int], bytes] = os.urandom) -> None:
@@ -901,11 +816,9 @@ class OpenEpisodes:
         self._randomness = randomness
         self.by_id: dict[EpisodeId, AnyWriter] = {}
         self._recent: deque[EpisodeId] = deque(maxlen=RECENT_MAX)
-        self._continuing: set[EpisodeId] = set()
         self._is_closing = False
         self._adding = threading.RLock()
         self.opened_count = 0
-        self.continued_count = 0
 
     def new_id(self) -> EpisodeId:
         """Make the id of a new episode."""
@@ -917,17 +830,14 @@ class OpenEpisodes:
             if self._is_closing:
                 raise CallerError("the memory is being closed")
             self.by_id[episode.id] = episode
-        self._note_opened(episode)
+        if not episode.simulated:
+            self._recent.append(episode.id)
+            self.opened_count += 1
 
     def refuse_new(self) -> None:
         """Add no episode from now on, because the memory is being closed."""
         with self._adding:
             self._is_closing = True
-
-    def _note_opened(self, episode: AnyWriter) -> None:
-        if not episode.simulated:
-            self._recent.append(episode.id)
-            self.opened_count += 1
 
     @property
     def all(self) -> tuple[AnyWriter, ...]:
@@ -942,35 +852,6 @@ class OpenEpisodes:
     def last_opened(self) -> AnyWriter | None:
         """Return the open episode that was opened last in any context, without simulations; None without one."""
         return next((each for each in reversed(self.all) if not each.simulated and not each.closed), None)
-
-    def continue_episode(
-        self,
-        episode: AnyWriter,
-        around: AbstractContextManager[Callable[[dict[int, int]], None] | None] = nullcontext(),  # noqa: B008  stateless
-    ) -> None:
-        """Continue an episode that reached `continue_at` in a follow-up episode. Exceptions are counted, not raised.
-
-        `around` is entered meanwhile; it yields a function for the new sequences of open nodes, or None.
-        """
-        if episode.id in self._continuing or self._emitter.is_closed:
-            return
-        former, follow_up = episode.id, self.new_id()
-        self._continuing.add(former)
-        self.by_id[follow_up] = episode
-        try:
-            with around as renumber:
-                renumbered = episode.continue_as(follow_up)
-                if renumber is not None:
-                    renumber(renumbered)
-        except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
-            self._emitter.note_fault("EpisodeStarted", error)
-        finally:
-            self.by_id.pop(former if episode.id == follow_up else follow_up, None)
-            self._continuing.discard(former)
-        if episode.id == follow_up:
-            self.continued_count += 1
-            self._note_opened(episode)
-            _log.info("episode %s reached its event limit and continues in episode %s", episode_text(former), episode)
 
     def close(self, episode: AnyWriter, failure: BaseException | None) -> None:
         """Write the end of an episode; `failure` is the exception that ended it, or None. Exceptions are counted."""

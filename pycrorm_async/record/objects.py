@@ -10,11 +10,10 @@ an event that names an object without a row would be damage.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Collection, Hashable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
 from pycrorm_async.events.codec import NotEncodable
 from pycrorm_async.events.ids import EpisodeId
@@ -44,14 +43,10 @@ class ObjectRows(Generic[K]):
 
     Attributes:
         last: sequence of the last event it recorded; 0 before the first.
-        continue_at: the first sequence at which a change calls `continue_`.
-        continue_: moves the episode to a follow-up.
     """
 
-    def __init__(self, emitter: Emitter, episode: EpisodeId, continue_: Callable[[], None] = lambda: None) -> None:
+    def __init__(self, emitter: Emitter, episode: EpisodeId) -> None:
         self.last = 0
-        self.continue_at = sys.maxsize  # no follow-up before the present state is recorded
-        self.continue_ = continue_
         self._emitter = emitter
         self._episode = episode
         self._references: dict[K, ObjectReference] = {}
@@ -97,16 +92,13 @@ class ObjectRows(Generic[K]):
             return 0
         if row_of is not None:
             self._references[row_of] = ObjectReference(sequence if identity is None else identity, sequence)
-        if sequence >= self.continue_at:
-            self.continue_()
         return sequence
 
 
 # === recorded objects =========================================================================================
 #
-# `RecordedObjects` writes the objects of an episode whose executive reports them by keys of its own.
-#
-# It keeps the last reported state of each object, because a follow-up episode begins with it.
+# `RecordedObjects` writes the objects of an episode whose executive reports them by keys of its own, and keeps the last
+# reported state of each.
 
 
 @dataclass(slots=True)
@@ -147,37 +139,19 @@ class _Described:
 
 
 class RecordedObjects(ObjectRows[Hashable]):
-    """The objects of one episode; begins with those of the episode that it continues."""
+    """The objects of one episode."""
 
-    def __init__(self, emitter: Emitter, episode: EpisodeId, former: RecordedObjects | None = None) -> None:
+    def __init__(self, emitter: Emitter, episode: EpisodeId) -> None:
         super().__init__(emitter, episode)
         self._objects: dict[Hashable, RecordedObject] = {}
         self._attached: dict[tuple[Hashable, Hashable], str | None] = {}
         self._identities: set[int] = set()
-        self._renewed: dict[int, ObjectReference] = {}
-        if former is None:
-            return
-        for key, each in former._objects.items():  # noqa: SLF001  of the same class
-            self.add(key, each, None)
-        for (parent, child), link in former._attached.items():  # noqa: SLF001  of the same class
-            self.attach(parent, child, link, None)
-        for key, before in former._references.items():  # noqa: SLF001  of the same class
-            if (now := self._references.get(key)) is not None:
-                self._renewed[before.object] = now
 
     def holds(self, reference: ObjectReference | None) -> bool:
         """Return whether this episode has such a row; True for None."""
         if reference is None:
             return True
         return reference.object in self._identities and reference.object <= reference.row <= self.last
-
-    def renewed(self, value: Any) -> Any:
-        """Return a value of the former episode with references to rows of this one; None for an object that left."""
-        if isinstance(value, ObjectReference):
-            return self._renewed.get(value.object)
-        if isinstance(value, dict):
-            return {key: self.renewed(each) for key, each in value.items()}
-        return [self.renewed(each) for each in value] if isinstance(value, list) else value
 
     def reference(self, key: Hashable) -> ObjectReference | None:
         """Return the current row of an object; None if there is none of this key."""

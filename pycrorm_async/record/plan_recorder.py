@@ -12,21 +12,27 @@ own. Only the caller's settings let an exception reach a plan, and only before `
 value that cannot be recorded is recorded as missing.
 
 `node_ended` may also run in a thread and context of the garbage collector, when it closes a plan that was dropped
-unfinished. So it resets `current_episode` only if the context still holds the node's episode, and it never starts a
-follow-up (see `episode`).
+unfinished. So it resets `current_episode` only if the context still holds the node's episode.
 """
 
 from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Awaitable, Callable, Iterator, Mapping
-from contextlib import contextmanager, nullcontext
+from collections.abc import Awaitable, Callable
 from contextvars import ContextVar
 from typing import Any, Literal
 
 from pycrorm_async.connected_var import ConnectedVar
-from pycrorm_async.errors import DeclarationRefused, EpisodeRefused, FilesError, SpoolFull, SpoolStuck, Unrecordable
+from pycrorm_async.errors import (
+    DeclarationRefused,
+    EpisodeFull,
+    EpisodeRefused,
+    FilesError,
+    SpoolFull,
+    SpoolStuck,
+    Unrecordable,
+)
 from pycrorm_async.events.types import Blob, NodeReference, StateSampled
 from pycrorm_async.plan.execution import CalledPerforms, Candidate, Cells, Refusal, Seen, Simulation, current_simulation
 from pycrorm_async.plan.task import TaskTreeNode, current_node
@@ -45,7 +51,7 @@ from pycrorm_async.record.episode_writer import (
     name_of,
     put_observation,
 )
-from pycrorm_async.record.parameters import EPISODE_TEXT_MAX, DeclaredType
+from pycrorm_async.record.parameters import EPISODE_TEXT_MAX
 from pycrorm_async.world.bullet import BulletWorld, Object, current_world
 from pycrorm_async.world.pose import ObjectType
 from pycrorm_async.world.world_copy import acting_robot
@@ -119,7 +125,7 @@ class Recorder:
             provenance=self._provenance,
             labels=labels,
         )
-        episode = Episode(self._emitter, self.episodes.new_id(), opening, self._declared)
+        episode = Episode(self._emitter, self.episodes.new_id(), opening)
         self.episodes.add(episode)  # first, so that the memory ends an episode whose start Ctrl-C interrupted
         try:
             episode.open()
@@ -129,20 +135,8 @@ class Recorder:
             self.episodes.by_id.pop(episode.id, None)
             raise
         if world is not None:
-            self._enter(episode, world)
+            episode.enter_world(world)
         return episode
-
-    def _enter(self, episode: Episode, world: BulletWorld) -> None:
-        episode.enter_world(world, lambda: self.continue_episode(episode))
-
-    def continue_episode(self, episode: Episode) -> None:
-        """Continue an episode that reached `continue_at` in a follow-up episode. Exceptions are counted, not raised."""
-        around = self._sampler.renumbering(episode) if self._sampler is not None else nullcontext()
-        self.episodes.continue_episode(episode, around)
-
-    def _declared(self, node: TaskTreeNode) -> DeclaredType:
-        assert node.designator is not None
-        return self._declarations.of(type(node.designator), self._emitter.put_declaration)
 
     def close_episode(self, episode: EpisodeWriter[Any], failure: BaseException | None) -> None:
         """Write the end of an episode that `failure` left, or None. Exceptions are counted, not raised."""
@@ -201,15 +195,13 @@ class Recorder:
                 raise
             self._emitter.note_fault("NodeStarted", error)  # a fault of the memory must not reach a plan
         else:
-            node.record = NodeRecord(episode, sequence, implicit is not None, outer_episode, episode.id)
+            node.record = NodeRecord(episode, sequence, implicit is not None, outer_episode)
             if implicit is not None:
                 current_episode.set(implicit)
             if declared.fault is not None:
                 self._emitter.missing.note(declared.dtype, "type", declared.fault)
             if self._sampler is not None and node.kind == "motion" and episode.acts_in_recorded_world:
                 self._sample(self._sampler.begin, episode, sequence)
-            if sequence >= episode.continue_at:
-                self.continue_episode(episode)
 
     def node_ended(self, node: TaskTreeNode) -> None:
         record: NodeRecord | None = node.record
@@ -234,15 +226,12 @@ class Recorder:
         if episode is None or self._emitter.is_closed:
             return
         try:
-            sequence = episode.record_location(
+            episode.record_location(
                 location=location, offered=offered, taken=taken, considered=considered, refused=refused,
                 offered_beyond=offered_beyond, cells=cells, node=node,
             )  # fmt: skip
         except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
             self._emitter.note_fault("LocationResolved", error)
-        else:
-            if sequence >= episode.continue_at:
-                self.continue_episode(episode)
 
     def object_detected(
         self, *, source: Literal["camera", "world_state"], object_type: ObjectType | None, seen: tuple[Seen, ...],
@@ -252,12 +241,9 @@ class Recorder:
         if episode is None or self._emitter.is_closed:
             return
         try:
-            sequence = episode.record_detection(source=source, object_type=object_type, seen=seen, node=node)
+            episode.record_detection(source=source, object_type=object_type, seen=seen, node=node)
         except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
             self._emitter.note_fault("ObjectDetected", error)
-        else:
-            if sequence >= episode.continue_at:
-                self.continue_episode(episode)
 
     def simulation_started(self, simulation: Simulation) -> None:
         if self._emitter.is_closed:
@@ -295,7 +281,7 @@ class Recorder:
         if episode is None or self._emitter.is_closed:
             return
         try:
-            self._enter(episode, world)
+            episode.enter_world(world)
         except Exception as error:  # noqa: BLE001  a fault of the memory must not prevent entering a world
             self._emitter.note_fault("entering a world", error)
 
@@ -356,24 +342,18 @@ def _description_of(simulation: Simulation) -> str:
 # in `omitted`, and the next one holds all changes since the last written sample.
 #
 # One condition variable guards the running motions. All samples are taken while it is held, so no sample follows the
-# end of its motion, and `renumbering` keeps samples out while an episode moves to a follow-up. Its lock is reentrant,
-# because the garbage collector may close a dropped plan, and so call `end`, in a thread that holds the lock. Therefore
-# `_sample` checks `is_over` again after it has read the channels.
+# end of its motion. Its lock is reentrant, because the garbage collector may close a dropped plan, and so call `end`,
+# in a thread that holds the lock. Therefore `_sample` checks `is_over` again after it has read the channels.
 
 
 class _Motion:
-    """A running motion: its node, the robot that acts, and the values last written of its channels.
-
-    `is_full` is set once a sample reached the episode's `continue_at`; then only the last sample of the motion is
-    still taken, to save sequences until the episode continues in a follow-up.
-    """
+    """A running motion: its node, the robot that acts, and the values last written of its channels."""
 
     def __init__(self, episode: Episode, node: int, robot: Object) -> None:
         self.episode = episode
         self.node = node
         self.robot = robot
         self.written: dict[str, float] | None = None
-        self.is_full = False
         self.is_over = False
 
 
@@ -432,25 +412,6 @@ class Sampler:
         for key in [key for key in self._running if key[0] is episode]:
             self._running.pop(key).is_over = True
 
-    @contextmanager
-    def renumbering(self, episode: Episode) -> Iterator[Callable[[Mapping[int, int]], None]]:
-        """Take no sample while the episode moves to a follow-up; yield a function for the new sequences of its nodes.
-
-        The next sample of each motion holds all channels, because the follow-up must not depend on the former episode.
-        """
-        with self._lock:
-            yield lambda renumbered: self._renumber(episode, renumbered)
-
-    def _renumber(self, episode: Episode, renumbered: Mapping[int, int]) -> None:
-        for key in [key for key in self._running if key[0] is episode]:
-            motion = self._running.pop(key)
-            node = renumbered.get(motion.node)
-            if node is None:
-                motion.is_over = True
-                continue
-            motion.node, motion.written, motion.is_full = node, None, False
-            self._running[episode, node] = motion
-
     def close(self) -> None:
         """Stop sampling, and wait until the thread has ended."""
         with self._lock:
@@ -472,9 +433,6 @@ class Sampler:
                     continue
                 self._changed.wait(self._interval_s)
                 for motion in tuple(self._running.values()):
-                    if motion.is_full:
-                        self.omitted += 1
-                        continue
                     try:
                         self._sample(motion, margin=self._change_min)
                     except Exception as error:  # noqa: BLE001  one failed sample must not end the thread
@@ -503,11 +461,10 @@ class Sampler:
         if not changed or motion.is_over or self._emitter.is_closed:
             return
         try:
-            sequence = self._emitter.offer(motion.episode.id, StateSampled(reference, changed, motion.node))
-        except (SpoolFull, SpoolStuck):
+            self._emitter.offer(motion.episode.id, StateSampled(reference, changed, motion.node))
+        except (EpisodeFull, SpoolFull, SpoolStuck):
             self.omitted += 1
             return
-        motion.is_full = sequence >= motion.episode.continue_at
         written.update(changed)
         recorded_world.sampled.setdefault(robot, {}).update(changed)
 
@@ -526,8 +483,7 @@ def _read_channels(robot: Object) -> dict[str, float]:
 # Record the observations that a program makes itself, from any thread.
 #
 # A thread without the plan's context, such as the callback of a sensor, observes for the episode that this memory
-# opened last. Such a thread does not continue a long episode in a follow-up, which is up to the plan's thread; it stops
-# recording at the same event.
+# opened last.
 
 
 class Observations:
@@ -536,7 +492,6 @@ class Observations:
     def __init__(self, emitter: Emitter, recorder: Recorder) -> None:
         self._emitter = emitter
         self._recorder = recorder
-        self._full: EpisodeWriter[Any] | None = None  # that has no room for observations of other threads
         self._kept: set[tuple[str, str]] = set()
 
     @property
@@ -579,17 +534,10 @@ class Observations:
             episode, node = own, current_node.get()
         else:
             episode = self._recorder.episodes.last_opened()
-        if episode is None or (episode is not own and episode is self._full):
-            reason = "no episode is open" if episode is None else "its episode has no more room for observations"
-            self._emitter.missing.note("observation", name_of(name), reason)
+        if episode is None:
+            self._emitter.missing.note("observation", name_of(name), "no episode is open")
             return 0
-        sequence = put_observation(self._emitter, episode, name, values, episode.node_or_root(node), may_refuse=True)
-        if sequence >= episode.continue_at:
-            if episode is own:
-                self._recorder.continue_episode(own)
-            else:
-                self._full = episode
-        return sequence
+        return put_observation(self._emitter, episode, name, values, episode.node_or_root(node), may_refuse=True)
 
 
 observations: ConnectedVar[Observations] = ConnectedVar("observations")

@@ -19,7 +19,6 @@ from msgspec.structs import replace
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.fields import checked_tags
-from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.events.reasons import UNNAMED, template_of
 from pycrorm_async.events.types import (
     EpisodeStatus,
@@ -201,14 +200,13 @@ def noted(emitter: Any, event_type: str, read: Callable[P, R], /, *args: P.args,
 
 # === recorded nodes ===========================================================================================
 #
-# `RecordedNodes` writes the nodes of an episode of any executive, its beginning, its end and its follow-ups.
+# `RecordedNodes` writes the nodes of an episode of any executive, its beginning and its end.
 #
 # Theory of operation. Each method first copies its arguments, which may run any code of the caller, and then has
 # `OrderedCalls` write them; so no other call comes between the events of one, and a node's parent has started before
-# it, whichever threads start them. If the episode is continued after the copy, `_now` replaces references to rows of
-# the former episode. No method raises into the caller: faults, and calls after the end of the episode, are counted in
-# `Memory.status`. `_nodes` holds the open nodes by key, `_ended` the last ones that ended, because a child may start
-# after the end of its parent.
+# it, whichever threads start them. No method raises into the caller: faults, and calls after the end of the episode,
+# are counted in `Memory.status`. `_nodes` holds the open nodes by key, `_ended` the last ones that ended, because a
+# child may start after the end of its parent.
 
 FOREVER_S = 1e8
 """The seconds that a start waits for room: three years, because a wait takes a number."""
@@ -219,26 +217,24 @@ _ENDED_MAX = 1_000
 
 
 class _Node:
-    """A node that an executive started, as it is written again when the episode is continued.
+    """A node that an executive started.
 
-    `sequence` counts in the episode with the id `episode_id`. `parent` is the parent, or, when this node has ended, the
-    nearest node above it that was open then.
+    `parent` is the parent, or, when this node has ended, the nearest node above it that was open then.
     """
 
-    __slots__ = ("declared", "episode_id", "key", "parameters", "parent", "robot", "sequence")
+    __slots__ = ("declared", "episode", "key", "parameters", "parent", "sequence")
 
     def __init__(self, key: Hashable, declared: DeclaredType, parameters: dict[str, Any]) -> None:
         self.key = key
         self.declared = declared
         self.parameters = parameters
         self.parent: _Node | None = None
-        self.robot: RobotValue | None = None
         self.sequence = 0
-        self.episode_id: EpisodeId | None = None
+        self.episode: RecordedNodes | None = None
 
 
 class RecordedNodes(EpisodeWriter[_Node]):
-    """The nodes of a `RecordedEpisode`, and its beginning, end and follow-ups."""
+    """The nodes of a `RecordedEpisode`, its beginning and its end."""
 
     def __init__(
         self,
@@ -269,25 +265,18 @@ class RecordedNodes(EpisodeWriter[_Node]):
             self._end_status = status
         self._episodes.close(self, failure)
 
-    def _write(self, event_type: str, write: Callable[P, int], *args: P.args, **kwargs: P.kwargs) -> None:
-        """Call `write` after all earlier calls; it returns the sequence of the event that it wrote, 0 for none."""
+    def _write(self, event_type: str, write: Callable[P, object], *args: P.args, **kwargs: P.kwargs) -> None:
+        """Call `write` after all earlier calls."""
         self._calls.run(partial(self._written, event_type, write, *args, **kwargs))
 
-    def _written(self, event_type: str, write: Callable[P, int], *args: P.args, **kwargs: P.kwargs) -> None:
+    def _written(self, event_type: str, write: Callable[P, object], *args: P.args, **kwargs: P.kwargs) -> None:
         if self.closed:
             self._note(event_type, f"episode {self} has ended")
             return
         try:  # not `noted`, because this is called for each event
-            sequence = write(*args, **kwargs)
+            write(*args, **kwargs)
         except Exception as error:  # noqa: BLE001  a fault of the memory must not reach a plan
             self.emitter.note_fault(event_type, error)
-            return
-        if sequence >= self.continue_at:
-            self._episodes.continue_episode(self)
-
-    def _now(self, value: Any, prepared: EpisodeId) -> Any:
-        """Return a value that was copied when the episode had the id `prepared`, with references to current rows."""
-        return value if prepared == self.id else self._objects.renewed(value)
 
     # --- nodes ------------------------------------------------------------------------------------------------
 
@@ -319,26 +308,25 @@ class RecordedNodes(EpisodeWriter[_Node]):
         if self.emitter.must_wait() and may_wait():
             self.emitter.sink.block_until_room(FOREVER_S, reserved=False)
         missing: dict[str, str] = {}
-        prepared = self.id
         values = noted(self.emitter, "NodeStarted", self._values.parameters, type, parameters, missing) or {}
         node = _Node(key, type, values)
-        self._write("NodeStarted", self._start_node, node, parent, robot, missing, prepared)
+        self._write("NodeStarted", self._start_node, node, parent, robot, missing)
         return node
 
-    def _start_node(
-        self, node: _Node, parent: Hashable | None, robot: object, missing: dict[str, str], prepared: EpisodeId
-    ) -> int:
+    def _start_node(self, node: _Node, parent: Hashable | None, robot: object, missing: dict[str, str]) -> None:
         key = node.key
         if key in self._nodes:
             self._note("NodeStarted", f"the key {clean_repr(key)} starts a second node before the first has ended")
             self._end_node(self._nodes[key], NodeEnded(self._nodes[key].sequence, "LOST"))
         node.parent = self._find(parent, "NodeStarted")
-        node.robot = noted(self.emitter, "NodeStarted", self._robot, robot)
-        node.parameters = self._now(node.parameters, prepared)
-        self._write_start(node, missing, continues=None)
+        declared, acting = node.declared, noted(self.emitter, "NodeStarted", self._robot, robot)
+        node.sequence = self._put_start(
+            node, declared, declared.declaration.kind, self.node_or_root(node.parent), node.parameters, acting,
+            missing=missing, may_refuse=False,
+        )  # fmt: skip
+        node.episode = self
         self._nodes[key] = node
         self._ended.pop(key, None)
-        return node.sequence
 
     def _robot(self, robot: Any) -> RobotValue | None:
         if robot is None:
@@ -349,14 +337,6 @@ class RecordedNodes(EpisodeWriter[_Node]):
         if (acting := self._objects.robot(robot)) is None:
             raise CallerError(f"no object has the key {clean_repr(robot)}, so the robot's state is not recorded")
         return acting
-
-    def _write_start(self, node: _Node, missing: Mapping[str, str], continues: int | None) -> None:
-        declared, parent = node.declared, self.node_or_root(node.parent)
-        node.sequence = self._put_start(
-            node, declared, declared.declaration.kind, parent, node.parameters, node.robot,
-            missing=missing, continues=continues, may_refuse=False,
-        )  # fmt: skip
-        node.episode_id = self.id
 
     @counted("NodeEnded")
     def end(
@@ -387,10 +367,9 @@ class RecordedNodes(EpisodeWriter[_Node]):
             raised = failure if isinstance(failure, BaseException) else None
             status = end_statuses(raised, self._failures)[1] if raised is failure else "FAILED"
         status, below = self._checked_status(status), self._checked_status(below) if below is not None else None
-        prepared = self.id
         value = noted(self.emitter, "NodeEnded", self._values.failure, failure) if failure is not None else None
         encoded = self._values.any(result) if result is not None else None
-        self._write("NodeEnded", self._end_open, key, status, value, encoded, below, prepared)
+        self._write("NodeEnded", self._end_open, key, status, value, encoded, below)
 
     def _checked_status(self, status: NodeStatus) -> NodeStatus:
         if status in END_STATUSES:
@@ -399,9 +378,8 @@ class RecordedNodes(EpisodeWriter[_Node]):
         return "ERROR"
 
     def _end_open(
-        self, key: Hashable, status: NodeStatus, failure: FailureValue | None, result: Any, below: NodeStatus | None,
-        prepared: EpisodeId,
-    ) -> int:  # fmt: skip
+        self, key: Hashable, status: NodeStatus, failure: FailureValue | None, result: Any, below: NodeStatus | None
+    ) -> None:
         node = self._nodes.get(key)
         if node is None:
             raise CallerError(f"no open node has the key {clean_repr(key)}")
@@ -412,13 +390,12 @@ class RecordedNodes(EpisodeWriter[_Node]):
             parameters = (each for each in node.parameters.values() if isinstance(each, str))
             template = template_of(failure.message, (*parameters, *self._objects.names()))
             failure = replace(failure, type=template or UNNAMED)
-        self._end_node(node, NodeEnded(node.sequence, status, failure, self._now(result, prepared)))
-        return 0  # an end continues no episode
+        self._end_node(node, NodeEnded(node.sequence, status, failure, result))
 
     def _end_node(self, node: _Node, event: NodeEnded) -> None:
         self._close_node(event, node.declared.dtype)
         self._nodes.pop(node.key, None)
-        node.parameters, node.robot = {}, None
+        node.parameters = {}
         while node.parent is not None and self._nodes.get(node.parent.key) is not node.parent:
             node.parent = node.parent.parent
         self._ended[node.key] = node
@@ -436,7 +413,7 @@ class RecordedNodes(EpisodeWriter[_Node]):
     def node_or_root(self, node: Any) -> int:
         """Return the sequence of this node, or of the nearest above it that is in this episode; None gives the root."""
         while isinstance(node, _Node):
-            if node.episode_id == self.id:
+            if node.episode is self:
                 return node.sequence
             node = node.parent
         return self._root
@@ -485,20 +462,6 @@ class RecordedNodes(EpisodeWriter[_Node]):
             return end_statuses(failure, self._failures)
         return status, ("CANCELLED" if status == "INTERRUPTED" else status)
 
-    def _has_ended(self, node: _Node) -> bool:
-        return self._nodes.get(node.key) is not node
-
-    def _restart_node(self, node: _Node, sequence: int) -> int:
-        node.parameters = self._objects.renewed(node.parameters)
-        if node.robot is not None:
-            node.robot = replace(node.robot, object=self._objects.renewed(node.robot.object))
-        self._write_start(node, {}, continues=sequence)
-        return node.sequence
-
-    def _restart_world(self) -> int:
-        self._objects = RecordedObjects(self.emitter, self.id, self._objects)
-        return self._objects.last
-
     def _leave_world(self) -> None:
         """Do nothing: the executive reports the objects, so no observer has to stop."""
 
@@ -520,9 +483,9 @@ class RecordedNodes(EpisodeWriter[_Node]):
         return key
 
     def _cause(self, key: Hashable | None) -> int | None:
-        """Return the sequence of the node that changes the world; None for one of a former episode."""
+        """Return the sequence of the node that changes the world; None for one of another episode."""
         node = self._find(key, "a change of the world")
-        return node.sequence if node is not None and node.episode_id == self.id else None
+        return node.sequence if node is not None and node.episode is self else None
 
     def _note(self, event_type: str, reason: str) -> None:
         self.emitter.note_fault(event_type, CallerError(reason))
@@ -896,7 +859,7 @@ class RecordedEpisode(RecordedNodes):
     def reference(self, key: Hashable) -> ObjectReference | None:
         """Return the current row of an object, for values that name it; None if there is none of this key.
 
-        Call it again for each value: the row changes when the object moves and when the episode is continued.
+        Call it again for each value: the row changes when the object moves.
         """
         return noted(self.emitter, "ObjectAdded", self._objects.reference, key)
 

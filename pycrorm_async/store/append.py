@@ -538,7 +538,7 @@ def events_warning(episode: EpisodeRow) -> str | None:
     share = episode.head * 100 // SEQUENCE_MAX
     return (
         f"episode {episode.number} ({episode.id}) has {episode.head:,} of {SEQUENCE_MAX:,} events ({share} %): it"
-        " continues in a follow-up episode before the last of these"
+        " records nothing but ends beyond the last of these: end it, and open another"
     )
 
 

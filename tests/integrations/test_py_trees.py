@@ -566,18 +566,6 @@ def test_a_tree_can_be_remembered_again_in_a_second_episode(tmp_path: Path) -> N
     assert [each[0] for each in nodes(tmp_path)] == ["look", "look"]
 
 
-def test_a_tree_that_runs_for_long_continues_in_follow_up_episodes(tmp_path: Path) -> None:
-    ticked = tree(parallel("both", Scripted("drive", named("R")), Condition("sees milk", named("RS" * 300))))
-    settings = Settings(fold="at_end", episode_events_max=200)
-    with Memory.sync(url_of(tmp_path), settings=settings) as memory:
-        with RememberedTree(ticked, memory.recording, instant_s=PATIENT_S):
-            tick(ticked, 600)
-        assert (memory.status.faults.total, memory.status.episodes_continued > 2) == (0, True)
-    assert_verified(tmp_path)
-    seen = "SELECT count(*) FROM designator WHERE dtype = 'Condition' AND status = 'SUCCEEDED'"
-    assert ask(tmp_path / "memory.db", seen) == [(300,)]
-
-
 def test_an_unknown_version_of_py_trees_is_refused_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(integration, "__version__", "3.0.0")
     with Memory.sync(url_of(tmp_path)) as memory, pytest.raises(CallerError, match=r"py_trees 3\.0\.0 is unknown"):

@@ -203,21 +203,6 @@ async def test_an_episode_that_another_process_records_is_refused_with_one_line(
 
 
 @pytest.mark.slow
-async def test_a_follow_up_has_the_tags_that_the_episode_had_when_it_was_continued(tmp_path: Path) -> None:
-    settings = Settings(episode_events_max=100)
-    async with Memory.open(f"sqlite:///{tmp_path}/memory.db", settings=settings) as memory:
-        async with memory.episode(description="long", tags=["a", "b"], metadata={"n": 1}) as episode:
-            await memory.tag(episode, "c", remove=["a"])
-            for number in range(60):
-                await NoteActionPerformable(str(number)).perform()
-        await memory.flush()
-        async with memory.session() as session:
-            rows = (await session.scalars(select(ProcessMetaData).order_by(ProcessMetaData.id))).all()
-            assert [(each.tags, each.episode_metadata) for each in rows] == [(["b", "c"], {"n": 1})] * len(rows)
-            assert len(rows) > 1
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("tags", "line"),
     [
@@ -422,7 +407,7 @@ async def test_status_and_log_warn_once_nine_tenths_of_an_episodes_sequences_are
     assert len(caplog.messages) == 1
     (warning,) = await log.limits_near()
     assert warning.startswith("episode 1 (")
-    assert "has 60,397,978 of 67,108,863 events (90 %): it continues in a follow-up episode" in warning
+    assert "has 60,397,978 of 67,108,863 events (90 %): it records nothing but ends beyond" in warning
     await log.close()
 
 

@@ -292,5 +292,5 @@ def test_the_largest_record_fits_beside_sixteen_open_episodes_or_the_settings_ar
 
 def test_with_the_default_settings_the_limit_on_episodes_is_reached_last() -> None:
     episodes = (8 * 2**20 - 2 * 72 - 56 - 64 - (2**20 + 256)) // 40
-    assert Capacity.of(Settings()) == Capacity(8 * 2**20, 512, 16 * 2**20, episodes)
+    assert Capacity.of(Settings()) == Capacity(8 * 2**20, 512, 16 * 2**20, episodes, 2**26 - 1 - 2**20)
     assert episodes > 180_000

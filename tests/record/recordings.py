@@ -34,7 +34,6 @@ from tests.databases import ask, put_memory
 
 HERE = Pose([1, 2, 3])
 AT_END = Settings(fold="at_end")
-SMALL = Settings(fold="at_end", episode_events_max=100)
 
 
 def url_of(folder: Path) -> str:
@@ -78,7 +77,7 @@ def assert_verified(folder: Path) -> None:
     assert problems(url_of(folder)) == []
 
 
-def record(folder: Path, write: Callable[[Recording, RecordedEpisode], None], settings: Settings = SMALL) -> Any:
+def record(folder: Path, write: Callable[[Recording, RecordedEpisode], None], settings: Settings = AT_END) -> Any:
     """Let `write` record one episode; check that nothing was parked, and return the status of the memory."""
     with Memory.sync(url_of(folder), settings=settings) as memory:
         with memory.recording.episode(description="d") as episode:

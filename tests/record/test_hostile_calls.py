@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -29,7 +28,7 @@ from pycrorm_async.record.recording import Recording
 from pycrorm_async.world import ObjectType
 from pycrorm_async.world.pose import Pose
 from tests.databases import ask
-from tests.record.recordings import HERE, SMALL, Recorded, assert_verified, events, nodes, record, url_of
+from tests.record.recordings import AT_END, HERE, Recorded, assert_verified, events, nodes, record, url_of
 
 # === hostile values ===========================================================================================
 #
@@ -190,7 +189,7 @@ def test_arguments_of_an_episode_that_would_stop_it_are_refused(tmp_path: Path) 
         {"thought_by": NodeReference("no uuid", 1)},
         {"thought_by": NodeReference("0197d8a0-0000-7000-8000-000000000000", 2**63)},
     ]
-    with Memory.sync(url_of(tmp_path), settings=SMALL) as memory:
+    with Memory.sync(url_of(tmp_path), settings=AT_END) as memory:
         for each in arguments:
             with pytest.raises(CallerError):
                 memory.recording.episode(**each)
@@ -242,44 +241,6 @@ def test_very_many_fields_of_one_type_are_bounded(tmp_path: Path) -> None:
     assert status.missing.total > 100
 
 
-@pytest.mark.slow
-def test_objects_and_the_tree_pass_into_a_follow_up_whole(tmp_path: Path) -> None:
-    def write(recording: Recording, episode: RecordedEpisode) -> None:
-        kind = recording.type("action", "Step", {"name": str})
-        for parent in ("a", "b"):
-            episode.object_added(parent, parent, "ROBOT", HERE)
-        episode.object_added("c", "cup", "CUP", HERE)
-        episode.object_attached("a", "c", "left")
-        episode.object_attached("b", "c", "right")
-        episode.object_detached("a", "c")
-        episode.start("p", kind, {"name": "p"})
-        episode.start("q", kind, {"name": "q"}, parent="p")
-        episode.start("r", kind, {"name": "r"}, parent="q")
-        episode.end("q")
-        episode.object_moved("c", Pose([math.nan, 0, 0]))
-        for number in range(300):  # each object of the follow-ups comes at another distance from their limits
-            episode.object_added(number, "n", "CUP", Pose([number, 0, 0]), {"j": float(number)})
-            episode.object_added(number, "n", "CUP", Pose([number, 1, 0]), {"j": number + 0.5})
-            episode.object_moved(number, Pose([number, 2, 0]))
-            if number >= 5:
-                episode.object_removed(number - 5)
-        episode.end("r")
-        episode.end("p")
-
-    status = record(tmp_path, write)
-    assert status.faults.total == 1, status.faults.last  # the pose that is no number
-    assert len(events(tmp_path, "JointsMoved")) == 300
-    links = [each.get("link") for each in events(tmp_path, "ObjectAttached")]
-    assert links == ["left", "right"] + ["right"] * (len(links) - 2)
-    assert events(tmp_path, "ObjectDetached")[0]["link"] == "left"
-    above = ask(
-        tmp_path / "memory.db",
-        "SELECT DISTINCT above.name FROM step JOIN task_tree_node AS node USING (id)"
-        " JOIN step AS above ON above.id = node.parent_id WHERE step.name = 'r'",
-    )
-    assert sorted(above) == [("p",), ("q",)]
-
-
 def test_no_argument_of_an_end_raises(tmp_path: Path) -> None:
     class Incomparable:
         def __eq__(self, other: object) -> bool:
@@ -317,7 +278,7 @@ def test_two_episodes_whose_values_call_each_other_do_not_wait_for_ever(tmp_path
             self.other.end("n")
             return 1
 
-    with Memory.sync(url_of(tmp_path), settings=SMALL) as memory:
+    with Memory.sync(url_of(tmp_path), settings=AT_END) as memory:
         kind = memory.recording.type("action", "Step")
         one, two = (memory.recording.episode(description=each) for each in ("one", "two"))
         for each in (one, two):
@@ -338,40 +299,10 @@ def test_two_episodes_whose_values_call_each_other_do_not_wait_for_ever(tmp_path
     assert_verified(tmp_path)
 
 
-def test_an_end_in_the_middle_of_a_follow_up_ends_its_own_node(tmp_path: Path) -> None:
-    ending: list[Callable[[], None]] = []
-
-    class Key:
-        """Ends another node the first time it is looked up after the follow-up began."""
-
-        def __hash__(self) -> int:
-            if ending:
-                ending.pop()()
-            return 2
-
-    def write(recording: Recording, episode: RecordedEpisode) -> None:
-        kind = recording.type("action", "Step", {"name": str})
-        episode.object_added(Key(), "m", "MILK", HERE)
-        episode.start("a", kind, {"name": "a"})
-        episode.start("b", kind, {"name": "b"})
-        for number in range(200):
-            if number == 80:
-                ending.append(lambda: episode.end("b", "FAILED", "seen by the collector"))
-            episode.observe("n", number)
-        episode.end("a")
-
-    assert record(tmp_path, write).faults == (0, None)
-    ends = ask(
-        tmp_path / "memory.db",
-        "SELECT name, status FROM step JOIN task_tree_node USING (id) WHERE status != 'INTERRUPTED' ORDER BY name",
-    )
-    assert ends == [("a", "SUCCEEDED"), ("b", "FAILED")]
-
-
 @pytest.mark.soak
 @pytest.mark.slow
 def test_an_episode_opened_while_the_memory_closes_is_counted_and_stays_empty(tmp_path: Path) -> None:
-    with Memory.sync(url_of(tmp_path), settings=SMALL) as memory:
+    with Memory.sync(url_of(tmp_path), settings=AT_END) as memory:
         recording, stop = memory.recording, threading.Event()
 
         def work() -> None:

@@ -45,7 +45,6 @@ from tests.record.test_executives import Group, State, machine, ticked_nodes
 PACKAGE = str(Path(pycrorm_async.__file__).parent)
 HANGS_S = 20.0
 """Bounds the wait for a run of a scenario; each takes less than 10 ms."""
-WITHOUT_LIMIT = 2**26 - 1
 
 
 class Interrupt:
@@ -81,9 +80,8 @@ class Interrupt:
 
 
 @pytest.fixture
-def recorded(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Recorded]:
-    settings = Settings(episode_events_max=getattr(request, "param", WITHOUT_LIMIT))
-    made = Recorded(tmp_path, settings)
+def recorded(tmp_path: Path) -> Iterator[Recorded]:
+    made = Recorded(tmp_path, Settings())
     yield made
     if not made.hangs:
         made.queue.release()
@@ -132,15 +130,12 @@ def assert_in_order(log: list[tuple[int, Happening]]) -> None:
 
 @pytest.mark.slow
 @pytest.mark.every_python
-@pytest.mark.parametrize("recorded", [WITHOUT_LIMIT, 100], ids=["one episode", "follow-ups"], indirect=True)
 def test_an_interrupt_at_any_call_of_an_executive_neither_hangs_nor_damages_the_log(recorded: Recorded) -> None:
     step = recorded.recording.type("action", "Step", {"number": int})
 
     def scenario() -> None:
         with recorded.recording.episode(description="d") as episode:
             episode.object_added("cup", "cup", "CUP", Pose())
-            if recorded.emitter.settings.episode_events_max < WITHOUT_LIMIT:
-                episode.continue_at = 8
             episode.start("outer", step, {"number": 1})
             episode.start("inner", step, {"number": 2}, parent="outer")
             episode.object_moved("cup", Pose([1, 0, 0]), node="inner")
@@ -179,14 +174,11 @@ class FailingActionPerformable(ActionAbstract):
 
 @pytest.mark.slow
 @pytest.mark.every_python
-@pytest.mark.parametrize("recorded", [WITHOUT_LIMIT, 100], ids=["one episode", "follow-ups"], indirect=True)
 def test_an_interrupt_at_any_call_of_our_own_plan_neither_hangs_nor_damages_the_log(recorded: Recorded) -> None:
     hooks = Recorder(recorded.emitter, episodes=recorded.episodes, software="test")
 
     async def plan() -> None:
         episode = hooks.open_episode(description="d")
-        if recorded.emitter.settings.episode_events_max < WITHOUT_LIMIT:
-            episode.continue_at = 4
         raised: BaseException | None = None
         token = current_episode.set(episode)
         try:

@@ -293,28 +293,6 @@ async def test_a_full_spool_leaves_observations_out_and_never_stops_the_plan(tmp
         assert rows[0] == ("camera", None, {"value": None})
 
 
-async def test_a_long_episode_continues_and_threads_stop_at_its_last_events(tmp_path: Path) -> None:
-    settings = Settings(episode_events_max=200)
-    async with Memory.open(f"sqlite:///{tmp_path}/memory.db", settings=settings) as memory:
-        async with memory.episode(description="seen"):
-            for number in range(300):
-                memory.observe("number", number)
-
-            def observe() -> None:
-                for number in range(300):
-                    memory.observe("thread", number)
-
-            other = threading.Thread(target=observe)
-            other.start()
-            other.join()
-        await memory.flush()
-        assert_no_faults(memory)
-        assert memory.status.episodes_continued == 1
-        rows = await observed(memory)
-        assert [values["value"] for name, _, values in rows if name == "number"] == list(range(300))
-        assert "no more room" in str(memory.status.missing.last)
-
-
 def returncode(script: Path) -> int:
     return run_script(script.read_text()).returncode
 

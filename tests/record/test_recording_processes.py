@@ -18,13 +18,11 @@ from pycrorm_async.projections import columns as union
 from pycrorm_async.projections.verify import verify
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.world.pose import Pose
 from tests.commands import environment, pycrorm, run_script
 from tests.databases import ask
 from tests.projections.event_script import Script, declarations, declared, field, name_of
 from tests.projections.sql_queries import stored_and_folded
 from tests.record.recordings import assert_verified, events, nodes, opened, url_of
-from tests.record.test_recorded_episode import HERE
 from tests.table_comparison import differences, tables_of
 from tests.writer.running_writers import Daemon
 
@@ -54,71 +52,6 @@ def test_a_thread_that_outlives_the_episode_is_counted_and_disturbs_nothing(tmp_
         assert memory.status.faults.total == 3
     assert len(nodes(tmp_path)) == 1
     assert events(tmp_path, "Observed") == []
-
-
-def test_a_long_episode_continues_with_its_open_nodes_and_its_objects(tmp_path: Path) -> None:
-    with opened(tmp_path, Settings(episode_events_max=200)) as memory:
-        kind = memory.recording.type("action", "Step", {"number": int, "what": "object"})
-        with memory.recording.episode(description="long") as episode:
-            episode.object_added("x", "cup", "CUP", HERE)  # so that the follow-ups have the others at other sequences
-            episode.object_added("r", "pr2", "ROBOT", HERE, {"j": 1.0})
-            episode.object_added("m", "milk", "MILK", HERE)
-            episode.object_attached("r", "m")
-            episode.object_removed("x")
-            episode.start("outer", kind, {"what": "m"}, robot="r")
-            for number in range(300):
-                episode.start(number, kind, {"number": number, "what": "m"}, parent="outer", robot="r")
-                episode.object_moved("m", Pose([number, 0, 0]), node=number)
-                episode.end(number)
-            episode.end("outer")
-        assert memory.status.faults == (0, None)
-        continued = memory.status.episodes_continued
-        assert continued > 3
-    assert_verified(tmp_path)
-    file = tmp_path / "memory.db"
-    numbers = ask(file, "SELECT number FROM step JOIN task_tree_node USING (id) WHERE status = 'SUCCEEDED' ORDER BY id")
-    assert [each for (each,) in numbers if each is not None] == list(range(300))
-    outers = [
-        each for each in events(tmp_path, "NodeStarted") if "designator" in each and "number" not in each["parameters"]
-    ]
-    assert len(outers) == continued + 1
-    rows = [each["parameters"]["what"] for each in outers]
-    assert rows[0] == {"object": 5, "row": 5}
-    assert {each["object"] for each in rows[1:]} == {4}  # as the follow-ups number it
-    assert len(events(tmp_path, "ObjectAttached")) == continued + 1
-
-
-def test_threads_that_reach_the_limit_together_continue_the_episode_once(tmp_path: Path) -> None:
-    interval = sys.getswitchinterval()
-    sys.setswitchinterval(1e-6)
-    try:
-        with opened(tmp_path, Settings(episode_events_max=200)) as memory:
-            kind = memory.recording.type("action", "Step", {"thread": int, "number": int})
-            with memory.recording.episode(description="long") as episode:
-
-                def work(thread: int) -> None:
-                    episode.start(thread, kind, {"thread": thread})
-                    for number in range(300):
-                        episode.start((thread, number), kind, {"thread": thread, "number": number}, parent=thread)
-                        episode.end((thread, number))
-                    episode.end(thread)
-
-                threads = [threading.Thread(target=work, args=(each,)) for each in range(4)]
-                for each in threads:
-                    each.start()
-                for each in threads:
-                    each.join()
-            assert memory.status.faults == (0, None)
-    finally:
-        sys.setswitchinterval(interval)
-    assert_verified(tmp_path)
-    rows = ask(
-        tmp_path / "memory.db",
-        "SELECT step.thread, step.number, above.thread FROM step JOIN task_tree_node AS node USING (id)"
-        " JOIN step AS above ON above.id = node.parent_id"
-        " WHERE node.status = 'SUCCEEDED' AND step.number IS NOT NULL ORDER BY 1, 2",
-    )
-    assert rows == [(thread, number, thread) for thread in range(4) for number in range(300)]
 
 
 @pytest.mark.slow
