@@ -198,9 +198,7 @@ def noted(emitter: Any, event_type: str, read: Callable[P, R], /, *args: P.args,
         return None
 
 
-# === recorded nodes ===========================================================================================
-#
-# `RecordedNodes` writes the nodes of an episode of any executive, its beginning and its end.
+# === recorded episode ========================================================================================
 #
 # Theory of operation. Each method first copies its arguments, which may run any code of the caller, and then has
 # `OrderedCalls` write them; so no other call comes between the events of one, and a node's parent has started before
@@ -230,11 +228,20 @@ class _Node:
         self.parameters = parameters
         self.parent: _Node | None = None
         self.sequence = 0
-        self.episode: RecordedNodes | None = None
+        self.episode: RecordedEpisode | None = None
 
 
-class RecordedNodes(EpisodeWriter[_Node]):
-    """The nodes of a `RecordedEpisode`, its beginning and its end."""
+class RecordedEpisode(EpisodeWriter[_Node]):
+    """An episode of any executive, from any thread; `Recording.episode` makes it.
+
+    >>> with recording.episode(description="Tutorial") as episode:
+    ...     episode.start("a", navigate, {"target_location": Pose([1, 0, 0])})
+    ...     episode.end("a")
+
+    Keys are any hashable values, `id(node)` for example; a key can be used again after its node has ended. No method
+    raises: values that cannot be recorded are counted in `Memory.status` and logged. `node` is always the key of the
+    acting node; None means the root of the episode.
+    """
 
     def __init__(
         self,
@@ -252,8 +259,16 @@ class RecordedNodes(EpisodeWriter[_Node]):
         self._nodes: dict[Hashable, _Node] = {}
         self._ended: OrderedDict[Hashable, _Node] = OrderedDict()
         self._objects = RecordedObjects(emitter, self.id)
-        self._values = RecordedValues(convert, lambda: self._objects, self)
+        self._values = RecordedValues(convert, self._objects, self)
         self._arguments = ArgumentReader(emitter.missing)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
+    ) -> None:
+        self.close(error)
 
     def close(self, failure: BaseException | None = None, status: EpisodeStatus | None = None) -> None:
         """End the episode. Without a failure it SUCCEEDED, and nodes that are still open are counted.
@@ -418,6 +433,149 @@ class RecordedNodes(EpisodeWriter[_Node]):
             node = node.parent
         return self._root
 
+    # --- objects ----------------------------------------------------------------------------------------------
+
+    @counted("ObjectAdded")
+    def object_added(
+        self,
+        key: Hashable,
+        name: str,
+        object_type: str | Enum,
+        pose: Pose | PoseValue,
+        joints: Mapping[str, float] = {},
+        *,
+        urdf: str | PathLike[str] | None = None,
+        color: tuple[float, float, float, float] | None = None,
+        model: str | None = None,
+        serial: str | None = None,
+        mass_kg: float | None = None,
+        base_link: str | None = None,
+        torso_joint: str | None = None,
+        node: Hashable | None = None,
+    ) -> None:
+        """Record that an object entered the world; for a known key, record its new pose and joints.
+
+        Args:
+            key: names the object from now on.
+            object_type: `ROBOT`, `MILK`, …; a type of `world.ObjectType` where one fits.
+            joints: positions by name, rad or m.
+            urdf: its description, which is recorded once: the text, or the path of a .urdf file. The names of its mesh
+                files start at the folder of that file, or for a text at the current folder; the boxes around the
+                meshes, for relations such as `on`, are computed from these files.
+            color, model, serial, mass_kg, base_link: see `events.types.ObjectAdded`.
+            torso_joint: of a robot with a torso that is lifted, the joint that does it.
+        """
+        added = self._arguments.object_of(
+            name, object_type, pose, joints, urdf=urdf, color=color, model=model, serial=serial, mass_kg=mass_kg,
+            base_link=base_link, torso_joint=torso_joint,
+        )  # fmt: skip
+        self._write("ObjectAdded", lambda: self._objects.add(key, added, self._cause(node)))
+
+    @counted("ObjectMoved")
+    def object_moved(self, key: Hashable, pose: Pose | PoseValue, *, node: Hashable | None = None) -> None:
+        """Record the new pose of an object, unless it is the same."""
+        if not self.closed and self._objects.is_at(key, pose):
+            return  # before the pose is copied, which takes longer
+        copied = pose_of(pose)
+        self._write("ObjectMoved", lambda: self._objects.move(self._known(key), copied, self._cause(node)))
+
+    @counted("JointsMoved")
+    def joints_moved(self, key: Hashable, joints: Mapping[str, float], *, node: Hashable | None = None) -> None:
+        """Record new joint positions (rad or m); only those that changed."""
+        copied = self._arguments.joints_of(joints)
+        self._write("JointsMoved", lambda: self._objects.turn(self._known(key), copied, self._cause(node)))
+
+    @counted("ObjectAttached")
+    def object_attached(
+        self, parent: Hashable, child: Hashable, link: str | None = None, *, node: Hashable | None = None
+    ) -> None:
+        """Record that `child` moves with `link` of `parent` from now on."""
+        name = self._arguments.text_of("link", link)
+
+        def write() -> int:
+            return self._objects.attach(self._known(parent), self._known(child), name, self._cause(node))
+
+        self._write("ObjectAttached", write)
+
+    @counted("ObjectDetached")
+    def object_detached(self, parent: Hashable, child: Hashable, *, node: Hashable | None = None) -> None:
+        """Record that `child` no longer moves with `parent`."""
+
+        def write() -> int:
+            return self._objects.detach(self._known(parent), self._known(child), self._cause(node))
+
+        self._write("ObjectDetached", write)
+
+    @counted("ObjectRemoved")
+    def object_removed(self, key: Hashable, *, node: Hashable | None = None) -> None:
+        """Record that an object left the world."""
+        self._write("ObjectRemoved", lambda: self._objects.remove(self._known(key), self._cause(node)))
+
+    def reference(self, key: Hashable) -> ObjectReference | None:
+        """Return the current row of an object, for values that name it; None if there is none of this key.
+
+        Call it again for each value: the row changes when the object moves.
+        """
+        return noted(self.emitter, "ObjectAdded", self._objects.reference, key)
+
+    # --- observations -----------------------------------------------------------------------------------------
+
+    @counted("Observed")
+    def observe(self, name: str, values: object, *, node: Hashable | None = None) -> None:
+        """Record an observation, as `Memory.observe` does."""
+        copied = self._values.converted(values)
+
+        def write() -> int:
+            observer = self.node_or_root(self._find(node, "Observed"))
+            return put_observation(self.emitter, self, name, copied, observer, may_refuse=False)
+
+        self._write("Observed", write)
+
+    @counted("ObjectDetected")
+    def detected(
+        self,
+        seen: Sequence[SeenValue],
+        *,
+        source: Literal["camera", "world_state"] = "camera",
+        object_type: str | None = None,
+        node: Hashable | None = None,
+    ) -> None:
+        """Record a result of perception; `object_type` is the type searched for."""
+        copied = (noted(self.emitter, "ObjectDetected", struct_of, each, SeenValue) for each in seen)
+        percepts = [each for each in copied if each is not None]
+        event = struct_of(ObjectDetected(source, object_type), ObjectDetected)
+
+        def write() -> int:
+            acting = self._find(node, "ObjectDetected")
+            number = self.node_or_root(acting) if acting is not None else None
+            held = (each if self._objects.holds(each.object) else replace(each, object=None) for each in percepts)
+            return self._put_detection(replace(event, seen=tuple(held), node=number))
+
+        self._write("ObjectDetected", write)
+
+    @counted("EpisodeTagged")
+    def tag(self, *tags: str, remove: Sequence[str] = ()) -> None:
+        """Add and remove tags."""
+        added, removed = checked_tags(tags), checked_tags(remove)
+
+        def write() -> int:
+            EpisodeWriter.change_tags(self, added, removed)
+            return 0
+
+        self._write("EpisodeTagged", write)
+
+    @counted("EpisodeStarted")
+    def wait_for_room(self, timeout_s: float | None = None) -> bool:
+        """Block while the spool is full, for a limited time; return whether it has room now.
+
+        `start` waits by itself, without a limit; so this is for an executive that has something else to do then.
+        """
+        sink = self.emitter.sink
+        has_room = not sink.full or sink.block_until_room(FOREVER_S if timeout_s is None else timeout_s, reserved=False)
+        return has_room and not self.emitter.is_closed
+
+    # --- the writer's part ------------------------------------------------------------------------------------
+
     def open(self) -> None:
         """Write the start of the episode; if that fails, count the fault, and record nothing."""
         self._calls.run(self._open_now)
@@ -448,7 +606,7 @@ class RecordedNodes(EpisodeWriter[_Node]):
 
         def change() -> None:
             try:
-                super(RecordedNodes, self).change_tags(added, removed)
+                EpisodeWriter.change_tags(self, added, removed)
             except Exception as error:  # noqa: BLE001  raised to the caller below
                 raised.append(error)
 
@@ -662,7 +820,7 @@ class _Objects(Protocol):
 class RecordedValues:
     """Converts values for one episode. `convert` is the executive's; it is called with each value and each item."""
 
-    def __init__(self, convert: Convert | None, objects: Callable[[], _Objects], references: References) -> None:
+    def __init__(self, convert: Convert | None, objects: _Objects, references: References) -> None:
         self._convert = convert
         self._objects = objects
         self._references = references
@@ -742,7 +900,7 @@ class RecordedValues:
         except CallerError as error:
             return RefusedValue(message_of(error))
         reference = whole.part_of if isinstance(whole, ObjectValue) else whole
-        if isinstance(reference, ObjectReference) and not self._objects().holds(reference):
+        if isinstance(reference, ObjectReference) and not self._objects.holds(reference):
             return RefusedValue("it refers to a row that this episode does not have")
         if isinstance(whole, ObjectValue) and whole.pose is not None:
             return self._checked(whole.pose) if isinstance(self._checked(whole.pose), RefusedValue) else whole
@@ -750,171 +908,6 @@ class RecordedValues:
 
     def _known_object(self, value: Any) -> ObjectReference | None:
         try:
-            return self._objects().reference(value)
+            return self._objects.reference(value)
         except TypeError:  # it is not hashable, so it is no key
             return None
-
-
-# === recorded episode =========================================================================================
-
-
-class RecordedEpisode(RecordedNodes):
-    """An episode of any executive, from any thread; `Recording.episode` makes it.
-
-    >>> with recording.episode(description="Tutorial") as episode:
-    ...     episode.start("a", navigate, {"target_location": Pose([1, 0, 0])})
-    ...     episode.end("a")
-
-    Keys are any hashable values, `id(node)` for example; a key can be used again after its node has ended. No method
-    raises: values that cannot be recorded are counted in `Memory.status` and logged. `node` is always the key of the
-    acting node; None means the root of the episode.
-    """
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        self.close(error)
-
-    # --- objects ----------------------------------------------------------------------------------------------
-
-    @counted("ObjectAdded")
-    def object_added(
-        self,
-        key: Hashable,
-        name: str,
-        object_type: str | Enum,
-        pose: Pose | PoseValue,
-        joints: Mapping[str, float] = {},
-        *,
-        urdf: str | PathLike[str] | None = None,
-        color: tuple[float, float, float, float] | None = None,
-        model: str | None = None,
-        serial: str | None = None,
-        mass_kg: float | None = None,
-        base_link: str | None = None,
-        torso_joint: str | None = None,
-        node: Hashable | None = None,
-    ) -> None:
-        """Record that an object entered the world; for a known key, record its new pose and joints.
-
-        Args:
-            key: names the object from now on.
-            object_type: `ROBOT`, `MILK`, …; a type of `world.ObjectType` where one fits.
-            joints: positions by name, rad or m.
-            urdf: its description, which is recorded once: the text, or the path of a .urdf file. The names of its mesh
-                files start at the folder of that file, or for a text at the current folder; the boxes around the
-                meshes, for relations such as `on`, are computed from these files.
-            color, model, serial, mass_kg, base_link: see `events.types.ObjectAdded`.
-            torso_joint: of a robot with a torso that is lifted, the joint that does it.
-        """
-        added = self._arguments.object_of(
-            name, object_type, pose, joints, urdf=urdf, color=color, model=model, serial=serial, mass_kg=mass_kg,
-            base_link=base_link, torso_joint=torso_joint,
-        )  # fmt: skip
-        self._write("ObjectAdded", lambda: self._objects.add(key, added, self._cause(node)))
-
-    @counted("ObjectMoved")
-    def object_moved(self, key: Hashable, pose: Pose | PoseValue, *, node: Hashable | None = None) -> None:
-        """Record the new pose of an object, unless it is the same."""
-        if not self.closed and self._objects.is_at(key, pose):
-            return  # before the pose is copied, which takes longer
-        copied = pose_of(pose)
-        self._write("ObjectMoved", lambda: self._objects.move(self._known(key), copied, self._cause(node)))
-
-    @counted("JointsMoved")
-    def joints_moved(self, key: Hashable, joints: Mapping[str, float], *, node: Hashable | None = None) -> None:
-        """Record new joint positions (rad or m); only those that changed."""
-        copied = self._arguments.joints_of(joints)
-        self._write("JointsMoved", lambda: self._objects.turn(self._known(key), copied, self._cause(node)))
-
-    @counted("ObjectAttached")
-    def object_attached(
-        self, parent: Hashable, child: Hashable, link: str | None = None, *, node: Hashable | None = None
-    ) -> None:
-        """Record that `child` moves with `link` of `parent` from now on."""
-        name = self._arguments.text_of("link", link)
-
-        def write() -> int:
-            return self._objects.attach(self._known(parent), self._known(child), name, self._cause(node))
-
-        self._write("ObjectAttached", write)
-
-    @counted("ObjectDetached")
-    def object_detached(self, parent: Hashable, child: Hashable, *, node: Hashable | None = None) -> None:
-        """Record that `child` no longer moves with `parent`."""
-
-        def write() -> int:
-            return self._objects.detach(self._known(parent), self._known(child), self._cause(node))
-
-        self._write("ObjectDetached", write)
-
-    @counted("ObjectRemoved")
-    def object_removed(self, key: Hashable, *, node: Hashable | None = None) -> None:
-        """Record that an object left the world."""
-        self._write("ObjectRemoved", lambda: self._objects.remove(self._known(key), self._cause(node)))
-
-    def reference(self, key: Hashable) -> ObjectReference | None:
-        """Return the current row of an object, for values that name it; None if there is none of this key.
-
-        Call it again for each value: the row changes when the object moves.
-        """
-        return noted(self.emitter, "ObjectAdded", self._objects.reference, key)
-
-    # --- observations -----------------------------------------------------------------------------------------
-
-    @counted("Observed")
-    def observe(self, name: str, values: object, *, node: Hashable | None = None) -> None:
-        """Record an observation, as `Memory.observe` does."""
-        copied = self._values.converted(values)
-
-        def write() -> int:
-            observer = self.node_or_root(self._find(node, "Observed"))
-            return put_observation(self.emitter, self, name, copied, observer, may_refuse=False)
-
-        self._write("Observed", write)
-
-    @counted("ObjectDetected")
-    def detected(
-        self,
-        seen: Sequence[SeenValue],
-        *,
-        source: Literal["camera", "world_state"] = "camera",
-        object_type: str | None = None,
-        node: Hashable | None = None,
-    ) -> None:
-        """Record a result of perception; `object_type` is the type searched for."""
-        copied = (noted(self.emitter, "ObjectDetected", struct_of, each, SeenValue) for each in seen)
-        percepts = [each for each in copied if each is not None]
-        event = struct_of(ObjectDetected(source, object_type), ObjectDetected)
-
-        def write() -> int:
-            acting = self._find(node, "ObjectDetected")
-            number = self.node_or_root(acting) if acting is not None else None
-            held = (each if self._objects.holds(each.object) else replace(each, object=None) for each in percepts)
-            return self._put_detection(replace(event, seen=tuple(held), node=number))
-
-        self._write("ObjectDetected", write)
-
-    @counted("EpisodeTagged")
-    def tag(self, *tags: str, remove: Sequence[str] = ()) -> None:
-        """Add and remove tags."""
-        added, removed = checked_tags(tags), checked_tags(remove)
-
-        def write() -> int:
-            super(RecordedNodes, self).change_tags(added, removed)
-            return 0
-
-        self._write("EpisodeTagged", write)
-
-    @counted("EpisodeStarted")
-    def wait_for_room(self, timeout_s: float | None = None) -> bool:
-        """Block while the spool is full, for a limited time; return whether it has room now.
-
-        `start` waits by itself, without a limit; so this is for an executive that has something else to do then.
-        """
-        sink = self.emitter.sink
-        has_room = not sink.full or sink.block_until_room(FOREVER_S if timeout_s is None else timeout_s, reserved=False)
-        return has_room and not self.emitter.is_closed
