@@ -50,7 +50,7 @@ import inspect
 import itertools
 import math
 import operator
-from abc import ABC, abstractmethod
+from abc import ABCMeta, abstractmethod
 from collections.abc import Awaitable, Callable, Generator, Iterable, Iterator, Mapping
 from contextvars import Context, copy_context
 from dataclasses import dataclass, field, fields
@@ -252,7 +252,20 @@ def _as_alternatives(value: Any) -> ObjectDesignatorDescription | tuple[Any, ...
 # === designator ===============================================================================================
 
 
-class Designator(Composable, ABC):
+if TYPE_CHECKING:
+
+    class DescribedClass(ABCMeta):
+        """Declares what describes a class where no annotation of a field, such as `kind: str`, contradicts it."""
+
+        kind: NodeKind
+        dtype: str
+        concept: str | None
+        orm_class: type | None
+else:
+    DescribedClass = ABCMeta
+
+
+class Designator(Composable, metaclass=DescribedClass):
     """Base of everything performable; derive from `ActionAbstract` or `BaseMotion`.
 
     Class attributes:
@@ -264,7 +277,7 @@ class Designator(Composable, ABC):
         orm_class: a mapped class of the user's own for queries. Not inherited.
 
     A field of a designator may have such a name too. Therefore the definition of the class keeps these attributes as
-    `__kind__`, `__dtype__` and so on, and all code reads them there.
+    `__kind__`, `__dtype__` and so on, and all code reads them there; type checkers know them of classes only.
 
     Raises:
         FieldHidesMethod: at class definition, if a field has the name of a method, such as `perform`.
@@ -272,10 +285,6 @@ class Designator(Composable, ABC):
         ResourcesNotAMethod: at class definition, if `resources` is a field or a value.
     """
 
-    kind: ClassVar[NodeKind]
-    dtype: ClassVar[str]
-    concept: ClassVar[str | None] = None
-    orm_class: ClassVar[type | None] = None
     __kind__: ClassVar[NodeKind]
     __dtype__: ClassVar[str]
     __aliases__: ClassVar[Any] = ()
@@ -290,8 +299,11 @@ class Designator(Composable, ABC):
         if (hidden := next((name for name in parameters if _is_method(cls, name)), None)) is not None:
             raise FieldHidesMethod(cls.__qualname__, hidden)
         _describe(cls, {name: value for name, value in own.items() if name not in parameters})
-        if "dtype" not in own and "dtype" not in parameters:
-            cls.dtype = cls.__dtype__
+        for name in ("kind", "dtype", "concept", "orm_class"):
+            owner = next((each for each in cls.__mro__ if name in vars(each)), Designator)
+            set_here = owner is Designator or vars(owner)[name] == getattr(owner, f"__{name}__", inspect)
+            if set_here and name not in own and name not in parameters:
+                setattr(cls, name, getattr(cls, f"__{name}__"))
         for name in own.get("__annotations__", {}):
             if name in parameters and name not in own and hasattr(ActionAbstract, name):
                 setattr(cls, name, field())  # otherwise `@dataclass` would take the inherited attribute as its default
@@ -357,7 +369,7 @@ def _describe(designator: type[Designator], own: Mapping[str, Any]) -> None:
 class ActionAbstract(Designator):
     """A goal of a plan, achieved by performing motions and other actions."""
 
-    kind: ClassVar[NodeKind] = "action"
+    __kind__: ClassVar[NodeKind] = "action"
 
     @classmethod
     def _name_in_memory(cls) -> str:
@@ -373,7 +385,7 @@ class BaseMotion(Designator):
         ResolutionError: names the fields that are missing or have another type than declared.
     """
 
-    kind: ClassVar[NodeKind] = "motion"
+    __kind__: ClassVar[NodeKind] = "motion"
 
     def __post_init__(self) -> None:
         check_properties(self)
@@ -394,7 +406,7 @@ class Expression(Designator):
         NotALanguageExpression: an operand is not performable, or there is no operand.
     """
 
-    kind: ClassVar[NodeKind] = "language"
+    __kind__: ClassVar[NodeKind] = "language"
     operands: tuple[Operand, ...] = ()
 
     def __init__(self, *operands: Composable) -> None:
@@ -537,7 +549,7 @@ class Code(Designator):
         NotALanguageExpression: the function is not callable.
     """
 
-    kind: ClassVar[NodeKind] = "language"
+    __kind__: ClassVar[NodeKind] = "language"
 
     function: str
     arguments: dict[str, str]

@@ -163,9 +163,6 @@ NodeKind = Literal["root", "action", "motion", "language"]
 class Performable(Protocol):
     """A designator, as its node sees it."""
 
-    kind: ClassVar[NodeKind]
-    dtype: ClassVar[str]
-    concept: ClassVar[str | None]
     __kind__: ClassVar[NodeKind]
     __dtype__: ClassVar[str]
     __aliases__: ClassVar[Any]

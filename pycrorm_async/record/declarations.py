@@ -6,7 +6,7 @@ import inspect
 import re
 import typing
 import weakref
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from enum import Enum
 from typing import Any, Literal, NamedTuple, TypeAlias, get_args
 
@@ -54,9 +54,9 @@ from pycrorm_async.recorded_names import recorded_name
 #
 # Declare a designator type from the names and types of its fields, for an executive that has no class for it.
 #
-# A field that cannot have its name is kept under `<field>_<type>`: one whose type contradicts a built-in type or an
-# earlier declaration of the same dtype, because one column cannot hold both, and one with a reserved name. A type that
-# cannot have its name gets the most similar one that it can have.
+# A field with a reserved name is kept under `<field>_`, as that of a designator. One whose type contradicts a built-in
+# type or an earlier declaration of the same dtype is kept under `<field>_<type>`, because one column cannot hold both.
+# A type that cannot have its name gets the most similar one that it can have.
 
 RecordedKind: TypeAlias = Literal["action", "motion", "language"]
 FieldSpec: TypeAlias = FieldType | tuple[FieldType, ItemType] | type[Any]
@@ -123,8 +123,9 @@ def declare_type(
     columns = AcceptedFields()
     undeclared: list[Undeclared] = []
     renamed_fields: dict[str, Renamed] = {}
+    unreserved = _unreserved(fields)
     for name, spec in fields.items():
-        named = _named(str(name), spec, known_types, table, columns)
+        named = _named(str(name), unreserved.get(str(name), str(name)), spec, known_types, table, columns)
         if isinstance(named, str):
             undeclared.append(Undeclared(clean(str(name)), (name,), cut(clean(named), _REASON_MAX)))
             continue
@@ -224,13 +225,22 @@ def _fault_in_aliases(declaration: DesignatorTypeDeclared, known_types: KnownTyp
     return None
 
 
-def _named(name: str, spec: FieldSpec, known_types: KnownTypes, table: str, accepted: AcceptedFields) -> _Named | str:
+def _unreserved(fields: Mapping[str, FieldSpec]) -> dict[str, str]:
+    """Return the names that fields of a designator would have, by their own names."""
+    shapes = {str(name): shape.kind for name, spec in fields.items() if (shape := _shape(spec)) is not None}
+    own = [FieldDeclared(name, column_name(name, kind), kind, SLOT_FIRST_FIELD) for name, kind in shapes.items()]
+    return {name: each.name for name, each in zip(shapes, without_reserved_names(own), strict=True)}
+
+
+def _named(
+    name: str, unreserved: str, spec: FieldSpec, known_types: KnownTypes, table: str, accepted: AcceptedFields
+) -> _Named | str:
     """Return the field under the first name that it may have; the reason if it may have none."""
     shape = _shape(spec)
     if shape is None:
         return f"{clean_repr(spec)} is not a type of a field ({', '.join(sorted(_TYPES))}) and not a Python type of one"
     first_reason: str | None = None
-    for candidate in _candidates(name, shape):
+    for candidate in _candidates(name, unreserved, shape, known_types.columns_of(table)):
         declared = FieldDeclared(
             name=candidate,
             column=column_name(candidate, shape.kind),
@@ -242,13 +252,15 @@ def _named(name: str, spec: FieldSpec, known_types: KnownTypes, table: str, acce
         )
         reason = _fault_in_field(declared, accepted) or known_types.fault_in_field(declared, table)
         if reason is None:
-            return _Named(Field(declared, (name,), shape.enum), first_reason)
+            return _Named(Field(declared, (name,), shape.enum), first_reason if candidate != unreserved else None)
         first_reason = first_reason or reason
     return first_reason or "it has no name"
 
 
-def _candidates(name: str, shape: Shape) -> Iterator[str]:
+def _candidates(name: str, unreserved: str, shape: Shape, columns: Collection[str]) -> Iterator[str]:
     yield name
+    if f"{name}_{shape.kind}".lower() not in columns:  # earlier versions kept a reserved name so
+        yield unreserved
     plain = re.sub(r"\W+", "_", name).strip("_") or "field"
     if not plain.isidentifier():
         plain = f"field_{plain}"
@@ -325,6 +337,10 @@ class KnownTypes:
         if len(columns) > _COLUMNS_MAX and field.name.lower() not in columns:
             return f"the table has {_COLUMNS_MAX} columns already"
         return None
+
+    def columns_of(self, table: str) -> Collection[str]:
+        """Return the names of the table's fields and columns, in lower case."""
+        return self._columns.get(table.lower(), {})
 
     def state_of(self, table: str) -> tuple[str | None, int]:
         """Return the owner of a table and the number of its names; they change with each declaration that adds any."""

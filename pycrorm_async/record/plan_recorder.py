@@ -177,7 +177,7 @@ class Recorder:
     def node_started(self, node: TaskTreeNode) -> None:
         assert node.designator is not None
         if self._emitter.is_closed:
-            self._emitter.note_unrecorded(node.designator.dtype)
+            self._emitter.note_unrecorded(node.designator.__dtype__)
             return
         outer_episode = current_episode.get()
         implicit: Episode | None = None

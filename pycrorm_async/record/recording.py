@@ -91,9 +91,9 @@ class Recording:
         """Declare a type of node once, and return it; the same arguments return the same type.
 
         A part that cannot be declared is counted as missing, with the reason, and never raises. A field that
-        contradicts a built-in type or an earlier declaration of this dtype is kept under `<field>_<type>`. A type whose
-        name cannot be a table's gets a similar one; the nodes of a type that still cannot have a table are recorded
-        without a type.
+        contradicts a built-in type or an earlier declaration of this dtype is kept under `<field>_<type>`, and one with
+        a reserved name, such as `kind`, under `kind_`. A type whose name cannot be a table's gets a similar one; the
+        nodes of a type that still cannot have a table are recorded without a type.
 
         Args:
             kind: an `action`; a `motion`, which moves the robot itself; `language`, which controls other nodes.

@@ -101,7 +101,7 @@ class StateObserver:
 
 def _dtype(node: Node) -> str:
     assert node.designator is not None
-    return type(node.designator).dtype
+    return type(node.designator).__dtype__
 
 
 def state_at(then: Moment) -> tuple[list[tuple[str | None, str, str | None]], dict[str, Any]]:

@@ -43,10 +43,19 @@ from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Po
 @dataclass
 class GreetActionPerformable(ActionAbstract):
     whom: str
+    kind: str = "warm"
+    dtype: int = 8
+    concept: float = 0.5
 
     async def perform(self) -> None:
         if not self.whom:
             raise PlanFailure("nobody to greet")
+
+
+def described(greet: GreetActionPerformable) -> str:
+    assert_type(greet.kind, str)
+    assert_type(ActionAbstract.dtype, str)
+    return greet.__dtype__
 
 
 class ORMGreet(Action):

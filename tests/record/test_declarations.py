@@ -532,7 +532,8 @@ async def test_a_field_that_contradicts_a_class_of_the_plan_layer_is_kept_under_
 @pytest.mark.parametrize(
     ("field", "kept"),
     [
-        ("id", "id_text"),
+        ("id", "id_"),
+        ("object", "object_"),
         ("target frame", "target_frame"),
         ("2nd", "field_2nd"),
         ("_x", "x"),
@@ -541,8 +542,18 @@ async def test_a_field_that_contradicts_a_class_of_the_plan_layer_is_kept_under_
     ],
 )
 def test_a_field_whose_name_cannot_be_a_column_gets_a_similar_one(tmp_path: Path, field: str, kept: str) -> None:
-    assert recorded(tmp_path, "Odd", {field: "text", "plain": "text"}, {field: "a", "plain": "b"}) == (kept != field)
+    counted = kept not in (field, f"{field}_")
+    assert recorded(tmp_path, "Odd", {field: "text", "plain": "text"}, {field: "a", "plain": "b"}) == counted
     assert ask(tmp_path / "memory.db", f'SELECT "{kept}", plain FROM odd') == [("a", "b")]
+
+
+def test_a_seam_keeps_a_reserved_name_as_designators_do_and_an_older_memory_as_it_began(tmp_path: Path) -> None:
+    assert recorded(tmp_path, "Odd", {"kind_text": "text"}, {"kind_text": "old"}) == 0
+    assert recorded(tmp_path, "Odd", {"kind": "text"}, {"kind": "new"}) == 1
+    values = {"kind": "a", "Kind": 1.5, "kind_": "b"}
+    assert recorded(tmp_path, "Even", {"kind": "text", "Kind": "real", "kind_": "text"}, values) == 0
+    assert ask(tmp_path / "memory.db", "SELECT kind_text FROM odd ORDER BY id") == [("old",), ("new",)]
+    assert ask(tmp_path / "memory.db", "SELECT kind__, Kind___, kind_ FROM even") == [("a", 1.5, "b")]
 
 
 @pytest.mark.parametrize(

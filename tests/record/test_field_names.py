@@ -223,11 +223,11 @@ def test_a_reserved_name_gets_underscores_until_no_other_field_has_it() -> None:
 
 @dataclass
 class PourActionPerformable(ActionAbstract):
-    kind: str = "motion"  # type: ignore[assignment, misc]  # a field of the user's, as those below
-    dtype: str = "tea"  # type: ignore[misc]
-    concept: int = 3  # type: ignore[assignment, misc]
+    kind: str = "motion"
+    dtype: str = "tea"
+    concept: int = 3
     aliases: int = 4
-    orm_class: int = 5  # type: ignore[assignment, misc]
+    orm_class: int = 5
 
     async def perform(self) -> None:
         """Succeed without doing anything."""
@@ -235,9 +235,9 @@ class PourActionPerformable(ActionAbstract):
 
 @dataclass
 class StirMotion(BaseMotion):
-    kind: str  # type: ignore[assignment, misc]
-    dtype: str  # type: ignore[misc]
-    concept: float  # type: ignore[assignment, misc]
+    kind: str
+    dtype: str
+    concept: float
 
     async def perform(self) -> None:
         """Succeed without doing anything."""
@@ -245,7 +245,7 @@ class StirMotion(BaseMotion):
 
 @dataclass(slots=True)
 class CarefulPourActionPerformable(PourActionPerformable):
-    concept: int = 9  # type: ignore[misc]
+    concept: int = 9
 
 
 class WipeActionPerformable(ActionAbstract):
@@ -253,7 +253,7 @@ class WipeActionPerformable(ActionAbstract):
     concept = "Wiping"
 
     def __init__(self, kind: str, aliases: str) -> None:
-        self.kind = kind  # type: ignore[assignment, misc]
+        self.kind = kind
         self.aliases = aliases
 
     async def perform(self) -> None:
@@ -276,6 +276,24 @@ def test_what_describes_a_class_is_read_from_the_class_and_never_from_a_field() 
     ]
     with pytest.raises(TypeError, match="missing 3 required positional arguments: 'kind', 'dtype', and 'concept'"):
         StirMotion()  # type: ignore[call-arg]  # the fault here
+
+
+class Described:
+    concept = "Mixing"
+
+    @property
+    def kind(self) -> str:
+        """The user's own property."""
+        return "a property"
+
+
+def test_attributes_of_a_users_own_base_class_stay_as_they_are() -> None:
+    own = {"perform": _nothing}
+    made: Any = make_dataclass("MixActionPerformable", [], bases=(Described, ActionAbstract), namespace=own)
+    below: Any = make_dataclass("MixAgainActionPerformable", [], bases=(made,))
+    for each in made, below:
+        assert (each().kind, each.concept) == ("a property", "Mixing")
+        assert (each.__kind__, each.__concept__) == ("action", None)
 
 
 @pytest.mark.parametrize("name", ["perform", "resolve", "resources", "_name_in_memory"])

@@ -503,13 +503,13 @@ async def test_a_believed_object_can_be_an_argument_of_every_action_and_is_recor
                 named = {each.dtype: each.object for each in rows if hasattr(each, "object_id")}
                 nodes = (await session.execute(select(TaskTreeNode.dtype, TaskTreeNode.status))).all()
     status: dict[str, TaskStatus] = {node.dtype: node.status for node in nodes}
-    assert {action.dtype for action in actions} >= {"PickUpAction", "PlaceAction", "MoveAndPickUpAction"}
+    assert {action.__dtype__ for action in actions} >= {"PickUpAction", "PlaceAction", "MoveAndPickUpAction"}
     for action in actions:
-        row = named[action.dtype]
+        row = named[action.__dtype__]
         assert isinstance(row, BelieveObjectRow), action
         assert place(row) == ("cup", 1.2, 0.4, 0.9)
         assert (row.obj_type, row.identity_id) == (ObjectType.JEROEN_CUP, None)
-        assert status[action.dtype] in (TaskStatus.FAILED, TaskStatus.SUCCEEDED), action
+        assert status[action.__dtype__] in (TaskStatus.FAILED, TaskStatus.SUCCEEDED), action
 
 
 async def test_a_located_object_is_recorded_with_its_reference_at_that_time(tmp_path: Path) -> None:

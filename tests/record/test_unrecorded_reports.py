@@ -24,6 +24,7 @@ from tests.databases import ask, put_memory
 @dataclass
 class StepActionPerformable(ActionAbstract):
     number: int
+    dtype: int = 8  # the user's own field, as any other
 
     async def perform(self) -> None:
         """Succeed without doing anything."""

@@ -91,10 +91,10 @@ async def test_to_sql(tmp_path: Path) -> None:
     root, *rows = await Recorded(tmp_path).all(select(TaskTreeNode).order_by(TaskTreeNode.id))
     assert (root.kind, root.action) == ("root", None)
     assert [(row.dtype, row.kind, row.status, row.reason) for row in rows] == [
-        (node.designator.dtype, node.kind, node.status, None) for node in tree if node.designator is not None
+        (node.designator.__dtype__, node.kind, node.status, None) for node in tree if node.designator is not None
     ]
     assert [row.parent.dtype for row in rows] == [
-        node.parent.designator.dtype if node.parent is not None and node.parent.designator is not None else None
+        node.parent.designator.__dtype__ if node.parent is not None and node.parent.designator is not None else None
         for node in tree
     ]
     for row, node in zip(rows, tree, strict=True):
