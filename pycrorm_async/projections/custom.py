@@ -700,7 +700,11 @@ def _value(table: str, name: str, storage: Storage, value: Any) -> Any:
 # they are; a process that has it catches up. A fault in one projection is logged, and the others continue.
 
 _CHECK_S = 1.0
-"""The interval between checks for events from other processes, because a check costs a scan of all episodes."""
+"""The interval between checks for events from other processes."""
+_SCAN_SHARE_MAX = 0.02
+"""Bounds the share of time in which all episodes are checked, and not the newest only: 100,000 take 25 ms."""
+_SCAN_S_MAX = 10.0
+"""Bounds the time until all episodes are checked again, also after a check that a busy machine made slow."""
 
 
 class CustomFoldDefinition:
@@ -821,8 +825,9 @@ class CustomTables:
         self._installed = installed
         self._batch_events = batch_events
         self._folded: dict[str, tuple[BatchFold, FoldPipeline]] = {}
+        self._targets: dict[str, SideTarget] = {}
         self._packed: set[str] = set()
-        self._checked_s = self._packed_s = 0.0
+        self._checked_s = self._packed_s = self._scan_due_s = 0.0
 
     async def set_up(self, connection: AsyncConnection, tables: Layout) -> bool:
         """Create missing tables; return whether the views must be created again.
@@ -840,6 +845,7 @@ class CustomTables:
                 continue
             changed = changed or is_new
             target = SideTarget(self._log, f"{PROJECTION}{each.name}", each.name, each.version)
+            self._targets[each.name] = target
             fold = BatchFold(self._log, target, generation, CustomFoldDefinition(each))
             local = None if self._log.address.is_sqlite else fold
             if isinstance(each, PackedProjection):
@@ -853,20 +859,29 @@ class CustomTables:
     async def fold_next_batch(self, *, now: bool, until_visible: bool = False) -> bool:
         """Fold a batch of each projection; return False if none was behind.
 
-        Checks only every `_CHECK_S` unless `now` is True. The package's own projections are folded every `_CHECK_S`
-        unless `until_visible` is True, because a batch of a few events costs as much as one of a thousand.
+        Checks only every `_CHECK_S` unless `now` is True, and then the newest episodes only, because older ones rarely
+        get events; all of them in some of the checks, and if `until_visible` is True. The package's own projections are
+        folded every `_CHECK_S` unless `until_visible` is True, because a batch of a few events costs as much as one of
+        a thousand.
         """
-        time_s = asyncio.get_running_loop().time()
+        loop = asyncio.get_running_loop()
+        time_s = loop.time()
         if not self._folded or (not now and time_s < self._checked_s + _CHECK_S):
             return False
-        packed = until_visible or time_s >= self._packed_s + _CHECK_S
-        count = 0
+        is_scan = until_visible or time_s >= self._scan_due_s
+        packed = is_scan or time_s >= self._packed_s + _CHECK_S
+        count = most_events = 0
         for name, (fold, pipeline) in [*self._folded.items()]:
             if name in self._packed and not packed:
                 continue
+            target = self._targets[name]
+            if is_scan and target.newest_only:
+                pipeline.begin_again()  # with the oldest, which have waited
+            target.newest_only = not is_scan
             try:
                 events = await pipeline.fold_next([fold])
                 count += events is not None
+                most_events = max(most_events, events or 0)
                 if name in self._packed and (events is None or events < LOOKAHEAD_EVENTS_MIN):
                     self._packed_s = time_s
             except DatabaseUnavailable:
@@ -875,6 +890,9 @@ class CustomTables:
                 _log.warning("this process stops folding the projection %s: %s", name, fault)
                 await self._note_fault(name, fold.generation, str(fault))
                 del self._folded[name]
+        if is_scan and most_events < min(LOOKAHEAD_EVENTS_MIN, self._batch_events):
+            pause_s = 0 if count else (loop.time() - time_s) / _SCAN_SHARE_MAX
+            self._scan_due_s = time_s + min(max(pause_s, _CHECK_S), _SCAN_S_MAX)
         if not count:
             self._checked_s = time_s
         return count > 0

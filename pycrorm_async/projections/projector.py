@@ -116,8 +116,7 @@ class Projector:
     async def fold_rest(self, *, now: bool) -> bool:
         """Refresh some rows of the materialised views or fold custom projections; return False if none was behind.
 
-        Unless `now` is true, custom projections are checked at intervals only, because a check costs a scan of all
-        episodes.
+        Unless `now` is true, custom projections are checked at intervals only.
         """
         with self._log.translated():
             return await self._refresh() or await self._custom.fold_next_batch(now=now)

@@ -17,7 +17,7 @@ from sqlalchemy.ext.asyncio import AsyncConnection
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.types import EpisodeStarted, NodeEnded, NodeStarted
 from pycrorm_async.memory import Memory
-from pycrorm_async.projections import pipeline
+from pycrorm_async.projections import custom, pipeline
 from pycrorm_async.projections.custom import Changes, CustomFoldDefinition, CustomRows, Event, Projection, states
 from pycrorm_async.projections.findings import Difference
 from pycrorm_async.projections.generations import PROJECTION, read_generation
@@ -143,6 +143,25 @@ async def test_rows_follow_event_by_event_as_the_daemon_folds(log: EventLog) -> 
     while await projector.fold_next_batch():
         pass
     assert await visible_rows(log) == rows_of(1)
+
+
+async def test_the_newest_episodes_are_checked_often_and_all_of_them_seldom(
+    log: EventLog, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(pipeline, "_NEWEST_EPISODES", 1)
+    for name in ("_CHECK_S", "_SCAN_S_MAX"):
+        monkeypatch.setattr(custom, name, 1e9)
+    begun = [each for number in (1, 2, 3) for each in tries(number).records[:4]]
+    projector = await folded(log, [*declarations(PICK_UP), *begun], GraspRate())
+    await log.append([*tries(1).records, *tries(2).records, *tries(3).records])
+    while await projector.fold_next_batch():
+        pass
+    assert await visible_rows(log) == [rows_of(1)[0], rows_of(2)[0], *rows_of(3)]
+    projector._custom._scan_due_s = 0
+    await log.append(tries(4).records[:4])
+    while await projector.fold_next_batch():
+        pass
+    assert await visible_rows(log) == [*rows_of(1), *rows_of(2), *rows_of(3), rows_of(4)[0]]
 
 
 async def test_simulations_are_left_out_unless_the_projection_asks_for_them(log: EventLog) -> None:
