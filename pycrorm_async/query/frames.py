@@ -84,8 +84,8 @@ _STATEMENT = TypeVar("_STATEMENT", bound=Select[Any])
 
 _CHARACTERS = re.compile("[^\0\ud800-\udfff]*")
 
-FAILED = (TaskStatus.FAILED, TaskStatus.ERROR, TaskStatus.LOST)
-TRIED = (TaskStatus.SUCCEEDED, TaskStatus.FAILED, TaskStatus.ERROR)
+FAILED = (TaskStatus.FAILED, TaskStatus.ERROR)
+TRIED = (TaskStatus.SUCCEEDED, *FAILED)
 """The statuses that count in a rate of success: what was cancelled, interrupted or lost is no evidence of either."""
 NORMAL_95 = 1.959964
 """95 % of a normal distribution are within this many standard deviations."""

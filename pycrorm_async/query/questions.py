@@ -223,7 +223,7 @@ def experience_at(
             func.count().label("times"),
             times_with(node.status == TaskStatus.SUCCEEDED).label("succeeded"),
             times_with(node.status.in_(FAILED)).label("failed"),
-            *success_rate(node.status, node.status.is_not(None)),
+            *success_rate(node.status, node.status.in_(TRIED)),
             func.avg(node.duration).label("mean_s"),
             func.max(node.start_time).label("last_time"),
         )
@@ -760,7 +760,10 @@ class Ask(Generic[Q]):
     def experience_at(
         self, x: float, y: float, *, radius_m: float = 0.5, dtype: str | None = None, limit: int | None = None
     ) -> Q:
-        """Sum up the actions that a robot started within `radius_m` of a place: by type and arm, with successes."""
+        """Sum up the actions that a robot started within `radius_m` of a place: by type and arm, with successes.
+
+        A share counts what `success_rates` counts.
+        """
         make = partial(experience_at, x=x, y=y, radius_m=radius_m, dtype=dtype, limit=limit)
         return self._ask("experience_at", None, make)
 

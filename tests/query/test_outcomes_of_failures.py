@@ -210,7 +210,7 @@ def test_an_episode_says_how_many_of_its_actions_failed_beside_its_own_status(tm
     assert texts == ["SUCCEEDED, 2 actions failed", "FAILED"]
 
 
-def test_a_reason_of_an_action_that_succeeded_is_no_failure(tmp_path: Path) -> None:
+def test_a_reason_of_an_action_that_succeeded_and_an_action_without_an_end_are_no_failures(tmp_path: Path) -> None:
     with Memory.sync(f"sqlite:///{tmp_path}/memory.db") as memory:
         take = memory.recording.type("action", "TakeAction", {"arm": "text"})
         with memory.recording.episode(description="odd") as episode:
@@ -218,11 +218,13 @@ def test_a_reason_of_an_action_that_succeeded_is_no_failure(tmp_path: Path) -> N
             for key, status in ends.items():
                 episode.start(key, take, {"arm": "LEFT"})
                 episode.end(key, status, ("Slip", "nearly"))
+            episode.start("lost", take, {"arm": "LEFT"})
         memory.flush()
         assert [(each.reason, each.times) for each in memory.ask.failures_by_cause().rows()] == [("Slip", 1)]
         assert memory.recall("TakeAction").reasons == [("Slip", 1)]
         [rate] = memory.ask.success_rates().rows()
-        assert (rate.times, rate.succeeded, rate.failed, rate.share) == (3, 1, 1, 0.5)
+        assert (rate.times, rate.succeeded, rate.failed, rate.share) == (4, 1, 1, 0.5)
+        assert [(each.succeeded, each.failed) for each in memory.ask.arms_used().rows()] == [(1, 1)]
 
 
 # --- pictures and comments ----------------------------------------------------------------------------------------
