@@ -20,7 +20,7 @@ from pycrorm_async import orm
 from pycrorm_async.errors import CallerError, MissingExtra
 from pycrorm_async.orm.base import EPISODE
 from pycrorm_async.orm.documentation import unit_of
-from pycrorm_async.query.frames import NORMAL_95, FrameColumn, columns_of
+from pycrorm_async.query.frames import NORMAL_95, TRIED, FrameColumn, columns_of
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.text import nearest, one_line
 from pycrorm_async.task_status import TaskStatus
@@ -105,7 +105,7 @@ def _title(table: SuccessTable) -> str:
     low, high = interval_95(table.succeeded, table.rows)
     rate = f"{_percent(table.succeeded / table.rows)} of {table.rows:,} succeeded (95 %: {_percent(low, high)})"
     left_out = [f"{table.missing:,} without a value"] if table.missing else []
-    left_out += [f"{table.running:,} not ended"] if table.running else []
+    left_out += [f"{table.running:,} neither succeeded nor failed"] if table.running else []
     more = f"; left out: {', '.join(left_out)}" if left_out else ""
     return _plain(f"{table.source}: success over {table.x.name} and {table.y.name}\n{rate}{more}")
 
@@ -244,7 +244,8 @@ _CATEGORIES_MAX, _CATEGORY_MAX = 20, 24
 """Bounds the categories of a column, and their characters."""
 _NUMBERS = ("integer", "number", "time", "local time", "date")
 _CATEGORIES = ("bool", "text", "enum")
-_SUCCEEDED, _RUNNING = TaskStatus.SUCCEEDED.name, TaskStatus.RUNNING.name
+_SUCCEEDED = TaskStatus.SUCCEEDED.name
+_UNTRIED = {None, *(each.name for each in TaskStatus if each not in TRIED)}
 
 
 class Values(NamedTuple):
@@ -271,7 +272,8 @@ class Samples(NamedTuple):
         source: name of the view.
         succeeded: for each row.
         missing: number of rows left out because a value is missing.
-        running: number of rows left out because they have not ended.
+        running: number of rows left out because they neither succeeded nor failed: they run, or were cancelled,
+            interrupted or lost.
     """
 
     source: str
@@ -307,17 +309,17 @@ async def success_samples(
             rows += part
             if len(rows) > _ROWS_MAX:
                 raise CallerError(f"{name} has more than {_ROWS_MAX:,} rows: choose some with a select")
-    ended = [row for row in rows if row[2] not in (_RUNNING, None)]
-    whole = [row for row in ended if row[0] is not None and row[1] is not None]
+    tried = [row for row in rows if row[2] not in _UNTRIED]
+    whole = [row for row in tried if row[0] is not None and row[1] is not None]
     if not whole:
-        raise CallerError(f"no row of {name} has ended and has {x} and {y}; it has {len(rows):,} rows")
+        raise CallerError(f"no row of {name} succeeded or failed and has {x} and {y}; it has {len(rows):,} rows")
     return Samples(
         name,
         _values(wanted[0], [row[0] for row in whole]),
         _values(wanted[1], [row[1] for row in whole]),
         np.array([row[2] == _SUCCEEDED for row in whole]),
-        missing=len(ended) - len(whole),
-        running=len(rows) - len(ended),
+        missing=len(tried) - len(whole),
+        running=len(rows) - len(tried),
     )
 
 

@@ -8,7 +8,7 @@ import io
 import json
 from itertools import product
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -19,6 +19,7 @@ from typer.testing import CliRunner
 from pycrorm_async import Memory, UserView
 from pycrorm_async.cli.main import app
 from pycrorm_async.errors import CallerError, MissingExtra
+from pycrorm_async.events.types import NodeStatus
 from pycrorm_async.orm import Action, PickUpWithContextView
 from pycrorm_async.orm.documentation import unit_of
 from pycrorm_async.query import success as figures
@@ -90,8 +91,18 @@ async def test_rows_without_a_value_or_an_end_are_counted_and_left_out(url: str)
         with memory.recording.episode(description="running") as episode:
             episode.start("1", memory.recording.type("action", "TryAction", {"speed": float}), {"speed": 1.0})
             await memory.flush()
-            with pytest.raises(CallerError, match="has ended and has speed and dtype; it has 1 rows"):
+            with pytest.raises(CallerError, match="succeeded or failed and has speed and dtype; it has 1 rows"):
                 await memory.plot_success("speed", "dtype", of="TryAction")
+            type_ = memory.recording.type("action", "TryAction", {"speed": float})
+            for status in set(get_args(NodeStatus)) - {"RUNNING"}:
+                episode.start(status, type_, {"speed": 2.0})
+                episode.end(status, status)
+            await memory.flush()
+            [rate] = await memory.ask.success_rates().rows()
+            tried = await success_samples(memory.reading, "speed", "dtype", "TryAction")
+            assert (rate.succeeded, rate.failed) == (1, 2)
+            assert (len(tried.succeeded), tried.succeeded.sum()) == (3, 1)
+            assert tried.running == rate.times - 3
 
 
 async def test_a_view_is_a_class_a_name_a_view_of_the_users_own_or_a_select(url: str) -> None:
@@ -124,7 +135,10 @@ async def test_the_labels_of_a_picture_have_the_units_that_the_schema_has(url: s
         (("speed", "arm", "TriAction"), "there is no view 'TriAction'"),
         (("x", "y", "Pose"), "Pose has no column 'status' whose success could be counted"),
         (("speed", "parameters", "TryAction"), "TryAction.parameters is of the type json, which cannot be an axis"),
-        (("relative_x", "relative_y"), "no row of PickUpWithContextView has ended and has relative_x and relative_y"),
+        (
+            ("relative_x", "relative_y"),
+            "no row of PickUpWithContextView succeeded or failed and has relative_x and",
+        ),
     ],
 )
 async def test_what_cannot_be_counted_is_one_line(url: str, arguments: tuple[str, ...], message: str) -> None:
