@@ -162,8 +162,16 @@ class TablesForeign(DatabaseForeign):
     """This process can append to the log but cannot use the tables: recording continues."""
 
 
-class TablesOutdated(TablesForeign):
+class TablesPending(TablesForeign):
+    """All events are stored, and another command or login must bring the tables up to date."""
+
+
+class TablesOutdated(TablesPending):
     """An older fold made the tables: `pycrorm rebuild` makes them usable again."""
+
+
+class TablesWithheld(TablesPending):
+    """This login may append to the log and not change the tables: another login folds."""
 
 
 class TablesUntrusted(TablesForeign):

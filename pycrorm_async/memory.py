@@ -47,7 +47,7 @@ from sqlalchemy import Select
 from pycrorm_async import __version__
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
 from pycrorm_async.connected_var import ConnectedVar, set_inside
-from pycrorm_async.errors import CallerError, EpisodeParked, FlushTimeout, PycrormError, TablesForeign, TablesOutdated
+from pycrorm_async.errors import CallerError, EpisodeParked, FlushTimeout, PycrormError, TablesForeign, TablesPending
 from pycrorm_async.events.codec import declaration_of
 from pycrorm_async.events.fields import checked_tags
 from pycrorm_async.events.ids import episode_id
@@ -450,13 +450,14 @@ class Memory:
         Raises:
             EpisodeParked: an episode could not be stored or folded, with the reason; each episode is reported once.
             TablesOutdated: all is stored, but an older version made the tables; reported once.
+            TablesWithheld: all is stored, but this login may not change the tables; reported once.
             TablesUntrusted: all is stored, but the tables belong to a role with fewer rights than this login.
             FlushTimeout: nothing was stored or folded for `flush_timeout_s`. The events are safe in the spool.
         """
         parts = self._open_parts
         try:
             await parts.flush()
-        except (EpisodeParked, TablesOutdated) as fault:
+        except (EpisodeParked, TablesPending) as fault:
             unreported = self._unreported(fault)
             if unreported is not None:
                 raise unreported from fault
@@ -465,7 +466,7 @@ class Memory:
 
     def _unreported(self, fault: PycrormError) -> PycrormError | None:
         """Return the fault less the parked episodes or outdated tables that a flush reported; None if that is all."""
-        if isinstance(fault, TablesOutdated):
+        if isinstance(fault, TablesPending):
             is_reported = "tables" in self._reported
             self._reported.add("tables")
             return None if is_reported else fault
@@ -776,7 +777,7 @@ class Memory:
         """Store and fold all recorded events. An error in doing so is logged, not raised, if the plan failed itself.
 
         A parked episode is logged and does not make closing fail; `pycrorm status` lists it, and `flush` raises for it.
-        Nor do tables that an older version made: all events are stored.
+        Nor do tables that an older version made or another login folds: all events are stored.
         """
         parts, self._parts = self._parts, None
         queue.close()
@@ -784,9 +785,9 @@ class Memory:
             await writer.close()
         except PycrormError as fault:
             unreported = self._unreported(fault)
-            if unreported is not None and error is None and not isinstance(unreported, EpisodeParked | TablesOutdated):
+            if unreported is not None and error is None and not isinstance(unreported, EpisodeParked | TablesPending):
                 raise unreported from fault
-            if unreported is not None and not isinstance(unreported, TablesOutdated):  # opening them logged that
+            if unreported is not None and not isinstance(unreported, TablesPending):  # opening them logged that
                 _log.error("when closing the memory: %s", unreported)
         finally:
             if parts is not None:  # else it could not be opened

@@ -34,7 +34,7 @@ from pycrorm_async.cli.output import (
     print_table,
     problem,
 )
-from pycrorm_async.errors import CallerError, EpisodeParked, TablesOutdated
+from pycrorm_async.errors import CallerError, EpisodeParked, TablesPending
 from pycrorm_async.events.fields import checked_tags
 from pycrorm_async.memory import Memory
 from pycrorm_async.progress_bar import stderr
@@ -258,7 +258,7 @@ async def _summarise(memory: Memory, outcome: _Outcome) -> None:
         await memory.flush()
     except EpisodeParked as parked:
         note(str(parked))
-    except TablesOutdated:  # opening the memory has warned of them
+    except TablesPending:  # opening the memory has warned of them
         outcome.is_written = False
         return
     recent = memory.recent_episodes

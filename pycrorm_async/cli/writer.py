@@ -129,6 +129,8 @@ def store_once(
         print_json({**extra, **_document(report)})
     else:
         _print(report)
+    if report.drained.pending is not None:
+        note(f"the tables do not show what is stored: {report.drained.pending}")
     for name, error in report.failed.items():
         remedy = ""
         if isinstance(error, SpoolDamaged):
@@ -168,6 +170,7 @@ def _document(report: RecoveryReport) -> dict[str, object]:
         "recorders": [each.source for each in report.drained.drained],
         "events_stored": sum(each.records for each in report.drained.drained),
         "events_folded": report.drained.folded,
+        "tables_pending": report.drained.pending,
         "lost": report.lost,
         "failed": {name: str(error) for name, error in report.failed.items()},
         "stopped": dict(report.drained.stopped),

@@ -18,7 +18,7 @@ from contextlib import asynccontextmanager
 from datetime import UTC, datetime
 from typing import Any
 
-from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable, LogDamaged, PycrormError, TablesOutdated
+from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable, LogDamaged, PycrormError, TablesPending
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX
 from pycrorm_async.events.reasons import reason_of
 from pycrorm_async.events.types import EpisodeEnded, EpisodeStarted, NodeEnded, NodeStarted, ObjectAdded
@@ -329,7 +329,7 @@ class LiveOverview:
         shown = (self._unjudged - {each.number for each in await log.behind()}) & self._activities.keys()
         try:
             outcomes = await failures_by_reason(self._reading, shown) if shown else {}
-        except (DatabaseUnavailable, TablesOutdated):  # the list shows what the events say
+        except (DatabaseUnavailable, TablesPending):  # the list shows what the events say
             return []
         self._unjudged -= shown
         for each in shown:

@@ -118,7 +118,10 @@ async def recover(
             for source, state in zip(living, done.drained, strict=False):
                 ids = map(episode_text, episodes[source.name])
                 stopped = {each: done.stopped[each] for each in ids if each in done.stopped}
-                source.mark_visible(state.appended or source.supplied, stopped)
+                if done.pending is None:
+                    source.mark_visible(state.appended or source.supplied, stopped)
+                else:
+                    source.mark_pending(done.pending)
     dead_letters = {each.refused: each.path for each in place.recorders() if each.refused is not None}
     return RecoveryReport(done, len(living), tuple(lost), {**done.failed, **failures}, dead_letters)
 

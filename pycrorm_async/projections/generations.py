@@ -141,7 +141,7 @@ async def current_generation(connection: AsyncConnection, *, hold: Hold | None =
 
 async def read_generation(connection: AsyncConnection, name: str, *, hold: Hold | None = None) -> Generation | None:
     """Read the generation under this key, of any version."""
-    if not await dialect_of(connection).has_table(connection, _NOTES):
+    if not await dialect_of(connection).has_table(connection, _NOTES, to_change=hold is not None):
         return None
     query = select(_notes).where(_notes.c.projection == name)
     if hold is not None:  # SQLite has no row locks and needs none: its write transaction excludes all others

@@ -334,6 +334,9 @@ class DeadSource:
     def mark_unavailable(self, reason: str | None) -> None:
         """Do nothing: no process waits for the records of a dead folder to be stored."""
 
+    def mark_pending(self, reason: str | None) -> None:
+        """Do nothing: no process waits for the records of a dead folder to become visible."""
+
     def release(self) -> str | None:
         """Delete the folder if all its records are stored, and release the locks. Idempotent.
 
@@ -558,6 +561,10 @@ class LiveSource:
     def mark_unavailable(self, reason: str | None) -> None:
         """Publish the reason why the database is unavailable; None when it is available. Raises `SpoolUnavailable`."""
         self._update_note(unavailable=reason)
+
+    def mark_pending(self, reason: str | None) -> None:
+        """Publish the reason why the tables do not show stored records. Raises `SpoolUnavailable`."""
+        self._update_note(pending=reason)
 
     @property
     def supplied(self) -> int:

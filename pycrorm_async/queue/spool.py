@@ -560,11 +560,13 @@ class DrainNote(msgspec.Struct, frozen=True, omit_defaults=True):
         failure: why the drainer will acknowledge no more records; None while it drains.
         unavailable: why the database is unavailable at the moment; None while it is available.
         stopped: by episode id, why the episode is refused or parked; only the first episodes, if there are many.
+        pending: why the tables do not show stored records; None while they are brought up to date.
     """
 
     failure: str | None = msgspec.field(default=None, name="given_up")
     unavailable: str | None = msgspec.field(default=None, name="away")
     stopped: Mapping[str, str] = {}
+    pending: str | None = None
 
 
 class DrainStatus(NamedTuple):
@@ -683,7 +685,7 @@ def _encode_note(note: DrainNote) -> bytes:
     """Encode the note as JSON, with reasons shortened and episodes dropped until it fits."""
     stopped = {episode: reason[:_REASON_CHARACTERS_MAX] for episode, reason in note.stopped.items()}
     while True:
-        short = DrainNote(_shorten(note.failure), _shorten(note.unavailable), stopped)
+        short = DrainNote(_shorten(note.failure), _shorten(note.unavailable), stopped, _shorten(note.pending))
         encoded = msgspec.json.encode(short)
         if len(encoded) <= _NOTE_BYTES_MAX:
             return encoded

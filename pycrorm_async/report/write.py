@@ -33,7 +33,7 @@ from pycrorm_async.errors import (
     DatabaseUnavailable,
     LogDamaged,
     PycrormError,
-    TablesOutdated,
+    TablesPending,
 )
 from pycrorm_async.events.ids import SLOT_NODE, row_id
 from pycrorm_async.orm import RootFailure, TaskTreeNode
@@ -367,7 +367,7 @@ async def outcomes_of(reading: Reading, number: int) -> dict[str, str]:
     query = select(RootFailure.sequence, RootFailure.outcome).where(RootFailure.process_metadata_id == number)
     try:
         rows = await reading.rows(query, simulated=True)
-    except (DatabaseUnavailable, TablesOutdated):  # the page shows the events alone
+    except (DatabaseUnavailable, TablesPending):  # the page shows the events alone
         return {}
     return {str(row.sequence): row.outcome for row in rows}
 
@@ -428,7 +428,7 @@ class SimilarCases:
         """
         try:
             library = await self._reader.library()
-        except (DatabaseUnavailable, TablesOutdated):
+        except (DatabaseUnavailable, TablesPending):
             return None
         except DamageError as fault:
             return {"fault": str(fault)}

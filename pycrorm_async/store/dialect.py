@@ -240,8 +240,11 @@ class Dialect(Protocol):
         """Create the schema for tables and views, if the database has schemas."""
         ...
 
-    async def has_table(self, connection: AsyncConnection, name: str) -> bool:
-        """Return whether a derived table of this name exists."""
+    async def has_table(self, connection: AsyncConnection, name: str, *, to_change: bool = False) -> bool:
+        """Return whether a derived table of this name exists.
+
+        Raises `TablesUntrusted`, and `TablesWithheld` for a login that appends and may not read or change the tables.
+        """
         ...
 
     async def expect(self, connection: AsyncConnection, tables: Sequence[Expected]) -> None:

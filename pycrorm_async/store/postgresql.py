@@ -43,7 +43,14 @@ from sqlalchemy.exc import DBAPIError
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.bulk_records import make
-from pycrorm_async.errors import DatabaseError, DatabaseForeign, DatabaseUnavailable, PycrormError, TablesUntrusted
+from pycrorm_async.errors import (
+    DatabaseError,
+    DatabaseForeign,
+    DatabaseUnavailable,
+    PycrormError,
+    TablesUntrusted,
+    TablesWithheld,
+)
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX
 from pycrorm_async.store import postgresql_errors
 from pycrorm_async.store.dialect import (
@@ -259,7 +266,12 @@ FOR EACH STATEMENT EXECUTE FUNCTION {LOG}.refuse_change()""",
 TABLE_NAMES = f"""
 SELECT relname FROM pg_catalog.pg_class WHERE relnamespace = pg_catalog.to_regnamespace('{LOG}')::oid"""
 HAS_TABLE = f"""
-SELECT pg_catalog.to_regclass(pg_catalog.format('{TABLES}.%I', $1::text)) IS NOT NULL, ({STRANGER}), session_user"""
+SELECT is_withheld, CASE WHEN is_withheld THEN false
+ELSE pg_catalog.to_regclass(pg_catalog.format('{TABLES}.%I', $1::text)) IS NOT NULL END, ({STRANGER}), session_user
+FROM (
+    SELECT pg_catalog.has_schema_privilege(pg_catalog.to_regnamespace('{TABLES}')::oid, $2::text) IS FALSE
+    AND pg_catalog.has_table_privilege(pg_catalog.to_regclass('{LOG}.event')::oid, 'INSERT')
+) AS login (is_withheld)"""
 READ_LOG = f"SELECT id, format FROM {LOG}.pycrorm_log"
 INSERT_LOG = f"INSERT INTO {LOG}.pycrorm_log (one, id, format, created_wall_ns) VALUES (1, $1, $2, $3)"
 SET_FORMAT = f"UPDATE {LOG}.pycrorm_log SET format = $1"
@@ -614,13 +626,19 @@ class PostgreSQL:
     async def make_place(self, connection: AsyncConnection) -> None:
         await connection.exec_driver_sql(f"CREATE SCHEMA IF NOT EXISTS {TABLES_SCHEMA}")
 
-    async def has_table(self, connection: AsyncConnection, name: str) -> bool:
-        exists, stranger, login = tuple((await connection.exec_driver_sql(HAS_TABLE, (name,))).one())
+    async def has_table(self, connection: AsyncConnection, name: str, *, to_change: bool = False) -> bool:
+        parameters = (name, "CREATE" if to_change else "USAGE")
+        is_withheld, exists, stranger, login = tuple((await connection.exec_driver_sql(HAS_TABLE, parameters)).one())
         if stranger is not None:
             raise TablesUntrusted(
                 f"the tables belong to {stranger}, whose members could run their code with the rights of {login}:"
                 f" fold with a login that is a member of {stranger} and has no right to the log, read with one of"
                 " pycrorm_reader"
+            )
+        if is_withheld:
+            raise TablesWithheld(
+                f"{login} may {'not change' if to_change else 'neither read nor change'} the tables: fold with"
+                " `pycrorm writer` and a login that may, read with one of pycrorm_reader"
             )
         return bool(exists)
 

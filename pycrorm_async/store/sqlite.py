@@ -418,7 +418,7 @@ class SQLite:
     async def make_place(self, connection: AsyncConnection) -> None:
         """Do nothing: tables and views are in the same file."""
 
-    async def has_table(self, connection: AsyncConnection, name: str) -> bool:
+    async def has_table(self, connection: AsyncConnection, name: str, *, to_change: bool = False) -> bool:  # noqa: ARG002
         return (await connection.exec_driver_sql(HAS_TABLE, (name,))).first() is not None
 
     async def expect(self, connection: AsyncConnection, tables: Sequence[Expected]) -> None:

@@ -29,7 +29,14 @@ from collections.abc import Awaitable, Callable, Mapping, Sequence
 from contextlib import suppress
 from typing import Final, NamedTuple, TypeVar
 
-from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable, FilesError, PycrormError, SpoolForeign
+from pycrorm_async.errors import (
+    DatabaseForeign,
+    DatabaseUnavailable,
+    FilesError,
+    PycrormError,
+    SpoolForeign,
+    TablesPending,
+)
 from pycrorm_async.events.codec import Record
 from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.settings import Settings
@@ -87,6 +94,7 @@ class Daemon:
         self._rests: dict[str, tuple[int, float]] = {}  # by name: number of attempts, time of the next one
         self._appended_events = asyncio.Event()
         self._unavailable: str | None = None
+        self._pending: str | None = None
         self._last_lines: dict[str, str] = {}  # by subject, the last line
         self._recorders = self._records = 0
 
@@ -180,6 +188,8 @@ class Daemon:
         try:
             if self._unavailable is not None:
                 source.mark_unavailable(self._unavailable)
+            if self._pending is not None:
+                tracker.mark_pending(self._pending)
             await tracker.run()
         except Exception as error:  # noqa: BLE001 - reported and retried; must not stop the other recorders
             fault = _one_line(error)
@@ -222,10 +232,14 @@ class Daemon:
             self._appended_events.clear()
             try:
                 while await self._availability.observe(self._tables.fold_next_batch()):
+                    self._publish_pending(None)
                     await self._publish_visibility()
+                self._publish_pending(None)
                 await self._publish_visibility()
             except Exception as error:  # noqa: BLE001 - reported and retried; appending continues
                 attempt += 1
+                if isinstance(error, TablesPending):
+                    self._publish_pending(str(error))
                 if not isinstance(error, DatabaseUnavailable):
                     self._report_if_new(f"the tables cannot be brought up to date: {_one_line(error)}", "fold")
                 self._appended_events.set()
@@ -254,6 +268,15 @@ class Daemon:
                 tracker.note(appended, behind, stopped)
             except FilesError as error:  # the drain meets the same disk error and reports it
                 self._report(f"recorder {tracker.source.name}: {error}")
+
+    def _publish_pending(self, reason: str | None) -> None:
+        if reason != self._pending:
+            self._pending = reason
+            for tracker in self._serving.values():
+                try:
+                    tracker.mark_pending(reason)
+                except FilesError as error:
+                    self._report(f"recorder {tracker.source.name}: {error}")
 
     # --- reports --------------------------------------------------------------------------------------
 
@@ -379,11 +402,15 @@ class VisibilityTracker:
             self._invisible.append((source.stored, _by_text(source.invisible)))
         self._stopped: dict[str, str] = {}
         self._updated = asyncio.Event()
+        self._is_pending = False
 
     async def run(self) -> None:
-        """Run until the folder is drained and all its records are visible. Raises as `Drain.run` does."""
+        """Run until the folder is drained and all its records are visible, or the tables wait for a rebuild.
+
+        Raises as `Drain.run` does.
+        """
         await self.drain.run()
-        while self._invisible:
+        while self._invisible and not self._is_pending:
             self._updated.clear()
             await self._updated.wait()
 
@@ -411,6 +438,12 @@ class VisibilityTracker:
         if visible_to:
             self.source.mark_visible(visible_to, self._stopped)
             self._updated.set()
+
+    def mark_pending(self, reason: str | None) -> None:
+        """Publish to the recorder why its stored records are not visible. Raises `FilesError`."""
+        self._is_pending = reason is not None
+        self._updated.set()
+        self.source.mark_pending(reason)
 
     def _track(self, batch: Sequence[Record]) -> None:
         lasts = _by_text({each.episode: each.sequence for each in batch if each.episode is not None})

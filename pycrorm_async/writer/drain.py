@@ -39,6 +39,7 @@ from pycrorm_async.errors import (
     FilesError,
     InternalError,
     PycrormError,
+    TablesPending,
 )
 from pycrorm_async.events.codec import Record
 from pycrorm_async.events.ids import EpisodeId, episode_text
@@ -399,6 +400,10 @@ class ClaimedSource(Source, Protocol):
         """Publish the reason why the database is unavailable; None when it is available again."""
         ...
 
+    def mark_pending(self, reason: str | None) -> None:
+        """Publish the reason why the tables do not show stored records; None when they do again."""
+        ...
+
     def release(self) -> str | None:
         """Release the folder; delete a dead recorder's folder if all its records are stored. Blocks.
 
@@ -414,6 +419,8 @@ class DrainReasons(Protocol):
     def failure(self) -> str | None: ...
     @property
     def unavailable(self) -> str | None: ...
+    @property
+    def pending(self) -> str | None: ...
     @property
     def stopped(self) -> Mapping[str, str]: ...
 
@@ -482,12 +489,14 @@ class DrainSummary:
         failed: by source name, the reason why it could not be drained to its end, or its refused records not be kept.
         folded: number of folded events.
         stopped: by episode id, the reason why it is refused or parked; includes episodes refused whole, without a row.
+        pending: the reason why the tables do not show what is stored.
     """
 
     drained: tuple[DrainState, ...]
     failed: Mapping[str, PycrormError]
     folded: int
     stopped: Mapping[str, str]
+    pending: str | None = None
 
 
 async def drain_once(
@@ -520,10 +529,16 @@ async def drain_once(
             failed[source.name] = drain.stuck
         drained.append(drain.state)
     await retry(destination.confirm, backoff=BRIEF)
-    folded = await retry(destination.fold, backoff=BRIEF)
+    folded, pending = 0, None
+    try:
+        folded = await retry(destination.fold, backoff=BRIEF)
+    except TablesPending as error:
+        pending = str(error)
     stopped = await retry(destination.stopped, backoff=BRIEF)
     refused = {episode: reason for each in drained for episode, reason in each.refused.items()}
-    return DrainSummary(drained=tuple(drained), failed=failed, folded=folded, stopped={**refused, **stopped})
+    return DrainSummary(
+        drained=tuple(drained), failed=failed, folded=folded, stopped={**refused, **stopped}, pending=pending
+    )
 
 
 # === patience =================================================================================================

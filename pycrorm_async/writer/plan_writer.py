@@ -16,7 +16,14 @@ from concurrent.futures import Future
 from contextlib import AbstractAsyncContextManager, AsyncExitStack
 from typing import NamedTuple, TypeVar
 
-from pycrorm_async.errors import DatabaseError, DatabaseUnavailable, EpisodeParked, FlushTimeout, InternalError
+from pycrorm_async.errors import (
+    DatabaseError,
+    DatabaseUnavailable,
+    EpisodeParked,
+    FlushTimeout,
+    InternalError,
+    TablesPending,
+)
 from pycrorm_async.settings import Settings
 from pycrorm_async.writer.drain import (
     PATIENT,
@@ -247,11 +254,13 @@ class DelegatedWriter:
         self._queue = queue
         self._settings = settings
         self._drained_s = asyncio.get_running_loop().time()
+        self._is_pending_logged = False
 
     async def flush(self, position: int) -> None:
         """Wait until the records up to this position are stored and visible in the tables.
 
-        Raises `EpisodeParked` for episodes of this queue that stopped, `DatabaseError` if the drainer had to stop, and
+        Raises `EpisodeParked` for episodes of this queue that stopped, `TablesPending` if all is stored and the daemon
+        cannot bring the tables up to date, `DatabaseError` if the drainer had to stop, and
         `FlushTimeout` after `flush_timeout_s` without progress; its message states whether a process drains the queue.
         """
         hindrance = await self._wait(position, undrained_s_max=math.inf, on_poll=self._raise_failure)
@@ -263,7 +272,8 @@ class DelegatedWriter:
         """Wait until the queue, which the caller closed, is stored and visible in the tables.
 
         Stops waiting, with a warning, when no process drains the queue, when the database is unavailable, and after
-        `flush_timeout_s` without progress: the next drainer of the spool stores the rest. Raises `EpisodeParked`.
+        `flush_timeout_s` without progress: the next drainer of the spool stores the rest. Raises `EpisodeParked`,
+        `TablesPending`.
         """
         await self._queue.synced_to()
         position = self._queue.written
@@ -287,7 +297,7 @@ class DelegatedWriter:
     async def _poll(self, position: int, undrained_s_max: float, on_poll: Callable[[], None]) -> bool:
         """Return True when the records up to this position are visible, False when none drains them for too long."""
         loop = asyncio.get_running_loop()
-        while self._status.folded < position:
+        while self._status.folded < position and not self._is_pending(position):
             on_poll()
             now_s = loop.time()
             if self._status.note.unavailable is None and self._queue.is_drained:
@@ -306,6 +316,11 @@ class DelegatedWriter:
     @property
     def _progress(self) -> tuple[int, int]:
         return self._status.stored, self._status.folded
+
+    def _is_pending(self, position: int) -> bool:
+        """Return whether the records up to this position are stored, and the daemon cannot fold them."""
+        status = self._status
+        return status.stored >= position and status.note.pending is not None
 
     def _raise_failure(self) -> None:
         """Raise the drainer's reason if it had to stop; a drainer that still runs only reports a refused episode."""
@@ -333,6 +348,11 @@ class DelegatedWriter:
         stopped = dict(self._status.note.stopped)
         if stopped:
             raise EpisodeParked(stopped)
+        if (pending := self._status.note.pending) is not None:
+            if not self._is_pending_logged:
+                self._is_pending_logged = True
+                _log.warning("the tables do not show what is stored: %s", pending)
+            raise TablesPending(pending)
 
 
 # === writer thread ============================================================================================

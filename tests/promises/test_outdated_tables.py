@@ -13,8 +13,9 @@ from pathlib import Path
 import pytest
 
 from pycrorm_async import Memory
-from pycrorm_async.errors import TablesOutdated
+from pycrorm_async.errors import TablesOutdated, TablesPending
 from pycrorm_async.operations import rebuild
+from pycrorm_async.operations.daemon import serve
 from pycrorm_async.operations.recovery import recover
 from pycrorm_async.plan import ActionAbstract
 from pycrorm_async.projections.generations import PROJECTION_VERSION
@@ -112,6 +113,46 @@ async def test_a_plan_in_a_large_outdated_memory_is_stored_and_raises_nothing(
     monkeypatch.setattr(rebuild, "SMALL_EVENTS_MAX", small)
     await recorded(database_url, 5)
     assert numbers_in(database_url) == [1, 2, 3, 4, 5]
+
+
+@pytest.mark.parametrize("drained_by", ["daemon", "writer --once"])
+async def test_a_plan_whose_events_another_process_stores_waits_for_no_rebuild(
+    database_url: str,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    tmp_path: Path,
+    drained_by: str,
+) -> None:
+    await outdated(database_url)
+    small = rebuild.SMALL_EVENTS_MAX
+    monkeypatch.setattr(rebuild, "SMALL_EVENTS_MAX", 5)
+    spool, stop, lines = tmp_path / "spool", asyncio.Event(), list[str]()
+    serving = serve(database_url, spool=spool, stop=stop, report=lines.append)
+    async with Memory.open(database_url, spool=spool, writer="daemon") as memory:
+        drains = asyncio.create_task(serving if drained_by == "daemon" else asyncio.sleep(0))
+        async with memory.episode(description="steps"):
+            await StepActionPerformable(3).perform()
+        if drained_by == "daemon":
+            with pytest.raises(TablesPending, match="run `pycrorm rebuild`"):
+                await memory.flush()
+            await memory.flush()  # reported once
+            monkeypatch.setattr(rebuild, "SMALL_EVENTS_MAX", small)
+            await rebuild.rebuild_memory(database_url)  # beside the daemon, which goes on folding
+            async with memory.episode(description="steps"):
+                await StepActionPerformable(4).perform()
+        else:
+            serving.close()
+            await memory.synced()
+            once = await asyncio.to_thread(pycrorm, "writer", "--once", "--url", database_url, "--spool", str(spool))
+            assert (once.returncode, once.stderr.count("run `pycrorm rebuild`")) == (0, 1), once.stderr
+            assert memory.status.stored > 0
+            with pytest.raises(TablesPending):
+                await memory.flush()
+    stop.set()
+    await drains
+    assert sum("run `pycrorm rebuild`" in each for each in warnings_in(caplog)) <= 2  # the plan's and the daemon's
+    assert numbers_in(database_url) == ([1, 2, 3, 4] if drained_by == "daemon" else [1, 2])
+    assert [each for each in lines if "not finished" in each] == []
 
 
 async def test_verify_checks_the_log_of_an_outdated_memory(database_url: str) -> None:

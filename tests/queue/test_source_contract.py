@@ -274,15 +274,17 @@ async def test_visibility_and_the_state_of_the_database_are_published_to_a_livin
     await source.acknowledge(20)
     before = contents(claimable.folder) if claimable.kind == "dead" else {}  # a living recorder writes meanwhile
     source.mark_unavailable("the server restarts")
+    source.mark_pending("rebuild")
     source.mark_visible(5, {"an episode": "a gap"})
     status = claimable.queue.external_drain_status
     if claimable.kind == "dead":
         assert contents(claimable.folder) == before
         assert status is None
         return
-    note = DrainNote(unavailable="the server restarts", stopped={"an episode": "a gap"})
+    note = DrainNote(unavailable="the server restarts", stopped={"an episode": "a gap"}, pending="rebuild")
     assert status == DrainStatus(stored=20, folded=5, note=note)
     source.mark_unavailable(None)
+    source.mark_pending(None)
     source.mark_visible(3, {})
     assert claimable.queue.external_drain_status == DrainStatus(stored=20, folded=5)
 

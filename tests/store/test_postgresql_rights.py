@@ -12,7 +12,7 @@ import pytest
 from sqlalchemy import text
 
 from pycrorm_async import Memory
-from pycrorm_async.errors import PycrormError, TablesUntrusted
+from pycrorm_async.errors import PycrormError, TablesUntrusted, TablesWithheld
 from pycrorm_async.operations.rebuild import rebuild_memory
 from pycrorm_async.operations.recovery import recover
 from pycrorm_async.projections.projector import Projector
@@ -125,6 +125,34 @@ async def test_a_recorder_inserts_digests_and_appends_without_them_where_it_may_
     assert await log.last_digests() == {}
     await log.close()
     assert [tuple(each) for each in ask(url, "SELECT episode, sequence FROM pycrorm.pycrorm_digest")] == [(2, 256)]
+
+
+@pytest.mark.parametrize("roles", ["pycrorm_recorder", "pycrorm_recorder, pycrorm_reader"])
+async def test_a_login_that_only_records_runs_plans_which_another_login_folds(
+    server: Server, roles: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    url = server.new_memory()
+    database = urlsplit(url).path.removeprefix("/")
+    assert pycrorm("roles", "--create", "--url", url, cwd=tmp_path).returncode == 0
+    login = f"robot_of_{database}_{len(roles)}"
+    ask(url, f"CREATE ROLE {login} LOGIN IN ROLE {roles}")
+    robot = server.url(database, user=login)
+    (tmp_path / "notes.py").write_text(NOTES_PLAN)
+    done = pycrorm("run", "notes.py", "--url", robot, cwd=tmp_path)
+    assert (done.returncode, done.stderr.count(f"{login} may ")) == (0, 1), done.stderr
+    async with Memory.open(robot) as memory, memory.episode(description="steps"):
+        await StepActionPerformable("a", 1).perform()
+        with pytest.raises(TablesWithheld, match="fold with `pycrorm writer` and a login that may"):
+            await memory.flush()
+        assert memory.status.faults.total == 0
+    once = pycrorm("writer", "--once", "--url", robot, cwd=tmp_path)
+    assert (once.returncode, once.stderr.count(f"{login} may ")) == (0, 1), once.stderr
+    steps = "SELECT count(*) FROM memory.step_action"
+    assert pycrorm("writer", "--once", "--url", url, cwd=tmp_path).returncode == 0
+    assert ask(url, steps) == [(1,)]
+    shown = pycrorm("episodes", "--url", robot, cwd=tmp_path)
+    assert (shown.returncode, shown.stderr.count("\n")) == ((0, 0) if "reader" in roles else (3, 1))
 
 
 async def test_the_roles_have_no_right_to_change_the_log_but_these(server: Server) -> None:
