@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from pycrorm_async.bulk_records import collect_seldom
-from pycrorm_async.cli.output import DEFAULT_URL, JsonOption, SpoolOption, print_json, print_table, problem
+from pycrorm_async.cli.output import DEFAULT_URL, CsvOption, JsonOption, SpoolOption, print_json, print_table, problem
 from pycrorm_async.cli.reading import note_pending_events
 from pycrorm_async.operations.copy import CopySummary, copy_episodes
 from pycrorm_async.progress_bar import progress_bar
@@ -30,6 +30,7 @@ def copy(
     ] = None,
     spool: SpoolOption = None,
     as_json: JsonOption = False,
+    as_csv: CsvOption = None,
 ) -> int:
     """Append the episodes of one memory to another, in SQLite or PostgreSQL. It is safe to repeat.
 
@@ -47,6 +48,7 @@ def copy(
             f"From {summary.source} to {summary.target}",
             ("episode", "id", "already present", "copied", "last event"),
             [(each.number, each.id, each.were_there, each.copied, each.head) for each in summary.episodes],
+            as_csv=as_csv,
         )
     damaged = [each.damage for each in summary.episodes if each.damage]
     stopped = [f"episode {each.id} is stopped: {each.stopped}" for each in summary.episodes if each.stopped]

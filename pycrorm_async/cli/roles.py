@@ -9,9 +9,11 @@ import typer
 
 from pycrorm_async.cli.output import (
     DEFAULT_URL,
+    CsvOption,
     JsonOption,
     SpoolOption,
     UrlOption,
+    note,
     print_json,
     print_line,
     print_table,
@@ -33,6 +35,7 @@ def roles(
     url: UrlOption = DEFAULT_URL,
     spool: SpoolOption = None,
     as_json: JsonOption = False,
+    as_csv: CsvOption = None,
 ) -> None:
     """Show the roles of a memory on PostgreSQL and the logins that have them; with --create, make them.
 
@@ -51,8 +54,10 @@ def roles(
         print_json([each._asdict() for each in states])
         return
     rows = [(each.name, "yes" if each.exists else "no", ", ".join(each.members)) for each in states]
-    print_table(f"Roles of {address}", ("role", "exists", "logins"), rows)
-    print_line(f"The tables belong to {states[0].tables_owner or 'no role yet'}; this login is {states[0].login}.")
+    print_table(f"Roles of {address}", ("role", "exists", "logins"), rows, as_csv=as_csv)
+    (print_line if as_csv is None else note)(
+        f"The tables belong to {states[0].tables_owner or 'no role yet'}; this login is {states[0].login}."
+    )
 
 
 async def _roles(address: DatabaseAddress, *, create: bool, shared: bool) -> list[RoleState]:

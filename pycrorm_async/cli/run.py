@@ -23,6 +23,7 @@ import typer
 from pycrorm_async.cli.interruption import Interruption
 from pycrorm_async.cli.output import (
     DEFAULT_URL,
+    CsvOption,
     FileAccessOption,
     JsonOption,
     ProjectionOption,
@@ -104,6 +105,7 @@ def run(
         bool, typer.Option("--traceback", help="Print the traceback of a failed plan on stderr.")
     ] = False,
     as_json: JsonOption = False,
+    as_csv: CsvOption = None,
 ) -> int:
     """Run a plan and record it.
 
@@ -133,7 +135,7 @@ def run(
         plan_source=plan_source(loaded.path, loaded.sha256),
     )
     outcome = _Outcome()
-    with redirect_stdout(sys.stderr) if as_json else nullcontext():
+    with redirect_stdout(sys.stderr) if as_json or as_csv is not None else nullcontext():
         try:
             recorded = _run_and_record(loaded, memory, url, description or loaded.description, seed, tags, outcome)
             asyncio.run(recorded)
@@ -157,6 +159,7 @@ def run(
             loaded.name,
             ("episode", "description", "status", "nodes"),
             [(each.number, each.description, each.status_text, each.nodes) for each in episodes],
+            as_csv=as_csv,
         )
     if outcome.left is not None:
         where = _place(outcome.left)

@@ -60,10 +60,14 @@ def test_a_piped_table_breaks_no_line(words: list[str], folder: Path) -> None:
         ["recall", "StepAction"],
         ["recall", "--follows", "StepAction"],
         ["diff", "1", "5"],
+        ["copy", "--to", "sqlite:///{OUT}/copy.db"],
+        ["run", "{OUT}/greet.py", "--url", "sqlite:///{OUT}/run.db"],
         ["query", "SELECT description, id FROM process_metadata"],
     ],
 )
-def test_every_table_of_an_answer_is_csv_on_request(words: list[str], folder: Path) -> None:
+def test_every_table_of_an_answer_is_csv_on_request(words: list[str], folder: Path, tmp_path: Path) -> None:
+    (tmp_path / "greet.py").write_text("async def plan():\n    print('Hello!')\n")
+    words = [each.format(OUT=tmp_path) for each in words]
     done = pycrorm(*words, "--csv", cwd=folder)
     assert done.returncode == 0
     head, *rows = csv.reader(io.StringIO(done.stdout))
