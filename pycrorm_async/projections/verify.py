@@ -443,8 +443,8 @@ async def _check_database(log: EventLog, result: VerifyResult) -> None:
             dialect = dialect_of(connection)
             for reason in await dialect.faults_of_file(connection):
                 result.add_damage(None, None, reason)
-            names = (await connection.execute(_FINGERPRINTS)).scalars()
-            for name, payload in zip(names, await dialect.declarations(connection), strict=True):
+            for name in (await connection.execute(_FINGERPRINTS)).scalars().all():
+                [payload] = await dialect.descriptions(connection, [name])  # by its name, which may be damaged too
                 if fingerprint(payload) != name:
                     result.add_damage(None, None, f"the declaration {name} does not match its fingerprint")
             described = sorted((await connection.execute(_DESCRIPTIONS)).scalars())

@@ -174,6 +174,18 @@ async def test_a_changed_value_in_a_payload_is_a_difference_of_the_tables(
     assert result.differences[2][4:] == ("camera", "world_state")
 
 
+@pytest.mark.parametrize("name", ["", "no name", "zz\x1b", "{}0"])
+async def test_a_changed_name_of_a_declaration_is_reported(log: EventLog, database_url: str, name: str) -> None:
+    name = name.format(name_of(NAVIGATE))
+    ask_to_change(
+        database_url,
+        f"UPDATE pycrorm_declaration SET fingerprint = '{name}' WHERE fingerprint = '{name_of(NAVIGATE)}'",
+    )
+    result = await verify(log)
+    line = f"the declaration {name} does not match its fingerprint"
+    assert " ".join(line.split()) in {str(each) for each in result.damages}
+
+
 async def test_swapped_or_changed_declarations_are_reported(
     log: EventLog, database_url: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
