@@ -74,7 +74,7 @@ from pycrorm_async.plan.objects import (
 from pycrorm_async.plan.task import Experience, PastSuccess, current_node, experience
 from pycrorm_async.world.bounding_boxes import BoundingBox, box_around
 from pycrorm_async.world.bullet import Object, current_world
-from pycrorm_async.world.kinematics import Unreachable, solve
+from pycrorm_async.world.kinematics import Unreachable, headings, solve
 from pycrorm_async.world.pose import Arms, Grasp, Pose, Quaternion, Vector, rotated, yaw_quaternion
 from pycrorm_async.world.queries import (
     Costmap,
@@ -165,13 +165,21 @@ def base_poses(
     yield cells
     clear, height_m = 0, base_height_m(reacher or viewer)
     for cell in _cells(costmap, robots, every=clearance is not None):
-        base_pose = face(cell, goal, height_m=height_m)
-        if clearance is not None and (collision := clearance.refusal(base_pose)) is not None:
-            yield base_pose, Reach(refusal=collision)
-            continue
-        if (clear := clear + 1) > CELLS_MAX:
-            return
-        yield _checked(base_pose, target, goal, reacher, viewer, arms)
+        facing = face(cell, goal, height_m=height_m)
+        place = facing, Reach(refusal="no heading was found at which the arm reaches the target")
+        collision = None
+        for base_pose in [facing] if reacher is None else _headings(reacher, arms, facing, target, goal):
+            collision = None if clearance is None else clearance.refusal(base_pose)
+            if collision is not None:
+                place = base_pose, Reach(refusal=collision)
+            elif clear < CELLS_MAX:
+                place = _checked(base_pose, target, goal, reacher, viewer, arms)
+            else:
+                return
+            if place[1].refusal is None:
+                break
+        clear += collision is None
+        yield place
 
 
 def _arms(robot: CurrentRobot, arm: Arms | None, target: Pose | ObjectLike) -> Arms | tuple[Arms, ...]:
@@ -180,6 +188,27 @@ def _arms(robot: CurrentRobot, arm: Arms | None, target: Pose | ObjectLike) -> A
         return arm
     candidates = tuple(robot.description.arms)
     return candidates if isinstance(target, Pose) else lifting_arms(robot, candidates, target)
+
+
+def _headings(
+    robot: CurrentRobot, arms: Arms | tuple[Arms, ...] | None, facing: Pose, target: Pose | ObjectLike, goal: Pose
+) -> Iterator[Pose]:
+    """Yield the poses of the base to check at a place, each once: for most arms the one that faces the target."""
+    headings_yielded: set[Pose] = set()
+    for arm in _each(robot, arms):
+        goals = _goals(robot, facing, target, goal, arm)
+        at = goals[0] if isinstance(target, Pose) else goals[1]
+        for pose in headings(robot.body, arm, at, base=facing, limits=chosen_limits()):
+            if pose is not facing or facing not in headings_yielded:
+                yield pose
+            headings_yielded.add(pose)
+
+
+def _each(robot: CurrentRobot, arm: Arms | tuple[Arms, ...] | None) -> tuple[Arms, ...]:
+    """Return the arms of a choice: both of BOTH, these of several, all of None."""
+    if isinstance(arm, tuple):
+        return arm
+    return tuple(robot.description.arms if arm is None else robot.each_arm(arm))
 
 
 def _cells(costmap: Costmap, robots: list[CurrentRobot], *, every: bool) -> Iterator[Pose]:
@@ -254,13 +283,9 @@ def reaching_arms(
     Raises `CapabilityAbsenceFailure` for an arm that the robot lacks.
     """
     limits, collides = chosen_limits(), grasps is not None and collisions_count()
-    if isinstance(arm, tuple):
-        candidates = arm
-    else:
-        candidates = tuple(robot.description.arms if arm is None else robot.each_arm(arm))
     reaching: list[Arms] = []
     refusals: list[str] = []
-    for candidate in candidates:
+    for candidate in _each(robot, arm):
         try:
             postures = [
                 solve(robot.body, candidate, each, base=base_pose, torso_height=torso_height, limits=limits)
@@ -270,7 +295,7 @@ def reaching_arms(
             refusals.append(f"{candidate.name}: {unreachable.reason}")
             continue
         if torso_height is not None and robot.description.torso_joint is not None:
-            postures = [{**each, robot.description.torso_joint: torso_height} for each in postures]
+            postures = [{robot.description.torso_joint: torso_height, **each} for each in postures]
         if collides and (collision := _collision(robot, candidate, postures, base_pose, grasps=bool(grasps))):
             refusals.append(f"{candidate.name}: " + "it would be in {1.name} with {0}".format(*collision))
             continue

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from enum import Enum
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pycrorm_async.errors import MissingExtra
 from pycrorm_async.world.pose import JointType, Pose, Quaternion, Vector, product, rotated, yaw_quaternion
 from pycrorm_async.world.urdf import PR2Arm
-from pycrorm_async.world.urdf_model import Bounds, Joint, Model, along
+from pycrorm_async.world.urdf_model import ENDLESS, Bounds, Joint, Model, along
 
 if TYPE_CHECKING:
     import optik
@@ -239,7 +239,10 @@ _ERROR_MAX = 1e-14
 """Square of the distance, m² and rad², at which a search ends; `kinematics` checks the answer."""
 DESCENTS_MAX, STEPS_MAX = 20, 60
 """Bound the damped least squares: 20 starts of 60 steps take half a second when the target is out of reach."""
-_EXACT, _DAMPING_MAX = 1e-9, 1e6
+HEADINGS_MAX = 3
+"""Bounds the headings of the base that are tried at one place for an arm that cannot turn its tool freely."""
+_EXACT, _DAMPING_MIN, _DAMPING_MAX = 1e-9, 1e-9, 1e6
+"""With less damping the equations of an arm of few directions are singular."""
 _STALLED, _STALLED_DAMPING = 0.999, 1e-3
 """A step with this damping or less that leaves more than this part of the squared way ends a descent."""
 _PARALLEL = 1e-9
@@ -252,7 +255,11 @@ class Held(Enum):
     ALL = "ALL"
     """All of it: the arm moves and turns its tool in six directions."""
     AHEAD = "AHEAD"
-    """The direction of the fingers, about which the tool may be turned: five directions, as with five joints."""
+    """The direction of the fingers, about which the tool may be turned: five directions, as with five joints.
+
+    Where the arm cannot hold it, nothing but the position: many an arm of five joints points its fingers only away from
+    its base.
+    """
     NONE = "NONE"
     """Nothing but the position: four directions or fewer."""
 
@@ -278,7 +285,7 @@ class Chain:
         self.bounds = {each.name: each.bounds for each in self._arm if each.moves_freely}
         """The limits of the model."""
         last = max((number for number, each in enumerate(self._arm) if each.kind is not JointType.FIXED), default=-1)
-        self._fixed_behind = len(self._arm) - last - 1
+        self._moving = self._arm[: last + 1]
         behind = along(self._arm[last + 1 :], {})
         self._behind = behind if tool_in_link is None else behind @ tool_in_link
         """The tool's frame in the link that the last joint moves."""
@@ -296,10 +303,6 @@ class Chain:
         _, jacobian = _miss(self._arm, start, {}, self._behind, Pose(), Held.ALL)
         directions = int(np.linalg.matrix_rank(jacobian, tol=_EXACT))
         return Held.ALL if directions == 6 else Held.AHEAD if directions == 5 else Held.NONE
-
-    def angle_rad(self, reached: Pose, target: Pose) -> float:
-        """Return the angle between two orientations of the tool, as far as the arm brings them to a target."""
-        return math.hypot(*_difference(reached, target, self.held)[3:])
 
     def forward(self, positions: Mapping[str, float]) -> Pose:
         """Return the tool's frame in the root link at these joint positions; joints that are left out are at 0."""
@@ -332,10 +335,10 @@ class Chain:
         if any(lower > upper for lower, upper in ranges):
             return None
         goal = target.relative_to(along(self._above, positions))
-        moving = self._arm[: len(self._arm) - self._fixed_behind]
+        moving = self._moving
         slides = any(each.kind is JointType.PRISMATIC or each.mimic is not None for each in moving)
         if slides or self.held is not Held.ALL:
-            angles = _descend(moving, ranges, positions, self._behind, goal, self.held)
+            angles = next(_postures(moving, ranges, positions, self._behind, goal, self.held, DESCENTS_MAX), None)
         else:
             solver = self._solvers.get(ranges)
             if solver is None:
@@ -350,6 +353,28 @@ class Chain:
             for name, angle, (lower, upper) in zip(self.joints, angles, ranges, strict=True)
         }
 
+    def turns_to(
+        self, target: Pose, base: Pose, positions: Mapping[str, float], bounds: Mapping[str, Bounds]
+    ) -> Iterator[float]:
+        """Yield angles by which a base would turn so that the arm reaches a target: the base is its first joint.
+
+        Args:
+            target: in the frame of the base link, before it turns.
+            base: the base link in the root link.
+            positions, bounds: as for `solve`.
+        """
+        ranges = (_within_a_turn(ENDLESS), *(_within_a_turn(bounds[name]) for name in self.joints))
+        mount = Joint("", JointType.FIXED, "", "", base.inverse() @ along(self._above, positions), *_NO_TURN)
+        for angles in _postures(
+            (_BASE, mount, *self._moving), ranges, positions, self._behind, target, self.held, HEADINGS_MAX
+        ):
+            yield angles[0]
+
+
+_NO_TURN = ((0.0, 0.0, 0.0), Vector(0.0, 0.0, 1.0), ENDLESS)
+_BASE = Joint("", JointType.CONTINUOUS, "", "", Pose(), *_NO_TURN)
+"""Turns the base of a robot about its vertical axis."""
+
 
 def _norm(pose: Pose) -> float:
     return math.hypot(*pose.position)
@@ -363,6 +388,32 @@ def _start(ranges: Sequence[Bounds], start: int) -> list[float]:
     ]
 
 
+def _postures(
+    joints: Sequence[Joint],
+    ranges: Sequence[Bounds],
+    given: Mapping[str, float],
+    behind: Pose,
+    goal: Pose,
+    held: Held,
+    starts: int,
+) -> Iterator[list[float]]:
+    """Yield the postures to which descents lead; `given` has the joints that others follow.
+
+    Where the direction of the fingers cannot be held, the position is reached from the postures nearest to both.
+    """
+    ends = []
+    for start in range(starts):
+        miss, angles = _descend(joints, ranges, given, behind, goal, held, _start(ranges, start))
+        if miss < _EXACT:
+            yield angles
+        ends.append((miss, angles))
+    if held is Held.AHEAD and min(ends)[0] >= _EXACT:
+        for _, nearest in sorted(ends)[:HEADINGS_MAX]:
+            miss, angles = _descend(joints, ranges, given, behind, goal, Held.NONE, nearest)
+            if miss < _EXACT:
+                yield angles
+
+
 def _descend(
     joints: Sequence[Joint],
     ranges: Sequence[Bounds],
@@ -370,27 +421,27 @@ def _descend(
     behind: Pose,
     goal: Pose,
     held: Held,
-) -> list[float] | None:
-    """Solve by damped least squares from `DESCENTS_MAX` starts; `given` has the joints that others follow."""
+    start: Sequence[float],
+) -> tuple[float, list[float]]:
+    """Return the posture to which damped least squares lead, and the greatest part of the way that is left."""
     lower, upper = np.array(ranges).T
-    for start in range(DESCENTS_MAX):
-        angles = np.array(_start(ranges, start))
-        miss, jacobian = _miss(joints, angles, given, behind, goal, held)
-        damping = 1e-2
-        for _ in range(STEPS_MAX):
-            if np.abs(miss).max() < _EXACT:
-                return [float(angle) for angle in angles]
-            step = jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + damping * np.eye(6), miss)
-            tried = np.clip(angles + step, lower, upper)
-            tried_miss, tried_jacobian = _miss(joints, tried, given, behind, goal, held)
-            if tried_miss @ tried_miss < miss @ miss:
-                stalls = tried_miss @ tried_miss > _STALLED * (miss @ miss) and damping < _STALLED_DAMPING
-                angles, miss, jacobian, damping = tried, tried_miss, tried_jacobian, damping / 4
-                if stalls:  # a local minimum, not the goal
-                    break
-            elif (damping := damping * 4) > _DAMPING_MAX:
+    angles = np.array(start)
+    miss, jacobian = _miss(joints, angles, given, behind, goal, held)
+    damping = 1e-2
+    for _ in range(STEPS_MAX):
+        if np.abs(miss).max() < _EXACT:
+            break
+        step = jacobian.T @ np.linalg.solve(jacobian @ jacobian.T + damping * np.eye(6), miss)
+        tried = np.clip(angles + step, lower, upper)
+        tried_miss, tried_jacobian = _miss(joints, tried, given, behind, goal, held)
+        if tried_miss @ tried_miss < miss @ miss:
+            stalls = tried_miss @ tried_miss > _STALLED * (miss @ miss) and damping < _STALLED_DAMPING
+            angles, miss, jacobian, damping = tried, tried_miss, tried_jacobian, max(damping / 4, _DAMPING_MIN)
+            if stalls:  # a local minimum, not the goal
                 break
-    return None
+        elif (damping := damping * 4) > _DAMPING_MAX:
+            break
+    return float(np.abs(miss).max()), [float(angle) for angle in angles]
 
 
 def _miss(

@@ -6,7 +6,7 @@ result is the posture that stays farthest from every limit. Continuous joints ha
 reach, except for rare ones at the rim of the workspace (about 1 in 10,000 of the reachable ones there) whose only
 postures lie in a narrow range between limits. Any other arm is solved numerically (`world.arms`). An arm that cannot
 turn its tool freely, such as one of four or five joints, brings it to the position and, with five directions of motion,
-to the direction of the fingers; the rest of the orientation stays free.
+to the direction of the fingers where it can; the rest of the orientation stays free.
 
 The result is deterministic: on one machine the same arguments yield the same result, to the bit. `solve` verifies it by
 forward kinematics to 1e-6 m and 1e-6 rad. Collisions, with the robot itself or with objects, are not checked.
@@ -15,15 +15,15 @@ forward kinematics to 1e-6 m and 1e-6 rad. Collisions, with the robot itself or 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.world import arms as arm_ik
-from pycrorm_async.world.arms import Chain, Floats, Reach
-from pycrorm_async.world.pose import Arms, Pose, Quaternion, Vector, product, rotated
+from pycrorm_async.world.arms import Chain, Floats, Held, Reach
+from pycrorm_async.world.pose import Arms, Pose, Quaternion, Vector, product, rotated, yaw_quaternion
 from pycrorm_async.world.urdf import ArmDescription, Bounds, Limits, PR2Arm, PR2Description, RobotDescription
 
 if TYPE_CHECKING:
@@ -153,9 +153,30 @@ def _solve_chain(
     joints = chain.solve(goal, positions, _chain_bounds(chain, arm_description, limits))
     if joints is not None:
         reached = chain.forward(positions | joints)
-        if reached.distance(goal) <= EXACT_M and chain.angle_rad(reached, goal) <= EXACT_RAD:
+        turned = _angle_between(reached.orientation, goal.orientation) if chain.held is Held.ALL else 0.0
+        if reached.distance(goal) <= EXACT_M and turned <= EXACT_RAD:
             return joints
     raise Unreachable(target, arm, f"no posture within its {limits.name.lower()} limits was found")
+
+
+def headings(robot: Object, arm: Arms, target: Pose, *, base: Pose, limits: Limits) -> Iterator[Pose]:
+    """Yield poses of the base link at the place of `base` from which an arm may reach a target in "map".
+
+    An arm that turns its tool freely is expected ahead: for it this is `base` alone. Any other one, such as one that
+    reaches sideways, is solved with the base as its first joint. An arm that moves the base has no other heading.
+    """
+    described = robot.robot_description.arms[arm] if robot.robot_description is not None else None
+    if described is None or isinstance(described, PR2Arm):
+        yield base
+        return
+    chain = chain_of(robot, arm)
+    if chain.held is Held.ALL or not {*robot.joints_above(None)}.isdisjoint(chain.joints):
+        yield base
+        return
+    in_root = base.relative_to(robot.root_pose(base))
+    bounds = _chain_bounds(chain, described, limits)
+    for turn in chain.turns_to(target.relative_to(base), in_root, robot.joint_positions(), bounds):
+        yield base @ Pose(orientation=yaw_quaternion(turn))
 
 
 def chain_of(robot: Object, arm: Arms) -> Chain:

@@ -13,13 +13,25 @@ from pycrorm_async.plan.actions import (
     NavigateActionPerformable,
     ParkArmsActionPerformable,
     PickUpActionPerformable,
+    PlaceActionPerformable,
 )
 from pycrorm_async.plan.locations import CostmapLocation
 from pycrorm_async.plan.motions import simulated_robot_within
-from pycrorm_async.world import Arms, BulletWorld, Grasp, Limits, Object, ObjectType, Pose, describe_arm, describe_robot
+from pycrorm_async.world import (
+    Arms,
+    BulletWorld,
+    Drive,
+    Grasp,
+    Limits,
+    Object,
+    ObjectType,
+    Pose,
+    describe_arm,
+    describe_robot,
+)
 from pycrorm_async.world.arms import Held
 from pycrorm_async.world.kinematics import chain_of, solve
-from pycrorm_async.world.pose import rotated
+from pycrorm_async.world.pose import rotated, yaw_quaternion
 
 
 def arm_of(*joints: tuple[str, str, str]) -> str:
@@ -74,6 +86,54 @@ def test_an_arm_of_four_or_five_joints_reaches_with_what_it_can_hold_of_the_orie
                 ahead = [rotated(each.orientation, (1, 0, 0)) for each in (here, there)]
                 assert math.dist(*ahead) < 1e-6
         assert reached == 20
+
+
+SIDEWAYS = (  # a lift, a telescope of four parts to the right of the base, and a wrist that turns
+    ("prismatic", "0 0 1", "-0.07 0.1 0.2"),
+    *(("prismatic", "0 -0.065 0", "0 -0.05 0"),) * 4,
+    ("revolute", "0 0 -1", "0.03 -0.1 0"),
+)
+AHEAD = (  # a lift beside the middle of the base, and the joints of an arm whose last one turns about the fingers
+    ("prismatic", "0 0 1", "0.14 0.08 0.34"),
+    ("revolute", "0 1 0", "0 0 0"),
+    ("revolute", "0 0 1", "0 0 0.345"),
+    ("revolute", "0 1 0", "0 0 0"),
+    ("revolute", "0 0 1", "0 0 0"),
+)
+
+
+@pytest.mark.parametrize(("joints", "tool"), [(SIDEWAYS, "0 -0.23 0"), (AHEAD, "0.012 0 0.2")])
+async def test_a_lift_and_few_joints_find_places_and_headings_from_which_they_pick_up_and_place(
+    joints: tuple[tuple[str, str, str], ...], tool: str
+) -> None:
+    text = arm_of(*joints)
+    turn = "0 0 -1.570796" if joints is SIDEWAYS else "0 -1.570796 0"
+    text = text.replace(
+        "</robot>",
+        f'<link name="tool"/><joint name="end" type="fixed"><parent link="{len(joints)}"/><child link="tool"/>'
+        f'<origin xyz="{tool}" rpy="{turn}"/></joint><link name="finger"/><joint name="grip" type="prismatic">'
+        '<parent link="tool"/><child link="finger"/><axis xyz="0 1 0"/><limit lower="0" upper="0.1"/></joint></robot>',
+    ).replace('lower="0" upper="2"', 'lower="0" upper="0.9"' if joints is AHEAD else 'lower="0" upper="1"', 1)
+    text = text.replace('lower="0" upper="2"', 'lower="0" upper="0.13"')
+    robot_described = describe_robot(
+        "robot", text, arms={Arms.RIGHT: describe_arm(text, "", "tool")}, torso_joint="j0", drive=Drive.DIFFERENTIAL
+    )
+    with BulletWorld() as world, simulated_robot_within(Limits.SOFT):
+        robot = Object("robot", ObjectType.ROBOT, robot=robot_described)
+        milk = Object("milk", ObjectType.MILK, pose=Pose([1.85, 0.1, 0.85]))
+        there = Pose([-1, -1, 0.8], yaw_quaternion(2))
+        before = world.save_state()
+        for place in itertools.islice(CostmapLocation(target=milk, reachable_for=robot), 3):
+            await NavigateActionPerformable(place.pose).perform()
+            await PickUpActionPerformable(milk, Arms.RIGHT, Grasp.FRONT).perform()
+            assert milk.attached_to is robot
+            second = CostmapLocation(target=there, reachable_for=robot).resolve()
+            await NavigateActionPerformable(second.pose).perform()
+            await PlaceActionPerformable(milk, Arms.RIGHT, there).perform()
+            assert math.dist(milk.pose.position, there.position) < 1e-5
+            world.restore_state(before)
+            picked = True
+        assert picked
 
 
 async def test_each_place_offered_for_the_milk_lets_the_arm_pick_it_up_among_obstacles() -> None:
