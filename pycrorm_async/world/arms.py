@@ -241,7 +241,7 @@ DESCENTS_MAX, STEPS_MAX = 20, 60
 """Bound the damped least squares: 20 starts of 60 steps take half a second when the target is out of reach."""
 HEADINGS_MAX = 3
 """Bounds the headings of the base that are tried at one place for an arm that cannot turn its tool freely."""
-_EXACT, _DAMPING_MIN, _DAMPING_MAX = 1e-9, 1e-9, 1e6
+_EXACT, _DAMPING_MIN, _DAMPING_MAX = 1e-9, 1e-9, 1e2
 """With less damping the equations of an arm of few directions are singular."""
 _STALLED, _STALLED_DAMPING = 0.999, 1e-3
 """A step with this damping or less that leaves more than this part of the squared way ends a descent."""

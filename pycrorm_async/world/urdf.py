@@ -532,7 +532,9 @@ def _positions(name: str, state: Element, model: Model) -> dict[str, float]:
         if joint is None or joint.kind is JointType.FIXED:
             continue
         try:
-            positions[joint.name] = number_of(each.get("value", "0"))
+            positions[joint.name] = number_of(each.get("value", ""))
+            if not math.isfinite(positions[joint.name]):
+                raise ValueError(f"{each.get('value')!r} is not finite")  # noqa: TRY301  a fault like the others
         except ValueError as fault:
             raise CallerError(
                 f"the SRDF of {name!r}: <group_state name={state.get('name', '')!r}>, joint {joint.name!r}: {fault}"

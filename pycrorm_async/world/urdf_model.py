@@ -334,6 +334,8 @@ def parsed_srdf(name: str, srdf: str | Path) -> Element:
         is_text = isinstance(srdf, str) and srdf.lstrip(_BEFORE).startswith("<")
         robot = parsed_urdf(str(srdf) if is_text else _decoded(Path(srdf).read_bytes()))
         _check_expanded(robot)
+        if robot.tag != "robot":
+            raise UrdfFault(f"its root element is <{robot.tag}>, not <robot>")
     except (OSError, SyntaxError, ValueError) as fault:
         raise CallerError(f"the SRDF of {name!r} cannot be read: {fault}") from fault
     return robot
@@ -534,9 +536,10 @@ def _joint(element: Element, left_out: list[str], unlimited: list[str]) -> Joint
             _number(each, attribute, owner, 0.0)
     follows = soft = None
     if mimic is not None:
-        follows = Mimic(
-            mimic.get("joint", ""), _number(mimic, "multiplier", owner, 1.0), _number(mimic, "offset", owner, 0.0)
-        )
+        line = _number(mimic, "multiplier", owner, 1.0), _number(mimic, "offset", owner, 0.0)
+        if not all(map(math.isfinite, line)):
+            raise UrdfFault(f"{owner}: <mimic> holds {line[0]:g} and {line[1]:g}; numbers must be finite")
+        follows = Mimic(mimic.get("joint", ""), *line)
     if safety is not None:
         soft = Bounds(_number(safety, "soft_lower_limit", owner, 0.0), _number(safety, "soft_upper_limit", owner, 0.0))
     bounds = ENDLESS if limit is None else Bounds(*(_number(limit, each, owner, 0.0) for each in ("lower", "upper")))

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pycrorm_async.errors import CallerError
 from pycrorm_async.memory import Memory
 from pycrorm_async.query.again import world_of
 from pycrorm_async.query.scene import link_frames, object_model
@@ -142,6 +143,7 @@ WORDS = {
     "an effort": (hinge(limit='<limit lower="0" upper="1" effort="much"/>'), "'much' is not a number"),
     "Python's own": (hinge(limit='<limit lower="0" upper="1_0"/>'), "'1_0' is not a number"),
     "a multiplier": (GRIPPER.replace('"0.5"', '"half"'), "<mimic multiplier=\"half\">: 'half' is not a number"),
+    "a multiplier without end": (GRIPPER.replace('"0.5"', '"inf"'), "<mimic> holds inf and"),
     "a soft limit": (
         hinge(limit='<limit lower="0" upper="1"/><safety_controller soft_lower_limit="a"/>'),
         "'a' is not",
@@ -361,3 +363,17 @@ def test_a_hand_is_open_where_its_tips_are_farthest_apart() -> None:
     arm = describe_arm(turned, "base", "hand")
     assert arm.gripper_joints[GripperState.OPEN]["thumb"] == -0.8
     assert arm.gripper_joints[GripperState.CLOSE]["thumb"] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("was", "word", "fault"),
+    [
+        ('"0.4"', '"nan"', "joint 'shoulder': 'nan' is not finite"),
+        (' value="0.4"', "", "joint 'shoulder': '' is not a number"),
+        ('robot name="dog"', "sdf", "its root element is <sdf>, not <robot>"),
+    ],
+)
+def test_an_srdf_without_numbers_for_its_states_or_of_another_kind_is_refused(was: str, word: str, fault: str) -> None:
+    text = SRDF.format(hand="").replace(was, word)
+    with pytest.raises(CallerError, match=fault):
+        describe_robot("dog", DOG, srdf=text.replace("</robot>", "</sdf>") if word == "sdf" else text)
