@@ -491,6 +491,8 @@ class ObjectRelativeLocation(LocationDesignator):
 class CostmapLocation(LocationDesignator):
     """Base poses near the target and clear of obstacles from which a robot, facing the target, reaches or sees it.
 
+    A robot whose arm moves its tool in five directions or fewer is turned as that arm reaches, for example sideways.
+
     Args:
         target: an object to pick up, or a pose to which the tool frame or a held object is brought.
         reachable_for: the robot that must reach the target. For an object that means all three goals of a pick-up

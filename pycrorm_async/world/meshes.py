@@ -10,6 +10,7 @@ import io
 import os
 import re
 import warnings
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -94,11 +95,17 @@ def _points(path: str, _status: tuple[int, int, int, int]) -> NDArray[np.float64
 
 
 def is_read_by_bullet(path: str, *, collision: bool) -> bool:
-    """Return whether Bullet reads a mesh file as `read_mesh` does: OBJ, binary STL and, to draw it only, DAE."""
+    """Return whether Bullet reads a mesh file as `read_mesh` does: OBJ, binary STL and, to draw it only, DAE.
+
+    A damaged OBJ or DAE would end the process inside Bullet.
+    """
     suffix = Path(path).suffix.lower()
     if not Path(path).is_file():
         return False
-    return suffix == ".obj" or (suffix == ".stl" and _is_binary(path)) or (suffix == ".dae" and not collision)
+    if suffix == ".obj" or (suffix == ".dae" and not collision):
+        with suppress(ValueError):
+            return bool(len(mesh_points(path)))
+    return suffix == ".stl" and _is_binary(path)
 
 
 def points_as_stl(points: NDArray[np.float64]) -> bytes:

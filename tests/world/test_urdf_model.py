@@ -269,6 +269,18 @@ def test_a_visual_mesh_that_is_missing_or_not_drawn_keeps_the_robot(
         Object("other", ObjectType.ROBOT, meshed("package://nowhere/body.glb"))
 
 
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [("a.dae", b"<COLLADA/>"), ("a.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 1\nf 1 2 99999999999\n"), ("a.DAE", b"")],
+)
+def test_a_damaged_visual_mesh_is_left_out_and_does_not_end_the_process(
+    world: BulletWorld, name: str, content: bytes, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    (tmp_path / name).write_bytes(content)
+    assert Object("robot", ObjectType.ROBOT, meshed(str(tmp_path / name), "visual")).links == ("base",)
+    assert f"visual of link 'base': Bullet does not draw {tmp_path / name}" in caplog.text
+
+
 def test_packages_are_found_by_name_and_by_the_variables_of_ros(
     world: BulletWorld, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
