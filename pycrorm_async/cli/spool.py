@@ -34,7 +34,7 @@ from pycrorm_async.operations.recovery import Rebinding
 from pycrorm_async.projections.custom import load_projections
 from pycrorm_async.queue.locks import REFUSED
 from pycrorm_async.queue.maintenance import (
-    Damage,
+    FileDamage,
     Range,
     RecorderReport,
     RepairReport,
@@ -221,7 +221,7 @@ def _state(each: RecorderReport) -> str:
     return f"{state}, being drained" if each.being_drained else state
 
 
-def _damage_text(damage: Damage) -> str:
+def _damage_text(damage: FileDamage) -> str:
     return f"{damage.file} is damaged at byte {damage.offset}: {damage.reason}"
 
 

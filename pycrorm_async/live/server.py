@@ -96,7 +96,7 @@ class LiveServer:
             server_header=False,
             timeout_graceful_shutdown=_STOP_S,
         )
-        server = _Server(config)
+        server = _PageServer(config)
 
         async def stop_server() -> None:
             await stop.wait()
@@ -281,7 +281,7 @@ class _Guard:
         await application(scope, receive, send_with_headers)
 
 
-class _Server(uvicorn.Server):
+class _PageServer(uvicorn.Server):
     """A server whose owner handles the signals."""
 
     def capture_signals(self) -> nullcontext[None]:  # type: ignore[override]  # any context manager serves

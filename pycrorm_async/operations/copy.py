@@ -254,7 +254,7 @@ def _refuse_unreadable(episode: str, event: StoredEvent) -> None:
         raise LogDamaged(episode, event.sequence, f"its payload cannot be read: {error}") from None
 
 
-class _Declared(msgspec.Struct):
+class _CopiedType(msgspec.Struct):
     designator: str | None = None
     description: str | None = None
 
@@ -265,7 +265,7 @@ _DECLARED_BY = {"NodeStarted": attrgetter("designator"), "ObjectAdded": attrgett
 def _declaration(event: StoredEvent) -> str | None:
     """Return the declaration's fingerprint; None where another version stores it, whose node the fold parks."""
     try:
-        fingerprint_: str | None = _DECLARED_BY[event.type](msgspec.json.decode(event.payload, type=_Declared))
+        fingerprint_: str | None = _DECLARED_BY[event.type](msgspec.json.decode(event.payload, type=_CopiedType))
     except msgspec.ValidationError:
         return None
     return fingerprint_

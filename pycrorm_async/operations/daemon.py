@@ -44,7 +44,7 @@ from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.writer.daemon import Daemon, DaemonSummary
-from pycrorm_async.writer.drain import ClaimedSource, ScanResult, Tables
+from pycrorm_async.writer.drain import ClaimedSource, ScanResult, TablesPort
 
 
 async def serve(
@@ -89,7 +89,7 @@ async def serve(
         workers = await stack.enter_async_context(
             FoldWorkers(fold_workers, assignment, settings=settings, report=report, note=note, forked=forked)
         )
-        tables: Tables = FoldWorkerTables(destination, workers) if fold_workers else destination
+        tables: TablesPort = FoldWorkerTables(destination, workers) if fold_workers else destination
         return await Daemon(destination, tables, folders, settings=settings, report=report).run(stop)
 
 

@@ -67,7 +67,7 @@ from pycrorm_async.store.address import BUSY_TIMEOUT_S, DatabaseAddress
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import Span
-from pycrorm_async.writer.drain import Backoff, Tables
+from pycrorm_async.writer.drain import Backoff, TablesPort
 
 #
 # Run one fold worker: start its process, restart it when it dies, and exchange requests with it.
@@ -703,7 +703,7 @@ def _import_drivers(url: str) -> None:
     import_module("sqlalchemy.dialects.postgresql")  # an index of the tables has an option of it, also on SQLite
 
 
-class FoldWorkerTables(Tables):
+class FoldWorkerTables(TablesPort):
     """Folds a destination's tables with workers, or in this process while no worker is ready. Implements `Tables`."""
 
     def __init__(self, destination: LogAndTables, workers: FoldWorkers) -> None:

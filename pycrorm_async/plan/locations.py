@@ -133,7 +133,7 @@ VISIBLE_SHARE_MIN = 0.5
 """Minimum visible share of an object that counts as seen from a place."""
 
 
-class Reach(NamedTuple):
+class PlaceReach(NamedTuple):
     """The arms that reach the target from a place; or, for an unsuitable place, none and the reason."""
 
     arms: tuple[Arms, ...] = ()
@@ -146,7 +146,7 @@ def base_poses(
     reachable_for: ObjectLike | None,
     visible_for: ObjectLike | None,
     reachable_arm: Arms | None,
-) -> Iterator[tuple[Pose, Reach] | Cells]:
+) -> Iterator[tuple[Pose, PlaceReach] | Cells]:
     """Yield the cells of the costmaps, then base poses that face the target, best first, suitable or not.
 
     For a fixed base yield only its own pose.
@@ -166,12 +166,12 @@ def base_poses(
     clear, height_m = 0, base_height_m(reacher or viewer)
     for cell in _cells(costmap, robots, every=clearance is not None):
         facing = face(cell, goal, height_m=height_m)
-        place = facing, Reach(refusal="no heading was found at which the arm reaches the target")
+        place = facing, PlaceReach(refusal="no heading was found at which the arm reaches the target")
         collision = None
         for base_pose in [facing] if reacher is None else _headings(reacher, arms, facing, target, goal):
             collision = None if clearance is None else clearance.refusal(base_pose)
             if collision is not None:
-                place = base_pose, Reach(refusal=collision)
+                place = base_pose, PlaceReach(refusal=collision)
             elif clear < CELLS_MAX:
                 place = _checked(base_pose, target, goal, reacher, viewer, arms)
             else:
@@ -229,12 +229,12 @@ def _checked(
     reacher: CurrentRobot | None,
     viewer: CurrentRobot | None,
     arms: Arms | tuple[Arms, ...] | None,
-) -> tuple[Pose, Reach]:
+) -> tuple[Pose, PlaceReach]:
     """Return the base pose with the arms that reach the target from there, or with the reason why none does."""
     if viewer is not None and not _sees(viewer, base_pose, target, goal):
-        return base_pose, Reach(refusal="the target is not visible from here")
+        return base_pose, PlaceReach(refusal="the target is not visible from here")
     if reacher is None:
-        return base_pose, Reach()
+        return base_pose, PlaceReach()
     goals = partial(_goals, reacher, base_pose, target, goal)
     return base_pose, reaching_arms(reacher, arms, base_pose, goals, grasps=not isinstance(target, Pose))
 
@@ -271,7 +271,7 @@ def reaching_arms(
     *,
     torso_height: float | None = None,
     grasps: bool | None = None,
-) -> Reach:
+) -> PlaceReach:
     """Return the arms that reach all their goals from this base pose, or a refusal if the required ones do not.
 
     Args:
@@ -301,7 +301,7 @@ def reaching_arms(
             continue
         reaching.append(candidate)
     enough = not refusals if arm is Arms.BOTH else bool(reaching)
-    return Reach(tuple(reaching)) if enough else Reach(refusal="; ".join(refusals))
+    return PlaceReach(tuple(reaching)) if enough else PlaceReach(refusal="; ".join(refusals))
 
 
 def _collision(
@@ -593,7 +593,7 @@ class SemanticCostmapLocation(LocationDesignator):
         return ObjectUnavailable(f"there is no room for {name} on {self.urdf_link_name}", self.urdf_link_name, name)
 
 
-def _candidate(searched: tuple[Pose, Reach] | Cells) -> Location | Refusal | Cells:
+def _candidate(searched: tuple[Pose, PlaceReach] | Cells) -> Location | Refusal | Cells:
     if isinstance(searched, Cells):
         return searched
     pose, reach = searched
@@ -621,7 +621,7 @@ _SWEEP_STEPS = 10
 """The steps of the joint at which the space that the drawer or door sweeps is computed."""
 
 
-def opening_poses(part: ObjectLike, robot: ObjectLike, arm: Arms | None) -> Iterator[tuple[Pose, Reach] | Cells]:
+def opening_poses(part: ObjectLike, robot: ObjectLike, arm: Arms | None) -> Iterator[tuple[Pose, PlaceReach] | Cells]:
     """Yield the cells of the costmaps, then base poses, best first, each with the arms that reach every goal or none.
 
     Places that the opening part does not sweep come first, facing the handle and then rotated by each multiple of 45
@@ -640,7 +640,7 @@ def opening_poses(part: ObjectLike, robot: ObjectLike, arm: Arms | None) -> Iter
                 base_pose = face(cell, handle_pose, height_m=height_m, turned=number * math.tau / HEADINGS)
                 collision = clearance.refusal(base_pose) if clearance is not None else None
                 if collision is not None:
-                    yield base_pose, Reach(refusal=collision)
+                    yield base_pose, PlaceReach(refusal=collision)
                 else:
                     yield base_pose, reaching_arms(reacher, arm, base_pose, lambda _: goals)
 
@@ -925,17 +925,17 @@ def _upright_pose(base: Pose, height_m: float) -> Pose | None:
     return Pose((base.position.x, base.position.y, height_m), yaw_quaternion(base.yaw), base.frame)
 
 
-def _reach(robot: CurrentRobot, base_pose: Pose, target_pose: Pose, past: PastSuccess) -> Reach:
+def _reach(robot: CurrentRobot, base_pose: Pose, target_pose: Pose, past: PastSuccess) -> PlaceReach:
     """Return the arm if it reaches all three goals of the grasp from the base pose at the past torso height."""
     body, description = robot
     if past.arm not in description.arms:
-        return Reach(refusal=f"the robot has no {past.arm.name} arm")
+        return PlaceReach(refusal=f"the robot has no {past.arm.name} arm")
     if past.torso_height is not None:
         if description.torso_joint is None:
-            return Reach(refusal="the robot has no torso to lift")
+            return PlaceReach(refusal="the robot has no torso to lift")
         lower, upper = body.joint_limits(description.torso_joint)
         if not lower <= past.torso_height <= upper:
-            return Reach(refusal=f"the torso cannot be lifted to {past.torso_height:g} m")
+            return PlaceReach(refusal=f"the torso cannot be lifted to {past.torso_height:g} m")
 
     def goals(arm: Arms) -> tuple[Pose, ...]:
         tool = robot.tool_pose(arm)

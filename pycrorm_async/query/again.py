@@ -55,7 +55,7 @@ from pycrorm_async.plan.objects import (
 from pycrorm_async.projections.row_batch import is_missing
 from pycrorm_async.query.snapshot import Moment, ObjectThen, WorldThen
 from pycrorm_async.record.declarations import declared_type
-from pycrorm_async.record.parameters import Parameter, Shape, Unresolved, parameters_of, shape_of
+from pycrorm_async.record.parameters import FieldShape, Parameter, Unresolved, parameters_of, shape_of
 from pycrorm_async.world.bounding_boxes import BoundingBox
 from pycrorm_async.world.bullet import BulletWorld, Object
 from pycrorm_async.world.model_boxes import with_boxes, with_mesh_files
@@ -206,7 +206,7 @@ class _RowReader:
             return None
         return _made(kind, self, names, {})
 
-    def _container(self, name: str, hint: Any, shape: Shape) -> Any:
+    def _container(self, name: str, hint: Any, shape: FieldShape) -> Any:
         container = next(each for each in (hint, *typing.get_args(hint)) if inspect.isclass(typing.get_origin(each)))
         arguments = typing.get_args(container)
         values: Any

@@ -107,7 +107,7 @@ class SegmentStart(NamedTuple):
     opened: Mapping[EpisodeId, LastRecord]
 
 
-class Span(NamedTuple):
+class SyncSpan(NamedTuple):
     """The records of one sync: those up to `position`, `records` of them new, and the files that hold them."""
 
     position: int
@@ -147,7 +147,7 @@ class Appender:
         self._type_names: dict[str, bytes] = {}
 
         self.position = 0
-        self.declarations = Declarations(capacity.descriptions_bytes_max)
+        self.declarations = RepeatedDeclarations(capacity.descriptions_bytes_max)
         self.open: dict[EpisodeId, tuple[int, int, int]] = {}
         self.begun: list[SegmentStart] = []
         self._refusal: Callable[[], PycrormError] | None = None
@@ -402,15 +402,15 @@ class Appender:
     # --- the sync thread ---------------------------------------------------------------------------------------
 
     @locked
-    def begin_sync(self) -> Span:
+    def begin_sync(self) -> SyncSpan:
         """Return the span since the last call; the next record begins a new span and wakes the sync thread."""
-        span = Span(self.position, self._span_count, self._span_checksum, (*self._sealed, self._current))
+        span = SyncSpan(self.position, self._span_count, self._span_checksum, (*self._sealed, self._current))
         self._span_count = self._span_checksum = 0
         self._quiet = True
         return span
 
     @locked
-    def append_commit(self, span: Span) -> Segment:
+    def append_commit(self, span: SyncSpan) -> Segment:
         """Append the commit frame of a synced span; return the segment that holds it, which the caller must sync."""
         frame = encode_commit(
             position=span.position,
@@ -436,13 +436,13 @@ class Appender:
         self._touched_from = offset
         segment.touch(offset, offset + taken)
 
-    def end_sync(self, span: Span) -> None:
+    def end_sync(self, span: SyncSpan) -> None:
         """Close the segments that were full when the span was taken: they are complete and on the disk."""
         for segment in self._complete(span):
             segment.close()
 
     @locked
-    def _complete(self, span: Span) -> list[Segment]:
+    def _complete(self, span: SyncSpan) -> list[Segment]:
         done = [segment for segment in self._sealed if segment in span.segments[:-1]]
         self._sealed = [segment for segment in self._sealed if segment not in done]
         return done
@@ -641,7 +641,7 @@ class AppendState(NamedTuple):
     checksum: int
 
 
-class Declarations:
+class RepeatedDeclarations:
     """The declarations in use. `bytes` is their size in each segment; `unrepeated` counts those that did not fit.
 
     `descriptions_bytes_max` bounds the bytes of the descriptions among them.

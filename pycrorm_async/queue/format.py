@@ -410,7 +410,7 @@ def span_checksum(checksums: Sequence[int]) -> int:
 # uses `scan.py`.
 
 
-class Cursor(NamedTuple):
+class ReadCursor(NamedTuple):
     """A place between two records: segment and offset of the next frame, and position of the record before it."""
 
     number: int
@@ -418,20 +418,20 @@ class Cursor(NamedTuple):
     position: int
 
 
-class Place(NamedTuple):
+class ReadPlace(NamedTuple):
     """A recorder's folder, the recorder's id, and the cursor from which its segments are read."""
 
     folder: Path
     recorder: bytes
-    start: Cursor
+    start: ReadCursor
 
 
-class Batch(NamedTuple):
+class ReadBatch(NamedTuple):
     """Records, the size of their payloads, and the cursor behind them. `complete`: one more would exceed a limit."""
 
     records: list[Record]
     payload_bytes: int
-    after: Cursor
+    after: ReadCursor
     complete: bool
 
 
@@ -449,7 +449,7 @@ def check_type(path: Path, offset: int, name: bytes) -> str:
 class Reader:
     """Read one recorder's segments."""
 
-    def __init__(self, place: Place) -> None:
+    def __init__(self, place: ReadPlace) -> None:
         self.cursor = place.start
         self._folder = place.folder
         self._recorder = place.recorder
@@ -458,14 +458,14 @@ class Reader:
         self._buffer: Buffer = b""
         self._types: dict[bytes, str] = {}
 
-    def read(self, *, last: int, events_max: int, bytes_max: int, partial: Batch | None = None) -> Batch:
+    def read(self, *, last: int, events_max: int, bytes_max: int, partial: ReadBatch | None = None) -> ReadBatch:
         """Extend `partial`, or a batch that begins at the cursor, by the records up to position `last`.
 
         The batch holds at most `events_max` records, and payloads of at most `bytes_max` bytes unless its first record
         is larger. The cursor stays; set it to `after` when the batch is handed out. Raises `SpoolDamaged`; and
         `FileNotFoundError` if the segments at the cursor were deleted.
         """
-        records, total, (number, offset, position), _ = partial or Batch([], 0, self.cursor, complete=False)
+        records, total, (number, offset, position), _ = partial or ReadBatch([], 0, self.cursor, complete=False)
         types = self._types
         if number != self._number:
             self._open_segment(number)
@@ -495,9 +495,9 @@ class Reader:
             else:
                 number, offset = number + 1, self._next_segment(number + 1, offset, position)
                 if not records:  # the finished segment may be deleted before the next read
-                    self.cursor = Cursor(number, offset, position)
+                    self.cursor = ReadCursor(number, offset, position)
         complete = full or len(records) >= events_max or total >= bytes_max
-        return Batch(records, total, Cursor(number, offset, position), complete)
+        return ReadBatch(records, total, ReadCursor(number, offset, position), complete)
 
     def skip_to(self, position: int, *, on_records: Callable[[Sequence[Record]], None] = lambda _: None) -> None:
         """Move the cursor behind this position; the records up to it must be readable. Raises as `read` does."""

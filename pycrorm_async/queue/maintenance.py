@@ -91,7 +91,7 @@ class OpenEpisode:
 
 
 @dataclass(frozen=True)
-class Damage:
+class FileDamage:
     """Synced bytes that differ from the bytes that were written: the file and the offset where they begin."""
 
     file: str
@@ -152,7 +152,7 @@ class RecorderReport(FolderReport):
     tail_bytes: int = 0
     cut_off: tuple[str, ...] = ()
     foreign: tuple[str, ...] = ()
-    damage: Damage | None = None
+    damage: FileDamage | None = None
 
     @property
     def records(self) -> int:
@@ -325,7 +325,7 @@ def _examine(recorder: RecorderFolder, state: FolderReport) -> RecorderReport:
         tail_bytes=0 if recorder.alive or damage else sum(len(tail) for _, tail in tails(folder, prefix)),
         cut_off=tuple(each for each in others if each.endswith(TAIL)),
         foreign=tuple(each for each in others if not each.endswith((TAIL, MAKING))),
-        damage=None if damage is None else Damage(str(damage.path), damage.offset, damage.reason),
+        damage=None if damage is None else FileDamage(str(damage.path), damage.offset, damage.reason),
     )
 
 
@@ -551,7 +551,7 @@ class RepairReport:
 
     name: str
     set_aside: str
-    damage: Damage
+    damage: FileDamage
     kept: int
     saved: int
     unreadable: tuple[Range, ...]
@@ -615,7 +615,7 @@ def _replace(folder: Path, result: Survey, damage: SpoolDamaged) -> RepairReport
     return RepairReport(
         name=folder.name,
         set_aside=str(damaged),
-        damage=Damage(str(damaged / damage.path.name), damage.offset, damage.reason),
+        damage=FileDamage(str(damaged / damage.path.name), damage.offset, damage.reason),
         kept=result.prefix.cut.position - result.prefix.start.position,
         saved=salvage.saved,
         unreadable=tuple(salvage.unreadable),

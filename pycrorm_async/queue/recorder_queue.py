@@ -46,7 +46,7 @@ from pycrorm_async.events.codec import Heading, Receipt, Record
 from pycrorm_async.events.ids import EpisodeId, episode_text
 from pycrorm_async.queue.appender import Appender, Capacity
 from pycrorm_async.queue.blobs import LiveBlobs
-from pycrorm_async.queue.format import Batch, Cursor, Place, Reader, Segment, header_bytes
+from pycrorm_async.queue.format import ReadBatch, ReadCursor, Reader, ReadPlace, Segment, header_bytes
 from pycrorm_async.queue.locks import ALIVE, DRAIN, FileIdentity, FileLock, call_in_forked_child, is_locked
 from pycrorm_async.queue.sources import DeadLetters
 from pycrorm_async.queue.spool import (
@@ -117,7 +117,7 @@ class RecorderQueue:
             self._drain_status = DrainStatusReader(folder) if offered else None
             self._identity = FileIdentity.of(folder.stat())
         self._blobs = LiveBlobs(folder, reserve=self._appender.reserve_blob, make_room=self._stored_segments.make_room)
-        self._source = OwnSource(self, self._notifier, Place(folder, recorder, Cursor(1, header_bytes(0), 0)))
+        self._source = OwnSource(self, self._notifier, ReadPlace(folder, recorder, ReadCursor(1, header_bytes(0), 0)))
         call_in_forked_child(self._abandon)
         self._sync_thread.start()
 
@@ -532,7 +532,7 @@ class RecorderQueue:
 class OwnSource:
     """The consumer's side of a queue; it holds the lock `drain` from its first batch on."""
 
-    def __init__(self, queue: RecorderQueue, notifier: Notifier, place: Place) -> None:
+    def __init__(self, queue: RecorderQueue, notifier: Notifier, place: ReadPlace) -> None:
         self._queue = queue
         self._notifier = notifier
         self._drain: FileLock | None = None
@@ -581,7 +581,7 @@ class OwnSource:
     def _has_news(self, position: int) -> bool:
         return self._queue.synced > position or self._queue.ends_at(position)
 
-    def _read(self, partial_batch: Batch | None, events_max: int, bytes_max: int) -> Batch:
+    def _read(self, partial_batch: ReadBatch | None, events_max: int, bytes_max: int) -> ReadBatch:
         with wrap_os_errors(self._queue.folder):
             last = self._queue.synced
             return self.reader.read(last=last, events_max=events_max, bytes_max=bytes_max, partial=partial_batch)

@@ -39,9 +39,9 @@ from pycrorm_async.queue.format import (
     FORMAT,
     HEADER_BYTES,
     Buffer,
-    Cursor,
     Frame,
     LastRecord,
+    ReadCursor,
     SegmentHeader,
     check_type,
     decode,
@@ -74,8 +74,8 @@ class ValidPrefix(NamedTuple):
         numbers: numbers of all segment files, including those behind the cut.
     """
 
-    start: Cursor
-    cut: Cursor
+    start: ReadCursor
+    cut: ReadCursor
     bases: dict[int, int]
     open: dict[EpisodeId, LastRecord]
     numbers: list[int]
@@ -143,7 +143,7 @@ class SegmentScanner:
         self._paths = segments
         self._numbers = segment_numbers(folder) if segments is None else sorted(segments)
         self._steps = 0
-        self._start = self._cut = Cursor(0, 0, 0)
+        self._start = self._cut = ReadCursor(0, 0, 0)
         self._bases: dict[int, int] = {}
         self._open: dict[bytes, tuple[int, int, int]] = {}
         self._uncommitted: list[int] = []  # checksums of the records that no commit frame has covered yet
@@ -201,15 +201,15 @@ class SegmentScanner:
             if header is None and number > 1:
                 raise SpoolDamaged(path, 0, "its header is unreadable, and the segments before it are deleted")
             base = 1 if header is None else header.base
-            self._start = self._cut = Cursor(number, header_bytes(0), base - 1)
+            self._start = self._cut = ReadCursor(number, header_bytes(0), base - 1)
         if header is None or number != self._cut.number + bool(self._bases) or header.base != self._cut.position + 1:
             return False
         first = header_bytes(len(header.open))
         if not self._bases:
-            self._start = Cursor(number, first, header.base - 1)
+            self._start = ReadCursor(number, first, header.base - 1)
             self._open = dict(header.open.items())
         self._bases[number] = header.base
-        self._cut = Cursor(number, first, header.base - 1)
+        self._cut = ReadCursor(number, first, header.base - 1)
         self._scan_records(path, buffer, number)
         return True
 
@@ -227,7 +227,7 @@ class SegmentScanner:
             for frame in decode_each(buffer, offset, salt_of(self._recorder, number)):
                 kind, version, at, sequence, wall_ns, monotonic_ns, episode, name, payload, checksum, size = frame
                 if kind == COMMIT:
-                    self._cut = Cursor(number, offset, position)
+                    self._cut = ReadCursor(number, offset, position)
                     self._check_commit(path, make(Frame, frame))
                 elif at == position + 1:
                     type_name = types.get(name)
@@ -254,7 +254,7 @@ class SegmentScanner:
                 if on_frame is not None:
                     on_frame(number, make(Frame, frame))
         finally:
-            self._cut = Cursor(number, offset, position)
+            self._cut = ReadCursor(number, offset, position)
 
     def _check_commit(self, path: Path, frame: Frame) -> None:
         """Check that the records a commit frame covers are present and unchanged."""
@@ -422,5 +422,5 @@ def truncate_at_lost_blob(folder: Path, recorder: bytes) -> None:
             header = read_header(path, read_segment(path), recorder=recorder, number=each.segment)
             assert header is not None, "the segment was scanned"
             offset = header_bytes(len(header.open)) + each.offset
-            seal(folder, prefix._replace(cut=Cursor(each.segment, offset, each.position - 1)))
+            seal(folder, prefix._replace(cut=ReadCursor(each.segment, offset, each.position - 1)))
             return

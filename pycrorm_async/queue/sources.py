@@ -19,11 +19,11 @@ from pycrorm_async.queue.blobs import blob_files
 from pycrorm_async.queue.format import (
     EPISODE_ENDED,
     EVENT,
-    Cursor,
     Frame,
     LastRecord,
-    Place,
+    ReadCursor,
     Reader,
+    ReadPlace,
     SegmentHeader,
     encode_segment_header,
     encode_span,
@@ -465,7 +465,7 @@ class LiveSource:
         before = progress.drained()
         self._status = before._replace(note=DrainNote())  # drops the note of an earlier drainer
         visible = min(before.stored, before.folded)
-        self._reader = Reader(Place(folder, recorder, self._start_of(visible)))
+        self._reader = Reader(ReadPlace(folder, recorder, self._start_of(visible)))
         self.invisible: dict[EpisodeId, int] = {}
         stored = min(before.stored, progress.recorded().synced)
         self._reader.skip_to(min(visible, stored))
@@ -627,9 +627,9 @@ class LiveSource:
             self._progress.write_drain_status(status)
         self._status = status
 
-    def _start_of(self, visible: int) -> Cursor:
+    def _start_of(self, visible: int) -> ReadCursor:
         """Return the beginning of the segment with the record behind this position, or of the oldest segment."""
-        start: Cursor | None = None
+        start: ReadCursor | None = None
         for number in segment_numbers(self.folder):
             path = segment_path(self.folder, number)
             try:
@@ -640,5 +640,5 @@ class LiveSource:
                 header = read_header(path, buffer, recorder=self._recorder, number=number)
             if header is None or (start is not None and header.base - 1 > visible):
                 break
-            start = Cursor(number, header_bytes(len(header.open)), header.base - 1)
-        return start or Cursor(1, header_bytes(0), 0)
+            start = ReadCursor(number, header_bytes(len(header.open)), header.base - 1)
+        return start or ReadCursor(1, header_bytes(0), 0)

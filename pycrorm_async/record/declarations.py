@@ -39,8 +39,8 @@ from pycrorm_async.record.parameters import (
     OUR_PACKAGE,
     DeclaredType,
     Field,
+    FieldShape,
     Parameter,
-    Shape,
     Undeclared,
     Unresolved,
     hint_text,
@@ -257,7 +257,7 @@ def _named(
     return first_reason or "it has no name"
 
 
-def _candidates(name: str, unreserved: str, shape: Shape, columns: Collection[str]) -> Iterator[str]:
+def _candidates(name: str, unreserved: str, shape: FieldShape, columns: Collection[str]) -> Iterator[str]:
     yield name
     if f"{name}_{shape.kind}".lower() not in columns:  # earlier versions kept a reserved name so
         yield unreserved
@@ -275,14 +275,14 @@ def _fault_in_field(field: FieldDeclared, accepted: AcceptedFields) -> str | Non
     return accepted.fault_in(field)
 
 
-def _shape(spec: object) -> Shape | None:
+def _shape(spec: object) -> FieldShape | None:
     """Return the field type of a spec; None if there is none."""
     if isinstance(spec, str):
-        return Shape(spec) if spec in _WITHOUT_ITEMS else None  # type: ignore[arg-type]  # just checked
+        return FieldShape(spec) if spec in _WITHOUT_ITEMS else None  # type: ignore[arg-type]  # just checked
     if isinstance(spec, tuple) and len(spec) == 2 and spec[0] in ("list", "dict") and spec[1] in _ITEMS:
-        return Shape(spec[0], item=spec[1])
+        return FieldShape(spec[0], item=spec[1])
     if isinstance(spec, type) and not isinstance(spec, Enum) and issubclass(spec, PoseValue | ObjectReference):
-        return Shape("pose" if issubclass(spec, PoseValue) else "object")
+        return FieldShape("pose" if issubclass(spec, PoseValue) else "object")
     shape = shape_of(spec)
     return shape if shape is not None and shape.nested is None else None
 
@@ -649,7 +649,7 @@ def _flattened_parameters(
     leave_out: Callable[[str, tuple[str, ...], str], None],
     *,
     optional: bool,
-) -> typing.Iterator[tuple[str, tuple[str, ...], Shape]]:
+) -> typing.Iterator[tuple[str, tuple[str, ...], FieldShape]]:
     for each in parameters_of(owner):
         names, path = (*outer, each.name), (*prefix, *each.path)
         name = "_".join(names)

@@ -62,7 +62,7 @@ class Described(Protocol):
         ...
 
 
-class _Declared(NamedTuple):
+class _DeclaredDescription(NamedTuple):
     """The encoded declaration of a description, and the reasons, by field, why some of it is missing."""
 
     fingerprint: str
@@ -86,7 +86,7 @@ class Descriptions:
         self._with_files = settings.record_meshes == "files"
         self._put_bytes_max = settings.segment_bytes // 16
         self._files: dict[str, tuple[str, ...]] = {}
-        self._known: dict[tuple[str, _Stats], _Declared] = {}
+        self._known: dict[tuple[str, _Stats], _DeclaredDescription] = {}
         self._known_characters = 0
         self._put: dict[str, int] = {}
         self._put_bytes = 0
@@ -130,7 +130,7 @@ class Descriptions:
         while self._put_bytes > self._put_bytes_max and len(self._put) > 1:
             self._put_bytes -= self._put.pop(next(iter(self._put)))
 
-    def _encoded(self, described: Described, files: tuple[str, ...]) -> _Declared:
+    def _encoded(self, described: Described, files: tuple[str, ...]) -> _DeclaredDescription:
         text = described.description_text
         meshes = {file: self._mesh(Path(file)) for file in files}
         meshed = meshed_links(text) if files else ()
@@ -159,7 +159,7 @@ class Descriptions:
         except NotEncodable as error:
             missing = [("urdf", _reason(error))]
             payload = encode(DescriptionDeclared(missing=missing[0][1]))
-        return _Declared(fingerprint(payload, _OWNER), payload, tuple(missing))
+        return _DeclaredDescription(fingerprint(payload, _OWNER), payload, tuple(missing))
 
     def _mesh(self, file: Path) -> MeshValue:
         """Hash a mesh file, and put its content as a blob if the settings ask for files."""

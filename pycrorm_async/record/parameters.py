@@ -448,7 +448,7 @@ def _resolved(annotation: Any, globals_: Mapping[str, Any], locals_: Mapping[str
 # --- from type hints to field types ---
 
 
-class Shape(NamedTuple):
+class FieldShape(NamedTuple):
     """The field type of a parameter; `nested` is a dataclass, whose fields replace the parameter."""
 
     kind: FieldType
@@ -458,7 +458,7 @@ class Shape(NamedTuple):
     nested: type | None = None
 
 
-def shape_of(hint: Any) -> Shape | None:
+def shape_of(hint: Any) -> FieldShape | None:
     """Map a type hint to a field type; None if no column can hold it."""
     origin = typing.get_origin(hint)
     if isinstance(hint, typing.NewType):
@@ -466,7 +466,7 @@ def shape_of(hint: Any) -> Shape | None:
     if origin in (typing.Union, types.UnionType):
         return _union_shape(hint)
     if origin is typing.Literal:
-        return Shape("text") if all(isinstance(each, str) for each in typing.get_args(hint)) else None
+        return FieldShape("text") if all(isinstance(each, str) for each in typing.get_args(hint)) else None
     if origin is not None and isinstance(origin, type):
         return _container_shape(origin, typing.get_args(hint))
     if isinstance(hint, type):
@@ -474,16 +474,16 @@ def shape_of(hint: Any) -> Shape | None:
     return None
 
 
-def _class_shape(kind: type) -> Shape | None:
+def _class_shape(kind: type) -> FieldShape | None:
     if issubclass(kind, Enum):
-        return Shape("enum", enum=kind)
+        return FieldShape("enum", enum=kind)
     for python, name in _SCALARS:
         if issubclass(kind, python):
-            return Shape(name)
+            return FieldShape(name)
     if issubclass(kind, OBJECT_TYPES):
-        return Shape("object")
+        return FieldShape("object")
     if dataclasses.is_dataclass(kind):
-        return Shape("text", nested=kind)
+        return FieldShape("text", nested=kind)
     return None
 
 
@@ -497,20 +497,20 @@ _SCALARS: tuple[tuple[type, FieldType], ...] = (
 )
 
 
-def _union_shape(hint: Any) -> Shape | None:
+def _union_shape(hint: Any) -> FieldShape | None:
     members = [each for each in typing.get_args(hint) if each is not type(None)]
     optional = len(members) < len(typing.get_args(hint))
     shapes = {shape._replace(optional=False) if shape else None for shape in map(shape_of, members)}
     optional = optional or any(shape is not None and shape.optional for shape in map(shape_of, members))
-    if shapes == {Shape("integer"), Shape("real")}:
-        shapes = {Shape("real")}
+    if shapes == {FieldShape("integer"), FieldShape("real")}:
+        shapes = {FieldShape("real")}
     if len(shapes) != 1:
         return None
     shape = shapes.pop()
     return shape._replace(optional=optional) if shape is not None else None
 
 
-def _container_shape(origin: type, arguments: tuple[Any, ...]) -> Shape | None:
+def _container_shape(origin: type, arguments: tuple[Any, ...]) -> FieldShape | None:
     kind: FieldType
     if issubclass(origin, Mapping) and len(arguments) == 2:
         key = shape_of(arguments[0])
@@ -524,7 +524,7 @@ def _container_shape(origin: type, arguments: tuple[Any, ...]) -> Shape | None:
     item = shape_of(value)
     if item is None or item.nested is not None or item.kind in ("list", "dict"):
         return None
-    return Shape(kind, item=typing.cast("ItemType", item.kind), enum=item.enum)
+    return FieldShape(kind, item=typing.cast("ItemType", item.kind), enum=item.enum)
 
 
 def hint_text(hint: Any) -> str:

@@ -114,8 +114,8 @@ class Connection(aiosqlite.Connection):
             self._end = (super().stop(),)
         return self._end[0]
 
-    def cursor(self) -> Cursor:  # type: ignore[override]
-        return Cursor(self)
+    def cursor(self) -> SharedCursor:  # type: ignore[override]
+        return SharedCursor(self)
 
     def begin_to_read(self) -> None:
         """Begin a reading transaction with the next statement, because only a statement takes the snapshot."""
@@ -171,7 +171,7 @@ class Connection(aiosqlite.Connection):
         )
 
 
-class Cursor:
+class SharedCursor:
     """The part of a cursor that SQLAlchemy uses.
 
     A statement and its first rows take one visit to the thread instead of the driver's four, because a visit takes

@@ -49,7 +49,7 @@ from pycrorm_async.writer.drain import (
     Log,
     ScanResult,
     SourceScanner,
-    Tables,
+    TablesPort,
     run_to_completion,
 )
 
@@ -76,7 +76,7 @@ class Daemon:
     def __init__(
         self,
         log: Log,
-        tables: Tables,
+        tables: TablesPort,
         scan: SourceScanner,
         *,
         settings: Settings,

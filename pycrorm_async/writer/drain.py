@@ -346,7 +346,7 @@ class Destination(Log, Protocol):
         ...
 
 
-class Tables(Protocol):
+class TablesPort(Protocol):
     """The tables behind a log, for a daemon that folds in steps while it appends."""
 
     async def fold_next_batch(self) -> bool:
@@ -586,7 +586,7 @@ class Patience:
                 await asyncio.wait([task])
 
 
-class Answers:
+class OpeningSteps:
     """Counts how often a coroutine resumed, because something that it had awaited was done: the progress of opening."""
 
     count = 0

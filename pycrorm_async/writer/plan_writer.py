@@ -28,12 +28,12 @@ from pycrorm_async.settings import Settings
 from pycrorm_async.writer.drain import (
     PATIENT,
     TOO_MANY_EVENTS,
-    Answers,
     Destination,
     Drain,
     DrainState,
     ExternalDrain,
     OfferedQueue,
+    OpeningSteps,
     Patience,
     PatienceEnded,
     Source,
@@ -538,7 +538,7 @@ class WriterThread:
         opening = stack.enter_async_context(self._open_destination())
         if self._local:  # a file needs no limit: waits for the locks of other processes are bounded where they wait
             return await opening
-        answers = Answers()
+        answers = OpeningSteps()
         timeout_s = self._settings.connect_timeout_s
         try:
             patience = Patience(timeout_s, progress=lambda: answers.count)

@@ -25,7 +25,7 @@ from pycrorm_async.events.ids import EpisodeId
 from pycrorm_async.events.types import references_in
 from pycrorm_async.queue import RecorderQueue, blobs, open_dead
 from pycrorm_async.queue import format as queue_format
-from pycrorm_async.queue.appender import Appender, Span
+from pycrorm_async.queue.appender import Appender, SyncSpan
 from pycrorm_async.queue.blobs import is_whole
 from pycrorm_async.queue.format import EVENT, Segment, salt_of
 from pycrorm_async.queue.sync_thread import SyncThread
@@ -512,7 +512,7 @@ def machine_on(place: Path, rng: random.Random) -> Iterator[Machine]:
 
         begin_sync = Appender.begin_sync
 
-        def begun(appender: Appender) -> Span:
+        def begun(appender: Appender) -> SyncSpan:
             span = begin_sync(appender)
             machine.put_meanwhile()
             return span

@@ -89,7 +89,7 @@ class Chronicle:
 
     def _note(self, *what: Any) -> None:
         node = current_node.get()
-        cause = type(node.designator).dtype if node is not None and node.designator is not None else None
+        cause = type(node.designator).__dtype__ if node is not None and node.designator is not None else None
         microseconds = -(-time.time_ns() // 1000)
         self.entries.append(Entry(what, cause, _EPOCH + timedelta(microseconds=microseconds)))
 

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from pycrorm_async.events.codec import Heading
 from pycrorm_async.events.ids import EpisodeId
-from pycrorm_async.queue.appender import Capacity, Declarations
+from pycrorm_async.queue.appender import Capacity, RepeatedDeclarations
 from pycrorm_async.queue.format import (
     COMMIT,
     DECLARATION,
@@ -292,7 +292,7 @@ async def test_the_latest_descriptions_are_repeated_and_every_designator_type(tm
 
 def test_a_description_larger_than_an_eighth_is_not_repeated_and_counted() -> None:
     capacity = Capacity.of(SMALL)
-    declarations = Declarations(capacity.descriptions_bytes_max)
+    declarations = RepeatedDeclarations(capacity.descriptions_bytes_max)
     payload = description(1, EIGHTH)
     declarations.add(payload, name=b"DescriptionDeclared", version=1, payload=payload, room=10 * EIGHTH)
     assert (declarations.bytes, declarations.unrepeated) == (0, 1)
@@ -302,7 +302,7 @@ def test_a_description_larger_than_an_eighth_is_not_repeated_and_counted() -> No
 
 def test_a_description_that_is_put_again_is_dropped_later() -> None:
     size = 64 + len(b"DescriptionDeclared") + len(description(1))
-    declarations = Declarations(3 * size)
+    declarations = RepeatedDeclarations(3 * size)
     for number in (1, 2, 3, 1, 4):
         body = b"DescriptionDeclared" + description(number)
         declarations.add(body, name=b"DescriptionDeclared", version=1, payload=description(number), room=10 * size)
@@ -311,7 +311,7 @@ def test_a_description_that_is_put_again_is_dropped_later() -> None:
 
 
 def test_the_bytes_of_the_descriptions_are_counted_exactly() -> None:
-    declarations = Declarations(1_000)
+    declarations = RepeatedDeclarations(1_000)
     for number in range(50):
         payload = description(number % 7, 100 + 40 * (number % 3))
         declarations.add(payload, name=b"DescriptionDeclared", version=1, payload=payload, room=5_000)

@@ -15,7 +15,7 @@ import pytest
 from pycrorm_async.errors import SpoolDamaged, SpoolFull, SpoolStuck
 from pycrorm_async.events.codec import Record
 from pycrorm_async.queue import LiveSource, RecorderQueue, Spool, open_dead
-from pycrorm_async.queue.format import Batch, Reader, segment_numbers, segment_path
+from pycrorm_async.queue.format import ReadBatch, Reader, segment_numbers, segment_path
 from pycrorm_async.queue.locks import ALIVE, FileLock
 from pycrorm_async.queue.spool import DrainStatus, Progress, RecorderStatus
 from tests.queue.factories import (
@@ -272,7 +272,7 @@ async def test_a_folder_whose_stored_segments_are_deleted_meanwhile_is_no_damage
     assert len(numbers) > 4
     read, deleted = Reader.read, iter([numbers[:2]])
 
-    def read_after_deletion(reader: Reader, *, last: int, events_max: int, bytes_max: int) -> Batch:
+    def read_after_deletion(reader: Reader, *, last: int, events_max: int, bytes_max: int) -> ReadBatch:
         read(reader, last=reader.cursor.position + 1, events_max=1, bytes_max=bytes_max)  # opens the first segment
         for each in next(deleted, ()):
             segment_path(folder, each).unlink()
