@@ -75,8 +75,6 @@ def faults_on(server: Server) -> list[Fault]:
         Fault("kill -9 of the daemon, PostgreSQL", robots.killed_daemons(server), 3, 200, 20),
         Fault("killed fold workers, SQLite", workers.faulty_workers(None, signal.SIGKILL), 2, 200, 20),
         Fault("killed fold workers, PostgreSQL", workers.faulty_workers(server, signal.SIGKILL), 2, 200, 20),
-        Fault("stopped fold workers, SQLite", workers.faulty_workers(None, signal.SIGSTOP), 2, 200, 20),
-        Fault("stopped fold workers, PostgreSQL", workers.faulty_workers(server, signal.SIGSTOP), 2, 200, 20),
         Fault("torn write at every byte", files.torn_writes, 300, 20_000, 2_000),
         Fault("flipped bit", files.flipped_bits, 150, 80_000, 80_000),
         Fault("power cut, simulated disk", files.power_cuts, 60, 5_000, 500),

@@ -500,9 +500,6 @@ def killed_daemons(server: Server | None) -> Callable[[int, random.Random, Path,
 _WORKER_SETTINGS = replace(
     SETTINGS,
     fold_worker_restart_s=0.02,
-    fold_worker_healthy_s=0.01,
-    fold_worker_report_s=0.05,
-    fold_worker_stopped_s=0.2,
 )
 _REPLACED_S_MAX = 120.0
 

@@ -49,7 +49,6 @@ from importlib import import_module
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
-from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple, Self, TypeAlias
 
 import msgspec
@@ -73,21 +72,18 @@ from pycrorm_async.writer.drain import Backoff, TablesPort
 # Run one fold worker: start its process, restart it when it dies, and exchange requests with it.
 #
 # Theory of operation. A worker has one asyncio task, which starts the process, waits for its end and starts it again.
-# The pause before a restart grows with each death, and is short again after a process has lived for
-# `fold_worker_healthy_s`. A worker's state is `idle` (not needed yet), `starting`, `running`, `stopped` or
-# `restarting`; only its task and the calls that wait for its answers change it, all in the parent's event loop.
+# The pause before a restart grows with each death, and is short again after a process has lived for `_HEALTHY_S`. A
+# worker's state is `idle` (not needed yet), `starting`, `running` or `restarting`; only its task and the calls that
+# wait for its answers change it, all in the parent's event loop.
 #
-# A process that is stopped (SIGSTOP, a debugger) inside a transaction keeps SQLite's only write lock, or row locks in
-# PostgreSQL, and so blocks other writers. Neither its CPU time nor its open connection shows that, so the parent reads
-# the state of the process while it waits for an answer. It reports a stopped worker after `fold_worker_report_s` and
-# kills it after `fold_worker_stopped_s`; the database then rolls the transaction back. A worker that is not stopped has
-# `fold_worker_answer_s` for an answer. The parent kills only processes that it started and has not reaped, so a reused
-# pid is never hit.
+# A process that does not answer for `fold_worker_answer_s`, because it loops, or because it was stopped inside a
+# transaction and keeps locks of the database, is killed; the database then rolls the transaction back. The parent kills
+# only processes that it started and has not reaped, so a reused pid is never hit.
 
 _RESTART_S_MAX: Final = 60.0
 """The longest pause before a restart."""
-_CHECK_S: Final = 0.25
-"""The interval at which the parent reads the state of a process while it waits for its answer."""
+_HEALTHY_S: Final = 60.0
+"""A worker that lived this long is restarted after the first, shortest pause."""
 
 
 class FoldWorkerLost(Exception):
@@ -99,7 +95,7 @@ class FoldWorkerState(msgspec.Struct, frozen=True):
 
     Attributes:
         number: from 1.
-        state: `idle`: not needed yet; `stopped`: the process is stopped while the daemon waits for it.
+        state: `idle`: not needed yet.
         since_wall_ns: the start of the state.
         pid: of the process; None without one.
         restarts: the number of restarts.
@@ -109,24 +105,13 @@ class FoldWorkerState(msgspec.Struct, frozen=True):
     """
 
     number: int
-    state: Literal["idle", "starting", "running", "stopped", "restarting"] = "idle"
+    state: Literal["idle", "starting", "running", "restarting"] = "idle"
     since_wall_ns: int = 0
     pid: int | None = None
     restarts: int = 0
     restart_wall_ns: int | None = None
     reason: str | None = None
     batches: int = 0
-
-
-def verdict(settings: Settings, *, unanswered_s: float, stopped_s: float) -> Literal["wait", "report", "replace"]:
-    """Decide about a worker that has not answered yet; `stopped_s` is 0 for a process that is not stopped.
-
-    >>> verdict(Settings(), unanswered_s=299.0, stopped_s=0.0), verdict(Settings(), unanswered_s=11.0, stopped_s=10.5)
-    ('wait', 'replace')
-    """
-    if stopped_s >= settings.fold_worker_stopped_s or unanswered_s >= settings.fold_worker_answer_s:
-        return "replace"
-    return "report" if stopped_s >= settings.fold_worker_report_s else "wait"
 
 
 class FoldWorker:
@@ -207,7 +192,7 @@ class FoldWorker:
         while True:
             began_s = now_s()
             name, reason = await self._run_process()
-            deaths = 1 if now_s() - began_s >= self._settings.fold_worker_healthy_s else deaths + 1
+            deaths = 1 if now_s() - began_s >= _HEALTHY_S else deaths + 1
             pause_s = backoff.pause_s(deaths, 1.0)
             assert pause_s is not None, "there is no last attempt"
             self._report(f"{name} {reason}; restarting it in {pause_s:g} s")
@@ -250,19 +235,18 @@ class FoldWorker:
         self._change("running")
 
     async def _exchange(self, process: ChildProcess, message: object, activity: str) -> Any:
-        """Send a message, watch the process, and return the answer. Raises `FoldWorkerLost`.
+        """Send a message and return the answer; kill a process that gives none. Raises `FoldWorkerLost`.
 
         Cancelling it kills the process, because the late answer would be taken for that of the next request.
         """
-        now_s = asyncio.get_running_loop().time
         exchange = asyncio.ensure_future(asyncio.to_thread(process.exchange, message))
-        sent_s = running_s = now_s()
+        limit_s = self._settings.fold_worker_answer_s
         try:
-            while not (await asyncio.wait([exchange], timeout=_CHECK_S))[0]:
-                checked_s = now_s()
-                running_s = running_s if process.is_stopped() else checked_s
-                self._treat(process, activity, unanswered_s=checked_s - sent_s, stopped_s=checked_s - running_s)
-            answer = exchange.result()
+            if not (await asyncio.wait([exchange], timeout=limit_s))[0]:
+                self._killed_because = f"gave no answer for {limit_s:.0f} s while it {activity}, and was killed"
+                self.is_ready = False
+                process.kill()
+            answer = await exchange
         except (EOFError, OSError):
             self.is_ready = False
             process.kill()  # without a connection it could only idle
@@ -272,34 +256,7 @@ class FoldWorker:
             exchange.add_done_callback(lambda done: done.cancelled() or done.exception())
             process.kill()
             raise
-        if self.state.state == "stopped":
-            self._continue()
         return answer
-
-    def _treat(self, process: ChildProcess, activity: str, *, unanswered_s: float, stopped_s: float) -> None:
-        """Report or kill the process according to `verdict`."""
-        settings, is_reported = self._settings, self.state.state == "stopped"
-        match verdict(settings, unanswered_s=unanswered_s, stopped_s=stopped_s):
-            case "replace" if self._killed_because is None:
-                cause = (
-                    f"was stopped for {stopped_s:.1f} s" if stopped_s else f"gave no answer for {unanswered_s:.0f} s"
-                )
-                self._killed_because = f"{cause} while it {activity}, and was killed"
-                self.is_ready = False
-                process.kill()
-            case "report" if not is_reported:
-                left_s = settings.fold_worker_stopped_s - stopped_s
-                self._report(
-                    f"fold worker {self.state.number} (pid {process.pid}) is stopped while it {activity};"
-                    f" replacing it in {left_s:.1f} s unless it continues"
-                )
-                self._change("stopped")
-            case "wait" if is_reported:
-                self._continue()
-
-    def _continue(self) -> None:
-        self._report(f"fold worker {self.state.number} (pid {self.state.pid}) continues")
-        self._change("running" if self.is_ready else "starting")
 
     def _change(self, state: str | None = None, **values: object) -> None:
         if state is not None:
@@ -529,14 +486,6 @@ class ChildProcess(NamedTuple):
         self.process.join()
         self.connection.close()
 
-    def is_stopped(self) -> bool:
-        """Return whether the process is stopped, by a signal or by a debugger."""
-        try:
-            status = Path(f"/proc/{self.pid}/stat").read_text(encoding="utf-8", errors="replace")
-        except OSError:  # it has ended
-            return False
-        return status.rpartition(")")[2].split()[0] in ("T", "t")
-
 
 class _Entry(NamedTuple):
     """The function that a child calls. A spawned child imports it without garbage collections.
@@ -604,7 +553,7 @@ class FoldWorkers:
 
     Args:
         forked: the first processes, if the command forked them; a worker without one is started when it is needed.
-        report: called with one line for each death, stop and continuation.
+        report: called with one line for each death.
         note: called with the states of all workers when one has changed.
     """
 

@@ -41,8 +41,6 @@ FAULTS = [
     "kill -9 of the daemon, PostgreSQL",
     "killed fold workers, SQLite",
     "killed fold workers, PostgreSQL",
-    "stopped fold workers, SQLite",
-    "stopped fold workers, PostgreSQL",
     "torn write at every byte",
     "flipped bit",
     "power cut, simulated disk",

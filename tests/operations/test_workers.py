@@ -304,8 +304,7 @@ def test_a_rebuild_in_a_daemonic_process_folds_without_workers(tmp_path: Path) -
 #
 # The daemon runs in this loop; its one worker is a process of its own, which is forked instead of spawned.
 
-PATIENT = Settings(sync_interval_ms=5, fold_worker_restart_s=0.1, fold_worker_report_s=0.1)
-IMPATIENT = replace(PATIENT, fold_worker_stopped_s=0.6)
+PATIENT = Settings(sync_interval_ms=5, fold_worker_restart_s=0.1)
 HURRIED = replace(PATIENT, fold_worker_answer_s=10.0)
 """The limit on the start of a worker, which takes a few seconds on a busy machine."""
 NOTES = 10
@@ -438,49 +437,20 @@ async def test_status_keeps_the_batch_count_of_a_worker_that_has_ended(
 
 
 @pytest.mark.usefixtures("forked_workers")
-async def test_a_worker_that_is_suspended_in_its_transaction_is_named_and_then_replaced(
-    database_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("trap", ["hang", "SIGSTOP"])
+async def test_a_worker_that_never_answers_is_replaced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, trap: str
 ) -> None:
-    async with lab_at(database_url, tmp_path, IMPATIENT, monkeypatch) as lab:
+    async with lab_at(f"sqlite:///{tmp_path}/memory.db", tmp_path, HURRIED, monkeypatch) as lab:
         pid = lab.worker().pid
-        arm(lab.trap, "SIGSTOP")
+        arm(lab.trap, trap)
         await lab.write()
-        named = await lab.wait_for_line("is stopped")
-        assert named.startswith(
-            f"fold worker 1 (pid {pid}) is stopped while it writes a batch and holds locks of the database; replacing"
-        )
-        killed = await lab.wait_for_line("restarting")
         assert re.fullmatch(
-            rf"fold worker 1 \(pid {pid}\) was stopped for \d\.\d s while it writes a batch and holds locks of the"
+            rf"fold worker 1 \(pid {pid}\) gave no answer for 10 s while it writes a batch and holds locks of the"
             r" database, and was killed; restarting it in 0\.1 s",
-            killed,
+            await lab.wait_for_line("restarting"),
         )
         await lab.worker_is("running", restarts=1)
-
-
-@pytest.mark.usefixtures("forked_workers")
-@pytest.mark.soak_on("postgresql")
-async def test_a_worker_that_continues_in_time_is_not_replaced(
-    database_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    async with lab_at(database_url, tmp_path, PATIENT, monkeypatch) as lab:
-        pid = lab.worker().pid
-        arm(lab.trap, "SIGSTOP")
-        await lab.write()
-        assert (await lab.worker_is("stopped")).pid == pid
-        assert pid is not None
-        os.kill(pid, signal.SIGCONT)
-        assert await lab.wait_for_line(r"\) continues$") == f"fold worker 1 (pid {pid}) continues"
-        await lab.memory.flush()
-        assert (lab.worker().state, lab.worker().pid, lab.worker().restarts) == ("running", pid, 0)
-
-
-@pytest.mark.usefixtures("forked_workers")
-async def test_a_worker_that_never_answers_is_replaced(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    async with lab_at(f"sqlite:///{tmp_path}/memory.db", tmp_path, HURRIED, monkeypatch) as lab:
-        arm(lab.trap, "hang")
-        await lab.write()
-        assert "gave no answer for" in await lab.wait_for_line("restarting")
 
 
 @pytest.mark.usefixtures("forked_workers")
