@@ -296,10 +296,7 @@ class Receipt:
     at any call, can determine whether the event was written before.
     """
 
-    __slots__ = ("sequence",)
-
-    def __init__(self) -> None:
-        self.sequence = 0
+    sequence = 0
 
 
 class Record(NamedTuple):

@@ -170,9 +170,10 @@ class Recorder:
     # --- the port of the plan layer ----------------------------------------------------------------------------------
 
     def admit(self) -> Awaitable[None] | None:
-        if self._emitter.is_closed or not self._emitter.must_wait():
+        sink = self._emitter.sink
+        if not sink.full or self._emitter.is_closed or not self._emitter.must_wait():
             return None
-        return self._emitter.sink.room()
+        return sink.room()
 
     def node_started(self, node: TaskTreeNode) -> None:
         assert node.designator is not None
