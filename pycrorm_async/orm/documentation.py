@@ -154,7 +154,11 @@ def _classes_in(module: str) -> dict[str, list[ast.stmt]]:
         source = inspect.getsource(sys.modules[module])
     except (OSError, TypeError, KeyError):
         return {}
-    return {each.name: each.body for each in ast.parse(source).body if isinstance(each, ast.ClassDef)}
+    try:
+        tree = ast.parse(source)
+    except SystemError:  # Python 3.11 and 3.12 count the recursion of all threads that parse together
+        tree = ast.parse(source)
+    return {each.name: each.body for each in tree.body if isinstance(each, ast.ClassDef)}
 
 
 def _documented(class_: type) -> dict[str, str]:

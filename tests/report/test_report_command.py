@@ -348,7 +348,7 @@ def test_successes_over_any_columns_of_the_chosen_episodes_are_in_the_page(url: 
         ("arm", "--plot 'arm' must be X,Y or X,Y,VIEW, for example arm,grasp,PickUpAction"),
         ("arm,grasp,GraspActoin", "there is no view 'GraspActoin'; did you mean grasp_action"),
         ("arm,gram,GraspAction", "GraspAction has no column 'gram'; did you mean grams?"),
-        ("arm,grasp", "no row of PickUpWithContextView has ended"),
+        ("arm,grasp", "no row of PickUpWithContextView succeeded or failed and has arm and grasp"),
     ],
 )
 def test_a_plot_that_cannot_be_drawn_is_one_line_and_leaves_no_file(
