@@ -212,7 +212,7 @@ def test_every_name_that_the_bench_imports_still_exists(path: Path) -> None:
 BUT = {"busy", "faults", "hook", "__main__", "concurrent_processes", "pycram"}  # the last needs PyCRAM's environment
 OTHERS = sorted({path.stem for path in (ROOT / "bench").glob("*.py")} - BUT)
 """Scripts without a test of their own."""
-SHORT = {"digests", "recall"}
+SHORT = {"digests"}
 """Scripts of a few seconds. The others run in turns, because most take ten seconds and more."""
 
 

@@ -95,6 +95,7 @@ def test_a_study_evaluates_the_policy_under_other_conditions(document: Any) -> N
     assert {each["default"]["rollouts"] for each in studied["elsewhere"]} == {4}
 
 
+@pytest.mark.soak
 def test_an_interrupt_is_one_line_and_resume_performs_the_rest_and_prints_all(tmp_path: Path) -> None:
     settings = ("learn", "--evaluate", "30", "--held-out", "30", "--min-samples-leaf", "10", "--workers", "1")
     process = Started(*settings, "--rollouts", "100000", cwd=tmp_path)

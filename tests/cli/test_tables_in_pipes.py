@@ -92,6 +92,7 @@ def test_csv_of_a_query_has_each_text_unchanged_or_without_formulas(folder: Path
     ]  # fmt: skip
 
 
+@pytest.mark.soak
 def test_an_export_of_csv_has_no_formulas_on_request_and_is_made_again_alike(folder: Path, tmp_path: Path) -> None:
     url = f"sqlite:///{folder / 'pycrorm.db'}"
     for options in ([], ["--no-formulas"]):
@@ -118,7 +119,9 @@ def test_an_export_of_csv_has_no_formulas_on_request_and_is_made_again_alike(fol
         (["--status", "SUCCEEDED", "--without-tag", "good", "--without-tag", "noisy"], [4, 5]),
     ],
 )
-@pytest.mark.parametrize("name", [[], ["step_action"], ["durations"]])
+@pytest.mark.parametrize(
+    "name", [[], *(pytest.param(each, marks=pytest.mark.soak) for each in (["step_action"], ["durations"]))]
+)
 def test_an_export_has_the_episodes_with_and_without_tags(
     options: list[str], numbers: list[int], name: list[str], folder: Path, tmp_path: Path
 ) -> None:

@@ -157,6 +157,7 @@ async def test_a_wrong_argument_is_refused_in_one_line_with_the_nearest_one(url:
         assert await agent.ask("at", when=1, episode=1) == await agent.ask("at", when="1", episode=1)
 
 
+@pytest.mark.soak
 async def test_every_answer_is_bounded_however_long_the_recorded_texts_are(tmp_path: Path) -> None:
     url = f"sqlite:///{tmp_path / 'memory.db'}"
     long = "b\x01\u20ac" * 8_000

@@ -135,6 +135,7 @@ def kill_one() -> None:
     workers_running()[0].kill()
 
 
+@pytest.mark.soak
 async def test_a_killed_worker_is_reported_and_resuming_loses_and_doubles_nothing(tmp_path: Path) -> None:
     place = MemoryLocation(f"sqlite:///{tmp_path}/memory.db")
     with pytest.raises(WorkerLost, match="a rollout worker was killed by SIGKILL; its finished rollouts are recorded"):

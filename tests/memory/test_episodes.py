@@ -498,6 +498,7 @@ async def test_a_world_that_is_entered_inside_an_episode_is_described(database_u
     ]
 
 
+@pytest.mark.soak_on("postgresql")
 @pytest.mark.soak_on("sqlite")
 async def test_the_world_of_an_episode_that_runs_or_is_lost_is_that_of_its_objects(
     database_url: str, tmp_path: Path

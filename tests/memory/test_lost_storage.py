@@ -358,6 +358,7 @@ async def test_lost_episodes_get_their_own_numbers_and_new_ones_get_others(
     assert "events were appended again; 0 of 2 episodes stay incomplete" in reason
 
 
+@pytest.mark.soak_on("postgresql")
 @pytest.mark.soak_on("sqlite")
 async def test_a_lost_episode_of_a_dead_recorder_ends_lost_again(
     database_url: str, spool: Path, take_backup: TakeBackup, tmp_path: Path

@@ -62,6 +62,7 @@ def test_where_an_episode_without_a_digest_differs_no_rebuild_is_recommended(dat
     assert answer("verify", "--url", f"sqlite:///{database}", cwd=tmp_path, code=1)["undecided"] == 1
 
 
+@pytest.mark.soak
 def test_where_an_episode_with_digests_differs_a_rebuild_is_recommended(tmp_path: Path) -> None:
     url = unpack_memory(ZOO / "fold_8.tar.gz", tmp_path)
     assert pycrorm("rebuild", "--url", url, cwd=tmp_path).returncode == 0

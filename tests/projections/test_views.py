@@ -285,6 +285,7 @@ async def drop_plans(log: EventLog) -> None:
         await connection.exec_driver_sql(f"DROP TABLE plans{' CASCADE' * (connection.dialect.name == 'postgresql')}")
 
 
+@pytest.mark.soak_on("postgresql")
 @pytest.mark.parametrize("materialised", [False, True])
 async def test_a_view_whose_table_was_dropped_is_left_out_and_all_events_are_visible(
     log: EventLog, materialised: bool, caplog: pytest.LogCaptureFixture
@@ -385,6 +386,7 @@ async def test_one_that_is_registered_later_shows_earlier_rows(log: EventLog) ->
     assert len(await visible_rows(log, "said")) == 1000
 
 
+@pytest.mark.soak_on("postgresql")
 @pytest.mark.soak_on("sqlite")
 async def test_a_changed_query_under_the_same_name_is_shown_and_the_next_rebuild_drops_the_old_rows(
     log: EventLog,
@@ -414,6 +416,7 @@ async def test_a_materialised_view_can_become_a_plain_view_and_back(log: EventLo
         assert len(await visible_rows(log, "said")) == 4
 
 
+@pytest.mark.soak_on("postgresql")
 @pytest.mark.soak_on("sqlite")
 async def test_a_rebuild_makes_it_again_and_it_is_kept_up_to_date(log: EventLog) -> None:
     projector = Projector(log, views=[KEPT, PLAIN])

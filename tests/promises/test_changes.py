@@ -144,6 +144,7 @@ async def every_event(request: pytest.FixtureRequest, golden: str) -> str:
     return url
 
 
+@pytest.mark.soak_on("postgresql")
 @pytest.mark.soak_on("sqlite")
 async def test_a_memory_of_the_first_version_has_all_its_rows_and_its_spool_is_adopted(every_event: str) -> None:
     t0 = 1_700_000_000_000_000

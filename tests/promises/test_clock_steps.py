@@ -113,6 +113,7 @@ VIEWS = {"process_metadata": ("id", "created_at", "ended_at")} | dict.fromkeys(
 """By view the columns of the episode, the start and the end."""
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_every_view_has_the_durations_of_the_monotonic_clock(database_url: str, tmp_path: Path) -> None:
     await record(database_url, tmp_path / "spool")
     for view, (episode, start, end) in VIEWS.items():

@@ -44,6 +44,7 @@ def few_and_many(request: pytest.FixtureRequest, many: int, tmp_path: Path) -> I
         yield urls
 
 
+@pytest.mark.soak_on("postgresql")
 @pytest.mark.parametrize(
     "many",
     [pytest.param(1_500, marks=pytest.mark.slow), pytest.param(5_000, marks=pytest.mark.soak)],

@@ -60,6 +60,7 @@ async def owner_url(server: Server) -> str:
     return url
 
 
+@pytest.mark.soak
 async def test_the_owner_queries_as_the_reader_and_no_attack_gets_out(owner_url: str, tmp_path: Path) -> None:
     async with opened_reader(owner_url) as sql:
         who = "SELECT current_user::text, session_user::text, count(*) FROM process_metadata"

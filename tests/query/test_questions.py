@@ -331,6 +331,7 @@ ARGUMENTS: dict[str, dict[str, Any]] = {
 OF_EPISODES = [each for each in QUESTIONS if each not in ("experience_at", "episodes")]
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_the_sql_of_each_question_returns_its_rows(reading: Reading, filled_url: str) -> None:
     identity = (await reading.episode("3")).id
     questions = [getattr(reading.ask, name)(**ARGUMENTS.get(name, {})) for name in QUESTIONS]
@@ -384,6 +385,7 @@ async def test_a_question_is_awaited_for_a_frame_of_its_columns(reading: Reading
         assert len(frame) == len(await question.rows())
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_a_question_to_an_empty_memory_has_no_rows(database_url: str) -> None:
     await append_and_fold(database_url, [])
     async with Reading.open(database_url) as reading:
@@ -527,6 +529,7 @@ def test_a_memory_without_asyncio_answers_with_frames_and_rows(tmp_path: Path) -
 # --- names that are not ASCII, or not as they are written -----------------------------------------------------
 
 
+@pytest.mark.soak_on("postgresql")
 @pytest.mark.filterwarnings("ignore:no row answers")
 def test_names_are_found_whatever_their_letters_are(database_url: str, tmp_path: Path) -> None:
     with Memory.sync(database_url, spool=tmp_path / "spool") as memory:

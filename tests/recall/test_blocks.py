@@ -255,6 +255,7 @@ async def test_nothing_is_left_of_a_memory_that_was_rebuilt_without_cases() -> N
 # A reader of a memory sees each change of its blocks, and asks once where nothing has changed.
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_a_reader_sees_new_merged_and_rebuilt_blocks_and_asks_once_where_none_has_changed(
     log: EventLog, database_url: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -73,6 +73,7 @@ pytestmark = pytest.mark.slow
 # The memory holds of robots and objects what a plan depended on: the masses, the base link, who took part.
 
 
+@pytest.mark.soak_on("postgresql")
 async def test_a_robot_that_is_added_again_has_one_row(database_url: str, tmp_path: Path) -> None:
     def add(name: str, serial: str | None = None) -> Object:
         return Object(name, ObjectType.ROBOT, robot=replace(COURIER, serial=serial))

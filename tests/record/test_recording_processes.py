@@ -154,6 +154,7 @@ with Memory.sync(url, spool=spool, writer="daemon") as memory:
 """
 
 
+@pytest.mark.soak_on("postgresql")
 @pytest.mark.slow
 @pytest.mark.soak_on("sqlite")
 async def test_each_type_of_a_field_has_a_column_and_no_episode_is_parked(database_url: str, tmp_path: Path) -> None:

@@ -90,6 +90,7 @@ async def test_the_status_of_a_closed_memory_is_its_last(tmp_path: Path, writer:
     assert status.stored == (written if writer == "thread" else 0)
 
 
+@pytest.mark.soak
 @pytest.mark.slow
 def test_a_forked_child_goes_on_without_recording_and_its_status_counts(tmp_path: Path) -> None:
     script = (

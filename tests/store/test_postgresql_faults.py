@@ -260,6 +260,7 @@ def own_server() -> Iterator[Server]:
         yield running
 
 
+@pytest.mark.soak
 async def test_a_server_killed_repeatedly_under_load_stores_everything_once_in_the_end(own_server: Server) -> None:
     url = own_server.new_database()
     records = records_of_three_episodes(random.Random(14), 20_000)
