@@ -18,6 +18,7 @@ from pycrorm_async.cli.output import (
     counted,
     note,
     print_json,
+    problem,
     stdout,
 )
 from pycrorm_async.cli.reading import note_pending_events
@@ -84,8 +85,11 @@ def rebuild(
             )
         for episode, reason in each.parked.items():
             note(f"episode {episode} is parked{f' in {name}' if name in projections else ''}: {reason}")
+    damaged = {number: each for summary in summaries.values() for number, each in summary.damaged.items()}
+    for number, identity in damaged.items():
+        problem(f"episode {number}: its id {identity!r:.100} was changed after it was stored: it is not a UUID")
     note_pending_events(url, spool)
-    return 1 if any(each.parked for each in summaries.values()) else 0
+    return 4 if damaged else 1 if any(each.parked for each in summaries.values()) else 0
 
 
 async def _choose(url: str, names: list[str], projections: Mapping[str, Projection]) -> list[str]:

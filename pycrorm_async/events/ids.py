@@ -90,3 +90,11 @@ def episode_text(episode: EpisodeId) -> str:
 def parse_episode_id(text: str) -> EpisodeId:
     """Parse the text of an episode id; the inverse of `episode_text`. Raises `ValueError` if it is not a UUID."""
     return EpisodeId(uuid.UUID(text).bytes)
+
+
+def is_episode_id(text: str) -> bool:
+    """Return whether this is the text of an episode id, in the one form in which ids are stored."""
+    try:
+        return episode_text(parse_episode_id(text)) == text
+    except ValueError:
+        return False

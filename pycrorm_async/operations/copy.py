@@ -22,7 +22,7 @@ from pycrorm_async.clock import SYSTEM_CLOCK, Clock
 from pycrorm_async.errors import CallerError, DamageError, DatabaseError, DatabaseUnavailable, LogDamaged
 from pycrorm_async.events.codec import Record, declaration_type, decode, encode, fingerprint
 from pycrorm_async.events.fields import changed_tags
-from pycrorm_async.events.ids import EpisodeId, episode_text
+from pycrorm_async.events.ids import EpisodeId, episode_text, is_episode_id
 from pycrorm_async.events.types import EVENT_TYPES, EpisodeTagged
 from pycrorm_async.operations.destination import LogAndTables, shared_address
 from pycrorm_async.projections.custom import own_projections
@@ -164,7 +164,7 @@ class _Copier:
 
     async def _heads(self, rows: Sequence[EpisodeRow]) -> dict[str, int]:
         """Return the last event that the target has of each of these episodes, by id."""
-        heads = await self._target.heads([row.identity for row in rows])
+        heads = await self._target.heads([row.identity for row in rows if is_episode_id(row.id)])
         return {row.id: row.head for row in heads.values()}
 
     async def _copy(self, row: EpisodeRow, head: int) -> None:

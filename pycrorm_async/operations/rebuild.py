@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
 from pycrorm_async.errors import DatabaseError, DatabaseForeign, DatabaseUnavailable, PycrormError
+from pycrorm_async.events.ids import is_episode_id
 from pycrorm_async.operations.destination import shared_address
 from pycrorm_async.operations.workers import Assignment, FoldWorker, FoldWorkerLost, FoldWorkers
 from pycrorm_async.progress_bar import ProgressCallback, progress_bar
@@ -49,6 +50,7 @@ class RebuildSummary(NamedTuple):
         seconds: its duration.
         parked: the parked episodes by id, with the reasons.
         left: replaced tables that could not be dropped, because queries still use them.
+        damaged: the damaged ids of episodes, by number.
     """
 
     generation: int
@@ -57,6 +59,7 @@ class RebuildSummary(NamedTuple):
     seconds: float
     parked: Mapping[str, str]
     left: Sequence[str]
+    damaged: Mapping[int, str]
 
 
 async def rebuild_memory(
@@ -154,7 +157,7 @@ async def _run(
             report_progress(1, 1, "clearing up")
             left = await clear(log)
         episodes, events = await recorded(log)
-        ids = {each.number: each.id for each in await log.episodes()} if parked else {}
+        ids = {each.number: each.id for each in await log.episodes()}
         return RebuildSummary(
             generation=rebuild.number,
             events=events,
@@ -162,6 +165,7 @@ async def _run(
             seconds=seconds,
             parked={ids[number]: reason for number, reason in parked.items()},
             left=left,
+            damaged={number: each for number, each in ids.items() if not is_episode_id(each)},
         )
     finally:
         await log.close()

@@ -496,7 +496,7 @@ async def episodes_behind(
     begun = "AND (episode.folded > 0 OR episode.parked IS NOT NULL)" if after_tables else ""
     rows = await connection.execute(
         text(f"""
-SELECT number, episode.id, head, coalesce(progress.folded, 0), started_wall_ns
+SELECT number, {dialect_of(connection).episode_id}, head, coalesce(progress.folded, 0), started_wall_ns
 FROM episode LEFT JOIN {place} AS progress ON progress.id = number
 WHERE number > :after AND head > coalesce(progress.folded, 0) AND progress.parked IS NULL
 AND number % :many = :part {begun} ORDER BY number LIMIT :limit"""),  # noqa: S608
@@ -513,7 +513,7 @@ async def late(connection: AsyncConnection, place: str, *, seen: str, limit: int
     """
     rows = await connection.execute(
         text(f"""
-SELECT episode.number, episode.id, seen.folded, coalesce(progress.folded, 0), started_wall_ns
+SELECT episode.number, {dialect_of(connection).episode_id}, seen.folded, coalesce(progress.folded, 0), started_wall_ns
 FROM episode JOIN ({seen}) AS seen ON seen.number = episode.number
 LEFT JOIN {place} AS progress ON progress.id = episode.number
 WHERE seen.folded > coalesce(progress.folded, 0) AND progress.parked IS NULL

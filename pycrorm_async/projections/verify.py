@@ -58,7 +58,7 @@ from pycrorm_async.projections.row_batch import CannotFold, Designators, Rows
 from pycrorm_async.store.address import no_tables
 from pycrorm_async.store.append import has_digests
 from pycrorm_async.store.dialects import dialect_of
-from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.log import EventLog, read_episodes
 from pycrorm_async.store.stored import BLOCK_EVENTS, EpisodeRow, RunningDigest, Span, StoredEvent, consecutive
 
 if TYPE_CHECKING:
@@ -250,7 +250,7 @@ class EpisodeCheck:
         self.damaged_blocks: set[int] = set()
         self.described = False
         self.head = 0
-        self._has_end = False
+        self._ended_wall_ns: int | None = None
         self._nodes: dict[int, list[Any]] = {}
         self._row: dict[str, Any] | None = None
         self._order: OrderCheck | None = OrderCheck()
@@ -285,14 +285,19 @@ class EpisodeCheck:
             if event is not None:
                 self._in_gap = False
                 self._one(event, folded, designators, rows)
+                if sequence == 1 and event.wall_ns != episode.started_wall_ns:
+                    self._damaged(1, f"the episode's started_wall_ns is {episode.started_wall_ns}{_OTHER_TIME}")
             elif not self._in_gap:
                 self._in_gap = True
                 self._damaged(sequence, "is missing")
                 self._lose(sequence, folded, rows)
-        ended = span.last == episode.head and episode.ended_wall_ns is not None
-        if ended and not self._has_end and self._order is not None:
+        if span.last < episode.head or self._order is None:
+            return
+        if self._ended_wall_ns is None and episode.ended_wall_ns is not None:
             evidence = "the episode has an end, and no EpisodeEnded"
             self._result.add_deleted(self.number, span.last + 1, f"it and all behind it were deleted: {evidence}")
+        elif self._ended_wall_ns != episode.ended_wall_ns:
+            self._damaged(span.last, f"the episode's ended_wall_ns is {episode.ended_wall_ns}{_OTHER_TIME}")
 
     def leave(self, rows: Rows, after: int, folded: int) -> None:
         """End a part after event `after` of an episode that continues: take the rows to carry out of `rows`."""
@@ -322,7 +327,8 @@ class EpisodeCheck:
         shown = event.sequence <= folded
         self._result.events += 1
         self._result.behind += not shown
-        self._has_end = self._has_end or event.type == EpisodeEnded.__name__
+        if event.type == EpisodeEnded.__name__:
+            self._ended_wall_ns = event.wall_ns
         for reference in references_in(event.type, event.payload):
             self._result.blobs.setdefault(reference.hash, (self.number, event.sequence))
         try:
@@ -358,6 +364,9 @@ class EpisodeCheck:
     def _damaged(self, sequence: int, reason: str) -> None:
         self.damaged_blocks.add((sequence - 1) // BLOCK_EVENTS)
         self._result.add_damage(self.number, sequence, reason)
+
+
+_OTHER_TIME = ", and the event has another time: one of them was changed after it was stored"
 
 
 def _named(reason: Exception) -> str:
@@ -667,14 +676,8 @@ def _cut(episodes: Sequence[EpisodeRow], at: Place, limit: int) -> tuple[list[Sp
 
 
 async def _episodes(connection: AsyncConnection, within: EpisodeRange, limit: int) -> list[EpisodeRow]:
-    rows = await connection.execute(
-        text(
-            "SELECT number, id, head, folded, started_wall_ns, ended_wall_ns, refused, parked FROM episode"
-            " WHERE number >= :first AND number < :end ORDER BY number LIMIT :limit"
-        ),
-        {**within.limits, "limit": limit},
-    )
-    return [EpisodeRow(*row) for row in rows]
+    clauses = "WHERE number >= :first AND number < :end ORDER BY number LIMIT :limit"
+    return await read_episodes(connection, clauses, **within.limits, limit=limit)
 
 
 async def _designators(connection: AsyncConnection, generation: Generation) -> Designators:

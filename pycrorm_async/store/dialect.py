@@ -83,6 +83,8 @@ class Dialect(Protocol):
     digest_statements: DigestStatements
     blob_table: Sequence[str]
     """Statements that create the table of the blobs unless it exists."""
+    episode_id: str
+    """SQL that reads an id from the table `episode`, as valid text even where it is damaged."""
 
     async def prepare(self, engine: AsyncEngine, name: str) -> None:
         """Prepare a database, outside a transaction, for creating or migrating a log. Raises `DatabaseForeign`."""

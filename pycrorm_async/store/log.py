@@ -21,14 +21,14 @@ from types import MappingProxyType
 from typing import Any
 
 import msgspec
-from sqlalchemy import ColumnElement, Select, bindparam, column, func, select, table, text
+from sqlalchemy import BindParameter, ColumnElement, Select, bindparam, column, func, select, table, text
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
 from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable, LogDamaged, PycrormError, UnknownEpisode
 from pycrorm_async.events.codec import Record, declared_dtype, fingerprint
 from pycrorm_async.events.fields import retagged
-from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, EpisodeId, episode_text, parse_episode_id
+from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, EpisodeId, episode_text, is_episode_id
 from pycrorm_async.settings import FILE_MODES, FileAccess
 from pycrorm_async.store.address import BUSY_TIMEOUT_S, DatabaseAddress
 from pycrorm_async.store.append import (
@@ -524,7 +524,7 @@ async def number_named(
             return int(number)
     # Between two whole ids, because no order of texts then depends on where their hyphens are.
     first, last = (name.lower() + end[len(name) :] for end in (_NO_ID, _LAST_ID))
-    if len(name) >= _DIGITS_OF_ID and _is_id(first):
+    if len(name) >= _DIGITS_OF_ID and is_episode_id(first):
         begins = select(func.count(), func.min(numbers)).where(ids.between(first, last))
         count, number = (await connection.execute(begins)).one()
         if count > 1:
@@ -532,13 +532,6 @@ async def number_named(
         if count:
             return int(number)
     raise UnknownEpisode(f"there is no episode {name!r} ({_present((await connection.execute(listed)).scalar_one())})")
-
-
-def _is_id(text_: str) -> bool:
-    try:
-        return episode_text(parse_episode_id(text_)) == text_
-    except ValueError:
-        return False
 
 
 def _present(listed: int) -> str:
@@ -563,17 +556,23 @@ async def episode_named(log: EventLog, name: str) -> EpisodeRow:
     return row
 
 
-_GROWN = text(
-    "SELECT number, id, head, folded, started_wall_ns, ended_wall_ns, refused, parked FROM episode"
-    " WHERE number > :above OR ended_wall_ns IS NULL OR number IN :numbers ORDER BY number"
-).bindparams(bindparam("numbers", expanding=True))
+_GROWN = "WHERE number > :above OR ended_wall_ns IS NULL OR number IN :numbers ORDER BY number"
 
 
 async def grown_episodes(log: EventLog, *, above: int, numbers: Collection[int]) -> list[EpisodeRow]:
     """Read the episodes that may have grown: with a number above `above`, not ended, or with one of these numbers."""
     async with log.reading() as connection:
-        rows = await connection.execute(_GROWN, {"above": above, "numbers": sorted(numbers)})
-        return [EpisodeRow(*row) for row in rows]
+        return await read_episodes(connection, _GROWN, above=above, numbers=sorted(numbers))
+
+
+async def read_episodes(connection: AsyncConnection, clauses: str, **values: object) -> list[EpisodeRow]:
+    """Read the rows of episodes with these clauses of SQL; an id that is not UTF-8 as its hexadecimal digits."""
+    columns = f"number, {dialect_of(connection).episode_id}, head, folded, started_wall_ns, ended_wall_ns"
+    query = text(f"SELECT {columns}, refused, parked FROM episode {clauses}")  # noqa: S608
+    lists: list[BindParameter[object]] = [
+        bindparam(name, expanding=True) for name, value in values.items() if isinstance(value, list)
+    ]
+    return [EpisodeRow(*row) for row in await connection.execute(query.bindparams(*lists), values)]
 
 
 async def tags_of(log: EventLog, row: EpisodeRow) -> tuple[str, ...]:

@@ -438,6 +438,7 @@ class PostgreSQL:
 
     migrations: Migrations = MIGRATIONS
     digest_statements = DIGEST_STATEMENTS
+    episode_id = "episode.id"
     blob_table: Sequence[str] = BLOB
     faults: tuple[type[Exception], ...] = postgresql_errors.FAULTS
 

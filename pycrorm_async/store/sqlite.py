@@ -209,7 +209,10 @@ SELECT value->>0, value->>1, value->>2 FROM json_each(?) WHERE true ON CONFLICT 
 
 # --- read -----------------------------------------------------------------------------------------------------
 
-_EPISODE_ROW = "number, id, head, folded, started_wall_ns, ended_wall_ns, refused, parked"
+# A damaged id of one episode, which may not be UTF-8, must not keep the other rows from being read.
+_DAMAGED = "episode.id GLOB '*[^ -~]*' OR length(episode.id) <> length(CAST(episode.id AS BLOB))"
+_EPISODE_ID = f"CASE WHEN {_DAMAGED} THEN quote(CAST(episode.id AS BLOB)) ELSE episode.id END"
+_EPISODE_ROW = f"number, {_EPISODE_ID}, head, folded, started_wall_ns, ended_wall_ns, refused, parked"
 
 SELECT_EPISODES_BY_ID = f"SELECT {_EPISODE_ROW} FROM episode WHERE id IN (SELECT value FROM json_each(?))"
 SELECT_EPISODES = f"SELECT {_EPISODE_ROW} FROM episode WHERE number BETWEEN ? AND ? ORDER BY number"
@@ -259,6 +262,7 @@ class SQLite:
     migrations: Migrations = MIGRATIONS
     blob_table: Sequence[str] = BLOB
     digest_statements = DIGEST_STATEMENTS
+    episode_id = _EPISODE_ID
     faults: tuple[type[Exception], ...] = (
         DBAPIError,
         sqlite3.Error,

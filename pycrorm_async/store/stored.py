@@ -33,7 +33,7 @@ import msgspec
 
 from pycrorm_async.errors import LogDamaged
 from pycrorm_async.events.codec import Record
-from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, EpisodeId, parse_episode_id
+from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, EpisodeId, is_episode_id, parse_episode_id
 
 
 class StoredEvent(NamedTuple):
@@ -81,11 +81,10 @@ class EpisodeRow(NamedTuple):
     @property
     def identity(self) -> EpisodeId:
         """The id in 16 bytes. Raises `LogDamaged` if the text is not an id."""
-        try:
-            return parse_episode_id(self.id)
-        except ValueError:
+        if not is_episode_id(self.id):
             reason = f"its id {self.id!r:.100} was changed after it was stored: it is not a UUID"
-            raise LogDamaged(str(self.number), 1, reason) from None
+            raise LogDamaged(str(self.number), 1, reason)
+        return parse_episode_id(self.id)
 
 
 class Basis(NamedTuple):

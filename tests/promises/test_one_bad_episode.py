@@ -58,6 +58,60 @@ def test_every_verb_names_the_damaged_episode_and_serves_the_others(url: str, tm
         assert "clean" in pycrorm(verb, cwd=tmp_path).stdout or verb == "status"
 
 
+@pytest.mark.parametrize("identity", [b"\xff1", b"01a21b3f\x00\xff", b"01A21B3F-8D6E-70B2-AB1D-1283293A2663"])
+async def test_a_damaged_id_is_named_with_its_episode_and_the_others_are_served(
+    tmp_path: Path, identity: bytes
+) -> None:
+    url = record_hostile_episodes(tmp_path / "pycrorm.db")
+    with sqlite3.connect(tmp_path / "pycrorm.db") as database:
+        database.execute("DROP TRIGGER episode_is_not_renamed")
+        database.execute("UPDATE episode SET id = CAST(? AS TEXT) WHERE number = ?", (identity, HOSTILE))
+    database.close()
+    for verb in ("verify", "rebuild"):
+        done = pycrorm(verb, cwd=tmp_path)
+        assert (done.returncode, "Traceback" in done.stderr) == (4, False)
+        assert f"episode {HOSTILE}" in done.stdout + done.stderr
+        assert "its id" in done.stdout + done.stderr
+    assert answer("verify", cwd=tmp_path, code=4)["episodes"] == 3
+    copied = answer("copy", "--to", "sqlite:///copy.db", cwd=tmp_path, code=4)
+    assert [bool(each["damage"]) for each in copied["episodes"]] == [False, True, False]
+    assert [each["copied"] > 0 for each in copied["episodes"]] == [True, False, True]
+    assert answer("verify", "--url", "sqlite:///copy.db", cwd=tmp_path)["episodes"] == 2
+    for file_format in ("lerobot", "parquet"):
+        done = pycrorm("export", "1", "2", "3", "--format", file_format, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+    assert pycrorm("report", "--all", "--out", "all.html", cwd=tmp_path).returncode == 0
+    follower = LogFollower(DatabaseAddress.parse(url))
+    try:
+        log = await follower.log()
+        assert await follower.overview.catch_up(log, await log.episodes())
+        assert {each["number"] for each in follower.overview.entries(0)} == {1, 2, 3}
+    finally:
+        await follower.close()
+
+
+@pytest.mark.parametrize("column", ["started_wall_ns", "ended_wall_ns"])
+@pytest.mark.parametrize("change", ["{} - 1", "{} + 86400000000000", "0"])
+def test_a_changed_time_of_an_episode_is_damage(tmp_path: Path, column: str, change: str) -> None:
+    record_hostile_episodes(tmp_path / "pycrorm.db")
+    assert pycrorm("verify", cwd=tmp_path).returncode == 0
+    with sqlite3.connect(tmp_path / "pycrorm.db") as database:
+        database.execute(f"UPDATE episode SET {column} = {change.format(column)} WHERE number = {HOSTILE}")
+    database.close()
+    [damage] = answer("verify", cwd=tmp_path, code=4)["damages"]
+    assert damage["number"] == HOSTILE
+    assert f"the episode's {column} is " in damage["reason"]
+
+
+def test_a_removed_end_of_an_episode_is_damage(tmp_path: Path) -> None:
+    record_hostile_episodes(tmp_path / "pycrorm.db")
+    with sqlite3.connect(tmp_path / "pycrorm.db") as database:
+        database.execute(f"UPDATE episode SET ended_wall_ns = NULL WHERE number = {HOSTILE}")
+    database.close()
+    [damage] = answer("verify", cwd=tmp_path, code=4)["damages"]
+    assert "the episode's ended_wall_ns is None" in damage["reason"]
+
+
 async def test_an_episode_that_no_page_can_be_made_of_leaves_the_pages_of_the_others(
     url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
