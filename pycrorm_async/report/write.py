@@ -376,9 +376,10 @@ async def _actions(reading: Reading) -> dict[int, dict[str, list[int]]]:
     """Count successes and tries of the actions of each episode, by type."""
     node = TaskTreeNode
     counted = times_with(node.status == TaskStatus.SUCCEEDED), times_with(node.status.in_(TRIED))
-    query = select(node.process_metadata_id, node.dtype, *counted).where(node.kind == "action")
+    name = func.coalesce(node.dtype, node.kind)  # another executive may report an action without a type
+    query = select(node.process_metadata_id, name, *counted).where(node.kind == "action")
     actions: dict[int, dict[str, list[int]]] = {}
-    for number, dtype, *counts in await reading.rows(query.group_by(node.process_metadata_id, node.dtype)):
+    for number, dtype, *counts in await reading.rows(query.group_by(node.process_metadata_id, name)):
         actions.setdefault(number, {})[dtype] = counts
     return actions
 

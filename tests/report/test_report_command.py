@@ -109,6 +109,19 @@ def test_all_episodes_are_a_table_with_pages_behind_it(recorded: Path, tmp_path:
 
 
 @pytest.mark.slow
+async def test_an_action_without_a_type_is_counted_in_the_table_of_all_episodes(tmp_path: Path) -> None:
+    url = f"sqlite:///{tmp_path}/pycrorm.db"
+    async with Memory.open(url) as memory:
+        with memory.recording.episode(description="untyped") as episode:
+            episode.start("a", memory.recording.type("action", None))  # type: ignore[arg-type]
+            episode.end("a")
+    async with Reading.open(url) as reading:
+        written = await overview(reading, tmp_path / "all.html")
+    assert (written.episodes, written.unreadable) == (1, {})
+    assert '"actions":{"action":[1,1]}' in (tmp_path / "all.html").read_text()
+
+
+@pytest.mark.slow
 def test_a_damaged_episode_has_a_row_with_the_reason_and_the_others_their_pages(recorded: Path, tmp_path: Path) -> None:
     shutil.copy(recorded / "pycrorm.db", tmp_path / "copy.db")
     with closing(sqlite3.connect(tmp_path / "copy.db")) as database, database:
