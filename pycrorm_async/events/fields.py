@@ -99,7 +99,7 @@ def bounded(name: str, bytes_max: int, shortened_bytes_max: int | None = None) -
     >>> bounded("pose__7_by_time", 63), bounded("a" * 80, 20)
     ('pose__7_by_time', 'aaaaaaa_01285d4c77f1')
     """
-    whole = name.encode()
+    whole = name.encode(errors="backslashreplace")  # half of a surrogate pair is refused where names are checked
     if len(whole) <= bytes_max:
         return name
     digest = hashlib.blake2b(whole, digest_size=6).hexdigest()

@@ -405,7 +405,8 @@ def world_of(
 def _object_type_then(then: ObjectThen) -> ObjectType:
     if then.object_type not in ObjectType.__members__:
         raise CallerError(
-            f"object {then.name!r} was recorded with the type {then.object_type!r}, which ObjectType lacks here"
+            f"object {then.name!r:.100} was recorded with the type {then.object_type!r:.100},"
+            " which ObjectType lacks here"
         )
     return ObjectType[then.object_type]
 

@@ -137,7 +137,7 @@ def declare_type(
         kind=kind,  # type: ignore[arg-type]  # checked below
         dtype=dtype,
         table=table,
-        concept=concept or (built_in.concept if built_in is not None else None),
+        concept=cut(clean(concept), _REASON_MAX) if concept else (built_in.concept if built_in is not None else None),
         bases=tuple(bases) or (built_in.bases if built_in is not None else ()),
         fields=tuple(each.declared for each in accepted),
         aliases=tuple(aliases),

@@ -468,3 +468,18 @@ def _stamped(events: list[tuple[str, bytes]]) -> Iterator[tuple[str, int, int, i
 def test_a_start_with_another_fault_is_still_refused(payload: bytes) -> None:
     with pytest.raises(ValueError, match=r"(missing|Expected)"):
         decode("NodeStarted", payload)
+
+
+def test_half_of_a_surrogate_pair_in_a_name_or_concept_keeps_neither_the_type_nor_its_values_from_being_recorded(
+    tmp_path: Path,
+) -> None:
+    url = f"sqlite:///{tmp_path}/memory.db"
+    bad = "a\udc80b"
+    with Memory.sync(url) as memory:
+        declared = memory.recording.type("action", "HalfAction", {bad: str, "x": str}, concept=f"soma:{bad}")
+        with memory.recording.episode() as episode:
+            episode.start("node", declared, {bad: "v", "x": "w"})
+            episode.end("node")
+        memory.flush()
+        assert not memory.status.faults.total
+    assert ask(url, "SELECT a_b, x FROM half_action") == [("v", "w")]
