@@ -974,8 +974,9 @@ def with_tree(plan: Callable[_P, Coroutine[Any, Any, T]]) -> Callable[_P, Corout
     """
     if not inspect.iscoroutinefunction(plan):
         raise CallerError(f"with_tree needs an `async def`, got {plan!r:.100}")
-    name = plan.__name__
-    description = (inspect.getdoc(plan) or name).partition("\n")[0]
+    named_plan = plan.func if isinstance(plan, partial) else plan
+    name = named_plan.__name__
+    description = (inspect.getdoc(named_plan) or name).partition("\n")[0]
 
     @wraps(plan)
     async def performed(*arguments: _P.args, **named: _P.kwargs) -> T:

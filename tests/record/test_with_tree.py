@@ -2,6 +2,7 @@
 
 import asyncio
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -80,3 +81,12 @@ async def test_a_connected_memory_records_it_in_every_context(tmp_path: Path) ->
 def test_a_function_that_cannot_be_awaited_is_refused_where_it_is_defined() -> None:
     with pytest.raises(CallerError, match="with_tree needs an `async def`, got <function"):
         with_tree(lambda: None)  # type: ignore[arg-type, return-value]
+
+
+async def test_a_plan_with_some_arguments_fixed_is_named_by_the_plan(tmp_path: Path) -> None:
+    async def pour(rounds: int) -> None:
+        await StirActionPerformable(rounds).perform()
+
+    async with Memory.open(f"sqlite:///{tmp_path}/memory.db") as memory:
+        await with_tree(partial(pour, 3))()
+        assert await episodes(memory) == [("pour", "pour", "SUCCEEDED", 1)]
