@@ -57,6 +57,7 @@ def rebuild(
     The new tables are built as a new generation beside the current one and replace it in one transaction, once they
     contain at least as many events. Run it again to continue an interrupted rebuild. It needs the code of the
     projections, but of no plan; a projection whose code is not available is skipped.
+    Exit code 1 if an episode is parked, 4 if the id of one is damaged; all others are shown.
     """
     given_projections = load_projections(projection or ())
     projections = {each.name: each for each in (*given_projections, *installed_projections(given_projections))}
