@@ -34,8 +34,8 @@ from pycrorm_async.errors import CallerError, DatabaseUnavailable, UnknownEpisod
 from pycrorm_async.live.access import kept_token
 from pycrorm_async.live.follower import LogFollower
 from pycrorm_async.operations.destination import shared_address
-from pycrorm_async.projections.row_batch import CannotFold
-from pycrorm_async.query.snapshot import Moment, MomentFold, NodeThen, unreadable
+from pycrorm_async.query.replay import EpisodeReplay
+from pycrorm_async.query.snapshot import Moment, NodeThen, moment_of
 from pycrorm_async.store.log import episode_named
 from pycrorm_async.store.stored import EpisodeRow
 from pycrorm_async.visible_text import visible
@@ -177,25 +177,20 @@ class _Drawing:
         self._follower = follower
         self._live = live
         self._identity = begun.identity
-        self._fold = MomentFold(begun.number, begun.id)
-        self._last = 0
+        self._replay = EpisodeReplay(begun, follower.address)
 
     async def draw(self) -> bool:
         """Read the new events and draw them; return whether the episode has ended."""
-        log = await self._follower.log()
+        log, replay = await self._follower.log(), self._replay
         row = await log.episode(self._identity)
         if row is None:
-            raise UnknownEpisode(f"{self._follower.address} no longer has episode {self._fold.number}")
-        if row.head > self._last:
-            dtypes = await log.dtypes()
-            async for page in log.pages(row, after=self._last):
+            raise UnknownEpisode(f"{self._follower.address} no longer has episode {replay.number}")
+        if row.head > replay.at.sequence:
+            replay.dtypes = await log.dtypes()
+            async for page in log.pages(row, after=replay.at.sequence):
                 for event in page:
-                    try:
-                        self._fold.read(event)
-                    except CannotFold as reason:
-                        raise unreadable(row.id, event, str(reason), log) from None
-                    self._last = event.sequence
-            self._live.update(_picture(self._fold.moment(dtypes, {}, {}), _lines()), refresh=True)
+                    replay.read(event)
+            self._live.update(_picture(moment_of(replay), _lines()), refresh=True)
         return row.ended_wall_ns is not None
 
 

@@ -32,8 +32,8 @@ from pycrorm_async.export.selection import CoveredEpisode
 from pycrorm_async.projections.fold import happening_of
 from pycrorm_async.projections.row_batch import CannotFold
 from pycrorm_async.query.reading import Reading
+from pycrorm_async.query.replay import unreadable
 from pycrorm_async.query.scene import assumed_model, joint_pose, link_poses, object_model, point_model
-from pycrorm_async.query.snapshot import unreadable
 from pycrorm_async.query.text import parameters_text, with_object_names
 from pycrorm_async.store.stored import StoredEvent
 from pycrorm_async.world.pose import Pose
@@ -119,7 +119,7 @@ async def read_episode(
             try:
                 fold.read(event)
             except CannotFold as reason:
-                raise unreadable(row.id, event, str(reason), log) from None
+                raise unreadable(row.id, event, str(reason), log.address) from None
         report_events(page[-1].sequence)
     return fold.episode
 

@@ -16,41 +16,25 @@ from __future__ import annotations
 import html
 import itertools
 import math
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from numbers import Integral, Real
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pycrorm_async.errors import CallerError, DatabaseForeign, LogDamaged, PycrormError, UnknownEpisode
+from pycrorm_async.errors import CallerError, LogDamaged, UnknownEpisode
 from pycrorm_async.events.codec import description_of
-from pycrorm_async.events.fields import retagged
 from pycrorm_async.events.ids import SLOT_NODE, row_id
-from pycrorm_async.events.reasons import reason_of
-from pycrorm_async.events.types import (
-    EVENT_TYPES,
-    DescriptionDeclared,
-    EpisodeEnded,
-    EpisodeStarted,
-    EpisodeTagged,
-    FailureValue,
-    Happening,
-    LocationResolved,
-    NodeEnded,
-    NodeStarted,
-    ObjectDetected,
-    Observed,
-)
-from pycrorm_async.projections.fold import WorldFold, WorldObject, happening_of
-from pycrorm_async.projections.row_batch import CannotFold
+from pycrorm_async.events.types import DescriptionDeclared
 from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary, Percept, PlaceSearch, percepts_in, search_in
+from pycrorm_async.query.replay import LATEST_MAX, EpisodeReplay, ReplayedNode, WorldObject
 from pycrorm_async.query.scene import Frame, assumed_model, link_frames, object_model, placed, triangles_of
-from pycrorm_async.query.text import Drawing, NotebookValue, one_line, with_object_names
+from pycrorm_async.query.text import Drawing, NotebookValue, one_line
 from pycrorm_async.store.log import EventLog, episode_named
 from pycrorm_async.store.stored import StoredEvent
 from pycrorm_async.visible_text import visible
@@ -244,7 +228,7 @@ class Moment(NotebookValue):
 
 # === as of ====================================================================================================
 #
-# Compute the task tree and the world of an episode at any moment by folding its events up to then.
+# Compute the task tree and the world of an episode at any moment by replaying its events up to then.
 #
 # It reads the log and not the tables, which contain only the final state of each node. So it also works for events that
 # are not folded yet, and for parked episodes. It reads no further than one page beyond the moment.
@@ -272,15 +256,19 @@ async def as_of(
     row = await episode_named(log, str(episode.number if isinstance(episode, EpisodeSummary) else episode))
     if row.head == 0:
         raise UnknownEpisode(f"the log has no event of episode {row.number}")
-    fold = MomentFold(row.number, row.id)
+    replay = EpisodeReplay(row, log.address)
     async for page in log.pages(row):
-        if not _read(fold, page, within, log):
+        if not _read(replay, page, within):
             break
-    if fold.first is None:
+    if replay.first is None:
         raise CallerError(f"{limit} is before episode {row.number} began")
-    payloads = await log.descriptions(fold.descriptions)
+    replay.dtypes = await log.dtypes()
+    objects = replay.world.objects.values()
+    payloads = await log.descriptions(
+        {each.added.description for each in objects if each.added.description is not None}
+    )
     descriptions = {name: _description(payload) for name, payload in payloads.items()}
-    return fold.moment(await log.dtypes(), descriptions, await _meshes(log, descriptions.values()) if meshes else {})
+    return moment_of(replay, descriptions, await _meshes(log, descriptions.values()) if meshes else {})
 
 
 async def _meshes(log: EventLog, descriptions: Iterable[DescriptionDeclared]) -> dict[str, bytes]:
@@ -299,15 +287,12 @@ def _description(payload: bytes) -> DescriptionDeclared:
         return DescriptionDeclared(missing=f"it cannot be read: {error}")
 
 
-def _read(fold: MomentFold, page: Sequence[StoredEvent], within: _Within, log: EventLog) -> bool:
-    """Fold the events of a page up to the moment; return whether the next page may have more."""
+def _read(replay: EpisodeReplay, page: Sequence[StoredEvent], within: _Within) -> bool:
+    """Read the events of a page up to the moment; return whether the next page may have more."""
     for event in page:
-        if not within(fold.first if fold.first is not None else event, event):
+        if not within(replay.first if replay.first is not None else event, event):
             return False
-        try:
-            fold.read(event)
-        except CannotFold as reason:
-            raise unreadable(fold.id, event, str(reason), log) from None
+        replay.read(event)
     return True
 
 
@@ -350,17 +335,6 @@ def _number(value: Any, kind: type) -> float | None:
     """Return a Python or NumPy number as a float; None if it is not finite or of another kind."""
     is_number = isinstance(value, kind) and not isinstance(value, bool)
     return float(value) if is_number and abs(value) < _NUMBERS_END else None
-
-
-def unreadable(episode: str, event: StoredEvent, reason: str, log: EventLog) -> PycrormError:
-    """Return the error for an event that cannot be folded: of a newer version, or damaged."""
-    shape = EVENT_TYPES.get(event.type)
-    if shape is not None and event.version <= shape.version:
-        return LogDamaged(episode, event.sequence, reason)
-    return DatabaseForeign(
-        f"{log.address}: episode {episode}, event {event.sequence}: {reason}: use a newer pycrorm, or ask for a moment"
-        f" before event {event.sequence}"
-    )
 
 
 # === world map ================================================================================================
@@ -566,244 +540,125 @@ def _hull(points: Sequence[Point]) -> tuple[Point, ...]:
     return (*chain(ordered), *chain(ordered[::-1]))
 
 
-# === snapshot fold ============================================================================================
+# === moment ===================================================================================================
 #
-# Fold an episode's events into the state of its task tree and world at a moment.
-#
-# The fold is pure, and its memory grows with the state it describes. It ignores StateSampled: every pose and joint in a
-# sample had an exact event of its own, while the sample may be older than the event before it.
-
-_LATEST_MAX = 100
-"""Bounds the percepts and the searches for places of a snapshot, each: an episode may have many thousands."""
+# Make the values of a moment from the replay of an episode.
 
 
-@dataclass(slots=True)
-class _Node:
-    """The state of a node, without the robot's state and the result, to save memory."""
+def moment_of(
+    replay: EpisodeReplay,
+    descriptions: Mapping[str, DescriptionDeclared] = MappingProxyType({}),
+    meshes: Mapping[str, bytes] = MappingProxyType({}),
+) -> Moment:
+    """Return the state of a replay that has read an event. Raises `LogDamaged`.
 
-    kind: str
-    parent: int | None
-    designator: str | None
-    parameters: dict[str, Any]
-    simulated: bool
-    wall_ns: int
-    monotonic_ns: int
-    status: str = "RUNNING"
-    ended_ns: int | None = None
-    end_sequence: int | None = None
-    failure: FailureValue | None = None
-    considered: int = 0
-    offered: int = 0
-    detected: int = 0
-
-
-class MomentFold:
-    """The state of an episode after the events read so far.
-
-    Attributes:
-        first: the first event; None before it is read.
+    Args:
+        descriptions: those of the objects, by fingerprint.
+        meshes: contents of their mesh files, by SHA-256.
     """
+    started, first, last = replay.started, replay.first, replay.last
+    assert first is not None, "an event was read"
+    assert last is not None, "an event was read"
+    number = replay.number
+    percepts = [each for answer in replay.detections for each in percepts_in(number, *answer)]
+    return Moment(
+        number=number,
+        id=replay.id,
+        description=started.description,
+        created_by=started.created_by,
+        started_at=_moment(first.wall_ns),
+        simulated=started.simulated,
+        sequence=last.sequence,
+        time_s=replay.at.since_ns / 1e9,
+        at=_moment(last.wall_ns),
+        status=replay.status,
+        tree=tuple(_tree(replay, first.monotonic_ns)),
+        world=_world(replay, descriptions, meshes),
+        observations={
+            name: ObservationThen(
+                values=observed.values,
+                sequence=event.sequence,
+                time_s=(event.monotonic_ns - first.monotonic_ns) / 1e9,
+                node=row_id(number, observed.node, SLOT_NODE) if observed.node is not None else None,
+                missing=observed.missing,
+            )
+            for name, (event, observed) in replay.observed.items()
+        },
+        tags=replay.tags,
+        percepts=tuple(percepts[-LATEST_MAX:]),
+        places=tuple(search_in(number, *answer) for answer in replay.searches),
+    )
 
-    def __init__(self, number: int, identity: str) -> None:
-        self.number = number
-        self.id = identity
-        self.first: StoredEvent | None = None
-        self._started: EpisodeStarted | None = None
-        self._last: StoredEvent | None = None
-        self._status = "RUNNING"
-        self._nodes: dict[int, _Node] = {}
-        self._fold = WorldFold()
-        self._tags: tuple[str, ...] = ()
-        self._observed: dict[str, tuple[StoredEvent, Observed]] = {}
-        self._percepts: deque[Percept] = deque(maxlen=_LATEST_MAX)
-        self._places: deque[PlaceSearch] = deque(maxlen=_LATEST_MAX)
 
-    def read(self, event: StoredEvent) -> None:
-        """Apply the next event. Raises `CannotFold`."""
-        if self.first is None and event.type != "EpisodeStarted":
-            raise CannotFold(f"the episode begins with {event.type} instead of EpisodeStarted")
-        if event.type != "StateSampled":
-            self._happened(event, happening_of(event))
-        self.first = event if self.first is None else self.first
-        self._last = event
+def _tree(replay: EpisodeReplay, begin_ns: int) -> Iterator[NodeThen]:
+    children: dict[int | None, list[int]] = {}
+    for sequence, node in replay.nodes.items():
+        children.setdefault(node.parent, []).append(sequence)
+    stack = [(sequence, 0) for sequence in reversed(children.get(None, []))]
+    while stack:
+        sequence, depth = stack.pop()
+        yield _node(replay, replay.nodes[sequence], depth, begin_ns)
+        stack.extend((child, depth + 1) for child in reversed(children.get(sequence, [])))
 
-    def _happened(self, event: StoredEvent, happening: Happening) -> None:
-        match happening:
-            case NodeStarted():
-                if happening.parent is not None and happening.parent not in self._nodes:
-                    raise CannotFold(f"its parent {happening.parent} never started")
-                self._nodes[event.sequence] = _Node(
-                    happening.kind,
-                    happening.parent,
-                    happening.designator,
-                    happening.parameters,
-                    happening.simulated,
-                    event.wall_ns,
-                    event.monotonic_ns,
-                )
-            case NodeEnded():
-                if (node := self._nodes.get(happening.node)) is None:
-                    raise CannotFold(f"node {happening.node} ends and never started")
-                node.status, node.failure = happening.status, happening.failure
-                if happening.status != "LOST":
-                    node.ended_ns, node.end_sequence = event.monotonic_ns, event.sequence
-            case EpisodeStarted():
-                if self._started is not None:
-                    raise CannotFold("the episode starts a second time")
-                self._started = happening
-                self._tags = retagged((), happening.tags, ())
-            case EpisodeTagged():
-                self._tags = retagged(self._tags, happening.added, happening.removed)
-            case EpisodeEnded():
-                self._ended(happening.status)
-            case Observed():
-                self._observed[happening.name] = event, happening
-            case ObjectDetected() | LocationResolved():
-                self._answered(event, happening)
-            case _:
-                self._fold.read(event.sequence, happening)
 
-    def _answered(self, event: StoredEvent, answer: ObjectDetected | LocationResolved) -> None:
-        """Keep the answer of perception or of a location designator, and count it at the node that asked."""
-        node = self._nodes.get(answer.node or 0)
-        if isinstance(answer, ObjectDetected):
-            percepts = percepts_in(self.number, event, answer)
-            self._percepts.extend(percepts)
-            if node is not None:
-                node.detected += len(percepts)
-            return
-        search = search_in(self.number, event, answer)
-        self._places.append(search)
-        if node is not None:
-            node.considered += search.considered
-            node.offered += search.offered
+def _node(replay: EpisodeReplay, node: ReplayedNode, depth: int, begin_ns: int) -> NodeThen:
+    start, end = node.start, node.end
+    if node.designator is not None and node.designator not in replay.dtypes:
+        raise LogDamaged(replay.id, start.sequence, f"the designator type {node.designator} was never declared")
+    return NodeThen(
+        id=row_id(replay.number, start.sequence, SLOT_NODE),
+        parent_id=row_id(replay.number, node.parent, SLOT_NODE) if node.parent is not None else None,
+        depth=depth,
+        dtype=replay.dtype(node) if node.designator is not None else None,
+        kind=node.kind,
+        parameters=replay.parameters(node),
+        status=node.status,
+        started_at=_moment(node.wall_ns),
+        duration_ns=end.since_ns - start.since_ns if end is not None else None,
+        reason=node.reason,
+        failure_message=node.message,
+        simulated=node.simulated,
+        sequence=start.sequence,
+        end_sequence=end.sequence if end is not None else None,
+        start_ns=begin_ns + start.since_ns,
+        start_s=start.since_ns / 1e9,
+        end_s=end.since_ns / 1e9 if end is not None else None,
+        considered=node.considered,
+        offered=node.offered,
+        detected=node.detected,
+    )
 
-    def _ended(self, status: str) -> None:
-        self._status = status
-        if status == "LOST":  # the process died, so the outcome of its running nodes is unknown
-            for node in self._nodes.values():
-                if node.status == "RUNNING":
-                    node.status = "LOST"
 
-    # --- the result -------------------------------------------------------------------------------------------
+def _world(
+    replay: EpisodeReplay, descriptions: Mapping[str, DescriptionDeclared], meshes: Mapping[str, bytes]
+) -> WorldThen:
+    objects = tuple(_object(replay, identity, each) for identity, each in replay.world.objects.items())
+    robots = tuple(_robot(each) for each in objects if each.object_type == "ROBOT")
+    return WorldThen(objects, robots[0] if robots else None, descriptions, meshes, robots)
 
-    @property
-    def descriptions(self) -> set[str]:
-        """The fingerprints of the objects' descriptions."""
-        return {each.description for each in self._fold.objects.values() if each.description is not None}
 
-    def moment(
-        self,
-        dtypes: Mapping[str, str],
-        descriptions: Mapping[str, DescriptionDeclared],
-        meshes: Mapping[str, bytes],
-    ) -> Moment:
-        """Return the state as values. Raises `LogDamaged`.
-
-        Args:
-            dtypes: the dtype of each declaration, by fingerprint.
-            descriptions: those of the objects, by fingerprint.
-            meshes: contents of their mesh files, by SHA-256.
-        """
-        started, first, last = self._started, self.first, self._last
-        assert started is not None
-        assert first is not None
-        assert last is not None
-        return Moment(
-            number=self.number,
-            id=self.id,
-            description=started.description,
-            created_by=started.created_by,
-            started_at=_moment(first.wall_ns),
-            simulated=started.simulated,
-            sequence=last.sequence,
-            time_s=(last.monotonic_ns - first.monotonic_ns) / 1e9,
-            at=_moment(last.wall_ns),
-            status=self._status,
-            tree=tuple(self._tree(dtypes, first.monotonic_ns)),
-            world=self._world(descriptions, meshes),
-            observations={name: self._observation(*each) for name, each in self._observed.items()},
-            tags=self._tags,
-            percepts=tuple(self._percepts),
-            places=tuple(self._places),
-        )
-
-    def _observation(self, event: StoredEvent, observed: Observed) -> ObservationThen:
-        assert self.first is not None
-        return ObservationThen(
-            values=observed.values,
-            sequence=event.sequence,
-            time_s=(event.monotonic_ns - self.first.monotonic_ns) / 1e9,
-            node=row_id(self.number, observed.node, SLOT_NODE) if observed.node is not None else None,
-            missing=observed.missing,
-        )
-
-    def _tree(self, dtypes: Mapping[str, str], start_ns: int) -> Iterator[NodeThen]:
-        children: dict[int | None, list[int]] = {}
-        for sequence, node in self._nodes.items():
-            children.setdefault(node.parent, []).append(sequence)
-        stack = [(sequence, 0) for sequence in reversed(children.get(None, []))]
-        while stack:
-            sequence, depth = stack.pop()
-            yield self._node(sequence, depth, dtypes, start_ns)
-            stack.extend((child, depth + 1) for child in reversed(children.get(sequence, [])))
-
-    def _node(self, sequence: int, depth: int, dtypes: Mapping[str, str], start_ns: int) -> NodeThen:
-        node = self._nodes[sequence]
-        if node.designator is not None and node.designator not in dtypes:
-            raise LogDamaged(self.id, sequence, f"the designator type {node.designator} was never declared")
-        return NodeThen(
-            id=row_id(self.number, sequence, SLOT_NODE),
-            parent_id=row_id(self.number, node.parent, SLOT_NODE) if node.parent is not None else None,
-            depth=depth,
-            dtype=dtypes[node.designator] if node.designator is not None else None,
-            kind=node.kind,
-            parameters=with_object_names(node.parameters, lambda each: self._fold.names.get(each["object"])),
-            status=node.status,
-            started_at=_moment(node.wall_ns),
-            duration_ns=node.ended_ns - node.monotonic_ns if node.ended_ns is not None else None,
-            reason=reason_of(node.failure) if node.failure is not None else None,
-            failure_message=node.failure.message if node.failure is not None else None,
-            simulated=node.simulated,
-            sequence=sequence,
-            end_sequence=node.end_sequence,
-            start_ns=node.monotonic_ns,
-            start_s=(node.monotonic_ns - start_ns) / 1e9,
-            end_s=(node.ended_ns - start_ns) / 1e9 if node.ended_ns is not None else None,
-            considered=node.considered,
-            offered=node.offered,
-            detected=node.detected,
-        )
-
-    def _world(self, descriptions: Mapping[str, DescriptionDeclared], meshes: Mapping[str, bytes]) -> WorldThen:
-        objects = tuple(self._object(identity, each) for identity, each in self._fold.objects.items())
-        robots = tuple(_robot(each) for each in objects if each.object_type == "ROBOT")
-        return WorldThen(objects, robots[0] if robots else None, descriptions, meshes, robots)
-
-    def _object(self, identity: int, value: WorldObject) -> ObjectThen:
-        at = value.pose
-        try:
-            pose = Pose(at.position, at.orientation, at.frame, at.time_ns)
-        except MalformedPose as error:
-            raise LogDamaged(self.id, value.row, str(error)) from None
-        parent = value.attached_to
-        return ObjectThen(
-            id=row_id(self.number, value.row, SLOT_NODE),
-            identity_id=row_id(self.number, identity, SLOT_NODE),
-            name=value.name,
-            object_type=value.object_type,
-            pose=pose,
-            joints=value.joints,
-            attached_to=(self._fold.names[parent[0]], parent[1])
-            if parent is not None and parent[0] in self._fold.objects
-            else None,
-            description_fingerprint=value.description,
-            color=value.color,
-            model=value.model,
-            serial=value.serial,
-            mass_kg=value.mass_kg,
-            base_link=value.base_link,
-        )
+def _object(replay: EpisodeReplay, identity: int, value: WorldObject) -> ObjectThen:
+    added, at, parent = value.added, value.pose, value.attached_to
+    try:
+        pose = Pose(at.position, at.orientation, at.frame, at.time_ns)
+    except MalformedPose as error:
+        raise LogDamaged(replay.id, value.row, str(error)) from None
+    holder = replay.world.objects.get(parent[0]) if parent is not None else None
+    return ObjectThen(
+        id=row_id(replay.number, value.row, SLOT_NODE),
+        identity_id=row_id(replay.number, identity, SLOT_NODE),
+        name=added.name,
+        object_type=added.object_type,
+        pose=pose,
+        joints=value.joints,
+        attached_to=(holder.added.name, parent[1]) if holder is not None and parent is not None else None,
+        description_fingerprint=added.description,
+        color=added.color,
+        model=added.model,
+        serial=added.serial,
+        mass_kg=added.mass_kg,
+        base_link=added.base_link,
+    )
 
 
 def _robot(robot: ObjectThen) -> RobotThen:

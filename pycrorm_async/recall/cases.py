@@ -62,11 +62,12 @@ from pycrorm_async.events.types import (
 from pycrorm_async.projections.columns import OWN, physical_name
 from pycrorm_async.projections.custom import EpisodeFolds, PackedProjection, ProjectedBatch, Projection, Refused
 from pycrorm_async.projections.findings import Comparison, Difference, EpisodeRange, PartCheck, VerifyResult
-from pycrorm_async.projections.fold import WorldFold, WorldObject, happening_of
+from pycrorm_async.projections.fold import happening_of
 from pycrorm_async.projections.generations import select_generation
 from pycrorm_async.projections.pipeline import Batch
 from pycrorm_async.projections.row_batch import is_missing, row_of
 from pycrorm_async.projections.verify import ProjectionCheck
+from pycrorm_async.query.replay import ReplayedWorld, WorldObject
 from pycrorm_async.recall.blocks import Block, BlockRow, decode, encode, merge
 from pycrorm_async.recall.columns import RESERVED, Case
 from pycrorm_async.store.dialect import Insertion, RowsByTable
@@ -250,7 +251,7 @@ class FeatureFields(NamedTuple):
 
 
 def situation(
-    fields: FeatureFields, parameters: Mapping[str, Any], robot: RobotValue | None, world: WorldFold
+    fields: FeatureFields, parameters: Mapping[str, Any], robot: RobotValue | None, world: ReplayedWorld
 ) -> tuple[Symbols, Numbers]:
     """Return the features of an action that starts with these parameters, for this robot and in this world."""
     symbols: Symbols = {}
@@ -302,7 +303,7 @@ class _Seen(NamedTuple):
     pose: PoseValue | None
 
 
-def _seen(value: Mapping[str, Any], world: WorldFold) -> _Seen:
+def _seen(value: Mapping[str, Any], world: ReplayedWorld) -> _Seen:
     """Return the state of a parameter's object, which may have been removed, or be outside of the recorded world."""
     identity = value.get("object")
     if identity is None:
@@ -310,8 +311,8 @@ def _seen(value: Mapping[str, Any], world: WorldFold) -> _Seen:
         return _Seen(value.get("name"), value.get("object_type"), pose and msgspec.convert(pose, PoseValue))
     present = world.objects.get(identity)
     if present is None:
-        return _Seen(world.names.get(identity), None, None)
-    return _Seen(present.name, present.object_type, present.pose)
+        return _Seen(world.name_of(identity), None, None)
+    return _Seen(present.added.name, present.added.object_type, present.pose)
 
 
 def _add_object(symbols: Symbols, numbers: Numbers, seen: _Seen, robot: RobotValue | None) -> None:
@@ -344,9 +345,9 @@ def _add_surroundings(
     near, held = set(), set()
     for each in objects.values():
         if each.attached_to is not None and each.attached_to[0] == holder:
-            held.add(each.object_type)
+            held.add(each.added.object_type)
         if target is not None and each is not target and _is_near(each, target):
-            near.add(each.object_type)
+            near.add(each.added.object_type)
     if near:
         symbols["near"] = tuple(sorted(near))
     if held:
@@ -354,7 +355,7 @@ def _add_surroundings(
 
 
 def _is_near(each: WorldObject, target: WorldObject) -> bool:
-    if each.object_type in _NEVER_NEAR:
+    if each.added.object_type in _NEVER_NEAR:
         return False
     x, y, z = each.pose.position
     to_x, to_y, to_z = target.pose.position
@@ -439,7 +440,7 @@ class EpisodeCases:
 
     def __init__(self, types: dict[str, FeatureFields] | None = None) -> None:
         self._types = {} if types is None else types
-        self._world = WorldFold()
+        self._world = ReplayedWorld()
         self._running: dict[int, _Action] = {}
         """The actions that run."""
         self._scopes: dict[int, _Action] = {}

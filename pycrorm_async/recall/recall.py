@@ -34,15 +34,15 @@ from pycrorm_async.errors import (
 )
 from pycrorm_async.events.codec import encode
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, EpisodeId, episode_text, parse_episode_id, row_id, row_key
-from pycrorm_async.events.types import DesignatorTypeDeclared, EpisodeEnded, ObjectReference, RobotValue
+from pycrorm_async.events.types import DesignatorTypeDeclared, EpisodeEnded, ObjectAdded, ObjectReference, RobotValue
 from pycrorm_async.orm import EpisodeRobot, EpisodeTag, TaskTreeNode
 from pycrorm_async.plan.language import Designator
 from pycrorm_async.plan.objects import ObjectDesignator
-from pycrorm_async.projections.fold import WorldFold, WorldObject
 from pycrorm_async.projections.generations import PROJECTION, read_generation
 from pycrorm_async.query.frames import member_of
 from pycrorm_async.query.named_queries import EpisodeSummary
 from pycrorm_async.query.reading import Reading
+from pycrorm_async.query.replay import ReplayedWorld, WorldObject
 from pycrorm_async.query.snapshot import AnyEpisode, Moment
 from pycrorm_async.recall.answer import Answer, Following, RecalledCase, Relation, Sequences, answer
 from pycrorm_async.recall.blocks import Block, CaseLibrary, merge
@@ -803,15 +803,16 @@ def _robot(world: BulletWorld, sequences: Mapping[Object, int]) -> RobotValue | 
     return RobotValue(pose_value(robot.pose), robot.object_type.name, height, reference, robot.name)
 
 
-def _world(world: BulletWorld, sequences: Mapping[Object, int]) -> WorldFold:
-    fold = WorldFold()
+def _world(world: BulletWorld, sequences: Mapping[Object, int]) -> ReplayedWorld:
+    replayed = ReplayedWorld()
     for each, sequence in sequences.items():
         attachment = world.attachments.of(each)
-        present = WorldObject(each.name, each.object_type.name, pose_value(each.pose), sequence)
+        added = ObjectAdded(each.name, each.object_type.name, pose_value(each.pose))
+        present = WorldObject(added, added.pose, sequence)
         if attachment is not None:
             present.attached_to = sequences[attachment.parent], attachment.link
-        fold.objects[sequence], fold.names[sequence] = present, each.name
-    return fold
+        replayed.objects[sequence], replayed.added[sequence] = present, added
+    return replayed
 
 
 # === running cases ============================================================================================

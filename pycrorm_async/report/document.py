@@ -48,8 +48,8 @@ from pycrorm_async.events.types import (
 from pycrorm_async.projections.fold import happening_of
 from pycrorm_async.projections.row_batch import CannotFold
 from pycrorm_async.query.reading import Reading
+from pycrorm_async.query.replay import unreadable
 from pycrorm_async.query.scene import Triangles, assumed_model, object_model, point_model, triangles_of
-from pycrorm_async.query.snapshot import unreadable
 from pycrorm_async.query.text import parameters_text, with_object_names
 from pycrorm_async.store.log import EventLog, episode_named
 from pycrorm_async.store.stored import EpisodeRow, StoredEvent
@@ -587,7 +587,7 @@ async def read_into(fold: EpisodeFold, log: EventLog, pages: AsyncIterable[Seque
             try:
                 fold.read(event, designators)
             except CannotFold as reason:
-                raise unreadable(fold.row.id, event, str(reason), log) from None
+                raise unreadable(fold.row.id, event, str(reason), log.address) from None
 
 
 async def document_behind(fold: EpisodeFold, log: EventLog, after: int = 0) -> dict[str, Any]:

@@ -38,9 +38,11 @@ from pycrorm_async.events.types import (
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.query.named_queries import NodeSummary, Percept, PlaceSearch, percepts_of, searches_of
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.query.snapshot import AttachmentThen, Moment, MomentFold, NodeThen, RobotThen
+from pycrorm_async.query.replay import EpisodeReplay
+from pycrorm_async.query.snapshot import AttachmentThen, Moment, NodeThen, RobotThen, moment_of
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.stored import EpisodeRow
 from pycrorm_async.world.pose import Pose
 from tests.commands import answer, pycrorm
 from tests.databases import run_in_own_loop
@@ -539,12 +541,14 @@ async def test_a_node_has_the_number_of_its_percepts_and_of_the_places_for_it(re
 
 
 def test_a_snapshot_keeps_the_latest_and_counts_all() -> None:
-    events, fold = search_script().stored(), MomentFold(1, "x")
+    events = search_script().stored()
+    replay = EpisodeReplay(EpisodeRow(1, "x", 204, 0, 0), DatabaseAddress.parse("sqlite:///x.db"))
+    replay.dtypes = {name_of(NAVIGATE): "NavigateAction"}
     for event in events[:4]:
-        fold.read(event)
+        replay.read(event)
     for sequence in range(5, 205):
-        fold.read(events[5]._replace(sequence=sequence))
-    then = fold.moment({name_of(NAVIGATE): "NavigateAction"}, {}, {})
+        replay.read(events[5]._replace(sequence=sequence))
+    then = moment_of(replay)
     assert [each.sequence for each in then.percepts] == [each for each in range(155, 205) for _ in range(2)]
     assert then.tree[1].detected == 400
 

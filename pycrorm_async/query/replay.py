@@ -1,0 +1,289 @@
+"""Replay the events of an episode into its state: task tree, world, percepts, observations, tags and times.
+
+As-of, the terminal view, the report, the live page and the exports all read an `EpisodeReplay`, event by event, and ask
+it. What only one of them needs, such as the tracks of the page, it keeps on top. `projections.fold` is another fold: it
+makes rows, and its state is a batch of them.
+
+A replay is pure, and its memory grows with the state that it has.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+from pycrorm_async.errors import DatabaseForeign, LogDamaged, PycrormError
+from pycrorm_async.events.fields import retagged
+from pycrorm_async.events.reasons import reason_of
+from pycrorm_async.events.types import (
+    EVENT_TYPES,
+    EpisodeEnded,
+    EpisodeStarted,
+    EpisodeTagged,
+    FailureValue,
+    Happening,
+    JointsMoved,
+    LocationResolved,
+    NodeEnded,
+    NodeStarted,
+    ObjectAdded,
+    ObjectAttached,
+    ObjectDetached,
+    ObjectDetected,
+    ObjectMoved,
+    ObjectRemoved,
+    Observed,
+    PoseValue,
+)
+from pycrorm_async.projections.fold import happening_of
+from pycrorm_async.projections.row_batch import CannotFold
+from pycrorm_async.query.text import with_object_names
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.stored import EpisodeRow, StoredEvent
+
+LATEST_MAX = 100
+"""Bounds the percepts and the searches for places of a replay, each: an episode may have many thousands."""
+
+
+class EventTime(NamedTuple):
+    """An event: its sequence, and the ns since the episode's first event."""
+
+    sequence: int
+    since_ns: int
+
+
+@dataclass(slots=True)
+class ReplayedNode:
+    """A node, without the robot's state and the result, to save memory. `end` is None while it runs, and if LOST."""
+
+    kind: str
+    parent: int | None
+    designator: str | None
+    parameters: dict[str, Any]
+    simulated: bool
+    wall_ns: int
+    start: EventTime
+    end: EventTime | None = None
+    status: str = "RUNNING"
+    failure: FailureValue | None = None
+    considered: int = 0
+    offered: int = 0
+    detected: int = 0
+
+    @property
+    def reason(self) -> str | None:
+        """The reason of its failure."""
+        return reason_of(self.failure) if self.failure is not None else None
+
+    @property
+    def message(self) -> str | None:
+        """The message of its failure."""
+        return self.failure.message if self.failure is not None else None
+
+
+@dataclass(slots=True)
+class WorldObject:
+    """An object in the world. `row` is the sequence of the event that set its pose."""
+
+    added: ObjectAdded
+    pose: PoseValue
+    row: int
+    joints: dict[str, float] = field(default_factory=dict)
+    attached_to: tuple[int, str | None] | None = None
+
+
+class ReplayedWorld:
+    """The objects in the world of an episode after the events read so far.
+
+    Args:
+        strict: whether an event of an object that was never added raises `CannotFold`, or has no effect.
+
+    Attributes:
+        objects: those that are present, by identity.
+        added: how each object was added, removed ones included, by identity.
+    """
+
+    def __init__(self, *, strict: bool = True) -> None:
+        self.objects: dict[int, WorldObject] = {}
+        self.added: dict[int, ObjectAdded] = {}
+        self._strict = strict
+
+    def read(self, sequence: int, happening: Happening) -> None:
+        """Apply an event of the world. Events of a removed object have no effect."""
+        match happening:
+            case ObjectAdded():
+                self.added[sequence] = happening
+                self.objects[sequence] = WorldObject(happening, happening.pose, sequence, dict(happening.joints))
+            case ObjectMoved():
+                if (moved := self._present(happening.object)) is not None:
+                    moved.pose, moved.row = happening.pose, sequence
+            case JointsMoved():
+                if (moved := self._present(happening.object.object)) is not None:
+                    moved.joints.update(happening.joints)
+            case ObjectAttached() | ObjectDetached():
+                self._present(happening.parent.object)
+                if (child := self._present(happening.child.object)) is not None:
+                    attached = isinstance(happening, ObjectAttached)
+                    child.attached_to = (happening.parent.object, happening.link) if attached else None
+            case ObjectRemoved():
+                self._present(happening.object.object)
+                self.objects.pop(happening.object.object, None)
+
+    def _present(self, identity: int) -> WorldObject | None:
+        """Return the object, None if it was removed. Raises `CannotFold` for one that was never added."""
+        if self._strict and identity not in self.added:
+            raise CannotFold(f"object {identity} was never added")
+        return self.objects.get(identity)
+
+    def name_of(self, identity: int) -> str | None:
+        """Return the name of an object, also of a removed one; None if it was never added."""
+        added = self.added.get(identity)
+        return added.name if added is not None else None
+
+
+class EpisodeReplay:
+    """The state of an episode after the events read so far.
+
+    Args:
+        address: of the log, for errors.
+        strict: whether an event that names an unknown object or parent is refused, or applied as far as it can be.
+        samples: whether `StateSampled` is decoded and returned. It changes no state, because every pose and joint in it
+            had an exact event of its own, while the sample may be older than the event before it.
+
+    Attributes:
+        number, id: of the episode.
+        dtypes: the dtype of each designator type, by fingerprint; the reader of the log keeps it up to date.
+        first, last: the first and the last event that was read; None before.
+        at: the last event that was read.
+        started: the first event; empty before it is read.
+        ended: the end of the episode; None before it is read.
+        tags: of the episode.
+        nodes: those that have started, by sequence, in that order.
+        world: the objects.
+        observed: the latest observation of each name.
+        detections, searches: the latest answers of perception with a percept, and of location designators.
+    """
+
+    def __init__(
+        self, row: EpisodeRow, address: DatabaseAddress, *, strict: bool = True, samples: bool = False
+    ) -> None:
+        self.number, self.id = row.number, row.id
+        self.dtypes: Mapping[str, str] = {}
+        self.first: StoredEvent | None = None
+        self.last: StoredEvent | None = None
+        self.at = EventTime(0, 0)
+        self.started = EpisodeStarted("", "", "", "", "")
+        self.ended: EpisodeEnded | None = None
+        self.tags: tuple[str, ...] = ()
+        self.nodes: dict[int, ReplayedNode] = {}
+        self.world = ReplayedWorld(strict=strict)
+        self.observed: dict[str, tuple[StoredEvent, Observed]] = {}
+        self.detections: deque[tuple[StoredEvent, ObjectDetected]] = deque(maxlen=LATEST_MAX)
+        self.searches: deque[tuple[StoredEvent, LocationResolved]] = deque(maxlen=LATEST_MAX)
+        self._address = address
+        self._strict = strict
+        self._samples = samples
+
+    @property
+    def status(self) -> str:
+        """The status of the episode."""
+        return self.ended.status if self.ended is not None else "RUNNING"
+
+    def dtype(self, node: ReplayedNode) -> str:
+        """Return the dtype of a node; empty for the root, and if its type is not known."""
+        return self.dtypes.get(node.designator or "", "")
+
+    def parameters(self, node: ReplayedNode) -> dict[str, Any]:
+        """Return the parameters of a node, with the names of the objects that they refer to."""
+        return with_object_names(node.parameters, lambda each: self.world.name_of(each["object"]))
+
+    def read(self, event: StoredEvent) -> Happening | None:
+        """Apply the next event and return it; None for a sample that is not decoded.
+
+        Raises `LogDamaged`, or `DatabaseForeign` for an event of a newer version.
+        """
+        begin = event if self.first is None else self.first
+        at = EventTime(event.sequence, event.monotonic_ns - begin.monotonic_ns)
+        try:
+            happening = self._decoded(event)
+            if happening is not None:
+                self._apply(event, at, happening)
+        except CannotFold as reason:
+            raise unreadable(self.id, event, str(reason), self._address) from None
+        self.first, self.last, self.at = begin, event, at
+        return happening
+
+    def _decoded(self, event: StoredEvent) -> Happening | None:
+        if self.first is None and event.type != "EpisodeStarted":
+            raise CannotFold(f"the episode begins with {event.type} instead of EpisodeStarted")
+        return happening_of(event) if self._samples or event.type != "StateSampled" else None
+
+    def _apply(self, event: StoredEvent, at: EventTime, happening: Happening) -> None:
+        match happening:
+            case NodeStarted():
+                self._start(event, at, happening)
+            case NodeEnded():
+                self._end(at, happening)
+            case EpisodeStarted():
+                if self.first is not None:
+                    raise CannotFold("the episode starts a second time")
+                self.started = happening
+                self.tags = retagged((), happening.tags, ())
+            case EpisodeTagged():
+                self.tags = retagged(self.tags, happening.added, happening.removed)
+            case EpisodeEnded():
+                self._end_episode(happening)
+            case Observed():
+                self.observed[happening.name] = event, happening
+            case ObjectDetected() | LocationResolved():
+                self._answer(event, happening)
+            case _:
+                self.world.read(event.sequence, happening)
+
+    def _start(self, event: StoredEvent, at: EventTime, started: NodeStarted) -> None:
+        parent = started.parent
+        if self._strict and parent is not None and parent not in self.nodes:
+            raise CannotFold(f"its parent {parent} never started")
+        self.nodes[event.sequence] = ReplayedNode(
+            started.kind, parent, started.designator, started.parameters, started.simulated, event.wall_ns, at
+        )
+
+    def _end(self, at: EventTime, ended: NodeEnded) -> None:
+        if (node := self.nodes.get(ended.node)) is None:
+            raise CannotFold(f"node {ended.node} ends and never started")
+        node.status, node.failure = ended.status, ended.failure
+        if ended.status != "LOST":
+            node.end = at
+
+    def _answer(self, event: StoredEvent, answer: ObjectDetected | LocationResolved) -> None:
+        """Keep the answer of perception or of a location designator, and count it at the node that asked."""
+        node = self.nodes.get(answer.node or 0)
+        if isinstance(answer, LocationResolved):
+            self.searches.append((event, answer))
+            if node is not None:
+                node.considered += answer.considered
+                node.offered += len(answer.offered) + answer.offered_beyond
+        elif answer.seen:
+            self.detections.append((event, answer))
+            if node is not None:
+                node.detected += len(answer.seen)
+
+    def _end_episode(self, ended: EpisodeEnded) -> None:
+        self.ended = ended
+        if ended.status == "LOST":  # the process died, so the outcome of its running nodes is unknown
+            for node in self.nodes.values():
+                if node.status == "RUNNING":
+                    node.status = "LOST"
+
+
+def unreadable(episode: str, event: StoredEvent, reason: str, address: DatabaseAddress) -> PycrormError:
+    """Return the error for an event that cannot be applied: of a newer version, or damaged."""
+    shape = EVENT_TYPES.get(event.type)
+    if shape is not None and event.version <= shape.version:
+        return LogDamaged(episode, event.sequence, reason)
+    return DatabaseForeign(
+        f"{address}: episode {episode}, event {event.sequence}: {reason}: use a newer pycrorm, or ask for a moment"
+        f" before event {event.sequence}"
+    )
