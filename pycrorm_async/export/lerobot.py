@@ -18,12 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pycrorm_async.errors import CallerError
-from pycrorm_async.export.scenes import Frames, RecordedEpisode
+from pycrorm_async.export.scenes import ExportedEpisode, Frames
 from pycrorm_async.query.again import world_of
 from pycrorm_async.query.frames import needed_pyarrow
 from pycrorm_async.query.picture import png
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.snapshot import Moment
+from pycrorm_async.query.text import parameters_text
 from pycrorm_async.world.pose import Vector
 from pycrorm_async.world.queries import Camera, photograph
 
@@ -81,14 +82,14 @@ class LeRobotFolder:
         """The number of frames added so far."""
         return self._frames
 
-    def add(self, episode: RecordedEpisode, frames: Frames, pictures: NDArray[np.uint8] | None = None) -> None:
+    def add(self, episode: ExportedEpisode, frames: Frames, pictures: NDArray[np.uint8] | None = None) -> None:
         """Write the frames of an episode, with their pictures; either all episodes have pictures or none has.
 
         Raises `CallerError` if its robot has other joints than that of the first.
         """
         self._check_channels(episode, frames)
         number, count = len(self._episodes), len(frames.at)
-        task = episode.description or f"episode {episode.number}"
+        task = episode.started.description or f"episode {episode.number}"
         columns = self._columns(frames, number, task)
         statistics = {name: statistics_of(values) for name, values in columns.items()}
         if pictures is not None:
@@ -136,7 +137,7 @@ class LeRobotFolder:
         _write_rows(meta / "episodes" / "chunk-000" / "file-000.parquet", self._episodes)
         _write_rows(meta / "plan.parquet", self._plan)
 
-    def _check_channels(self, episode: RecordedEpisode, frames: Frames) -> None:
+    def _check_channels(self, episode: ExportedEpisode, frames: Frames) -> None:
         if self._first is None:
             self._first = episode.number, frames
         first, (robot, channels, *_) = self._first
@@ -195,23 +196,23 @@ class LeRobotFolder:
         self._file_bytes += table.nbytes
         return chunk, file
 
-    def _add_plan(self, episode: RecordedEpisode, frames: Frames, number: int) -> None:
+    def _add_plan(self, episode: ExportedEpisode, frames: Frames, number: int) -> None:
         """Note every node with the frames from its start to its end; `to_index` is behind the last one."""
         sequences = np.array([each.sequence for each in frames.at])
-        for node in episode.nodes:
-            begin = int(np.searchsorted(sequences, node.sequence, side="left"))
+        for node in episode.nodes.values():
+            begin = int(np.searchsorted(sequences, node.start.sequence, side="left"))
             end = len(sequences)
             if node.end is not None:
                 end = int(np.searchsorted(sequences, node.end.sequence, side="left"))
             self._plan.append(
                 {
                     "episode_index": number,
-                    "node": node.sequence,
+                    "node": node.start.sequence,
                     "parent": node.parent,
                     "kind": node.kind,
-                    "dtype": node.dtype,
-                    "label": node.label,
-                    "parameters": node.parameters,
+                    "dtype": episode.type_of(node),
+                    "label": episode.label(node),
+                    "parameters": parameters_text(episode.parameters(node)),
                     "status": node.status,
                     "reason": node.reason,
                     "message": node.message,
@@ -302,7 +303,7 @@ def check_size(size: ImageSize) -> None:
 
 async def draw_frames(
     reading: Reading,
-    episode: RecordedEpisode,
+    episode: ExportedEpisode,
     frames: Frames,
     size: ImageSize,
     report_events: Callable[[int], object],

@@ -5,10 +5,10 @@ from __future__ import annotations
 import heapq
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from functools import partial
 from itertools import groupby
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
@@ -16,40 +16,29 @@ from numpy.typing import NDArray
 
 from pycrorm_async.errors import CallerError, MissingExtra
 from pycrorm_async.events.codec import description_of
-from pycrorm_async.events.reasons import reason_of
 from pycrorm_async.events.types import (
-    EpisodeEnded,
-    EpisodeStarted,
+    Happening,
     JointsMoved,
-    NodeEnded,
-    NodeStarted,
     ObjectAdded,
     ObjectMoved,
     ObjectRemoved,
+    PoseValue,
     StateSampled,
 )
 from pycrorm_async.export.selection import CoveredEpisode
-from pycrorm_async.projections.fold import happening_of
-from pycrorm_async.projections.row_batch import CannotFold
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.query.replay import unreadable
+from pycrorm_async.query.replay import EpisodeReplay, EventTime, ReplayedNode
 from pycrorm_async.query.scene import assumed_model, joint_pose, link_poses, object_model, point_model
-from pycrorm_async.query.text import parameters_text, with_object_names
-from pycrorm_async.store.stored import StoredEvent
+from pycrorm_async.query.text import parameters_text
+from pycrorm_async.store.address import DatabaseAddress
+from pycrorm_async.store.stored import EpisodeRow, StoredEvent
 from pycrorm_async.world.pose import Pose
 from pycrorm_async.world.urdf_model import origin
 
 #
-# Read an episode's events into objects, their changes, and nodes of the plan, which all formats of robots share.
+# Read an episode's events into the history of its world and of its plan, which all formats of robots share.
 
-_BASE = ("base.x", "base.y", "base.z", "base.qx", "base.qy", "base.qz", "base.qw")
-
-
-class EventTime(NamedTuple):
-    """An event: its sequence, and the ns since the episode's first event."""
-
-    sequence: int
-    since_ns: int
+BASE = ("base.x", "base.y", "base.z", "base.qx", "base.qy", "base.qz", "base.qw")
 
 
 class Change(NamedTuple):
@@ -59,52 +48,102 @@ class Change(NamedTuple):
     object: int
     pose: tuple[float, ...] | None
     joints: Mapping[str, float]
-    removed: bool = False
-    sampled: bool = False
+    removed: bool
 
 
-@dataclass(slots=True)
-class ExportedNode:
-    """A node of the plan. `label` is its type with the names of its objects; `parameters` all of them as text."""
+class PlanLine(NamedTuple):
+    """The start or the end of a node as text. `label` is its type with the names of its objects."""
 
-    sequence: int
-    parent: int | None
-    kind: str
-    dtype: str
+    when: EventTime
     label: str
-    parameters: str
-    start: EventTime
-    end: EventTime | None = None
-    status: str = "RUNNING"
-    reason: str | None = None
-    message: str | None = None
+    text: str
+    is_failure: bool = False
 
 
-@dataclass
-class RecordedEpisode:
-    """The events of an episode up to its head when it was chosen.
+class ExportedEpisode(EpisodeReplay):
+    """An episode up to its head when it was chosen, with what changed at each event.
 
     Attributes:
         events: all of them, in order.
-        objects: each object's `ObjectAdded`, by identity, the sequence of that event.
         changes: of the world, in order; an object's first one adds it.
-        nodes: in the order in which they started.
     """
 
-    number: int
-    id: str
-    description: str = ""
-    status: str = "RUNNING"
-    started_wall_ns: int = 0
-    events: list[EventTime] = field(default_factory=list)
-    objects: dict[int, ObjectAdded] = field(default_factory=dict)
-    changes: list[Change] = field(default_factory=list)
-    nodes: list[ExportedNode] = field(default_factory=list)
+    def __init__(self, row: EpisodeRow, address: DatabaseAddress) -> None:
+        super().__init__(row, address, strict=False, samples=True)
+        self.events: list[EventTime] = []
+        self.changes: list[Change] = []
+        self._poses: dict[int, tuple[float, ...]] = {}
+
+    def read(self, event: StoredEvent) -> Happening | None:
+        """Apply the next event, as `EpisodeReplay.read`, and keep its change of the world."""
+        happening = super().read(event)
+        self.events.append(self.at)
+        match happening:
+            case ObjectAdded():
+                self._change(event.sequence, _numbers(happening.pose), happening.joints)
+            case ObjectMoved():
+                self._change(happening.object, _numbers(happening.pose))
+            case JointsMoved():
+                self._change(happening.object.object, joints=happening.joints)
+            case StateSampled():
+                self._sampled(happening.object.object, happening.channels)
+            case ObjectRemoved():
+                self._change(happening.object.object, removed=True)
+        return happening
+
+    def _change(
+        self,
+        identity: int,
+        pose: tuple[float, ...] | None = None,
+        joints: Mapping[str, float] = MappingProxyType({}),
+        *,
+        removed: bool = False,
+    ) -> None:
+        if identity not in self.world.added:
+            return
+        if pose is not None:
+            self._poses[identity] = pose
+        self.changes.append(Change(self.at, identity, pose, joints, removed))
+
+    def _sampled(self, identity: int, channels: Mapping[str, float]) -> None:
+        """Apply a sample of the robot's state, which holds the channels that have changed."""
+        before = self._poses.get(identity)
+        pose = None
+        if before is not None and not channels.keys().isdisjoint(BASE):
+            pose = tuple(channels.get(name, value) for name, value in zip(BASE, before, strict=True))
+        self._change(identity, pose, {name: value for name, value in channels.items() if name not in BASE})
+
+    def type_of(self, node: ReplayedNode) -> str:
+        """Return the dtype of a node, or its kind without one."""
+        return self.dtype(node) or node.kind
+
+    def label(self, node: ReplayedNode) -> str:
+        """Return the type of a node with the names of its objects."""
+        named = self.parameters(node)
+        names = [each["name"] for key, each in named.items() if each is not node.parameters[key]]
+        return " ".join([self.type_of(node), *names])
+
+    def plan_lines(self) -> list[PlanLine]:
+        """Return a line for each start and end of a node, in the order of the events."""
+        lines: list[PlanLine] = []
+        for node in self.nodes.values():
+            dtype, label = self.type_of(node), self.label(node)
+            lines.append(
+                PlanLine(node.start, label, f"{dtype} started {parameters_text(self.parameters(node))}".rstrip())
+            )
+            if node.end is not None:
+                text = f"{dtype} {node.status}" + (f" {node.reason}: {node.message}" if node.reason else "")
+                lines.append(PlanLine(node.end, label, text, node.status in ("FAILED", "ERROR")))
+        return sorted(lines, key=lambda each: each.when.sequence)
+
+
+def _numbers(pose: PoseValue) -> tuple[float, ...]:
+    return (*pose.position, *pose.orientation)
 
 
 async def read_episode(
     reading: Reading, covered: CoveredEpisode, report_events: Callable[[int], object]
-) -> RecordedEpisode:
+) -> ExportedEpisode:
     """Read an episode up to the event `covered.events`. `report_events` gets the number of events read so far.
 
     Raises `CallerError` for one without an event; `LogDamaged` or `DatabaseForeign` for an event that cannot be read.
@@ -113,106 +152,13 @@ async def read_episode(
     [row] = await log.episodes(covered.number, covered.number)
     if covered.events == 0:
         raise CallerError(f"the log has no event of episode {covered.number}")
-    fold = _EpisodeFold(RecordedEpisode(row.number, row.id), await log.dtypes())
+    episode = ExportedEpisode(row, log.address)
+    episode.dtypes = await log.dtypes()
     async for page in log.pages(row._replace(head=covered.events)):
         for event in page:
-            try:
-                fold.read(event)
-            except CannotFold as reason:
-                raise unreadable(row.id, event, str(reason), log.address) from None
+            episode.read(event)
         report_events(page[-1].sequence)
-    return fold.episode
-
-
-class _EpisodeFold:
-    def __init__(self, episode: RecordedEpisode, dtypes: Mapping[str, str]) -> None:
-        self.episode = episode
-        self._dtypes = dtypes
-        self._begin_ns = 0
-        self._nodes: dict[int, ExportedNode] = {}
-        self._poses: dict[int, tuple[float, ...]] = {}
-
-    def read(self, event: StoredEvent) -> None:
-        happening = happening_of(event)
-        if event.sequence == 1:
-            self._begin_ns, self.episode.started_wall_ns = event.monotonic_ns, event.wall_ns
-        when = EventTime(event.sequence, event.monotonic_ns - self._begin_ns)
-        self.episode.events.append(when)
-        match happening:
-            case EpisodeStarted():
-                self.episode.description = happening.description
-            case EpisodeEnded():
-                self.episode.status = happening.status
-            case ObjectAdded():
-                self.episode.objects[event.sequence] = happening
-                pose = (*happening.pose.position, *happening.pose.orientation)
-                self._change(when, event.sequence, pose, happening.joints)
-            case ObjectMoved():
-                self._change(when, happening.object, (*happening.pose.position, *happening.pose.orientation), {})
-            case JointsMoved():
-                self._change(when, happening.object.object, None, happening.joints)
-            case StateSampled():
-                self._sampled(when, happening)
-            case ObjectRemoved():
-                self._change(when, happening.object.object, None, {}, removed=True)
-            case NodeStarted():
-                self._started(when, happening)
-            case NodeEnded():
-                self._ended(when, happening)
-
-    def _change(
-        self,
-        when: EventTime,
-        identity: int,
-        pose: tuple[float, ...] | None,
-        joints: Mapping[str, float],
-        *,
-        removed: bool = False,
-        sampled: bool = False,
-    ) -> None:
-        if identity not in self.episode.objects:
-            return
-        if pose is not None:
-            self._poses[identity] = pose
-        self.episode.changes.append(Change(when, identity, pose, joints, removed, sampled))
-
-    def _sampled(self, when: EventTime, sample: StateSampled) -> None:
-        """Apply a sample of the robot's state, which holds the channels that have changed."""
-        identity, channels = sample.object.object, sample.channels
-        before = self._poses.get(identity)
-        pose = None
-        if before is not None and not channels.keys().isdisjoint(_BASE):
-            pose = tuple(channels.get(name, value) for name, value in zip(_BASE, before, strict=True))
-        joints = {name: value for name, value in channels.items() if name not in _BASE}
-        self._change(when, identity, pose, joints, sampled=True)
-
-    def _started(self, when: EventTime, started: NodeStarted) -> None:
-        dtype = self._dtypes.get(started.designator or "", "") or started.kind
-        named = with_object_names(started.parameters, self._name_of)
-        names = [each["name"] for key, each in named.items() if each is not started.parameters[key]]
-        node = ExportedNode(
-            when.sequence,
-            started.parent,
-            started.kind,
-            dtype,
-            " ".join([dtype, *names]),
-            parameters_text(named),
-            when,
-        )
-        self._nodes[when.sequence] = node
-        self.episode.nodes.append(node)
-
-    def _name_of(self, reference: Mapping[str, int]) -> str | None:
-        added = self.episode.objects.get(reference["object"])
-        return added.name if added is not None else None
-
-    def _ended(self, when: EventTime, ended: NodeEnded) -> None:
-        if (node := self._nodes.get(ended.node)) is None:
-            raise CannotFold(f"node {ended.node} ends and never started")
-        node.status = ended.status
-        node.end = when if ended.status != "LOST" else None
-        if ended.failure is not None:
-            node.reason, node.message = reason_of(ended.failure), ended.failure.message
+    return episode
 
 
 # === states ===================================================================================================
@@ -225,7 +171,6 @@ class _EpisodeFold:
 Clock: TypeAlias = Literal["event", "time"]
 """The axis of the frames."""
 
-BASE = ("base.x", "base.y", "base.z", "base.qx", "base.qy", "base.qz", "base.qw")
 IDLE = "idle"
 """The subtask while no action runs."""
 _FRAMES_MAX = 10_000_000
@@ -251,15 +196,15 @@ class Frames(NamedTuple):
     subtasks: list[str]
 
 
-def frames_of(episode: RecordedEpisode, clock: Clock, fps: int) -> Frames:
+def frames_of(episode: ExportedEpisode, clock: Clock, fps: int) -> Frames:
     """Return the frames of the robot that was added first, while it was in the world.
 
     Raises `CallerError` for an episode without a robot, or with fewer than two frames.
     """
-    robots = [identity for identity, each in episode.objects.items() if each.object_type == "ROBOT"]
+    robots = [identity for identity, each in episode.world.added.items() if each.object_type == "ROBOT"]
     if not robots:
         raise CallerError(f"episode {episode.number} has no robot, whose states LeRobot's frames are: leave it out")
-    robot = episode.objects[robots[0]]
+    robot = episode.world.added[robots[0]]
     channels = (*BASE, *sorted(robot.joints))
     changed = list(_states(episode, robots[0], channels))
     while_there = _events_with(episode, robots[0])
@@ -272,11 +217,11 @@ def frames_of(episode: RecordedEpisode, clock: Clock, fps: int) -> Frames:
         raise CallerError(f"episode {episode.number} has {count} by {clock}, and LeRobot needs two: {remedy}")
     at = [when for when, _ in chosen]
     states = np.array([state for _, state in chosen], dtype=np.float32)
-    return Frames(robot.model or robot.name, channels, states, at, list(_subtasks(episode.nodes, at)))
+    return Frames(robot.model or robot.name, channels, states, at, list(_subtasks(episode, at)))
 
 
 def _states(
-    episode: RecordedEpisode, identity: int, channels: Sequence[str]
+    episode: ExportedEpisode, identity: int, channels: Sequence[str]
 ) -> Iterator[tuple[EventTime, tuple[float, ...]]]:
     """Yield each event that changed the robot's state, and the state after it."""
     index = {name: position for position, name in enumerate(channels)}
@@ -298,7 +243,7 @@ def _states(
             yield change.when, now
 
 
-def _events_with(episode: RecordedEpisode, identity: int) -> list[EventTime]:
+def _events_with(episode: ExportedEpisode, identity: int) -> list[EventTime]:
     """Return the events from the one that added the robot to the last one before its removal."""
     removals = (each.when.sequence for each in episode.changes if each.removed and each.object == identity)
     removal = next(removals, None)
@@ -323,18 +268,19 @@ def _resampled(
         yield events[event]._replace(since_ns=since_ns), changed[state][1]
 
 
-def _subtasks(nodes: Sequence[ExportedNode], at: Sequence[EventTime]) -> Iterator[str]:
+def _subtasks(episode: ExportedEpisode, at: Sequence[EventTime]) -> Iterator[str]:
     """Yield the label of the action that was running last at each of these events."""
-    actions = [each for each in nodes if each.kind == "action"]
-    running: list[tuple[int, ExportedNode]] = []  # the one that started last comes first
+    actions = [(each.start.sequence, each) for each in episode.nodes.values() if each.kind == "action"]
+    running: list[tuple[int, str, EventTime | None]] = []  # the one that started last comes first
     started = 0
     for when in at:
-        while started < len(actions) and actions[started].sequence <= when.sequence:
-            heapq.heappush(running, (-actions[started].sequence, actions[started]))
+        while started < len(actions) and actions[started][0] <= when.sequence:
+            sequence, action = actions[started]
+            heapq.heappush(running, (-sequence, episode.label(action), action.end))
             started += 1
-        while running and (end := running[0][1].end) is not None and end.sequence <= when.sequence:
+        while running and (end := running[0][2]) is not None and end.sequence <= when.sequence:
             heapq.heappop(running)
-        yield running[0][1].label if running else IDLE
+        yield running[0][1] if running else IDLE
 
 
 # === mcap file ================================================================================================
@@ -358,7 +304,7 @@ class _Message(NamedTuple):
 
 
 def write_mcap(
-    episode: RecordedEpisode,
+    episode: ExportedEpisode,
     objects: dict[int, SceneObject],
     path: Path,
     report_events: Callable[[int], object],
@@ -388,7 +334,7 @@ def write_mcap(
         channels = {topic: _channel(writer, topic, getattr(messages, name)) for topic, name in _TOPICS.items()}
         for each in sorted(_messages(episode, objects, messages), key=lambda message: message.when.sequence):
             by_event_ns = each.when.sequence * _SECOND_NS // fps
-            time_ns = episode.started_wall_ns + (each.when.since_ns if clock == "time" else by_event_ns)
+            time_ns = episode.begin_wall_ns + (each.when.since_ns if clock == "time" else by_event_ns)
             stamped = each.content(messages.Timestamp(sec=time_ns // _SECOND_NS, nsec=time_ns % _SECOND_NS))
             writer.add_message(channels[each.topic], time_ns, stamped.encode(), time_ns, each.when.sequence)
             count += 1
@@ -398,11 +344,11 @@ def write_mcap(
     return count
 
 
-def _metadata(episode: RecordedEpisode) -> dict[str, str]:
+def _metadata(episode: ExportedEpisode) -> dict[str, str]:
     return {
         "number": str(episode.number),
         "id": episode.id,
-        "description": episode.description,
+        "description": episode.started.description,
         "status": episode.status,
     }
 
@@ -414,7 +360,7 @@ def _channel(writer: Any, topic: str, kind: Any) -> int:
     return channel
 
 
-def _messages(episode: RecordedEpisode, objects: dict[int, SceneObject], kinds: Any) -> Iterator[_Message]:
+def _messages(episode: ExportedEpisode, objects: dict[int, SceneObject], kinds: Any) -> Iterator[_Message]:
     for when, changes in groupby(frame_changes(episode, objects), key=lambda each: each.when):
         yield _Message(when, "/tf", partial(_transforms, kinds, list(changes)))
     yield from _scene(episode, objects, kinds)
@@ -436,7 +382,7 @@ def _transforms(kinds: Any, changes: list[FrameChange], stamp: Any) -> Any:
     )
 
 
-def _scene(episode: RecordedEpisode, objects: dict[int, SceneObject], kinds: Any) -> Iterator[_Message]:
+def _scene(episode: ExportedEpisode, objects: dict[int, SceneObject], kinds: Any) -> Iterator[_Message]:
     seen: set[int] = set()
     for change in episode.changes:
         shapes = {frame: each for frame, each in objects[change.object].shapes.items() if each}
@@ -482,14 +428,10 @@ def _entity(kinds: Any, stamp: Any, frame: str, shapes: list[Shape]) -> Any:
     )
 
 
-def _plan(episode: RecordedEpisode, kinds: Any) -> Iterator[_Message]:
-    for node in episode.nodes:
-        line, level = partial(_line, kinds, node.label), kinds.LogLevel.Info
-        yield _Message(node.start, "/plan", partial(line, level, f"{node.dtype} started {node.parameters}".rstrip()))
-        if node.end is not None:
-            level = kinds.LogLevel.Error if node.status in ("FAILED", "ERROR") else level
-            reason = f" {node.reason}: {node.message}" if node.reason else ""
-            yield _Message(node.end, "/plan", partial(line, level, f"{node.dtype} {node.status}{reason}"))
+def _plan(episode: ExportedEpisode, kinds: Any) -> Iterator[_Message]:
+    for line in episode.plan_lines():
+        level = kinds.LogLevel.Error if line.is_failure else kinds.LogLevel.Info
+        yield _Message(line.when, "/plan", partial(_line, kinds, line.label, level, line.text))
 
 
 def _line(kinds: Any, name: str, level: Any, text: str, stamp: Any) -> Any:
@@ -517,7 +459,7 @@ _APPLICATION = "pycrorm"
 
 
 def write_rerun(
-    episode: RecordedEpisode, objects: dict[int, SceneObject], path: Path, report_events: Callable[[int], object]
+    episode: ExportedEpisode, objects: dict[int, SceneObject], path: Path, report_events: Callable[[int], object]
 ) -> int:
     """Write the file and return the number of changes in it. `report_events` gets the event of the latest change.
 
@@ -532,7 +474,7 @@ def write_rerun(
     recording = rr.RecordingStream(_APPLICATION, recording_id=episode.id)
     # Not `save`, whose thread only logs that the disk is full. The changes below take more memory than the file.
     encoded = recording.memory_recording()
-    recording.send_recording_name(f"episode {episode.number}: {episode.description}")
+    recording.send_recording_name(f"episode {episode.number}: {episode.started.description}")
     recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     entities: dict[str, str] = {MAP: "world"}
     changes: dict[str, list[FrameChange]] = {}
@@ -577,7 +519,7 @@ def _indexes(rr: Any, whens: Sequence[EventTime]) -> list[Any]:
     ]
 
 
-def _added(episode: RecordedEpisode) -> dict[int, EventTime]:
+def _added(episode: ExportedEpisode) -> dict[int, EventTime]:
     """Return the event that added each object."""
     added: dict[int, EventTime] = {}
     for each in episode.changes:
@@ -609,7 +551,7 @@ def _log_shapes(rr: Any, recording: Any, entity: str, shapes: Sequence[Shape]) -
 
 
 def _send_removals(
-    rr: Any, recording: Any, episode: RecordedEpisode, objects: Mapping[int, SceneObject], entities: Mapping[str, str]
+    rr: Any, recording: Any, episode: ExportedEpisode, objects: Mapping[int, SceneObject], entities: Mapping[str, str]
 ) -> int:
     """Make an object vanish at the event that removed it, and count the removals; not at the end of the episode.
 
@@ -623,21 +565,16 @@ def _send_removals(
     return len(removals)
 
 
-def _send_plan(rr: Any, recording: Any, episode: RecordedEpisode) -> int:
+def _send_plan(rr: Any, recording: Any, episode: ExportedEpisode) -> int:
     """Send a line for each start and end of a node; return their number."""
-    lines: list[tuple[EventTime, str, str]] = []
-    for node in episode.nodes:
-        lines.append((node.start, "INFO", f"{node.dtype} started {node.parameters}".rstrip()))
-        if node.end is not None:
-            failed = node.status in ("FAILED", "ERROR")
-            text = f"{node.dtype} {node.status}" + (f" {node.reason}: {node.message}" if node.reason else "")
-            lines.append((node.end, "ERROR" if failed else "INFO", text))
-    lines.sort(key=lambda each: each[0].sequence)
+    lines = episode.plan_lines()
     if lines:
         recording.send_columns(
             "plan",
-            indexes=_indexes(rr, [when for when, _, _ in lines]),
-            columns=rr.TextLog.columns(text=[text for _, _, text in lines], level=[level for _, level, _ in lines]),
+            indexes=_indexes(rr, [each.when for each in lines]),
+            columns=rr.TextLog.columns(
+                text=[each.text for each in lines], level=["ERROR" if each.is_failure else "INFO" for each in lines]
+            ),
         )
     return len(lines)
 
@@ -727,10 +664,10 @@ class SceneObject:
                 yield FrameChange(change.when, self.frame(parent), self.frame(child), *_parts(frame))
 
 
-async def scene_objects(reading: Reading, episode: RecordedEpisode) -> dict[int, SceneObject]:
+async def scene_objects(reading: Reading, episode: ExportedEpisode) -> dict[int, SceneObject]:
     """Return the objects of an episode by identity, with their recorded, assumed or missing shapes."""
     log = await reading.log()
-    fingerprints = {each.description for each in episode.objects.values() if each.description is not None}
+    fingerprints = {each.description for each in episode.world.added.values() if each.description is not None}
     models: dict[str, Mapping[str, Any]] = {}
     for name, payload in (await log.descriptions(fingerprints)).items():
         try:
@@ -739,7 +676,7 @@ async def scene_objects(reading: Reading, episode: RecordedEpisode) -> dict[int,
             models[name] = point_model(f"its description cannot be read: {error}")
     objects: dict[int, SceneObject] = {}
     names: set[str] = set()
-    for identity, added in episode.objects.items():
+    for identity, added in episode.world.added.items():
         if added.description is None:
             model: Mapping[str, Any] = assumed_model(added.name, added.object_type, set(added.joints))
         else:
@@ -751,7 +688,7 @@ async def scene_objects(reading: Reading, episode: RecordedEpisode) -> dict[int,
     return objects
 
 
-def frame_changes(episode: RecordedEpisode, objects: Mapping[int, SceneObject]) -> Iterator[FrameChange]:
+def frame_changes(episode: ExportedEpisode, objects: Mapping[int, SceneObject]) -> Iterator[FrameChange]:
     """Yield every change of a frame, in the order of the events."""
     seen: set[int] = set()
     for change in episode.changes:

@@ -155,8 +155,8 @@ class EpisodeReplay:
     Attributes:
         number, id: of the episode.
         dtypes: the dtype of each designator type, by fingerprint; the reader of the log keeps it up to date.
-        first, last: the first and the last event that was read; None before.
-        at: the last event that was read.
+        begin_ns, begin_wall_ns: monotonic and wall time of the first event.
+        at, wall_ns: the last event that was read, and its wall time; event 0 before.
         started: the first event; empty before it is read.
         ended: the end of the episode; None before it is read.
         tags: of the episode.
@@ -171,8 +171,7 @@ class EpisodeReplay:
     ) -> None:
         self.number, self.id = row.number, row.id
         self.dtypes: Mapping[str, str] = {}
-        self.first: StoredEvent | None = None
-        self.last: StoredEvent | None = None
+        self.begin_ns = self.begin_wall_ns = self.wall_ns = 0
         self.at = EventTime(0, 0)
         self.started = EpisodeStarted("", "", "", "", "")
         self.ended: EpisodeEnded | None = None
@@ -204,19 +203,20 @@ class EpisodeReplay:
 
         Raises `LogDamaged`, or `DatabaseForeign` for an event of a newer version.
         """
-        begin = event if self.first is None else self.first
-        at = EventTime(event.sequence, event.monotonic_ns - begin.monotonic_ns)
+        if self.at.sequence == 0:
+            self.begin_ns, self.begin_wall_ns = event.monotonic_ns, event.wall_ns
+        at = EventTime(event.sequence, event.monotonic_ns - self.begin_ns)
         try:
             happening = self._decoded(event)
             if happening is not None:
                 self._apply(event, at, happening)
         except CannotFold as reason:
             raise unreadable(self.id, event, str(reason), self._address) from None
-        self.first, self.last, self.at = begin, event, at
+        self.at, self.wall_ns = at, event.wall_ns
         return happening
 
     def _decoded(self, event: StoredEvent) -> Happening | None:
-        if self.first is None and event.type != "EpisodeStarted":
+        if self.at.sequence == 0 and event.type != "EpisodeStarted":
             raise CannotFold(f"the episode begins with {event.type} instead of EpisodeStarted")
         return happening_of(event) if self._samples or event.type != "StateSampled" else None
 
@@ -227,7 +227,7 @@ class EpisodeReplay:
             case NodeEnded():
                 self._end(at, happening)
             case EpisodeStarted():
-                if self.first is not None:
+                if self.at.sequence > 0:
                     raise CannotFold("the episode starts a second time")
                 self.started = happening
                 self.tags = retagged((), happening.tags, ())

@@ -239,8 +239,8 @@ AnyEpisode: TypeAlias = "int | str | Episode | EpisodeSummary"
 _NUMBERS_END = 1e15
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
-_Within: TypeAlias = Callable[[StoredEvent, StoredEvent], bool]
-"""Takes the episode's first event and another event; returns whether the other is not later than the moment."""
+_Within: TypeAlias = Callable[[int, StoredEvent], bool]
+"""Takes the monotonic time of the first event and another event; returns whether this is not later than the moment."""
 
 
 async def as_of(
@@ -260,7 +260,7 @@ async def as_of(
     async for page in log.pages(row):
         if not _read(replay, page, within):
             break
-    if replay.first is None:
+    if replay.at.sequence == 0:
         raise CallerError(f"{limit} is before episode {row.number} began")
     replay.dtypes = await log.dtypes()
     objects = replay.world.objects.values()
@@ -290,7 +290,7 @@ def _description(payload: bytes) -> DescriptionDeclared:
 def _read(replay: EpisodeReplay, page: Sequence[StoredEvent], within: _Within) -> bool:
     """Read the events of a page up to the moment; return whether the next page may have more."""
     for event in page:
-        if not within(replay.first if replay.first is not None else event, event):
+        if not within(replay.begin_ns if replay.at.sequence else event.monotonic_ns, event):
             return False
         replay.read(event)
     return True
@@ -314,7 +314,7 @@ def _limit(time: float | datetime | None, sequence: int | None) -> tuple[str, _W
     if seconds is None:
         raise CallerError(f"time must be seconds since the episode's start or a datetime, got {time!r}")
     since_ns = round(seconds * 1e9)
-    return f"{seconds:g} s", lambda first, event: event.monotonic_ns - first.monotonic_ns <= since_ns
+    return f"{seconds:g} s", lambda begin_ns, event: event.monotonic_ns - begin_ns <= since_ns
 
 
 def parse_moment(text: str, option: str = "at") -> tuple[float | None, int | None]:
@@ -556,29 +556,26 @@ def moment_of(
         descriptions: those of the objects, by fingerprint.
         meshes: contents of their mesh files, by SHA-256.
     """
-    started, first, last = replay.started, replay.first, replay.last
-    assert first is not None, "an event was read"
-    assert last is not None, "an event was read"
-    number = replay.number
+    started, number = replay.started, replay.number
     percepts = [each for answer in replay.detections for each in percepts_in(number, *answer)]
     return Moment(
         number=number,
         id=replay.id,
         description=started.description,
         created_by=started.created_by,
-        started_at=_moment(first.wall_ns),
+        started_at=_moment(replay.begin_wall_ns),
         simulated=started.simulated,
-        sequence=last.sequence,
+        sequence=replay.at.sequence,
         time_s=replay.at.since_ns / 1e9,
-        at=_moment(last.wall_ns),
+        at=_moment(replay.wall_ns),
         status=replay.status,
-        tree=tuple(_tree(replay, first.monotonic_ns)),
+        tree=tuple(_tree(replay)),
         world=_world(replay, descriptions, meshes),
         observations={
             name: ObservationThen(
                 values=observed.values,
                 sequence=event.sequence,
-                time_s=(event.monotonic_ns - first.monotonic_ns) / 1e9,
+                time_s=(event.monotonic_ns - replay.begin_ns) / 1e9,
                 node=row_id(number, observed.node, SLOT_NODE) if observed.node is not None else None,
                 missing=observed.missing,
             )
@@ -590,18 +587,18 @@ def moment_of(
     )
 
 
-def _tree(replay: EpisodeReplay, begin_ns: int) -> Iterator[NodeThen]:
+def _tree(replay: EpisodeReplay) -> Iterator[NodeThen]:
     children: dict[int | None, list[int]] = {}
     for sequence, node in replay.nodes.items():
         children.setdefault(node.parent, []).append(sequence)
     stack = [(sequence, 0) for sequence in reversed(children.get(None, []))]
     while stack:
         sequence, depth = stack.pop()
-        yield _node(replay, replay.nodes[sequence], depth, begin_ns)
+        yield _node(replay, replay.nodes[sequence], depth)
         stack.extend((child, depth + 1) for child in reversed(children.get(sequence, [])))
 
 
-def _node(replay: EpisodeReplay, node: ReplayedNode, depth: int, begin_ns: int) -> NodeThen:
+def _node(replay: EpisodeReplay, node: ReplayedNode, depth: int) -> NodeThen:
     start, end = node.start, node.end
     if node.designator is not None and node.designator not in replay.dtypes:
         raise LogDamaged(replay.id, start.sequence, f"the designator type {node.designator} was never declared")
@@ -620,7 +617,7 @@ def _node(replay: EpisodeReplay, node: ReplayedNode, depth: int, begin_ns: int) 
         simulated=node.simulated,
         sequence=start.sequence,
         end_sequence=end.sequence if end is not None else None,
-        start_ns=begin_ns + start.since_ns,
+        start_ns=replay.begin_ns + start.since_ns,
         start_s=start.since_ns / 1e9,
         end_s=end.since_ns / 1e9 if end is not None else None,
         considered=node.considered,

@@ -170,6 +170,21 @@ async def test_by_time_a_frame_names_the_action_that_runs_while_the_robot_does_n
     assert ranges == ([0, 2, 8, 16], [21, 6, 12, 20])
 
 
+async def test_the_plan_says_that_nodes_are_lost_which_ran_when_the_process_died(tmp_path: Path) -> None:
+    script = Script()
+    put = script.put
+    put(EpisodeStarted("dies", "me", "host", "1.0", "3.11"))
+    root = put(NodeStarted("root"))
+    robot = put(ObjectAdded("pr2", "ROBOT", pose()))
+    put(ObjectMoved(robot, "pr2", "ROBOT", pose(1), root))
+    put(EpisodeEnded("LOST"))
+    url = f"sqlite:///{tmp_path}/memory.db"
+    await append_and_fold(url, script.records)
+    async with Reading.open(url) as reading:
+        await export(reading, 1, tmp_path / "set", file_format="lerobot")
+    assert pd.read_parquet(tmp_path / "set/meta/plan.parquet").status.tolist() == ["LOST"]
+
+
 @pytest.mark.slow
 async def test_images_show_the_scene_of_each_frame(reading: Reading, tmp_path: Path) -> None:
     await export(reading, 3, tmp_path / "seen", file_format="lerobot", images=(64, 48))
