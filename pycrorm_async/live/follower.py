@@ -27,7 +27,7 @@ from pycrorm_async.projections.row_batch import CannotFold
 from pycrorm_async.query.frames import TRIED
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.text import parameters_text, with_object_names
-from pycrorm_async.report.document import EpisodeFold, document_behind, read_into
+from pycrorm_async.report.document import EpisodePage, document_behind, read_into
 from pycrorm_async.report.write import (
     NO_REASON,
     failures_by_reason,
@@ -54,42 +54,42 @@ _FEEDS_MAX = 8
 
 
 class EpisodeFeed:
-    """An episode, folded as far as it was read, from event `first` on.
+    """The page of an episode, from event `first` on, as far as its events were read.
 
     Attributes:
         listeners: number of pages that follow it.
         fault: why its events cannot be read any further, or None.
     """
 
-    def __init__(self, row: EpisodeRow, first: int) -> None:
-        self._fold = EpisodeFold(row, first)
+    def __init__(self, row: EpisodeRow, address: DatabaseAddress, first: int) -> None:
+        self._page = EpisodePage(row, address, first)
         self._reading = asyncio.Lock()
         self.listeners = 0
         self.fault: str | None = row.refused
 
     @property
     def id(self) -> str:
-        return self._fold.row.id
+        return self._page.id
 
     @property
     def number(self) -> int:
-        return self._fold.row.number
+        return self._page.number
 
     @property
     def last(self) -> int:
-        """The sequence of the last event that was folded."""
-        return self._fold.last
+        """The sequence of the last event that was read."""
+        return self._page.at.sequence
 
     async def catch_up(self, log: EventLog, row: EpisodeRow) -> None:
-        """Fold the events that were stored since the last call."""
+        """Read the events that were stored since the last call."""
         async with self._reading:
-            fold = self._fold
-            fold.row = row
+            page = self._page
+            page.row = row
             self.fault = row.refused or self.fault
-            if fold.is_full or row.head <= fold.last or self.fault is not None:
+            if page.is_full or row.head <= page.at.sequence or self.fault is not None:
                 return
             try:
-                await read_into(fold, log, log.pages(row, after=fold.last))
+                await read_into(page, log, log.pages(row, after=page.at.sequence))
             except (LogDamaged, DatabaseForeign) as error:
                 self.fault = str(error)
             except PycrormError:
@@ -100,7 +100,7 @@ class EpisodeFeed:
     async def document(self, log: EventLog, after: int = 0) -> dict[str, Any]:
         """Return the document, or the part of it behind event `after`."""
         async with self._reading:
-            return await document_behind(self._fold, log, after)
+            return await document_behind(self._page, log, after)
 
 
 class LogFollower:
@@ -191,7 +191,7 @@ class LogFollower:
         key = (row.number, first)
         feed = self._feeds.pop(key, None)
         if feed is None or feed.id != row.id or row.head < feed.last:
-            feed = EpisodeFeed(row, first)
+            feed = EpisodeFeed(row, self.address, first)
         self._feeds[key] = feed
         for idle in [each for each, other in self._feeds.items() if not other.listeners][:-_FEEDS_MAX]:
             del self._feeds[idle]

@@ -1,10 +1,10 @@
-"""Fold the events of an episode into the document that the page shows, as a whole or the part behind an event.
+"""Make the document that the page of an episode shows, as a whole or the part behind an event.
 
 The document holds columns and numbers of texts instead of one object per node, so that 100,000 nodes stay below 20 MB.
 `web/episode.js` reads it. Sequences of events are the axis of everything; `times` maps them to seconds.
 
 A part holds the additions and changes of the events behind `after`; a whole document is the part behind event 0. Each
-entry is found by the sequence of its event, so one fold serves any number of pages, wherever each of them has stopped.
+entry is found by the sequence of its event, so one replay serves any number of pages, wherever each has stopped.
 """
 
 from __future__ import annotations
@@ -22,13 +22,10 @@ import msgspec
 
 from pycrorm_async.errors import CallerError, UnknownEpisode
 from pycrorm_async.events.codec import description_of
-from pycrorm_async.events.fields import retagged
 from pycrorm_async.events.reasons import reason_of
 from pycrorm_async.events.types import (
     DescriptionDeclared,
     EpisodeEnded,
-    EpisodeStarted,
-    EpisodeTagged,
     Happening,
     JointsMoved,
     LocationResolved,
@@ -45,12 +42,11 @@ from pycrorm_async.events.types import (
     PoseValue,
     StateSampled,
 )
-from pycrorm_async.projections.fold import happening_of
-from pycrorm_async.projections.row_batch import CannotFold
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.query.replay import unreadable
+from pycrorm_async.query.replay import EpisodeReplay, ReplayedWorld
 from pycrorm_async.query.scene import Triangles, assumed_model, object_model, point_model, triangles_of
-from pycrorm_async.query.text import parameters_text, with_object_names
+from pycrorm_async.query.text import parameters_text
+from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog, episode_named
 from pycrorm_async.store.stored import EpisodeRow, StoredEvent
 
@@ -73,71 +69,54 @@ _VALUES_MAX = 2_000
 """Bounds the characters of an observation's values in the page."""
 
 
-class EpisodeFold:
-    """The document of an episode as far as its events were read, from event `first` on."""
+class EpisodePage(EpisodeReplay):
+    """The replay of an episode, with what its page shows from event `first` on."""
 
-    def __init__(self, row: EpisodeRow, first: int = 1) -> None:
+    def __init__(self, row: EpisodeRow, address: DatabaseAddress, first: int = 1) -> None:
+        super().__init__(row, address, strict=False, samples=True)
         self.row = row
-        self.world = ObjectTracks(first)
+        self.tracks = ObjectTracks(self.world, first)
         self._first = first
         self._texts = Texts()
-        self._started: EpisodeStarted | None = None
-        self._first_event: StoredEvent | None = None
-        self.last = 0
-        """The sequence of the last event that was read."""
-        self._status = "RUNNING"
-        self._tags: tuple[str, ...] = ()
-        self._failure: dict[str, str] | None = None
         self._times: list[int] = []
-        self._nodes: dict[int, list[Any]] = {}
-        self._ended_nodes: list[tuple[int, int]] = []
-        """The event that ended a node, and the node's start; both also of a node that is LOST."""
+        self._rows: dict[int, list[int]] = {}
+        """The nodes of the page by start: `[start, end, parent]`, and the numbers of their texts."""
+        self._ended_nodes: dict[int, int] = {}
+        """The event that ended a node, by the node's start; also of a node that is LOST."""
         self._listed: dict[str, list[dict[str, Any]]] = {name: [] for name in _LISTS}
         self._unlisted = dict.fromkeys(_LISTS, 0)
         self._series: dict[str, Track] = {}
 
-    def read(self, event: StoredEvent, designators: Mapping[str, str]) -> None:
-        """Apply the next event. Raises `CannotFold`."""
-        happening = happening_of(event)
-        if self._first_event is None:
-            self._first_event = event
-        self.last = self._texts.sequence = event.sequence
-        if event.sequence >= self._first:
-            self._times.append((event.monotonic_ns - self._first_event.monotonic_ns) // 1000)
-        self._happened(event.sequence, happening, designators)
-
-    def _happened(self, sequence: int, happening: Happening, designators: Mapping[str, str]) -> None:
+    def read(self, event: StoredEvent) -> Happening | None:
+        """Apply the next event, as `EpisodeReplay.read`, and keep what the page shows of it."""
+        happening = super().read(event)
+        sequence = self._texts.sequence = event.sequence
+        if sequence >= self._first:
+            self._times.append(self.at.since_ns // 1000)
         match happening:
             case NodeStarted():
-                dtype = designators.get(happening.designator or "", "")
-                number = self._texts.number
-                parameters = parameters_text(with_object_names(happening.parameters, self._name_of))
-                self._nodes[sequence] = [
-                    *(sequence, 0, happening.parent or 0),
-                    *(number(happening.kind), number(dtype), number(parameters), number("RUNNING"), 0, 0),
-                ]
+                self._start_row(sequence)
+            case NodeEnded() if sequence < self._first:
+                del self.nodes[happening.node], self._rows[happening.node]
             case NodeEnded():
-                self._node_ended(sequence, happening)
-            case EpisodeStarted():
-                self._started = happening
-                self._tags = retagged((), happening.tags, ())
-            case EpisodeTagged():
-                self._tags = retagged(self._tags, happening.added, happening.removed)
-            case EpisodeEnded():
-                self._ended(sequence, happening)
+                self._end_row(sequence, happening.node)
+            case EpisodeEnded(status="LOST"):
+                for start in [each for each in self._rows if each not in self._ended_nodes]:
+                    self._end_row(sequence, start)
             case ObjectDetected() if sequence >= self._first:
                 self._list("detections", _detection(sequence, happening))
             case Observed() if sequence >= self._first:
                 self._observed(sequence, happening)
             case LocationResolved() if sequence >= self._first:
                 self._list("locations", _location(sequence, happening))
-            case _:
-                self.world.read(sequence, happening)
+            case Happening():
+                self.tracks.read(sequence, happening)
+        return happening
 
     @property
     def is_full(self) -> bool:
         """True if a page can hold no further node, or no further move."""
-        return len(self._nodes) >= _NODES_MAX or self.world.numbers >= _NUMBERS_MAX
+        return len(self._rows) >= _NODES_MAX or self.tracks.numbers >= _NUMBERS_MAX
 
     def _list(self, name: str, entry: dict[str, Any]) -> None:
         if len(self._listed[name]) < _LISTED_MAX:
@@ -145,34 +124,19 @@ class EpisodeFold:
         else:
             self._unlisted[name] += 1
 
-    def _name_of(self, reference: Mapping[str, int]) -> str | None:
-        referred = self.world.objects.get(reference["object"])
-        return referred.added.name if referred is not None else None
+    def _start_row(self, start: int) -> None:
+        node, number = self.nodes[start], self._texts.number
+        parameters = parameters_text(self.parameters(node))
+        texts = [number(each) for each in (node.kind, self.dtype(node), parameters, node.status)]
+        self._rows[start] = [start, 0, node.parent or 0, *texts, 0, 0]
+        node.parameters = {}  # the page has them as text
 
-    def _node_ended(self, sequence: int, ended: NodeEnded) -> None:
-        if (node := self._nodes.get(ended.node)) is None:
-            raise CannotFold(f"node {ended.node} ends and never started")
-        if sequence < self._first:
-            del self._nodes[ended.node]
-            return
-        node[6] = self._texts.number(ended.status)
-        self._ended_nodes.append((sequence, ended.node))
-        if ended.status != "LOST":
-            node[1] = sequence
-        if ended.failure is not None:
-            node[7] = self._texts.number(reason_of(ended.failure))
-            node[8] = self._texts.number(ended.failure.message)
-
-    def _ended(self, sequence: int, ended: EpisodeEnded) -> None:
-        self._status = ended.status
-        if ended.failure is not None:
-            self._failure = {"reason": reason_of(ended.failure), "message": ended.failure.message[:_TEXT_LONGEST]}
-        if ended.status == "LOST":
-            running, lost = self._texts.number("RUNNING"), self._texts.number("LOST")
-            for start, node in self._nodes.items():
-                if node[6] == running:
-                    node[6] = lost
-                    self._ended_nodes.append((sequence, start))
+    def _end_row(self, sequence: int, start: int) -> None:
+        node = self.nodes[start]
+        end = node.end.sequence if node.end is not None else 0
+        texts = [self._texts.number(each or "") for each in (node.status, node.reason, node.message)]
+        self._rows[start] = [start, end, *self._rows[start][2:6], *texts]
+        self._ended_nodes[start] = sequence
 
     def _observed(self, sequence: int, observed: Observed) -> None:
         text = msgspec.json.encode(observed.values).decode()
@@ -197,74 +161,75 @@ class EpisodeFold:
             "texts": self._texts.cut(
                 _TEXTS_CHARACTERS, shortest=_TEXT_SHORTEST, longest=_TEXT_LONGEST, after=after or -1
             ),
-            "nodes": _columns(_newest(self._nodes.values(), after), 9),
+            "nodes": _columns(_newest(self._rows.values(), after), 9),
             "ended": _columns([self._end_of(start) for start in self._ended_since(after)], 5),
             "models": dict(models),
             "objects": [
-                each for each in (self._object(identity, models, after) for identity in self.world.objects) if each
+                each for each in (self._object(identity, models, after) for identity in self.tracks.objects) if each
             ],
-            "attachments": [each for each in self.world.attachments if max(each[3:]) > after],
+            "attachments": [each for each in self.tracks.attachments if max(each[3:]) > after],
             **{name: _behind(entries, after) for name, entries in self._listed.items()},
             "series": _tracks(self._series, after),
             "samples": {
                 str(identity): tracks
-                for identity, channels in self.world.samples.items()
+                for identity, channels in self.tracks.samples.items()
                 if (tracks := _tracks(channels, after))
             },
         }
 
     def _header(self) -> dict[str, Any]:
-        started, first = self._started, self._first_event
-        assert started is not None, "an event was read before"
-        assert first is not None, "an event was read before"
-        opens = self.world.full_until if self.world.full_until is not None else self.last
+        started, last = self.started, self.at.sequence
+        failure = self.ended.failure if self.ended is not None else None
+        opens = self.tracks.full_until if self.tracks.full_until is not None else last
         return {
-            "number": self.row.number,
-            "id": self.row.id,
+            "number": self.number,
+            "id": self.id,
             "description": started.description,
             "created_by": started.created_by,
             "host": started.host,
             "software": started.software,
             "plan": started.plan,
             "simulated": started.simulated,
-            "started": f"{datetime.fromtimestamp(first.wall_ns // 10**9, UTC):%Y-%m-%d %H:%M:%S} UTC",
-            "status": self._status,
-            "failure": self._failure,
-            "tags": list(self._tags),
+            "started": f"{datetime.fromtimestamp(self.begin_wall_ns // 10**9, UTC):%Y-%m-%d %H:%M:%S} UTC",
+            "status": self.status,
+            "failure": None
+            if failure is None
+            else {"reason": reason_of(failure), "message": failure.message[:_TEXT_LONGEST]},
+            "tags": list(self.tags),
             "metadata": {name: _short(each) for name, each in started.metadata.items()},
             "first": self._first,
-            "last": self.last,
-            "head": max(self.row.head, self.last),
+            "last": last,
+            "head": max(self.row.head, last),
             "full": self.is_full,
             "unlisted": dict(self._unlisted),
-            "opens": min(max(opens, self._first), self.last),
+            "opens": min(max(opens, self._first), last),
         }
 
     def _ended_since(self, after: int) -> list[int]:
         """Return the starts of the nodes that started up to event `after` and ended behind it."""
-        begin = bisect_right(self._ended_nodes, after, key=lambda each: each[0])
-        return [start for _, start in self._ended_nodes[begin:] if start <= after]
+        newest = takewhile(lambda start: self._ended_nodes[start] > after, reversed(self._ended_nodes))
+        return [start for start in newest if start <= after][::-1]
 
-    def _end_of(self, start: int) -> tuple[Any, ...]:
-        _, end, _, _, _, _, status, reason, message = self._nodes[start]
-        return start, end, status, reason, message
+    def _end_of(self, start: int) -> list[int]:
+        row = self._rows[start]
+        return [*row[:2], *row[6:]]
 
     def _object(self, identity: int, models: Mapping[str, Any], after: int) -> dict[str, Any] | None:
         """Return an object, or its identity with what changed behind event `after`; None if nothing did."""
-        each = self.world.objects[identity]
+        each, added = self.tracks.objects[identity], self.world.added[identity]
         poses, joints = each.poses.columns(after=after), _tracks(each.joints, after, points_max=None)
         if identity <= after:
             if not poses[0] and not joints and (each.removed or 0) <= after:
                 return None
             return {"id": identity, "removed": each.removed or 0, "poses": poses, "joints": joints}
-        name = model_name(each.added)
+        name = model_name(added)
         return {
             "id": identity,
-            "name": each.added.name,
-            "type": each.added.object_type,
+            "name": added.name,
+            "type": added.object_type,
             "model": name if name in models else "",
-            "color": each.added.color,
-            "base_link": each.added.base_link,
+            "color": added.color,
+            "base_link": added.base_link,
             "removed": each.removed or 0,
             "poses": poses,
             "joints": joints,
@@ -276,10 +241,9 @@ def model_name(added: ObjectAdded) -> str:
     return added.description or f"{added.object_type} {added.name}"
 
 
-def _newest(nodes: Reversible[list[Any]], after: int) -> list[list[Any]]:
+def _newest(rows: Reversible[list[int]], after: int) -> list[list[int]]:
     """Return the nodes that started behind event `after`, in their order."""
-    newest = list(takewhile(lambda each: each[0] > after, reversed(nodes)))
-    return newest[::-1]
+    return list(takewhile(lambda each: each[0] > after, reversed(rows)))[::-1]
 
 
 def _columns(rows: Sequence[Sequence[Any]], width: int) -> list[list[Any]]:
@@ -445,14 +409,13 @@ class Texts:
 
 # === recorded objects =========================================================================================
 #
-# Fold the objects of an episode's world into tracks: poses, joint positions, attachments, samples of the state.
+# Keep the history of an episode's world as tracks: poses, joint positions, attachments, samples of the state.
 
 
 @dataclass(slots=True)
 class RecordedObject:
-    """An object from its `ObjectAdded` to its `ObjectRemoved` (`removed` is None if it stayed)."""
+    """The tracks of an object from its `ObjectAdded` to its `ObjectRemoved` (`removed` is None if it stayed)."""
 
-    added: ObjectAdded
     poses: Track
     joints: dict[str, Track] = field(default_factory=dict)
     removed: int | None = None
@@ -462,6 +425,7 @@ class ObjectTracks:
     """The objects of a world with their tracks, as far as the events were read.
 
     Args:
+        world: the world that has read the same events.
         first: the first event that the page shows; a track has one value for all that came before it.
 
     Attributes:
@@ -472,14 +436,14 @@ class ObjectTracks:
         numbers: the number of values in the tracks of poses and joints, which bounds the size of the page.
     """
 
-    def __init__(self, first: int) -> None:
+    def __init__(self, world: ReplayedWorld, first: int) -> None:
+        self._world = world
         self._first = first
         self.objects: dict[int, RecordedObject] = {}
         self.attachments: list[list[Any]] = []
         self.samples: dict[int, dict[str, Track]] = {}
         self.full_until: int | None = None
         self.numbers = 0
-        self._present = 0
         self._removals_from: int | None = None
 
     def read(self, sequence: int, happening: Happening) -> None:
@@ -509,10 +473,9 @@ class ObjectTracks:
         self._removals_from = None
 
     def _add(self, sequence: int, added: ObjectAdded) -> None:
-        self.objects[sequence] = RecordedObject(added, Track(self._first))
+        self.objects[sequence] = RecordedObject(Track(self._first))
         self._move(sequence, sequence, added.pose)
         self._set_joints(sequence, sequence, added.joints)
-        self._present += 1
         self.full_until = None
 
     def _move(self, identity: int, sequence: int, pose: PoseValue) -> None:
@@ -537,10 +500,9 @@ class ObjectTracks:
         if removed is None or removed.removed is not None:
             return
         removed.removed = sequence
-        self._present -= 1
         if self._removals_from is None:
             self._removals_from = sequence
-        if self._present == 0:
+        if not self._world.objects:
             self.full_until = self._removals_from - 1
         for pair in self.attachments:
             if identity in pair[:2] and not pair[4]:
@@ -569,36 +531,33 @@ async def episode_document(
     begin, end = first or 1, min(last or row.head, row.head)
     if begin > end:
         raise CallerError(f"episode {row.number} has {row.head} events, and none from event {begin} to {last or end}")
-    fold = EpisodeFold(row, begin)
-    await read_into(fold, log, log.pages(row._replace(head=end)))
-    return await document_behind(fold, log)
+    page = EpisodePage(row, log.address, begin)
+    await read_into(page, log, log.pages(row._replace(head=end)))
+    return await document_behind(page, log)
 
 
-async def read_into(fold: EpisodeFold, log: EventLog, pages: AsyncIterable[Sequence[StoredEvent]]) -> None:
-    """Fold these events, up to the one at which the page is full.
+async def read_into(page: EpisodePage, log: EventLog, events: AsyncIterable[Sequence[StoredEvent]]) -> None:
+    """Read these events, up to the one at which the page is full.
 
     Raises `LogDamaged` or `DatabaseForeign` for an event that cannot be read.
     """
-    designators = await log.dtypes()
-    async for page in pages:
-        for event in page:
-            if fold.is_full:
+    page.dtypes = await log.dtypes()
+    async for some in events:
+        for event in some:
+            if page.is_full:
                 return
-            try:
-                fold.read(event, designators)
-            except CannotFold as reason:
-                raise unreadable(fold.row.id, event, str(reason), log.address) from None
+            page.read(event)
 
 
-async def document_behind(fold: EpisodeFold, log: EventLog, after: int = 0) -> dict[str, Any]:
-    """Return the document of the events that were folded, or the part of those behind event `after`."""
-    return fold.document(await _models(log, fold, after), after=after)
+async def document_behind(page: EpisodePage, log: EventLog, after: int = 0) -> dict[str, Any]:
+    """Return the document of the events that were read, or the part of those behind event `after`."""
+    return page.document(await _models(log, page, after), after=after)
 
 
-async def _models(log: EventLog, fold: EpisodeFold, after: int) -> Mapping[str, Any]:
+async def _models(log: EventLog, page: EpisodePage, after: int) -> Mapping[str, Any]:
     """Return the models of the objects that were added behind event `after`."""
-    added = [each for identity, each in fold.world.objects.items() if identity > after]
-    names = {each.added.description for each in added} - {None}
+    added = {identity: each for identity, each in page.world.added.items() if identity > after}
+    names = {each.description for each in added.values()} - {None}
     payloads = await log.descriptions([name for name in names if name is not None])
     meshes = Meshes(log)
     models: dict[str, Any] = {"": point_model("its description is not in the log")} if added or not after else {}
@@ -607,10 +566,10 @@ async def _models(log: EventLog, fold: EpisodeFold, after: int) -> Mapping[str, 
             models[name] = await meshes.model(description_of(payload))
         except ValueError as error:
             models[name] = point_model(f"its description cannot be read: {error}")
-    for each in added:
-        name = model_name(each.added)
-        if each.added.description is None and name not in models:
-            models[name] = assumed_model(each.added.name, each.added.object_type, set(each.joints))
+    for identity, each in added.items():
+        name = model_name(each)
+        if each.description is None and name not in models:
+            models[name] = assumed_model(each.name, each.object_type, set(page.tracks.objects[identity].joints))
     return models
 
 

@@ -115,7 +115,7 @@ def test_a_removed_end_of_an_episode_is_damage(tmp_path: Path) -> None:
 async def test_an_episode_that_no_page_can_be_made_of_leaves_the_pages_of_the_others(
     url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    _break(monkeypatch, document.EpisodeFold, "read", lambda fold, *_: fold.row.number == HOSTILE)
+    _break(monkeypatch, document.EpisodePage, "read", lambda page, *_: page.number == HOSTILE)
     async with Reading.open(url) as reading:
         written = await overview(reading, tmp_path / "all.html")
     assert set(written.unreadable) == {DAMAGED, HOSTILE}

@@ -23,7 +23,7 @@ from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.scene import object_model
 from pycrorm_async.record.recorded_episode import RecordedEpisode
 from pycrorm_async.report import document as episode_fold
-from pycrorm_async.report.document import EpisodeFold, Texts, Track, document_behind, episode_document, read_into
+from pycrorm_async.report.document import EpisodePage, Texts, Track, document_behind, episode_document, read_into
 from pycrorm_async.report.write import Report, page_of
 from pycrorm_async.store.log import episode_named
 from pycrorm_async.store.stored import StoredEvent
@@ -315,12 +315,12 @@ async def parts_of(recorded: Path, number: int, step: int) -> list[dict[str, Any
     """Return an episode's document in parts of so many events."""
     async with Reading.open(f"sqlite:///{recorded / 'pycrorm.db'}") as reading:
         log = await reading.log()
-        fold = EpisodeFold(await episode_named(log, str(number)))
+        page = EpisodePage(await episode_named(log, str(number)), log.address)
         parts = []
-        while events := await log.events(number, after=fold.last, limit=step):
-            after = fold.last
-            await read_into(fold, log, one_page(events))
-            parts.append(await document_behind(fold, log, after))
+        while events := await log.events(number, after=page.at.sequence, limit=step):
+            after = page.at.sequence
+            await read_into(page, log, one_page(events))
+            parts.append(await document_behind(page, log, after))
         return parts
 
 
@@ -349,11 +349,11 @@ async def test_the_part_behind_any_event_is_the_end_of_the_whole(recorded: Path)
     async with Reading.open(f"sqlite:///{recorded / 'pycrorm.db'}") as reading:
         log = await reading.log()
         whole = await episode_document(reading, 1)
-        fold = EpisodeFold(await episode_named(log, "1"))
-        await read_into(fold, log, log.pages(fold.row))
+        page = EpisodePage(await episode_named(log, "1"), log.address)
+        await read_into(page, log, log.pages(page.row))
         last = whole["episode"]["last"]
-        middle = await document_behind(fold, log, last // 2)
-        end = await document_behind(fold, log, last)
+        middle = await document_behind(page, log, last // 2)
+        end = await document_behind(page, log, last)
     assert sum(middle["times"]) == sum(whole["times"])
     assert [each for each in whole["nodes"][0] if each > last // 2] == middle["nodes"][0]
     assert [len(end[name]) for name in ("times", "texts", "objects", "models", "attachments", "series")] == [0] * 6
