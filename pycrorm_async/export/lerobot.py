@@ -23,7 +23,7 @@ from pycrorm_async.query.again import world_of
 from pycrorm_async.query.frames import needed_pyarrow
 from pycrorm_async.query.picture import png
 from pycrorm_async.query.reading import Reading
-from pycrorm_async.query.snapshot import Moment
+from pycrorm_async.query.snapshot import Moment, moments
 from pycrorm_async.query.text import parameters_text
 from pycrorm_async.world.pose import Vector
 from pycrorm_async.world.queries import Camera, photograph
@@ -317,13 +317,15 @@ async def draw_frames(
     camera = _camera(frames, size)
     sequences = sorted({each.sequence for each in frames.at})
     drawn: dict[int, NDArray[np.uint8]] = {}
-    for begin in range(0, len(sequences), _EVENTS_AT_ONCE):
-        part = sequences[begin : begin + _EVENTS_AT_ONCE]
-        moments = [await reading.as_of(episode.number, sequence=each) for each in part]
-        # In a thread with an empty context the world belongs to no open episode and is not recorded.
-        pictures = await asyncio.to_thread(Context().run, _drawn, moments, camera, size)
-        drawn.update(zip(part, pictures, strict=True))
-        report_events(part[-1])
+    waiting: list[Moment] = []
+    async for moment in moments(await reading.log(), episode.number, set(sequences)):
+        waiting.append(moment)
+        if len(waiting) == _EVENTS_AT_ONCE or moment.sequence == sequences[-1]:
+            # In a thread with an empty context the world belongs to no open episode and is not recorded.
+            pictures = await asyncio.to_thread(Context().run, _drawn, waiting, camera, size)
+            drawn.update(zip((each.sequence for each in waiting), pictures, strict=True))
+            report_events(moment.sequence)
+            waiting = []
     return [drawn[each.sequence] for each in frames.at]
 
 

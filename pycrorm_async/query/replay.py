@@ -211,7 +211,7 @@ class EpisodeReplay:
             if happening is not None:
                 self._apply(event, at, happening)
         except CannotFold as reason:
-            raise unreadable(self.id, event, str(reason), self._address) from None
+            raise _unreadable(self.id, event, str(reason), self._address) from None
         self.at, self.wall_ns = at, event.wall_ns
         return happening
 
@@ -278,7 +278,7 @@ class EpisodeReplay:
                     node.status = "LOST"
 
 
-def unreadable(episode: str, event: StoredEvent, reason: str, address: DatabaseAddress) -> PycrormError:
+def _unreadable(episode: str, event: StoredEvent, reason: str, address: DatabaseAddress) -> PycrormError:
     """Return the error for an event that cannot be applied: of a newer version, or damaged."""
     shape = EVENT_TYPES.get(event.type)
     if shape is not None and event.version <= shape.version:

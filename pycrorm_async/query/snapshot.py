@@ -16,7 +16,7 @@ from __future__ import annotations
 import html
 import itertools
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
@@ -263,10 +263,24 @@ async def as_of(
     if replay.at.sequence == 0:
         raise CallerError(f"{limit} is before episode {row.number} began")
     replay.dtypes = await log.dtypes()
-    objects = replay.world.objects.values()
-    payloads = await log.descriptions(
-        {each.added.description for each in objects if each.added.description is not None}
-    )
+    return await _moment_of(replay, log, meshes=meshes)
+
+
+async def moments(log: EventLog, number: int, sequences: Collection[int]) -> AsyncIterator[Moment]:
+    """Yield the state of an episode after each of these events, in one pass over its events."""
+    [row] = await log.episodes(number, number)
+    replay = EpisodeReplay(row, log.address)
+    replay.dtypes = await log.dtypes()
+    async for page in log.pages(row._replace(head=max(sequences))):
+        for event in page:
+            replay.read(event)
+            if event.sequence in sequences:
+                yield await _moment_of(replay, log)
+
+
+async def _moment_of(replay: EpisodeReplay, log: EventLog, *, meshes: bool = False) -> Moment:
+    described = {each.added.description for each in replay.world.objects.values()}
+    payloads = await log.descriptions({each for each in described if each is not None})
     descriptions = {name: _description(payload) for name, payload in payloads.items()}
     return moment_of(replay, descriptions, await _meshes(log, descriptions.values()) if meshes else {})
 
@@ -647,7 +661,7 @@ def _object(replay: EpisodeReplay, identity: int, value: WorldObject) -> ObjectT
         name=added.name,
         object_type=added.object_type,
         pose=pose,
-        joints=value.joints,
+        joints=dict(value.joints),  # the replay may go on
         attached_to=(holder.added.name, parent[1]) if holder is not None and parent is not None else None,
         description_fingerprint=added.description,
         color=added.color,

@@ -39,10 +39,10 @@ from pycrorm_async.projections.projector import Projector
 from pycrorm_async.query.named_queries import NodeSummary, Percept, PlaceSearch, percepts_of, searches_of
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.replay import EpisodeReplay
-from pycrorm_async.query.snapshot import AttachmentThen, Moment, NodeThen, RobotThen, moment_of
+from pycrorm_async.query.snapshot import AttachmentThen, Moment, NodeThen, RobotThen, moment_of, moments
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.stored import EpisodeRow
+from pycrorm_async.store.stored import EpisodeRow, StoredEvent
 from pycrorm_async.world.pose import Pose
 from tests.commands import answer, pycrorm
 from tests.databases import run_in_own_loop
@@ -263,6 +263,23 @@ async def test_a_time_selects_the_last_event_before_it(reading: Reading) -> None
 
 
 @pytest.mark.slow
+async def test_the_moments_of_one_pass_are_the_snapshots_after_each_of_these_events(
+    reading: Reading, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log, events = await reading.log(), {1, 6, 10, 14, 15}
+    expected = [await reading.as_of(1, sequence=each) for each in sorted(events)]
+    read: list[int] = []
+    real = EpisodeReplay.read
+
+    def noted(replay: EpisodeReplay, event: StoredEvent) -> Any:
+        read.append(event.sequence)
+        return real(replay, event)
+
+    monkeypatch.setattr(EpisodeReplay, "read", noted)
+    assert [each async for each in moments(log, 1, events)] == expected
+    assert read == [*range(1, 16)]
+
+
 async def test_a_moment_after_the_end_is_the_end(reading: Reading) -> None:
     end = await reading.as_of(1, sequence=len(STORY))
     for when in ({"sequence": 10**9}, {"time": 1e9}, {"time": datetime(2099, 1, 1, tzinfo=UTC)}):
