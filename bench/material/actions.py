@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from pycrorm_async.events.ids import row_id
 from pycrorm_async.recall.blocks import Block, Spread
-from pycrorm_async.recall.columns import Numbers, Sets, Symbols, Words
+from pycrorm_async.recall.columns import Column, Words
 from pycrorm_async.recall.search import Cue, Wanted
 
 __all__ = ["Actions", "BLOCK_CASES", "CUES"]
@@ -64,10 +64,10 @@ class Actions:
     def _block(self, rows: NDArray[np.int64]) -> Block:
         numbers, sizes = np.unique(self.types[rows], return_counts=True)
         types = tuple(f"Type{number:02}Action" for number in numbers)
-        texts: dict[str, Symbols | Sets] = {name: self._column(name, codes[rows]) for name, codes in self.texts.items()}
-        texts["status"] = Symbols(Words(("FAILED", "SUCCEEDED")), self.succeeded[rows].astype(np.uint8) + 1)
-        values = {name: Numbers(each[rows]) for name, each in self.numbers.items()}
-        values["duration"] = Numbers(np.full(rows.size, 2.5, np.float32))
+        texts = {name: self._column(name, codes[rows]) for name, codes in self.texts.items()}
+        texts["status"] = Column(self.succeeded[rows].astype(np.uint8) + 1, Words(("FAILED", "SUCCEEDED")))
+        values = {name: Column(each[rows]) for name, each in self.numbers.items()}
+        values["duration"] = Column(np.full(rows.size, 2.5, np.float32))
         return Block(
             dict(zip(types, sizes.tolist(), strict=True)),
             row_id(1, 0, 0) + (rows + 1) * 32,
@@ -77,10 +77,10 @@ class Actions:
             {name: Spread(types, column) for name, column in values.items()},
         )
 
-    def _column(self, name: str, codes: NDArray[np.int16]) -> Symbols:
+    def _column(self, name: str, codes: NDArray[np.int16]) -> Column:
         words = Words(f"{name.upper()}_{code}" for code in range(_TEXTS[name][0]))
         width = np.uint8 if len(words) < 256 else np.uint16
-        return Symbols(words, (codes + 1).astype(width))
+        return Column((codes + 1).astype(width), words)
 
     def _words(self, size: int, exponent: float, count: int) -> NDArray[np.int16]:
         shares = np.arange(1, size + 1) ** -float(exponent)

@@ -586,16 +586,14 @@ def _refuse_different(dtype: str, present: Mapping[str, Storage], columns: Mappi
 #
 # Three kinds of tables are not divided. `pycrorm_link_box` has the boxes of descriptions, each once by its content,
 # however many episodes use it: a catalogue of which each part needs a copy, as of the declarations. A row of
-# `recall_block` and `recall_column`, the index of the recall of all episodes, has cases of many of them, and 0 as its
-# episode. The checkpoints of a projection (`pycrorm_progress`) are keyed by the number of an episode, as `episode` is.
+# `recall_block`, the index of the recall of all episodes, has cases of many of them, and 0 as its episode. The
+# checkpoints of a projection (`pycrorm_progress`) are keyed by the number of an episode, as `episode` is.
 
 _TEXT_KEYS = {
     ("parameter_item", "field"),
     ("joint_change", "joint"),
     ("state_sample", "channel"),
     (LINK_BOX, "model"),
-    (f"{OWN}recall_column", "feature"),
-    (f"{OWN}recall_column", "kind"),
 }
 
 _INDEXED = {

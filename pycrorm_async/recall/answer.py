@@ -28,7 +28,7 @@ from pycrorm_async.query.notebook_html import cases_html
 from pycrorm_async.query.snapshot import Moment
 from pycrorm_async.query.success import interval_95
 from pycrorm_async.recall.blocks import EPISODE_SHIFT, CaseLibrary, Group
-from pycrorm_async.recall.columns import Case, Mask, is_angle, joined_words
+from pycrorm_async.recall.columns import Case, Mask, is_angle
 from pycrorm_async.recall.search import Cue, Match, Weights, closest, search, weights_of
 from pycrorm_async.visible_text import visible
 
@@ -543,8 +543,8 @@ class Sequences:
         width = len(self._statuses) + 1
         codes = {name: code for code, name in enumerate(self._types)}
         for group, first in zip(self._groups, self._firsts, strict=True):
-            statuses = joined_words([group.texts.get("status")], [len(group)], self._statuses)
-            outcomes[first : first + len(group)] = codes[group.type] * width + statuses.codes.astype(np.int64)
+            statuses = group.texts["status"].recoded(self._statuses).values.astype(np.int64)
+            outcomes[first : first + len(group)] = codes[group.type] * width + statuses
         following = np.full_like(self._places, -1)
         is_next = np.flatnonzero(self._keys[1:] == self._keys[:-1])
         following[self._by_parent[is_next]] = outcomes[self._by_parent[is_next + 1]]
@@ -597,7 +597,9 @@ class Sequences:
         width = len(self._statuses) + 1
         for outcome, count in enumerate(numbers):
             if count:
-                counts.setdefault(self._types[outcome // width], Counter())[self._statuses[outcome % width - 1]] = count
+                counts.setdefault(self._types[outcome // width], Counter())[
+                    str(self._statuses[outcome % width - 1])
+                ] = count
         followers = [
             Follower(name, each.total(), each.total() / outcomes.size, rate_of(each)) for name, each in counts.items()
         ]
@@ -629,9 +631,9 @@ def _chosen(group: Group, status: str | None, reason: str | None) -> Mask:
     for feature, word in (("status", status), ("reason", reason)):
         if word is not None:
             column = group.texts.get(feature)
-            chosen &= column is not None and column.equal_to(word, slice(None))
+            chosen &= column is not None and column.having(word)
     if "simulated" in group.texts:
-        chosen &= ~group.texts["simulated"].equal_to("yes", slice(None))
+        chosen &= ~group.texts["simulated"].present()
     return chosen
 
 

@@ -1,26 +1,8 @@
-"""A block holds many cases as columns; the section "block rows" encodes it as rows of a table.
+"""A block holds many cases as columns; the section "block bytes" encodes it for its row in the table.
 
 The cases of one type form a group, the newest first: by the time of their start, then by their node. Groups follow each
 other in the alphabetical order of their types. A column has the cases of those types that have its feature, so types
 whose parameters differ take no space from each other. Equal cases make equal columns, in any order and by any merges.
-
-**Block rows.** Encode a block as rows `(feature, kind, words, data)` of a table, and decode it from them.
-
-The groups follow each other in the alphabetical order of their types. The column of a feature holds one value for each
-case of the groups that have the feature, group after group.
-
-| kind | words | data, little-endian |
-|---|---|---|
-| `groups` (feature `type`) | the types, as a JSON list | uint32: the number of cases of each |
-| `integer64` (`node`, `started`) | NULL | int64 for each case: id of the node; µs since 1970 |
-| `integer32` (`parent`) | NULL | int32: sequence of the nearest action around it; 0 for none |
-| `symbol8`, `symbol16` | `{"types": [...], "words": [...]}` | uint8 or uint16: 0 for none, else 1 + the word's place |
-| `set8`, `set16` | the same | uint8: how many values each case has; then all values, as for `symbol` |
-| `number32`, `number64` | `{"types": [...]}` | float32 or float64; NaN for none |
-| `left_out` | NULL | empty: the feature has more than `WORDS_MAX` words here, so it is not kept |
-
-A feature may have a row of text and one of numbers: feature and kind name a row. Equal cases make equal rows, whatever
-their order. The words of a column are in alphabetical order.
 """
 
 from __future__ import annotations
@@ -29,12 +11,12 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import chain
 from operator import itemgetter
 from types import MappingProxyType
-from typing import Any, Final, Generic, NamedTuple, TypeVar
+from typing import Any, Final, NamedTuple
 
 import msgspec
 import numpy as np
@@ -45,14 +27,13 @@ from pycrorm_async.recall.columns import (
     FEATURES_MAX,
     RESERVED,
     Case,
-    Numbers,
-    Sets,
-    Symbols,
+    Column,
+    Rows,
+    Summary,
     Words,
-    bounded_case,
+    bounded,
     is_angle,
     joined,
-    joined_numbers,
     joined_words,
 )
 
@@ -65,8 +46,6 @@ EPISODE_SHIFT: Final = row_id(1, 0, 0).bit_length() - 1
 """The bits of a node's id below its episode's number."""
 
 _SEQUENCE: Final = row_id(0, 1, 0)
-_Column = TypeVar("_Column", Numbers, Symbols | Sets)
-Rows = slice | NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,10 +61,8 @@ class Group:
     nodes: NDArray[np.int64]
     started_us: NDArray[np.int64]
     parents: NDArray[np.int32]
-    texts: Mapping[str, Symbols | Sets]
-    numbers: Mapping[str, Numbers]
-    caches: dict[object, Any] = field(default_factory=dict, repr=False)
-    """Counts and sums of this group, computed at the first search; `CaseLibrary` and `joined_words` own the keys."""
+    texts: Mapping[str, Column]
+    numbers: Mapping[str, Column]
 
     def __len__(self) -> int:
         """Return the number of cases."""
@@ -102,8 +79,6 @@ class Group:
         texts = {name: value for name, column in self.texts.items() if (value := column.value(row)) is not None}
         numbers = {name: number for name, each in self.numbers.items() if (number := each.value(row)) is not None}
         status, reason, simulated = texts.pop("status", ""), texts.pop("reason", None), texts.pop("simulated", None)
-        assert isinstance(status, str)
-        assert reason is None or isinstance(reason, str)
         return Case(
             node,
             int(self.started_us[row]),
@@ -118,12 +93,14 @@ class Group:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class Spread(Generic[_Column]):
+class Spread(NamedTuple):
     """A column over the groups of some types of a block, in their order."""
 
     types: tuple[str, ...]
-    column: _Column
+    column: Column
+
+
+Spreads = Mapping[str, Spread]
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,39 +118,34 @@ class Block:
     nodes: NDArray[np.int64]
     started_us: NDArray[np.int64]
     parents: NDArray[np.int32]
-    texts: Mapping[str, Spread[Symbols | Sets]]
-    numbers: Mapping[str, Spread[Numbers]]
+    texts: Spreads
+    numbers: Spreads
     left_out: frozenset[str] = frozenset()
 
     @classmethod
     def of(cls, cases: Iterable[Case]) -> Block:
-        """Make a block of cases, each as `bounded_case` returns it."""
-        rows = [case if len(case.symbols) + len(case.numbers) <= FEATURES_MAX else bounded_case(case) for case in cases]
-        counts = Counter(case.type for case in rows)
-        sizes = {name: counts[name] for name in sorted(counts)}
-        codes = {name: code for code, name in enumerate(sizes)}
-        types = np.array([codes[case.type] for case in rows])
-        nodes = np.array([case.node for case in rows], np.int64)
-        started = np.array([case.started_us for case in rows], np.int64)
-        order = np.lexsort((-nodes, -started, types))
-        ordered = [rows[place] for place in order.tolist()]
-        columns = list(zip(*ordered, strict=True)) or [()] * len(Case._fields)
-        *_, symbols, numbers, statuses, reasons, durations, parents, simulated = columns
-        texts: dict[str, Spread[Symbols | Sets]] = {
-            "status": _spread(sizes, _texts, statuses),
-            "reason": _spread(sizes, _texts, reasons),
-            "simulated": _spread(sizes, _texts, ["yes" if each else None for each in simulated]),
-            **_spreads(sizes, _texts, symbols),
-        }
-        values = {"duration": _spread(sizes, Numbers.of, durations), **_spreads(sizes, Numbers.of, numbers)}
+        """Make a block of cases, at least one.
+
+        A block keeps a case without infinite numbers, long texts and features beyond `FEATURES_MAX`, and with rounded
+        numbers. What it keeps depends on the case alone, so an action gives the same case in any block.
+        """
+        rows = [case if len(case.symbols) + len(case.numbers) <= FEATURES_MAX else _limited(case) for case in cases]
+        rows.sort(key=lambda case: (case.type, -case.started_us, -case.node))
+        sizes = Counter(case.type for case in rows)
+        nodes, started_us, _, symbols, numbers, statuses, reasons, durations, parents, simulated = zip(
+            *rows, strict=True
+        )
+        texts = _owned(sizes, symbols)
+        texts |= {"status": (sizes, statuses), "reason": (sizes, reasons)}
+        texts["simulated"] = sizes, ["yes" if each else None for each in simulated]
         return _without_long_dictionaries(
             cls(
                 sizes,
-                nodes[order],
-                started[order],
+                np.array(nodes, np.int64),
+                np.array(started_us, np.int64),
                 (np.array([each or 0 for each in parents], np.int64) // _SEQUENCE & SEQUENCE_MAX).astype(np.int32),
-                {name: each for name, each in sorted(texts.items()) if each.types},
-                {name: each for name, each in sorted(values.items()) if each.types},
+                _spreads(texts, Column.of_texts),
+                _spreads(_owned(sizes, numbers) | {"duration": (sizes, durations)}, Column.of_numbers),
             )
         )
 
@@ -188,61 +160,49 @@ class Block:
     @cached_property
     def spans(self) -> dict[str, slice]:
         """The places of the cases of each type."""
-        spans, first = {}, 0
-        for name, size in self.sizes.items():
-            spans[name] = slice(first, first + size)
-            first += size
-        return spans
+        ends = np.cumsum([*self.sizes.values()]).tolist()
+        return {name: slice(end - size, end) for (name, size), end in zip(self.sizes.items(), ends, strict=True)}
 
     @cached_property
     def groups(self) -> dict[str, Group]:
-        """The groups by type, in alphabetical order."""
-        return {name: self.group(name) for name in self.sizes}
+        """The groups by type, in alphabetical order; their columns share the memory of the block."""
+        texts, numbers = self._parts(self.texts), self._parts(self.numbers)
+        return {
+            name: Group(name, self.nodes[span], self.started_us[span], self.parents[span], texts[name], numbers[name])
+            for name, span in self.spans.items()
+        }
 
-    def group(self, name: str) -> Group:
-        """Return the cases of a type, always the same object; the columns share the memory of the block."""
-        if name not in self._made:
-            self._made[name] = self._group(name)
-        return self._made[name]
-
-    @cached_property
-    def _made(self) -> dict[str, Group]:
-        return {}
-
-    def _group(self, name: str) -> Group:
-        span = self.spans[name]
-        return Group(
-            name,
-            self.nodes[span],
-            self.started_us[span],
-            self.parents[span],
-            {feature: self._part(each, name) for feature, each in self.texts.items() if name in each.types},
-            {feature: self._part(each, name) for feature, each in self.numbers.items() if name in each.types},
-        )
+    def _parts(self, spreads: Spreads) -> dict[str, dict[str, Column]]:
+        parts: dict[str, dict[str, Column]] = {name: {} for name in self.sizes}
+        for feature, (types, column) in spreads.items():
+            first = 0
+            for name in types:
+                last = first + self.sizes[name]
+                parts[name][feature] = column.taken(slice(first, last))
+                first = last
+        return parts
 
     def where(self, kept: NDArray[np.bool_]) -> Block:
         """Return the block with those of its cases for which `kept` is True, in their order."""
         sizes = {name: size for name, span in self.spans.items() if (size := int(kept[span].sum()))}
-        columns = self.nodes[kept], self.started_us[kept], self.parents[kept]
-        texts = {name: self._where(each, kept, sizes) for name, each in self.texts.items()}
-        numbers = {name: self._where(each, kept, sizes) for name, each in self.numbers.items()}
-        texts = {name: each for name, each in texts.items() if each.types}
-        numbers = {name: each for name, each in numbers.items() if each.types}
-        return Block(sizes, *columns, texts, numbers, self.left_out)
 
-    def _where(self, spread: Spread[_Column], kept: NDArray[np.bool_], sizes: Mapping[str, int]) -> Spread[_Column]:
-        column = spread.column.taken(np.flatnonzero(kept[self.rows_of(spread.types)]))
-        return Spread(tuple(name for name in spread.types if name in sizes), column)
+        def where(spreads: Spreads) -> Spreads:
+            columns = {
+                feature: Spread(
+                    tuple(name for name in types if name in sizes), column.taken(kept[self.rows_of(types)].nonzero()[0])
+                )
+                for feature, (types, column) in spreads.items()
+            }
+            return {feature: each for feature, each in columns.items() if each.types}
+
+        columns = self.nodes[kept], self.started_us[kept], self.parents[kept]
+        return Block(sizes, *columns, where(self.texts), where(self.numbers), self.left_out)
 
     def rows_of(self, types: tuple[str, ...]) -> Rows:
         """Return the places of the cases of these types."""
         if len(types) == len(self.sizes):
             return slice(None)
         return np.concatenate([np.arange(self.spans[name].start, self.spans[name].stop) for name in types])
-
-    def _part(self, spread: Spread[_Column], name: str) -> _Column:
-        first = sum(self.sizes[each] for each in spread.types[: spread.types.index(name)])
-        return spread.column.part(first, first + self.sizes[name])
 
 
 def merge(blocks: Sequence[Block]) -> Block:
@@ -253,8 +213,8 @@ def merge(blocks: Sequence[Block]) -> Block:
     nodes = np.concatenate([each.nodes for each in blocks])
     started = np.concatenate([each.started_us for each in blocks])
     order = np.lexsort((-nodes, -started, types))
-    sizes = dict(zip(names, np.bincount(types, minlength=len(names)).tolist(), strict=True))
     parents = np.concatenate([each.parents for each in blocks])[order]
+    sizes = dict(zip(names, np.bincount(types).tolist(), strict=True))
     left_out = frozenset[str]().union(*(each.left_out for each in blocks))
     merged = Block(sizes, nodes[order], started[order], parents, {}, {}, left_out)
     rows: dict[tuple[Block, tuple[str, ...]], Rows] = {}
@@ -264,56 +224,48 @@ def merge(blocks: Sequence[Block]) -> Block:
             rows[block, owners] = block.rows_of(owners)
         return rows[block, owners]
 
-    def joined(spreads: Sequence[Spread[_Column] | None], join: Callable[..., _Column]) -> Spread[_Column]:
-        owned = {name for each in spreads if each is not None for name in each.types}
-        owners = tuple(name for name in names if name in owned)
-        whole = join(
-            [
-                None if each is None else each.column.placed(places(block, each.types), len(block))
-                for block, each in zip(blocks, spreads, strict=True)
-            ],
-            [len(block) for block in blocks],
-        )
-        return Spread(owners, whole.taken(order).taken(places(merged, owners)))
+    def merged_spreads(spreads_of_blocks: Sequence[Spreads]) -> Spreads:
+        spreads = {}
+        for feature in sorted(frozenset[str]().union(*spreads_of_blocks)):
+            having = [each.get(feature) for each in spreads_of_blocks]
+            owned = frozenset(chain.from_iterable(each.types for each in having if each is not None))
+            whole = joined(
+                [
+                    None if each is None else each.column.placed(places(block, each.types), len(block))
+                    for block, each in zip(blocks, having, strict=True)
+                ],
+                [*map(len, blocks)],
+            )
+            owners = tuple(name for name in names if name in owned)
+            spreads[feature] = Spread(owners, whole.taken(order).taken(places(merged, owners)))
+        return spreads
 
-    texts = {
-        name: joined([block.texts.get(name) for block in blocks], joined_words)
-        for name in sorted({name for block in blocks for name in block.texts} - left_out)
-    }
-    numbers = {
-        name: joined([block.numbers.get(name) for block in blocks], joined_numbers)
-        for name in sorted({name for block in blocks for name in block.numbers})
-    }
-    return _without_long_dictionaries(
-        Block(sizes, merged.nodes, merged.started_us, merged.parents, texts, numbers, left_out)
-    )
+    texts, numbers = merged_spreads([each.texts for each in blocks]), merged_spreads([each.numbers for each in blocks])
+    return _without_long_dictionaries(replace(merged, texts=texts, numbers=numbers))
 
 
 # --- columns of cases -----------------------------------------------------------------------------------------
 
+_Owned = dict[str, tuple[Mapping[str, int], Sequence[Any]]]
+"""The values of each feature, in those types that have it, which are given with their sizes."""
 
-def _spreads(
-    sizes: Mapping[str, int], column: Callable[[Sequence[Any]], _Column], situations: Sequence[Mapping[str, Any]]
-) -> dict[str, Spread[_Column]]:
-    """Make the column of each feature of the situations, each over the types that have it."""
-    owners: dict[str, list[str]] = {}
+
+def _owned(sizes: Mapping[str, int], situations: Sequence[Mapping[str, Any]]) -> _Owned:
+    """Return the values of each feature of the situations, None where a case of a type does not have it."""
+    owners: dict[str, dict[str, int]] = {}
     values: dict[str, list[Any]] = {}
     first = 0
     for name, size in sizes.items():
         for feature, each in _values_by_feature(situations[first : first + size]).items():
-            owners.setdefault(feature, []).append(name)
+            owners.setdefault(feature, {})[name] = size
             values.setdefault(feature, []).extend(each)
         first += size
     reserved = RESERVED.intersection(owners)
     assert not reserved, f"features of a situation cannot be named {', '.join(sorted(reserved))}"
-    spreads = {}
-    for feature, types in owners.items():
-        spreads[feature] = _spread({name: sizes[name] for name in types}, column, values[feature])
-    return spreads
+    return {feature: (types, values[feature]) for feature, types in owners.items()}
 
 
 def _values_by_feature(situations: Sequence[Mapping[str, Any]]) -> Mapping[str, Sequence[Any]]:
-    """Return the values of each feature of the situations, None where one does not have it."""
     names = tuple(situations[0])
     if len(names) > 1 and {*map(len, situations)} == {len(names)}:  # as of most types, whose fields are always set
         with suppress(KeyError):
@@ -322,187 +274,100 @@ def _values_by_feature(situations: Sequence[Mapping[str, Any]]) -> Mapping[str, 
     return {feature: [each.get(feature) for each in situations] for feature in features}
 
 
-def _spread(
-    sizes: Mapping[str, int], column: Callable[[Sequence[Any]], _Column], values: Sequence[Any]
-) -> Spread[_Column]:
-    """Make the column of a feature, without the types of which no case has a value that is kept."""
-    spread = Spread(tuple(sizes), column(values))
-    present = spread.column.present()
-    if present.all():
-        return spread
-    firsts = np.cumsum([0, *sizes.values()])[:-1]
-    having = np.logical_or.reduceat(present, firsts).tolist()
-    types = tuple(name for name, each in zip(sizes, having, strict=True) if each)
-    kept = np.repeat(having, [*sizes.values()])
-    return spread if all(having) else Spread(types, spread.column.taken(np.flatnonzero(kept)))
+def _spreads(owned: _Owned, column_of: Callable[[Sequence[Any]], Column]) -> Spreads:
+    """Make the column of each feature, without the types of which no case has a value that is kept."""
+    spreads = {}
+    for feature, (sizes, values) in sorted(owned.items()):
+        column, types = column_of(values), tuple(sizes)
+        present = column.present()
+        if not present.all():
+            having = np.logical_or.reduceat(present, np.cumsum([0, *sizes.values()])[:-1])
+            types = tuple(name for name, each in zip(sizes, having.tolist(), strict=True) if each)
+            column = column.taken(np.repeat(having, [*sizes.values()]).nonzero()[0])
+        if types:
+            spreads[feature] = Spread(types, column)
+    return spreads
 
 
-def _texts(values: Sequence[Any]) -> Symbols | Sets:
-    return Sets.of(values) if tuple in {*map(type, values)} else Symbols.of(values)
+def _limited(case: Case) -> Case:
+    """Return a case with the first `FEATURES_MAX` of its features that a block keeps."""
+    symbols = {name: value for name, value in case.symbols.items() if bounded(value)}
+    numbers = {name: number for name, number in case.numbers.items() if math.isfinite(number)}
+    kept = {*sorted({*symbols, *numbers})[:FEATURES_MAX]}
+    return case._replace(
+        symbols={name: value for name, value in symbols.items() if name in kept},
+        numbers={name: number for name, number in numbers.items() if name in kept},
+    )
 
 
 def _without_long_dictionaries(block: Block) -> Block:
-    long = {name for name, each in block.texts.items() if len(each.column.words) > WORDS_MAX}
-    if not long:
+    long = {name for name, each in block.texts.items() if each.column.words.word_count > WORDS_MAX}
+    left_out = block.left_out | long
+    if not left_out:
         return block
-    texts = {name: each for name, each in block.texts.items() if name not in long}
-    columns = block.nodes, block.started_us, block.parents
-    return Block(block.sizes, *columns, texts, block.numbers, block.left_out | long)
+    return replace(
+        block, texts={name: each for name, each in block.texts.items() if name not in left_out}, left_out=left_out
+    )
 
 
-# === block rows ===============================================================================================
-
-_Shape = TypeVar("_Shape")
-
-
-class BlockRow(NamedTuple):
-    """One row of a stored block; see the module."""
-
-    feature: str
-    kind: str
-    words: str | None
-    data: bytes
+# === block bytes ==============================================================================================
+#
+# The bytes of a block: the length of its heading in 8 bytes, the heading as MessagePack, and the arrays, all
+# little-endian. The heading and each array are followed by zeros up to a multiple of 8 bytes, so that arrays can be
+# used where they are read. A block of 65,536 cases is decoded in 0.1 ms, as `npz` in 5 ms; Arrow would be a dependency.
 
 
-def encode(block: Block) -> list[BlockRow]:
-    """Return the rows of a block. Raises `ValueError` for a block without a case."""
-    if not block.sizes:
-        raise ValueError("a block without a case has no rows")
-    return [
-        BlockRow("type", "groups", _json(list(block.sizes)), np.array([*block.sizes.values()], "<u4").tobytes()),
-        BlockRow("node", "integer64", None, block.nodes.astype("<i8").tobytes()),
-        BlockRow("started", "integer64", None, block.started_us.astype("<i8").tobytes()),
-        BlockRow("parent", "integer32", None, block.parents.astype("<i4").tobytes()),
-        *(_text_row(name, each) for name, each in block.texts.items()),
-        *(_number_row(name, each) for name, each in block.numbers.items()),
-        *(BlockRow(name, "left_out", None, b"") for name in sorted(block.left_out)),
-    ]
+class _Heading(msgspec.Struct, array_like=True):
+    """The number of cases of each type, feature, types, kind and dictionary of each column, and what is left out.
+
+    The arrays are the nodes and starts (int64), the parents (int32), and the values of each column of this kind.
+    """
+
+    sizes: dict[str, int]
+    columns: list[tuple[str, tuple[str, ...], str, list[str | tuple[str, ...]] | None]]
+    left_out: list[str]
 
 
-def decode(rows: Iterable[tuple[str, str, str | None, bytes]]) -> Block:
-    """Return the block of these rows, in any order. Raises `ValueError` if they contradict each other."""
-    by_key = {(feature, kind): (words, data) for feature, kind, words, data in rows}
-    try:
-        names, sizes = by_key.pop(("type", "groups"))
-        nodes, started, parents = (
-            by_key.pop(each)[1] for each in (("node", "integer64"), ("started", "integer64"), ("parent", "integer32"))
-        )
-    except KeyError as error:
-        raise ValueError(f"the block has no row {error}") from None
-    groups = _sizes(_decoded(names, list[str]), _array(sizes, "<u4"))
-    texts: dict[str, Spread[Symbols | Sets]] = {}
-    numbers: dict[str, Spread[Numbers]] = {}
-    left_out = set()
-    for (feature, kind), (words, data) in sorted(by_key.items()):
-        if kind == "left_out":
-            left_out.add(feature)
-        elif kind in ("number32", "number64"):
-            numbers[feature] = _numbers(feature, kind, words, data, groups)
+_heading: Final = msgspec.msgpack.Decoder(_Heading).decode
+
+
+def encode(block: Block) -> bytes:
+    """Return the bytes of a block."""
+    spreads = [*block.texts.items(), *block.numbers.items()]
+    columns = [(name, types, _kind(each.values), each.dictionary()) for name, (types, each) in spreads]
+    heading = msgspec.msgpack.encode(_Heading({**block.sizes}, columns, sorted(block.left_out)))
+    arrays: list[NDArray[Any]] = [block.nodes, block.started_us, block.parents]
+    arrays += [each.column.values for _, each in spreads]
+    parts = [len(heading).to_bytes(8, "little"), heading, *(each.astype(_kind(each)).tobytes() for each in arrays)]
+    return b"".join(chain.from_iterable((each, bytes(-len(each) % 8)) for each in parts))
+
+
+def decode(data: bytes) -> Block:
+    """Return the block of the bytes that `encode` made; its arrays share their memory."""
+    place = 8 + int.from_bytes(data[:8], "little")
+    heading = _heading(data[8:place])
+
+    def array(kind: str, count: int) -> NDArray[Any]:
+        nonlocal place
+        place += -place % 8
+        values = np.frombuffer(data, kind, count, place)
+        place += values.nbytes
+        return values
+
+    count = sum(heading.sizes.values())
+    arrays = array("<i8", count), array("<i8", count), array("<i4", count)
+    texts, numbers = {}, {}
+    for feature, types, kind, words in heading.columns:
+        values = array(kind, sum(heading.sizes[name] for name in types))
+        if words is None:
+            numbers[feature] = Spread(types, Column(values))
         else:
-            texts[feature] = _row_texts(feature, kind, words, data, groups)
-    count = sum(groups.values())
-    node, start, parent = _array(nodes, "<i8", count), _array(started, "<i8", count), _array(parents, "<i4", count)
-    block = Block(groups, node, start, parent, texts, numbers, frozenset(left_out))
-    _validate_order(block)
-    return block
+            texts[feature] = Spread(types, Column(values, Words(words)))
+    return Block(heading.sizes, *arrays, texts, numbers, frozenset(heading.left_out))
 
 
-# --- rows of columns ------------------------------------------------------------------------------------------
-
-
-class _Types(msgspec.Struct):
-    types: list[str]
-
-
-class _Dictionary(_Types):
-    words: list[str]
-
-
-def _text_row(name: str, spread: Spread[Symbols | Sets]) -> BlockRow:
-    column = spread.column
-    words = _json({"types": spread.types, "words": tuple(column.words)})
-    width = 1 if len(column.words) < 256 else 2
-    codes = column.codes.astype(f"<u{width}").tobytes()
-    if isinstance(column, Sets):
-        return BlockRow(name, f"set{8 * width}", words, column.sizes.tobytes() + codes)
-    return BlockRow(name, f"symbol{8 * width}", words, codes)
-
-
-def _number_row(name: str, spread: Spread[Numbers]) -> BlockRow:
-    values = spread.column.values
-    data = values.astype(f"<f{values.itemsize}").tobytes()
-    return BlockRow(name, f"number{8 * values.itemsize}", _json({"types": spread.types}), data)
-
-
-def _numbers(feature: str, kind: str, words: str | None, data: bytes, groups: Mapping[str, int]) -> Spread[Numbers]:
-    types = _decoded(words, _Types).types
-    count = _count(feature, types, groups)
-    return Spread(tuple(types), Numbers(_array(data, "<f4" if kind == "number32" else "<f8", count)))
-
-
-def _row_texts(
-    feature: str, kind: str, words: str | None, data: bytes, groups: Mapping[str, int]
-) -> Spread[Symbols | Sets]:
-    if kind not in ("symbol8", "symbol16", "set8", "set16"):
-        raise ValueError(f"feature {feature!r} has the unknown kind {kind!r}")
-    dictionary = _decoded(words, _Dictionary)
-    vocabulary, types = Words(dictionary.words), tuple(dictionary.types)
-    count = _count(feature, dictionary.types, groups)
-    dtype = "<u1" if kind.endswith("8") else "<u2"
-    if kind.startswith("symbol"):
-        codes = _array(data, dtype, count)
-        _validate_codes(feature, codes, vocabulary)
-        return Spread(types, Symbols(vocabulary, codes))
-    sizes = _array(data[:count], "<u1", count)
-    codes = _array(data[count:], dtype, int(sizes.sum(dtype=np.int64)))
-    _validate_codes(feature, codes, vocabulary)
-    return Spread(types, Sets(vocabulary, sizes, codes))
-
-
-def _validate_codes(feature: str, codes: NDArray[Any], words: Words) -> None:
-    if codes.size and int(codes.max()) > len(words):
-        raise ValueError(f"feature {feature!r} has the code {int(codes.max())} and {len(words)} words")
-
-
-def _sizes(types: Sequence[str], sizes: NDArray[Any]) -> dict[str, int]:
-    if len(types) != sizes.size or len(set(types)) != len(types):
-        raise ValueError(f"the block has {len(types)} types and {sizes.size} sizes of groups")
-    return dict(zip(types, sizes.tolist(), strict=True))
-
-
-def _count(feature: str, types: Sequence[str], groups: Mapping[str, int]) -> int:
-    """Return the length of a column that has these types only."""
-    owners = set(types)
-    if list(types) != [name for name in groups if name in owners]:
-        raise ValueError(f"feature {feature!r} has the types {types!r}, the block {list(groups)!r}")
-    return sum(groups[name] for name in types)
-
-
-def _array(data: bytes, dtype: str, count: int | None = None) -> NDArray[Any]:
-    """Return the values; `count` is their number, if the block knows it."""
-    if len(data) % np.dtype(dtype).itemsize or count not in (None, len(data) // np.dtype(dtype).itemsize):
-        raise ValueError(f"{len(data)} bytes are not {count} values of {np.dtype(dtype).name}")
-    return np.frombuffer(data, dtype)
-
-
-def _json(value: object) -> str:
-    return msgspec.json.encode(value).decode()
-
-
-def _decoded(text: str | None, shape: type[_Shape]) -> _Shape:
-    try:
-        return msgspec.json.decode(text or "", type=shape)
-    except (msgspec.DecodeError, msgspec.ValidationError) as error:
-        raise ValueError(f"the words of a column cannot be read: {error}") from None
-
-
-def _validate_order(block: Block) -> None:
-    """Raise `ValueError` for cases of one type that are not in order."""
-    ages = np.diff(block.started_us)
-    wrong = (ages > 0) | ((ages == 0) & (np.diff(block.nodes) >= 0))
-    wrong[np.cumsum([*block.sizes.values()])[:-1] - 1] = False
-    if wrong.any():
-        raise ValueError("the cases of a type are not in the order of their starts")
+def _kind(values: NDArray[Any]) -> str:
+    return f"<{values.dtype.kind}{values.itemsize}"
 
 
 # === library ==================================================================================================
@@ -522,8 +387,8 @@ class CaseLibrary:
     """The cases of a memory at one moment, which never change: a reader makes a new library when it has more blocks.
 
     `type` None means the cases of all types in each method. A renamed type is found by any of its names; its cases
-    carry the present name. Counts are cached in the library, and those of one group in `Group.caches`, which belong to
-    the block and therefore serve the next library too. No lock protects the caches.
+    carry the present name. Counts are cached in the library, and those of one column in it, which belongs to the block
+    and therefore serves the next library too. No lock protects the caches.
 
     Args:
         blocks: the cases.
@@ -534,11 +399,9 @@ class CaseLibrary:
     def __init__(self, blocks: Sequence[Block] = (), names: Mapping[str, str] = MappingProxyType({})) -> None:
         self.blocks = tuple(blocks)
         self._names = names
-        self._spreads: dict[tuple[str | None, str], float] = {}
         self._groups: dict[str | None, tuple[Group, ...]] = {}
         self._words: dict[str, Words] = {}
-        self._texts: dict[str | None, frozenset[str]] = {}
-        self._numbers: dict[str | None, frozenset[str]] = {}
+        self._features: dict[str | None, tuple[frozenset[str], frozenset[str]]] = {}
 
     def __len__(self) -> int:
         """Return the number of cases."""
@@ -590,22 +453,23 @@ class CaseLibrary:
         """Return the groups of a type, that with the newest case first."""
         groups = self._groups.get(type)
         if groups is None:
-            chosen = [self._group(block, name) for block in self.blocks for name in block.sizes if self._is(name, type)]
+            chosen = [
+                self._group(block.groups[name]) for block in self.blocks for name in block.sizes if self._is(name, type)
+            ]
             groups = tuple(sorted(chosen, key=lambda each: (-int(each.started_us[0]), -int(each.nodes[0]))))
             self._groups[type] = groups
         return groups
 
+    def _group(self, group: Group) -> Group:
+        present = self.present_name(group.type)
+        return group if present == group.type else replace(group, type=present)
+
     def words(self, feature: str) -> Words:
         """Return one dictionary of a text feature, for the cases of all types."""
-        words = self._words.get(feature)
-        if words is None:
+        if feature not in self._words:
             columns = (block.texts[feature].column for block in self.blocks if feature in block.texts)
-            words = self._words[feature] = joined(column.words for column in columns)
-        return words
-
-    def _group(self, block: Block, name: str) -> Group:
-        group, present = block.group(name), self.present_name(name)
-        return group if present == name else replace(group, type=present)
+            self._words[feature] = joined_words(column.words for column in columns) or Words()
+        return self._words[feature]
 
     def size(self, type: str | None = None) -> int:  # noqa: A002
         """Return the number of cases of a type."""
@@ -613,31 +477,23 @@ class CaseLibrary:
 
     def seen(self, type: str | None, feature: str, word: str) -> int:  # noqa: A002
         """Return the number of cases of a type whose text feature has this word."""
-        total, key = 0, ("counts", feature)
-        for group in self.groups(type):
-            column = group.texts.get(feature)
-            code = 0 if column is None else column.words.code(word)
-            if column is not None and code:
-                counts = group.caches.get(key)
-                if counts is None:
-                    counts = group.caches[key] = column.counts().tolist()
-                total += counts[code]
-        return total
+        return sum(group.texts[feature].count(word) for group in self.groups(type) if feature in group.texts)
 
     def texts(self, type: str | None = None) -> frozenset[str]:  # noqa: A002
         """Return the names of the text features of a type, those of the outcome among them."""
-        names = self._texts.get(type)
-        if names is None:
-            every = frozenset(chain.from_iterable(group.texts for group in self.groups(type)))
-            names = self._texts[type] = every - (RESERVED - {"status", "reason"}) - self.left_out
-        return names
+        return self._features_of(type)[0]
 
     def numbers(self, type: str | None = None) -> frozenset[str]:  # noqa: A002
         """Return the names of the numbers of a type, the duration among them."""
-        names = self._numbers.get(type)
-        if names is None:
-            names = self._numbers[type] = frozenset(chain.from_iterable(group.numbers for group in self.groups(type)))
-        return names
+        return self._features_of(type)[1]
+
+    def _features_of(self, type: str | None) -> tuple[frozenset[str], frozenset[str]]:  # noqa: A002
+        if type not in self._features:
+            groups = self.groups(type)
+            texts = frozenset(chain.from_iterable(group.texts for group in groups))
+            numbers = frozenset(chain.from_iterable(group.numbers for group in groups))
+            self._features[type] = texts - (RESERVED - {"status", "reason"}) - self.left_out, numbers
+        return self._features[type]
 
     def tolerance(self, type: str | None, feature: str) -> float:  # noqa: A002
         """Return the tolerance of a number for which the cue has none: its standard deviation, to two digits.
@@ -647,20 +503,23 @@ class CaseLibrary:
         """
         if is_angle(feature):
             return ANGLE_TOLERANCE
-        spread = self._spreads.get((type, feature))
-        if spread is None:
-            groups = [group for group in self.groups(type) if feature in group.numbers]
-            spread = self._spreads[type, feature] = float(f"{_standard_deviation(groups, feature):.1e}")
-        return spread if spread > 0 else 1.0
+        low, high = self.range_of(type, feature) or (0.0, 0.0)
+        if low == high:
+            return 1.0
+        parts = self._summaries(type, feature)
+        size = sum(each.size for each in parts)
+        mean = math.fsum(each.size * each.mean for each in parts) / size
+        squares = math.fsum(each.size * (each.variance + (each.mean - mean) ** 2) for each in parts)
+        return float(f"{math.sqrt(squares / size):.1e}")
 
     def range_of(self, type: str | None, feature: str) -> tuple[float, float] | None:  # noqa: A002
         """Return the least and the greatest number of a feature among the cases of a type; None without any."""
-        groups = [group for group in self.groups(type) if feature in group.numbers]
-        ranges = [_cached(group, ("range", feature), lambda group: _range(group, feature)) for group in groups]
-        lows_and_highs = [each for each in ranges if each is not None]
-        if not lows_and_highs:
-            return None
-        return min(low for low, _ in lows_and_highs), max(high for _, high in lows_and_highs)
+        parts = self._summaries(type, feature)
+        return (min(each.least for each in parts), max(each.greatest for each in parts)) if parts else None
+
+    def _summaries(self, type: str | None, feature: str) -> list[Summary]:  # noqa: A002
+        columns = (group.numbers[feature] for group in self.groups(type) if feature in group.numbers)
+        return [summary for column in columns if (summary := column.summary) is not None]
 
     def find(self, node: int) -> Case | None:
         """Return the case of a node; None if it has none."""
@@ -680,37 +539,6 @@ def _exceeds(dictionaries: Sequence[Words]) -> bool:
 
     Checks the sum of sizes first, because it usually decides without building the union.
     """
-    return sum(map(len, dictionaries)) > WORDS_MAX and len({*chain.from_iterable(dictionaries)}) > WORDS_MAX
-
-
-def _standard_deviation(groups: Sequence[Group], feature: str) -> float:
-    """Compute the standard deviation from sums about the midrange, to avoid cancellation."""
-    ranges = [_cached(group, ("range", feature), lambda group: _range(group, feature)) for group in groups]
-    ranges = [each for each in ranges if each is not None]
-    if not ranges:
-        return 0.0
-    middle = (min(low for low, _ in ranges) + max(high for _, high in ranges)) / 2
-    parts = [
-        _cached(group, ("moments", feature, middle), lambda group: _moments(group, feature, middle)) for group in groups
-    ]
-    count, total, squares = (math.fsum(each) for each in zip(*parts, strict=True))
-    return math.sqrt(max(0.0, squares / count - (total / count) ** 2))
-
-
-def _range(group: Group, feature: str) -> tuple[float, float] | None:
-    column = group.numbers[feature]
-    values = column.values[column.present()]
-    return (float(values.min()), float(values.max())) if values.size else None
-
-
-def _moments(group: Group, feature: str, middle: float) -> tuple[float, float, float]:
-    """Return the count, the sum and the sum of squares of the distances from the middle."""
-    column = group.numbers[feature]
-    distances = column.values[column.present()].astype(np.float64) - middle
-    return float(distances.size), float(distances.sum()), float(np.square(distances).sum())
-
-
-def _cached(group: Group, key: object, computed: Callable[[Group], Any]) -> Any:
-    if key not in group.caches:
-        group.caches[key] = computed(group)
-    return group.caches[key]
+    if sum(each.word_count for each in dictionaries) <= WORDS_MAX:
+        return False
+    return len({*chain.from_iterable(each.codes_by_word for each in dictionaries)}) > WORDS_MAX

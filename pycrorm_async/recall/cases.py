@@ -42,7 +42,7 @@ from sqlalchemy import Select, TableClause, column, delete, func, select, table,
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.bulk_records import make
-from pycrorm_async.errors import DamageError, DatabaseForeign
+from pycrorm_async.errors import DamageError
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, row_key
 from pycrorm_async.events.reasons import reason_of
 from pycrorm_async.events.types import (
@@ -68,7 +68,7 @@ from pycrorm_async.projections.pipeline import Batch
 from pycrorm_async.projections.row_batch import is_missing, row_of
 from pycrorm_async.projections.verify import ProjectionCheck
 from pycrorm_async.query.replay import ReplayedWorld, WorldObject
-from pycrorm_async.recall.blocks import Block, BlockRow, decode, encode, merge
+from pycrorm_async.recall.blocks import EPISODE_SHIFT, Block, decode, encode, merge
 from pycrorm_async.recall.columns import RESERVED, Case
 from pycrorm_async.store.dialect import Insertion, RowsByTable
 from pycrorm_async.store.dialects import dialect_of
@@ -533,7 +533,7 @@ class EpisodeCases:
 
 # === stored blocks ============================================================================================
 #
-# Store blocks of cases in the two tables of a generation, merge them as they grow, and read them.
+# Store blocks of cases in the table of a generation, merge them as they grow, and read them.
 #
 # Theory of operation. Each batch of folded events writes the cases of its actions as one block, in the transaction that
 # advances the checkpoints. A block has a level, by the number of its cases: 1, 16, 256, 4,096 or 65,536 and more. In
@@ -544,13 +544,12 @@ class EpisodeCases:
 # Several processes may fold one memory. On PostgreSQL a merge locks the blocks that it takes and skips those that
 # another transaction has locked, so that two merges never take the same block, and no process waits. A transaction that
 # is rolled back, by a kill too, leaves the blocks as they were, with the checkpoints. A reader that reads the list of
-# the blocks and then their columns in one snapshot finds each case once.
+# the blocks and then their bytes in one snapshot finds each case once.
 #
 # The number of a block is the greatest node id among its cases, plus its level: node ids end in five zero bits. A case
 # moves to higher levels only, so a number is never used twice in a generation.
 
 BLOCKS: Final = "recall_block"
-COLUMNS: Final = "recall_column"
 BLOCK_COLUMNS: Final = {
     "level": "integer",
     "cases": "integer",
@@ -558,25 +557,24 @@ BLOCK_COLUMNS: Final = {
     "episode_max": "integer",
     "time_min": "time",
     "time_max": "time",
-    "format": "integer",
+    "checksum": "integer",
+    "left_out": "text",
+    "data": "bytes",
 }
-"""The columns of `recall_block`. Its `id` is the block's number. The episodes and times are those of its cases."""
-COLUMN_COLUMNS: Final = {"feature": "key", "kind": "key", "words": "text", "data": "bytes", "checksum": "integer"}
-"""The columns of `recall_column`. Its `id` is the block's number; see `recall.blocks` for the others. The checksum is
-the CRC-32 of feature, kind, words and data."""
-_FORMAT: Final = 1
-"""The format of the rows of a block (`recall.blocks`)."""
+"""The columns of `recall_block`. Its `id` is the block's number. The episodes and times are those of its cases. `data`
+has the bytes of the block (`recall.blocks`), `checksum` their CRC-32. `left_out` is a JSON list of the features that
+have more than `WORDS_MAX` words here; it is null if there are none."""
 _MERGED: Final = 16
 """The number of blocks of one level that are merged into one of the next level."""
 _FULL_LEVEL: Final = 4
-"""The level of a block that is not merged any more, with 65,536 cases. Its columns take some 4 MB, and merging several
+"""The level of a block that is not merged any more, with 65,536 cases. It takes some 4 MB, and merging several
 of them would hold the write lock of SQLite for long."""
 _NO_EPISODE: Final = 0
 """The episode of the rows of blocks, because a block has cases of many."""
 
 
 class BlockHeading(NamedTuple):
-    """A stored block without its columns: number, level, number of cases, and the first and last episode of them."""
+    """A stored block without its bytes: number, level, number of cases, and the first and last episode of them."""
 
     number: int
     level: int
@@ -586,29 +584,26 @@ class BlockHeading(NamedTuple):
 
 
 def rows_of(block: Block, generation: int) -> RowsByTable:
-    """Return the rows of a block in both tables of this generation."""
-    groups = block.groups.values()
-    nodes = [int(each.nodes.max()) for each in groups]
+    """Return the row of a block in the table of this generation."""
     cases = len(block)
     level = _level_of(cases)
-    number = max(nodes) + level
+    number = int(block.nodes.max()) + level
+    data = encode(block)
     heading = (
         number,
         _NO_EPISODE,
         level,
         cases,
-        min(int(each.episodes.min()) for each in groups),
-        max(int(each.episodes.max()) for each in groups),
-        min(int(each.started_us.min()) for each in groups),
-        max(int(each.started_us.max()) for each in groups),
-        _FORMAT,
+        int(block.nodes.min()) >> EPISODE_SHIFT,
+        int(block.nodes.max()) >> EPISODE_SHIFT,
+        int(block.started_us.min()),
+        int(block.started_us.max()),
+        zlib.crc32(data),
+        msgspec.json.encode(sorted(block.left_out)).decode() if block.left_out else None,
+        data,
     )
-    rows = [(number, _NO_EPISODE, *each, _checksum(each)) for each in encode(block)]
-    episode = "process_metadata_id"
-    return {
-        (physical_name(f"{OWN}{BLOCKS}", generation), ("id", episode, *BLOCK_COLUMNS)): [heading],
-        (physical_name(f"{OWN}{COLUMNS}", generation), ("id", episode, *COLUMN_COLUMNS)): rows,
-    }
+    name = physical_name(f"{OWN}{BLOCKS}", generation)
+    return {(name, ("id", "process_metadata_id", *BLOCK_COLUMNS)): [heading]}
 
 
 async def read_headings(connection: AsyncConnection, generation: int) -> list[BlockHeading]:
@@ -631,33 +626,23 @@ def select_numbers(name: str, generation: int) -> Select[Any]:
 async def read_blocks(connection: AsyncConnection, generation: int, numbers: Collection[int]) -> dict[int, Block]:
     """Read these blocks, by number; one that was merged in the meantime is left out.
 
-    Raises `DamageError` for a block whose bytes were changed, `DatabaseForeign` for one in a newer format.
+    Raises `DamageError` for a block whose bytes were changed.
     """
-    blocks, columns = _blocks(generation), _columns(generation)
-    wanted = list(numbers)
-    formats = await connection.execute(select(blocks.c.id, blocks.c.format).where(blocks.c.id.in_(wanted)))
-    for number, format_ in formats:
-        if format_ != _FORMAT:
-            raise DatabaseForeign(f"block {number} of recall has format {format_}: use a newer pycrorm")
-    fields = columns.c.id, columns.c.feature, columns.c.kind, columns.c.words, columns.c.data, columns.c.checksum
-    rows_by_number: dict[int, list[BlockRow]] = {}
-    for number, feature, kind, words, data, checksum in await connection.execute(
-        select(*fields).where(columns.c.id.in_(wanted))
-    ):
-        if isinstance(data, str):  # SQLite keeps a value of any type in a column
-            raise _damaged(number, f"its column {feature!r} is a text")
-        row = BlockRow(feature, kind, words, bytes(data))
-        if _checksum(row) != checksum:
-            raise _damaged(number, f"the bytes of its column {feature!r} were changed")
-        rows_by_number.setdefault(number, []).append(row)
-    return {number: _decoded(number, rows) for number, rows in rows_by_number.items()}
+    table = _blocks(generation)
+    columns = table.c.id, table.c.checksum, table.c.data
+    blocks: dict[int, Block] = {}
+    for number, checksum, data in await connection.execute(select(*columns).where(table.c.id.in_([*numbers]))):
+        if isinstance(data, str) or zlib.crc32(data) != checksum:  # SQLite keeps a value of any type in a column
+            raise DamageError(f"block {number} of recall is damaged: its bytes were changed: {_ADVICE}")
+        blocks[number] = decode(data)
+    return blocks
 
 
 async def read_left_out(connection: AsyncConnection, generation: int) -> list[str]:
     """Read the names of the features that a block has left out, because they have more than `WORDS_MAX` words."""
-    columns = _columns(generation)
-    query = select(columns.c.feature).where(columns.c.kind == "left_out").distinct().order_by(columns.c.feature)
-    return list(await connection.scalars(query))
+    column = _blocks(generation).c.left_out
+    rows = await connection.scalars(select(column).where(column.is_not(None)))
+    return sorted({name for each in rows for name in msgspec.json.decode(each)})
 
 
 async def merge_blocks(connection: AsyncConnection, generation: int) -> None:
@@ -681,7 +666,7 @@ async def _full_level(connection: AsyncConnection, generation: int) -> int | Non
 
 async def _merge_level(connection: AsyncConnection, generation: int, level: int) -> bool:
     """Merge blocks of this level; return False if other transactions have locked too many of them."""
-    blocks, columns = _blocks(generation), _columns(generation)
+    blocks = _blocks(generation)
     query = select(blocks.c.id, blocks.c.cases).where(blocks.c.level == level).order_by(blocks.c.id)
     locked = (await connection.execute(query.with_for_update(skip_locked=True))).all()
     numbers: list[int] = []
@@ -696,8 +681,7 @@ async def _merge_level(connection: AsyncConnection, generation: int, level: int)
     merged = merge([*(await read_blocks(connection, generation, numbers)).values()])
     if len(merged) != cases:
         raise DamageError(f"{len(numbers)} blocks of recall have {len(merged)} cases instead of {cases}: {_ADVICE}")
-    for place in (columns, blocks):
-        await connection.execute(delete(place).where(place.c.id.in_(numbers)))
+    await connection.execute(delete(blocks).where(blocks.c.id.in_(numbers)))
     dialect = dialect_of(connection)
     await dialect.insert(connection, await dialect.insertion(rows_of(merged, generation)))
     return True
@@ -719,32 +703,8 @@ def _level_of(cases: int) -> int:
     return max(level for level in range(_FULL_LEVEL + 1) if cases >= _MERGED**level)
 
 
-def _checksum(row: BlockRow) -> int:
-    text = "\0".join((row.feature, row.kind, row.words or ""))
-    return zlib.crc32(row.data, zlib.crc32(text.encode()))
-
-
-def _decoded(number: int, rows: Iterable[BlockRow]) -> Block:
-    try:
-        return decode(rows)
-    except ValueError as fault:
-        raise _damaged(number, str(fault)) from fault
-
-
-def _damaged(number: int, reason: str) -> DamageError:
-    return DamageError(f"block {number} of recall is damaged: {reason}: {_ADVICE}")
-
-
 def _blocks(generation: int) -> TableClause:
-    return _table(BLOCKS, BLOCK_COLUMNS, generation)
-
-
-def _columns(generation: int) -> TableClause:
-    return _table(COLUMNS, COLUMN_COLUMNS, generation)
-
-
-def _table(name: str, columns: Mapping[str, str], generation: int) -> TableClause:
-    return table(physical_name(f"{OWN}{name}", generation), column("id"), *map(column, columns))
+    return table(physical_name(f"{OWN}{BLOCKS}", generation), column("id"), *map(column, BLOCK_COLUMNS))
 
 
 # === case projection ==========================================================================================
@@ -756,8 +716,8 @@ class CaseProjection(PackedProjection):
     """Makes a case of each action that ends. The row of a case is packed with others into a block."""
 
     name = "recall"
-    version = 2
-    tables: ClassVar[Any] = {BLOCKS: BLOCK_COLUMNS, COLUMNS: COLUMN_COLUMNS}
+    version = 3
+    tables: ClassVar[Any] = {BLOCKS: BLOCK_COLUMNS}
     reads = READS
 
     def __init__(self) -> None:

@@ -1,12 +1,12 @@
 """Hold one feature of many cases as a column of a block (`recall.blocks`), in NumPy arrays.
 
-`Symbols` holds at most one word a case, `Sets` several, `Numbers` a float. Words are kept once, in a dictionary of the
-column; code 0 means that a case does not have the feature, code i the word i - 1, and NaN that it has no number.
+A column of texts keeps each different value once, in its dictionary: a word, or a tuple of words, as the types of
+nearby objects. It has a code for each case: i for the value i - 1 of the dictionary, 0 for none. A column of numbers
+has a float for each case, NaN for none.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from functools import cached_property
@@ -19,260 +19,193 @@ from numpy.typing import NDArray
 from pycrorm_async.events.ids import row_key
 
 Mask: TypeAlias = NDArray[np.bool_]
-Codes: TypeAlias = "NDArray[np.unsignedinteger[Any]]"
-Floats: TypeAlias = NDArray[np.floating[Any]]
 Rows: TypeAlias = "slice | NDArray[np.int64]"
+Value: TypeAlias = "str | tuple[str, ...]"
 
 
-class Words(tuple[str, ...]):
-    """The dictionary of a column: different words, in alphabetical order."""
+class Words(tuple[Value, ...]):
+    """The dictionary of a column: different values in alphabetical order, words before tuples of words."""
+
+    @classmethod
+    def of(cls, values: Iterable[Value]) -> Words:
+        """Return the dictionary of these values."""
+        return cls(sorted({*values}, key=lambda each: (isinstance(each, tuple), each)))
 
     @cached_property
-    def codes(self) -> Mapping[str, int]:
-        """The code of each word."""
-        return {word: code for code, word in enumerate(self, 1)}
+    def codes(self) -> Mapping[Value | None, int]:
+        """The code of each value."""
+        return {value: code for code, value in enumerate(self, 1)}
 
-    def code(self, word: str) -> int:
-        """Return the code of a word; 0 if no case has it."""
-        return self.codes.get(word, 0)
+    @cached_property
+    def codes_by_word(self) -> Mapping[str, Sequence[int]]:
+        """The codes of the values that are this word, or have it among several, by word."""
+        codes: dict[str, list[int]] = {}
+        for code, value in enumerate(self, 1):
+            for word in (value,) if isinstance(value, str) else value:
+                codes.setdefault(word, []).append(code)
+        return codes
 
-    def codes_in(self, other: Words) -> Codes:
-        """Return, for each code of this dictionary, that of its word in another one, which contains all of them.
+    @property
+    def has_tuples(self) -> bool:
+        """Whether a value is a tuple of words."""
+        return bool(self) and isinstance(self[-1], tuple)
+
+    @property
+    def word_count(self) -> int:
+        """The number of different words, also inside of tuples."""
+        return len(self.codes_by_word) if self.has_tuples else len(self)
+
+    def codes_in(self, other: Words) -> NDArray[Any]:
+        """Return, for each code of this dictionary, that of its value in another one, which contains all of them.
 
         The last result is kept, because the columns of many groups share two dictionaries.
         """
-        kept: tuple[Words, Codes] | None = self.__dict__.get("_codes_in")
+        kept: tuple[Words, NDArray[Any]] | None = self.__dict__.get("_codes_in")
         if kept is None or kept[0] is not other:
-            codes = other.codes
-            kept = other, smallest_codes([0, *(codes[word] for word in self)], len(other))
-            self.__dict__["_codes_in"] = kept
+            codes = np.array([0, *map(other.codes.__getitem__, self)], np.min_scalar_type(len(other)))
+            kept = self.__dict__["_codes_in"] = other, codes
         return kept[1]
 
 
-class Symbols:
-    """A text feature that has at most one value a case."""
+class Summary(NamedTuple):
+    """The numbers of a column: how many there are, their mean, variance, least and greatest."""
 
-    def __init__(self, words: Words, codes: Codes) -> None:
-        self.words = words
-        self.codes = codes
-
-    @classmethod
-    def of(cls, values: Sequence[Any]) -> Symbols:
-        """Make the column of these texts, None where a case does not have the feature. Long ones are left out."""
-        different = {*values}
-        words = Words(sorted(each for each in different if each and len(each) <= TEXT_MAX))
-        codes = {**dict.fromkeys(different, 0), **words.codes}
-        return cls(words, np.fromiter(map(codes.__getitem__, values), np.min_scalar_type(len(words)), len(values)))
-
-    def equal_to(self, word: str, rows: slice) -> Mask:
-        """Return a mask of these rows: True where the case has the word."""
-        code = self.words.code(word)
-        return self.codes[rows] == code if code else np.zeros(self.codes[rows].size, np.bool_)
-
-    def value(self, row: int) -> str | None:
-        """Return the value of a case; None if it has none."""
-        code = int(self.codes[row])
-        return self.words[code - 1] if code else None
-
-    def counts(self) -> NDArray[np.int64]:
-        """Return the number of cases that have each code."""
-        return np.bincount(self.codes, minlength=len(self.words) + 1)
-
-    def present(self) -> Mask:
-        """Return a mask of all cases: True where the case has the feature."""
-        return self.codes > 0
-
-    def part(self, first: int, last: int) -> Symbols:
-        """Return the column of some cases, with the same dictionary."""
-        return Symbols(self.words, self.codes[first:last])
-
-    def placed(self, rows: Rows, count: int) -> Symbols:
-        """Return the column of more cases, of which these rows are its own and the others have no value."""
-        codes = np.zeros(count, self.codes.dtype)
-        codes[rows] = self.codes
-        return Symbols(self.words, codes)
-
-    def taken(self, rows: Rows) -> Symbols:
-        """Return the column with some of its cases, in their order."""
-        return Symbols(self.words, self.codes[rows])
-
-    def recoded(self, words: Words) -> Symbols:
-        """Return the column with a dictionary that contains its own."""
-        return self if words is self.words else Symbols(words, self.words.codes_in(words)[self.codes])
+    size: int
+    mean: float
+    variance: float
+    least: float
+    greatest: float
 
 
-class Sets:
-    """A text feature that has any number of values a case, as the types of nearby objects."""
+class Column:
+    """One feature of some cases: `values` are codes of `words`, or numbers if that is None."""
 
-    def __init__(self, words: Words, sizes: NDArray[np.uint8], codes: Codes) -> None:
-        self.words = words
-        self.sizes = sizes
-        self.codes = codes
-
-    @classmethod
-    def of(cls, values: Sequence[Any]) -> Sets:
-        """Make the column of these texts and tuples of texts, None where a case does not have the feature."""
-        kept = {each: _bounded_set(each) for each in {*values}}
-        words = Words(sorted({*chain.from_iterable(kept.values())}))
-        codes = {each: [words.codes[word] for word in row] for each, row in kept.items()}
-        rows = [codes[each] for each in values]
-        sizes = np.array([len(row) for row in rows], np.uint8)
-        return cls(words, sizes, smallest_codes([*chain.from_iterable(rows)], len(words)))
-
-    @cached_property
-    def _ends(self) -> NDArray[np.int64]:
-        return np.cumsum(self.sizes, dtype=np.int64)
-
-    @cached_property
-    def _rows(self) -> NDArray[np.int32]:
-        return np.repeat(np.arange(self.sizes.size, dtype=np.int32), self.sizes)
-
-    def equal_to(self, word: str, rows: slice) -> Mask:
-        """Return a mask of these rows: True where the case has the word among its values."""
-        start, stop, _ = rows.indices(self.sizes.size)
-        mask = np.zeros(stop - start, np.bool_)
-        code = self.words.code(word)
-        if code and stop > start:
-            ends = self._ends
-            values = slice(int(ends[start] - self.sizes[start]), int(ends[stop - 1]))
-            mask[self._rows[values][self.codes[values] == code] - start] = True
-        return mask
-
-    def value(self, row: int) -> tuple[str, ...] | None:
-        """Return the values of a case; None if it has none."""
-        end = int(self._ends[row])
-        codes = self.codes[end - int(self.sizes[row]) : end].tolist()
-        return tuple(self.words[code - 1] for code in codes) or None
-
-    def counts(self) -> NDArray[np.int64]:
-        """Return the number of cases that have each code."""
-        return np.bincount(self.codes, minlength=len(self.words) + 1)
-
-    def present(self) -> Mask:
-        """Return a mask of all cases: True where the case has the feature."""
-        return self.sizes > 0
-
-    def part(self, first: int, last: int) -> Sets:
-        """Return the column of some cases, with the same dictionary."""
-        start = int(self._ends[first - 1]) if first else 0
-        stop = int(self._ends[last - 1]) if last else 0
-        return Sets(self.words, self.sizes[first:last], self.codes[start:stop])
-
-    def placed(self, rows: Rows, count: int) -> Sets:
-        """Return the column of more cases, of which these rows are its own and the others have no value."""
-        sizes = np.zeros(count, np.uint8)
-        sizes[rows] = self.sizes
-        return Sets(self.words, sizes, self.codes)
-
-    def taken(self, rows: Rows) -> Sets:
-        """Return the column with some of its cases, in their order."""
-        sizes = self.sizes[rows]
-        starts = (self._ends - self.sizes)[rows]
-        firsts = np.cumsum(sizes, dtype=np.int64) - sizes
-        places = np.repeat(starts - firsts, sizes) + np.arange(int(sizes.sum(dtype=np.int64)))
-        return Sets(self.words, sizes, self.codes[places])
-
-    def recoded(self, words: Words) -> Sets:
-        """Return the column with a dictionary that contains its own."""
-        return self if words is self.words else Sets(words, self.sizes, self.words.codes_in(words)[self.codes])
-
-
-class Numbers:
-    """A number, as float32 unless a case has a larger one than `SINGLE_MAX`, which are kept as float64."""
-
-    def __init__(self, values: Floats) -> None:
+    def __init__(self, values: NDArray[Any], words: Words | None = None) -> None:
         self.values = values
+        self._words = words
 
     @classmethod
-    def of(cls, values: Sequence[float | None]) -> Numbers:
-        """Make the column of these numbers, None where a case does not have the feature; infinite ones are left out."""
+    def of_texts(cls, values: Sequence[Any]) -> Column:
+        """Make the column of words and tuples of words, None where a case does not have the feature.
+
+        Long words are left out, and all but the first `SYMBOLS_MAX` of a case.
+        """
+        kept = {each: bounded(each) for each in {*values}}
+        words = Words.of(each for each in kept.values() if each)
+        codes = {each: words.codes.get(value, 0) for each, value in kept.items()}
+        return cls(np.fromiter(map(codes.__getitem__, values), np.min_scalar_type(len(words)), len(values)), words)
+
+    @classmethod
+    def of_numbers(cls, values: Sequence[float | None]) -> Column:
+        """Make the column of these numbers, None where a case does not have the feature; infinite ones are left out.
+
+        They are float32 unless a case has one larger than `SINGLE_MAX`, which are kept as float64.
+        """
         wide = np.array(values, np.float64)  # with NaN for None
         wide[np.isinf(wide)] = np.nan
         large = np.abs(wide) > SINGLE_MAX
         narrow = np.where(large, np.nan, wide).astype(np.float32)
         return cls(np.where(large, wide, narrow) if large.any() else narrow)
 
-    def value(self, row: int) -> float | None:
-        """Return the value of a case; None if it has none."""
-        value = float(self.values[row])
-        return value if value == value else None
+    @property
+    def words(self) -> Words:
+        """The dictionary of a column of texts."""
+        assert self._words is not None
+        return self._words
+
+    def dictionary(self) -> list[Value] | None:
+        """Return the values of a column of texts; None for one of numbers."""
+        return None if self._words is None else [*self._words]
+
+    def having(self, word: str, rows: slice = slice(None)) -> Mask:
+        """Return a mask of these rows: True where the case has the word."""
+        codes = self.words.codes_by_word.get(word, ())
+        mask: Mask
+        if len(codes) == 1:
+            mask = self.values[rows] == codes[0]
+        else:
+            wanted = np.zeros(len(self.words) + 1, np.bool_)
+            wanted[[*codes]] = True
+            mask = wanted[self.values[rows]]
+        return mask
+
+    def count(self, word: str) -> int:
+        """Return the number of cases that have the word."""
+        return sum(self._counts[code] for code in self.words.codes_by_word.get(word, ()))
+
+    @cached_property
+    def _counts(self) -> list[int]:
+        counts: list[int] = np.bincount(self.values, minlength=len(self.words) + 1).tolist()
+        return counts
+
+    @cached_property
+    def summary(self) -> Summary | None:
+        """The summary of the numbers; None without any."""
+        numbers = self.values[self.present()].astype(np.float64)
+        if not numbers.size:
+            return None
+        return Summary(numbers.size, *map(float, (numbers.mean(), numbers.var(), numbers.min(), numbers.max())))
+
+    def value(self, row: int) -> Any:
+        """Return the word, the tuple of words or the number of a case; None if it has none."""
+        if self._words is None:
+            number = float(self.values[row])
+            return number if number == number else None
+        code = int(self.values[row])
+        return self._words[code - 1] if code else None
 
     def present(self) -> Mask:
-        """Return a mask of all cases: True where the case has the number."""
-        return ~np.isnan(self.values)
+        """Return a mask of all cases: True where the case has the feature."""
+        mask: Mask = ~np.isnan(self.values) if self._words is None else self.values > 0
+        return mask
 
-    def part(self, first: int, last: int) -> Numbers:
-        """Return the column of some cases."""
-        return Numbers(self.values[first:last])
-
-    def placed(self, rows: Rows, count: int) -> Numbers:
-        """Return the column of more cases, of which these rows are its own and the others have no number."""
-        values = np.full(count, np.nan, self.values.dtype)
-        values[rows] = self.values
-        return Numbers(values)
-
-    def taken(self, rows: Rows) -> Numbers:
+    def taken(self, rows: Rows) -> Column:
         """Return the column with some of its cases, in their order."""
-        return Numbers(self.values[rows])
+        return Column(self.values[rows], self._words)
+
+    def placed(self, rows: Rows, count: int) -> Column:
+        """Return the column of more cases, of which these rows are its own and the others do not have the feature."""
+        values = np.full(count, np.nan if self._words is None else 0, self.values.dtype)
+        values[rows] = self.values
+        return Column(values, self._words)
+
+    def recoded(self, words: Words | None) -> Column:
+        """Return the column with a dictionary that contains its own."""
+        if words is None or words is self._words:
+            return self
+        return Column(self.words.codes_in(words)[self.values], words)
 
 
-def joined_words(
-    columns: Sequence[Symbols | Sets | None], sizes: Sequence[int], words: Words | None = None
-) -> Symbols | Sets:
+def joined(columns: Sequence[Column | None], sizes: Sequence[int], words: Words | None = None) -> Column:
     """Put columns of one feature below each other; for a missing column, that many cases without the feature are added.
 
-    `words` is a dictionary that contains those of all columns; by default it is made.
+    Args:
+        columns: one of them at least.
+        sizes: the number of cases of each.
+        words: a dictionary that contains those of all columns of texts; by default it is made.
     """
+    present = [each for each in columns if each is not None]
     if words is None:
-        words = joined([column.words for column in columns if column is not None])
-    parts = list(zip(columns, sizes, strict=True))
-    if any(isinstance(column, Sets) for column in columns):
-        sets = [_as_sets(column, size).recoded(words) for column, size in parts]
-        codes = np.concatenate([each.codes for each in sets])
-        return Sets(words, np.concatenate([each.sizes for each in sets]), codes)
-    symbols = [
-        column.recoded(words).codes if isinstance(column, Symbols) else np.zeros(size, np.uint8)
-        for column, size in parts
-    ]
-    return Symbols(words, np.concatenate(symbols) if symbols else np.zeros(0, np.uint8))
+        words = joined_words(each._words for each in present)  # noqa: SLF001 - None for numbers
+    absent, narrow = (np.nan, np.float32) if words is None else (0, np.uint8)
+    parts = zip(columns, sizes, strict=True)
+    values = [np.full(size, absent, narrow) if each is None else each.recoded(words).values for each, size in parts]
+    return Column(np.concatenate(values), words)
 
 
-def joined_numbers(columns: Sequence[Numbers | None], sizes: Sequence[int]) -> Numbers:
-    """Put columns of one number below each other; for a missing column, that many cases without it are added."""
-    values = [
-        np.full(size, np.nan, np.float32) if column is None else column.values
-        for column, size in zip(columns, sizes, strict=True)
-    ]
-    return Numbers(np.concatenate(values))
+def joined_words(dictionaries: Iterable[Words | None]) -> Words | None:
+    """Return one dictionary with the values of all; None if there are none."""
+    different = {id(each): each for each in dictionaries if each is not None}
+    if len(different) < 2:
+        return next(iter(different.values()), None)
+    return Words.of(chain.from_iterable(different.values()))
 
 
-def smallest_codes(codes: Any, largest: int) -> Codes:
-    """Return codes as the smallest unsigned integers that hold `largest`."""
-    smallest: Codes = np.asarray(codes, np.min_scalar_type(largest))
-    return smallest
-
-
-def joined(dictionaries: Iterable[Words]) -> Words:
-    """Return one dictionary with the words of all."""
-    different = {id(each): each for each in dictionaries}
-    if len(different) == 1:
-        return next(iter(different.values()))
-    return Words(sorted({*chain.from_iterable(different.values())}))
-
-
-def _bounded_set(value: str | tuple[str, ...] | None) -> tuple[str, ...]:
-    words = (value,) if isinstance(value, str) else value or ()
-    return tuple(sorted({each for each in words if each and len(each) <= TEXT_MAX}))[:SYMBOLS_MAX]
-
-
-def _as_sets(column: Symbols | Sets | None, count: int) -> Sets:
-    match column:
-        case None:
-            return Sets(Words(), np.zeros(count, np.uint8), np.zeros(0, np.uint8))
-        case Symbols(words=words, codes=codes):
-            return Sets(words, (codes > 0).astype(np.uint8), codes[codes > 0])
-        case Sets():
-            return column
+def bounded(value: Value | None) -> Value | None:
+    """Return a value as a block keeps it: without words that are too long, and at most `SYMBOLS_MAX` of them."""
+    if value is None or isinstance(value, str):
+        return value if value and len(value) <= TEXT_MAX else None
+    return tuple(sorted({each for each in value if each and len(each) <= TEXT_MAX}))[:SYMBOLS_MAX] or None
 
 
 # === case =====================================================================================================
@@ -340,36 +273,6 @@ class Case(NamedTuple):
         return _EPOCH + timedelta(microseconds=self.started_us)
 
 
-def bounded_case(case: Case) -> Case:
-    """Return the case as blocks store it: without infinite numbers, long texts and excess features, numbers rounded.
-
-    The result depends on the case alone, so an action gives the same case in any block.
-    """
-    symbols = {name: kept for name, value in case.symbols.items() if (kept := _bounded(value))}
-    numbers = {name: _stored(value) for name, value in case.numbers.items() if math.isfinite(value)}
-    taken = RESERVED & (symbols.keys() | numbers.keys())
-    assert not taken, f"features of a situation cannot be named {', '.join(sorted(taken))}"
-    if len(symbols) + len(numbers) > FEATURES_MAX:
-        kept_names = set(sorted({*symbols, *numbers})[:FEATURES_MAX])
-        symbols = {name: value for name, value in symbols.items() if name in kept_names}
-        numbers = {name: value for name, value in numbers.items() if name in kept_names}
-    duration_s = case.duration_s
-    if duration_s is not None:
-        duration_s = _stored(duration_s) if math.isfinite(duration_s) else None
-    reason = case.reason if case.reason and len(case.reason) <= TEXT_MAX else None
-    return case._replace(symbols=symbols, numbers=numbers, duration_s=duration_s, reason=reason)
-
-
 def is_angle(feature: str) -> bool:
     """Return whether the feature is an angle in rad, so that -3.1 is near 3.1."""
     return feature.endswith("yaw")
-
-
-def _bounded(value: str | tuple[str, ...]) -> str | tuple[str, ...]:
-    if isinstance(value, str):
-        return value if len(value) <= TEXT_MAX else ""
-    return tuple(sorted({each for each in value if each and len(each) <= TEXT_MAX}))[:SYMBOLS_MAX]
-
-
-def _stored(value: Any) -> float:
-    return float(value) if abs(value) > SINGLE_MAX else float(np.float32(value))

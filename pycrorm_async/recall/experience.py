@@ -29,7 +29,6 @@ from pycrorm_async.orm import PickUpAction
 from pycrorm_async.plan.task import PastSuccess
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.recall.blocks import CaseLibrary, Group
-from pycrorm_async.recall.columns import Symbols
 from pycrorm_async.recall.recall import CaseReader, DatabaseSource
 from pycrorm_async.world.pose import Arms, Grasp, ObjectType, Pose, yaw_quaternion
 
@@ -163,7 +162,9 @@ def _tries(group: Group, object_type: ObjectType, arm: Arms | None) -> tuple[NDA
 def _texts(group: Group, feature: str) -> NDArray[Any]:
     """Return a text feature of each case; empty where it has none, or several."""
     column = group.texts[feature]
-    return np.array(["", *column.words])[column.codes] if isinstance(column, Symbols) else np.full(len(group), "")
+    words = np.array(["", *("" if isinstance(each, tuple) else each for each in column.words)])
+    texts: NDArray[Any] = words[column.values]
+    return texts
 
 
 def best_first(tries: Tries, *, height: float | None = None, torso: float | None = None) -> list[PastSuccess]:

@@ -243,7 +243,9 @@ class Recall:
         """Return the classes of the failures with which actions of a type have ended, in alphabetical order."""
         dtype = dtype_of(type)
         library = await self._reader.library(dtype, aliases_of(type))
-        return tuple(sorted(each for each in library.words("reason") if library.seen(dtype, "reason", each)))
+        return tuple(
+            sorted(each for each in library.words("reason").codes_by_word if library.seen(dtype, "reason", each))
+        )
 
     # --- around a case ----------------------------------------------------------------------------------------
 

@@ -44,7 +44,7 @@ from numpy.typing import NDArray
 from pycrorm_async.errors import CallerError
 from pycrorm_async.query.text import nearest
 from pycrorm_async.recall.blocks import WORDS_MAX, CaseLibrary, Group
-from pycrorm_async.recall.columns import FEATURES_MAX, OUTCOME, TEXT_MAX, Mask, Symbols, is_angle, joined_words
+from pycrorm_async.recall.columns import FEATURES_MAX, OUTCOME, TEXT_MAX, Mask, is_angle, joined
 
 WEIGHT_MAX: Final = 3.0
 """Bounds the weight of a word; it is that of a word which one of twenty cases has."""
@@ -183,8 +183,8 @@ def _similarity(group: Group, rows: slice, cue: Cue, weights: Weights) -> NDArra
     total = np.zeros(rows.stop - rows.start)
     for pair, weight in zip(cue.has, weights.words, strict=True):
         column = group.texts.get(pair[0])
-        if column is not None and column.words.code(pair[1]):
-            total += column.equal_to(pair[1], rows) * weight
+        if column is not None and pair[1] in column.words.codes_by_word:
+            total += column.having(pair[1], rows) * weight
     for wanted, tolerance in zip(cue.near, weights.tolerances, strict=True):
         numbers = group.numbers.get(wanted.feature)
         if numbers is not None:
@@ -207,7 +207,7 @@ def _reachable(group: Group, cue: Cue, weights: Weights) -> float:
     total = 0.0
     for pair, weight in zip(cue.has, weights.words, strict=True):
         column = group.texts.get(pair[0])
-        if column is not None and column.words.code(pair[1]):
+        if column is not None and pair[1] in column.words.codes_by_word:
             total += weight
     for wanted in cue.near:
         total += wanted.feature in group.numbers
@@ -225,7 +225,7 @@ def _conditions(group: Group, rows: slice, cue: Cue) -> Iterator[Mask]:
     if cue.prohibit:
         yield np.isin(group.nodes[rows], list(cue.prohibit), invert=True)
     if not cue.simulated and "simulated" in group.texts:
-        yield ~group.texts["simulated"].equal_to("yes", rows)
+        yield ~group.texts["simulated"].present()[rows]
     if cue.during_us is not None:
         yield group.started_us[rows] >= cue.during_us[0]
         yield _ended_by(group, cue.during_us[1], rows)
@@ -235,9 +235,7 @@ def _conditions(group: Group, rows: slice, cue: Cue) -> Iterator[Mask]:
 
 def _having(group: Group, pair: tuple[str, str], rows: slice) -> Mask:
     column = group.texts.get(pair[0])
-    return (
-        np.zeros(len(range(*rows.indices(len(group)))), np.bool_) if column is None else column.equal_to(pair[1], rows)
-    )
+    return np.zeros(group.nodes[rows].size, np.bool_) if column is None else column.having(pair[1], rows)
 
 
 def _ended_by(group: Group, moment_us: int, rows: slice = slice(None)) -> Mask:
@@ -552,14 +550,14 @@ def _numbers_of_ways(groups: Sequence[Group], library: CaseLibrary) -> NDArray[n
     ways, count = np.zeros(sum(sizes), np.int64), 1
     names = {name for group in groups for name in group.texts}
     for name in sorted(names - {*OUTCOME, "simulated"} - library.left_out):
-        column = joined_words([group.texts.get(name) for group in groups], sizes, library.words(name))
-        if not isinstance(column, Symbols):
+        if library.words(name).has_tuples:
             continue
+        column = joined([group.texts.get(name) for group in groups], sizes, library.words(name))
         different = len(column.words) + 1
         if count > _NUMBERS_MAX // different:
             ways, count = _renumbered(ways)
         ways *= different
-        ways += column.codes
+        ways += column.values
         count *= different
     return ways
 

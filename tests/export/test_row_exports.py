@@ -370,7 +370,7 @@ async def test_an_empty_memory_has_views_without_rows_and_no_episode(tmp_path: P
 #
 # The metadata for Datasette: hidden tables, described views, and queries that SQLite answers.
 
-WITH_BYTES = {"recall_column"}
+WITH_BYTES = {"recall_block"}
 """The views with a column of bytes, whose pages Datasette answers with an error."""
 
 

@@ -117,7 +117,7 @@ def traces(url: str) -> list[str]:
     )
     tables = [name for (name,) in ask(url, listed)]
     cases = f"SELECT generation FROM {at}pycrorm_generation WHERE projection = 'projection/recall'"
-    made = ("pycrorm_own_recall_block", "pycrorm_own_recall_column", "pycrorm_progress_recall")
+    made = ("pycrorm_own_recall_block", "pycrorm_progress_recall")
     of_cases = {f"zz_{table}__{number}" for (number,) in ask(url, cases) for table in made}
     tables = [each for each in tables if each not in of_cases]
     traces_left = [each for each in notes if each not in ("tables", "projection/recall")]

@@ -49,5 +49,6 @@ def test_a_memory_of_an_earlier_format_is_read_verified_and_rebuilt_and_what_its
         for node in episode["tree"]
         if node["dtype"] == "PourAction"
     ] == [("glass", 0.25, "SUCCEEDED"), ("bowl", 1.5, "FAILED"), ("jug", 0.5, "SUCCEEDED")]
+    assert answer("recall", "PourAction", *database, cwd=tmp_path)["considered"] == 3
     rows = answer("query", "select litres from pour_action order by litres", *database, cwd=tmp_path)
     assert [row["litres"] for row in rows["rows"]] == [0.25, 0.5, 1.5]

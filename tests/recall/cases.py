@@ -7,6 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from random import Random
 from typing import Any
 
+import numpy as np
 from hypothesis import strategies as st
 
 from pycrorm_async.events.ids import row_id
@@ -184,6 +185,14 @@ def random_cases(count: int, seed: int, *, words: tuple[str, ...] = WORDS) -> li
     """Return cases with different nodes."""
     chance = random.Random(seed)
     return [random_case(sequence, chance, words=words) for sequence in range(1, count + 1)]
+
+
+def kept_case(case: Case) -> Case:
+    """Return a random case as a block keeps it: numbers are float32, but for columns with large ones."""
+    numbers = {name: number if number > 2**24 else float(np.float32(number)) for name, number in case.numbers.items()}
+    symbols = {name: value for name, value in case.symbols.items() if value}
+    duration_s = None if case.duration_s is None else float(np.float32(case.duration_s))
+    return case._replace(symbols=symbols, numbers=numbers, duration_s=duration_s)
 
 
 CASES = st.builds(random_cases, st.integers(1, 40), st.integers(0, 2**32))

@@ -14,8 +14,11 @@ from pathlib import Path
 from random import Random
 
 import pytest
+from sqlalchemy import column, table, update
+from sqlalchemy.ext.asyncio import AsyncConnection
 
-from pycrorm_async.errors import DamageError
+from pycrorm_async import Reading
+from pycrorm_async.errors import DamageError, TablesOutdated
 from pycrorm_async.events.types import (
     EpisodeEnded,
     NodeStarted,
@@ -37,12 +40,15 @@ from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.rebuild import Rebuild, claimed, clear
 from pycrorm_async.projections.verify import verify
 from pycrorm_async.recall import cases as stored_blocks
-from pycrorm_async.recall.cases import BlockHeading, read_blocks, read_headings
+from pycrorm_async.recall.blocks import Block
+from pycrorm_async.recall.cases import BLOCK_COLUMNS, BlockHeading, read_blocks, read_headings, rows_of
 from pycrorm_async.recall.columns import RESERVED, Case
+from pycrorm_async.recall.recall import Recall
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from tests.golden.unpacking import unpack_memory_v1
+from tests.golden.unpacking import unpack_memory, unpack_memory_v1
+from tests.golden.zoo import ZOO
 from tests.memory.note_actions import NoteActionPerformable
 from tests.projections.event_script import T0_NS, declared, mixed, name_of, pose, row, time_us
 from tests.projections.sql_queries import ask
@@ -176,6 +182,30 @@ async def test_a_memory_of_an_earlier_version_has_its_cases_after_a_rebuild_and_
         ]
 
 
+@pytest.mark.slow
+async def test_blocks_of_an_earlier_format_stop_no_other_fold_and_a_rebuild_makes_them_again(tmp_path: Path) -> None:
+    url = unpack_memory(ZOO / "fold_9_cases_2.tar.gz", tmp_path)
+    async with Memory.open(url) as memory:
+        await NoteActionPerformable("one").perform()
+        await memory.flush()
+        with pytest.raises(TablesOutdated, match="version 2 instead of 3: run `pycrorm rebuild recall`"):
+            await memory.recall("PourAction")
+    async with opened(url) as log:
+        assert await ask(log, "SELECT count(*) FROM task_tree_node WHERE dtype = 'NoteAction'") == [(1,)]
+        (state,) = await states(log, own_projections())
+        assert state.fault is not None
+        assert "run `pycrorm rebuild recall`" in state.fault
+    await rebuild_projection(url, own_projections()[0])
+    async with Reading.open(url) as reading:
+        poured = await Recall.of(reading)("PourAction", has={"into": "bowl"})
+        assert (poured[0].symbols["into"], poured[0].status) == ("bowl", "FAILED")
+        assert (await Recall.of(reading)("NoteAction")).considered == 1
+    async with opened(url) as log:
+        assert (await verified(log)).drift == 0
+        views = await ask(log, "SELECT name FROM sqlite_master WHERE name LIKE '%recall%' AND name NOT LIKE 'zz%'")
+        assert views == [("recall_block",)]
+
+
 async def test_a_memory_that_makes_no_cases_leaves_them_to_the_next(tmp_path: Path) -> None:
     url = f"sqlite:///{tmp_path}/memory.db"
     async with Memory.open(url, settings=Settings(recall=False)) as memory:
@@ -233,33 +263,40 @@ async def filled(log: EventLog) -> list[Case]:
     return cases_of(*scripts)
 
 
-BLOCK, COLUMN = (f"zz_pycrorm_own_recall_{each}__1001" for each in ("block", "column"))
-OF_SECOND = f"(SELECT id FROM {BLOCK} ORDER BY id LIMIT 1 OFFSET 1)"
-ARM = f"id = {OF_SECOND} AND feature = 'arm'"
-NODES = f"id = {OF_SECOND} AND feature = 'node'"
-COPIED = "process_metadata_id, feature, kind, words, data, checksum"
-HEADING = "process_metadata_id, level, cases, episode_min, episode_max, time_min, time_max, format"
-CHANGES = {
+BLOCK = "zz_pycrorm_own_recall_block__1001"
+SECOND = f"id = (SELECT id FROM {BLOCK} ORDER BY id LIMIT 1 OFFSET 1)"
+COLUMNS = ", ".join(["process_metadata_id", *BLOCK_COLUMNS])
+CHANGES: dict[str, tuple[str | dict[str, str], str]] = {
     "a changed byte": (
-        {"sqlite": f"UPDATE {COLUMN} SET data = CAST(x'02' || substr(data, 2) AS BLOB) WHERE {ARM}",
-         "postgresql": f"UPDATE {COLUMN} SET data = set_byte(data, 0, 2) WHERE {ARM}"},
-        "is damaged: the bytes of its column 'arm' were changed",
+        {"sqlite": f"UPDATE {BLOCK} SET data = CAST(substr(data, 1, 99) || x'02' || substr(data, 101) AS BLOB)"
+                   f" WHERE {SECOND}",
+         "postgresql": f"UPDATE {BLOCK} SET data = set_byte(data, 99, 2) WHERE {SECOND}"},
+        "is damaged: its bytes were changed",
     ),
-    "a changed word": (f"UPDATE {COLUMN} SET words = replace(words, 'LEFT', 'BEST') WHERE {ARM}", "'arm' were changed"),
-    "a changed byte with its checksum": (
-        f"UPDATE {COLUMN} SET checksum = checksum + 1 WHERE {NODES}", "the bytes of its column 'node' were changed",
+    "a changed checksum": (
+        f"UPDATE {BLOCK} SET checksum = checksum + 1 WHERE {SECOND}", "is damaged: its bytes were changed",
     ),
-    "a missing column": (f"DELETE FROM {COLUMN} WHERE {ARM}", "recall_block.arm is None, and should be 'LEFT'"),
-    "a missing block": (f"DELETE FROM {BLOCK} WHERE id = {OF_SECOND}", "recall_block lacks a row: Case(node="),
-    "a block without columns": (f"DELETE FROM {COLUMN} WHERE id = {OF_SECOND}", "has 0 cases, and should have"),
+    "a text": (f"UPDATE {BLOCK} SET data = 'text' WHERE {SECOND}", "is damaged: its bytes were changed"),
+    "another word": ("", "recall_block.arm is 'RIGHT', and should be 'LEFT'"),
+    "a missing block": (f"DELETE FROM {BLOCK} WHERE {SECOND}", "recall_block lacks a row: Case(node="),
+    "another number of cases": (f"UPDATE {BLOCK} SET cases = cases + 1 WHERE {SECOND}", "cases, and should have"),
     "doubled cases": (
-        (
-            f"INSERT INTO {COLUMN} (id, {COPIED}) SELECT id + 3, {COPIED} FROM {COLUMN} WHERE id = {OF_SECOND}",
-            f"INSERT INTO {BLOCK} (id, {HEADING}) SELECT id + 3, {HEADING} FROM {BLOCK} WHERE id = {OF_SECOND}",
-        ),
+        f"INSERT INTO {BLOCK} (id, {COLUMNS}) SELECT id + 3, {COLUMNS} FROM {BLOCK} WHERE {SECOND}",
         "recall_block.blocks with it is 2, and should be 1",
     ),
 }  # fmt: skip
+
+
+async def take_right_arms(connection: AsyncConnection) -> None:
+    """Write a block whose cases have another arm than in the log."""
+    number = (await read_headings(connection, 1001))[1].number
+    block = (await read_blocks(connection, 1001, [number]))[number]
+    changed = [case._replace(symbols={**case.symbols, "arm": "RIGHT"}) for case in block.cases() if case.symbols]
+    [[row]] = rows_of(Block.of(changed), 1001).values()
+    values = dict(zip(BLOCK_COLUMNS, row[2:], strict=True))
+    table_ = table(BLOCK, column("id"), column("data"), column("checksum"), column("cases"))
+    values = {name: values[name] for name in ("data", "checksum", "cases")}
+    await connection.execute(update(table_).where(table_.c.id == number).values(values))
 
 
 @pytest.mark.soak_on("postgresql")
@@ -270,21 +307,18 @@ async def test_verify_finds_what_was_changed_and_a_rebuild_repairs_it(log: Event
     assert (await verified(log)).drift == 0
     kind = log.engine.dialect.name
     async with log.engine.begin() as connection:
-        for place in (BLOCK, COLUMN):
-            await connection.exec_driver_sql(f"CREATE TABLE kept_{place} AS SELECT * FROM {place}")
+        await connection.exec_driver_sql(f"CREATE TABLE kept AS SELECT * FROM {BLOCK}")
     for change, message in CHANGES.values():
-        statements = change[kind] if isinstance(change, dict) else change
         async with log.engine.begin() as connection:
-            for statement in [statements] if isinstance(statements, str) else statements:
-                await connection.exec_driver_sql(statement)
+            await connection.exec_driver_sql(f"DELETE FROM {BLOCK}")
+            await connection.exec_driver_sql(f"INSERT INTO {BLOCK} SELECT * FROM kept")
+            if change:
+                await connection.exec_driver_sql(change[kind] if isinstance(change, dict) else change)
+            else:
+                await take_right_arms(connection)
         result = await verified(log)
         assert any(message in str(each) for each in result.differences), (message, result.differences)
         assert result.damage == 0
-        if change != list(CHANGES.values())[-1][0]:
-            async with log.engine.begin() as connection:
-                for place in (BLOCK, COLUMN):
-                    await connection.exec_driver_sql(f"DELETE FROM {place}")
-                    await connection.exec_driver_sql(f"INSERT INTO {place} SELECT * FROM kept_{place}")
     await rebuilt(log)
     assert (await stored(log))[1] == expected
     assert (await verified(log)).drift == 0
@@ -297,7 +331,7 @@ async def test_a_damaged_block_stops_the_merge_with_its_reason_and_no_other_fold
 ) -> None:
     await filled(log)
     async with log.engine.begin() as connection:
-        await connection.exec_driver_sql(f"UPDATE {COLUMN} SET words = 'nonsense' WHERE {ARM}")
+        await connection.exec_driver_sql(f"UPDATE {BLOCK} SET checksum = checksum + 1 WHERE {SECOND}")
     with pytest.raises(DamageError, match=r"block [0-9]+ of recall is damaged.*run `pycrorm rebuild recall`"):
         await stored(log)
     small_blocks(monkeypatch)

@@ -43,7 +43,7 @@ def tried(
 
 
 def tries(*cases: Case, arm: Arms | None = None) -> Tries:
-    library = CaseLibrary([Block.of(cases)])
+    library = CaseLibrary([Block.of(cases)] if cases else [])
     return tries_of(library, ["PickUpAction", "CarefulPickUpAction"], ObjectType.MILK, arm)
 
 

@@ -16,7 +16,7 @@ from pycrorm_async.recall import search as activations
 from pycrorm_async.recall import search as searching
 from pycrorm_async.recall.answer import answer
 from pycrorm_async.recall.blocks import WORDS_MAX, Block, CaseLibrary, Group, decode, encode
-from pycrorm_async.recall.columns import FEATURES_MAX, Case, bounded_case
+from pycrorm_async.recall.columns import FEATURES_MAX, Case
 from pycrorm_async.recall.recall import cue_like
 from pycrorm_async.recall.search import (
     K_MAX,
@@ -33,13 +33,13 @@ from pycrorm_async.recall.search import (
     weights_of,
 )
 from pycrorm_async.world.pose import Arms, ObjectType
-from tests.recall.cases import CASE_STATUSES, CASE_TYPES, WORDS, random_cases
+from tests.recall.cases import CASE_STATUSES, CASE_TYPES, WORDS, kept_case, random_cases
 
 # === search ===================================================================================================
 #
 # The search finds exactly the cases, in exactly the order, that comparing every case in plain Python finds.
 
-CASES = [bounded_case(case) for case in random_cases(400, seed=1)]
+CASES = [kept_case(case) for case in random_cases(400, seed=1)]
 Answer = list[tuple[float, int]]
 
 

@@ -124,7 +124,7 @@ async def test_a_memory_without_cases_of_this_version_has_pages_without_them(
 
 async def test_a_page_reports_that_its_cases_are_damaged(url: str, tmp_path: Path) -> None:
     with closing(sqlite3.connect(copy_of(url, tmp_path))) as database, database:
-        (table,) = database.execute("SELECT name FROM sqlite_master WHERE name LIKE 'zz_%_recall_column%'").fetchone()
+        (table,) = database.execute("SELECT name FROM sqlite_master WHERE name LIKE 'zz_%_recall_block%'").fetchone()
         database.execute(f"UPDATE {table} SET data = x'00'")
     async with Reading.open(f"sqlite:///{tmp_path / 'memory.db'}") as reading:
         await report(reading, 2, tmp_path / "page.html")
