@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pycrorm_async.events.ids import row_id
-from pycrorm_async.recall.blocks import Block, Spread
+from pycrorm_async.recall.blocks import Block, Group
 from pycrorm_async.recall.columns import Column, Words
 from pycrorm_async.recall.search import Cue, Wanted
 
@@ -62,20 +63,15 @@ class Actions:
             yield self._block(rows[np.argsort(self.types[rows], kind="stable")])
 
     def _block(self, rows: NDArray[np.int64]) -> Block:
-        numbers, sizes = np.unique(self.types[rows], return_counts=True)
-        types = tuple(f"Type{number:02}Action" for number in numbers)
-        texts = {name: self._column(name, codes[rows]) for name, codes in self.texts.items()}
-        texts["status"] = Column(self.succeeded[rows].astype(np.uint8) + 1, Words(("FAILED", "SUCCEEDED")))
+        columns = {name: self._column(name, codes[rows]) for name, codes in self.texts.items()}
+        columns["status"] = Column(self.succeeded[rows].astype(np.uint8) + 1, Words(("FAILED", "SUCCEEDED")))
         values = {name: Column(each[rows]) for name, each in self.numbers.items()}
         values["duration"] = Column(np.full(rows.size, 2.5, np.float32))
-        return Block(
-            dict(zip(types, sizes.tolist(), strict=True)),
-            row_id(1, 0, 0) + (rows + 1) * 32,
-            rows * 1_000_000,
-            np.zeros(rows.size, np.int32),
-            {name: Spread(types, column) for name, column in texts.items()},
-            {name: Spread(types, column) for name, column in values.items()},
-        )
+        nodes = row_id(1, 0, 0) + (rows + 1) * 32
+        whole = Group("", nodes, rows * 1_000_000, np.zeros(rows.size, np.int32), columns, values)
+        types = self.types[rows]
+        names = {number: f"Type{number:02}Action" for number in np.unique(types).tolist()}
+        return Block({name: replace(whole.taken(types == each), type=name) for each, name in names.items()})
 
     def _column(self, name: str, codes: NDArray[np.int16]) -> Column:
         words = Words(f"{name.upper()}_{code}" for code in range(_TEXTS[name][0]))

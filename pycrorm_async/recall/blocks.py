@@ -16,7 +16,7 @@ from functools import cached_property
 from itertools import chain
 from operator import itemgetter
 from types import MappingProxyType
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import msgspec
 import numpy as np
@@ -28,7 +28,6 @@ from pycrorm_async.recall.columns import (
     RESERVED,
     Case,
     Column,
-    Rows,
     Summary,
     Words,
     bounded,
@@ -64,9 +63,53 @@ class Group:
     texts: Mapping[str, Column]
     numbers: Mapping[str, Column]
 
+    @classmethod
+    def of(cls, cases: Iterable[Case]) -> Group:
+        """Make a group of cases of one type."""
+        rows = sorted(cases, key=lambda case: (-case.started_us, -case.node))
+        nodes, started_us, types, symbols, numbers, statuses, reasons, durations, parents, simulated = zip(
+            *rows, strict=True
+        )
+        texts, values = _values(symbols), _values(numbers)
+        reserved = RESERVED & (texts.keys() | values.keys())
+        assert not reserved, f"features of a situation cannot be named {', '.join(sorted(reserved))}"
+        marks = ["yes" if each else None for each in simulated]
+        return cls(
+            types[0],
+            np.array(nodes, np.int64),
+            np.array(started_us, np.int64),
+            (np.array([each or 0 for each in parents], np.int64) // _SEQUENCE & SEQUENCE_MAX).astype(np.int32),
+            _columns({**texts, "status": statuses, "reason": reasons, "simulated": marks}, Column.of_texts),
+            _columns({**values, "duration": durations}, Column.of_numbers),
+        )
+
+    @classmethod
+    def joined(cls, groups: Sequence[Group]) -> Group:
+        """Return one group with the cases of all, which have one type."""
+        nodes = np.concatenate([each.nodes for each in groups])
+        started_us = np.concatenate([each.started_us for each in groups])
+        parents = np.concatenate([each.parents for each in groups])
+        sizes = [*map(len, groups)]
+        texts, numbers = (
+            {
+                name: joined([each.get(name) for each in columns], sizes)
+                for name in sorted(frozenset[str]().union(*columns))
+            }
+            for columns in ([each.texts for each in groups], [each.numbers for each in groups])
+        )
+        return cls(groups[0].type, nodes, started_us, parents, texts, numbers).taken(np.lexsort((-nodes, -started_us)))
+
     def __len__(self) -> int:
         """Return the number of cases."""
         return int(self.nodes.size)
+
+    def taken(self, rows: NDArray[Any]) -> Group:
+        """Return the group of some of its cases: of these rows, or those for which a mask is True."""
+        arrays = self.nodes[rows], self.started_us[rows], self.parents[rows]
+        texts, numbers = (
+            {name: each.taken(rows) for name, each in columns.items()} for columns in (self.texts, self.numbers)
+        )
+        return Group(self.type, *arrays, texts, numbers)
 
     @cached_property
     def episodes(self) -> NDArray[np.int64]:
@@ -93,179 +136,89 @@ class Group:
         )
 
 
-class Spread(NamedTuple):
-    """A column over the groups of some types of a block, in their order."""
-
-    types: tuple[str, ...]
-    column: Column
-
-
-Spreads = Mapping[str, Spread]
-
-
 @dataclass(frozen=True, eq=False)
 class Block:
     """Many cases, grouped by type.
 
     Attributes:
-        sizes: the number of cases of each type, in alphabetical order.
-        nodes, started_us, parents: as in `Group`, group after group.
-        texts, numbers: the columns by feature, those of the outcome among them.
+        groups: by type, in alphabetical order. They have one dictionary for each text feature.
         left_out: features that are not kept because they have too many words.
     """
 
-    sizes: Mapping[str, int]
-    nodes: NDArray[np.int64]
-    started_us: NDArray[np.int64]
-    parents: NDArray[np.int32]
-    texts: Spreads
-    numbers: Spreads
+    groups: Mapping[str, Group]
     left_out: frozenset[str] = frozenset()
 
     @classmethod
     def of(cls, cases: Iterable[Case]) -> Block:
-        """Make a block of cases, at least one.
+        """Make a block of cases.
 
         A block keeps a case without infinite numbers, long texts and features beyond `FEATURES_MAX`, and with rounded
         numbers. What it keeps depends on the case alone, so an action gives the same case in any block.
         """
-        rows = [case if len(case.symbols) + len(case.numbers) <= FEATURES_MAX else _limited(case) for case in cases]
-        rows.sort(key=lambda case: (case.type, -case.started_us, -case.node))
-        sizes = Counter(case.type for case in rows)
-        nodes, started_us, _, symbols, numbers, statuses, reasons, durations, parents, simulated = zip(
-            *rows, strict=True
-        )
-        texts = _owned(sizes, symbols)
-        texts |= {"status": (sizes, statuses), "reason": (sizes, reasons)}
-        texts["simulated"] = sizes, ["yes" if each else None for each in simulated]
-        return _without_long_dictionaries(
-            cls(
-                sizes,
-                np.array(nodes, np.int64),
-                np.array(started_us, np.int64),
-                (np.array([each or 0 for each in parents], np.int64) // _SEQUENCE & SEQUENCE_MAX).astype(np.int32),
-                _spreads(texts, Column.of_texts),
-                _spreads(_owned(sizes, numbers) | {"duration": (sizes, durations)}, Column.of_numbers),
-            )
-        )
+        by_type: dict[str, list[Case]] = {}
+        for case in cases:
+            is_small = len(case.symbols) + len(case.numbers) <= FEATURES_MAX
+            by_type.setdefault(case.type, []).append(case if is_small else _limited(case))
+        return _block([Group.of(by_type[name]) for name in sorted(by_type)])
 
     def __len__(self) -> int:
         """Return the number of cases."""
         return int(self.nodes.size)
 
+    @cached_property
+    def nodes(self) -> NDArray[np.int64]:
+        """The nodes of the cases, group after group."""
+        return np.concatenate([each.nodes for each in self.groups.values()] or [np.zeros(0, np.int64)])
+
     def cases(self) -> Iterator[Case]:
         """Yield the cases, group after group, the newest of each group first."""
         return (group.case(row) for group in self.groups.values() for row in range(len(group)))
 
-    @cached_property
-    def spans(self) -> dict[str, slice]:
-        """The places of the cases of each type."""
-        ends = np.cumsum([*self.sizes.values()]).tolist()
-        return {name: slice(end - size, end) for (name, size), end in zip(self.sizes.items(), ends, strict=True)}
-
-    @cached_property
-    def groups(self) -> dict[str, Group]:
-        """The groups by type, in alphabetical order; their columns share the memory of the block."""
-        texts, numbers = self._parts(self.texts), self._parts(self.numbers)
-        return {
-            name: Group(name, self.nodes[span], self.started_us[span], self.parents[span], texts[name], numbers[name])
-            for name, span in self.spans.items()
+    def without(self, nodes: NDArray[np.int64]) -> Block:
+        """Return the block without the cases of these nodes."""
+        kept = {name: np.isin(group.nodes, nodes, invert=True) for name, group in self.groups.items()}
+        groups = {
+            name: group if kept[name].all() else group.taken(kept[name])
+            for name, group in self.groups.items()
+            if kept[name].any()
         }
-
-    def _parts(self, spreads: Spreads) -> dict[str, dict[str, Column]]:
-        parts: dict[str, dict[str, Column]] = {name: {} for name in self.sizes}
-        for feature, (types, column) in spreads.items():
-            first = 0
-            for name in types:
-                last = first + self.sizes[name]
-                parts[name][feature] = column.taken(slice(first, last))
-                first = last
-        return parts
-
-    def where(self, kept: NDArray[np.bool_]) -> Block:
-        """Return the block with those of its cases for which `kept` is True, in their order."""
-        sizes = {name: size for name, span in self.spans.items() if (size := int(kept[span].sum()))}
-
-        def where(spreads: Spreads) -> Spreads:
-            columns = {
-                feature: Spread(
-                    tuple(name for name in types if name in sizes), column.taken(kept[self.rows_of(types)].nonzero()[0])
-                )
-                for feature, (types, column) in spreads.items()
-            }
-            return {feature: each for feature, each in columns.items() if each.types}
-
-        columns = self.nodes[kept], self.started_us[kept], self.parents[kept]
-        return Block(sizes, *columns, where(self.texts), where(self.numbers), self.left_out)
-
-    def rows_of(self, types: tuple[str, ...]) -> Rows:
-        """Return the places of the cases of these types."""
-        if len(types) == len(self.sizes):
-            return slice(None)
-        return np.concatenate([np.arange(self.spans[name].start, self.spans[name].stop) for name in types])
+        return Block(groups, self.left_out)
 
 
 def merge(blocks: Sequence[Block]) -> Block:
     """Return one block with the cases of all."""
-    names = sorted({name for block in blocks for name in block.sizes})
-    codes = {name: code for code, name in enumerate(names)}
-    types = np.concatenate([np.repeat([codes[name] for name in each.sizes], [*each.sizes.values()]) for each in blocks])
-    nodes = np.concatenate([each.nodes for each in blocks])
-    started = np.concatenate([each.started_us for each in blocks])
-    order = np.lexsort((-nodes, -started, types))
-    parents = np.concatenate([each.parents for each in blocks])[order]
-    sizes = dict(zip(names, np.bincount(types).tolist(), strict=True))
+    by_type: dict[str, list[Group]] = {}
+    for group in chain.from_iterable(block.groups.values() for block in blocks):
+        by_type.setdefault(group.type, []).append(group)
     left_out = frozenset[str]().union(*(each.left_out for each in blocks))
-    merged = Block(sizes, nodes[order], started[order], parents, {}, {}, left_out)
-    rows: dict[tuple[Block, tuple[str, ...]], Rows] = {}
-
-    def places(block: Block, owners: tuple[str, ...]) -> Rows:
-        if (block, owners) not in rows:
-            rows[block, owners] = block.rows_of(owners)
-        return rows[block, owners]
-
-    def merged_spreads(spreads_of_blocks: Sequence[Spreads]) -> Spreads:
-        spreads = {}
-        for feature in sorted(frozenset[str]().union(*spreads_of_blocks)):
-            having = [each.get(feature) for each in spreads_of_blocks]
-            owned = frozenset(chain.from_iterable(each.types for each in having if each is not None))
-            whole = joined(
-                [
-                    None if each is None else each.column.placed(places(block, each.types), len(block))
-                    for block, each in zip(blocks, having, strict=True)
-                ],
-                [*map(len, blocks)],
-            )
-            owners = tuple(name for name in names if name in owned)
-            spreads[feature] = Spread(owners, whole.taken(order).taken(places(merged, owners)))
-        return spreads
-
-    texts, numbers = merged_spreads([each.texts for each in blocks]), merged_spreads([each.numbers for each in blocks])
-    return _without_long_dictionaries(replace(merged, texts=texts, numbers=numbers))
+    return _block([Group.joined(by_type[name]) for name in sorted(by_type)], left_out)
 
 
-# --- columns of cases -----------------------------------------------------------------------------------------
-
-_Owned = dict[str, tuple[Mapping[str, int], Sequence[Any]]]
-"""The values of each feature, in those types that have it, which are given with their sizes."""
-
-
-def _owned(sizes: Mapping[str, int], situations: Sequence[Mapping[str, Any]]) -> _Owned:
-    """Return the values of each feature of the situations, None where a case of a type does not have it."""
-    owners: dict[str, dict[str, int]] = {}
-    values: dict[str, list[Any]] = {}
-    first = 0
-    for name, size in sizes.items():
-        for feature, each in _values_by_feature(situations[first : first + size]).items():
-            owners.setdefault(feature, {})[name] = size
-            values.setdefault(feature, []).extend(each)
-        first += size
-    reserved = RESERVED.intersection(owners)
-    assert not reserved, f"features of a situation cannot be named {', '.join(sorted(reserved))}"
-    return {feature: (types, values[feature]) for feature, types in owners.items()}
+def _block(groups: Sequence[Group], left_out: frozenset[str] = frozenset()) -> Block:
+    """Return the block of these groups, with one dictionary for each feature, and without those that are too long."""
+    words = {name: joined_words(each) for name, each in dictionaries(groups).items()}
+    left_out |= {name for name, each in words.items() if each.word_count > WORDS_MAX}
+    united = (
+        replace(
+            group,
+            texts={name: each.recoded(words[name]) for name, each in group.texts.items() if name not in left_out},
+        )
+        for group in groups
+    )
+    return Block({group.type: group for group in united}, left_out)
 
 
-def _values_by_feature(situations: Sequence[Mapping[str, Any]]) -> Mapping[str, Sequence[Any]]:
+def dictionaries(groups: Iterable[Group]) -> Mapping[str, Sequence[Words]]:
+    """Return the different dictionaries of each text feature in these groups."""
+    words: dict[str, dict[int, Words]] = {}
+    for group in groups:
+        for name, column in group.texts.items():
+            words.setdefault(name, {})[id(column.words)] = column.words
+    return {name: [*each.values()] for name, each in words.items()}
+
+
+def _values(situations: Sequence[Mapping[str, Any]]) -> Mapping[str, Sequence[Any]]:
+    """Return the values of each feature of the situations, None where one does not have it."""
     names = tuple(situations[0])
     if len(names) > 1 and {*map(len, situations)} == {len(names)}:  # as of most types, whose fields are always set
         with suppress(KeyError):
@@ -274,19 +227,10 @@ def _values_by_feature(situations: Sequence[Mapping[str, Any]]) -> Mapping[str, 
     return {feature: [each.get(feature) for each in situations] for feature in features}
 
 
-def _spreads(owned: _Owned, column_of: Callable[[Sequence[Any]], Column]) -> Spreads:
-    """Make the column of each feature, without the types of which no case has a value that is kept."""
-    spreads = {}
-    for feature, (sizes, values) in sorted(owned.items()):
-        column, types = column_of(values), tuple(sizes)
-        present = column.present()
-        if not present.all():
-            having = np.logical_or.reduceat(present, np.cumsum([0, *sizes.values()])[:-1])
-            types = tuple(name for name, each in zip(sizes, having.tolist(), strict=True) if each)
-            column = column.taken(np.repeat(having, [*sizes.values()]).nonzero()[0])
-        if types:
-            spreads[feature] = Spread(types, column)
-    return spreads
+def _columns(values: Mapping[str, Sequence[Any]], column_of: Callable[[Sequence[Any]], Column]) -> Mapping[str, Column]:
+    """Make the columns of these features, without those of which no case has a value that is kept."""
+    columns = {name: column_of(values[name]) for name in sorted(values)}
+    return {name: each for name, each in columns.items() if each.present().any()}
 
 
 def _limited(case: Case) -> Case:
@@ -300,16 +244,6 @@ def _limited(case: Case) -> Case:
     )
 
 
-def _without_long_dictionaries(block: Block) -> Block:
-    long = {name for name, each in block.texts.items() if each.column.words.word_count > WORDS_MAX}
-    left_out = block.left_out | long
-    if not left_out:
-        return block
-    return replace(
-        block, texts={name: each for name, each in block.texts.items() if name not in left_out}, left_out=left_out
-    )
-
-
 # === block bytes ==============================================================================================
 #
 # The bytes of a block: the length of its heading in 8 bytes, the heading as MessagePack, and the arrays, all
@@ -318,13 +252,14 @@ def _without_long_dictionaries(block: Block) -> Block:
 
 
 class _Heading(msgspec.Struct, array_like=True):
-    """The number of cases of each type, feature, types, kind and dictionary of each column, and what is left out.
+    """Each group by type, with the number of its cases and its columns by feature and kind, and the dictionaries.
 
-    The arrays are the nodes and starts (int64), the parents (int32), and the values of each column of this kind.
+    The arrays of a group are its nodes and starts (int64), its parents (int32), and the values of each column of this
+    kind: unsigned integers for texts, floats for numbers.
     """
 
-    sizes: dict[str, int]
-    columns: list[tuple[str, tuple[str, ...], str, list[str | tuple[str, ...]] | None]]
+    groups: list[tuple[str, int, list[tuple[str, str]]]]
+    words: dict[str, list[str | tuple[str, ...]]]
     left_out: list[str]
 
 
@@ -333,11 +268,14 @@ _heading: Final = msgspec.msgpack.Decoder(_Heading).decode
 
 def encode(block: Block) -> bytes:
     """Return the bytes of a block."""
-    spreads = [*block.texts.items(), *block.numbers.items()]
-    columns = [(name, types, _kind(each.values), each.dictionary()) for name, (types, each) in spreads]
-    heading = msgspec.msgpack.encode(_Heading({**block.sizes}, columns, sorted(block.left_out)))
-    arrays: list[NDArray[Any]] = [block.nodes, block.started_us, block.parents]
-    arrays += [each.column.values for _, each in spreads]
+    groups: list[tuple[str, int, list[tuple[str, str]]]] = []
+    arrays: list[NDArray[Any]] = []
+    for group in block.groups.values():
+        columns = [*group.texts.items(), *group.numbers.items()]
+        groups.append((group.type, len(group), [(name, _kind(each.values)) for name, each in columns]))
+        arrays += [group.nodes, group.started_us, group.parents, *(each.values for _, each in columns)]
+    words = {name: [*each] for name, (each,) in dictionaries(block.groups.values()).items()}
+    heading = msgspec.msgpack.encode(_Heading(groups, words, sorted(block.left_out)))
     parts = [len(heading).to_bytes(8, "little"), heading, *(each.astype(_kind(each)).tobytes() for each in arrays)]
     return b"".join(chain.from_iterable((each, bytes(-len(each) % 8)) for each in parts))
 
@@ -354,16 +292,18 @@ def decode(data: bytes) -> Block:
         place += values.nbytes
         return values
 
-    count = sum(heading.sizes.values())
-    arrays = array("<i8", count), array("<i8", count), array("<i4", count)
-    texts, numbers = {}, {}
-    for feature, types, kind, words in heading.columns:
-        values = array(kind, sum(heading.sizes[name] for name in types))
-        if words is None:
-            numbers[feature] = Spread(types, Column(values))
-        else:
-            texts[feature] = Spread(types, Column(values, Words(words)))
-    return Block(heading.sizes, *arrays, texts, numbers, frozenset(heading.left_out))
+    words = {name: Words(each) for name, each in heading.words.items()}
+    groups = {}
+    for name, size, columns in heading.groups:
+        arrays = array("<i8", size), array("<i8", size), array("<i4", size)
+        texts, numbers = {}, {}
+        for feature, kind in columns:
+            if kind[1] == "u":
+                texts[feature] = Column(array(kind, size), words[feature])
+            else:
+                numbers[feature] = Column(array(kind, size))
+        groups[name] = Group(name, *arrays, texts, numbers)
+    return Block(groups, frozenset(heading.left_out))
 
 
 def _kind(values: NDArray[Any]) -> str:
@@ -411,15 +351,18 @@ class CaseLibrary:
     def types(self) -> Mapping[str, int]:
         """The number of cases of each type, in alphabetical order."""
         sizes: Counter[str] = Counter()
-        for block in self.blocks:
-            for name, size in block.sizes.items():
-                sizes[self.present_name(name)] += size
+        for group in self._recorded_groups:
+            sizes[self.present_name(group.type)] += len(group)
         return dict(sorted(sizes.items()))
 
     @cached_property
     def recorded_types(self) -> frozenset[str]:
         """The names under which the cases were recorded."""
-        return frozenset(chain.from_iterable(block.sizes for block in self.blocks))
+        return frozenset(group.type for group in self._recorded_groups)
+
+    @cached_property
+    def _recorded_groups(self) -> tuple[Group, ...]:
+        return tuple(chain.from_iterable(block.groups.values() for block in self.blocks))
 
     def names_of(self, type: str | None) -> tuple[str, ...]:  # noqa: A002
         """Return the names under which the cases of a type were recorded."""
@@ -442,20 +385,14 @@ class CaseLibrary:
     @cached_property
     def left_out(self) -> frozenset[str]:
         """The text features with more than `WORDS_MAX` words, which are not compared."""
-        words: dict[str, list[Words]] = {}
-        for block in self.blocks:
-            for name, spread in block.texts.items():
-                words.setdefault(name, []).append(spread.column.words)
-        long = (name for name, each in words.items() if _exceeds(each))
+        long = (name for name, each in self._dictionaries.items() if _exceeds(each))
         return frozenset(chain(long, *(block.left_out for block in self.blocks)))
 
     def groups(self, type: str | None = None) -> tuple[Group, ...]:  # noqa: A002  the name of the feature
         """Return the groups of a type, that with the newest case first."""
         groups = self._groups.get(type)
         if groups is None:
-            chosen = [
-                self._group(block.groups[name]) for block in self.blocks for name in block.sizes if self._is(name, type)
-            ]
+            chosen = [self._group(each) for each in self._recorded_groups if self._is(each.type, type)]
             groups = tuple(sorted(chosen, key=lambda each: (-int(each.started_us[0]), -int(each.nodes[0]))))
             self._groups[type] = groups
         return groups
@@ -467,9 +404,12 @@ class CaseLibrary:
     def words(self, feature: str) -> Words:
         """Return one dictionary of a text feature, for the cases of all types."""
         if feature not in self._words:
-            columns = (block.texts[feature].column for block in self.blocks if feature in block.texts)
-            self._words[feature] = joined_words(column.words for column in columns) or Words()
+            self._words[feature] = joined_words(self._dictionaries.get(feature, ()))
         return self._words[feature]
+
+    @cached_property
+    def _dictionaries(self) -> Mapping[str, Sequence[Words]]:
+        return dictionaries(self._recorded_groups)
 
     def size(self, type: str | None = None) -> int:  # noqa: A002
         """Return the number of cases of a type."""

@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from pycrorm_async.events.ids import row_key
 
 Mask: TypeAlias = NDArray[np.bool_]
-Rows: TypeAlias = "slice | NDArray[np.int64]"
 Value: TypeAlias = "str | tuple[str, ...]"
 
 
@@ -108,14 +107,15 @@ class Column:
         return cls(np.where(large, wide, narrow) if large.any() else narrow)
 
     @property
+    def is_number(self) -> bool:
+        """Whether it is a column of numbers."""
+        return self._words is None
+
+    @property
     def words(self) -> Words:
         """The dictionary of a column of texts."""
         assert self._words is not None
         return self._words
-
-    def dictionary(self) -> list[Value] | None:
-        """Return the values of a column of texts; None for one of numbers."""
-        return None if self._words is None else [*self._words]
 
     def having(self, word: str, rows: slice = slice(None)) -> Mask:
         """Return a mask of these rows: True where the case has the word."""
@@ -159,15 +159,9 @@ class Column:
         mask: Mask = ~np.isnan(self.values) if self._words is None else self.values > 0
         return mask
 
-    def taken(self, rows: Rows) -> Column:
-        """Return the column with some of its cases, in their order."""
+    def taken(self, rows: NDArray[Any]) -> Column:
+        """Return the column of some of its cases: of these rows, or those for which a mask is True."""
         return Column(self.values[rows], self._words)
-
-    def placed(self, rows: Rows, count: int) -> Column:
-        """Return the column of more cases, of which these rows are its own and the others do not have the feature."""
-        values = np.full(count, np.nan if self._words is None else 0, self.values.dtype)
-        values[rows] = self.values
-        return Column(values, self._words)
 
     def recoded(self, words: Words | None) -> Column:
         """Return the column with a dictionary that contains its own."""
@@ -184,21 +178,19 @@ def joined(columns: Sequence[Column | None], sizes: Sequence[int], words: Words 
         sizes: the number of cases of each.
         words: a dictionary that contains those of all columns of texts; by default it is made.
     """
-    present = [each for each in columns if each is not None]
-    if words is None:
-        words = joined_words(each._words for each in present)  # noqa: SLF001 - None for numbers
+    first = next(each for each in columns if each is not None)
+    if words is None and not first.is_number:
+        words = joined_words(each.words for each in columns if each is not None)
     absent, narrow = (np.nan, np.float32) if words is None else (0, np.uint8)
     parts = zip(columns, sizes, strict=True)
     values = [np.full(size, absent, narrow) if each is None else each.recoded(words).values for each, size in parts]
     return Column(np.concatenate(values), words)
 
 
-def joined_words(dictionaries: Iterable[Words | None]) -> Words | None:
-    """Return one dictionary with the values of all; None if there are none."""
-    different = {id(each): each for each in dictionaries if each is not None}
-    if len(different) < 2:
-        return next(iter(different.values()), None)
-    return Words.of(chain.from_iterable(different.values()))
+def joined_words(dictionaries: Iterable[Words]) -> Words:
+    """Return one dictionary with the values of all."""
+    different = {id(each): each for each in dictionaries}
+    return next(iter(different.values())) if len(different) == 1 else Words.of(chain.from_iterable(different.values()))
 
 
 def bounded(value: Value | None) -> Value | None:

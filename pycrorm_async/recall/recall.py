@@ -471,20 +471,16 @@ class CaseReader:
         blocks = [*self._blocks.values(), *self._unstored, *([Block.of(self._unnumbered)] if self._unnumbered else [])]
         if not self._hidden.size:
             return blocks
-        kept = [(block, ~np.isin(block.nodes, self._hidden)) for block in blocks]
-        return [block if each.all() else block.where(each) for block, each in kept if each.any()]
+        return [each for block in blocks if len(each := block.without(self._hidden))]
 
 
 def _without(blocks: Sequence[Block], stored: Collection[Block]) -> list[Block]:
-    """Return the blocks without the cases that a stored block has; a block of which none are left is left out."""
-    left: list[Block] = []
-    for block in blocks:
-        first, last = block.nodes.min(), block.nodes.max()
-        both = [np.isin(block.nodes, each.nodes[(each.nodes >= first) & (each.nodes <= last)]) for each in stored]
-        kept = ~np.logical_or.reduce(both) if both else np.ones(len(block), np.bool_)
-        if kept.any():
-            left.append(block if kept.all() else block.where(kept))
-    return left
+    """Return the blocks without the cases that a stored block has, and skip those of which no case is left."""
+    if not blocks or not stored:
+        return [*blocks]
+    first = min(int(block.nodes.min()) for block in blocks)
+    nodes = np.concatenate([each.nodes[each.nodes >= first] for each in stored])
+    return [each for block in blocks if len(each := block.without(nodes))]
 
 
 # === cue arguments ============================================================================================

@@ -74,20 +74,13 @@ class Weights(NamedTuple):
     @property
     def total(self) -> float:
         """The sum of all weights; 1 for a cue of conditions only, which every case fulfils alike."""
-        total = 0.0
-        for weight in self.words:
-            total += weight
-        return total + len(self.tolerances) or 1.0
+        return sum(self.words) + len(self.tolerances) or 1.0
 
     @property
     def reachable(self) -> float:
         """The highest weighted similarity that a case can have: without words that no case has."""
-        total, unseen = 0.0, set(self.never_seen)
-        for pair, weight in zip(self.pairs, self.words, strict=True):
-            total += 0.0 if pair in unseen else weight
-        for _ in self.tolerances:
-            total += 1
-        return total or float(not self.pairs)
+        seen = (weight for pair, weight in zip(self.pairs, self.words, strict=True) if pair not in self.never_seen)
+        return sum(seen) + len(self.tolerances) or float(not self.pairs)
 
 
 class Match(NamedTuple):
@@ -204,14 +197,12 @@ def _reachable(group: Group, cue: Cue, weights: Weights) -> float:
     """Return the highest weighted similarity that the words and numbers of a group allow."""
     if not (cue.has or cue.near):
         return 1.0
-    total = 0.0
-    for pair, weight in zip(cue.has, weights.words, strict=True):
-        column = group.texts.get(pair[0])
-        if column is not None and pair[1] in column.words.codes_by_word:
-            total += weight
-    for wanted in cue.near:
-        total += wanted.feature in group.numbers
-    return total
+    numbers = sum(wanted.feature in group.numbers for wanted in cue.near)
+    return numbers + sum(
+        weight
+        for (feature, word), weight in zip(cue.has, weights.words, strict=True)
+        if feature in group.texts and word in group.texts[feature].words.codes_by_word
+    )
 
 
 def _conditions(group: Group, rows: slice, cue: Cue) -> Iterator[Mask]:
@@ -482,19 +473,6 @@ class Forgotten(NamedTuple):
     nodes: NDArray[np.int64]
 
 
-def activation(ages_s: NDArray[np.float64]) -> float:
-    """Return the activation of a way from the ages of its uses in s, the youngest first.
-
-    >>> round(activation(np.array([1.0, 4.0])), 3)
-    0.405
-    """
-    ages = np.maximum(ages_s, _AGE_S_MIN)
-    total = float(np.sum(ages[:_EXACT] ** -_DECAY))
-    if ages.size > _EXACT:
-        total += _spread_evenly(ages.size - _EXACT, float(ages[_EXACT - 1]), float(ages[-1]))
-    return float(np.log(total))
-
-
 def forgotten(library: CaseLibrary, *, threshold: float, now_us: int) -> Forgotten:
     """Return the cases whose ways have an activation below the threshold. Nothing is deleted."""
     nodes, count = [], 0
@@ -540,7 +518,7 @@ def _ways_of(name: str, library: CaseLibrary, now_us: int) -> _Ways:
         totals[having] += ages[firsts[having] + use] ** -_DECAY
     long = sizes > _EXACT
     third, oldest = ages[firsts[long] + _EXACT - 1], ages[firsts[long] + sizes[long] - 1]
-    totals[long] += _spread_evenly_all(sizes[long] - _EXACT, third, oldest)
+    totals[long] += _spread_evenly(sizes[long] - _EXACT, third, oldest)
     return _Ways(nodes[by_way], sizes, np.log(totals))
 
 
@@ -568,11 +546,7 @@ def _renumbered(ways: NDArray[np.int64]) -> tuple[NDArray[np.int64], int]:
     return numbers.astype(np.int64), int(different.size)
 
 
-def _spread_evenly(count: int, third_s: float, oldest_s: float) -> float:
-    return float(_spread_evenly_all(np.array([count]), np.array([third_s]), np.array([oldest_s]))[0])
-
-
-def _spread_evenly_all(
+def _spread_evenly(
     counts: NDArray[np.int64], third_s: NDArray[np.float64], oldest_s: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Return the sum over the older uses of each way; if all have the same age, that of one times their number."""

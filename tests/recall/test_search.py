@@ -24,7 +24,6 @@ from pycrorm_async.recall.search import (
     Match,
     Wanted,
     Weights,
-    activation,
     check_cue,
     forgotten,
     numbers_of,
@@ -232,21 +231,32 @@ def test_the_tolerance_of_a_number_does_not_depend_on_the_blocks() -> None:
 NOW_US = 10_000_000_000
 
 
-def test_up_to_three_uses_are_counted_exactly_and_more_nearly() -> None:
-    assert activation(np.array([4.0])) == pytest.approx(np.log(0.5))
-    assert activation(np.array([1.0, 4.0, 100.0])) == pytest.approx(np.log(1.6))
-    assert activation(np.array([0.0])) < 4, "an action that starts now does not outweigh all others"
-    assert activation(np.full(10, 4.0)) == pytest.approx(np.log(5))
-    chance = np.random.default_rng(1)
-    for size in (4, 20, 300):
-        ages = np.sort(chance.uniform(1, 10_000, size))
-        assert activation(ages) == pytest.approx(float(np.log(np.sum(ages**-0.5))), abs=0.15)
-
-
 def use(sequence: int, age_s: float, arm: str, name: str = "A") -> Case:
     texts: dict[str, str | tuple[str, ...]] = {"arm": arm, "near": ("CUP",) if sequence % 2 else ("BOWL",)}
     status = "FAILED" if sequence % 3 else "SUCCEEDED"
     return Case(row_id(1, sequence, 0), NOW_US - round(age_s * 1e6), name, texts, {"x": age_s}, status, None, 1.0)
+
+
+def activation(ages_s: list[float]) -> float:
+    """Return the activation of a way with uses of these ages: the threshold from which on it is forgotten."""
+    library = CaseLibrary([Block.of(use(number, age_s, "L") for number, age_s in enumerate(ages_s, 1))])
+    low, high = -50.0, 50.0
+    for _ in range(60):
+        middle = (low + high) / 2
+        is_forgotten = forgotten(library, threshold=middle, now_us=NOW_US).cases > 0
+        low, high = (low, middle) if is_forgotten else (middle, high)
+    return low
+
+
+def test_up_to_three_uses_are_counted_exactly_and_more_nearly() -> None:
+    assert activation([4.0]) == pytest.approx(np.log(0.5))
+    assert activation([1.0, 4.0, 100.0]) == pytest.approx(np.log(1.6))
+    assert activation([0.0]) < 4, "an action that starts now does not outweigh all others"
+    assert activation([4.0] * 10) == pytest.approx(np.log(5))
+    chance = np.random.default_rng(1)
+    for size in (4, 20, 300):
+        ages = np.sort(chance.uniform(1, 10_000, size))
+        assert activation(ages.tolist()) == pytest.approx(float(np.log(np.sum(ages**-0.5))), abs=0.15)
 
 
 @pytest.mark.parametrize("numbers_max", [2**62, 3])
@@ -262,8 +272,7 @@ def test_all_cases_of_a_way_have_its_activation(numbers_max: int, monkeypatch: p
     for name in "AB":
         for arm in "LR":
             way = [case for case in cases if (case.type, case.symbols["arm"]) == (name, arm)]
-            ages = np.sort([(NOW_US - case.started_us) / 1e6 for case in way])
-            nodes, value = {case.node for case in way}, activation(ages)
+            nodes, value = {case.node for case in way}, activation([(NOW_US - case.started_us) / 1e6 for case in way])
             assert nodes <= hidden(value + 1e-9)
             assert not nodes & hidden(value - 1e-9)
 
