@@ -24,13 +24,11 @@ from numpy.typing import NDArray
 
 from pycrorm_async.events.ids import SEQUENCE_MAX, row_id, row_key
 from pycrorm_async.recall.columns import (
-    FEATURES_MAX,
     RESERVED,
     Case,
     Column,
     Summary,
     Words,
-    bounded,
     is_angle,
     joined,
     joined_words,
@@ -152,13 +150,11 @@ class Block:
     def of(cls, cases: Iterable[Case]) -> Block:
         """Make a block of cases.
 
-        A block keeps a case without infinite numbers, long texts and features beyond `FEATURES_MAX`, and with rounded
-        numbers. What it keeps depends on the case alone, so an action gives the same case in any block.
+        A block keeps a case without infinite numbers and long texts, and with rounded numbers.
         """
         by_type: dict[str, list[Case]] = {}
         for case in cases:
-            is_small = len(case.symbols) + len(case.numbers) <= FEATURES_MAX
-            by_type.setdefault(case.type, []).append(case if is_small else _limited(case))
+            by_type.setdefault(case.type, []).append(case)
         return _block([Group.of(by_type[name]) for name in sorted(by_type)])
 
     def __len__(self) -> int:
@@ -231,17 +227,6 @@ def _columns(values: Mapping[str, Sequence[Any]], column_of: Callable[[Sequence[
     """Make the columns of these features, without those of which no case has a value that is kept."""
     columns = {name: column_of(values[name]) for name in sorted(values)}
     return {name: each for name, each in columns.items() if each.present().any()}
-
-
-def _limited(case: Case) -> Case:
-    """Return a case with the first `FEATURES_MAX` of its features that a block keeps."""
-    symbols = {name: value for name, value in case.symbols.items() if bounded(value)}
-    numbers = {name: number for name, number in case.numbers.items() if math.isfinite(number)}
-    kept = {*sorted({*symbols, *numbers})[:FEATURES_MAX]}
-    return case._replace(
-        symbols={name: value for name, value in symbols.items() if name in kept},
-        numbers={name: number for name, number in numbers.items() if name in kept},
-    )
 
 
 # === block bytes ==============================================================================================

@@ -38,7 +38,7 @@ from typing import Any, ClassVar, Final, NamedTuple, TypeAlias
 
 import msgspec
 import numpy as np
-from sqlalchemy import Select, TableClause, column, delete, func, select, table, true
+from sqlalchemy import Select, TableClause, column, delete, select, table, true
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.bulk_records import make
@@ -537,10 +537,10 @@ class EpisodeCases:
 # they hold 65,536 cases. So a case is rewritten at most four times, a memory has at most some sixty blocks besides the
 # full ones, and the full ones never change.
 #
-# Several processes may fold one memory. On PostgreSQL a merge locks the blocks that it takes and skips those that
-# another transaction has locked, so that two merges never take the same block, and no process waits. A transaction that
-# is rolled back, by a kill too, leaves the blocks as they were, with the checkpoints. A reader that reads the list of
-# the blocks and then their bytes in one snapshot finds each case once.
+# Several processes may fold one memory. On PostgreSQL a merge locks the blocks that it takes, and is left to a later
+# batch if another transaction has locked one of them, so that two merges never take the same block, and no process
+# waits. A transaction that is rolled back, by a kill too, leaves the blocks as they were, with the checkpoints. A
+# reader that reads the list of the blocks and then their bytes in one snapshot finds each case once.
 #
 # The number of a block is the greatest node id among its cases, plus its level: node ids end in five zero bits. A case
 # moves to higher levels only, so a number is never used twice in a generation.
@@ -551,13 +551,11 @@ BLOCK_COLUMNS: Final = {
     "cases": "integer",
     "episode_min": "integer",
     "episode_max": "integer",
-    "time_min": "time",
-    "time_max": "time",
     "checksum": "integer",
     "left_out": "text",
     "data": "bytes",
 }
-"""The columns of `recall_block`. Its `id` is the block's number. The episodes and times are those of its cases. `data`
+"""The columns of `recall_block`. Its `id` is the block's number. The episodes are those of its cases. `data`
 has the bytes of the block (`recall.blocks`), `checksum` their CRC-32. `left_out` is a JSON list of the features that
 have more than `WORDS_MAX` words here; it is null if there are none."""
 _MERGED: Final = 16
@@ -581,7 +579,7 @@ class BlockHeading(NamedTuple):
 
 def rows_of(block: Block, generation: int) -> RowsByTable:
     """Return the row of a block in the table of this generation."""
-    cases, groups = len(block), block.groups.values()
+    cases = len(block)
     level = _level_of(cases)
     number = int(block.nodes.max()) + level
     data = encode(block)
@@ -592,8 +590,6 @@ def rows_of(block: Block, generation: int) -> RowsByTable:
         cases,
         int(block.nodes.min()) >> EPISODE_SHIFT,
         int(block.nodes.max()) >> EPISODE_SHIFT,
-        min(int(each.started_us[-1]) for each in groups),
-        max(int(each.started_us[0]) for each in groups),
         zlib.crc32(data),
         msgspec.json.encode(sorted(block.left_out)).decode() if block.left_out else None,
         data,
@@ -643,51 +639,37 @@ async def read_left_out(connection: AsyncConnection, generation: int) -> list[st
 
 async def merge_blocks(connection: AsyncConnection, generation: int) -> None:
     """Merge the blocks of each level that has enough of them, in the caller's transaction. Raises `DamageError`."""
-    while (level := await _full_level(connection, generation)) is not None:
-        if not await _merge_level(connection, generation, level):
-            return
+    blocks, dialect = _blocks(generation), dialect_of(connection)
+    while chosen := await _lock_blocks(connection, generation):
+        numbers, cases = [each.number for each in chosen], sum(each.cases for each in chosen)
+        merged = merge([*(await read_blocks(connection, generation, numbers)).values()])
+        if len(merged) != cases:
+            raise DamageError(f"{len(numbers)} blocks of recall have {len(merged)} cases instead of {cases}: {_ADVICE}")
+        await connection.execute(delete(blocks).where(blocks.c.id.in_(numbers)))
+        await dialect.insert(connection, await dialect.insertion(rows_of(merged, generation)))
 
 
-async def _full_level(connection: AsyncConnection, generation: int) -> int | None:
-    """Return the lowest level whose blocks are to be merged."""
-    blocks = _blocks(generation)
-    sizes = await connection.execute(
-        select(blocks.c.level, func.count(), func.sum(blocks.c.cases))
-        .where(blocks.c.level < _FULL_LEVEL)
-        .group_by(blocks.c.level)
-        .order_by(blocks.c.level)
-    )
-    return next((level for level, count, cases in sizes if _is_enough(count, cases)), None)
+async def _lock_blocks(connection: AsyncConnection, generation: int) -> Sequence[BlockHeading]:
+    """Lock the blocks to merge, of the lowest level that has enough; none if another transaction has one of them."""
+    headings = await read_headings(connection, generation)
+    levels = ([each for each in headings if each.level == level] for level in range(_FULL_LEVEL))
+    chosen = next(filter(None, map(_enough, levels)), [])
+    number = _blocks(generation).c.id
+    query = select(number).where(number.in_([each.number for each in chosen])).with_for_update(skip_locked=True)
+    return chosen if chosen and len((await connection.execute(query)).all()) == len(chosen) else []
 
 
-async def _merge_level(connection: AsyncConnection, generation: int, level: int) -> bool:
-    """Merge blocks of this level; return False if other transactions have locked too many of them."""
-    blocks = _blocks(generation)
-    query = select(blocks.c.id, blocks.c.cases).where(blocks.c.level == level).order_by(blocks.c.id)
-    locked = (await connection.execute(query.with_for_update(skip_locked=True))).all()
-    numbers: list[int] = []
+def _enough(headings: Sequence[BlockHeading]) -> Sequence[BlockHeading]:
+    """Return the first blocks of a level that are enough to be merged; none if all are not."""
     cases = 0
-    for each in locked:
-        numbers.append(each.id)
+    for count, each in enumerate(headings, 1):
         cases += each.cases
-        if _is_enough(len(numbers), cases):
-            break
-    else:
-        return False
-    merged = merge([*(await read_blocks(connection, generation, numbers)).values()])
-    if len(merged) != cases:
-        raise DamageError(f"{len(numbers)} blocks of recall have {len(merged)} cases instead of {cases}: {_ADVICE}")
-    await connection.execute(delete(blocks).where(blocks.c.id.in_(numbers)))
-    dialect = dialect_of(connection)
-    await dialect.insert(connection, await dialect.insertion(rows_of(merged, generation)))
-    return True
+        if count >= _MERGED or cases >= _MERGED**_FULL_LEVEL:
+            return headings[:count]
+    return []
 
 
 _ADVICE = "run `pycrorm rebuild recall`"
-
-
-def _is_enough(count: int, cases: int) -> bool:
-    return count >= _MERGED or cases >= _MERGED**_FULL_LEVEL
 
 
 def _level_of(cases: int) -> int:

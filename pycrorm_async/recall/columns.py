@@ -87,9 +87,9 @@ class Column:
     def of_texts(cls, values: Sequence[Any]) -> Column:
         """Make the column of words and tuples of words, None where a case does not have the feature.
 
-        Long words are left out, and all but the first `SYMBOLS_MAX` of a case.
+        Long words are left out.
         """
-        kept = {each: bounded(each) for each in {*values}}
+        kept = {each: _bounded(each) for each in {*values}}
         words = Words.of(each for each in kept.values() if each)
         codes = {each: words.codes.get(value, 0) for each, value in kept.items()}
         return cls(np.fromiter(map(codes.__getitem__, values), np.min_scalar_type(len(words)), len(values)), words)
@@ -193,11 +193,10 @@ def joined_words(dictionaries: Iterable[Words]) -> Words:
     return next(iter(different.values())) if len(different) == 1 else Words.of(chain.from_iterable(different.values()))
 
 
-def bounded(value: Value | None) -> Value | None:
-    """Return a value as a block keeps it: without words that are too long, and at most `SYMBOLS_MAX` of them."""
+def _bounded(value: Value | None) -> Value | None:
     if value is None or isinstance(value, str):
         return value if value and len(value) <= TEXT_MAX else None
-    return tuple(sorted({each for each in value if each and len(each) <= TEXT_MAX}))[:SYMBOLS_MAX] or None
+    return tuple(sorted({each for each in value if each and len(each) <= TEXT_MAX})) or None
 
 
 # === case =====================================================================================================
@@ -211,10 +210,6 @@ OUTCOME = ("status", "reason", "duration")
 """The features of the outcome. They are found by name like others, but only if a cue names them."""
 RESERVED = frozenset({"node", "parent", "started", "type", "simulated", *OUTCOME})
 """Names that a feature of a situation cannot have, because the case itself has them."""
-FEATURES_MAX = 256
-"""Bounds the features of one case; beyond them the last ones in alphabetical order are left out."""
-SYMBOLS_MAX = 255
-"""Bounds the symbols of one feature, as the objects nearby; beyond them the last ones in order are left out."""
 TEXT_MAX = 120
 """The longest symbol in characters. A longer text is prose, which hardly ever recurs, and is left out."""
 SINGLE_MAX = 2.0**24

@@ -58,8 +58,9 @@ from pycrorm_async.recall.cases import (
     select_numbers,
     situation,
 )
-from pycrorm_async.recall.columns import FEATURES_MAX, RESERVED, Case
+from pycrorm_async.recall.columns import RESERVED, Case
 from pycrorm_async.recall.search import (
+    FEATURES_MAX,
     Cue,
     Forgotten,
     Wanted,
@@ -387,20 +388,12 @@ class RunningCases(Protocol):
         ...
 
 
-class NoRunningCases:
-    """The cases of a process that records nothing."""
-
-    async def new(self) -> tuple[Sequence[Case], Sequence[Case]]:
-        """Return nothing."""
-        return (), ()
-
-
 class CaseReader:
     """The cases of one memory, for one event loop."""
 
     def __init__(self, source: BlockSource, running: RunningCases | None = None) -> None:
         self._source = source
-        self._running = running if running is not None else NoRunningCases()
+        self._running = running
         self._generation = -1
         self._blocks: dict[int, Block] = {}
         self._unstored: list[Block] = []
@@ -449,7 +442,7 @@ class CaseReader:
             return cases
 
     async def _read(self, *, changed: bool = False) -> CaseLibrary:
-        running, unnumbered = await self._running.new()
+        running, unnumbered = await self._running.new() if self._running is not None else ((), ())
         stored = await self._source.read(self._generation, self._blocks.keys())
         self._generation = stored.generation  # of another generation the source has returned all blocks
         gone = self._blocks.keys() - stored.numbers

@@ -44,7 +44,7 @@ from numpy.typing import NDArray
 from pycrorm_async.errors import CallerError
 from pycrorm_async.query.text import nearest
 from pycrorm_async.recall.blocks import WORDS_MAX, CaseLibrary, Group
-from pycrorm_async.recall.columns import FEATURES_MAX, OUTCOME, TEXT_MAX, Mask, is_angle, joined
+from pycrorm_async.recall.columns import OUTCOME, TEXT_MAX, Mask, is_angle, joined
 
 WEIGHT_MAX: Final = 3.0
 """Bounds the weight of a word; it is that of a word which one of twenty cases has."""
@@ -249,6 +249,8 @@ def _bound(similarity: float, total: float) -> int:
 # `has` and `near` make cases similar; a case without some of them has a lower score. Type, `lacks`, times, episodes and
 # `prohibit` are conditions: a case that does not fulfil them is left out.
 
+FEATURES_MAX = 256
+"""Bounds the words and numbers of a cue."""
 K_MAX = 10_000
 """Bounds the cases of one answer."""
 _LISTED = 12

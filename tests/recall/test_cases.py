@@ -374,7 +374,7 @@ def _die(url: str, place: str, last: int) -> None:
 @pytest.mark.parametrize(
     ("place", "last"),
     [
-        pytest.param("_full_level", 3, id="a block is written"),
+        pytest.param("_lock_blocks", 3, id="a block is written"),
         pytest.param("_level_of", 8, id="the blocks of a merge are deleted"),
     ],
 )

@@ -16,9 +16,10 @@ from pycrorm_async.recall import search as activations
 from pycrorm_async.recall import search as searching
 from pycrorm_async.recall.answer import answer
 from pycrorm_async.recall.blocks import WORDS_MAX, Block, CaseLibrary, Group, decode, encode
-from pycrorm_async.recall.columns import FEATURES_MAX, Case
+from pycrorm_async.recall.columns import Case
 from pycrorm_async.recall.recall import cue_like
 from pycrorm_async.recall.search import (
+    FEATURES_MAX,
     K_MAX,
     Cue,
     Match,
