@@ -353,13 +353,6 @@ class CaseLibrary:
         """Return the names under which the cases of a type were recorded."""
         return tuple(sorted(name for name in self.recorded_types if self._is(name, type)))
 
-    def joins(self, names: Mapping[str, str]) -> bool:
-        """Return whether these names give any type another present name than the library's own names do.
-
-        The reader then makes a new library, in which the cases of the renamed types belong together.
-        """
-        return any(names.get(each, each) != self.present_name(each) for each in {*names, *self._names, *self.types})
-
     def present_name(self, name: str) -> str:
         """Return the present name of a type."""
         return self._names.get(name, name)

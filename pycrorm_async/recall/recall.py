@@ -347,8 +347,7 @@ def frame_of(recalled: Answer) -> pd.DataFrame:
 # no case is missing or doubled. In another generation, which a rebuild has made, all blocks are new. A case of this
 # process is included as soon as its action has ended; once a stored block has it too, that of the block is used.
 
-_UNSTORED_BLOCKS = 16
-"""Bounds the blocks of cases of this process, each of one recall; more of them are merged."""
+_NO_NODES: Final = np.zeros(0, np.int64)
 
 
 class StoredBlocks(NamedTuple):
@@ -396,9 +395,9 @@ class CaseReader:
         self._running = running
         self._generation = -1
         self._blocks: dict[int, Block] = {}
-        self._unstored: list[Block] = []
+        self._unstored = Block.of(())
         self._unnumbered: Sequence[Case] = ()
-        self._hidden: NDArray[np.int64] = np.zeros(0, np.int64)
+        self._hidden: NDArray[np.int64] = _NO_NODES
         self._library = CaseLibrary()
         self._names: Mapping[str, str] = {}
         self._aliases: dict[str, str] = {}
@@ -419,7 +418,7 @@ class CaseReader:
                 self._aliases |= {alias: type for alias in aliases if type is not None}
                 names = dict(await self._source.present_names())
                 names |= {alias: each for alias, each in self._aliases.items() if names.get(alias, alias) == alias}
-                if library.joins(names):
+                if names != self._names:
                     self._library = CaseLibrary(library.blocks, names)
                 self._names = names
             return self._library
@@ -434,7 +433,7 @@ class CaseReader:
     async def forget(self, threshold: float, now_us: int, *, dry_run: bool) -> Forgotten:
         """Hide the cases whose ways have an activation below the threshold now, and no others, from this reader."""
         async with self._reading:
-            hidden, self._hidden = self._hidden, np.zeros(0, np.int64)
+            hidden, self._hidden = self._hidden, _NO_NODES
             cases = forgotten(await self._read(changed=hidden.size > 0), threshold=threshold, now_us=now_us)
             self._hidden = hidden if dry_run else cases.nodes
             if self._hidden.size:
@@ -449,31 +448,22 @@ class CaseReader:
         for number in gone:
             del self._blocks[number]
         self._blocks.update(stored.added)
-        unstored = self._unstored
-        if stored.added:
-            unstored = _without(unstored, stored.added.values())
         if running:
-            unstored = [*unstored, *_without([Block.of(running)], self._blocks.values())]
-        if changed or gone or stored.added or unstored != self._unstored or [*unnumbered] != [*self._unnumbered]:
-            self._unstored = unstored if len(unstored) <= _UNSTORED_BLOCKS else [merge(unstored)]
+            self._unstored = merge([self._unstored, Block.of(running)])
+        if len(self._unstored) and (running or stored.added):
+            first = self._unstored.nodes.min()
+            nodes = [_NO_NODES, *(each.nodes[each.nodes >= first] for each in self._blocks.values())]
+            self._unstored = self._unstored.without(np.concatenate(nodes))
+        if changed or gone or stored.added or running or [*unnumbered] != [*self._unnumbered]:
             self._unnumbered = unnumbered
             self._library = CaseLibrary(self._visible(), self._names)
         return self._library
 
     def _visible(self) -> list[Block]:
-        blocks = [*self._blocks.values(), *self._unstored, *([Block.of(self._unnumbered)] if self._unnumbered else [])]
-        if not self._hidden.size:
-            return blocks
-        return [each for block in blocks if len(each := block.without(self._hidden))]
-
-
-def _without(blocks: Sequence[Block], stored: Collection[Block]) -> list[Block]:
-    """Return the blocks without the cases that a stored block has, and skip those of which no case is left."""
-    if not blocks or not stored:
-        return [*blocks]
-    first = min(int(block.nodes.min()) for block in blocks)
-    nodes = np.concatenate([each.nodes[each.nodes >= first] for each in stored])
-    return [each for block in blocks if len(each := block.without(nodes))]
+        blocks = [*self._blocks.values(), self._unstored, Block.of(self._unnumbered)]
+        if self._hidden.size:
+            blocks = [each.without(self._hidden) for each in blocks]
+        return [each for each in blocks if len(each)]
 
 
 # === cue arguments ============================================================================================
@@ -841,10 +831,11 @@ class _Running:
     has_ended: bool = False
 
 
+@dataclass
 class ProcessCases:
     """The cases of the episodes that one memory records. Implements `RunningCases`.
 
-    Args:
+    Attributes:
         emitter: of the memory.
         open_episodes: returns the ids of the open episodes.
         flush: makes all events visible in the tables.
@@ -852,36 +843,26 @@ class ProcessCases:
         clock: gives the times of published events.
     """
 
-    def __init__(
-        self,
-        emitter: Emitter,
-        *,
-        open_episodes: Callable[[], Iterable[EpisodeId]],
-        flush: Callable[[], Awaitable[None]],
-        log: Callable[[], Awaitable[EventLog]],
-        clock: Clock,
-    ) -> None:
-        self._emitter = emitter
-        self._feed = emitter.feed
-        self._open_episodes = open_episodes
-        self._flush = flush
-        self._log = log
-        self._clock = clock
-        self._buffer: EventBuffer | None = None
-        self._left_out = 0
-        self._episodes: dict[str, _Running] = {}
-        self._own_numbers = 0
+    emitter: Emitter
+    open_episodes: Callable[[], Iterable[EpisodeId]]
+    flush: Callable[[], Awaitable[None]]
+    log: Callable[[], Awaitable[EventLog]]
+    clock: Clock
+    _buffer: EventBuffer | None = None
+    _left_out: int = 0
+    _episodes: dict[str, _Running] = field(default_factory=dict)
+    _own_numbers: int = 0
 
     async def new(self) -> tuple[Sequence[Case], Sequence[Case]]:
         """Return the new cases of episodes with a number, and all cases of those that have none yet.
 
         Raises `CallerError` once the memory is closed.
         """
-        if self._emitter.is_closed:
+        if self.emitter.is_closed:
             raise CallerError("the memory is closed, so nothing can be recalled from it: ask while it is open")
         cases: list[Case] = []
         if self._buffer is None:
-            self._buffer = self._feed.keep(READS, _EVENTS_MAX, self._clock)
+            self._buffer = self.emitter.feed.keep(READS, _EVENTS_MAX, self.clock)
             cases += await self._read_open()
         elif self._buffer.left_out > self._left_out:
             self._left_out = self._buffer.left_out
@@ -909,10 +890,10 @@ class ProcessCases:
     async def _read_open(self) -> list[Case]:
         """Fold the earlier events of the open episodes; cases that are in the tables too are returned again."""
         with suppress(EpisodeParked):  # `flush` and `status` report it; what is stored is folded here
-            await self._flush()
-        log = await self._log()
+            await self.flush()
+        log = await self.log()
         cases: list[Case] = []
-        for episode in self._open_episodes():
+        for episode in self.open_episodes():
             if await log.episode_number(episode) is None:
                 continue
             row = await episode_named(log, episode_text(episode))
@@ -928,7 +909,7 @@ class ProcessCases:
         if stored.type not in _READS:
             return ()
         cases: list[Case] = []
-        if running.fold.read([stored], self._feed.declaration, cases) is not None:
+        if running.fold.read([stored], self.emitter.feed.declaration, cases) is not None:
             running.has_ended = True  # the fold of the tables parks the episode, with the reason
         return cases
 
@@ -937,7 +918,7 @@ class ProcessCases:
         cases: list[Case] = []
         for episode, running in list(self._episodes.items()):
             if not running.is_numbered:
-                number = await (await self._log()).episode_number(parse_episode_id(episode))
+                number = await (await self.log()).episode_number(parse_episode_id(episode))
                 if number is not None:
                     running.number, running.is_numbered = number, True
             if running.is_numbered:
