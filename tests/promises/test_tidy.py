@@ -15,7 +15,7 @@ import pytest
 ROOT = Path(__file__).parent.parent.parent
 PACKAGE = ROOT / "pycrorm_async"
 MODULES = sorted(PACKAGE.rglob("*.py"))
-CODE_LINES_MAX = 47_700
+CODE_LINES_MAX = 47_050
 """Bounds the lines of code of the package: lower it when the package gets smaller, and never raise it."""
 IMPORT_LINES_MAX = 4_880
 """Bounds those of them that are import statements; 4 to 9 % of all are usual in packages of this size."""
