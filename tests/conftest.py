@@ -22,7 +22,7 @@ from tests.commands import fork_child
 from tests.databases import Server, put_memory, server_in_memory
 from tests.long_modules import long_modules_first
 from tests.report.browser import Browser, browser, chromium
-from tests.soak_turns import current_commit, place_of, turn_of
+from tests.soak_turns import SLOW_IN_TURNS, current_commit, place_of, turn_of
 
 # A busy machine must not fail a test by its time; Hypothesis measures its deadline on the wall clock.
 settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -149,7 +149,8 @@ def _select(config: pytest.Config, items: list[pytest.Item]) -> None:
         variants = (
             item.callspec.params.values() if isinstance(item, pytest.Function) and hasattr(item, "callspec") else ()
         )
-        if any(variant in mark.args for mark in item.iter_markers("soak_on") for variant in variants):
+        in_turns = item.get_closest_marker("slow") and item.path.parent.name in SLOW_IN_TURNS
+        if in_turns or any(variant in mark.args for mark in item.iter_markers("soak_on") for variant in variants):
             item.add_marker(pytest.mark.soak)
     commit = config.getoption("--soak-turn")
     if commit is None:

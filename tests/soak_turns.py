@@ -18,6 +18,8 @@ from typing import Final
 TURNS: Final = 10
 """Ten turns limit each to a few minutes of two cores."""
 FIXED: Final = "0"
+SLOW_IN_TURNS: Final = frozenset({"bench", "cli", "learning", "plan", "query", "report"})
+"""The folders whose slow tests are soak: what they show of one part, `promises/` shows of the whole at each commit."""
 
 
 def turn_of(commit: str) -> int:

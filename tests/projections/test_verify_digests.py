@@ -79,6 +79,7 @@ async def digests_of(log: EventLog) -> tuple[OutsideDigest, ...]:
 
 
 CHANGED = "or their digest, was changed after it was stored: the digest does not match"
+OTHER_TIME = "and the event has another time: one of them was changed after it was stored"
 CUT = [
     "DELETE FROM event WHERE episode = 2 AND sequence > 580",
     "UPDATE episode SET head = 580, folded = 580 WHERE number = 2",
@@ -105,7 +106,7 @@ KEYS = {"event": "episode", "episode": "number", "pycrorm_digest": "episode"}
         ),
         (
             ["UPDATE event SET wall_ns = wall_ns + 1 WHERE episode = 2 AND sequence = {last}"],
-            ["episode 2, event 513: one of the events 513 to {last}, " + CHANGED],
+            ["episode 2, event {last}: the episode's ended_wall_ns is {ended}, " + OTHER_TIME],
         ),
         (
             ["UPDATE event SET payload = replace(payload, 'e3', 'e4') WHERE episode = 3 AND sequence = 1"],
@@ -156,10 +157,10 @@ KEYS = {"event": "episode", "episode": "number", "pycrorm_digest": "episode"}
 async def test_each_change_of_the_log_is_found_and_named_in_one_line(
     log: EventLog, filled_url: str, changes: list[str], lines: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    head = ask(filled_url, "SELECT head FROM episode WHERE number = 2")[0][0]
+    [(head, ended)] = ask(filled_url, "SELECT head, ended_wall_ns FROM episode WHERE number = 2")
     for change in changes:
         ask_to_change(filled_url, change.format(last=head))
-    assert await findings(log, (), monkeypatch) == [each.format(last=head) for each in lines]
+    assert await findings(log, (), monkeypatch) == [each.format(last=head, ended=ended) for each in lines]
 
 
 @pytest.mark.soak_on("postgresql")

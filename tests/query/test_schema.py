@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from pycrorm_async.errors import CallerError
-from pycrorm_async.orm.base import Base, MomentType
+from pycrorm_async.orm.base import Base, Moment
 from pycrorm_async.orm.documentation import comments, described
 from pycrorm_async.projections.views import comments as stored_comments
 from pycrorm_async.query.memory_schema import CORE_VIEWS, as_text, read_schema
@@ -41,7 +41,7 @@ def test_every_column_of_a_time_has_its_unit_and_every_built_in_view_a_sentence(
     for name, table in Base.metadata.tables.items():
         assert views[name].text, name
         for column in table.columns:
-            if isinstance(column.type, MomentType):
+            if isinstance(column.type, Moment):
                 assert views[name].columns[column.name].endswith("µs since 1970-01-01 00:00 UTC"), (name, column.name)
             if column.name.endswith("_ns"):
                 assert views[name].columns[column.name].startswith("ns of"), (name, column.name)
