@@ -1,4 +1,4 @@
-"""Choose the turn of the soak that a commit runs: a tenth of the tests marked `soak`, another one at another commit.
+"""Choose the turn of the soak that a commit runs: a twentieth of the tests marked `soak`, another one at another commit.
 
     python -m pytest -m soak --soak-turn              the turn of the commit that is checked out, as .ci/run does
     python -m pytest -m soak --soak-turn=4f1c2ab      the turn of that commit, again
@@ -15,8 +15,8 @@ import subprocess
 from pathlib import Path
 from typing import Final
 
-TURNS: Final = 10
-"""Ten turns limit each to a few minutes of two cores."""
+TURNS: Final = 20
+"""Twenty turns limit each to a few minutes of two cores."""
 FIXED: Final = "0"
 SLOW_IN_TURNS: Final = frozenset({"bench", "cli", "learning", "plan", "query", "report"})
 """The folders whose slow tests are soak: what they show of one part, `promises/` shows of the whole at each commit."""
