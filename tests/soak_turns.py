@@ -1,4 +1,4 @@
-"""Choose the turn of the soak that a commit runs: a twentieth of the tests marked `soak`, another one at another commit.
+"""Choose the turn of the soak that a commit runs: a twentieth of the tests marked `soak`, another at another commit.
 
     python -m pytest -m soak --soak-turn              the turn of the commit that is checked out, as .ci/run does
     python -m pytest -m soak --soak-turn=4f1c2ab      the turn of that commit, again
