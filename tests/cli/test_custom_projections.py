@@ -110,7 +110,7 @@ def test_a_named_projection_is_folded_by_the_run_rebuilt_and_verified(lab: Path)
     done = answer("rebuild", "weighed", "--projection", "lab:Weighed", cwd=lab)
     assert done.keys() == {"projections"}
     assert {**done["projections"]["weighed"], "seconds": 0} == {
-        "generation": 1002, "events": 8, "episodes": 1, "seconds": 0, "parked": {}, "left": []
+        "generation": 1002, "events": 8, "episodes": 1, "seconds": 0, "parked": {}, "damaged": {}, "left": []
     }  # fmt: skip
     assert weighed(lab) == WEIGHED
     assert answer("verify", "--projection", "lab:Weighed", cwd=lab)["drift"] == 0

@@ -338,7 +338,7 @@ def test_a_rebuild_needs_no_code_of_the_plan_and_reports_what_it_made(tmp_path: 
     assert next(iter(before["weigh_action"].values()))["grams"] == 0.1
     done = answer("rebuild", "--workers", "2", cwd=tmp_path)
     assert {**done, "seconds": 0} == {
-        "generation": 1002, "events": 6, "episodes": 1, "seconds": 0, "parked": {}, "left": []
+        "generation": 1002, "events": 6, "episodes": 1, "seconds": 0, "parked": {}, "damaged": {}, "left": []
     }  # fmt: skip
     assert differences(before, tables_of(url)) == []
     assert traces(url) == []
