@@ -155,7 +155,7 @@ class BackgroundWriter:
     def _note_failure(self, error: Exception) -> None:
         """Note that appending has stopped for good; log it now, because the next flush may be far away."""
         self._failure = error
-        _log.error("the writer stopped; recorded events are kept in the spool: %s", error)
+        _log.error("the writer stopped; what the spool still holds is kept: %s", error)
 
     def _raise_failure(self) -> None:
         if self._failure is not None:

@@ -209,7 +209,7 @@ async def test_damage_is_reported_once_and_raised_at_every_flush_and_at_close_wh
     assert source.kept == [1, 2, 3, 4, 5, 6, 4, 5, 6]
     assert writers_alive() == []
     assert [each.getMessage() for each in caplog.records] == [
-        f"the writer stopped; recorded events are kept in the spool: {writer.state.failure}"
+        f"the writer stopped; what the spool still holds is kept: {writer.state.failure}"
     ]
 
 
