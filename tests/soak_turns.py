@@ -19,7 +19,7 @@ TURNS: Final = 20
 """Twenty turns limit each to a few minutes of two cores."""
 FIXED: Final = "0"
 SLOW_IN_TURNS: Final = frozenset({"bench", "cli", "learning", "plan", "query", "report"})
-"""The folders whose slow tests are soak: what they show of one part, `promises/` shows of the whole at each commit."""
+"""The folders whose slow tests are soak, so that the README's test command stays short."""
 
 
 def turn_of(commit: str) -> int:
