@@ -4,9 +4,10 @@
 a disk. On return the event is *written*: it survives `kill -9`. The sync thread makes it *synced*, and only then does
 `get_batch` return it; `acknowledge` makes it *stored*.
 
-After a failed sync the queue refuses every new event with the disk's error, and still supplies the events synced before. It cannot continue in a new file, because it has no second copy of the unsynced records. Files
-that another program has deleted or replaced end the queue in the same way, within a sync: nothing is acknowledged any
-more, because the sync of a file without a name succeeds and keeps nothing.
+After a failed sync the queue refuses every new event with the disk's error, and still supplies the events synced
+before. It cannot continue in a new file, because it has no second copy of the unsynced records. Files that another
+program has deleted or replaced end the queue in the same way, within a sync: nothing is acknowledged any more, because
+the sync of a file without a name succeeds and keeps nothing.
 
 **Theory of operation.** Three actors share a queue. The *sync thread* alone changes the files and, in `_turn`, the
 positions. *Producers* put through `_appender` and wait for space on `_room_notifier`. The *consumer* and callers of
