@@ -171,8 +171,9 @@ def _help() -> str:
     )
     options = "--version             Print the version and exit.\n  -h, --help            Show this message and exit."
     shell = "--install-completion  Install completion for the current shell; --show-completion prints it."
+    words = 'The section "Words" of the README explains episode, node, event, spool, fold and generation.'
     usage = "Usage: pycrorm VERB [OPTIONS] [ARGUMENTS]...    (`pycrorm VERB --help` lists those of a verb)"
-    return "\n\n".join([usage, _HELP, *panels, f"Options:\n  {options}\n  {shell}"]) + "\n"
+    return "\n\n".join([usage, _HELP, *panels, f"Options:\n  {options}\n  {shell}", words]) + "\n"
 
 
 def _options(
