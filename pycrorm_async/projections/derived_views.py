@@ -54,7 +54,7 @@ from pycrorm_async.events.ids import SEQUENCE_MAX, SLOT_MAX
 from pycrorm_async.projections.columns import EPISODE
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.model_boxes import link_boxes
-from pycrorm_async.world.models import built_in_urdf, kitchen_urdf
+from pycrorm_async.world.models import built_in_model, built_in_urdf
 from pycrorm_async.world.pose import ObjectType
 
 #
@@ -743,6 +743,6 @@ def _built_in_rows() -> Iterator[tuple[str | float | None, ...]]:
         if kind not in (ObjectType.ROBOT, ObjectType.ENVIRONMENT):
             for box in link_boxes(built_in_urdf("any", kind)):
                 yield kind.name, None, None, *box.center, *box.half, *box.axis
-    for box in link_boxes(kitchen_urdf()):
+    for box in link_boxes(built_in_model("kitchen")):
         if not box.link.endswith("_handle"):
             yield "kitchen", box.link, box.joint, *box.center, *box.half, *box.axis

@@ -92,45 +92,15 @@ __all__ = [
     "watcher",
 ]
 
-_NAMES_BY_MODULE = {
-    "bounding_boxes": ("BoundingBox",),
-    "pose": (
-        "Arms",
-        "Grasp",
-        "GripperState",
-        "JointType",
-        "ObjectType",
-        "Pose",
-        "Quaternion",
-        "Vector",
-        "WorldMode",
-    ),
-    "bullet": ("BulletWorld", "Object", "WorldObserver", "WorldWatcher", "current_world", "watcher"),
-    "bullet_body": ("WorldState",),
-    "world_copy": ("acting_robot", "copied", "robot_acting"),
-    "queries": ("Costmap", "GaussianCostmap", "OccupancyCostmap", "SemanticCostmap", "VisibilityCostmap"),
-    "urdf": (
-        "COURIER",
-        "PR2",
-        "ArmDescription",
-        "Bounds",
-        "Drive",
-        "FieldOfView",
-        "Limits",
-        "RobotDescription",
-        "describe_arm",
-        "describe_robot",
-        "register_robot",
-        "robot_description",
-    ),
-}
+_MODULES = ("pose", "urdf", "bounding_boxes", "bullet_body", "bullet", "world_copy", "queries")
+"""The modules that define these names; each imports some of those before it, and none after it."""
 
 
 def __getattr__(name: str) -> Any:
-    for module, names in _NAMES_BY_MODULE.items():
-        if name in names:
-            return getattr(import_module(f"{__name__}.{module}"), name)
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    modules = (vars(import_module(f"{__name__}.{each}")) for each in _MODULES)
+    return next(names[name] for names in modules if name in names)
 
 
 def __dir__() -> list[str]:

@@ -56,7 +56,7 @@ from pycrorm_async.world import (
     describe_robot,
     register_robot,
 )
-from pycrorm_async.world.models import courier_urdf
+from pycrorm_async.world.models import built_in_model
 from pycrorm_async.world.pose import rotated, yaw_quaternion
 from tests.world.fakes import HEIGHT_M, RAILS, link_poses, rail_robot, raised_robot
 
@@ -190,7 +190,7 @@ def with_fingers_along_x(description: RobotDescription) -> RobotDescription:
 async def test_a_third_arm_has_a_name_of_its_own_and_parts_of_its_own() -> None:
     arm = COURIER.arms[Arms.RIGHT]
     centre = Arms.named("CENTRE")
-    three = RobotDescription(name="three", urdf=courier_urdf(), arms={centre: arm})
+    three = RobotDescription(name="three", urdf=built_in_model("courier"), arms={centre: arm})
     with BulletWorld(), simulated_robot:
         robot = Object("three", ObjectType.ROBOT, robot=three)
         park = ParkArmsActionPerformable(centre)
@@ -235,7 +235,7 @@ def test_an_srdf_names_arms_grippers_and_postures() -> None:
 
 def test_a_registered_robot_needs_its_name_only(request: pytest.FixtureRequest) -> None:
     model = f"model of {request.node.name}"
-    description = RobotDescription(name=model, urdf=courier_urdf(), drive=Drive.FIXED)
+    description = RobotDescription(name=model, urdf=built_in_model("courier"), drive=Drive.FIXED)
     assert register_robot(description) is description
     with BulletWorld():
         robot = Object(model, ObjectType.ROBOT)

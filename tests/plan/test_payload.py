@@ -43,7 +43,7 @@ from pycrorm_async.world import (
     register_robot,
     robot_description,
 )
-from pycrorm_async.world.models import courier_urdf
+from pycrorm_async.world.models import built_in_model
 from pycrorm_async.world.pose import ObjectRefused
 from pycrorm_async.world.world_copy import copied, counterpart
 
@@ -141,7 +141,7 @@ async def test_an_arm_without_a_known_payload_refuses_nothing(world: BulletWorld
 
 
 def test_a_payload_is_given_with_an_arm_a_robot_or_its_registration() -> None:
-    urdf = courier_urdf()
+    urdf = built_in_model("courier")
     arm = describe_arm(urdf, "column_link", "tool_frame", payload_kg=2)
     assert arm.payload_kg == 2
     robot = describe_robot("mule", urdf, arms={Arms.RIGHT: arm, Arms.LEFT: arm}, payload_kg={Arms.LEFT: 4})

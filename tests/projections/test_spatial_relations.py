@@ -31,7 +31,7 @@ from pycrorm_async.settings import Settings
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.world import BulletWorld, Object, ObjectType
 from pycrorm_async.world.model_boxes import link_boxes
-from pycrorm_async.world.models import kitchen_urdf
+from pycrorm_async.world.models import built_in_model
 from tests.projections.event_script import PICK_UP, T0_NS, Script, declarations, declared, field, name_of, pose, row
 from tests.projections.sql_queries import ask, stored_and_folded
 from tests.projections.verify_cases import rebuilt
@@ -253,12 +253,12 @@ async def test_an_object_is_in_a_sliding_part_of_a_recorded_description(log: Eve
 @pytest.mark.slow
 async def test_the_links_of_a_recorded_kitchen_are_those_of_the_built_in_one(log: EventLog) -> None:
     declared_ = Declared()
-    kitchen = declared_.description(kitchen_urdf())
+    kitchen = declared_.description(built_in_model("kitchen"))
     event = decode("DescriptionDeclared", declared_.records[0].payload)
     assert isinstance(event, DescriptionDeclared)
     recorded = {each.link: each for each in event.link_boxes}
-    assert recorded.keys() == {each.link for each in link_boxes(kitchen_urdf())}
-    for each in link_boxes(kitchen_urdf()):
+    assert recorded.keys() == {each.link for each in link_boxes(built_in_model("kitchen"))}
+    for each in link_boxes(built_in_model("kitchen")):
         box = recorded[each.link]
         assert (box.joint, box.axis) == (each.joint, each.axis)
         assert [*box.center, *box.half] == pytest.approx([*each.center, *each.half], abs=1e-5)
@@ -271,7 +271,7 @@ async def test_the_links_of_a_recorded_kitchen_are_those_of_the_built_in_one(log
 
 
 def test_the_boxes_of_the_kitchen_are_those_of_its_links() -> None:
-    boxes = {each.link: each for each in link_boxes(kitchen_urdf())}
+    boxes = {each.link: each for each in link_boxes(built_in_model("kitchen"))}
     surface, drawer = boxes["kitchen_counter_surface"], boxes["kitchen_island_upper_drawer"]
     assert (surface.center, surface.half) == ((1.35, 0.15, 0.828), (0.3, 0.7, 0.02))
     assert (drawer.center, drawer.half) == ((-1.315, 1.0, 0.74), (0.235, 0.3, 0.1))
@@ -287,12 +287,12 @@ async def boxes_by_model(log: EventLog, generation: int = 1001) -> dict[str, int
 @pytest.mark.slow
 async def test_the_boxes_of_a_description_are_stored_once_rebuilt_and_verified(log: EventLog) -> None:
     declared_, tidying = Declared(), Tidying()
-    kitchen = declared_.description(kitchen_urdf())
+    kitchen = declared_.description(built_in_model("kitchen"))
     crate = declared_.description(box_urdf("crate", "0.6 0.4 0.3"))
     tidying.add("home", "ENVIRONMENT", 9, 0, 0, description=kitchen)
     records = [*declarations(PICK_UP, PLACE), *declared_.records, *tidying.script.records]
     projector = await stored_and_folded(log, records)
-    links = sum(not each.link.endswith("_handle") for each in link_boxes(kitchen_urdf()))
+    links = sum(not each.link.endswith("_handle") for each in link_boxes(built_in_model("kitchen")))
     assert await boxes_by_model(log) == {kitchen: links}  # no object is made from the other one yet
     again = Script(2)
     for description in (crate, kitchen, crate):

@@ -33,7 +33,7 @@ from pycrorm_async.query.sql import SqlResult
 from pycrorm_async.query.text import NotebookValue, value_html
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
-from pycrorm_async.world.models import courier_urdf
+from pycrorm_async.world.models import built_in_model
 from tests.mesh_files import binary_stl
 
 START = datetime(2026, 3, 1, 12, tzinfo=UTC)
@@ -116,7 +116,7 @@ def described(urdf: str) -> DescriptionDeclared:
 
 
 def moment(*objects: ObjectThen, **fields: object) -> Moment:
-    world = WorldThen(objects, None, {"described": described(courier_urdf())})
+    world = WorldThen(objects, None, {"described": described(built_in_model("courier"))})
     plain = Moment(1, "id", "Set the table", "ada", START, False, 7, 1.5, START, "RUNNING", (), world)
     return replace(plain, **fields)  # type: ignore[arg-type]
 
@@ -289,7 +289,7 @@ def test_a_moment_shows_what_runs_where_everything_is_and_what_was_observed() ->
 def test_links_are_drawn_where_bullet_has_them() -> None:
     pose, link = Pose([0.3, 0.2, 0.8], [0, 0, 0.6, 0.8]), "forearm_link"
     with BulletWorld():
-        courier = Object("courier", ObjectType.ROBOT, courier_urdf())
+        courier = Object("courier", ObjectType.ROBOT, built_in_model("courier"))
         joints = {each: 0.03 * (index + 1) for index, each in enumerate(courier.joints)}
     then = moment(ObjectThen(1, 1, "courier", "ROBOT", pose, joints, None, "described", base_link=link))
     frames = link_frames(object_model(then.world.descriptions["described"]), pose, joints, link)

@@ -60,7 +60,7 @@ from pycrorm_async.world import (
     register_robot,
     robot_acting,
 )
-from pycrorm_async.world.models import courier_urdf
+from pycrorm_async.world.models import built_in_model
 from tests.commands import answer, pycrorm
 from tests.databases import ask
 from tests.world.fakes import RAILS, link_poses, rail_robot, raised_robot
@@ -202,7 +202,8 @@ async def test_every_episode_names_its_robots_with_model_serial_and_description(
 ) -> None:
     third = replace(COURIER, serial="C-03")
     arm = Arms.named("CENTRE")
-    many = replace(third, name="many", urdf=courier_urdf(), arms={arm: COURIER.arms[Arms.RIGHT]}, serial=None)
+    urdf, arms = built_in_model("courier"), {arm: COURIER.arms[Arms.RIGHT]}
+    many = replace(third, name="many", urdf=urdf, arms=arms, serial=None)
     register_robot(many)
     async with Memory.open(database_url, spool=tmp_path / "spool") as memory:
         async with memory.episode(description="nobody"):

@@ -13,7 +13,7 @@ from pycrorm_async.cli.demo import kitchen_world
 from pycrorm_async.plan import NavigateAction, ObjectDesignatorDescription, ParkArmsAction, PickUpAction, PlanFailure
 from pycrorm_async.plan import TransportAction, simulated_robot
 from pycrorm_async.world import Arms, BulletWorld, Grasp, Object, ObjectType, Pose
-from pycrorm_async.world.models import courier_urdf
+from pycrorm_async.world.models import built_in_model
 
 LINK = "forearm_link"
 
@@ -42,7 +42,8 @@ async def drives():
     with BulletWorld(), simulated_robot:
         Object("courier", ObjectType.ROBOT)
         await NavigateAction([Pose([1, 0.5, 0])]).resolve().perform()
-        arm = Object("other", ObjectType.ROBOT, courier_urdf(), Pose([3, 1, 0.8], [0, 0, 0.6, 0.8]), base_link=LINK)
+        urdf, place = built_in_model("courier"), Pose([3, 1, 0.8], [0, 0, 0.6, 0.8])
+        arm = Object("other", ObjectType.ROBOT, urdf, place, base_link=LINK)
         arm.set_joint_positions(dict.fromkeys(arm.joints, 0.02))
 '''
 

@@ -6,14 +6,13 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
-from xml.etree.ElementTree import fromstring, indent, tostring
+from xml.etree.ElementTree import fromstring, tostring
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pycrorm_async.world import COURIER, Object, Pose, RobotDescription
-from pycrorm_async.world.models import courier_urdf, link, moving
-from pycrorm_async.world.urdf import Bounds
+from pycrorm_async.world.models import built_in_model
 
 Matrix = NDArray[np.float64]
 
@@ -112,23 +111,29 @@ RAILS = {"rail_x": 0.4, "rail_y": -0.3, "rail_turn": 0.9}
 
 def raised_robot() -> RobotDescription:
     """Return a courier whose base link is fixed 0.2 m above its root, the link `base_footprint`."""
-    robot = fromstring(courier_urdf())
+    robot = fromstring(built_in_model("courier"))
     [origin] = robot.iterfind("joint[@name='base_footprint_joint']/origin")
     origin.set("xyz", f"0 0 {HEIGHT_M}")
     return replace(COURIER, name="raised", base_link="base_link", urdf=tostring(robot, encoding="unicode"))
 
 
+_RAILS = """
+<link name="hall"><collision><origin xyz="0 3 0.01"/><geometry><box size="6 0.1 0.02"/></geometry></collision></link>
+<link name="carriage"/>
+<link name="slide"/>
+<joint name="rail_x" type="prismatic"><parent link="hall"/><child link="carriage"/><origin xyz="0 0 0.1"/>
+  <axis xyz="1 0 0"/><limit lower="-2" upper="2"/></joint>
+<joint name="rail_y" type="prismatic"><parent link="carriage"/><child link="slide"/>
+  <axis xyz="0 1 0"/><limit lower="-2" upper="2"/></joint>
+<joint name="rail_turn" type="revolute"><parent link="slide"/><child link="base_footprint"/><origin xyz="0 0 0.07"/>
+  <axis xyz="0 0 1"/><limit lower="-3" upper="3"/></joint>
+"""
+
+
 def rail_robot() -> RobotDescription:
     """Return a courier on two rails and a turntable above its root, the link `hall`."""
-    robot = fromstring(courier_urdf())
-    link(robot, "hall", (6, 0.1, 0.02), (0, 3, 0.01))
-    link(robot, "carriage")
-    link(robot, "slide")
-    moving(robot, "rail_x", "hall", "carriage", (0, 0, 0.1), (1, 0, 0), Bounds(-2, 2), prismatic=True)
-    moving(robot, "rail_y", "carriage", "slide", (0, 0, 0), (0, 1, 0), Bounds(-2, 2), prismatic=True)
-    moving(robot, "rail_turn", "slide", "base_footprint", (0, 0, 0.07), (0, 0, 1), Bounds(-3, 3))
-    indent(robot)
-    return replace(COURIER, name="railed", base_link="base_link", urdf=tostring(robot, encoding="unicode"))
+    robot = built_in_model("courier").removesuffix("</robot>")
+    return replace(COURIER, name="railed", base_link="base_link", urdf=f"{robot}{_RAILS}</robot>")
 
 
 def link_poses(robot: Object) -> dict[str, Pose]:

@@ -32,7 +32,7 @@ from pycrorm_async.world import (
     copied,
 )
 from pycrorm_async.world.kinematics import Unreachable, chain_of, forward, solve, solve_from
-from pycrorm_async.world.models import courier_urdf, pr2_urdf
+from pycrorm_async.world.models import built_in_model
 from pycrorm_async.world.pose import Arms, Grasp, Pose, Quaternion, Vector, product, rotated, yaw_quaternion
 from pycrorm_async.world.urdf import GRASP_ORIENTATIONS, PR2, Limits
 from pycrorm_async.world.world_copy import counterpart
@@ -60,7 +60,7 @@ def least_margin(arm: Arms, joints: dict[str, float], limits: Limits) -> float:
 @pytest.fixture
 def model(tmp_path: Path) -> Iterator[LoadedModel]:
     path = tmp_path / "pr2.urdf"
-    path.write_text(pr2_urdf(), encoding="utf-8")
+    path.write_text(built_in_model("pr2"), encoding="utf-8")
     loaded = LoadedModel(path)
     yield loaded
     loaded.close()
@@ -267,7 +267,7 @@ def test_a_solution_uses_the_robots_pose_in_the_world_and_does_not_move_it() -> 
 
 def test_hard_limits_are_those_of_the_loaded_model_if_they_are_narrower() -> None:
     target = Pose([0.55, 0.3, 0.75], GRASP_ORIENTATIONS[Grasp.TOP])
-    stiff = pr2_urdf().replace('lower="-2.18"', 'lower="-1.0"')
+    stiff = built_in_model("pr2").replace('lower="-2.18"', 'lower="-1.0"')
     with BulletWorld():
         robot = Object("pr2", ObjectType.ROBOT)
         answer = solve(robot, Arms.LEFT, target, limits=Limits.HARD)
@@ -355,7 +355,7 @@ MILK = Pose((1.3, 1.0, 0.9))
 @pytest.fixture(scope="module")
 def robots(tmp_path_factory: pytest.TempPathFactory) -> dict[Arms, optik.Robot]:
     """Return the arms of the model, from the torso to the tool frame, within soft limits; rolls within one turn."""
-    model = ET.fromstring(pr2_urdf())
+    model = ET.fromstring(built_in_model("pr2"))
     soft = {joint: bounds for arm in PR2.arms.values() for joint, bounds in arm.soft_limits.items()}
     for joint in model.iter("joint"):
         bounds = soft.get(joint.get("name", ""))
@@ -519,7 +519,7 @@ def test_a_description_that_does_not_fit_the_model_is_refused_by_name() -> None:
         ("column_link", "elbow_link", "but its description has arm_yaw_joint: correct it"),
     ):
         wrong = ArmDescription(joints=("arm_yaw_joint",), base_link=base, tool_frame=tool)
-        unfit = RobotDescription(name="unfit", urdf=courier_urdf(), arms={Arms.LEFT: wrong})
+        unfit = RobotDescription(name="unfit", urdf=built_in_model("courier"), arms={Arms.LEFT: wrong})
         with BulletWorld(), pytest.raises(CallerError, match=named):
             solve(Object("unfit", ObjectType.ROBOT, robot=unfit), Arms.LEFT, Pose([0.6, 0, 0.8]))
 

@@ -13,7 +13,7 @@ import pytest
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.world import BulletWorld, JointType, Object, ObjectType, Pose
-from pycrorm_async.world.models import pr2_mesh_urdf_path, pr2_urdf
+from pycrorm_async.world.models import built_in_model, pr2_mesh_urdf_path
 from pycrorm_async.world.pose import (
     DescriptionNotLoadable,
     DuplicateName,
@@ -443,13 +443,13 @@ def test_a_robot_or_environment_that_is_not_built_in_needs_a_description(
 def test_the_built_in_robot_is_the_pr2(world: BulletWorld) -> None:
     robot = Object("pr2", ObjectType.ROBOT)
     assert robot.robot_description is PR2
-    assert robot.description_text == pr2_urdf()
+    assert robot.description_text == built_in_model("pr2")
     assert robot.joint_limits("torso_lift_joint") == (0.0, 0.33)
 
 
 def test_the_mesh_model_of_the_extra_loads_and_has_the_same_extents(world: BulletWorld) -> None:
     by_mesh = Object("pr2", ObjectType.ROBOT, pr2_mesh_urdf_path())
-    by_shape = Object("built in", ObjectType.ROBOT, pr2_urdf())
+    by_shape = Object("built in", ObjectType.ROBOT, built_in_model("pr2"))
     assert by_mesh.robot_description is PR2
     np.testing.assert_allclose(by_mesh.bounding_box(), by_shape.bounding_box(), atol=0.03)
 

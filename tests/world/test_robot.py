@@ -13,7 +13,7 @@ import pytest
 
 import pycrorm_async
 from pycrorm_async.world.kinematics import forward
-from pycrorm_async.world.models import pr2_mesh_urdf_path, pr2_urdf
+from pycrorm_async.world.models import built_in_model, pr2_mesh_urdf_path
 from pycrorm_async.world.pose import Arms, Grasp, GripperState, Pose, product, rotated, yaw_quaternion
 from pycrorm_async.world.urdf import GRASP_ORIENTATIONS, PR2, Limits, robot_description
 from tests.world.loaded_model import LoadedModel, angle_between, random_arm, random_base_pose
@@ -54,7 +54,7 @@ CONTINUOUS = {"l_forearm_roll_joint", "l_wrist_roll_joint", "r_forearm_roll_join
 @pytest.fixture
 def model(tmp_path: Path) -> Iterator[LoadedModel]:
     path = tmp_path / "pr2.urdf"
-    path.write_text(pr2_urdf(), encoding="utf-8")
+    path.write_text(built_in_model("pr2"), encoding="utf-8")
     loaded = LoadedModel(path)
     yield loaded
     loaded.close()
@@ -62,7 +62,7 @@ def model(tmp_path: Path) -> Iterator[LoadedModel]:
 
 def test_the_model_of_boxes_loads_without_output(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "pr2.urdf"
-    path.write_text(pr2_urdf(), encoding="utf-8")
+    path.write_text(built_in_model("pr2"), encoding="utf-8")
     LoadedModel(path).close()
     assert capfd.readouterr() == ("", "")
 

@@ -9,9 +9,8 @@ import contextlib
 import os
 from pathlib import Path
 from typing import Any
-from xml.etree.ElementTree import Element, fromstring, indent, tostring
 
-from pycrorm_async.world.models import fixed, link, pr2_urdf
+from pycrorm_async.world.models import built_in_model
 
 _BOXES = {"plane": (10.0, 10.0, 0.001), "milk": (0.06, 0.06, 0.2), "cereal": (0.06, 0.16, 0.25)}
 
@@ -22,10 +21,7 @@ def start_pycram(home: Path) -> Any:
     (resources / "robots").mkdir(parents=True)
     (resources / "robots" / "pr2.urdf").write_text(_pr2())
     for name, size in _BOXES.items():
-        robot = Element("robot", name=name)
-        link(robot, f"{name}_link", size)
-        indent(robot)
-        (resources / f"{name}.urdf").write_text(tostring(robot, encoding="unicode"))
+        (resources / f"{name}.urdf").write_text(f'<robot name="{name}">{_box(f"{name}_link", size)}</robot>')
     os.environ["HOME"] = str(home)
     with Path(os.devnull).open("w") as silence, contextlib.redirect_stdout(silence):
         from pycram.config.ik_conf import PinocchioConfig
@@ -42,14 +38,25 @@ def start_pycram(home: Path) -> Any:
 
 def _pr2() -> str:
     """Return our PR2 with the finger tips that PyCRAM's description of it names."""
-    robot = fromstring(pr2_urdf())
+    tips = ""
     for arm in ("l", "r"):
         for finger in ("l", "r"):
-            tip = f"{arm}_gripper_{finger}_finger_tip_link"
-            link(robot, tip, (0.02, 0.02, 0.03))
-            fixed(robot, tip.replace("_link", "_joint"), tip.replace("_tip", ""), tip, (0.12, 0, 0))
-    indent(robot)
-    return tostring(robot, encoding="unicode")
+            link = f"{arm}_gripper_{finger}_finger"
+            tips += (
+                f'{_box(f"{link}_tip_link", (0.02, 0.02, 0.03))}<joint name="{link}_tip_joint" type="fixed">\n'
+                f'<parent link="{link}_link"/><child link="{link}_tip_link"/><origin xyz="0.12 0 0"/></joint>\n'
+            )
+    return built_in_model("pr2").removesuffix("</robot>") + tips + "</robot>"
+
+
+def _box(link: str, size: tuple[float, float, float]) -> str:
+    geometry = f'<geometry><box size="{" ".join(map(str, size))}"/></geometry>'
+    return (
+        f'<link name="{link}">\n<inertial><mass value="1"/>'
+        '<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>\n'
+        f'<visual>{geometry}<material name="grey"><color rgba="0.6 0.6 0.65 1"/></material></visual>\n'
+        f"<collision>{geometry}</collision>\n</link>\n"
+    )
 
 
 def leave_out_mesh_checks() -> None:
