@@ -58,7 +58,7 @@ from pycrorm_async.clock import SYSTEM_CLOCK, Clock
 from pycrorm_async.errors import DatabaseError, DatabaseForeign, DatabaseUnavailable
 from pycrorm_async.operations.destination import LogAndTables, shared_address
 from pycrorm_async.projections.custom import Projection, installed_projections
-from pycrorm_async.projections.pipeline import LOOKAHEAD_EVENTS_MIN, BatchPreview, FoldPipeline, LiveTarget, Share
+from pycrorm_async.projections.pipeline import LOOKAHEAD_EVENTS_MIN, BatchPreview, FoldRunner, LiveTarget, Share
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.rebuild import Rebuild
 from pycrorm_async.settings import Settings
@@ -364,9 +364,9 @@ class _RequestHandler:
             self._log = await self._open_same_log()
         match request:
             case Prepare(spans):
-                return await (await self._opened(self._log)).prepare(spans)
+                return await (await self._opened(self._log)).runner.prepare(spans)
             case Write():
-                return await (await self._opened(self._log)).write()
+                return await (await self._opened(self._log)).runner.write()
             case FoldRest(now):
                 return await (await self._opened(self._log)).fold_rest(now=now)
             case FoldShare(share):
@@ -658,13 +658,12 @@ class FoldWorkerTables(TablesPort):
     def __init__(self, destination: LogAndTables, workers: FoldWorkers) -> None:
         self._destination = destination
         self._workers = workers
-        self._pipeline = FoldPipeline(LiveTarget(destination.log))
+        self._runner = FoldRunner(LiveTarget(destination.log))
         self._has_news = True
 
     async def fold_next_batch(self) -> bool:
         if not self._workers.are_wanted:  # start processes only when there are events, to keep an idle daemon small
-            with self._destination.log.translated():
-                self._workers.want(await self._pipeline.size())
+            self._workers.want(await self._runner.size())
         workers = self._workers.ready
         if not workers:
             folded = await self._destination.fold_next_batch()
@@ -672,8 +671,7 @@ class FoldWorkerTables(TablesPort):
                 self._workers.want(events=1)
             return folded
         try:
-            with self._destination.log.translated():
-                count = await self._pipeline.fold_next(workers)
+            count = await self._runner.fold_next(workers)
             self._has_news = count is not None or await workers[0].fold_rest(now=self._has_news)
         except FoldWorkerLost:  # reported by the worker's task; the next call uses the other workers
             return True

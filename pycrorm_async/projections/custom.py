@@ -41,7 +41,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, NamedTuple, Protocol, TypeAlias, final, get_args
 
 import msgspec
-from sqlalchemy import Dialect
+from sqlalchemy import Dialect, text
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.bulk_records import make
@@ -64,7 +64,7 @@ from pycrorm_async.projections.generations import (
     write_generation,
 )
 from pycrorm_async.projections.mapped_tables import UserView, with_user_views
-from pycrorm_async.projections.pipeline import LOOKAHEAD_EVENTS_MIN, Batch, BatchFold, FoldPipeline, SideTarget
+from pycrorm_async.projections.pipeline import LOOKAHEAD_EVENTS_MIN, Batch, FoldRunner, Learn, SideTarget
 from pycrorm_async.projections.row_batch import CannotFold, Row, in_slot, is_missing, json_text, microseconds, row_of
 from pycrorm_async.store.dialect import Insertion
 from pycrorm_async.store.dialects import dialect_of
@@ -705,27 +705,28 @@ _SCAN_SHARE_MAX = 0.02
 """Bounds the share of time in which all episodes are checked, and not the newest only: 100,000 take 25 ms."""
 _SCAN_S_MAX = 10.0
 """Bounds the time until all episodes are checked again, also after a check that a busy machine made slow."""
+_NEWEST_EPISODES = 1_000
+"""The episodes that a check of the newest reads, in 0.3 ms: more than record at a time."""
+_NEWEST = text("SELECT coalesce(max(number), 0) FROM episode")
 
 
-class CustomFoldDefinition:
-    """The fold of a custom projection. Implements `FoldDefinition`."""
+def learner_of(projection: Projection) -> Learn:
+    """Return the function that learns to fold into the tables of a projection."""
+    folds = EpisodeFolds(projection) if isinstance(projection, EpisodeProjection) else None
 
-    def __init__(self, projection: Projection) -> None:
-        self._projection = projection
-        self._folds = EpisodeFolds(projection) if isinstance(projection, EpisodeProjection) else None
-
-    def learn(self, layout: Layout, payloads: Sequence[bytes]) -> tuple[Layout, Callable[[], Batch]]:
+    def learn(layout: Layout, payloads: Sequence[bytes]) -> tuple[Layout, Callable[[], Batch]]:
         declared = {}
         for payload in payloads:
             try:
                 declared[fingerprint(payload)] = declaration_of(payload)
             except ValueError:  # from a newer version: its nodes cannot be folded
                 continue
-        projection, folds = self._projection, self._folds
         if isinstance(projection, PackedProjection):
             assert folds is not None, "it is an EpisodeProjection"
             return layout, partial(projection.batch, declared, folds)
         return layout, partial(CustomRows, projection, declared, folds)
+
+    return learn
 
 
 def layout_of(projection: Projection, dialect: Dialect) -> Layout:
@@ -771,8 +772,8 @@ def refuse_taken(name: str, layout: Layout, tables: Layout, projections: Mapping
             raise CallerError(f"the projection {name} needs the name {each!r}, which {owners[each]} has: rename it")
 
 
-async def _set_up(connection: AsyncConnection, projection: Projection, tables: Layout) -> tuple[Generation, bool]:
-    """Create the projection's missing tables; return its generation, and whether the views must be created again.
+async def _set_up(connection: AsyncConnection, projection: Projection, tables: Layout) -> bool:
+    """Create the projection's missing tables; return whether the views must be created again.
 
     Args:
         connection: in a transaction that excludes all other writers of the memory.
@@ -787,15 +788,15 @@ async def _set_up(connection: AsyncConnection, projection: Projection, tables: L
     generation = generations.get(projection.name)
     key = f"{PROJECTION}{projection.name}"
     if generation is None:
-        return await make_projection_tables(connection, projection, key), True
+        await make_projection_tables(connection, projection, key)
+        return True
     fault = fault_in_version(projection, generation, layout)
     if fault is not None:
         raise DatabaseForeign(fault)
     if generation.layout == layout:
-        return generation, False
-    generation = replace(generation, revision=generation.revision + 1, layout=layout)
-    await write_generation(connection, key, generation)
-    return generation, True
+        return False
+    await write_generation(connection, key, replace(generation, revision=generation.revision + 1, layout=layout))
+    return True
 
 
 def fault_in_version(projection: Projection, generation: Generation, layout: Layout) -> str | None:
@@ -814,6 +815,14 @@ def fault_in_version(projection: Projection, generation: Generation, layout: Lay
     return None
 
 
+class _CustomFold(NamedTuple):
+    """The fold of one projection in this process."""
+
+    projection: Projection
+    target: SideTarget
+    runner: FoldRunner
+
+
 class CustomTables:
     """Folds the custom projections of a process. A fault in one is logged once, and then it is left out."""
 
@@ -824,9 +833,7 @@ class CustomTables:
         self._named = named
         self._installed = installed
         self._batch_events = batch_events
-        self._folded: dict[str, tuple[BatchFold, FoldPipeline]] = {}
-        self._targets: dict[str, SideTarget] = {}
-        self._packed: set[str] = set()
+        self._folds: list[_CustomFold] = []
         self._checked_s = self._packed_s = self._scan_due_s = 0.0
 
     async def set_up(self, connection: AsyncConnection, tables: Layout) -> bool:
@@ -835,9 +842,10 @@ class CustomTables:
         Raises `CallerError` for a taken name of a projection that the caller gave; an installed one is left out.
         """
         changed = False
+        self._folds = []
         for each in (*self._named, *self._installed):
             try:
-                generation, is_new = await _set_up(connection, each, tables)
+                is_new = await _set_up(connection, each, tables)
             except (DatabaseForeign, CallerError) as fault:
                 if isinstance(fault, CallerError) and each in self._named:
                     raise
@@ -845,15 +853,9 @@ class CustomTables:
                 continue
             changed = changed or is_new
             target = SideTarget(self._log, f"{PROJECTION}{each.name}", each.name, each.version)
-            self._targets[each.name] = target
-            fold = BatchFold(self._log, target, generation, CustomFoldDefinition(each))
-            local = None if self._log.address.is_sqlite else fold
-            if isinstance(each, PackedProjection):
-                self._packed.add(each.name)
-            self._folded[each.name] = (
-                fold,
-                FoldPipeline(target, batch_events=events_of_batch(each, self._batch_events), local=local),
-            )
+            batch_events = events_of_batch(each, self._batch_events)
+            runner = FoldRunner(target, learner_of(each), batch_events=batch_events)
+            self._folds.append(_CustomFold(each, target, runner))
         return changed
 
     async def fold_next_batch(self, *, now: bool, until_visible: bool = False) -> bool:
@@ -866,30 +868,29 @@ class CustomTables:
         """
         loop = asyncio.get_running_loop()
         time_s = loop.time()
-        if not self._folded or (not now and time_s < self._checked_s + _CHECK_S):
+        if not self._folds or (not now and time_s < self._checked_s + _CHECK_S):
             return False
         is_scan = until_visible or time_s >= self._scan_due_s
         packed = is_scan or time_s >= self._packed_s + _CHECK_S
+        first = 0 if is_scan else await self._first_of_newest()
         count = most_events = 0
-        for name, (fold, pipeline) in [*self._folded.items()]:
-            if name in self._packed and not packed:
-                continue
-            target = self._targets[name]
-            if is_scan and target.newest_only:
-                pipeline.begin_again()  # with the oldest, which have waited
-            target.newest_only = not is_scan
+        for fold in [each for each in self._folds if packed or not each.projection.is_packed]:
+            projection, target, runner = fold
+            if is_scan and target.first:
+                runner.last_number = 0  # begin with the oldest, which have waited
+            target.first = first
             try:
-                events = await pipeline.fold_next([fold])
+                events = await runner.fold_next()
                 count += events is not None
                 most_events = max(most_events, events or 0)
-                if name in self._packed and (events is None or events < LOOKAHEAD_EVENTS_MIN):
+                if projection.is_packed and (events is None or events < LOOKAHEAD_EVENTS_MIN):
                     self._packed_s = time_s
             except DatabaseUnavailable:
                 raise
             except PycrormError as fault:
-                _log.warning("this process stops folding the projection %s: %s", name, fault)
-                await self._note_fault(name, fold.generation, str(fault))
-                del self._folded[name]
+                _log.warning("this process stops folding the projection %s: %s", projection.name, fault)
+                await self._note_fault(fold, str(fault))
+                self._folds.remove(fold)
         if is_scan and most_events < min(LOOKAHEAD_EVENTS_MIN, self._batch_events):
             pause_s = 0 if count else (loop.time() - time_s) / _SCAN_SHARE_MAX
             self._scan_due_s = time_s + min(max(pause_s, _CHECK_S), _SCAN_S_MAX)
@@ -897,15 +898,19 @@ class CustomTables:
             self._checked_s = time_s
         return count > 0
 
-    async def _note_fault(self, name: str, folded: Generation, reason: str) -> None:
+    async def _first_of_newest(self) -> int:
+        async with self._log.reading() as connection:
+            return max(1, int((await connection.execute(_NEWEST)).scalar_one()) - _NEWEST_EPISODES + 1)
+
+    async def _note_fault(self, fold: _CustomFold, reason: str) -> None:
         """Write the reason into the projection's generation, where `pycrorm status` reads it until it is set up again.
 
         Tables that another process has rebuilt in the meantime get no note.
         """
-        key = f"{PROJECTION}{name}"
+        key, folded = f"{PROJECTION}{fold.projection.name}", fold.runner.generation
         async with self._log.engine.begin() as connection:
             generation = await read_generation(connection, key, hold="change")
-            if generation is not None and generation.number == folded.number:
+            if generation is not None and (folded is None or generation.number == folded.number):
                 layout = msgspec.structs.replace(generation.layout, fault=reason)
                 await write_generation(connection, key, replace(generation, layout=layout))
 

@@ -570,7 +570,7 @@ async def _grow(
     if name not in united.accepted:  # the declaration has no tables, so a view is at fault: raise its error
         return await target.grow(connection, generation, united.layout)
     dtype = united.accepted[name].dtype
-    remedy = ": rename your table or view, then open the memory again" if "already exists" in reason else ""
+    remedy = ": rename your table or view, then run `pycrorm rebuild`" if "already exists" in reason else ""
     reason = f"the database refuses the tables of {dtype}: {' '.join(reason.split())}{remedy}"
     grown = await target.grow(connection, generation, generation.layout.with_unmade(name, reason))
     _log.warning("%s; episodes that use this type are parked, all others continue", reason)

@@ -1,36 +1,49 @@
-"""Fold batch after batch into one target: while one batch is written, prepare the next.
+"""Run a fold: bring one set of tables up to date with the log, batch after batch.
 
-    pipeline = FoldPipeline(LiveTarget(log))
-    while await pipeline.fold_next(workers) is not None: ...
+    runner = FoldRunner(LiveTarget(log))
+    while await runner.fold_next() is not None: ...
 
-Theory of operation. A `BatchWorker` folds into the target's tables, in this process or in one of its own. It prepares a
-batch (reads the events and folds them into rows) and later writes it in one transaction. The pipeline chooses the
-events of each batch. It prepares at most one batch ahead, and writes a prepared batch only if the batch before it was
-written whole; otherwise it discards the prepared one and reads the checkpoints again. A worker process may die or be
-replaced at any moment: its batch then counts as not written. If its transaction committed although its answer was lost,
-the checkpoints show it, because the next batch is read from them, and a batch that does not continue the checkpoints is
-rolled back. So no event is folded twice or left out.
+**Theory of operation: batches.** A batch has two phases. `prepare` reads the declarations and then the events, a page
+at a time, and folds them into rows in memory; it holds no lock and writes nothing. `write` opens a transaction, locks
+the generation's row, compares number and revision of the generation and the checkpoint of each episode with those that
+`prepare` assumed, and only then writes rows and checkpoints. If anything differs, because another process folded the
+same events or changed the tables, it rolls back and returns 0, and the caller reads the events again. So any number
+of processes may fold one memory: every event is folded exactly once, and rows and checkpoints never disagree.
 
-Another worker prepares ahead, if there is one. A `local` worker can also prepare ahead itself, which is faster where a
-server writes in its own process, and slower with SQLite, which writes in this one.
+A declaration that the generation has no tables for makes the write transaction exclusive and grows the tables first
+(`generations`). If the database creates only some of them, the growth is committed, the batch is not, and it is
+folded again for the tables that exist now. An event that cannot be folded parks its episode at this event: the events
+before it are written, later ones are not folded, and all other episodes continue. If the database refuses a row, the
+batch is written again episode by episode, and then in halves, until the refused event is alone; it parks its episode.
+A parked episode stays so until the tables are rebuilt.
+
+**Workers.** A `BatchWorker` folds one batch at a time into the target's tables: the runner itself, or a process of its
+own. The runner chooses the events of each batch. It prepares at most one batch ahead, and writes a prepared batch only
+if the batch before it was written whole; otherwise it discards the prepared one and reads the checkpoints again. A
+worker process may die or be replaced at any moment: its batch then counts as not written. If its transaction committed
+although its answer was lost, the checkpoints show it, because the next batch is read from them, and a batch that does
+not continue the checkpoints is rolled back. So no event is folded twice or left out. Another worker prepares ahead, if
+there is one. The runner itself also prepares ahead while it writes to a server, which works in a process of its own.
+
+**Targets.** The tables that a fold fills, and where their checkpoints are (section "targets"). The fold itself is a
+`Learn`: it makes the rows of the built-in tables (`learn_tables`) or of a custom projection.
 """
 
 from __future__ import annotations
 
 import asyncio
 import logging
-import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Final, NamedTuple, Protocol
+from collections.abc import Callable, Mapping, Sequence
+from itertools import groupby
+from operator import attrgetter
+from typing import Final, NamedTuple, Protocol, TypeAlias
 
 from sqlalchemy import TableClause, column, or_, select, table, text, update
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable, InternalError, LogDamaged
-from pycrorm_async.events.codec import fingerprint
 from pycrorm_async.projections.columns import Layout, Storage, physical_name, unite
-from pycrorm_async.projections.fold import TableRows, fold
+from pycrorm_async.projections.fold import TableRows
 from pycrorm_async.projections.generations import (
     Generation,
     GrowthTarget,
@@ -42,14 +55,34 @@ from pycrorm_async.projections.generations import (
     show,
     write_generation,
 )
-from pycrorm_async.projections.row_batch import CannotFold, Designators, Rows
+from pycrorm_async.projections.row_batch import Designators
 from pycrorm_async.store.dialect import Progress, RowRefused
 from pycrorm_async.store.dialects import dialect_of
-from pycrorm_async.store.log import EventLog, advance_folded, park
+from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import EpisodeRow, Span, StoredEvent, beyond, consecutive, pages_of, share_out, size_of
 
 LOOKAHEAD_EVENTS_MIN: Final = 2_000
 """The smallest batch that is prepared ahead; a smaller one waits for the events that arrive during the write."""
+_REASON_LENGTH_MAX = 2_000
+"""Bounds the characters of the reason for parking an episode: `status` shows it, and a value may have megabytes."""
+_PAGE_EVENTS = 10_000
+"""Bounds the events that are read at once, and so their memory; all of a batch, unless it makes few rows."""
+_SLICE_EVENTS = 100
+"""The events folded between two yields to the event loop, some 0.4 ms."""
+
+
+class BatchPreview(NamedTuple):
+    """The effect of a prepared batch once it is written.
+
+    Attributes:
+        events: the number folded in the batch.
+        reached: by episode number, the last sequence folded.
+        is_whole: False if the batch parks an episode.
+    """
+
+    events: int
+    reached: Mapping[int, int]
+    is_whole: bool
 
 
 class BatchWorker(Protocol):
@@ -62,127 +95,6 @@ class BatchWorker(Protocol):
     async def write(self) -> int:
         """Write the batch; return the number of its events that are in the tables now."""
         ...
-
-
-class FoldPipeline:
-    """Assigns the events that a target lacks to workers, batch by batch.
-
-    Args:
-        target: of all workers.
-        batch_events: the most events in one transaction.
-        local: a worker of this process that prepares the next batch while it writes.
-    """
-
-    def __init__(self, target: FoldTarget, *, batch_events: int = 10_000, local: BatchWorker | None = None) -> None:
-        self._target = target
-        self._batch_events = batch_events
-        self._local = local
-        self._ready: tuple[BatchWorker, BatchPreview] | None = None
-        self._last_number = 0
-
-    async def fold_next(self, workers: Sequence[BatchWorker]) -> int | None:
-        """Fold one batch with one or more workers; return the number of events, None if no episode is behind.
-
-        The number is smaller than the batch if an episode was parked, and 0 if another process folded it first. Raises
-        the errors of the workers; rows that were written stay.
-        """
-        prepared, self._ready = self._ready, None
-        if prepared is None or prepared[0] not in workers:
-            spans = await self._spans(None)
-            if not spans:
-                return None
-            prepared = workers[0], await workers[0].prepare(spans)
-        worker, preview = prepared
-        following = next((each for each in workers if each is not worker), self._local)
-        if following is None or not preview.is_whole:
-            return await worker.write()
-        # `write` comes first, because a local worker takes its batch before it prepares another.
-        count, ready = await asyncio.gather(
-            worker.write(), self._prepare_ahead(following, preview), return_exceptions=True
-        )
-        for fault in (count, ready):
-            if isinstance(fault, BaseException):
-                raise fault
-        assert isinstance(count, int)
-        if count == preview.events and isinstance(ready, BatchPreview):
-            self._ready = following, ready
-        return count
-
-    def begin_again(self) -> None:
-        """Begin the next batch with the first episode that is behind."""
-        self._last_number = 0
-
-    async def size(self) -> int:
-        """Return the number of events that the next batch would have."""
-        return size_of(await self._target.unfolded(self._batch_events, after=0, reached={}))
-
-    async def _prepare_ahead(self, worker: BatchWorker, before: BatchPreview) -> BatchPreview | None:
-        spans = await self._spans(before)
-        return await worker.prepare(spans) if size_of(spans) >= min(LOOKAHEAD_EVENTS_MIN, self._batch_events) else None
-
-    async def _spans(self, before: BatchPreview | None) -> list[Span]:
-        # Start behind the last batch's episode, so that an episode that always grows does not starve the others.
-        reached = before.reached if before is not None else {}
-        spans = await self._target.unfolded(self._batch_events, after=self._last_number, reached=reached)
-        if spans:
-            self._last_number = spans[-1].number
-        return spans
-
-
-# === batch fold ===============================================================================================
-#
-# Fold batches of events into a generation, writing rows and checkpoints in one transaction.
-#
-# Theory of operation. A batch has two phases. `prepare` reads the declarations and then the events, a page at a time,
-# and folds them into rows in memory; it holds no lock and writes nothing. `write` opens a transaction, locks the
-# generation's row, compares number and revision of the generation and the checkpoint of each episode with those that
-# `prepare` assumed, and only then writes rows and checkpoints. If anything differs, because another process folded the
-# same events or changed the tables, it rolls back and returns 0, and the caller reads the events again. So any number
-# of processes may fold one memory: every event is folded exactly once, and rows and checkpoints never disagree.
-#
-# A declaration that the generation has no tables for makes the write transaction exclusive and grows the tables first
-# (`generations`). If the database creates only some of them, the growth is committed, the batch is not, and it is
-# folded again for the tables that exist now. An event that cannot be folded parks its episode at this event: the events
-# before it are written, later ones are not folded, and all other episodes continue. If the database refuses a row, the
-# batch is written again episode by episode, and then in halves, until the refused event is alone; it parks its episode.
-#
-# `FoldTarget` is the generation and its checkpoints, of which there are two kinds (section "targets"). `FoldDefinition`
-# turns events into rows: those of the built-in tables, here, or those of a custom projection.
-
-_REASON_LENGTH_MAX = 2_000
-"""Bounds the characters of the reason for parking an episode: `status` shows it, and a value may have megabytes."""
-_PAGE_EVENTS = 10_000
-"""Bounds the events that are read at once, and so their memory; all of a batch, unless it makes few rows."""
-_SLICE_EVENTS = 100
-"""The events folded between two yields to the event loop, some 0.4 ms."""
-
-
-class FoldTarget(GrowthTarget, Protocol):
-    """A generation to fold into, and its checkpoints. All methods but `unfolded` run in the caller's transaction.
-
-    Attributes:
-        parks_gaps: whether an event that is missing in the log parks its episode; otherwise `LogDamaged` is raised.
-    """
-
-    parks_gaps: bool
-
-    async def unfolded(self, limit: int, *, after: int, reached: Mapping[int, int]) -> list[Span]:
-        """Return spans of events that this generation lacks, at most `limit` in total; without parked episodes.
-
-        Begins with the episodes whose number is above `after`, or with the first if there are none. `reached` is the
-        last sequence, by number, of a batch that is being written.
-        """
-        ...
-
-    async def generation(self, connection: AsyncConnection, hold: Hold) -> Generation:
-        """Read the generation and lock it until the transaction ends."""
-        ...
-
-    async def advance(self, connection: AsyncConnection, steps: Sequence[Progress]) -> bool:
-        """Advance the checkpoints; return False if one has moved, and then the caller must not commit."""
-        ...
-
-    async def park(self, connection: AsyncConnection, number: int, reason: str) -> None: ...
 
 
 class Batch(Protocol):
@@ -208,16 +120,18 @@ class Batch(Protocol):
         ...
 
 
-class FoldDefinition(Protocol):
-    """A way of turning events into rows."""
-
-    def learn(self, layout: Layout, payloads: Sequence[bytes]) -> tuple[Layout, Callable[[], Batch]]:
-        """Return the layout with these declarations, and a factory of empty batches for it."""
-        ...
+Learn: TypeAlias = Callable[[Layout, Sequence[bytes]], tuple[Layout, Callable[[], Batch]]]
+"""Takes a layout and declarations; returns the layout that has them, and a factory of empty batches for it."""
 
 
-@dataclass(frozen=True)
-class _Types:
+def learn_tables(layout: Layout, payloads: Sequence[bytes]) -> tuple[Layout, Callable[[], Batch]]:
+    """Learn to fold into the built-in tables."""
+    united = unite(layout, payloads)
+    designators = Designators.of_union(united)
+    return united.layout, lambda: TableRows(designators)
+
+
+class _Types(NamedTuple):
     """The declarations that were read, and the layout and batch factory for them at one revision."""
 
     payloads: list[bytes]
@@ -226,8 +140,7 @@ class _Types:
     batch: Callable[[], Batch]
 
 
-@dataclass(frozen=True)
-class _PreparedBatch:
+class _PreparedBatch(NamedTuple):
     """A batch between `prepare` and `write`.
 
     Attributes:
@@ -244,59 +157,75 @@ class _PreparedBatch:
     parked: dict[int, str]
 
     @property
-    def count(self) -> int:
+    def events(self) -> int:
         """The number of its folded events."""
         return sum(now - before for _, before, now in self.steps)
 
 
-class BatchPreview(NamedTuple):
-    """The effect of a prepared batch once it is written.
+class FoldRunner:
+    """Folds the events that a target lacks, batch by batch. Implements `BatchWorker`.
 
-    Attributes:
-        events: the number folded in the batch.
-        reached: by episode number, the last sequence folded.
-        is_whole: False if the batch parks an episode.
+    Args:
+        target: of this runner and of all workers.
+        learn: makes the rows.
+        batch_events: the most events in one transaction.
     """
 
-    events: int
-    reached: Mapping[int, int]
-    is_whole: bool
-
-
-class _Tables:
-    """The fold into the built-in tables. Implements `FoldDefinition`."""
-
-    def learn(self, layout: Layout, payloads: Sequence[bytes]) -> tuple[Layout, Callable[[], Batch]]:
-        united = unite(layout, payloads)
-        designators = Designators.of_union(united)
-        return united.layout, lambda: TableRows(designators)
-
-
-TABLES = _Tables()
-
-
-class BatchFold:
-    """Folds events of one log into one target. Implements `BatchWorker`.
-
-    Attributes:
-        generation: its state when this process last read it.
-    """
-
-    def __init__(
-        self, log: EventLog, target: FoldTarget, generation: Generation, definition: FoldDefinition = TABLES
-    ) -> None:
-        self._log = log
+    def __init__(self, target: FoldTarget, learn: Learn = learn_tables, *, batch_events: int = 10_000) -> None:
         self._target = target
-        self._definition = definition
-        self.generation = generation
+        self._log = target.log
+        self._learn = learn
+        self._batch_events = batch_events
+        self.generation: Generation | None = None
+        """The state of the target's generation when this process last read it."""
+        self.last_number = 0
+        """The last episode of the last batch; the next one begins with the episode behind it."""
         self._types: _Types | None = None
         self._prepared: _PreparedBatch | None = None
+        self._ahead: tuple[BatchWorker, BatchPreview] | None = None
+
+    async def fold_next(self, workers: Sequence[BatchWorker] = ()) -> int | None:
+        """Fold one batch, here or by workers; return the number of events, None if no episode is behind.
+
+        The number is smaller than the batch if an episode was parked, and 0 if another process folded it first. Raises
+        the errors of the workers; rows that were written stay.
+        """
+        with self._log.translated():
+            workers = workers or [self]
+            prepared, self._ahead = self._ahead, None
+            if prepared is None or prepared[0] not in workers:
+                spans = await self._spans(None)
+                if not spans:
+                    return None
+                prepared = workers[0], await workers[0].prepare(spans)
+            worker, preview = prepared
+            alone = self if worker is self and not self._log.address.is_sqlite else None
+            following = next((each for each in workers if each is not worker), alone)
+            if following is None or not preview.is_whole:
+                return await worker.write()
+            # `write` comes first, because the runner takes its batch before it prepares another.
+            count, ahead = await asyncio.gather(
+                worker.write(), self._prepare_ahead(following, preview), return_exceptions=True
+            )
+            for fault in (count, ahead):
+                if isinstance(fault, BaseException):
+                    raise fault
+            assert isinstance(count, int)
+            if count == preview.events and isinstance(ahead, BatchPreview):
+                self._ahead = following, ahead
+            return count
+
+    async def size(self) -> int:
+        """Return the number of events that the next batch would have."""
+        with self._log.translated():
+            return size_of(share_out(await self._target.behind(0, self._batch_events), self._batch_events))
 
     async def prepare(self, spans: Sequence[Span]) -> BatchPreview:
         """Read and fold these events, yielding to the event loop at intervals. Writes nothing."""
         self._prepared = None
-        self._prepared = batch = await self._folded(spans)
-        return BatchPreview(batch.count, {number: now for number, _, now in batch.steps}, not batch.parked)
+        with self._log.translated():
+            self._prepared = batch = await self._folded(spans)
+        return BatchPreview(batch.events, {number: now for number, _, now in batch.steps}, not batch.parked)
 
     async def write(self) -> int:
         """Write the prepared batch; return the number of events folded.
@@ -304,58 +233,92 @@ class BatchFold:
         It is smaller if an episode was parked, and 0 if another process folded them first or changed the tables.
         """
         batch, self._prepared = self._prepared, None
-        return 0 if batch is None else await self._write(batch)
+        with self._log.translated():
+            return 0 if batch is None else await self._write(batch)
 
     async def write_in(self, connection: AsyncConnection, spans: Sequence[Span]) -> bool:
         """Fold in the caller's transaction, which must be rolled back if this returns False or raises `RowRefused`."""
         batch = await self._folded(spans)
-        generation = await self._generation(connection, batch)
-        if generation is not None and generation.layout != batch.types.layout:
+        generation = await self._lock_generation(connection, batch)
+        if generation is None or generation.layout != batch.types.layout:
             return False
-        return await self._write_rows(connection, batch, generation) is not None
+        return await self._write_rows(connection, batch, generation)
+
+    async def _prepare_ahead(self, worker: BatchWorker, before: BatchPreview) -> BatchPreview | None:
+        spans = await self._spans(before)
+        return await worker.prepare(spans) if size_of(spans) >= min(LOOKAHEAD_EVENTS_MIN, self._batch_events) else None
+
+    async def _spans(self, before: BatchPreview | None) -> list[Span]:
+        # Start behind the last batch's episode, so that an episode that always grows does not starve the others.
+        for after in (self.last_number, 0) if self.last_number else (0,):
+            episodes = await self._target.behind(after, self._batch_events)
+            if episodes := beyond(episodes, before.reached if before is not None else {}):
+                spans = share_out(episodes, self._batch_events)
+                self.last_number = spans[-1].number
+                return spans
+        return []
 
     async def _folded(self, spans: Sequence[Span]) -> _PreparedBatch:
         """Read and fold these events, a page at a time, so that the events of a large batch never are in memory."""
-        types = await self._types_now()
-        rows, number = types.batch(), self.generation.number
+        generation, types = await self._types_now()
+        rows = types.batch()
         await rows.restore(self._log, spans)
         reached = {each.number: each.after for each in spans}
         parked: dict[int, str] = {}
         for page in pages_of(spans, _PAGE_EVENTS):
-            wanted = [each for each in page if each.number not in parked]
-            events = await self._log.spans(wanted)
-            if not self._target.parks_gaps and len(events) < size_of(wanted):
-                raise await _damage(self._log, wanted, events)
-            steps, reasons = await _fold_all(wanted, events, rows)
-            reached |= {number: now for number, _, now in steps}
-            parked |= reasons
-        await rows.ready(self._log.engine, number)
+            await self._fold_page([each for each in page if each.number not in parked], rows, reached, parked)
+        await rows.ready(self._log.engine, generation.number)
         steps = [(each.number, each.after, reached[each.number]) for each in spans]
-        return _PreparedBatch(spans, types, rows, number, steps, parked)
+        return _PreparedBatch(spans, types, rows, generation.number, steps, parked)
+
+    async def _fold_page(
+        self, spans: Sequence[Span], rows: Batch, reached: dict[int, int], parked: dict[int, str]
+    ) -> None:
+        """Fold the events of these spans into `rows`, in order; note the checkpoints and the episodes to park."""
+        events = await self._log.spans(spans)
+        by_number = {number: [*each] for number, each in groupby(events, key=attrgetter("number"))}
+        folded = _SLICE_EVENTS  # since this yielded to the event loop
+        for number, after, last in spans:
+            part = consecutive(by_number.get(number, ()), after)
+            for first in range(0, len(part), _SLICE_EVENTS):
+                if folded >= _SLICE_EVENTS:
+                    await asyncio.sleep(0)
+                    folded = 0
+                some = part[first : first + _SLICE_EVENTS]
+                folded += len(some)
+                if (refused := rows.fold(some)) is not None:
+                    sequence, reason = refused
+                    reached[number] = sequence - 1
+                    parked[number] = _writable(f"event {sequence}: {reason}")
+                    break
+            else:
+                reached[number] = after + len(part)
+                if reached[number] < last:
+                    parked[number] = await self._target.missing(number, reached[number] + 1)
 
     async def _write(self, batch: _PreparedBatch) -> int:
         try:
             async with self._log.writing() as connection:
-                generation = await self._generation(connection, batch)
+                generation = await self._lock_generation(connection, batch)
+                # If some tables of the batch do not exist, the caller folds it again for those that do.
                 grown = generation is not None and generation.layout != batch.types.layout
-                written = generation if grown else await self._write_rows(connection, batch, generation)
-                if written is None:
+                if generation is None or (not grown and not await self._write_rows(connection, batch, generation)):
                     await connection.rollback()
                     return 0
-            self.generation = written
-            if grown:  # some tables of this batch do not exist: the caller folds it again for those that do
-                return 0
         except RowRefused as refusal:
             return await self._isolate(batch.spans, refusal)
-        return batch.count
+        self.generation = generation
+        if generation.revision != batch.types.revision:
+            await sweep(self._log)
+        return 0 if grown else batch.events
 
-    async def _generation(self, connection: AsyncConnection, batch: _PreparedBatch) -> Generation | None:
+    async def _lock_generation(self, connection: AsyncConnection, batch: _PreparedBatch) -> Generation | None:
         """Lock the generation and create missing tables; return None if its number or revision has changed.
 
         The layout of the result differs from that of the batch if some tables could not be created.
         """
         types = batch.types
-        growing = types.layout != self.generation.layout
+        growing = self.generation is None or types.layout != self.generation.layout
         if growing:
             await dialect_of(connection).lock_log_changes(connection)
         generation = await self._target.generation(connection, "change" if growing else "share")
@@ -364,26 +327,23 @@ class BatchFold:
             return None
         return await grow(connection, self._target, generation, types.payloads) if growing else generation
 
-    async def _write_rows(
-        self, connection: AsyncConnection, batch: _PreparedBatch, generation: Generation | None
-    ) -> Generation | None:
-        """Write rows and checkpoints; return None, to roll back, without a generation or if a checkpoint has moved."""
-        if generation is None or not await self._target.advance(connection, batch.steps):
-            return None
+    async def _write_rows(self, connection: AsyncConnection, batch: _PreparedBatch, generation: Generation) -> bool:
+        """Write rows and checkpoints; return False, to roll back, if a checkpoint has moved."""
+        if not await self._target.advance(connection, batch.steps, batch.parked):
+            return False
         await batch.rows.write(connection, generation.number)
-        for number, reason in batch.parked.items():
-            await self._target.park(connection, number, _writable(reason))
-        return generation
+        return True
 
-    async def _types_now(self) -> _Types:
+    async def _types_now(self) -> tuple[Generation, _Types]:
         """Read the declarations. They include those of all stored events: each is stored before its first use."""
         payloads = await self._log.declarations()
-        types = self._types
-        if types is None or types.revision != self.generation.revision or types.payloads != payloads:
-            layout, batch = self._definition.learn(self.generation.layout, payloads)
-            types = _Types(payloads, self.generation.revision, layout, batch)
-            self._types = types
-        return types
+        if self.generation is None:
+            async with self._log.reading() as connection:
+                self.generation = await self._target.generation(connection, None)
+        generation, types = self.generation, self._types
+        if types is None or types.revision != generation.revision or types.payloads != payloads:
+            self._types = types = _Types(payloads, generation.revision, *self._learn(generation.layout, payloads))
+        return generation, types
 
     async def _isolate(self, spans: Sequence[Span], refusal: RowRefused) -> int:
         """Fold the batch in smaller parts until the refused row's event is alone, and park its episode there."""
@@ -398,8 +358,8 @@ class BatchFold:
                 return count
             return count + await self._write(await self._folded([span._replace(after=middle)]))
         async with self._log.writing() as connection:
-            reason = f"event {span.last}: the database refuses it: {refusal}"
-            await self._target.park(connection, span.number, _writable(reason))
+            reason = _writable(f"event {span.last}: the database refuses it: {refusal}")
+            await self._target.advance(connection, [], {span.number: reason})
         return 0
 
 
@@ -409,55 +369,10 @@ def _writable(reason: str) -> str:
     return shortened.encode(errors="backslashreplace").decode().replace("\0", "\\x00")
 
 
-async def _damage(log: EventLog, spans: Sequence[Span], events: Sequence[StoredEvent]) -> LogDamaged:
-    """Return the error for the first event of these spans that is missing."""
-    present = {(each.number, each.sequence) for each in events}
-    number, sequence = next(
-        (span.number, sequence)
-        for span in spans
-        for sequence in range(span.after + 1, span.last + 1)
-        if (span.number, sequence) not in present
-    )
-    [episode] = await log.episodes(number, number)
-    return LogDamaged(episode.id, sequence, f"is missing in {log.address}")
-
-
-async def _fold_all(
-    spans: Sequence[Span], events: Sequence[StoredEvent], rows: Batch
-) -> tuple[list[Progress], dict[int, str]]:
-    """Fold the events of these spans into `rows`, in order; return the new checkpoints and the episodes to park."""
-    steps: list[Progress] = []
-    parked: dict[int, str] = {}
-    folded = _SLICE_EVENTS  # since this yielded to the event loop
-    for span, part in _by_span(spans, events):
-        for first in range(0, len(part), _SLICE_EVENTS):
-            if folded >= _SLICE_EVENTS:
-                await asyncio.sleep(0)
-                folded = 0
-            some = part[first : first + _SLICE_EVENTS]
-            folded += len(some)
-            if (refused := rows.fold(some)) is not None:
-                sequence, reason = refused
-                last = sequence - 1
-                parked[span.number] = f"event {sequence}: {reason}"
-                break
-        else:
-            last = span.after + len(part)
-            if last < span.last:
-                parked[span.number] = f"event {last + 1} is missing in the log"
-        steps.append((span.number, span.after, last))
-    return steps, parked
-
-
-def _by_span(spans: Sequence[Span], events: Sequence[StoredEvent]) -> Iterator[tuple[Span, Sequence[StoredEvent]]]:
-    """Pair each span with its events up to the first that is missing; each episode has one span."""
-    first = 0
-    for span in spans:
-        part = events[first : first + span.last - span.after]
-        if part and part[-1].number != span.number:  # some are missing, so it has events of the next span
-            part = [each for each in part if each.number == span.number]
-        first += len(part)
-        yield span, consecutive(part, span.after)
+async def sweep(log: EventLog) -> None:
+    """Drop replaced views that no query reads."""
+    async with log.engine.begin() as connection:
+        await dialect_of(connection).sweep(connection)
 
 
 # === checkpoints ==============================================================================================
@@ -547,8 +462,10 @@ async def parked(connection: AsyncConnection, place: str) -> dict[int, str]:
     return {each.id: each.parked for each in rows}
 
 
-async def advance(connection: AsyncConnection, place: str, steps: Sequence[Progress]) -> bool:
-    """Write (number, folded before, folded now) of each episode; return False if a checkpoint has moved."""
+async def advance(
+    connection: AsyncConnection, place: str, steps: Sequence[Progress], parked: Mapping[int, str]
+) -> bool:
+    """Write (number, folded before, folded now) of each episode, and park some; return False if a checkpoint moved."""
     dialect = dialect_of(connection)
     progress = _table(place)
     query = select(progress.c.id, progress.c.folded).where(progress.c.id.in_([number for number, _, _ in steps]))
@@ -565,18 +482,13 @@ async def advance(connection: AsyncConnection, place: str, steps: Sequence[Progr
         return False
     if grown:
         await dialect.update_rows(connection, place, {"id": "bigint", "folded": "bigint"}, grown)
+    park = f"INSERT INTO {place} (id, folded, parked) VALUES (:number, 0, :reason)"  # noqa: S608
+    for number, reason in parked.items():
+        await connection.execute(
+            text(f"{park} ON CONFLICT (id) DO UPDATE SET parked = excluded.parked"),
+            {"number": number, "reason": reason},
+        )
     return True
-
-
-async def park_in_generation(connection: AsyncConnection, place: str, number: int, reason: str) -> None:
-    """Park an episode in this generation."""
-    await connection.execute(
-        text(
-            f"INSERT INTO {place} (id, folded, parked) VALUES (:number, 0, :reason)"  # noqa: S608
-            " ON CONFLICT (id) DO UPDATE SET parked = excluded.parked"
-        ),
-        {"number": number, "reason": reason},
-    )
 
 
 async def carry_over(connection: AsyncConnection, place: str) -> None:
@@ -600,72 +512,16 @@ def _table(place: str) -> TableClause:
     return table(place, *map(column, COLUMNS))
 
 
-# === parked release ===========================================================================================
-#
-# Release parked episodes whose next event can be folded now: by a newer version, or because a name became free.
-#
-# A process tries this once, when it opens the tables. It folds the one event at which each episode is parked and
-# discards the rows; the next batch folds it again and continues there.
-
-_RELEASED_EPISODES_MAX = 1_000
-"""Bounds the parked episodes that one process tries, at 0.1 ms each, so that opening a memory never takes minutes."""
-_AT_AN_EVENT = re.compile(r"event (\d+): (?!the database refuses it)")
-"""Matches a reason from the fold. A row that the database refused is excluded, because only writing it again shows
-whether the database accepts it now."""
-
-
-async def release_parked(connection: AsyncConnection, target: GrowthTarget, generation: Generation) -> Generation:
-    """Release episodes and create tables that the database refused before; return the generation with those.
-
-    Runs in the caller's transaction, which must exclude all other writers of the memory.
-    """
-    dialect = dialect_of(connection)
-    parked = [each for each in await dialect.stopped(connection) if each.parked is not None]
-    places = [(each, _AT_AN_EVENT.match(each.parked or "")) for each in parked[:_RELEASED_EPISODES_MAX]]
-    payloads = await dialect.declarations(connection) if parked or generation.layout.unmade else []
-    generation = await _retry_unmade(connection, target, generation, payloads)
-    if not parked:
-        return generation
-    designators = Designators.of_union(unite(generation.layout, payloads))
-    for episode, place in places:
-        if place is None or int(place[1]) != episode.folded + 1:
-            continue
-        for event in await dialect.events(connection, episode.number, after=episode.folded, limit=1):
-            try:
-                fold(event, designators, Rows())
-            except CannotFold:
-                continue
-            await park(connection, episode.number, None)
-    return generation
-
-
-async def _retry_unmade(
-    connection: AsyncConnection, target: GrowthTarget, generation: Generation, payloads: Sequence[bytes]
-) -> Generation:
-    """Try again to create the tables that the database refused; return the generation with those it creates now."""
-    unmade = generation.layout.unmade
-    if not unmade:
-        return generation
-    attempt = await connection.begin_nested()
-    cleared = generation.without_unmade()
-    grown = await grow(connection, target, cleared, [each for each in payloads if fingerprint(each) in unmade])
-    if grown.layout == generation.layout:
-        await attempt.rollback()  # keeps the revision, so that no other process has to read the layout again
-        return generation
-    await attempt.commit()
-    return grown
-
-
 # === targets ==================================================================================================
 #
 # Define the targets of a fold: `LiveTarget` is the visible generation, `SideTarget` any other, with its checkpoints.
 #
-# Theory of operation. There are two stores of checkpoints. Those of the visible built-in tables are `episode.folded`,
-# whose index makes a poll for new events take 0.03 ms, however many episodes there are. Every other generation, one
-# that a rebuild fills or that of a custom projection, has a table with one row for each episode (section
-# "checkpoints"), which is dropped together with it. A rebuild copies its checkpoints into `episode.folded` when it
-# switches. No index leads from it to the episodes that are behind, so a custom projection checks the newest episodes
-# often and all of them seldom (`custom`).
+# Theory of operation. There are two stores of checkpoints, and `behind` and `advance` differ by them. Those of the
+# visible built-in tables are `episode.folded`, whose index makes a poll for new events take 0.03 ms, however many
+# episodes there are. Every other generation, one that a rebuild fills or that of a custom projection, has a table with
+# one row for each episode (section "checkpoints"), which is dropped together with it. A rebuild copies its checkpoints
+# into `episode.folded` when it switches. No index leads from it to the episodes that are behind, so a custom projection
+# checks the newest episodes often and all of them seldom (`custom`).
 #
 # `SideTarget` reads the generation under its key in every transaction. For a rebuild another number is an error. For a
 # projection it means that another process has rebuilt it: a batch folded for the old tables is folded again for the new
@@ -678,10 +534,6 @@ _BEHIND_EPISODES_MAX = 400
 """Bounds the episodes in one batch, because reading each of them costs as much as folding some of its events."""
 
 
-_NEWEST_EPISODES = 1_000
-"""The episodes that a check of the newest reads, in 0.3 ms: more than record at a time."""
-
-
 class Share(NamedTuple):
     """The episodes that one of several workers folds: those whose number modulo `many` is `part`."""
 
@@ -692,15 +544,47 @@ class Share(NamedTuple):
 WHOLE = Share()
 
 
+class FoldTarget(GrowthTarget, Protocol):
+    """A generation to fold into, and its checkpoints. Methods with a connection run in the caller's transaction."""
+
+    log: EventLog
+
+    async def behind(self, after: int, limit: int) -> list[EpisodeRow]:
+        """Return the episodes above number `after` whose events this generation lacks, without parked ones."""
+        ...
+
+    async def advance(self, connection: AsyncConnection, steps: Sequence[Progress], parked: Mapping[int, str]) -> bool:
+        """Advance checkpoints and park episodes; return False if a checkpoint has moved: then roll back."""
+        ...
+
+    async def generation(self, connection: AsyncConnection, hold: Hold | None) -> Generation:
+        """Read the generation and lock it until the transaction ends."""
+        ...
+
+    async def missing(self, number: int, sequence: int) -> str:
+        """Return the reason to park the episode whose event is missing in the log, or raise `LogDamaged`."""
+        ...
+
+
 class LiveTarget:
     """The visible generation, with `episode.folded` as its checkpoints. Implements `FoldTarget`."""
 
-    parks_gaps = True
-
     def __init__(self, log: EventLog) -> None:
-        self._log = log
+        self.log = log
 
-    async def generation(self, connection: AsyncConnection, hold: Hold) -> Generation:
+    async def behind(self, after: int, limit: int) -> list[EpisodeRow]:
+        async with self.log.reading() as connection:
+            return await dialect_of(connection).behind(connection, after=after, limit=limit)
+
+    async def advance(self, connection: AsyncConnection, steps: Sequence[Progress], parked: Mapping[int, str]) -> bool:
+        dialect = dialect_of(connection)
+        if steps and await dialect.advance_folded(connection, steps) != len(steps):
+            return False
+        for number, reason in parked.items():
+            await dialect.park(connection, number, reason)
+        return True
+
+    async def generation(self, connection: AsyncConnection, hold: Hold | None) -> Generation:
         generation = await current_generation(connection, hold=hold)
         if generation is None:
             raise DatabaseUnavailable("the tables are missing: restore them from a backup, or run `pycrorm rebuild`")
@@ -709,14 +593,8 @@ class LiveTarget:
     async def grow(self, connection: AsyncConnection, generation: Generation, layout: Layout) -> Generation:
         return await show(connection, await grow_tables(connection, generation, layout))
 
-    async def unfolded(self, limit: int, *, after: int, reached: Mapping[int, int]) -> list[Span]:
-        return await self._log.unfolded(limit, after=after, reached=reached)
-
-    async def advance(self, connection: AsyncConnection, steps: Sequence[Progress]) -> bool:
-        return await advance_folded(connection, steps)
-
-    async def park(self, connection: AsyncConnection, number: int, reason: str) -> None:
-        await park(connection, number, reason)
+    async def missing(self, number: int, sequence: int) -> str:  # noqa: ARG002 - of the protocol
+        return f"event {sequence} is missing in the log"
 
 
 class SideTarget:
@@ -731,11 +609,8 @@ class SideTarget:
         share: the episodes that this process folds.
 
     Attributes:
-        newest_only: whether `unfolded` leaves out all but the newest episodes.
+        first: `behind` leaves out the episodes below this number.
     """
-
-    parks_gaps = False
-    newest_only = False
 
     def __init__(
         self,
@@ -747,7 +622,8 @@ class SideTarget:
         number: int | None = None,
         share: Share = WHOLE,
     ) -> None:
-        self._log = log
+        self.log = log
+        self.first = 0
         self._key = key
         self._projection = projection
         self._version = version
@@ -755,7 +631,26 @@ class SideTarget:
         self._share = share
         self._place = ""
 
-    async def generation(self, connection: AsyncConnection, hold: Hold) -> Generation:
+    async def behind(self, after: int, limit: int) -> list[EpisodeRow]:
+        async with self.log.reading() as connection:
+            await self.generation(connection, "share")  # locked, so that no rebuild drops its tables
+            return await episodes_behind(
+                connection,
+                self._place,
+                after=max(after, self.first - 1),
+                limit=min(limit, _BEHIND_EPISODES_MAX),
+                share=self._share,
+                after_tables=self._projection is not None,
+            )
+
+    async def advance(self, connection: AsyncConnection, steps: Sequence[Progress], parked: Mapping[int, str]) -> bool:
+        if not await advance(connection, self._place, steps, parked):
+            return False
+        for number, reason in parked.items() if self._projection is not None else ():
+            _log.warning("episode %s is parked in the projection %s: %s", number, self._projection, reason)
+        return True
+
+    async def generation(self, connection: AsyncConnection, hold: Hold | None) -> Generation:
         generation = await read_generation(connection, self._key, hold=hold)
         if generation is None or self._number not in (None, generation.number):
             raise InternalError(
@@ -773,32 +668,6 @@ class SideTarget:
         await write_generation(connection, self._key, grown)
         return grown
 
-    async def unfolded(self, limit: int, *, after: int, reached: Mapping[int, int]) -> list[Span]:
-        async with self._log.reading() as connection:
-            await self.generation(connection, "share")  # locked, so that no rebuild drops its tables
-            first = 0
-            if self.newest_only:
-                newest = await connection.execute(text("SELECT coalesce(max(number), 0) FROM episode"))
-                first = max(newest.scalar_one() - _NEWEST_EPISODES, 0)
-            after = max(after, first)
-            while True:
-                episodes = await episodes_behind(
-                    connection,
-                    self._place,
-                    after=after,
-                    limit=_BEHIND_EPISODES_MAX,
-                    share=self._share,
-                    after_tables=self._projection is not None,
-                )
-                behind = beyond(episodes, reached)
-                if behind or after == first:
-                    return share_out(behind, limit)
-                after = first
-
-    async def advance(self, connection: AsyncConnection, steps: Sequence[Progress]) -> bool:
-        return await advance(connection, self._place, steps)
-
-    async def park(self, connection: AsyncConnection, number: int, reason: str) -> None:
-        await park_in_generation(connection, self._place, number, reason)
-        if self._projection is not None:
-            _log.warning("episode %s is parked in the projection %s: %s", number, self._projection, reason)
+    async def missing(self, number: int, sequence: int) -> str:
+        [episode] = await self.log.episodes(number, number)
+        raise LogDamaged(episode.id, sequence, f"is missing in {self.log.address}")

@@ -25,10 +25,9 @@ from pycrorm_async.projections.generations import (
     show,
 )
 from pycrorm_async.projections.mapped_tables import UserView, mapped_leaves, with_user_views
-from pycrorm_async.projections.pipeline import BatchFold, BatchPreview, FoldPipeline, LiveTarget, release_parked
+from pycrorm_async.projections.pipeline import FoldRunner, LiveTarget, sweep
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.stored import Span
 
 _log = logging.getLogger("pycrorm_async.projections")
 
@@ -36,7 +35,7 @@ _ANYTHING_FOLDED = text("SELECT 1 FROM episode WHERE folded > 0 LIMIT 1")
 
 
 class Projector:
-    """Folds one log into its tables. Implements `BatchWorker`.
+    """Folds one log into its tables.
 
     Args:
         log: open for writing.
@@ -44,6 +43,9 @@ class Projector:
         projections: custom projections to fold too.
         installed: custom projections of installed packages; a name conflict in one is logged and not raised.
         batch_events: the most events in one transaction.
+
+    Attributes:
+        runner: folds into the built-in tables.
     """
 
     def __init__(
@@ -60,8 +62,8 @@ class Projector:
         self._custom = CustomTables(log, projections, installed, batch_events=batch_events)
         self._has_news = True
         self._target = LiveTarget(log)
-        self._pipeline = FoldPipeline(self._target, batch_events=batch_events)
-        self._fold: BatchFold | None = None
+        self._batch_events = batch_events
+        self.runner = FoldRunner(self._target, batch_events=batch_events)
 
     async def open(self) -> None:
         """Create missing tables and views: those of every memory, of the mapped classes and of the users.
@@ -85,9 +87,9 @@ class Projector:
                 for name, reason in generation.layout.failed_views.items():
                     if registered.get(name) != layout.user_views.get(name):  # new or changed by this caller
                         raise CallerError(f"the database refuses the view {name}: {reason}")
-                generation = await release_parked(connection, self._target, generation)
-            self._fold = BatchFold(self._log, self._target, generation)
-            await self._sweep()
+            self.runner = FoldRunner(self._target, batch_events=self._batch_events)
+            self.runner.generation = generation
+            await sweep(self._log)
 
     async def catch_up(self) -> int:
         """Fold everything in the log; return the number of events folded.
@@ -97,7 +99,7 @@ class Projector:
         """
         count = 0
         with self._log.translated():
-            while (folded := await self._pipeline.fold_next([self])) is not None:
+            while (folded := await self.runner.fold_next()) is not None:
                 count += folded
             while await self._refresh():
                 pass
@@ -107,10 +109,7 @@ class Projector:
 
     async def fold_next_batch(self) -> bool:
         """Fold one batch, or do one step of `fold_rest`; return False if nothing was behind the log."""
-        with self._log.translated():
-            self._has_news = await self._pipeline.fold_next([self]) is not None or await self.fold_rest(
-                now=self._has_news
-            )
+        self._has_news = await self.runner.fold_next() is not None or await self.fold_rest(now=self._has_news)
         return self._has_news
 
     async def fold_rest(self, *, now: bool) -> bool:
@@ -121,27 +120,9 @@ class Projector:
         with self._log.translated():
             return await self._refresh() or await self._custom.fold_next_batch(now=now)
 
-    async def prepare(self, spans: Sequence[Span]) -> BatchPreview:
-        """Read and fold the events of these spans, and write nothing. Raises `DatabaseUnavailable`."""
-        with self._log.translated():
-            return await self._opened.prepare(spans)
-
-    async def write(self) -> int:
-        """Write the prepared batch; return the number of its events written, 0 if the tables changed since then."""
-        before = self._opened.generation.revision
-        with self._log.translated():
-            count = await self._opened.write()
-            if self._opened.generation.revision != before:
-                await self._sweep()
-        return count
-
-    @property
-    def _opened(self) -> BatchFold:
-        assert self._fold is not None, "opened before anything is folded"
-        return self._fold
-
     async def _refresh(self) -> bool:
-        if not self._opened.generation.layout.kept:
+        generation = self.runner.generation
+        if generation is None or not generation.layout.kept:
             return False
         async with self._log.engine.begin() as connection:
             await dialect_of(connection).lock_log_changes(connection)
@@ -154,7 +135,3 @@ class Projector:
                 layout = layout.with_failed_views(layout.failed_views | {fault.view: fault.reason})
                 await show(connection, replace(generation, revision=generation.revision + 1, layout=layout))
                 return True
-
-    async def _sweep(self) -> None:
-        async with self._log.engine.begin() as connection:
-            await dialect_of(connection).sweep(connection)

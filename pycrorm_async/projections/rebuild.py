@@ -38,10 +38,10 @@ from pycrorm_async.errors import CallerError, DatabaseForeign, DatabaseUnavailab
 from pycrorm_async.projections import pipeline
 from pycrorm_async.projections.columns import CORE, OF_NO_EPISODE, next_number, physical_name
 from pycrorm_async.projections.custom import (
-    CustomFoldDefinition,
     Projection,
     events_of_batch,
     layout_of,
+    learner_of,
     make_projection_tables,
     refuse_taken,
 )
@@ -68,7 +68,7 @@ from pycrorm_async.projections.generations import (
     write_generation,
 )
 from pycrorm_async.projections.mapped_tables import UserView, mapped_leaves, with_user_views
-from pycrorm_async.projections.pipeline import TABLES, WHOLE, BatchFold, FoldPipeline, Share, SideTarget
+from pycrorm_async.projections.pipeline import WHOLE, FoldRunner, Share, SideTarget, learn_tables, sweep
 from pycrorm_async.projections.views import Tables
 from pycrorm_async.store.dialect import RowRefused
 from pycrorm_async.store.dialects import dialect_of
@@ -125,11 +125,9 @@ class Rebuild:
         self._place = pipeline.place_of(generation.number, name)
         key = f"{self._key}{_MAKING}"
         self._making = SideTarget(log, key, name, generation.version, number=generation.number, share=share)
-        definition = TABLES if projection is None else CustomFoldDefinition(projection)
-        self._fold = BatchFold(log, self._making, generation, definition)
-        local = None if log.address.is_sqlite else self._fold
+        learn = learn_tables if projection is None else learner_of(projection)
         batch_events = _BATCH_EVENTS if projection is None else events_of_batch(projection, _BATCH_EVENTS)
-        self._pipeline = FoldPipeline(self._making, batch_events=batch_events, local=local)
+        self._runner = FoldRunner(self._making, learn, batch_events=batch_events)
 
     @classmethod
     async def begin(
@@ -194,8 +192,7 @@ class Rebuild:
 
     async def fold_next_batch(self) -> int | None:
         """Fold a batch; return the number of events, None when none is left of this share."""
-        with self._log.translated():
-            return await self._pipeline.fold_next([self._fold])
+        return await self._runner.fold_next()
 
     async def show(self) -> None:
         """Make the new tables visible, with at least the events of the old ones. `clear` drops the old ones."""
@@ -255,7 +252,7 @@ class Rebuild:
                 return False
             if late:
                 spans = [Span(each.number, each.folded, each.head) for each in late]
-                if not await self._fold.write_in(connection, spans):
+                if not await self._runner.write_in(connection, spans):
                     await connection.rollback()
                     return False
                 new = await self._making.generation(connection, "change")
@@ -346,7 +343,7 @@ async def clear(log: EventLog) -> list[str]:
     with log.translated():
         async with log.reading() as connection:
             generations = await readable_generations(log, connection)
-        await _sweep(log)
+        await sweep(log)
         for key, generation in generations.items():
             if key == SHOWN:
                 await _drop(log, pipeline.place_of(generation.number))
@@ -379,16 +376,11 @@ async def readable_generations(log: EventLog, connection: AsyncConnection) -> di
     return generations
 
 
-async def _sweep(log: EventLog) -> None:
-    async with log.engine.begin() as connection:
-        await dialect_of(connection).sweep(connection)
-
-
 async def _drop_all(log: EventLog, tables: list[str]) -> list[str]:
     """Drop these tables; return those that stay in use after the last attempt."""
     for pause_s in _DROP_PAUSES_S:
         await asyncio.sleep(pause_s)
-        await _sweep(log)  # drops replaced views first, because a table cannot be dropped before its views
+        await sweep(log)  # drops replaced views first, because a table cannot be dropped before its views
         while tables and await _drop(log, tables[0]):
             tables = tables[1:]
         if not tables:

@@ -18,12 +18,12 @@ from pycrorm_async.events.types import EpisodeEnded, ObjectAdded, references_in
 from pycrorm_async.projections import pipeline
 from pycrorm_async.projections.columns import OWN, Layout, unite
 from pycrorm_async.projections.custom import (
-    CustomFoldDefinition,
     CustomRows,
     PackedProjection,
     Projection,
     fault_in_version,
     layout_of,
+    learner_of,
 )
 from pycrorm_async.projections.findings import (
     Comparison,
@@ -734,7 +734,7 @@ class ProjectionCheck:
         place = self._place(comparison.generation)
         folded = await _folded(connection, place, within._replace(first=at.number), limit)
         payloads = await dialect_of(connection).declarations(connection)
-        _, batch = CustomFoldDefinition(self._projection).learn(comparison.generation.layout, payloads)
+        _, batch = learner_of(self._projection)(comparison.generation.layout, payloads)
         rows = batch()
         findings: list[Difference] = []
         count = 0

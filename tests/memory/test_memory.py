@@ -31,6 +31,7 @@ from pycrorm_async.errors import (
 )
 from pycrorm_async.events.codec import Heading, encode, fingerprint
 from pycrorm_async.events.types import NodeStarted
+from pycrorm_async.operations.rebuild import rebuild_memory
 from pycrorm_async.orm import ProcessMetaData, TaskTreeNode
 from pycrorm_async.plan import ActionAbstract, PlanFailure
 from pycrorm_async.plan.execution import recorder
@@ -285,10 +286,8 @@ async def test_a_parked_episode_is_reported_once(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-async def test_a_foreign_table_with_a_used_name_is_named_and_parks_that_type_until_it_is_renamed(
-    tmp_path: Path,
-) -> None:
-    in_the_way = r"note_action already exists: rename your table or view, then open the memory again"
+async def test_a_foreign_table_with_a_used_name_is_named_and_parks_that_type_until_a_rebuild(tmp_path: Path) -> None:
+    in_the_way = r"note_action already exists: rename your table or view, then run `pycrorm rebuild`"
     async with Memory.open(url_of(tmp_path)) as memory:
         with sqlite3.connect(tmp_path / "memory.db") as plain:
             plain.execute("CREATE TABLE note_action (mine TEXT)")
@@ -298,8 +297,8 @@ async def test_a_foreign_table_with_a_used_name_is_named_and_parks_that_type_unt
     with plain:
         plain.execute("ALTER TABLE note_action RENAME TO my_notes")
     plain.close()
+    assert (await rebuild_memory(url_of(tmp_path))).parked == {}
     async with Memory.open(url_of(tmp_path)) as memory:
-        await memory.flush()
         assert await texts(memory) == ["a"]
 
 

@@ -18,17 +18,18 @@ from pycrorm_async.errors import CallerError
 from pycrorm_async.events.types import EpisodeStarted, NodeEnded, NodeStarted
 from pycrorm_async.memory import Memory
 from pycrorm_async.projections import custom, pipeline
-from pycrorm_async.projections.custom import Changes, CustomFoldDefinition, CustomRows, Event, Projection, states
+from pycrorm_async.projections.custom import Changes, CustomRows, Event, Projection, learner_of, states
 from pycrorm_async.projections.findings import Difference
-from pycrorm_async.projections.generations import PROJECTION, read_generation
+from pycrorm_async.projections.generations import PROJECTION
 from pycrorm_async.projections.mapped_tables import UserView
-from pycrorm_async.projections.pipeline import BatchFold, SideTarget
+from pycrorm_async.projections.pipeline import FoldRunner, SideTarget
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.rebuild import Rebuild, claimed, clear
 from pycrorm_async.projections.verify import verify
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.stored import share_out
 from tests.commands import FORKED, fork
 from tests.projections.event_script import PICK_UP, SAYING, Script, declarations, declared, field, mixed, name_of, row
 from tests.projections.sql_queries import ask, names
@@ -148,7 +149,7 @@ async def test_rows_follow_event_by_event_as_the_daemon_folds(log: EventLog) -> 
 async def test_the_newest_episodes_are_checked_often_and_all_of_them_seldom(
     log: EventLog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pipeline, "_NEWEST_EPISODES", 1)
+    monkeypatch.setattr(custom, "_NEWEST_EPISODES", 1)
     for name in ("_CHECK_S", "_SCAN_S_MAX"):
         monkeypatch.setattr(custom, name, 1e9)
     begun = [each for number in (1, 2, 3) for each in tries(number).records[:4]]
@@ -224,12 +225,9 @@ async def test_a_batch_that_another_process_has_folded_meanwhile_is_not_written(
     try:
         folds = []
         for each in (log, other):
-            async with each.reading() as connection:
-                generation = await read_generation(connection, f"{PROJECTION}grasp_rate")
-            assert generation is not None
             target = SideTarget(each, f"{PROJECTION}grasp_rate", "grasp_rate", GraspRate.version)
-            folds.append(BatchFold(each, target, generation, CustomFoldDefinition(GraspRate())))
-            await folds[-1].prepare(await target.unfolded(100, after=0, reached={}))
+            folds.append(FoldRunner(target, learner_of(GraspRate())))
+            await folds[-1].prepare(share_out(await target.behind(0, 100), 100))
         assert [await each.write() for each in folds] == [len(script.records) - 4, 0]
     finally:
         await other.close()

@@ -18,7 +18,7 @@ from pycrorm_async.events.types import (
     NodeStarted,
 )
 from pycrorm_async.projections import pipeline
-from pycrorm_async.projections.pipeline import BatchPreview, FoldPipeline, LiveTarget
+from pycrorm_async.projections.pipeline import BatchPreview, FoldRunner, LiveTarget
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import Span
@@ -36,10 +36,10 @@ class WorkerInLoop:
         self.wrote: list[int] = []
 
     async def prepare(self, spans: Sequence[Span]) -> BatchPreview:
-        return await self.projector.prepare(spans)
+        return await self.projector.runner.prepare(spans)
 
     async def write(self) -> int:
-        self.wrote.append(await self.projector.write())
+        self.wrote.append(await self.projector.runner.write())
         return self.wrote[-1]
 
 
@@ -89,9 +89,9 @@ class WritesTwice(WorkerInLoop):
 
     async def prepare(self, spans: Sequence[Span]) -> BatchPreview:
         preview = await super().prepare(spans)
-        batch = self.projector._opened._prepared
+        batch = self.projector.runner._prepared
         await super().write()
-        self.projector._opened._prepared = batch
+        self.projector.runner._prepared = batch
         return preview
 
 
@@ -133,10 +133,10 @@ async def workers_of(logs: Sequence[EventLog], kind: type[WorkerInLoop], batch_e
 
 async def fold_all(log: EventLog, hands: Sequence[WorkerInLoop], batch_events: int) -> int:
     """Fold until nothing is left, and return the number of events that the pipeline counted."""
-    pipeline, count = FoldPipeline(LiveTarget(log), batch_events=batch_events), 0
+    runner, count = FoldRunner(LiveTarget(log), batch_events=batch_events), 0
     while True:
         try:
-            folded = await pipeline.fold_next(hands)
+            folded = await runner.fold_next(hands)
         except Died:
             hands = [*hands[1:], hands[0]]
             continue

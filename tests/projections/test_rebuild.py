@@ -25,7 +25,7 @@ from pycrorm_async.orm import Action, PickUpAction, TaskTreeNode
 from pycrorm_async.projections import rebuild
 from pycrorm_async.projections import rebuild as steps
 from pycrorm_async.projections.mapped_tables import UserView
-from pycrorm_async.projections.pipeline import _fold_all
+from pycrorm_async.projections.pipeline import FoldRunner, LiveTarget
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.rebuild import Rebuild, claimed
 from pycrorm_async.settings import Settings
@@ -360,7 +360,9 @@ async def test_a_rebuild_cancelled_at_any_moment_is_continued(
     assert traces(database_url) == []
 
 
-async def test_a_batch_yields_to_the_loop_even_when_all_its_episodes_are_short() -> None:
+async def test_a_batch_yields_to_the_loop_even_when_all_its_episodes_are_short(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     class NothingToDo:
         async def restore(self, log: EventLog, spans: Sequence[Span]) -> None: ...
 
@@ -373,6 +375,14 @@ async def test_a_batch_yields_to_the_loop_even_when_all_its_episodes_are_short()
     events = [StoredEvent(number, turn, "", 1, 1, 1, b"") for number in range(1, 101) for turn in range(1, 21)]
     turns = 0
 
+    async def read(_: EventLog, _spans: Sequence[Span]) -> list[StoredEvent]:
+        return events
+
+    monkeypatch.setattr(EventLog, "spans", read)
+    log = await EventLog.open(DatabaseAddress.parse(f"sqlite:///{tmp_path}/memory.db"), create=True)
+    await Projector(log).open()
+    runner = FoldRunner(LiveTarget(log), lambda layout, _: (layout, NothingToDo))
+
     async def other() -> None:
         nonlocal turns
         while True:
@@ -380,10 +390,11 @@ async def test_a_batch_yields_to_the_loop_even_when_all_its_episodes_are_short()
             await asyncio.sleep(0)
 
     task = asyncio.create_task(other())
-    far, _ = await _fold_all([Span(number, 0, 20) for number in range(1, 101)], events, NothingToDo())
+    preview = await runner.prepare([Span(number, 0, 20) for number in range(1, 101)])
     task.cancel()
-    assert far == [(number, 0, 20) for number in range(1, 101)]
+    assert preview.reached == dict.fromkeys(range(1, 101), 20)
     assert turns >= 10
+    await log.close()
 
 
 # === rebuild limits ===========================================================================================

@@ -28,7 +28,7 @@ from pycrorm_async.events.types import (
     RobotValue,
 )
 from pycrorm_async.projections.columns import Layout
-from pycrorm_async.projections.custom import CustomFoldDefinition
+from pycrorm_async.projections.custom import learner_of
 from pycrorm_async.recall.blocks import Block
 from pycrorm_async.recall.cases import CaseBatch, CaseProjection
 from pycrorm_async.recall.columns import Case
@@ -87,7 +87,7 @@ class CaseScript(Script):
 
 def cases_of(*scripts: Script, first_number: int = 1) -> list[Case]:
     """Fold whole episodes in memory; return their cases as a memory keeps them, by node."""
-    _, batch = CustomFoldDefinition(CaseProjection()).learn(Layout(), [each.payload for each in TYPES])
+    _, batch = learner_of(CaseProjection())(Layout(), [each.payload for each in TYPES])
     rows = batch()
     assert isinstance(rows, CaseBatch)
     for number, script in enumerate(scripts, first_number):
