@@ -1,29 +1,19 @@
 """Wire the log and the tables of a database to the writer, and bind a spool to them.
 
-**Healed log.** Append to a log, and append again the events that it lost in a failover or a restored backup.
+**Healing.** Append again the events that the log lost in a failover or a restored backup. A log loses its commits from
+the end: if the last commit is present, all are. Each append names the episode that this process stored last. The
+transaction that appends reads that episode's head in the log. If the log has less than it had confirmed, it went back:
+nothing is stored and `LogWentBack` is raised. An append that finds less of one of its own episodes proves the same.
+`confirm` compares without an append: at a flush, and at intervals in the daemon. The first comparison of a process
+reads the last event of each recorder from its kept segments (`queue/stored_segments.py`), and the stored events of
+living recorders from their folders.
 
-    healed = HealedLog(log, spool, stored_in(spool, log.log_id), settings, clock=clock)
-    refusals = await healed.append(records)
-    await healed.confirm()
+Healing appends every event of the segments beyond the log's heads, declarations first, each episode under its old
+number. Several processes may heal at once, because the log stores the same event only once. Events that no segment
+contains any more stay missing: the episode is refused with its gap.
 
-Theory of operation. The spool remembers the acknowledged head of each episode, the last sequence that the log has
-confirmed (`queue/spool.py`), and keeps stored segments for a while
-(`queue/stored_segments.py`). Every append names the episode of this spool that was stored last, by any
-process. The transaction that appends reads that episode's head in the log. If the log has less than was acknowledged,
-it went back: nothing is stored and `LogWentBack` is raised. A log loses its commits from the end, so if the last one is
-present, all are. An append that finds a gap in an episode with a higher acknowledged head proves the same. `confirm`
-makes this check without an append: at a start, at a flush, and at intervals in the daemon.
-
-Healing compares the acknowledged heads of all episodes with those of the log. It reads the records beyond the log's
-heads from the segments and appends them, declarations first, each episode under its old number. Several processes may
-heal at once, because the log stores the same event only once. Records that no segment contains any more stay missing:
-the acknowledged head is lowered to the log's, so that healing does not search for them again, and the episode is
-refused with its gap when later events of it arrive.
-
-An append assigns only episode numbers above the highest number remembered, and leaves a reserve free behind it for
-other spools that were stored in the same log and return later. A spool that remembers none of the lost episodes and
-appends before all others may receive their numbers; then a lost episode gets a new number, and its row ids change. No
-number is ever given to two episodes.
+A spool that appends new episodes before another spool has healed may get numbers of the other's lost episodes; these
+then get new numbers, and their row ids change. No number is given to two episodes.
 """
 
 from __future__ import annotations
@@ -31,13 +21,14 @@ from __future__ import annotations
 import asyncio
 import logging
 import socket
-from collections.abc import AsyncIterator, Iterable, Iterator, Mapping, Sequence
-from contextlib import asynccontextmanager
+from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
+from contextlib import asynccontextmanager, suppress
+from functools import partial
 from pathlib import Path
 from shlex import quote
-from typing import Final, NamedTuple, TypeVar
+from typing import Final, NamedTuple
 
-from pycrorm_async.clock import Clock
+from pycrorm_async.clock import SYSTEM_CLOCK, Clock
 from pycrorm_async.errors import (
     CallerError,
     DatabaseError,
@@ -53,15 +44,21 @@ from pycrorm_async.projections.custom import Projection, installed_projections
 from pycrorm_async.projections.mapped_tables import UserView
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.queue.blobs import read_blob
-from pycrorm_async.queue.format import segment_numbers, segment_path
-from pycrorm_async.queue.scan import SegmentScanner
+from pycrorm_async.queue.format import (
+    map_segment,
+    salt_of,
+    segment_numbers,
+    segment_path,
+)
+from pycrorm_async.queue.locks import STORED
+from pycrorm_async.queue.scan import SegmentScanner, last_event
 from pycrorm_async.queue.sources import computed_ends
-from pycrorm_async.queue.spool import AcknowledgedHeads, Spool, is_folder_name, parse_folder_name, wrap_os_errors
-from pycrorm_async.queue.stored_segments import stored_in
+from pycrorm_async.queue.spool import Progress, Spool, is_folder_name, parse_folder_name, wrap_os_errors
+from pycrorm_async.queue.stored_segments import EpisodeNumbers, stored_in
 from pycrorm_async.settings import Settings
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.stored import Basis, EpisodeRow
+from pycrorm_async.store.stored import EpisodeRow
 
 _APPENDS_AT_ONCE = 4
 """Bounds the concurrent appends to a server, for any number of recorders: the pool's connections less one for folding.
@@ -73,21 +70,40 @@ _WATCH_S = 1.0
 _log = logging.getLogger("pycrorm_async")
 
 
+_HEADS_MAX: Final = 64
+"""Bounds the episodes whose confirmed heads a process compares: more than it appends to at once."""
+_HEALINGS_MAX: Final = 3
+"""Bounds the healings in one append, because a log may go back again while it is healed."""
+
+
 class LogAndTables:
     """The log and the tables folded from it. Implements the writer's `Log`, `Destination` and `Tables`.
 
-    While this process cannot use the tables, it appends events and folding raises `TablesForeign`.
+    While this process cannot use the tables, it appends events and folding raises `TablesForeign`. With a spool, the
+    events in its segments are appended again to a log that lost them.
     """
 
-    def __init__(self, log: EventLog, projector: Projector, healed: HealedLog | None = None) -> None:
+    def __init__(
+        self,
+        log: EventLog,
+        projector: Projector,
+        spool: Path | None = None,
+        *,
+        batch_events_max: int = Settings.batch_events_max,
+        clock: Clock = SYSTEM_CLOCK,
+    ) -> None:
         self.log = log
         self.log_id = log.log_id
-        self._healed = healed
         self._projector = projector
+        self._spool = spool
+        self._batch_events_max = batch_events_max
+        self._clock = clock
         self._refused = False
-        self._rounds = 0
         # SQLite allows one writer, and a waiting connection polls for the lock. A semaphore serves waiters in order.
         self._appending = asyncio.Semaphore(1 if log.address.is_sqlite else _APPENDS_AT_ONCE)
+        self._numbers = EpisodeNumbers((spool or Path()) / STORED / log.log_id)
+        self._heads: dict[EpisodeId, int] | None = None  # confirmed, the last one last; None before a comparison
+        self._comparing = asyncio.Lock()
 
     async def open_tables(self) -> None:
         """Open the tables. Raises as `Projector.open` does, except `TablesForeign`: each fold then opens them again."""
@@ -97,33 +113,94 @@ class LogAndTables:
             self._refused = True
             _log.warning("%s; events are stored in the log but not folded until then", error)
 
+    # --- the log ----------------------------------------------------------------------------------------------
+
     async def append(self, records: Sequence[Record]) -> Mapping[EpisodeId, str]:
         await self.log.store_blobs(records)  # before this process' turn, so that others need not wait for large blobs
         async with self._appending:
-            if self._healed is None:
+            if self._spool is None:
                 return await self.log.append(records)
-            async with self._folding_healed(self._healed):
-                return await self._healed.append(records)
+            for _ in range(_HEALINGS_MAX):
+                if self._heads is None:
+                    await self.confirm()
+                heads = self._heads or {}
+                try:
+                    stored = await self.log.store(records, witness=next(reversed(heads.items()), None))
+                except LogWentBack:
+                    await self.confirm()
+                    continue
+                if all(row.head >= heads.get(each, 0) for each, row in stored.rows.items()):
+                    break
+                await self.confirm()
+            else:
+                stored = await self.log.store(records)
+        self._numbers.note({each: row.number for each, row in stored.rows.items()})
+        others = {each: head for each, head in (self._heads or {}).items() if each not in stored.rows}
+        self._heads = _latest(others | {each: row.head for each, row in stored.rows.items()})
+        return stored.refusals
 
     async def confirm(self) -> None:
-        if self._healed is not None:
-            async with self._folding_healed(self._healed):
-                await self._healed.confirm()
+        if self._spool is None:
+            return
+        async with self._comparing:
+            heads = self._heads
+            if heads is None:
+                heads = await asyncio.to_thread(stored_heads, self._spool, self.log_id)
+            rows = await self.log.heads(list(heads))
+            now = {each: rows[each].head if each in rows else 0 for each in heads}
+            lost = next((each for each, head in heads.items() if now[each] < head), None)
+            if lost is not None:
+                await self._heal(LogWentBack(episode_text(lost), heads[lost], now[lost]), self._spool, heads)
+                # What no segment contains is not searched again.
+                self._heads = {each: row.head for each, row in (await self.log.heads(list(_latest(heads)))).items()}
+            elif self._heads is None:
+                self._heads = _latest(heads)
 
-    @asynccontextmanager
-    async def _folding_healed(self, healed: HealedLog) -> AsyncIterator[None]:
-        """Fold the events that `healed` appended again inside, because a flush waits for new events only."""
-        rounds = healed.rounds
-        yield
-        if healed.rounds != rounds:
+    async def _heal(self, cause: LogWentBack, spool: Path, confirmed: Mapping[EpisodeId, int]) -> None:
+        """Append again what the segments contain, and fold it, because a flush waits for new events only.
+
+        Events of a recorder's own folder that were not stored before are appended with the others, and not counted. In
+        the first comparison of a process a healing that changed nothing is not reported again.
+        """
+        changed: dict[EpisodeId, EpisodeRow] = {}
+        appended = 0
+        numbers = await asyncio.to_thread(self._numbers.read)
+        await self.log.skip_numbers(max(numbers.values(), default=0))
+        for recorder in await asyncio.to_thread(stored_recorders, spool, self.log_id):
+            parts = stored_records(recorder)
             try:
-                await self.fold()
+                while (part := await asyncio.to_thread(next, parts, None)) is not None:
+                    rows = await self.log.heads(list({each.episode for each in part if each.episode is not None}))
+                    heads = {each: row.head for each, row in rows.items()}
+                    lost = [each for each in part if each.episode is None or each.sequence > heads.get(each.episode, 0)]
+                    for start in range(0, len(lost), self._batch_events_max):
+                        batch = lost[start : start + self._batch_events_max]
+                        for each, row in (await self.log.store(batch, numbers=numbers)).rows.items():
+                            is_lost = recorder.over or each in confirmed
+                            appended += is_lost * (row.head - heads.get(each, 0))
+                            heads[each] = row.head
+                            if is_lost and (each not in rows or rows[each]._replace(folded=0, parked=None) != row):
+                                changed[each] = row
+            except LogDamaged as error:  # skip this recorder; the segments of the others may still heal the log
+                _log.error("recorder %s: %s", recorder.name, error)
+        if self._heads is None and not changed:
+            return
+        incomplete = sum(row.refused is not None for row in changed.values())
+        done = f"{appended:,} events were appended again; {incomplete} of {len(changed)} episodes stay incomplete"
+        _log.warning("%s: %s; %s", self.log.address, cause, done)
+        self._refused = True  # the layout of the tables may have gone back too
+        noticed = self._clock.wall_ns(), f"{socket.gethostname()}:{spool}", f"{cause}; {done}"
+        for work in (partial(self.log.note_incarnation, *noticed), self.fold):
+            try:
+                await work()
             except DatabaseError as error:
-                _log.warning("the events that were appended again are not visible in the tables yet: %s", error)
+                _log.warning("%s: the healing is not noted or not visible yet: %s", self.log.address, error)
 
     @property
     def writes(self) -> int:
         return self.log.writes
+
+    # --- the tables -------------------------------------------------------------------------------------------
 
     async def fold(self) -> int:
         async with self._tables():
@@ -136,9 +213,7 @@ class LogAndTables:
     @asynccontextmanager
     async def _tables(self) -> AsyncIterator[None]:
         """Open the tables again after a failed fold or a healed log, because their layout may have changed."""
-        if self._refused or self._rounds != self._rounds_healed:
-            self._rounds = self._rounds_healed
-            self._refused = True
+        if self._refused:
             await self._projector.open()
             self._refused = False
         try:
@@ -147,15 +222,15 @@ class LogAndTables:
             self._refused = True
             raise
 
-    @property
-    def _rounds_healed(self) -> int:
-        return 0 if self._healed is None else self._healed.rounds
-
     async def behind(self) -> Mapping[str, int]:
         return {each.id: each.folded for each in await self.log.behind()}
 
     async def stopped(self) -> Mapping[str, str]:
         return {each.id: each.refused or each.parked or "" for each in await self.log.stopped()}
+
+
+def _latest(heads: Mapping[EpisodeId, int]) -> dict[EpisodeId, int]:
+    return dict(list(heads.items())[-_HEADS_MAX:])
 
 
 @asynccontextmanager
@@ -166,12 +241,11 @@ async def open_destination(
     clock: Clock,
     views: Sequence[UserView] = (),
     projections: Sequence[Projection] = (),
-    settings: Settings | None = None,
+    settings: Settings = Settings(),  # noqa: B008  frozen
 ) -> AsyncIterator[LogAndTables]:
     """Open the log and the tables for writing in the running loop, and bind the spool to the log.
 
-    Folds these projections and the installed ones. With `settings`, the events that the spool keeps are appended again
-    to a log that lost them. Raises `SpoolForeign`.
+    Folds these projections and the installed ones. Raises `SpoolForeign`.
     """
     expected = expected_log(address, spool)
     log = await EventLog.open(address, create=True, clock=clock, file_access=spool.access, belongs_to=expected)
@@ -184,13 +258,10 @@ async def open_destination(
     try:
         spool.bind(log.log_id)
         log.blobs.source = _SpoolBlobs(spool.path)
-        installed = installed_projections(projections, own=settings is None or settings.recall)
+        installed = installed_projections(projections, own=settings.recall)
         projector = Projector(log, views=views, projections=projections, installed=installed)
-        healed: HealedLog | None = None
-        if settings is not None and settings.keep_stored_s and settings.keep_stored_bytes:
-            folder = stored_in(spool.path, log.log_id)
-            healed = None if folder is None else HealedLog(log, spool.path, folder, settings, clock=clock)
-        destination = LogAndTables(log, projector, healed)
+        kept = spool.path if stored_in(spool.path, log.log_id) else None
+        destination = LogAndTables(log, projector, kept, batch_events_max=settings.batch_events_max, clock=clock)
         await destination.open_tables()
         yield destination
     finally:
@@ -237,144 +308,6 @@ def shared_address(url: str | DatabaseAddress) -> DatabaseAddress:
     if address.is_private:
         raise CallerError("sqlite:// exists only in its own process, no other can open it: name a file")
     return address
-
-
-# === healed log ===============================================================================================
-
-_EPISODES_MAX: Final = 1_000
-"""Bounds the episodes whose heads one statement reads."""
-_ROUNDS: Final = 3
-"""Bounds the healings in one append, because a log may go back again while it is healed; then the caller retries."""
-
-_T = TypeVar("_T")
-
-
-class HealedLog:
-    """One log, with the heads that a spool remembers of it in a folder. Belongs to the loop of the log.
-
-    Attributes:
-        rounds: the number of healings.
-        offered: the number of events that were appended again.
-        missing: the number of episodes that could not be completed.
-    """
-
-    def __init__(self, log: EventLog, spool: Path, folder: Path, settings: Settings, *, clock: Clock) -> None:
-        self._store = log
-        self._spool = spool
-        self._settings = settings
-        self._clock = clock
-        self._heads = AcknowledgedHeads(folder, keep_s=settings.keep_stored_s, wall_ns=clock.wall_ns)
-        self._healing = asyncio.Lock()
-        self.rounds = 0
-        self.offered = 0
-        self.missing = 0
-
-    async def append(self, records: Sequence[Record]) -> Mapping[EpisodeId, str]:
-        """Append as `EventLog.append` does, healing a log that went back. Raises `LogWentBack` if that failed."""
-        heads = self._heads
-        for _ in range(_ROUNDS):
-            heads.refresh()
-            try:
-                stored = await self._store.store(records, self._basis())
-            except LogWentBack as error:
-                await self._heal(error)
-                continue
-            acknowledged = heads.all  # without this batch, whose heads are noted below
-            short = [
-                LogWentBack(row.id, acknowledged[each].head, row.head)
-                for each, row in stored.rows.items()
-                if each in acknowledged and row.head < acknowledged[each].head
-            ]
-            if not short:
-                break
-            await self._heal(short[0])
-        else:
-            stored = await self._store.store(records, self._basis())
-        heads.note({each: (row.number, row.head) for each, row in stored.rows.items()})
-        return stored.refusals
-
-    async def confirm(self) -> None:
-        """Append again the events that the log lost. Raises `DatabaseUnavailable`; may then be called again."""
-        heads = self._heads
-        heads.refresh()
-        if heads.last is None:
-            return
-        episode, head = heads.last
-        row = (await self._store.heads([episode])).get(episode)
-        if row is None or row.head < head:
-            await self._heal(LogWentBack(episode_text(episode), head, 0 if row is None else row.head))
-
-    def _basis(self) -> Basis:
-        heads = self._heads
-
-        def number_of(episode: EpisodeId) -> int | None:
-            acknowledged = heads.all.get(episode)
-            return (acknowledged.number or None) if acknowledged is not None else None
-
-        return Basis(heads.last, number_of, heads.number_max)
-
-    async def _heal(self, cause: LogWentBack) -> None:
-        heads = self._heads
-        async with self._healing:
-            heads.refresh()
-            lost = await self._lost()
-            if not lost:  # another task or process has healed it
-                return
-            self.rounds += 1
-            _log.warning("%s: searching %s for the lost events of %d episodes", cause, self._spool, len(lost))
-            await self._store.skip_numbers(heads.number_max)
-            offered = await self._offer(lost)
-            self.offered += offered
-            left = await self._lost()
-            self.missing += len(left)
-            if left:
-                heads.note({each: (heads.all[each].number, head) for each, head in left.items()}, lowered=True)
-            done = f"{offered:,} events were appended again; {len(left)} of {len(lost)} episodes stay incomplete"
-            _log.warning("%s: %s", self._store.address, done)
-            noticed_by = f"{socket.gethostname()}:{self._spool}"
-            try:
-                await self._store.note_incarnation(self._clock.wall_ns(), noticed_by, f"{cause}; {done}")
-            except DatabaseError as error:
-                _log.warning("%s: the healing cannot be recorded in the log: %s", self._store.address, error)
-
-    async def _lost(self) -> dict[EpisodeId, int]:
-        """Return the episodes whose head in the log is below the acknowledged one, with their heads in the log."""
-        acknowledged = dict(self._heads.all)
-        rows: dict[EpisodeId, EpisodeRow] = {}
-        for part in _parts(list(acknowledged), _EPISODES_MAX):
-            rows |= await self._store.heads(part)
-        present = {each: rows[each].head if each in rows else 0 for each in acknowledged}
-        return {each: head for each, head in present.items() if head < acknowledged[each].head}
-
-    async def _offer(self, lost: Mapping[EpisodeId, int]) -> int:
-        """Append the lost events that the segments contain; return their number."""
-        basis = self._basis()._replace(witness=None)
-        offered = 0
-        recorders = await asyncio.to_thread(stored_recorders, self._spool, self._store.log_id)
-        for recorder in recorders:
-            parts = _lost_records(stored_records(recorder), lost)
-            try:
-                while batch := await asyncio.to_thread(next, parts, None):
-                    for part in _parts(batch, self._settings.batch_events_max):
-                        await self._store.store(part, basis)
-                    offered += sum(each.episode is not None for each in batch)
-            except LogDamaged as error:  # skip this recorder; the segments of the others may still heal the log
-                _log.error("recorder %s: %s", recorder.name, error)
-        return offered
-
-
-def _lost_records(parts: Iterable[Sequence[Record]], lost: Mapping[EpisodeId, int]) -> Iterator[list[Record]]:
-    """Yield the declarations and the events beyond these heads, and skip segments that have neither."""
-    for part in parts:
-        wanted = [
-            each for each in part if each.episode is None or each.sequence > lost.get(each.episode, each.sequence)
-        ]
-        if wanted:
-            yield wanted
-
-
-def _parts(items: Sequence[_T], size: int) -> Iterator[Sequence[_T]]:
-    return (items[start : start + size] for start in range(0, len(items), size))
 
 
 # === stored records ===========================================================================================
@@ -434,6 +367,34 @@ def stored_records(recorder: StoredRecorder) -> Iterator[list[Record]]:
             yielded += count
     except (FileNotFoundError, SpoolDamaged, FilesError):
         return
+
+
+def stored_heads(spool: Path, log_id: str) -> dict[EpisodeId, int]:
+    """Return heads that the log must have reached, by episode; the last ones last. Raises `FilesError`.
+
+    Of each recorder with kept segments that is the last event of these; of a living recorder that another process
+    drains, each episode in its folder.
+    """
+    heads: dict[EpisodeId, int] = {}
+    kept = stored_in(spool, log_id)
+    for folder in sorted(kept.iterdir()) if kept is not None and kept.is_dir() else ():
+        segments = _segments(folder) if is_folder_name(folder.name) else {}
+        if segments:
+            number = max(segments)
+            with suppress(FileNotFoundError, SpoolDamaged), map_segment(segments[number]) as buffer:
+                last = last_event(buffer, salt_of(parse_folder_name(folder.name).recorder, number))
+                if last is not None:
+                    heads[EpisodeId(last.episode)] = last.sequence
+    for recorder in Spool(spool).recorders():
+        progress = Progress.open(recorder.path, writing=False) if recorder.alive else None
+        if progress is not None:
+            stored = min(progress.drained().stored, progress.recorded().synced)
+            progress.close()
+            for part in stored_records(StoredRecorder(recorder.name, _segments(recorder.path), over=False)):
+                heads |= {each.episode: each.sequence for each in part if each.episode and each.position <= stored}
+                if part and part[-1].position >= stored:
+                    break
+    return heads
 
 
 def _segments(folder: Path) -> dict[int, Path]:

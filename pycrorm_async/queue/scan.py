@@ -318,6 +318,18 @@ def whole_frames(buffer: Buffer, start: int, salt: int) -> Iterator[tuple[int, F
         index = buffer.find(salted, max(index + 1, end))
 
 
+def last_event(buffer: Buffer, salt: int) -> Frame | None:
+    """Find the last whole frame with an event, from the end of the segment; None without one."""
+    salted = CHECKSUM.pack(salt)
+    index = buffer.rfind(salted)
+    while index >= 0:
+        frame = decode(buffer, index - _SALT_OFFSET, salt) if index >= _SALT_OFFSET else None
+        if frame is not None and frame.kind == EVENT:
+            return frame
+        index = buffer.rfind(salted, 0, index + len(salted) - 1)
+    return None
+
+
 def _refuse_damage(folder: Path, recorder: bytes, prefix: ValidPrefix) -> None:
     """Raise `SpoolDamaged` if a commit frame behind the cut covers a record that is missing."""
     for number in prefix.numbers:

@@ -2,6 +2,7 @@
 
     spool/stored/<log id>/<recorder>/00000001.segment
     spool/stored/<log id>/<recorder>/00000001.segment.blobs/<sha256>
+    spool/stored/<log id>/numbers        the numbers of episodes in that log
 
 One rename moves a segment here instead of deleting it; it is not written again. Its blobs are deleted with it. Segments
 stored in another log, before an empty spool was bound to this one, are in that log's folder.
@@ -15,15 +16,17 @@ from __future__ import annotations
 import logging
 import os
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Final, NamedTuple
+from zlib import crc32
 
 from pycrorm_async.errors import SpoolUnavailable
+from pycrorm_async.events.ids import EpisodeId, episode_text, parse_episode_id
 from pycrorm_async.queue.blobs import blob_bytes, keep_blobs, kept_with
 from pycrorm_async.queue.format import segment_numbers, segment_path
-from pycrorm_async.queue.locks import STORED, create_folders
+from pycrorm_async.queue.locks import NUMBERS, STORED, create_folders, open_file
 from pycrorm_async.queue.spool import Spool
 from pycrorm_async.settings import Settings
 
@@ -183,3 +186,56 @@ def _delete(segment: Path) -> None:
     segment.unlink(missing_ok=True)
     with suppress(OSError):  # it contains more segments
         segment.parent.rmdir()
+
+
+# === episode numbers ==========================================================================================
+
+_NUMBERS_BYTES_MAX: Final = 2**20
+"""Bounds each of the two files: together they hold the numbers of the last 20,000 to 40,000 episodes."""
+_NOTED_MAX: Final = 10_000
+"""Bounds the episodes that a process remembers to have noted; it may note the others again."""
+
+
+class EpisodeNumbers:
+    """The numbers that a log gave to episodes, so that an episode that the log lost gets its own number again.
+
+        0192f3c0-…-9ab0 17 9f3c2a1b      id, number, crc32 of both
+
+    All processes of a spool append lines to one file; a full file replaces the one before it. A line that is torn or
+    missing costs an episode its number, and no event.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._path = folder / NUMBERS
+        self._full = folder / f"{NUMBERS}.full"
+        self._noted: set[EpisodeId] = set()
+
+    def note(self, numbers: Mapping[EpisodeId, int]) -> None:
+        """Append the numbers that this process has not noted yet. An `OSError` is logged."""
+        new = {each: number for each, number in numbers.items() if each not in self._noted}
+        if not new:
+            return
+        if len(self._noted) > _NOTED_MAX:
+            self._noted.clear()
+        self._noted.update(new)
+        fields = [f"{episode_text(each)} {number}".encode() for each, number in new.items()]
+        lines = b"".join(b"\n%b %08x" % (each, crc32(each)) for each in fields)  # "\n" ends a torn line
+        try:
+            create_folders(self._path.parents[2], self._path.parent)
+            with os.fdopen(open_file(self._path, os.O_WRONLY | os.O_APPEND), "ab") as file:
+                file.write(lines)
+                if file.tell() > _NUMBERS_BYTES_MAX:
+                    self._path.replace(self._full)
+        except OSError as error:
+            _log.warning("numbers of episodes cannot be noted in %s: %s", self._path, error)
+
+    def read(self) -> dict[EpisodeId, int]:
+        """Return the numbers that any process has noted. Raises `OSError`, but not for a missing file."""
+        numbers = {}
+        for path in (self._full, self._path):
+            for line in path.read_bytes().splitlines() if path.exists() else ():
+                fields, _, checksum = line.rpartition(b" ")
+                if checksum == b"%08x" % crc32(fields):
+                    episode, number = fields.decode().split()
+                    numbers[parse_episode_id(episode)] = int(number)
+        return numbers

@@ -15,9 +15,8 @@ episode rows, then the new events. Events at or below an episode's head are repe
 stored bytes and raises `LogDamaged` if one differs. A transaction that stores no event still writes a record, so that
 its COMMIT is as durable as the one that stored the repeats.
 
-`Basis` carries the facts that the log confirmed before. If the log now holds less of the witness episode, it went back,
-and `write` raises `LogWentBack` before it stores an event. An episode that the log lost gets its former number again if
-no other episode has it.
+A caller may name a witness, an episode with the head that the log confirmed. If the log now holds less of it, the log
+went back, and `write` raises `LogWentBack` before it stores an event.
 """
 
 from __future__ import annotations
@@ -28,6 +27,7 @@ from collections.abc import AsyncIterator, Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass, field
 from hashlib import sha256
+from types import MappingProxyType
 from typing import Any, Final, NamedTuple, Protocol
 
 import msgspec
@@ -41,8 +41,6 @@ from pycrorm_async.events.types import Blob, BlobReference, references_in
 from pycrorm_async.store.dialect import Dialect, Insertion
 from pycrorm_async.store.stored import (
     BLOCK_EVENTS,
-    NOTHING_KNOWN,
-    Basis,
     DigestRow,
     EpisodeRow,
     RunningDigest,
@@ -350,18 +348,24 @@ class _Plan(NamedTuple):
 
 
 class Appending:
-    """One batch and its append; use it once. Digests are stored only if `digests` is given."""
+    """One batch and its append; use it once. Digests are stored only if `digests` is given.
+
+    `witness` is an episode and its confirmed head. A new episode gets its number in `numbers` if no other has it.
+    """
 
     def __init__(
         self,
         dialect: Dialect,
         records: Sequence[Record],
-        basis: Basis = NOTHING_KNOWN,
         digests: RunningDigests | None = None,
+        *,
+        witness: tuple[EpisodeId, int] | None = None,
+        numbers: Mapping[EpisodeId, int] = MappingProxyType({}),
     ) -> None:
         self._dialect = dialect
-        self._basis = basis
         self._digests = digests
+        self._witness = witness
+        self._numbers = numbers
         self._batch = sort(records)
         self._plan: _Plan | None = None
         self.warnings: dict[str, str] = {}
@@ -376,8 +380,8 @@ class Appending:
     async def write(self, connection: AsyncConnection) -> Stored:
         """Append the batch in the caller's transaction.
 
-        Raises `LogWentBack` if the log holds less than `basis` states, and `LogDamaged` if another event is stored
-        under a record's key; the caller must then roll back.
+        Raises `LogWentBack` if the log holds less of the witness than it had confirmed, and `LogDamaged` if another
+        event is stored under a record's key; the caller must then roll back.
         """
         batch, dialect = self._batch, self._dialect
         if batch.declarations:
@@ -418,7 +422,7 @@ class Appending:
     async def _read_rows(self, connection: AsyncConnection) -> dict[EpisodeId, EpisodeRow]:
         """Read the rows of the batch's episodes, without `folded` and `parked`, which folding changes meanwhile."""
         names = {episode_text(each): each for each in self._batch.episodes}
-        witness, confirmed = self._basis.witness or (None, 0)
+        witness, confirmed = self._witness or (None, 0)
         witness_name = None if witness is None else episode_text(witness)
         rows = await self._dialect.episodes_by_id(connection, list(names), witness=witness_name)
         if witness_name is not None:
@@ -435,21 +439,20 @@ class Appending:
         refusals: dict[EpisodeId, str] = {}
         missing = [each for each in self._batch.episodes if each not in rows]
         if missing:
-            for each, number in (await self._numbers(connection, missing)).items():
+            for each, number in (await self._assign_numbers(connection, missing)).items():
                 try:
                     rows[each] = new_episode(each, self._batch.episodes[each][0], number)
                 except NumbersExhausted as refusal:
                     refusals[each] = str(refusal)
         return rows, refusals
 
-    async def _numbers(self, connection: AsyncConnection, missing: Sequence[EpisodeId]) -> dict[EpisodeId, int]:
-        """Assign each episode its former number if that is free, else a new one."""
-        own = {each: number for each in missing if (number := self._basis.number_of(each)) is not None}
+    async def _assign_numbers(self, connection: AsyncConnection, missing: Sequence[EpisodeId]) -> dict[EpisodeId, int]:
+        own = {each: self._numbers[each] for each in missing if each in self._numbers}
         taken = await self._dialect.numbers_taken(connection, list(own.values())) if own else set()
         numbers = {each: number for each, number in own.items() if number not in taken}
         new = [each for each in missing if each not in numbers]
         if new:
-            above = max(self._basis.above, *numbers.values(), 0)
+            above = max(numbers.values(), default=0)
             numbers |= zip(new, await self._dialect.new_numbers(connection, len(new), above=above), strict=True)
         return numbers
 

@@ -122,12 +122,11 @@ class Dialect(Protocol):
         ...
 
     async def new_numbers(self, connection: AsyncConnection, count: int, *, above: int = 0) -> list[int]:
-        """Return numbers that no episode has or had. If the next free number is not above `above`, skip those up to
-        `above` and a reserve behind it (`numbers_reserved`)."""
+        """Return numbers above `above` that no episode has."""
         ...
 
     async def skip_numbers(self, connection: AsyncConnection, above: int) -> None:
-        """Skip the numbers up to `above` and the reserve behind it in a database that assigns numbers itself."""
+        """Skip the numbers up to `above` in a database that assigns numbers itself."""
         ...
 
     async def numbers_taken(self, connection: AsyncConnection, numbers: Sequence[int]) -> set[int]:

@@ -45,8 +45,6 @@ from pycrorm_async.store.dialect import Birth, Dialect, LogIdentity, Migrations,
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.sqlite_engine import BEGIN, READ, move_leftovers
 from pycrorm_async.store.stored import (
-    NOTHING_KNOWN,
-    Basis,
     DigestRow,
     EpisodeRow,
     Incarnation,
@@ -151,13 +149,22 @@ class EventLog:
         """
         return dict((await self.store(records)).refusals)
 
-    async def store(self, records: Sequence[Record], basis: Basis = NOTHING_KNOWN) -> Stored:
-        """Append, but raise `LogWentBack`, and store nothing, if the log holds less than `basis` states."""
+    async def store(
+        self,
+        records: Sequence[Record],
+        *,
+        witness: tuple[EpisodeId, int] | None = None,
+        numbers: Mapping[EpisodeId, int] = MappingProxyType({}),
+    ) -> Stored:
+        """Append; give a new episode its number in `numbers` if no other episode has it.
+
+        Raises `LogWentBack`, and stores nothing, if the log holds less of the witness than this head.
+        """
         if not records:
             return Stored({}, {})
         with self.translated():
             await self.blobs.store_for(records)  # again, because the log may have lost them since
-            appending = Appending(self._dialect, records, basis, self.digests)
+            appending = Appending(self._dialect, records, self.digests, witness=witness, numbers=numbers)
             if self._write_turn is not None and len(records) >= _MANY_EVENTS:
                 async with self.reading() as connection:
                     await appending.prepare(connection)
@@ -183,7 +190,7 @@ class EventLog:
             return {names[row.id]: row for row in await self._dialect.heads(connection, list(names))}
 
     async def skip_numbers(self, above: int) -> None:
-        """Never assign the numbers up to `above`, nor the reserve behind it, to new episodes."""
+        """Never assign the numbers up to `above` to new episodes."""
         with self.translated():
             async with self.writing() as connection:
                 await self._dialect.skip_numbers(connection, above)

@@ -68,7 +68,7 @@ from pycrorm_async.store.postgresql_engine import LOG_SCHEMA, PATH, STRANGER, TA
 from pycrorm_async.store.postgresql_engine import LOG_SCHEMA as LOG
 from pycrorm_async.store.postgresql_engine import TABLES_SCHEMA as TABLES
 from pycrorm_async.store.postgresql_engine import VIEWS_SCHEMA as VIEWS
-from pycrorm_async.store.stored import EpisodeRow, Incarnation, Span, StoredEvent, numbers_reserved
+from pycrorm_async.store.stored import EpisodeRow, Incarnation, Span, StoredEvent
 
 # === tables ===================================================================================================
 #
@@ -488,23 +488,14 @@ class PostgreSQL:
             return await _rows(EpisodeRow, connection, SELECT_EPISODES_BY_ID, list(ids))
         return await _rows(EpisodeRow, connection, SELECT_EPISODES_AND_WITNESS, list(ids), witness)
 
-    async def new_numbers(self, connection: AsyncConnection, count: int, *, above: int = 0) -> list[int]:
-        numbers = list((await connection.exec_driver_sql(NEW_NUMBERS, (count,))).scalars())
-        if numbers[0] > above:
-            return numbers
-        await self._skip(connection, numbers[-1], above)
+    async def new_numbers(self, connection: AsyncConnection, count: int, *, above: int = 0) -> list[int]:  # noqa: ARG002
         return list((await connection.exec_driver_sql(NEW_NUMBERS, (count,))).scalars())
 
     async def skip_numbers(self, connection: AsyncConnection, above: int) -> None:
-        number = (await connection.exec_driver_sql(NEW_NUMBERS, (1,))).scalar_one()
-        if number <= above:
-            await self._skip(connection, number, above)
-
-    async def _skip(self, connection: AsyncConnection, current: int, above: int) -> None:
         # Uses nextval, because setval needs a privilege and could move the sequence back behind another session.
-        count = above + numbers_reserved(above) - current
-        if count > 0:
-            await connection.exec_driver_sql(SKIP_NUMBERS, (count,))
+        number = (await connection.exec_driver_sql(NEW_NUMBERS, (1,))).scalar_one()
+        if number < above:
+            await connection.exec_driver_sql(SKIP_NUMBERS, (above - number,))
 
     async def numbers_taken(self, connection: AsyncConnection, numbers: Sequence[int]) -> set[int]:
         return set((await connection.exec_driver_sql(SELECT_NUMBERS_TAKEN, (list(numbers),))).scalars())

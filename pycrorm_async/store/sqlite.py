@@ -35,7 +35,7 @@ from pycrorm_async.store.dialect import (
     StoredOn,
 )
 from pycrorm_async.store.sqlite_engine import BEGIN, USE_WAL, Connection, claim
-from pycrorm_async.store.stored import EpisodeRow, Incarnation, Span, StoredEvent, numbers_reserved
+from pycrorm_async.store.stored import EpisodeRow, Incarnation, Span, StoredEvent
 
 # === tables ===================================================================================================
 #
@@ -312,9 +312,8 @@ class SQLite:
 
     async def new_numbers(self, connection: AsyncConnection, count: int, *, above: int = 0) -> list[int]:
         taken = (await connection.exec_driver_sql(SELECT_NUMBER_MAX)).scalar_one()
-        if taken < above:
-            taken = above + numbers_reserved(above)
-        return list(range(taken + 1, taken + 1 + count))
+        first = max(taken, above) + 1
+        return list(range(first, first + count))
 
     async def skip_numbers(self, connection: AsyncConnection, above: int) -> None:
         """Do nothing: SQLite has no sequence; `new_numbers` skips the numbers."""

@@ -25,7 +25,7 @@ takes half the time of BLAKE2b where the processor has instructions for it, as m
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from hashlib import sha256
 from typing import Final, NamedTuple
 
@@ -33,7 +33,7 @@ import msgspec
 
 from pycrorm_async.errors import LogDamaged
 from pycrorm_async.events.codec import Record
-from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, EpisodeId, is_episode_id, parse_episode_id
+from pycrorm_async.events.ids import EpisodeId, is_episode_id, parse_episode_id
 
 
 class StoredEvent(NamedTuple):
@@ -87,24 +87,6 @@ class EpisodeRow(NamedTuple):
         return parse_episode_id(self.id)
 
 
-class Basis(NamedTuple):
-    """Facts that this log confirmed before an append.
-
-    Attributes:
-        witness: the episode stored last, and its head. A log with a lower head went back and refuses the append.
-        number_of: returns an episode's former number, which it gets again if the number is free.
-        above: the highest number known to be assigned; new episodes get higher ones.
-    """
-
-    witness: tuple[EpisodeId, int] | None
-    number_of: Callable[[EpisodeId], int | None]
-    above: int
-
-
-NOTHING_KNOWN = Basis(None, lambda _: None, 0)
-"""The basis of an append without confirmed facts."""
-
-
 class Stored(NamedTuple):
     """The result of an append: reasons of refusals by episode, and the current row of each episode in the batch."""
 
@@ -118,20 +100,6 @@ class Incarnation(NamedTuple):
     noticed_wall_ns: int
     noticed_by: str
     reason: str
-
-
-_RESERVE_MAX = 4_096
-"""Bounds the numbers left free behind the highest known one when a log went back, for episodes that other spools had
-stored: as many as a hundred robots begin in an hour. Shrinks as numbers run out: failovers never exhaust them."""
-
-
-def numbers_reserved(above: int) -> int:
-    """Return the number of episode numbers to leave free behind this one.
-
-    >>> numbers_reserved(1_000), numbers_reserved(EPISODE_NUMBER_MAX - 640)
-    (4096, 10)
-    """
-    return min(_RESERVE_MAX, max(0, EPISODE_NUMBER_MAX - above) // 64)
 
 
 class Span(NamedTuple):

@@ -11,12 +11,12 @@ import pytest
 
 from pycrorm_async.clock import Clock
 from pycrorm_async.events.ids import EpisodeId, episode_text
-from pycrorm_async.operations.destination import stored_recorders, stored_records
+from pycrorm_async.operations.destination import stored_heads, stored_recorders, stored_records
 from pycrorm_async.queue import RecorderQueue, Spool, open_dead, stored_segments
 from pycrorm_async.queue.format import Segment
 from pycrorm_async.queue.maintenance import inspect_spool
 from pycrorm_async.queue.scan import scan
-from pycrorm_async.queue.stored_segments import StoredSegments, kept_segments
+from pycrorm_async.queue.stored_segments import EpisodeNumbers, StoredSegments, kept_segments
 from pycrorm_async.settings import Settings
 from tests.queue.factories import (
     DECLARED,
@@ -31,6 +31,7 @@ from tests.queue.factories import (
     make,
     node,
     started,
+    take,
 )
 
 HOUR_NS = 3600 * 10**9
@@ -236,4 +237,78 @@ async def test_a_declaration_without_space_is_recorded_once_and_counted(bound: P
     queue.put_nowait(started(2), b"s" * 2_000)  # the largest record still fits
     queue.close()
     assert len(await drain(queue)) == queue.written
+    queue.release()
+
+
+# === episode numbers ==========================================================================================
+
+
+def test_numbers_are_read_as_any_process_noted_them_and_each_is_noted_once(tmp_path: Path) -> None:
+    mine, other = EpisodeNumbers(tmp_path / "stored" / "a"), EpisodeNumbers(tmp_path / "stored" / "a")
+    assert mine.read() == {}
+    mine.note({episode(1): 7})
+    other.note({episode(1): 7, episode(2): 8})
+    size = (tmp_path / "stored" / "a" / "numbers").stat().st_size
+    mine.note({episode(1): 7})
+    assert (tmp_path / "stored" / "a" / "numbers").stat().st_size == size
+    assert mine.read() == other.read() == {episode(1): 7, episode(2): 8}
+
+
+def test_a_file_of_numbers_cut_or_changed_at_any_byte_never_gives_a_wrong_number(tmp_path: Path) -> None:
+    file = tmp_path / "stored" / "a" / "numbers"
+    EpisodeNumbers(file.parent).note({episode(1): 10})
+    content = file.read_bytes()
+    for damaged in (
+        *(content[:length] for length in range(len(content))),
+        *(content[:at] + bytes([content[at] ^ 1]) + content[at + 1 :] for at in range(len(content))),
+    ):
+        file.write_bytes(damaged)
+        assert EpisodeNumbers(file.parent).read() in ({}, {episode(1): 10})
+        EpisodeNumbers(file.parent).note({episode(2): 20})
+        assert EpisodeNumbers(file.parent).read()[episode(2)] == 20
+
+
+def test_a_full_file_of_numbers_replaces_the_one_before_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stored_segments, "_NUMBERS_BYTES_MAX", 500)
+    monkeypatch.setattr(stored_segments, "_NOTED_MAX", 3)
+    numbers = EpisodeNumbers(tmp_path / "stored" / "a")
+    for number in range(1, 41):
+        numbers.note({episode(number): number})
+    read = numbers.read()
+    assert read == {episode(number): number for number in range(41 - len(read), 41)}
+    assert 9 < len(read) < 25
+
+
+def test_numbers_that_cannot_be_noted_are_no_error(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    (tmp_path / "stored").write_text("not a folder")
+    numbers = EpisodeNumbers(tmp_path / "stored" / "a")
+    numbers.note({episode(1): 1})
+    assert "numbers of episodes cannot be noted" in caplog.text
+
+
+# === stored heads =============================================================================================
+
+
+async def test_the_last_event_of_each_recorder_is_read_from_its_newest_segment(bound: Path) -> None:
+    await live(bound)
+    assert stored_heads(bound, "a-log") == {episode(1): 11}
+    newest = kept_segments(bound)[-1].path
+    newest.write_bytes(newest.read_bytes()[:-1])  # the commit frame is torn
+    assert stored_heads(bound, "a-log") == {episode(1): 11}
+    newest.write_bytes(b"")
+    assert stored_heads(bound, "a-log") == {}
+
+
+async def test_the_stored_events_of_a_living_recorder_are_read_as_far_as_its_drainer_stored_them(bound: Path) -> None:
+    queue = make(bound, offered=True)
+    for number in (1, 2, 3):
+        queue.put_nowait(started(number), b"{}")
+        queue.put_nowait(node(number), b"n" * 900)
+    await queue.synced_to()
+    assert stored_heads(bound, "a-log") == {}
+    source = take(queue)
+    await source.get_batch(events_max=3, bytes_max=2**20, age_s_max=0)
+    await source.acknowledge(3)
+    assert stored_heads(bound, "a-log") == {episode(1): 2, episode(2): 1}
+    source.release()
     queue.release()

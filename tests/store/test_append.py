@@ -17,7 +17,6 @@ from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX, episode_t
 from pycrorm_async.store.append import Appending
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.stored import Basis
 from tests.databases import ask, ask_to_change
 from tests.store.factories import HEADS, declaration, episode, name, record, run_of
 
@@ -381,22 +380,21 @@ async def test_inserted_and_updated_rows_hold_the_values_that_were_passed(
 async def test_a_log_that_holds_less_than_it_confirmed_refuses_the_batch(log: EventLog, database_url: str) -> None:
     await log.append(run_of(episode(1), 1, 3))
     with pytest.raises(LogWentBack, match=f"1 to 5 of episode {name(1)} and holds 3"):
-        await log.store(run_of(episode(2), 1, 2), Basis((episode(1), 5), lambda _: None, 0))
+        await log.store(run_of(episode(2), 1, 2), witness=(episode(1), 5))
     with pytest.raises(LogWentBack):
-        await log.store(run_of(episode(2), 1, 2), Basis((episode(3), 1), lambda _: None, 0))
-    await log.store(run_of(episode(2), 1, 1), Basis((episode(1), 3), lambda _: None, 0))
+        await log.store(run_of(episode(2), 1, 2), witness=(episode(3), 1))
+    await log.store(run_of(episode(2), 1, 1), witness=(episode(1), 3))
     assert ask(database_url, "SELECT number, head FROM episode ORDER BY number") == [(1, 3), (2, 1)]
 
 
 async def test_an_episode_gets_its_former_number_unless_another_has_it(log: EventLog, database_url: str) -> None:
     await log.append(run_of(episode(1), 1, 1))
-    former = {episode(2): 1, episode(3): 2}
-    await log.store(
-        [*run_of(episode(2), 1, 1), *run_of(episode(3), 1, 1, position=2)], Basis(None, former.__getitem__, 2)
-    )
+    former = {episode(2): 1, episode(3): 7}
+    await log.skip_numbers(7)
+    await log.store([*run_of(episode(2), 1, 1), *run_of(episode(3), 1, 1, position=2)], numbers=former)
+    await log.append(run_of(episode(4), 1, 1))
     numbers = dict(ask(database_url, "SELECT id, number FROM episode"))
-    assert (numbers[name(1)], numbers[name(3)]) == (1, 2)
-    assert numbers[name(2)] > 2
+    assert [numbers[name(each)] for each in (1, 3, 2, 4)] == [1, 7, 8, 9]
 
 
 async def test_a_gap_stops_its_episode_before_the_gap_and_no_other(log: EventLog, database_url: str) -> None:

@@ -21,7 +21,6 @@ from pycrorm_async.projections.verify import verify
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.dialect import StoredOn
 from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.stored import numbers_reserved
 from pycrorm_async.writer.drain import Backoff, Drain
 from tests.backups import STANDBY, replicas_in
 from tests.crash.step_robot import SETTINGS, StepActionPerformable
@@ -226,20 +225,6 @@ async def test_a_memory_continues_after_its_schemas_were_dropped_and_restored_wh
         await asyncio.to_thread(backup.restore)
         await flushing
     assert ask(database_url, "SELECT step FROM step_action ORDER BY step") == [(1,), (2,)]
-
-
-async def test_numbers_that_are_skipped_are_given_to_no_episode_nor_is_the_reserve_behind_them(
-    database_url: str,
-) -> None:
-    log = await EventLog.open(DatabaseAddress.parse(database_url), create=True)
-    await log.append(run_of(episode(1), 1, 2))
-    await log.skip_numbers(500)
-    await log.skip_numbers(400)  # below the last one: changes nothing
-    await log.append(run_of(episode(2), 1, 2))
-    first, second = sorted(each.number for each in await log.episodes())
-    await log.close()
-    assert first == 1
-    assert second > 500 + numbers_reserved(500)
 
 
 GONE: dict[str, Callable[[Backup], None]] = {

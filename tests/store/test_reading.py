@@ -16,7 +16,7 @@ from pycrorm_async.store.append import EPISODES_MANY, EVENTS_MANY
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog, advance_folded, park
 from pycrorm_async.store.sqlite_engine import Connection
-from pycrorm_async.store.stored import Basis, EpisodeRow, Incarnation, Span, StoredEvent
+from pycrorm_async.store.stored import EpisodeRow, Incarnation, Span, StoredEvent
 from tests.databases import ask, ask_to_change
 from tests.store.factories import episode, record, run_of
 
@@ -93,8 +93,7 @@ async def test_a_parked_episode_is_not_behind_and_still_takes_events(log: EventL
 async def test_a_memory_and_an_open_episode_near_their_limits_are_named(log: EventLog, database_url: str) -> None:
     await log.append([*run_of(episode(1), 1, 2), *run_of(episode(2), 1, 2, position=3)])
     assert await log.limits_near() == []
-    late = Basis(None, {episode(3): EPISODES_MANY}.get, 0)
-    await log.store([record(episode(3), 1)], late)
+    await log.store([record(episode(3), 1)], numbers={episode(3): EPISODES_MANY})
     ask_to_change(database_url, f"UPDATE episode SET head = {EVENTS_MANY} WHERE number = 1")
     numbers, events = await log.limits_near()
     assert numbers.startswith("3,774,873 of 4,194,303 episode numbers are used")
