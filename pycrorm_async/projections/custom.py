@@ -72,7 +72,7 @@ from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import Span, StoredEvent, consecutive
 
 if TYPE_CHECKING:
-    from pycrorm_async.projections.findings import PartCheck, VerifyResult
+    from pycrorm_async.projections.findings import TableCheck, VerifyResult
 
 
 # === discovery ================================================================================================
@@ -477,7 +477,7 @@ class PackedProjection(EpisodeProjection):
         """Return an empty batch."""
 
     @abstractmethod
-    def check(self, result: VerifyResult) -> PartCheck:
+    def check(self, result: VerifyResult) -> TableCheck:
         """Return the check that compares the tables with the log."""
 
 

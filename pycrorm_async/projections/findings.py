@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from operator import itemgetter
 from typing import Any, Literal, NamedTuple, Protocol
@@ -10,25 +10,17 @@ from typing import Any, Literal, NamedTuple, Protocol
 from sqlalchemy import ColumnElement, Table, column, select
 from sqlalchemy.ext.asyncio import AsyncConnection
 
-from pycrorm_async.errors import DatabaseForeign
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, row_id_min, row_key
 from pycrorm_async.projections.columns import CORE, LINK_BOX, OF_NO_EPISODE, Storage, leaf_columns, make_table
 from pycrorm_async.projections.generations import Generation
 from pycrorm_async.projections.row_batch import Row
-from pycrorm_async.store.dialects import dialect_of
-from pycrorm_async.store.log import EventLog
-from pycrorm_async.store.stored import Span
+from pycrorm_async.store.stored import EpisodeRow, Span, StoredEvent
 
 # === row comparison ===========================================================================================
 #
-# Compare the rows that the fold makes with the rows in the tables, for one part of the log at a time.
-#
-# A part may be any piece of an episode: nodes that still run where it ends are compared with a later part.
+# Compare the rows that the fold makes with the rows in the tables, for some whole episodes at a time.
 
 _EPISODE_KEYED = ("process_metadata", "simulated_episode")
-_NODES = "task_tree_node"
-_KEYS_AT_ONCE = 1_000
-"""Bounds the keys of one query, because databases bound its parameters."""
 
 
 class Difference(NamedTuple):
@@ -68,13 +60,16 @@ class FoldedRows(Protocol):
         ...
 
 
-class Range(NamedTuple):
-    """A half-open range of row ids, `low` to `high`, and of episode numbers, `first` to `end`. None is unbounded."""
+class EpisodeRange(NamedTuple):
+    """The episodes with numbers from `first` up to but not including `end`; None is the end of the memory."""
 
-    low: int | None
-    high: int | None
-    first: int | None
-    end: int | None
+    first: int = 0
+    end: int | None = None
+
+    @property
+    def limits(self) -> dict[str, int]:
+        """The parameters `first` and `end` of a query."""
+        return {"first": self.first, "end": EPISODE_NUMBER_MAX + 1 if self.end is None else self.end}
 
 
 class Comparison:
@@ -111,53 +106,26 @@ class Comparison:
         return [*_compared(LINK_BOX, [*self._link_box.columns.keys()], folded, stored)]
 
     async def differences(
-        self,
-        connection: AsyncConnection,
-        rows: FoldedRows,
-        within: Range,
-        *,
-        carried: Collection[int],
-        settled: Collection[int],
+        self, connection: AsyncConnection, rows: FoldedRows, episodes: EpisodeRange
     ) -> list[Difference]:
-        """Return the differences in one part of the log.
-
-        Args:
-            connection: in the transaction to read in.
-            rows: the folded rows of this part.
-            within: the range of rows that this part, and no other, makes.
-            carried: ids of nodes that still run and are compared with a later part.
-            settled: ids of nodes carried from earlier parts that are compared now.
-        """
+        """Return the differences between the tables and the folded rows of these episodes, in the caller's snapshot."""
         self.count = 0
         expected = self._expected(rows)
         differences: list[Difference] = []
+        first, end = episodes
+        row_range = row_id_min(first), None if end is None else row_id_min(end)
         for name, table in self._tables.items():
             folded = expected.pop(name, {})
-            first, end = (within.first, within.end) if name in _EPISODE_KEYED else (within.low, within.high)
-            stored = await self._read(connection, table, first, end)
-            if name == _NODES:
-                stored |= await self._nodes(connection, table, [*settled])
-                for each in carried:
-                    folded.pop((each,), None)
-                    stored.pop((each,), None)
+            low, high = (first, end) if name in _EPISODE_KEYED else row_range
+            key = next(iter(table.primary_key.columns))
+            # The first range also has the rows of numbers below 0, which no episode has.
+            where = [*([key >= low] if first else []), *([key < high] if high is not None else [])]
+            stored = await _rows(connection, table, *where)
             self.count += len(stored)
             differences += _compared(name, [*table.columns.keys()], folded, stored)
         for name, folded in expected.items():  # of types declared after these tables were created
             differences += _compared(name, [], folded, {})
         return differences
-
-    async def _nodes(self, connection: AsyncConnection, table: Table, keys: list[int]) -> dict[Row, Row]:
-        read: dict[Row, Row] = {}
-        for start in range(0, len(keys), _KEYS_AT_ONCE):
-            read |= await _rows(connection, table, table.c.id.in_(keys[start : start + _KEYS_AT_ONCE]))
-        return read
-
-    async def _read(
-        self, connection: AsyncConnection, table: Table, first: int | None, end: int | None
-    ) -> dict[Row, Row]:
-        key = next(iter(table.primary_key.columns))
-        where = [key >= first] if first is not None else []
-        return await _rows(connection, table, *where, *([key < end] if end is not None else []))
 
     def _expected(self, rows: FoldedRows) -> dict[str, dict[Row, Row]]:
         expected: dict[str, dict[Row, Row]] = {}
@@ -325,94 +293,39 @@ class VerifyResult:
             self.differences.append(difference)
 
 
-# === parts ====================================================================================================
-#
-# Check a range of episodes part by part, each part in one snapshot, with a `PartCheck` for the tables to compare.
-
-_PART_EVENTS = 4_000
-"""Bounds the events of one part, and so the memory used."""
-_ATTEMPTS = 10
-"""Bounds the snapshots for one part while rebuilds replace the tables."""
+# === checks ===================================================================================================
 
 
 class Unreadable(Exception):
-    """The database cannot read the first event of this span, or a later one."""
+    """The database cannot read this event of an episode."""
 
-    def __init__(self, span: Span, reason: str) -> None:
+    def __init__(self, number: int, sequence: int, reason: str) -> None:
         super().__init__(reason)
-        self.span = span
+        self.number = number
+        self.sequence = sequence
 
 
-class Place(NamedTuple):
-    """The place in the log behind event `after` of episode `number`."""
-
-    number: int
-    after: int = 0
-
-    @property
-    def row(self) -> int:
-        """The smallest id of a row made by an event behind this place."""
-        return row_id_min(self.number, self.after + 1 if self.after else 0)
-
-
-class PartCheck(Protocol):
-    """Compares one kind of tables with the log.
+class TableCheck(Protocol):
+    """Compares one kind of tables with the log, some whole episodes at a time.
 
     Attributes:
-        result: to which the findings are added.
         missing_table: the error for a table that is missing.
     """
 
-    result: VerifyResult
     missing_table: str
 
-    async def comparison(self, connection: AsyncConnection) -> Comparison | None:
-        """Return the comparison with the tables of this snapshot; None ends the check."""
+    async def begin(self, connection: AsyncConnection, part: EpisodeRange, episodes: Sequence[EpisodeRow], /) -> bool:
+        """Begin with these episodes, all of this range, in a snapshot; return False if a table is missing."""
         ...
 
-    async def check(
-        self, connection: AsyncConnection, comparison: Comparison, at: Place, within: EpisodeRange, limit: int
-    ) -> Place | None:
-        """Check some `limit` events behind this place; return the next place, None at the end of the range.
-
-        Raises `Unreadable`, and then has reported nothing.
-        """
+    def read(self, span: Span, events: Sequence[StoredEvent]) -> None:
+        """Fold the next events of an episode; `events` lacks those that the log lacks."""
         ...
 
+    def lose(self, number: int, sequence: int) -> None:
+        """Stop reading an episode, whose events from this one on cannot be read."""
+        ...
 
-class EpisodeRange(NamedTuple):
-    """The episodes with numbers from `first` up to but not including `end`; None is the end of the memory."""
-
-    first: int = 0
-    end: int | None = None
-
-    @property
-    def limits(self) -> dict[str, int]:
-        """The parameters `first` and `end` of a query."""
-        return {"first": self.first, "end": EPISODE_NUMBER_MAX + 1 if self.end is None else self.end}
-
-    async def check(self, log: EventLog, check: PartCheck) -> None:
-        """Check all parts of this range. Raises `DatabaseForeign` if a table is missing."""
-        at: Place | None = Place(self.first)
-        limit = _PART_EVENTS
-        while at is not None:
-            try:
-                at = await self._check_part(log, check, at, limit)
-                limit = min(limit * 8, _PART_EVENTS)
-            except Unreadable as fault:
-                if limit > 1:  # shorten the part until the unreadable event is alone
-                    limit = max(limit // 8, 1)
-                else:
-                    check.result.add_damage(fault.span.number, fault.span.last, f"cannot be read: {fault}")
-                    at = Place(fault.span.number + 1)
-
-    async def _check_part(self, log: EventLog, check: PartCheck, at: Place, limit: int) -> Place | None:
-        for _ in range(_ATTEMPTS):
-            async with log.snapshot() as connection:
-                comparison = await check.comparison(connection)
-                if comparison is None:
-                    return None
-                if not comparison.tables or await dialect_of(connection).keep(connection, comparison.tables):
-                    return await check.check(connection, comparison, at, self, limit)
-            # A rebuild replaced and dropped the tables between two statements: read the generation again.
-        raise DatabaseForeign(f"{log.address}: {check.missing_table}")
+    async def compare(self, connection: AsyncConnection) -> None:
+        """Compare the tables with the events that were read."""
+        ...

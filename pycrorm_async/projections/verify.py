@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from itertools import groupby
 from operator import attrgetter
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from sqlalchemy import text
 from sqlalchemy.ext.asyncio import AsyncConnection
 
-from pycrorm_async.errors import DamageError, DatabaseUnavailable, LogDamaged, TablesOutdated
+from pycrorm_async.errors import DamageError, DatabaseForeign, DatabaseUnavailable, LogDamaged, TablesOutdated
 from pycrorm_async.events.codec import DESCRIPTION_PREFIX, fingerprint
-from pycrorm_async.events.ids import row_id, row_id_min, row_key
+from pycrorm_async.events.ids import row_key
 from pycrorm_async.events.order import OrderCheck
 from pycrorm_async.events.types import EpisodeEnded, ObjectAdded, references_in
 from pycrorm_async.projections import pipeline
@@ -29,10 +29,8 @@ from pycrorm_async.projections.findings import (
     Comparison,
     Difference,
     EpisodeRange,
-    PartCheck,
-    Place,
-    Range,
     StoppedEpisode,
+    TableCheck,
     Unreadable,
     VerifyResult,
 )
@@ -59,7 +57,16 @@ from pycrorm_async.store.address import no_tables
 from pycrorm_async.store.append import has_digests
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog, read_episodes
-from pycrorm_async.store.stored import BLOCK_EVENTS, EpisodeRow, RunningDigest, Span, StoredEvent, consecutive
+from pycrorm_async.store.stored import (
+    BLOCK_EVENTS,
+    EpisodeRow,
+    RunningDigest,
+    Span,
+    StoredEvent,
+    consecutive,
+    pages_of,
+    size_of,
+)
 
 if TYPE_CHECKING:
     from pycrorm_async.progress_bar import ProgressCallback
@@ -74,8 +81,7 @@ if TYPE_CHECKING:
 
 _KEPT = text("""
 SELECT episode, sequence, digest FROM pycrorm_digest
-WHERE episode >= :first AND episode <= :last AND (episode > :first OR sequence > :after)
-AND (episode < :last OR sequence <= :end) ORDER BY episode, sequence""")
+WHERE episode >= :first AND episode < :end ORDER BY episode, sequence""")
 _WITHOUT_EPISODE = text("""
 SELECT DISTINCT episode FROM pycrorm_digest
 WHERE episode >= :first AND episode < :end AND episode NOT IN (SELECT number FROM episode) ORDER BY episode""")
@@ -117,14 +123,15 @@ class DigestCheck:
         kept: Mapping[int, str],
         checked: EpisodeCheck,
     ) -> None:
-        """Check the events of the next span, given by sequence, with the digests kept inside it.
+        """Check the events of the next span, given by sequence, with the kept digests of the episode.
 
         `head` is the episode's last event in this snapshot; an episode that is being recorded grows meanwhile. If
         damage was reported for an event of a block, the digest of that block is not reported too.
         """
         done = span.after
         block_ends = range(done - done % BLOCK_EVENTS + BLOCK_EVENTS, span.last + 1, BLOCK_EVENTS)
-        for end in sorted({*kept, *block_ends, span.last} - {span.after}):
+        ends = {each for each in kept if span.after < each <= span.last}
+        for end in sorted({*ends, *block_ends, span.last} - {span.after}):
             present = [events[each] for each in range(done + 1, end + 1) if each in events]
             digest = self._digest_behind(present, end - done)
             block = (end - 1) // BLOCK_EVENTS
@@ -172,13 +179,11 @@ def _behind(digest: str, sequence: int) -> RunningDigest | None:
         return None
 
 
-async def read_kept(connection: AsyncConnection, spans: Sequence[Span]) -> dict[int, dict[int, str]]:
-    """Read the digests kept in these spans of consecutive episodes, by number and sequence."""
-    if not spans or not await has_digests(dialect_of(connection), connection):
+async def read_kept(connection: AsyncConnection, episodes: EpisodeRange) -> dict[int, dict[int, str]]:
+    """Read the digests kept of these episodes, by number and sequence."""
+    if not await has_digests(dialect_of(connection), connection):
         return {}
-    first, last = spans[0], spans[-1]
-    places = {"first": first.number, "after": first.after, "last": last.number, "end": last.last}
-    rows = await connection.execute(_KEPT, places)
+    rows = await connection.execute(_KEPT, episodes.limits)
     by_number = groupby(rows, key=lambda each: int(each.episode))
     return {number: {each.sequence: each.digest for each in some} for number, some in by_number}
 
@@ -223,97 +228,62 @@ async def check_outside(
 
 # === episode check ============================================================================================
 #
-# Check one episode of the log part by part: validate its events and fold them again.
-#
-# Nodes that still run where a part ends, and the episode's row, are carried to the next part. So a part may be any
-# piece of an episode, and the memory used does not depend on the episode's length.
+# Check one episode of the log page by page: validate its events and fold them again.
 
 
 class EpisodeCheck:
-    """The check of the episode with this number, up to the last part read. Adds its findings to `result`.
+    """The check of one episode, up to the last page read. Adds its findings to `result`, and its rows to `rows`.
 
     Attributes:
-        compared: whether the rows are compared completely, because the tables ended before the last part did.
-        carried: ids of the running nodes, which a later part compares.
-        descriptions: fingerprints of the stored descriptions.
-        damaged_blocks: indexes of the blocks (`store.digests`) with an event for which damage was reported.
+        head: the episode's last event.
+        damaged_blocks: indexes of the blocks (`store.stored`) with an event for which damage was reported.
         described: whether an object added in the first block names its description.
-        head: the episode's last event in the snapshot of the last part read.
     """
 
-    def __init__(self, number: int, result: VerifyResult) -> None:
-        self.number = number
-        self._result = result
-        self.compared = False
-        self.carried: frozenset[int] = frozenset()
-        self.descriptions: frozenset[str] = frozenset()
+    def __init__(
+        self,
+        episode: EpisodeRow,
+        result: VerifyResult,
+        designators: Designators,
+        rows: Rows,
+        descriptions: Collection[str],
+    ) -> None:
+        self.head = episode.head
         self.damaged_blocks: set[int] = set()
         self.described = False
-        self.head = 0
+        self._episode = episode
+        self._number = episode.number
+        self._result = result
+        self._designators = designators
+        self._rows = rows
+        self._descriptions = descriptions
         self._ended_wall_ns: int | None = None
-        self._nodes: dict[int, list[Any]] = {}
-        self._row: dict[str, Any] | None = None
         self._order: OrderCheck | None = OrderCheck()
         self._in_gap = False
         self._lost: int | None = None
         self._open_when_lost: set[int] = set()
 
-    def resume(self, rows: Rows, after: int, folded: int) -> None:
-        """Add the carried rows to those of this part, which follows `after`."""
-        if folded < after:  # a rebuild made the tables shorter, so the carried rows are ahead of them
-            self.compared = True
-            return
-        rows.nodes |= self._nodes
-        if self._row is not None:
-            rows.episodes[self.number] = self._row
-            if self._row["simulated"]:
-                rows.inserts["simulated_episode"].append((self.number,))
-
-    def read(
-        self,
-        span: Span,
-        events: Mapping[int, StoredEvent],
-        episode: EpisodeRow,
-        designators: Designators,
-        rows: Rows,
-    ) -> None:
-        """Check the events of a span, given by sequence, and fold those that are visible into `rows`."""
-        self.head = episode.head
-        folded = 0 if self.compared else episode.folded
+    def read(self, span: Span, events: Mapping[int, StoredEvent]) -> None:
+        """Check the events of the next span, given by sequence, and fold those that are visible."""
+        episode = self._episode
         for sequence in range(span.after + 1, span.last + 1):
             event = events.get(sequence)
             if event is not None:
                 self._in_gap = False
-                self._one(event, folded, designators, rows)
+                self._one(event)
                 if sequence == 1 and event.wall_ns != episode.started_wall_ns:
                     self._damaged(1, f"the episode's started_wall_ns is {episode.started_wall_ns}{_OTHER_TIME}")
             elif not self._in_gap:
                 self._in_gap = True
                 self._damaged(sequence, "is missing")
-                self._lose(sequence, folded, rows)
+                self.lose(sequence)
         if span.last < episode.head or self._order is None:
             return
         if self._ended_wall_ns is None and episode.ended_wall_ns is not None:
             evidence = "the episode has an end, and no EpisodeEnded"
-            self._result.add_deleted(self.number, span.last + 1, f"it and all behind it were deleted: {evidence}")
+            self._result.add_deleted(self._number, span.last + 1, f"it and all behind it were deleted: {evidence}")
         elif self._ended_wall_ns != episode.ended_wall_ns:
             self._damaged(span.last, f"the episode's ended_wall_ns is {episode.ended_wall_ns}{_OTHER_TIME}")
-
-    def leave(self, rows: Rows, after: int, folded: int) -> None:
-        """End a part after event `after` of an episode that continues: take the rows to carry out of `rows`."""
-        self._nodes, self._row, self.carried = {}, None, frozenset()
-        # Tables that end inside this part are compared to their end now, because the next snapshot may have more rows
-        # than this part folded.
-        self.compared = self.compared or folded < after
-        if self.compared:
-            return
-        first = row_id(self.number, 0, 0)
-        self._nodes = {key: row for key, row in rows.nodes.items() if key >= first and row[STATUS] == "RUNNING"}
-        self.carried = frozenset(self._nodes)
-        self._row = rows.episodes.pop(self.number, None)
-        simulated = rows.inserts["simulated_episode"]
-        if (self.number,) in simulated:
-            simulated.remove((self.number,))
 
     def hides(self, difference: Difference) -> bool:
         """Return whether to suppress a difference, because lost events make its expected row unknown."""
@@ -323,19 +293,19 @@ class EpisodeCheck:
         of_whole = difference.table in ("process_metadata", "simulated_episode")
         return difference.sequence >= self._lost or open_then or of_whole
 
-    def _one(self, event: StoredEvent, folded: int, designators: Designators, rows: Rows) -> None:
-        shown = event.sequence <= folded
+    def _one(self, event: StoredEvent) -> None:
+        shown = event.sequence <= self._episode.folded
         self._result.events += 1
         self._result.behind += not shown
         if event.type == EpisodeEnded.__name__:
             self._ended_wall_ns = event.wall_ns
         for reference in references_in(event.type, event.payload):
-            self._result.blobs.setdefault(reference.hash, (self.number, event.sequence))
+            self._result.blobs.setdefault(reference.hash, (self._number, event.sequence))
         try:
             happening = happening_of(event)
             described = happening.description if isinstance(happening, ObjectAdded) else None
             self.described = self.described or (described is not None and event.sequence <= BLOCK_EVENTS)
-            if described is not None and described not in self.descriptions:
+            if described is not None and described not in self._descriptions:
                 self._damaged(event.sequence, f"the description {described} was never declared")
             if self._order is not None:
                 for finding in self._order.read(event.sequence, happening):
@@ -344,7 +314,7 @@ class EpisodeCheck:
                     else:
                         self._result.remarks += 1
             if shown and self._lost is None:
-                fold_happening(event, happening, designators, rows)
+                fold_happening(event, happening, self._designators, self._rows)
         except Exception as reason:  # noqa: BLE001  one event must not end the check of all others
             # An event that is in the tables could be folded once, so the log has changed since.
             if shown or isinstance(reason, UndecodablePayload) or not isinstance(reason, CannotFold):
@@ -352,18 +322,19 @@ class EpisodeCheck:
                     event.sequence,
                     f"is in the tables, and cannot be folded: {_named(reason)}" if shown else _named(reason),
                 )
-            self._lose(event.sequence, folded, rows)
+            self.lose(event.sequence)
 
-    def _lose(self, sequence: int, folded: int, rows: Rows) -> None:
+    def lose(self, sequence: int) -> None:
+        """Stop to check the order of the events and to fold them, because this one cannot be read or folded."""
         self._order = None
-        if sequence <= folded and self._lost is None:
+        if sequence <= self._episode.folded and self._lost is None:
             self._lost = sequence
-            keys = (row_key(key) for key, row in rows.nodes.items() if row[STATUS] == "RUNNING")
-            self._open_when_lost = {key.sequence for key in keys if key.number == self.number}
+            keys = (row_key(key) for key, row in self._rows.nodes.items() if row[STATUS] == "RUNNING")
+            self._open_when_lost = {key.sequence for key in keys if key.number == self._number}
 
     def _damaged(self, sequence: int, reason: str) -> None:
         self.damaged_blocks.add((sequence - 1) // BLOCK_EVENTS)
-        self._result.add_damage(self.number, sequence, reason)
+        self._result.add_damage(self._number, sequence, reason)
 
 
 _OTHER_TIME = ", and the event has another time: one of them was changed after it was stored"
@@ -377,7 +348,15 @@ def _named(reason: Exception) -> str:
 #
 # Verify a memory: check that the log is complete, fold it again and compare the tables.
 #
-# Writes nothing. Each part is read in one snapshot, so that recording and folding continue in the meantime.
+# Writes nothing. A part consists of whole episodes and is read in one snapshot, so that recording and folding continue
+# meanwhile. Its events are read once for all tables.
+
+_PART_EVENTS = 4_000
+"""The events of a part, unless one episode has more: the memory that verify uses grows with the longest episode."""
+_PAGE_EVENTS = 4_000
+"""Bounds the events that are read at once."""
+_ATTEMPTS = 10
+"""Bounds the snapshots for one part while rebuilds replace the tables."""
 
 _BY_PREFIX = "SELECT fingerprint FROM pycrorm_declaration WHERE substr(fingerprint, 1, 5)"
 _FINGERPRINTS = text(f"{_BY_PREFIX} <> '{DESCRIPTION_PREFIX}' ORDER BY ordinal")
@@ -433,16 +412,103 @@ async def verify(
         result.stopped = await _stopped(log, episode)
         await check_outside(log, digests, result, episode)
         total = await _check_heads(log, within, result)
-        await within.check(log, _TablesCheck(log, result, total, report_progress))
-        await _check_blobs(log, result)
         result.not_compared = await uncompared_projections(log, projections)
-        for each in projections:
-            if each.name not in result.not_compared:
-                try:
-                    await within.check(log, check_of(each, result))
-                except DamageError as fault:
-                    result.add_damage(None, None, str(fault))
+        compared = [each for each in projections if each.name not in result.not_compared]
+        checks = [_TablesCheck(log, result), *(check_of(each, result) for each in compared)]
+        left: EpisodeRange | None = within
+        while left is not None:
+            left = await _check_part(log, left, checks, result)
+            report_progress(result.events, max(total, result.events))
+        await _check_blobs(log, result)
     return result
+
+
+async def _check_part(
+    log: EventLog, within: EpisodeRange, checks: Sequence[TableCheck], result: VerifyResult
+) -> EpisodeRange | None:
+    """Check the next whole episodes in one snapshot; return the range that is left. Raises `DatabaseForeign`."""
+    missing = ""
+    for _ in range(_ATTEMPTS):
+        async with log.snapshot() as connection:
+            clauses = "WHERE number >= :first AND number < :end ORDER BY number LIMIT :limit"
+            episodes = await read_episodes(connection, clauses, **within.limits, limit=_PART_EVENTS)
+            episodes, left = _first_part(episodes, within)
+            part = within if left is None else EpisodeRange(within.first, left.first)
+            for check in checks:
+                if not await check.begin(connection, part, episodes):
+                    missing = check.missing_table
+                    break
+            else:
+                result.episodes += len(episodes)
+                await _read_part(log, connection, episodes, checks, result)
+                for check in checks:
+                    try:
+                        with log.translated():
+                            async with connection.begin_nested():
+                                await check.compare(connection)
+                    except DamageError as fault:
+                        result.add_damage(None, None, str(fault))
+                return left
+        # A rebuild replaced and dropped the tables between two statements: read the generation again.
+    raise DatabaseForeign(f"{log.address}: {missing}")
+
+
+def _first_part(episodes: list[EpisodeRow], within: EpisodeRange) -> tuple[list[EpisodeRow], EpisodeRange | None]:
+    """Return the episodes of the next part, at least one if there is any, and the range behind them, if any."""
+    events = 0
+    for place, row in enumerate(episodes):
+        events += row.head
+        if place and events > _PART_EVENTS:
+            return episodes[:place], within._replace(first=row.number)
+    if len(episodes) < _PART_EVENTS:
+        return episodes, None
+    return episodes, within._replace(first=episodes[-1].number + 1)
+
+
+async def _read_part(
+    log: EventLog,
+    connection: AsyncConnection,
+    episodes: Sequence[EpisodeRow],
+    checks: Sequence[TableCheck],
+    result: VerifyResult,
+) -> None:
+    """Give the events of these episodes to the checks, page by page; report those that cannot be read."""
+    unreadable: set[int] = set()
+    for page in pages_of([Span(each.number, 0, each.head) for each in episodes], _PAGE_EVENTS):
+        spans = [each for each in page if each.number not in unreadable]
+        faults: list[Unreadable] = []
+        events = await _readable_events(log, connection, spans, faults)
+        by_number = {number: [*each] for number, each in groupby(events, key=attrgetter("number"))}
+        ends = {each.number: each.sequence for each in faults}
+        for span in spans:
+            read = span._replace(last=ends.get(span.number, span.last + 1) - 1)
+            for check in checks:
+                check.read(read, by_number.get(span.number, ()))
+        for fault in faults:
+            unreadable.add(fault.number)
+            result.add_damage(fault.number, fault.sequence, f"cannot be read: {fault}")
+            for check in checks:
+                check.lose(fault.number, fault.sequence)
+
+
+async def _readable_events(
+    log: EventLog, connection: AsyncConnection, spans: Sequence[Span], faults: list[Unreadable]
+) -> list[StoredEvent]:
+    """Read the events of these spans; of an episode with an unreadable one, those before it, and add its fault."""
+    try:
+        with log.translated():
+            async with connection.begin_nested():
+                return await dialect_of(connection).spans(connection, spans)
+    except DamageError as fault:
+        if size_of(spans) == 1:
+            faults.append(Unreadable(spans[0].number, spans[0].last, str(fault)))
+            return []
+    events: list[StoredEvent] = []
+    for half in pages_of(spans, (size_of(spans) + 1) // 2):
+        lost = {each.number for each in faults}
+        if left := [each for each in half if each.number not in lost]:
+            events += await _readable_events(log, connection, left, faults)
+    return events
 
 
 async def _check_database(log: EventLog, result: VerifyResult) -> None:
@@ -518,179 +584,97 @@ async def _check_heads(log: EventLog, within: EpisodeRange, result: VerifyResult
 
 
 class _TablesCheck:
-    """The check of the log and of the built-in tables. Implements `PartCheck`."""
+    """The check of the log and of the built-in tables. Implements `TableCheck`."""
 
     missing_table = "a table is missing: run `pycrorm rebuild`"
 
-    def __init__(self, log: EventLog, result: VerifyResult, total: int, report_progress: ProgressCallback) -> None:
+    def __init__(self, log: EventLog, result: VerifyResult) -> None:
         self._log = log
-        self._dialect = dialect_of(log.engine)
-        self.result = result
-        self._total = total
-        self._report_progress = report_progress
-        self._unfinished = EpisodeCheck(0, result)
-        self._digests: DigestCheck | None = None
+        self._result = result
         self._comparison: Comparison | None = None
+        self._part = EpisodeRange()
+        self._rows = Rows()
+        self._episodes: dict[int, EpisodeCheck] = {}
+        self._digests: dict[int, DigestCheck] = {}
+        self._kept: dict[int, dict[int, str]] = {}
 
-    async def comparison(self, connection: AsyncConnection) -> Comparison:
+    async def begin(self, connection: AsyncConnection, part: EpisodeRange, episodes: Sequence[EpisodeRow]) -> bool:
         try:
             generation = await current_generation(connection)
         except TablesOutdated as fault:  # check the log alone
-            self.result.outdated = str(fault)
+            self._result.outdated = str(fault)
             generation = Generation(0, 0, Layout(), {})
         if generation is None:
             raise DatabaseUnavailable(no_tables(self._log.address))
+        dialect = dialect_of(connection)
         if self._comparison is None or self._comparison.generation != generation:
-            self._comparison = Comparison(generation, self._dialect.stored_column)
-            if self.result.outdated is not None:
-                self._comparison.tables.clear()
-        return self._comparison
-
-    async def check(
-        self, connection: AsyncConnection, comparison: Comparison, at: Place, within: EpisodeRange, limit: int
-    ) -> Place | None:
-        episodes = await _episodes(connection, within._replace(first=at.number), limit)
-        spans, place = _cut(episodes, at, limit)
-        events = await self._events_of(connection, spans)
-        kept = await read_kept(connection, spans)
-        designators = await _designators(connection, comparison.generation)
+            self._comparison = Comparison(generation, dialect.stored_column)
+        if self._result.outdated is None and not await dialect.keep(connection, self._comparison.tables):
+            return False
+        self._part, self._rows, self._episodes, self._digests = part, Rows(), {}, {}
+        self._kept = await read_kept(connection, part)
+        designators = Designators.of_union(unite(generation.layout, await dialect.declarations(connection)))
         descriptions = frozenset((await connection.execute(_DESCRIPTIONS)).scalars())
-        folded = {each.number: each.folded for each in episodes}
-        by_number = {each.number: each for each in episodes}
-        rows = Rows()
-        low, high = at, place or (None if within.end is None else Place(within.end))
-        settled: frozenset[int] = frozenset()
-        if at.after:
-            self._unfinished.resume(rows, at.after, folded.get(at.number, 0))
-            settled = self._unfinished.carried.intersection(rows.nodes)
-            if self._unfinished.compared:
-                low = Place(at.number + 1)
-        read: dict[int, EpisodeCheck] = {}
-        for span in spans:
-            if span.after == 0:
-                self._unfinished = EpisodeCheck(span.number, self.result)
-                try:
-                    certain = self._log.address.is_sqlite
-                    self._digests = DigestCheck(by_number[span.number], self.result, certain=certain)
-                except LogDamaged as fault:
-                    self._digests = None
-                    self.result.add_damage(span.number, fault.sequence, fault.reason)
-                self.result.episodes += 1
-            read[span.number] = self._unfinished
-            self._unfinished.descriptions = descriptions
-            self._unfinished.read(span, events.get(span.number, {}), by_number[span.number], designators, rows)
-            if self._digests is not None:
-                self._digests.read(
-                    span,
-                    by_number[span.number].head,
-                    events.get(span.number, {}),
-                    kept.get(span.number, {}),
-                    self._unfinished,
-                )
-        carried: frozenset[int] = frozenset()
-        if place is not None and place.after:
-            self._unfinished.leave(rows, place.after, folded[place.number])
-            carried = self._unfinished.carried
-            if self._unfinished.compared:
-                high = Place(place.number + 1)
+        for each in episodes:
+            self._episodes[each.number] = EpisodeCheck(each, self._result, designators, self._rows, descriptions)
+            try:
+                certain = self._log.address.is_sqlite
+                self._digests[each.number] = DigestCheck(each, self._result, certain=certain)
+            except LogDamaged as fault:
+                self._result.add_damage(each.number, fault.sequence, fault.reason)
+        return True
+
+    def read(self, span: Span, events: Sequence[StoredEvent]) -> None:
+        by_sequence = {each.sequence: each for each in events}
+        episode, digests = self._episodes[span.number], self._digests.get(span.number)
+        episode.read(span, by_sequence)
+        if digests is not None:
+            digests.read(span, episode.head, by_sequence, self._kept.get(span.number, {}), episode)
+
+    def lose(self, number: int, sequence: int) -> None:
+        self._episodes[number].lose(sequence)
+
+    async def compare(self, connection: AsyncConnection) -> None:
+        comparison, rows = self._comparison, self._rows
+        assert comparison is not None, "the check has begun"
+        if self._result.outdated is not None:
+            return
         if rows.episodes:
             name_episodes(rows, await uuids_of(connection, rows.episodes))
-        folded_range = Range(low.row or None, high and high.row, low.number or None, high and high.number)
-        await self._compare(connection, comparison, rows, folded_range, carried, settled - carried, read)
-        self._report_progress(self.result.events, max(self._total, self.result.events))
-        return place
-
-    async def _events_of(self, connection: AsyncConnection, spans: Sequence[Span]) -> dict[int, dict[int, StoredEvent]]:
-        """Read the events of these spans, by number and sequence."""
-        try:
-            with self._log.translated():
-                events = await self._dialect.spans(connection, spans)
-        except DamageError as fault:
-            for span in spans:
-                if span.last > span.after:
-                    raise Unreadable(span, str(fault)) from fault
-            raise
-        by_number = groupby(events, key=attrgetter("number"))
-        return {number: {event.sequence: event for event in each} for number, each in by_number}
-
-    async def _compare(
-        self,
-        connection: AsyncConnection,
-        comparison: Comparison,
-        rows: Rows,
-        within: Range,
-        carried: Collection[int],
-        settled: Collection[int],
-        read: Mapping[int, EpisodeCheck],
-    ) -> None:
-        if self.result.outdated is not None:
-            return
-        try:
-            with self._log.translated():
-                differences = await comparison.differences(connection, rows, within, carried=carried, settled=settled)
-                if rows.descriptions:
-                    boxes = await boxes_of(connection, rows.descriptions)
-                    differences += await comparison.box_differences(connection, boxes)
-        except DamageError as fault:
-            self.result.add_damage(None, None, str(fault))
-            return
-        self.result.rows += comparison.count
+        differences = await comparison.differences(connection, rows, self._part)
+        if rows.descriptions:
+            boxes = await boxes_of(connection, rows.descriptions)
+            differences += await comparison.box_differences(connection, boxes)
+        self._result.rows += comparison.count
         for each in sorted(differences, key=attrgetter("number", "sequence")):
-            if each.number not in read or not read[each.number].hides(each):
-                self.result.add_difference(each)
-        self._check_superfluous([each for each in differences if each.is_superfluous and each.number], read)
+            if each.number not in self._episodes or not self._episodes[each.number].hides(each):
+                self._result.add_difference(each)
+        self._check_superfluous([each for each in differences if each.is_superfluous and each.number])
 
-    def _check_superfluous(self, rows: Iterable[Difference], read: Mapping[int, EpisodeCheck]) -> None:
+    def _check_superfluous(self, rows: Iterable[Difference]) -> None:
         """Report the events and episodes that the log does not have, although the tables have their rows."""
         last: dict[int, int] = {}
+        read = self._episodes
         for each in rows:
             if each.number not in read or each.sequence > read[each.number].head:
                 last[each.number] = max(each.sequence, last.get(each.number, 0))
-                self.result.rows_without_event += 1
+                self._result.rows_without_event += 1
         for number, sequence in last.items():
             if number not in read:
                 reason = f"episode {number} was deleted: the tables have rows of its events up to {sequence}"
-                self.result.add_deleted(number, None, f"{reason}, and the log has none of them")
+                self._result.add_deleted(number, None, f"{reason}, and the log has none of them")
             else:
                 first = read[number].head + 1
                 reason = f"the events {first} to {sequence} were deleted: the tables have rows of event {sequence}"
-                self.result.add_deleted(number, first, reason)
-
-
-def _cut(episodes: Sequence[EpisodeRow], at: Place, limit: int) -> tuple[list[Span], Place | None]:
-    """Return the spans of the next part of these episodes, and the place behind it; None at the end of the memory."""
-    spans: list[Span] = []
-    left = limit
-    for each in episodes:
-        after = at.after if each.number == at.number else 0
-        last = min(each.head, after + left)
-        spans.append(Span(each.number, after, last))
-        left -= last - after
-        if last < each.head:
-            return spans, Place(each.number, last)
-        if left <= 0:
-            return spans, Place(each.number + 1)
-    if len(episodes) < limit:
-        return spans, None
-    return spans, Place(episodes[-1].number + 1)
-
-
-async def _episodes(connection: AsyncConnection, within: EpisodeRange, limit: int) -> list[EpisodeRow]:
-    clauses = "WHERE number >= :first AND number < :end ORDER BY number LIMIT :limit"
-    return await read_episodes(connection, clauses, **within.limits, limit=limit)
-
-
-async def _designators(connection: AsyncConnection, generation: Generation) -> Designators:
-    payloads = await dialect_of(connection).declarations(connection)
-    return Designators.of_union(unite(generation.layout, payloads))
+                self._result.add_deleted(number, first, reason)
 
 
 # === verify custom ============================================================================================
 #
-# Fold the log again for a custom projection and compare its tables, in parts of whole episodes.
+# Compare the tables of a custom projection with the log.
 
 
-def check_of(projection: Projection, result: VerifyResult) -> PartCheck:
+def check_of(projection: Projection, result: VerifyResult) -> TableCheck:
     """Return the check of the tables of this projection."""
     return projection.check(result) if isinstance(projection, PackedProjection) else ProjectionCheck(projection, result)
 
@@ -712,85 +696,69 @@ async def uncompared_projections(log: EventLog, projections: Sequence[Projection
 
 
 class ProjectionCheck:
-    """The check of the tables of one projection. Implements `PartCheck`; a part consists of whole episodes."""
+    """The check of the tables of one projection. Implements `TableCheck`."""
 
     def __init__(self, projection: Projection, result: VerifyResult) -> None:
         self._projection = projection
         self.result = result
         name = projection.name
         self.missing_table = f"a table of the projection {name} is missing: run `pycrorm rebuild {name}`"
+        self._comparison: Comparison | None = None
+        self._part = EpisodeRange()
+        self._folded: dict[int, int] = {}
+        self._refused: dict[int, Difference] = {}
+        self._lost: set[int] = set()
 
-    async def comparison(self, connection: AsyncConnection) -> Comparison | None:
-        generation = projections_in(await read_generations(connection)).get(self._projection.name)
-        if generation is None or generation.version != self._projection.version:
-            return None
-        comparison = Comparison(generation, dialect_of(connection).stored_column, {})
-        comparison.tables.append(self._place(generation))
-        return comparison
+    async def begin(self, connection: AsyncConnection, part: EpisodeRange, _: Sequence[EpisodeRow]) -> bool:
+        dialect, name = dialect_of(connection), self._projection.name
+        generation = projections_in(await read_generations(connection)).get(name)
+        self._comparison = None
+        if generation is None or generation.version != self._projection.version:  # another program has rebuilt it
+            return True
+        comparison = Comparison(generation, dialect.stored_column, {})
+        place = pipeline.place_of(generation.number, name)
+        if not await dialect.keep(connection, [*comparison.tables, place]):
+            return False
+        clauses = "WHERE id >= :first AND id < :end"
+        checkpoints = await connection.execute(text(f"SELECT id, folded FROM {place} {clauses}"), part.limits)  # noqa: S608
+        self._folded = {each.id: each.folded for each in checkpoints}
+        learn = learner_of(self._projection)
+        batch = learn(generation.layout, await dialect.declarations(connection))[1]
+        self._comparison, self._part, self._rows = comparison, part, batch()
+        self._refused, self._lost = {}, set()
+        return True
 
-    async def check(
-        self, connection: AsyncConnection, comparison: Comparison, at: Place, within: EpisodeRange, limit: int
-    ) -> Place | None:
-        place = self._place(comparison.generation)
-        folded = await _folded(connection, place, within._replace(first=at.number), limit)
-        payloads = await dialect_of(connection).declarations(connection)
-        _, batch = learner_of(self._projection)(comparison.generation.layout, payloads)
-        rows = batch()
-        findings: list[Difference] = []
-        count = 0
-        following = within.end
-        for number, last in folded:
-            if count >= limit:
-                following = number
-                break
-            fault = await _fold_again(connection, rows, Span(number, 0, last), limit)
-            count += last
-            if fault is not None:
-                sequence, reason = fault
-                stored = "folded in the tables"
-                findings.append(
-                    Difference(number, sequence, self._projection.name, "fold", stored, f"parked: {reason}")
-                )
-        else:
-            if len(folded) == limit:
-                following = folded[-1][0] + 1
-        lost = {each.number for each in findings}
-        differences = await self.differences(connection, comparison, rows, EpisodeRange(at.number, following))
-        for each in (*findings, *(each for each in differences if each.number not in lost)):
+    def read(self, span: Span, events: Sequence[StoredEvent]) -> None:
+        number, after, last = span
+        count = min(last, self._folded.get(number, 0)) - after
+        if self._comparison is None or number in self._refused or count <= 0:
+            return
+        whole = consecutive(events, after)[:count]
+        refused = self._rows.fold(whole) if whole else None
+        if refused is None and len(whole) < count:
+            refused = after + len(whole) + 1, "it is missing in the log"
+        if refused is not None:
+            sequence, reason = refused
+            self._refused[number] = Difference(
+                number, sequence, self._projection.name, "fold", "folded in the tables", f"parked: {reason}"
+            )
+
+    def lose(self, number: int, sequence: int) -> None:  # noqa: ARG002 - of the protocol
+        self._lost.add(number)
+
+    async def compare(self, connection: AsyncConnection) -> None:
+        if self._comparison is None:
+            return
+        differences = await self.differences(connection, self._comparison, self._rows, self._part)
+        hidden = self._lost | self._refused.keys()
+        for each in (*self._refused.values(), *(each for each in differences if each.number not in hidden)):
             self.result.add_difference(each._replace(table=each.table.removeprefix(OWN)))
-        return None if following is None or following == within.end else Place(following)
 
     async def differences(
         self, connection: AsyncConnection, comparison: Comparison, rows: Batch, episodes: EpisodeRange
     ) -> Sequence[Difference]:
         """Compare the tables with the rows that the events of these episodes make; count the stored rows."""
         assert isinstance(rows, CustomRows)
-        last = None if episodes.end is None else row_id_min(episodes.end)
-        within = Range(row_id_min(episodes.first) or None, last, None, None)
-        differences = await comparison.differences(connection, rows, within, carried=(), settled=())
+        differences = await comparison.differences(connection, rows, episodes)
         self.result.rows += comparison.count
         return differences
-
-    def _place(self, generation: Generation) -> str:
-        return pipeline.place_of(generation.number, self._projection.name)
-
-
-async def _folded(connection: AsyncConnection, place: str, within: EpisodeRange, limit: int) -> list[tuple[int, int]]:
-    """Return number and checkpoint of each episode."""
-    rows = await connection.execute(
-        text(f"SELECT id, folded FROM {place} WHERE id >= :first AND id < :end ORDER BY id LIMIT :limit"),  # noqa: S608
-        {**within.limits, "limit": limit},
-    )
-    return [(each.id, each.folded) for each in rows]
-
-
-async def _fold_again(connection: AsyncConnection, rows: Batch, span: Span, limit: int) -> tuple[int, str] | None:
-    """Fold an episode again; return the first event that cannot be folded, with the reason."""
-    for after in range(0, span.last, limit):
-        page = Span(span.number, after, min(after + limit, span.last))
-        whole = consecutive(await dialect_of(connection).spans(connection, [page]), after)
-        if whole and (refused := rows.fold(whole)) is not None:
-            return refused
-        if after + len(whole) < page.last:
-            return after + len(whole) + 1, "it is missing in the log"
-    return None

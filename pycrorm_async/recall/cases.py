@@ -61,7 +61,7 @@ from pycrorm_async.events.types import (
 )
 from pycrorm_async.projections.columns import OWN, physical_name
 from pycrorm_async.projections.custom import EpisodeFolds, PackedProjection, ProjectedBatch, Projection, Refused
-from pycrorm_async.projections.findings import Comparison, Difference, EpisodeRange, PartCheck, VerifyResult
+from pycrorm_async.projections.findings import Comparison, Difference, EpisodeRange, TableCheck, VerifyResult
 from pycrorm_async.projections.fold import happening_of
 from pycrorm_async.projections.generations import select_generation
 from pycrorm_async.projections.pipeline import Batch
@@ -113,7 +113,7 @@ _BLOCKS_KEPT: Final = 20
 
 
 class CaseCheck(ProjectionCheck):
-    """The check of the blocks of cases. Implements `PartCheck`; a part consists of whole episodes."""
+    """The check of the blocks of cases. Implements `TableCheck`."""
 
     def __init__(self, projection: Projection, result: VerifyResult) -> None:
         super().__init__(projection, result)
@@ -707,5 +707,5 @@ class CaseProjection(PackedProjection):
     def batch(self, declared: Mapping[str, DesignatorTypeDeclared], folds: EpisodeFolds) -> ProjectedBatch:
         return CaseBatch(self, declared, folds)
 
-    def check(self, result: VerifyResult) -> PartCheck:
+    def check(self, result: VerifyResult) -> TableCheck:
         return CaseCheck(self, result)

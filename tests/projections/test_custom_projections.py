@@ -453,7 +453,7 @@ async def test_an_interrupted_rebuild_is_continued(log: EventLog, monkeypatch: p
 
 
 async def test_verify_finds_every_change_and_nothing_else(log: EventLog, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("pycrorm_async.projections.findings._PART_EVENTS", 10)  # several parts
+    monkeypatch.setattr("pycrorm_async.projections.verify._PART_EVENTS", 10)  # several parts
     records = [*declarations(PICK_UP), *mixed(*(tries(episode) for episode in range(1, 5)))]
     await folded(log, [*records, *tries(5).records[:6]], GraspRate())
     result = await verify(log, projections=[GraspRate()])

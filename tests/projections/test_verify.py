@@ -15,7 +15,7 @@ from pycrorm_async import Memory
 from pycrorm_async.errors import DatabaseUnavailable
 from pycrorm_async.events.codec import Record
 from pycrorm_async.events.types import EpisodeEnded, NodeStarted
-from pycrorm_async.projections import findings as parts
+from pycrorm_async.projections import verify as parts
 from pycrorm_async.projections.findings import Difference
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.verify import verify
@@ -179,11 +179,11 @@ async def test_an_episode_that_grows_between_two_parts_is_no_fault(
     database_url: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     log = await opened(database_url)
-    whole, beginning = full(1, rounds=3), Script(1)
-    stored = 12
-    beginning.records = whole.records[:stored]
-    await fold_in_batches(log, [beginning], 10_000)
+    whole, beginning = full(2, rounds=3), Script(2)
+    beginning.records = whole.records[:12]
+    await fold_in_batches(log, [full(1), beginning, full(3)], 10_000)
     monkeypatch.setattr(parts, "_PART_EVENTS", 5)
+    stored = 12
 
     async def record() -> None:
         other = await opened(database_url)
@@ -193,14 +193,14 @@ async def test_an_episode_that_grows_between_two_parts_is_no_fault(
         await projector.catch_up()
         await other.close()
 
-    def record_once(_done: int, _total: int, _what: str | None = None) -> None:
+    def record_more(_done: int, _total: int, _what: str | None = None) -> None:
         nonlocal stored
         in_own_loop(record)
         stored += 6
 
-    result = await verify(log, report_progress=record_once)
+    result = await verify(log, report_progress=record_more)
     assert_clean(result)
-    assert (result.events, result.behind) == (len(whole.records), 0)
+    assert (result.events, result.behind) == (2 * len(full(1).records) + 18, 0)
     await log.close()
 
 

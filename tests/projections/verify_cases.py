@@ -37,7 +37,7 @@ from pycrorm_async.events.types import (
     SeenValue,
     StateSampled,
 )
-from pycrorm_async.projections import findings as parts
+from pycrorm_async.projections import verify as parts
 from pycrorm_async.projections.findings import VerifyResult
 from pycrorm_async.projections.projector import Projector
 from pycrorm_async.projections.rebuild import Rebuild, claimed, clear
