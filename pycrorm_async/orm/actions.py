@@ -31,17 +31,53 @@ from pycrorm_async.orm.rows import (
 )
 from pycrorm_async.world.pose import Arms, Grasp, GripperState, ObjectType
 
+__all__ = [
+    "NavigateAction",
+    "ParkArmsAction",
+    "MoveTorsoAction",
+    "SetGripperAction",
+    "ReleaseAction",
+    "GripAction",
+    "PickUpAction",
+    "PlaceAction",
+    "TransportAction",
+    "LookAtAction",
+    "DetectAction",
+    "OpenAction",
+    "CloseAction",
+    "GraspingAction",
+    "FaceAtAction",
+    "MoveAndPickUpAction",
+    "BatchRolloutAction",
+    "LearnPolicyAction",
+    "MoveMotion",
+    "MoveTCPMotion",
+    "LookingMotion",
+    "MoveGripperMotion",
+    "MoveArmJointsMotion",
+    "MoveJointsMotion",
+    "DetectingMotion",
+    "OpeningMotion",
+    "ClosingMotion",
+    "WorldStateDetectingMotion",
+    "AccessingMotion",
+    "Sequential",
+    "TryInOrder",
+    "Parallel",
+    "TryAll",
+    "Repeat",
+    "Monitor",
+    "Code",
+    "Retry",
+]
+
 
 class NavigateAction(TargetLocationParameter, Action):
     """Drive to a place."""
 
-    __tablename__ = "navigate_action"
-
 
 class ParkArmsAction(Action):
     """Fold an arm, or both, out of the way."""
-
-    __tablename__ = "park_arms_action"
 
     arm: Mapped[Arms]
 
@@ -49,15 +85,11 @@ class ParkArmsAction(Action):
 class MoveTorsoAction(Action):
     """Lift or lower the torso to `position` (m)."""
 
-    __tablename__ = "move_torso_action"
-
     position: Mapped[float]
 
 
 class SetGripperAction(Action):
     """Open or close a gripper."""
-
-    __tablename__ = "set_gripper_action"
 
     gripper: Mapped[Arms]
     motion: Mapped[GripperState]
@@ -66,15 +98,11 @@ class SetGripperAction(Action):
 class ReleaseAction(ObjectDesignatorParameter, Action):
     """Release an object."""
 
-    __tablename__ = "release_action"
-
     gripper: Mapped[Arms] = mapped_column(sort_order=-1)
 
 
 class GripAction(ObjectDesignatorParameter, Action):
     """Hold an object with `effort` (N)."""
-
-    __tablename__ = "grip_action"
 
     gripper: Mapped[Arms] = mapped_column(sort_order=-1)
     effort: Mapped[float]
@@ -83,8 +111,6 @@ class GripAction(ObjectDesignatorParameter, Action):
 class PickUpAction(ObjectDesignatorParameter, Action):
     """Grasp an object and lift it; `object` is its row from before the action."""
 
-    __tablename__ = "pick_up_action"
-
     arm: Mapped[Arms]
     grasp: Mapped[Grasp]
 
@@ -92,15 +118,11 @@ class PickUpAction(ObjectDesignatorParameter, Action):
 class PlaceAction(ObjectDesignatorParameter, TargetLocationParameter, Action):
     """Place a grasped object at a pose."""
 
-    __tablename__ = "place_action"
-
     arm: Mapped[Arms]
 
 
 class TransportAction(ObjectDesignatorParameter, TargetLocationParameter, Action):
     """Fetch an object and bring it to a place."""
-
-    __tablename__ = "transport_action"
 
     arm: Mapped[Arms]
 
@@ -108,19 +130,13 @@ class TransportAction(ObjectDesignatorParameter, TargetLocationParameter, Action
 class LookAtAction(TargetParameter, Action):
     """Turn the head to a point."""
 
-    __tablename__ = "look_at_action"
-
 
 class DetectAction(ObjectDesignatorParameter, Action):
     """Look for an object."""
 
-    __tablename__ = "detect_action"
-
 
 class OpenAction(ObjectDesignatorParameter, Action):
     """Open the container that `object`, a handle, belongs to."""
-
-    __tablename__ = "open_action"
 
     arm: Mapped[Arms]
 
@@ -128,15 +144,11 @@ class OpenAction(ObjectDesignatorParameter, Action):
 class CloseAction(ObjectDesignatorParameter, Action):
     """Close the container that `object`, a handle, belongs to."""
 
-    __tablename__ = "close_action"
-
     arm: Mapped[Arms]
 
 
 class GraspingAction(ObjectParameter, Action):
     """Grasp a handle."""
-
-    __tablename__ = "grasping_action"
 
     arm: Mapped[Arms]
 
@@ -148,8 +160,6 @@ class GraspingAction(ObjectParameter, Action):
 class FaceAtAction(PoseParameter, Action):
     """Turn the base and the head to a point."""
 
-    __tablename__ = "face_at_action"
-
     pose_id: Mapped[int] = mapped_column(ForeignKey("pose.id"))
 
 
@@ -159,8 +169,6 @@ class MoveAndPickUpAction(PoseParameter, ObjectDesignatorParameter, Action):
     Attributes:
         policy: name of the policy that chose place, arm and grasp; None if none did.
     """
-
-    __tablename__ = "move_and_pick_up_action"
 
     arm: Mapped[Arms]
     grasp: Mapped[Grasp]
@@ -182,8 +190,6 @@ class BatchRolloutAction(Action):
         count: the number of rollouts requested; an interrupted batch has fewer children.
         arms, grasps: names of those to which the policy was limited; empty if it was not.
     """
-
-    __tablename__ = "batch_rollout_action"
 
     policy: Mapped[str]
     scene: Mapped[str]
@@ -212,8 +218,6 @@ class LearnPolicyAction(Action):
         episode_count: number of the episodes that hold the samples.
     """
 
-    __tablename__ = "learn_policy_action"
-
     policy: Mapped[str]
     successes: Mapped[int]
     min_samples_leaf: Mapped[int]
@@ -238,31 +242,21 @@ class LearnPolicyAction(Action):
 class Sequential(Language):
     """Performs its operands in order, up to the first that fails."""
 
-    __tablename__ = "sequential"
-
 
 class TryInOrder(Language):
     """Performs its operands in order, up to the first that succeeds."""
-
-    __tablename__ = "try_in_order"
 
 
 class Parallel(Language):
     """Performs its operands concurrently; succeeds if all do."""
 
-    __tablename__ = "parallel"
-
 
 class TryAll(Language):
     """Performs its operands concurrently; succeeds if one does."""
 
-    __tablename__ = "try_all"
-
 
 class Repeat(Language):
     """Performs its operand `times` times."""
-
-    __tablename__ = "repeat"
 
     times: Mapped[int]
 
@@ -275,8 +269,6 @@ class Monitor(Language):
         interval_s: the time between two evaluations of it.
     """
 
-    __tablename__ = "monitor"
-
     condition: Mapped[str]
     interval_s: Mapped[float]
 
@@ -288,8 +280,6 @@ class Code(Language):
         function: its qualified name.
     """
 
-    __tablename__ = "code"
-
     function: Mapped[str]
 
     @property
@@ -300,8 +290,6 @@ class Code(Language):
 
 class Retry(Language):
     """Repeats its operand, or its next alternative, until one succeeds, at most `max_tries` times."""
-
-    __tablename__ = "retry"
 
     max_tries: Mapped[int]
 
@@ -316,13 +304,9 @@ class Retry(Language):
 class MoveMotion(TargetParameter, Motion):
     """Drive the base to a pose."""
 
-    __tablename__ = "move_motion"
-
 
 class MoveTCPMotion(TargetParameter, Motion):
     """Bring the tool frame of one arm to a pose."""
-
-    __tablename__ = "move_tcp_motion"
 
     arm: Mapped[Arms]
     allow_gripper_collision: Mapped[bool | None]
@@ -331,13 +315,9 @@ class MoveTCPMotion(TargetParameter, Motion):
 class LookingMotion(TargetParameter, Motion):
     """Turn the head to a point."""
 
-    __tablename__ = "looking_motion"
-
 
 class MoveGripperMotion(Motion):
     """Open or close a gripper."""
-
-    __tablename__ = "move_gripper_motion"
 
     motion: Mapped[GripperState]
     gripper: Mapped[Arms]
@@ -346,8 +326,6 @@ class MoveGripperMotion(Motion):
 
 class MoveArmJointsMotion(Motion):
     """Move arm joints to positions (rad), by name."""
-
-    __tablename__ = "move_arm_joints_motion"
 
     @property
     def left_arm_poses(self) -> dict[str, float]:
@@ -363,8 +341,6 @@ class MoveArmJointsMotion(Motion):
 class MoveJointsMotion(Motion):
     """Move joints to positions (rad or m)."""
 
-    __tablename__ = "move_joints_motion"
-
     @property
     def names(self) -> list[str]:
         """The joints' names, in the designator's order."""
@@ -379,15 +355,11 @@ class MoveJointsMotion(Motion):
 class DetectingMotion(Motion):
     """Look for objects of a type."""
 
-    __tablename__ = "detecting_motion"
-
     object_type: Mapped[ObjectType]
 
 
 class OpeningMotion(ObjectPartParameter, Motion):
     """Move an arm so that the container whose handle it grasps opens."""
-
-    __tablename__ = "opening_motion"
 
     arm: Mapped[Arms]
 
@@ -395,23 +367,17 @@ class OpeningMotion(ObjectPartParameter, Motion):
 class ClosingMotion(ObjectPartParameter, Motion):
     """Move an arm so that the container whose handle it grasps closes."""
 
-    __tablename__ = "closing_motion"
-
     arm: Mapped[Arms]
 
 
 class WorldStateDetectingMotion(Motion):
     """Read objects of a type from the state of the world instead of a camera."""
 
-    __tablename__ = "world_state_detecting_motion"
-
     object_type: Mapped[ObjectType]
 
 
 class AccessingMotion(ObjectParameter, Motion):
     """Open or close a drawer by its handle."""
-
-    __tablename__ = "accessing_motion"
 
     arm: Mapped[Arms]
     gripper: Mapped[str]

@@ -17,7 +17,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from datetime import UTC, datetime, timedelta
 from enum import Enum
-from typing import Any, ClassVar, TypeVar, dataclass_transform
+from typing import Any, ClassVar, Final, TypeVar, dataclass_transform
 
 import msgspec
 from sqlalchemy import (
@@ -160,6 +160,17 @@ _Value = TypeVar("_Value")
 
 EPISODE = "process_metadata_id"
 """The column of every table that names the episode of a row."""
+COMPUTED: Final = {"storage": None}
+"""Marks a column of a view that its select computes, so that the table behind the view does not have it.
+
+The `info` of another column may name its `storage`, if its type does not say it, and the column that it comes `after`
+in the table, if that is not the one before it in the class. `projections/schema.json` is made from both.
+"""
+
+
+def is_built_in(class_: type) -> bool:
+    """Return whether every memory has the view of a mapped class; users declare other classes."""
+    return class_.__module__.startswith("pycrorm_async.orm.")
 
 
 def one_of(reference: Callable[[], Any], table: str, class_: Any = None, **options: Any) -> Any:
@@ -247,6 +258,9 @@ def _read_members(state: InstanceState[Base], *_: Any) -> None:
 )
 class Base(MappedAsDataclass, AsyncAttrs, DeclarativeBase, init=False, repr=False, eq=False):
     """The root of the mapped classes. The text of an object has the columns of its class and the robot's state."""
+
+    _unmapped: ClassVar[dict[str, dict[str, str]]] = {}
+    """Columns of the table that the view leaves out, with their `info` (`COMPUTED`)."""
 
     type_annotation_map: ClassVar[dict[Any, Any]] = {
         int: BigInteger(),

@@ -1,8 +1,8 @@
-"""Describe the views of the mapped classes and their columns, in words and with their units.
+"""Describe the tables and views of the mapped classes, with their columns in words and with their units.
 
 A column's text comes from the docstring behind its attribute, from the section `Attributes` of its class or of a base,
-and from its type: times are integers in SQL, so their text has their unit. Run as a program, it writes the comments on
-views and columns of PostgreSQL, `projections/comments.json`, from these docstrings.
+and from its type: times are integers in SQL, so their text has their unit. Run as a program, it writes the columns of
+the built-in tables and the comments on their views, `projections/schema.json`, from these classes.
 """
 
 from __future__ import annotations
@@ -20,9 +20,10 @@ from typing import Any
 import msgspec
 from sqlalchemy import Table
 
-from pycrorm_async.orm.base import EPISODE, Base, JsonText, Moment
+from pycrorm_async.orm.base import EPISODE, Base, JsonText, Moment, is_built_in
 from pycrorm_async.orm.rows import Action, Designator, Language, Motion
-from pycrorm_async.projections.views import COMMENTS_FILE
+from pycrorm_async.projections.columns import INDEXED, SCHEMA_FILE, Schema, Storage
+from pycrorm_async.projections.mapped_tables import column_storage, leaves_of
 
 _TIME = "µs since 1970-01-01 00:00 UTC"
 _UNIT = re.compile(r"(?:^|, | in )(m|rad|s|kg|ns)(?=[,;:]|$)")
@@ -111,8 +112,8 @@ def describe(class_: Any) -> ViewDescription:
     if class_ in _KINDS:
         columns = describe(Designator).columns | columns
     references = {str(column.name): key.target_fullname for column in table.columns for key in column.foreign_keys}
-    built_in = class_.__module__.startswith("pycrorm_async.orm.")
-    return ViewDescription(table.name, class_.__name__, _first_paragraph(class_.__doc__), columns, references, built_in)
+    text = _first_paragraph(class_.__doc__)
+    return ViewDescription(table.name, class_.__name__, text, columns, references, is_built_in(class_))
 
 
 def unit_of(column: Any) -> str:
@@ -181,11 +182,45 @@ def _documented(class_: type) -> dict[str, str]:
     return texts
 
 
-def comments() -> dict[str, dict[str, str]]:
-    """Return the texts of the built-in views and their columns; the view's own text has the empty name."""
-    views = (each for each in described().values() if each.built_in)
-    return {each.name: {"": each.text, **each.columns} for each in views}
+# === schema ===================================================================================================
+
+_REFERENCES: dict[str, Storage] = {"process_metadata.id": "number", "task_tree_node.id": "row"}
+
+
+def schema() -> Schema:
+    """Return the built-in tables and the texts of their views as the mapped classes declare them."""
+    views = {each.name: each for each in described().values() if each.built_in}
+    return Schema(
+        {name: _columns_of(name) for name in INDEXED if name in views},
+        [each for each in leaves_of(Designator) if each.dtype is not None],
+        {name: {"": each.text, **each.columns} for name, each in views.items()},
+    )
+
+
+def _columns_of(table: str) -> dict[str, Storage]:
+    """Return the columns of a table: those of the class and of those that share its view, as their `info` has them."""
+    roots = (each.class_ for each in Base.registry.mappers if each.inherits is None)
+    [class_] = (each for each in roots if each.__table__.name == table)
+    storages = {each.name: _storage_of(each) for each in class_.__table__.columns}
+    places = {each.name: each.info["after"] for each in class_.__table__.columns if "after" in each.info}
+    for name, info in class_._unmapped.items():  # noqa: SLF001  of our own base class
+        storages[name], places[name] = info["storage"], info["after"]
+    names = [name for name in storages if name not in places]
+    for name, before in places.items():
+        names.insert(names.index(before) + 1, name)
+    return {name: storage for name in names if (storage := storages[name]) is not None}
+
+
+def _storage_of(column: Any) -> Storage | None:
+    """Return the storage of a column in the table behind its view; None if the view computes the column."""
+    if "storage" in column.info:
+        storage: Storage | None = column.info["storage"]
+        return storage
+    if column.primary_key:
+        return "key"
+    references = (_REFERENCES[key.target_fullname] for key in column.foreign_keys if key.target_fullname in _REFERENCES)
+    return next(references, "json" if isinstance(column.type, JsonText) else column_storage(column))
 
 
 if __name__ == "__main__":  # `python -m pycrorm_async.orm.documentation`, after a docstring or a column has changed
-    COMMENTS_FILE.write_bytes(msgspec.json.format(msgspec.json.encode(comments()), indent=1) + b"\n")
+    SCHEMA_FILE.write_bytes(msgspec.json.format(msgspec.json.encode(schema()), indent=1) + b"\n")

@@ -3,13 +3,23 @@
 from __future__ import annotations
 
 from datetime import datetime
-from typing import Any
+from typing import Any, ClassVar
 
 from sqlalchemy import ForeignKey
 from sqlalchemy.orm import Mapped, mapped_column, relationship, synonym
 
-from pycrorm_async.orm.base import Base, JsonText, RowOfEvent, on_request, one_of
+from pycrorm_async.orm.base import COMPUTED, Base, JsonText, RowOfEvent, on_request, one_of
 from pycrorm_async.world.pose import ObjectType
+
+__all__ = [
+    "ProcessMetaData",
+    "EpisodeTag",
+    "EpisodeRobot",
+    "Position",
+    "Quaternion",
+    "Pose",
+    "RobotState",
+]
 
 
 class ProcessMetaData(Base):
@@ -19,6 +29,7 @@ class ProcessMetaData(Base):
     """
 
     __tablename__ = "process_metadata"
+    _unmapped: ClassVar[dict[str, dict[str, str]]] = {"entered_world": {"storage": "text", "after": "clock_error_us"}}
 
     id: Mapped[int] = mapped_column(primary_key=True)
     uuid: Mapped[str]
@@ -40,7 +51,7 @@ class ProcessMetaData(Base):
     status: Mapped[str]
     start_ns: Mapped[int]
     end_ns: Mapped[int | None]
-    end_sequence: Mapped[int | None]
+    end_sequence: Mapped[int | None] = mapped_column(info={"storage": "number"})
     """The sequence of its last event; None while it runs."""
     failure_type: Mapped[str | None]
     failure_message: Mapped[str | None]
@@ -65,9 +76,9 @@ class ProcessMetaData(Base):
     clock_synchronized: Mapped[bool | None]
     """True if a time service kept the wall clock; `clock_error_us` is its estimated error, µs."""
     clock_error_us: Mapped[int | None]
-    ended_at: Mapped[datetime | None]
+    ended_at: Mapped[datetime | None] = mapped_column(info=COMPUTED)
     """`created_at` and the duration; None while it runs."""
-    duration_s: Mapped[float | None]
+    duration_s: Mapped[float | None] = mapped_column(info=COMPUTED)
     """From its first to its last event by the robot's monotonic clock, s; None while it runs."""
     episode_metadata: Mapped[dict[str, Any] | None] = mapped_column("metadata", JsonText())
     """The metadata of the executive; the column is `metadata`, a name that SQLAlchemy reserves as an attribute."""
@@ -146,10 +157,10 @@ class Pose(RowOfEvent, Base):
 
     id: Mapped[int] = mapped_column(primary_key=True)
     process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"))
-    time: Mapped[datetime]
-    frame: Mapped[str]
-    position_id: Mapped[int] = mapped_column(ForeignKey("position.id"))
-    orientation_id: Mapped[int] = mapped_column(ForeignKey("quaternion.id"))
+    time: Mapped[datetime] = mapped_column(info={"after": "qw"})
+    frame: Mapped[str] = mapped_column(info={"after": "qw"})
+    position_id: Mapped[int] = mapped_column(ForeignKey("position.id"), info=COMPUTED)
+    orientation_id: Mapped[int] = mapped_column(ForeignKey("quaternion.id"), info=COMPUTED)
     x: Mapped[float]
     y: Mapped[float]
     z: Mapped[float]

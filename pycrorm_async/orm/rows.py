@@ -23,7 +23,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from datetime import datetime
 from functools import cached_property
-from typing import Any
+from typing import Any, ClassVar
 
 from sqlalchemy import (
     BigInteger,
@@ -43,14 +43,17 @@ from sqlalchemy.orm import Mapped, MappedAsDataclass, declared_attr, mapped_colu
 from sqlalchemy.types import TypeDecorator
 
 from pycrorm_async.events.codec import description_of
+from pycrorm_async.events.fields import table_name
 from pycrorm_async.events.types import BoxValue, DescriptionDeclared, MeshValue
 from pycrorm_async.orm.base import (
+    COMPUTED,
     EPISODE,
     Base,
     HybridOnRequest,
     JsonText,
     RowOfEvent,
     inherited_from,
+    is_built_in,
     known_classes,
     many_of,
     on_request,
@@ -60,6 +63,34 @@ from pycrorm_async.orm.base import (
 from pycrorm_async.orm.episodes import Pose, ProcessMetaData, RobotState
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.pose import Arms, Grasp, ObjectType
+
+__all__ = [
+    "Concept",
+    "ConceptAncestor",
+    "ObjectConcept",
+    "Object",
+    "ObjectDescription",
+    "ObjectPart",
+    "BelieveObject",
+    "LocatedObject",
+    "ObjectRemoval",
+    "Attachment",
+    "JointChange",
+    "TaskTreeNode",
+    "LocationResolution",
+    "LocationCandidate",
+    "LocationRefusal",
+    "Detection",
+    "StateSample",
+    "Observation",
+    "ObservationValue",
+    "DesignatorType",
+    "Designator",
+    "ParameterItem",
+    "Action",
+    "Motion",
+    "Language",
+]
 
 # === objects ==================================================================================================
 #
@@ -230,7 +261,7 @@ _ADDED: FromClause = Object.__table__.alias("added")
 class ObjectPart(Object):
     """A link of an object as an action's parameter; `part_of` is the object it belongs to."""
 
-    part_of_id: Mapped[int | None] = mapped_column(ForeignKey("object.id"))
+    part_of_id: Mapped[int | None] = mapped_column(ForeignKey("object.id"), info={"after": "pose_id"})
 
     part_of: Mapped[Object | None] = one_of(lambda: ObjectPart.part_of_id, "object")
 
@@ -415,10 +446,11 @@ class Designator(RowOfEvent, Base):
     __tablename__ = "designator"
 
     def __init_subclass__(cls, **arguments: Any) -> None:
-        # Each class gets a table of its own, named like the class unless the class names one, and that table's key.
+        # Each class gets a table of its own and that table's key. Unless the class names the table, it has the name of
+        # the class; that of a built-in class is the table of its designator.
         if not vars(cls).keys() & {"__table__", "__abstract__"}:
             if "__tablename__" not in vars(cls):
-                cls.__tablename__ = cls.__name__
+                cls.__tablename__ = table_name(cls.__name__) if is_built_in(cls) else cls.__name__
             if "id" not in vars(cls):
                 base = _mapped_base(cls)
                 cls.id = mapped_column(ForeignKey(f"{base.__tablename__}.id"), primary_key=True, sort_order=-2)
@@ -543,19 +575,13 @@ def _mapped_base(class_: Any) -> Any:
 class Action(Designator):
     """A performed action: a task that a plan requests."""
 
-    __tablename__ = "action"
-
 
 class Motion(Designator):
     """A performed motion: one command to a robot's controllers."""
 
-    __tablename__ = "motion"
-
 
 class Language(Designator):
     """A performed expression of the plan language. The nodes of its operands are children of its node."""
-
-    __tablename__ = "language"
 
 
 # --- parameters of actions and motions --------------------------------------------------------------------------
@@ -666,19 +692,23 @@ class TaskTreeNode(RowOfEvent, Base):
     """
 
     __tablename__ = "task_tree_node"
+    _unmapped: ClassVar[dict[str, dict[str, str]]] = {
+        "robot_type": {"storage": "text", "after": "torso_height"},
+        "parameters": {"storage": "json", "after": "simulated"},
+    }
 
     id: Mapped[int] = mapped_column(primary_key=True)
     process_metadata_id: Mapped[int] = mapped_column(ForeignKey("process_metadata.id"))
     parent_id: Mapped[int | None] = mapped_column(ForeignKey("task_tree_node.id"))
-    action_id: Mapped[int | None] = mapped_column(ForeignKey("designator.id"))
+    action_id: Mapped[int | None] = mapped_column(ForeignKey("designator.id"), info=COMPUTED)
     kind: Mapped[str]
     dtype: Mapped[str | None]
     status: Mapped[TaskStatus]
     start_time: Mapped[datetime]
-    end_time: Mapped[datetime | None]
+    end_time: Mapped[datetime | None] = mapped_column(info=COMPUTED)
     start_ns: Mapped[int]
     end_ns: Mapped[int | None]
-    end_sequence: Mapped[int | None]
+    end_sequence: Mapped[int | None] = mapped_column(info={"storage": "number"})
     reason: Mapped[str | None]
     failure_message: Mapped[str | None]
     failure_arguments: Mapped[list[Any] | None] = mapped_column(JsonText())
@@ -688,9 +718,9 @@ class TaskTreeNode(RowOfEvent, Base):
     robot_object_id: Mapped[int | None] = mapped_column(ForeignKey("object.id"))
     robot: Mapped[str | None]
     simulated: Mapped[bool]
-    duration_s: Mapped[float | None]
-    duration: Mapped[float | None]
-    _outcome: Mapped[str | None] = mapped_column("outcome", deferred=True)
+    duration_s: Mapped[float | None] = mapped_column(info=COMPUTED)
+    duration: Mapped[float | None] = mapped_column(info=COMPUTED)
+    _outcome: Mapped[str | None] = mapped_column("outcome", deferred=True, info=COMPUTED)
 
     outcome: Mapped[str | None] = synonym("_outcome", descriptor=on_request("outcome"))
     action: Mapped[Designator | None] = one_of(lambda: TaskTreeNode.action_id, "designator")

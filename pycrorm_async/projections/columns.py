@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from functools import lru_cache
+from pathlib import Path
 from typing import Any, Final, Literal, NamedTuple, Self, TypeAlias
 
 import msgspec
@@ -57,220 +58,51 @@ OWN = "pycrorm_own_"
 EPISODE = "process_metadata_id"
 """The column that names the episode of a row. In `process_metadata` and `simulated_episode` it is `id`."""
 
-_POSE: dict[str, Storage] = {
-    "x": "real",
-    "y": "real",
-    "z": "real",
-    "qx": "real",
-    "qy": "real",
-    "qz": "real",
-    "qw": "real",
-    "frame": "text",
-}
 
-_ROW: dict[str, Storage] = {"id": "key", "process_metadata_id": "number"}
-_ITEM: dict[str, Storage] = {"id": "key", "position": "key", "process_metadata_id": "number"}
+class Leaf(NamedTuple):
+    """A leaf table as one class or one declaration defines it."""
 
-CORE: dict[str, dict[str, Storage]] = {
-    "process_metadata": {
-        "id": "key",
-        "uuid": "text",
-        "created_at": "time",
-        "created_by": "text",
-        "description": "text",
-        "version": "text",
-        "host": "text",
-        "python": "text",
-        "plan": "text",
-        "world": "text",
-        "seed": "integer",
-        "status": "text",
-        "start_ns": "integer",
-        "end_ns": "integer",
-        "end_sequence": "number",
-        "failure_type": "text",
-        "failure_message": "text",
-        "simulated": "boolean",
-        "thought_by": "text",
-        "thought_by_node": "integer",
-        "continues": "text",
-        "continued_in": "text",
-        "plan_sha256": "text",
-        "git_commit": "text",
-        "git_dirty": "boolean",
-        "libraries": "json",
-        "settings": "json",
-        "clock_synchronized": "boolean",
-        "clock_error_us": "integer",
-        "entered_world": "text",
-        "metadata": "json",
-    },
+    table: str
+    columns: dict[str, Storage]
+    dtype: str | None = None
+    kind: str | None = None
+
+
+class Schema(msgspec.Struct, frozen=True):
+    """The built-in tables and views, as the mapped classes declare them.
+
+    A process that makes tables, such as a daemon, does not import these classes, because mapping them takes 0.3 s. So
+    `python -m pycrorm_async.orm.documentation` writes the declarations to a file, and a test compares the two.
+
+    Attributes:
+        tables: columns of each table that a class maps, in the order in which the fold writes their values.
+        leaves: tables of the built-in designators.
+        comments: texts by view and column, which PostgreSQL keeps; the text under the empty name is the view's own.
+    """
+
+    tables: dict[str, dict[str, Storage]]
+    leaves: list[Leaf]
+    comments: dict[str, dict[str, str]]
+
+
+SCHEMA_FILE: Final = Path(__file__).with_name("schema.json")
+SCHEMA: Final = msgspec.json.decode(SCHEMA_FILE.read_bytes(), type=Schema)
+
+CORE: Final[dict[str, dict[str, Storage]]] = SCHEMA.tables | {
     "episode_tagging": {
-        **_ITEM,
+        "id": "key",
+        "position": "key",
+        EPISODE: "number",
         "tag": "text",
         "added": "boolean",
         "time": "time",
     },
     "simulated_episode": {"id": "key"},
-    "task_tree_node": {
-        **_ROW,
-        "parent_id": "row",
-        "kind": "text",
-        "dtype": "text",
-        "status": "text",
-        "start_time": "time",
-        "start_ns": "integer",
-        "end_ns": "integer",
-        "end_sequence": "number",
-        "reason": "text",
-        "failure_message": "text",
-        "failure_arguments": "json",
-        "result": "json",
-        "robot_pose_id": "pose",
-        "torso_height": "real",
-        "robot_type": "text",
-        "robot_object_id": "object",
-        "robot": "text",
-        "simulated": "boolean",
-        "parameters": "json",
-    },
-    "pose": {"id": "key", "process_metadata_id": "number", **_POSE, "time": "time"},
-    "object": {
-        **_ROW,
-        "dtype": "text",
-        "name": "text",
-        "obj_type": "text",
-        "pose_id": "pose",
-        "part_of_id": "object",
-        "identity_id": "object",
-        "time": "time",
-        "node_id": "row",
-        "joints": "json",
-        "description_fingerprint": "text",
-        "color": "json",
-        "model": "text",
-        "serial": "text",
-        "mass_kg": "real",
-        "base_link": "text",
-    },
-    "object_removal": {
-        **_ROW,
-        "object_id": "object",
-        "identity_id": "object",
-        "time": "time",
-        "node_id": "row",
-    },
-    "parameter_item": {
-        "node_id": "key",
-        "field": "key",
-        "position": "key",
-        "process_metadata_id": "number",
-        "key": "text",
-        "integer": "integer",
-        "real": "real",
-        "text": "text",
-        "boolean": "boolean",
-        "time": "time",
-        **_POSE,
-        "object_id": "object",
-        "object_name": "text",
-        "obj_type": "text",
-    },
-    "attachment": {
-        **_ROW,
-        "kind": "text",
-        "parent_id": "object",
-        "child_id": "object",
-        "link": "text",
-        "time": "time",
-        "node_id": "row",
-    },
-    "joint_change": {
-        "id": "key",
-        "joint": "key",
-        "process_metadata_id": "number",
-        "object_id": "object",
-        "position": "real",
-        "time": "time",
-        "node_id": "row",
-    },
-    "location_resolution": {
-        **_ROW,
-        "node_id": "row",
-        "location": "text",
-        "considered": "integer",
-        "offered": "integer",
-        "taken": "integer",
-        "pose_id": "pose",
-        "time": "time",
-        "refused": "integer",
-        "occupied_cells": "integer",
-        "hidden_cells": "integer",
-        "free_cells": "integer",
-    },
-    "location_candidate": {
-        "resolution_id": "key",
-        "position": "key",
-        "process_metadata_id": "number",
-        **_POSE,
-        "arms": "text",
-        "taken": "boolean",
-        "grasp": "text",
-        "torso_height": "real",
-    },
-    "location_refusal": {
-        "resolution_id": "key",
-        "position": "key",
-        "process_metadata_id": "number",
-        **_POSE,
-        "reason": "text",
-    },
-    "detection": {
-        **_ITEM,
-        "node_id": "row",
-        "source": "text",
-        "looked_for": "text",
-        "object_id": "object",
-        "name": "text",
-        "obj_type": "text",
-        **_POSE,
-        "visible": "real",
-        "confidence": "real",
-        "time": "time",
-    },
-    "state_sample": {
-        "id": "key",
-        "channel": "key",
-        "process_metadata_id": "number",
-        "object_id": "object",
-        "node_id": "row",
-        "value": "real",
-        "time": "time",
-        "ns": "integer",
-    },
-    "observation": {
-        **_ROW,
-        "node_id": "row",
-        "name": "text",
-        "time": "time",
-        "ns": "integer",
-    },
-    "observation_value": {
-        **_ITEM,
-        "key": "text",
-        "number": "real",
-        "text": "text",
-        "truth": "boolean",
-        "blob": "text",
-        "media_type": "text",
-        "size": "integer",
-        "missing": "text",
-    },
 }
-"""The columns of each table, in the order in which the fold writes their values.
+"""The columns of each table that every memory has.
 
-`simulated_episode` has no view. It repeats the ids of simulations, so that every view can exclude their rows by a
-lookup in a small table that consists of its key only.
+No class maps the last two. `simulated_episode` repeats the ids of simulations, so that every view can exclude their
+rows by a lookup in a small table that consists of its key only.
 """
 
 LINK_BOX = "pycrorm_link_box"
@@ -359,15 +191,6 @@ class LayoutConflict(ValueError):
 
 class Contradiction(LayoutConflict):
     """A declaration contradicts another one, so it needs other names."""
-
-
-class Leaf(NamedTuple):
-    """A leaf table as one class or one declaration defines it."""
-
-    table: str
-    columns: dict[str, Storage]
-    dtype: str | None = None
-    kind: str | None = None
 
 
 class DesignatorType(msgspec.Struct, frozen=True):
@@ -596,7 +419,7 @@ _TEXT_KEYS = {
     (LINK_BOX, "model"),
 }
 
-_INDEXED = {
+INDEXED = {
     "process_metadata": ("uuid", "thought_by"),
     "episode_tagging": ("process_metadata_id", "tag"),
     "task_tree_node": ("process_metadata_id", "parent_id", "status", "dtype"),
@@ -728,7 +551,7 @@ def leaf_columns(columns: dict[str, Storage]) -> dict[str, Storage]:
 def indexed(name: str, columns: dict[str, Storage]) -> tuple[str, ...]:
     """Return the indexed columns: of a core table those that queries filter and join by, of a leaf its objects."""
     if name in CORE:
-        return _INDEXED.get(name, ())
+        return INDEXED.get(name, ())
     return tuple(column for column, storage in columns.items() if storage == "object")
 
 

@@ -43,6 +43,7 @@ from pycrorm_async.projections.columns import (
     EPISODE,
     OF_NO_EPISODE,
     OWN,
+    SCHEMA,
     Layout,
     MaterialisedView,
     Storage,
@@ -57,7 +58,7 @@ from pycrorm_async.projections.columns import (
     unite,
 )
 from pycrorm_async.projections.mapped_tables import view_text
-from pycrorm_async.projections.views import Tables, ViewDefinition, comments, projection_views, public_views
+from pycrorm_async.projections.views import Tables, ViewDefinition, projection_views, public_views
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog
 
@@ -229,7 +230,7 @@ async def show(connection: AsyncConnection, generation: Generation) -> Generatio
     views = view_texts_of(connection, generation, projections)
     failed = await _replace_views(connection, before.views if before else {}, views, generation, projections)
     if before is None or before.views != views:
-        await dialect_of(connection).comment_views(connection, comments())
+        await dialect_of(connection).comment_views(connection, SCHEMA.comments)
     layout = generation.layout.with_failed_views(generation.layout.failed_views | failed)
     shown = replace(generation, layout=layout, views={name: each for name, each in views.items() if name not in failed})
     await write_generation(connection, SHOWN, shown)

@@ -3,9 +3,6 @@
 A built-in class has the dtype of its name. A class that a user declared (`class ORMSaying(Action)`) has only a table
 until a designator is declared for it. Classes that exist in one memory only are derived from its declarations.
 
-The tables of the built-in classes are listed here once more, because mapping the classes takes 0.3 s: a process that
-queries none of them, such as the daemon or a fold worker, never imports them.
-
 **User views.** Define views that users register: a name and a `select`, created and rebuilt together with the tables.
 
 >>> successes = UserView("successful_grasps", select(PickUpWithContextView.grasp, PickUpWithContextView.status))
@@ -19,113 +16,30 @@ import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from sqlalchemy import Boolean, Column, Dialect, Double, Float, Integer, Select, Table, TableClause, column, table
 from sqlalchemy.types import TypeEngine
 
 from pycrorm_async.errors import CallerError
-from pycrorm_async.events.fields import is_reserved, table_name
-from pycrorm_async.projections.columns import EPISODE, Layout, Leaf, MaterialisedView, Storage
+from pycrorm_async.events.fields import is_reserved
+from pycrorm_async.projections.columns import EPISODE, SCHEMA, Layout, Leaf, MaterialisedView, Storage
 
 if TYPE_CHECKING:
     from pycrorm_async.orm import Designator
-
-
-_Columns = dict[str, Storage]
-_ARM: Final[_Columns] = {"arm": "text"}
-_GRIPPER: Final[_Columns] = {"gripper": "text"}
-_OBJECT: Final[_Columns] = {"object_designator_id": "object"}
-_TARGET: Final[_Columns] = {"target_id": "pose"}
-_LOCATION: Final[_Columns] = {"target_location_id": "pose"}
-_UNCHECKED: Final[_Columns] = {"allow_gripper_collision": "boolean"}
-_BUILT_IN: Final[dict[str, dict[str, _Columns]]] = {
-    "action": {
-        "NavigateAction": _LOCATION,
-        "ParkArmsAction": _ARM,
-        "MoveTorsoAction": {"position": "real"},
-        "SetGripperAction": {**_GRIPPER, "motion": "text"},
-        "ReleaseAction": {**_GRIPPER, **_OBJECT},
-        "GripAction": {**_GRIPPER, **_OBJECT, "effort": "real"},
-        "PickUpAction": {**_OBJECT, **_ARM, "grasp": "text"},
-        "PlaceAction": {**_OBJECT, **_ARM, **_LOCATION},
-        "TransportAction": {**_OBJECT, **_ARM, **_LOCATION},
-        "LookAtAction": _TARGET,
-        "DetectAction": _OBJECT,
-        "OpenAction": {**_OBJECT, **_ARM},
-        "CloseAction": {**_OBJECT, **_ARM},
-        "GraspingAction": {**_ARM, "object_desig_id": "object"},
-        "FaceAtAction": {"pose_id": "pose"},
-        "MoveAndPickUpAction": {"standing_position_id": "pose", **_OBJECT, **_ARM, "grasp": "text", "policy": "text"},
-        "BatchRolloutAction": {
-            "policy": "text",
-            "scene": "text",
-            "seed": "integer",
-            "first": "integer",
-            "count": "integer",
-        },
-        "LearnPolicyAction": {
-            "policy": "text",
-            "successes": "integer",
-            "min_samples_leaf": "integer",
-            "rollouts": "integer",
-            "scene": "text",
-            "episode_count": "integer",
-        },
-    },
-    "motion": {
-        "MoveMotion": _TARGET,
-        "MoveTCPMotion": {**_TARGET, **_ARM, **_UNCHECKED},
-        "LookingMotion": _TARGET,
-        "MoveGripperMotion": {"motion": "text", **_GRIPPER, **_UNCHECKED},
-        "MoveArmJointsMotion": {},
-        "MoveJointsMotion": {},
-        "DetectingMotion": {"object_type": "text"},
-        "OpeningMotion": {"object_part_id": "object", **_ARM},
-        "ClosingMotion": {"object_part_id": "object", **_ARM},
-        "WorldStateDetectingMotion": {"object_type": "text"},
-        "AccessingMotion": {
-            "part_of_id": "object",
-            **_ARM,
-            **_GRIPPER,
-            "drawer_joint": "text",
-            "drawer_handle": "text",
-            "distance": "real",
-        },
-    },
-    "language": {
-        "Sequential": {},
-        "TryInOrder": {},
-        "Parallel": {},
-        "TryAll": {},
-        "Repeat": {"times": "integer"},
-        "Monitor": {"condition": "text", "interval_s": "real"},
-        "Code": {"function": "text"},
-        "Retry": {"max_tries": "integer"},
-    },
-}
-"""The columns of the built-in classes below `Designator`, by kind and class."""
 
 
 def mapped_leaves() -> list[Leaf]:
     """Return the tables of all classes below `Designator` that every memory of this process shares."""
     orm = sys.modules.get("pycrorm_async.orm")
     declared = [] if orm is None else [each for each in leaves_of(orm.Designator) if each.dtype is None]
-    return [*built_in_leaves(), *declared]
-
-
-def built_in_leaves() -> list[Leaf]:
-    """Return the tables of the built-in classes, without importing them."""
-    return [
-        Leaf(table_name(name), columns, name, kind)
-        for kind, classes in _BUILT_IN.items()
-        for name, columns in classes.items()
-    ]
+    return [*SCHEMA.leaves, *declared]
 
 
 def leaves_of(root: type[Designator]) -> Iterator[Leaf]:
     """Yield the tables of the classes below `root` and of itself, built-in or declared by a user."""
     from pycrorm_async.orm import Action, Designator, Language, Motion
+    from pycrorm_async.orm.base import is_built_in
 
     kinds = {Action: "action", Motion: "motion", Language: "language"}
     roots = (Designator, *kinds)
@@ -135,13 +49,14 @@ def leaves_of(root: type[Designator]) -> Iterator[Leaf]:
             continue
         if table.metadata is not root.metadata:
             continue
-        columns = {str(each.name): _storage(each) for each in table.columns if each.name not in ("id", EPISODE)}
-        built_in = mapper.class_.__module__.startswith("pycrorm_async.orm.")
+        columns = {str(each.name): column_storage(each) for each in table.columns if each.name not in ("id", EPISODE)}
+        built_in = is_built_in(mapper.class_)
         kind = next((kind for root, kind in kinds.items() if issubclass(mapper.class_, root)), None)
         yield Leaf(str(table.name), columns, mapper.class_.__name__ if built_in else None, kind if built_in else None)
 
 
-def _storage(column: Column[object]) -> Storage:
+def column_storage(column: Column[Any]) -> Storage:
+    """Return the storage of a mapped parameter."""
     for key in column.foreign_keys:
         target = key.target_fullname
         if target in ("pose.id", "object.id"):

@@ -11,11 +11,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
-from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
-import msgspec
 from sqlalchemy import (
     Column,
     ColumnElement,
@@ -411,19 +408,3 @@ def _united(parts: Sequence[Select[Any]]) -> View:
 def _labelled(column: Column[Any]) -> ColumnElement[Any]:
     """Return the column under its name in the view."""
     return column if column.name == column.key else column.label(column.key)
-
-
-# === comments =================================================================================================
-#
-# Load the comments on views and columns, which PostgreSQL keeps.
-#
-# `python -m pycrorm_async.orm.documentation` writes the file from the docstrings of the mapped classes. It exists
-# because a process that makes tables, such as a daemon, does not load these classes.
-
-COMMENTS_FILE = Path(__file__).with_name("comments.json")
-
-
-@cache
-def comments() -> dict[str, dict[str, str]]:
-    """Return the texts by view and column; the text under the empty name is the view's own."""
-    return msgspec.json.decode(COMMENTS_FILE.read_bytes(), type=dict[str, dict[str, str]])

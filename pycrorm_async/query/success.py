@@ -16,9 +16,9 @@ from sqlalchemy import Select, Text, column, inspect, select, table, type_coerce
 from sqlalchemy.ext.asyncio import AsyncConnection
 from sqlalchemy.orm import DeclarativeBase
 
-from pycrorm_async import orm
 from pycrorm_async.errors import CallerError, MissingExtra
-from pycrorm_async.orm.base import EPISODE
+from pycrorm_async.orm import Designator
+from pycrorm_async.orm.base import EPISODE, Base, is_built_in
 from pycrorm_async.orm.documentation import unit_of
 from pycrorm_async.query.frames import NORMAL_95, TRIED, FrameColumn, columns_of
 from pycrorm_async.query.reading import Reading
@@ -299,7 +299,7 @@ async def success_samples(
         columns = {each.name: each for each in columns_of(statement, deferred=True)}
         wanted = [_column(each, columns, name) for each in (x, y, "status")]
         whole_class = statement.column_descriptions[0]["expr"]
-        if isinstance(whole_class, type) and issubclass(whole_class, orm.Designator):  # not that of a field `status`
+        if isinstance(whole_class, type) and issubclass(whole_class, Designator):  # not that of a field `status`
             wanted[2] = wanted[2]._replace(expression=type_coerce(whole_class._status, Text()))  # noqa: SLF001
         if episodes is not None:
             statement = statement.where(_column(EPISODE, columns, name).expression.in_(episodes))
@@ -329,10 +329,13 @@ async def _statement(reading: Reading, connection: AsyncConnection, of: Source) 
         return "the select", of
     if not isinstance(of, str):
         return of.__name__, select(of)
-    mapped = {each: getattr(orm, each) for each in orm.__all__ if hasattr(getattr(orm, each), "__tablename__")}
-    by_table = {each.__tablename__: each for each in mapped.values()}
-    if (class_ := mapped.get(of) or by_table.get(of)) is not None:
-        return of, select(class_)
+    mapped: dict[str, Any] = {}
+    for mapper in sorted(Base.registry.mappers, key=lambda each: len(each.class_.__mro__)):
+        if is_built_in(mapper.class_):  # of the classes that share a view, the first one is their base
+            mapped[mapper.class_.__name__] = mapper.class_
+            mapped.setdefault(str(mapper.class_.__table__.name), mapper.class_)
+    if of in mapped:
+        return of, select(mapped[of])
     names = await connection.run_sync(lambda sync: inspect(sync).get_view_names())
     if of in names:
         described = await connection.run_sync(lambda sync: inspect(sync).get_columns(of))

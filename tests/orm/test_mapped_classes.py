@@ -32,7 +32,7 @@ from pycrorm_async.plan import (
     motions,
 )
 from pycrorm_async.projections.columns import Layout
-from pycrorm_async.projections.mapped_tables import built_in_leaves, leaves_of, mapped_leaves
+from pycrorm_async.projections.mapped_tables import mapped_leaves
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.record.declarations import declared_type
 from pycrorm_async.store.log import EventLog
@@ -78,10 +78,6 @@ def test_every_declaration_of_a_plan_fits_into_the_tables_of_the_classes(designa
     layout = Layout().with_leaves(mapped_leaves())
     declaration = declared_type(designator).declaration
     assert layout.with_declaration(declaration) == layout
-
-
-def test_the_listed_tables_are_those_of_the_classes() -> None:
-    assert built_in_leaves() == [each for each in leaves_of(Designator) if each.dtype is not None]
 
 
 _LIGHT = """

@@ -21,6 +21,7 @@ from pycrorm_async.projections.views import public_views
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from tests.databases import ask
+from tests.golden.definitions import FILE, changed
 from tests.projections.event_script import PICK_UP, SAYING, append_and_fold, declared, field
 from tests.projections.rebuild_cases import TYPES, picking, traces
 from tests.table_comparison import differences, tables_of
@@ -223,6 +224,13 @@ def test_a_new_type_changes_only_the_views_that_show_its_rows() -> None:
 
     assert changed(before.with_declaration(telling)) == {"telling_action"}
     assert changed(before.with_declaration(shouting)) == {"shouting_action", "saying_action", "designator"}
+
+
+def test_a_changed_table_or_view_is_noticed_and_a_changed_table_raises_the_version() -> None:
+    before = FILE.read_text().splitlines()
+    tables = {each for each in changed(before) if each.startswith("table ")}
+    assert not tables or "version" in changed(before), f"raise PROJECTION_VERSION: {tables} changed"
+    assert changed(before) == set(), "run python -m tests.golden.definitions"
 
 
 # === table names ==============================================================================================

@@ -15,7 +15,7 @@ from pycrorm_async import Memory, Reading
 from pycrorm_async.events.types import EpisodeStatus, NodeStatus
 from pycrorm_async.live.follower import LogFollower
 from pycrorm_async.memory import SyncMemory
-from pycrorm_async.projections.views import comments
+from pycrorm_async.projections.columns import SCHEMA
 from pycrorm_async.query.success import Samples, Values, interval_95, success_figure
 from pycrorm_async.recall.recall import Recall
 from pycrorm_async.report.write import newest_episodes, outcomes_of, overview_document
@@ -245,7 +245,7 @@ def test_a_failure_and_a_success_at_one_place_are_both_drawn() -> None:
 
 
 def test_no_two_columns_of_a_view_have_the_same_comment_but_the_parts_of_one_vector() -> None:
-    for view, texts in comments().items():
+    for view, texts in SCHEMA.comments.items():
         names: dict[str, list[str]] = {}
         for column, text in texts.items():
             names.setdefault(text, []).append(column)
@@ -255,7 +255,7 @@ def test_no_two_columns_of_a_view_have_the_same_comment_but_the_parts_of_one_vec
 
 
 def test_the_columns_of_the_robot_in_the_frame_of_the_object_say_so() -> None:
-    texts = comments()["PickUpWithContextView"]
+    texts = SCHEMA.comments["PickUpWithContextView"]
     robot = [name for name, text in texts.items() if "robot's base in the object's own frame" in text]
     assert robot == [f"robot_in_object_{each}" for each in ("x", "y", "z", "qx", "qy", "qz", "qw")]
     assert json.dumps(texts["object_x"]).count("robot_in_object_x") == 1

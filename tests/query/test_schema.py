@@ -11,8 +11,9 @@ import pytest
 
 from pycrorm_async.errors import CallerError
 from pycrorm_async.orm.base import Base, Moment
-from pycrorm_async.orm.documentation import comments, described
-from pycrorm_async.projections.views import comments as stored_comments
+from pycrorm_async.orm.documentation import described
+from pycrorm_async.orm.documentation import schema as declared_schema
+from pycrorm_async.projections.columns import SCHEMA
 from pycrorm_async.query.memory_schema import CORE_VIEWS, as_text, read_schema
 from pycrorm_async.query.reading import Reading
 from tests.commands import pycrorm
@@ -83,8 +84,8 @@ def test_the_command_prints_text_json_and_a_diagram(url: str, tmp_path: Path) ->
     assert (wrong.returncode, wrong.stderr) == (2, "pycrorm: this memory has no view 'posse'; did you mean pose?\n")
 
 
-def test_the_stored_comments_are_those_of_the_docstrings() -> None:
-    assert stored_comments() == comments(), "run python -m pycrorm_async.orm.documentation"
+def test_the_file_with_tables_and_comments_is_that_of_the_mapped_classes() -> None:
+    assert declared_schema() == SCHEMA, "run python -m pycrorm_async.orm.documentation"
 
 
 def commented(url: str) -> dict[tuple[str, str], str]:
