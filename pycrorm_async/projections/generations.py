@@ -199,8 +199,8 @@ async def delete_generation(connection: AsyncConnection, name: str) -> None:
 
 async def make_generation(connection: AsyncConnection, number: int) -> Generation:
     """Create the tables that every memory has, in a generation of this number. `show` makes them visible."""
-    await dialect_of(connection).make_place(connection)
-    await connection.exec_driver_sql(_CREATE)
+    dialect = dialect_of(connection)
+    await dialect.execute_all(connection, [*dialect.place, _CREATE])
     await make_empty(connection, CORE | OF_NO_EPISODE, number)
     return Generation(number, 0, Layout(), {})
 

@@ -58,7 +58,7 @@ from pycrorm_async.projections.generations import (
 from pycrorm_async.projections.row_batch import Designators
 from pycrorm_async.store.dialect import Progress, RowRefused
 from pycrorm_async.store.dialects import dialect_of
-from pycrorm_async.store.log import EventLog
+from pycrorm_async.store.log import EventLog, advance_folded, park
 from pycrorm_async.store.stored import EpisodeRow, Span, StoredEvent, beyond, consecutive, pages_of, share_out, size_of
 
 LOOKAHEAD_EVENTS_MIN: Final = 2_000
@@ -573,15 +573,13 @@ class LiveTarget:
         self.log = log
 
     async def behind(self, after: int, limit: int) -> list[EpisodeRow]:
-        async with self.log.reading() as connection:
-            return await dialect_of(connection).behind(connection, after=after, limit=limit)
+        return await self.log.behind(after, limit)
 
     async def advance(self, connection: AsyncConnection, steps: Sequence[Progress], parked: Mapping[int, str]) -> bool:
-        dialect = dialect_of(connection)
-        if steps and await dialect.advance_folded(connection, steps) != len(steps):
+        if steps and not await advance_folded(connection, steps):
             return False
         for number, reason in parked.items():
-            await dialect.park(connection, number, reason)
+            await park(connection, number, reason)
         return True
 
     async def generation(self, connection: AsyncConnection, hold: Hold | None) -> Generation:

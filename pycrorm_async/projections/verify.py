@@ -53,10 +53,10 @@ from pycrorm_async.projections.generations import (
 from pycrorm_async.projections.node_row import STATUS
 from pycrorm_async.projections.pipeline import Batch
 from pycrorm_async.projections.row_batch import CannotFold, Designators, Rows
+from pycrorm_async.store import schema
 from pycrorm_async.store.address import no_tables
-from pycrorm_async.store.append import has_digests
 from pycrorm_async.store.dialects import dialect_of
-from pycrorm_async.store.log import EventLog, read_episodes
+from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.stored import (
     BLOCK_EVENTS,
     EpisodeRow,
@@ -179,9 +179,13 @@ def _behind(digest: str, sequence: int) -> RunningDigest | None:
         return None
 
 
+async def _has_digests(connection: AsyncConnection) -> bool:
+    return (await dialect_of(connection).table_state(connection, schema.DIGEST)).readable
+
+
 async def read_kept(connection: AsyncConnection, episodes: EpisodeRange) -> dict[int, dict[int, str]]:
     """Read the digests kept of these episodes, by number and sequence."""
-    if not await has_digests(dialect_of(connection), connection):
+    if not await _has_digests(connection):
         return {}
     rows = await connection.execute(_KEPT, episodes.limits)
     by_number = groupby(rows, key=lambda each: int(each.episode))
@@ -190,7 +194,7 @@ async def read_kept(connection: AsyncConnection, episodes: EpisodeRange) -> dict
 
 async def check_places(connection: AsyncConnection, limits: Mapping[str, int], result: VerifyResult) -> None:
     """Report digests of events and of episodes that the log does not have: they were deleted."""
-    if not await has_digests(dialect_of(connection), connection):
+    if not await _has_digests(connection):
         return
     for (number,) in await connection.execute(_WITHOUT_EPISODE, limits):
         result.add_deleted(number, None, f"episode {number} was deleted: the log has its digests and not its events")
@@ -204,12 +208,12 @@ async def check_outside(
 ) -> None:
     """Compare the kept digests with digests kept outside of the memory; with `episode`, those of it alone."""
     async with log.snapshot() as connection:
-        dialect = dialect_of(connection)
-        readable = await has_digests(dialect, connection)
+        readable = await _has_digests(connection)
         for each in digests:
             if episode is not None and episode.id != each.id:
                 continue
-            row = await dialect.episode(connection, each.id)
+            heads = await dialect_of(connection).rows(connection, EpisodeRow, schema.SELECT_HEADS, ids=[(each.id,)])
+            row: EpisodeRow | None = next(iter(heads), None)
             if row is None:
                 result.add_damage(
                     None, None, f"episode {each.id} is missing: a digest at event {each.sequence} is given"
@@ -430,8 +434,8 @@ async def _check_part(
     missing = ""
     for _ in range(_ATTEMPTS):
         async with log.snapshot() as connection:
-            clauses = "WHERE number >= :first AND number < :end ORDER BY number LIMIT :limit"
-            episodes = await read_episodes(connection, clauses, **within.limits, limit=_PART_EVENTS)
+            limits = {"first": within.first, "last": within.limits["end"] - 1, "limit": _PART_EVENTS}
+            episodes = await dialect_of(connection).rows(connection, EpisodeRow, schema.SELECT_EPISODES, **limits)
             episodes, left = _first_part(episodes, within)
             part = within if left is None else EpisodeRange(within.first, left.first)
             for check in checks:

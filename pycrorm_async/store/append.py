@@ -30,20 +30,20 @@ from hashlib import sha256
 from types import MappingProxyType
 from typing import Any, Final, NamedTuple, Protocol
 
-import msgspec
-from sqlalchemy import bindparam, inspect, text
 from sqlalchemy.ext.asyncio import AsyncConnection
 
-from pycrorm_async.errors import DamageError, LogDamaged, LogWentBack
+from pycrorm_async.errors import DamageError, InternalError, LogDamaged, LogWentBack
 from pycrorm_async.events.codec import DECLARATION_TYPES, Record, fingerprint, is_computed_end
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX, EpisodeId, episode_text
 from pycrorm_async.events.types import Blob, BlobReference, references_in
-from pycrorm_async.store.dialect import Dialect, Insertion
+from pycrorm_async.store import schema
+from pycrorm_async.store.dialect import DECLARATIONS, Dialect, Insertion, RowRefused
 from pycrorm_async.store.stored import (
     BLOCK_EVENTS,
     DigestRow,
     EpisodeRow,
     RunningDigest,
+    Span,
     Stored,
     StoredEvent,
 )
@@ -231,15 +231,6 @@ def _declaration(record: Record) -> bytes:
 _EPISODES_MAX: Final = 1_000
 """Bounds the running digests that a process keeps, half a kilobyte each; without one, a block is read again."""
 
-_AT = text("SELECT digest FROM pycrorm_digest WHERE episode = :number AND sequence = :sequence")
-_LAST = text("""
-SELECT episode, sequence, digest
-FROM (
-    SELECT episode, max(sequence) AS sequence FROM pycrorm_digest
-    WHERE episode BETWEEN :first AND :last GROUP BY episode
-) AS last
-JOIN pycrorm_digest USING (episode, sequence) WHERE episode BETWEEN :first AND :last""")
-
 
 class Extension:
     """The digests after an append: rows to insert, and running digests by number; None: the episode gets no digests."""
@@ -269,7 +260,7 @@ class RunningDigests:
     async def begin(self, connection: AsyncConnection, rows: Iterable[EpisodeRow]) -> Extension | None:
         """Begin an append to the episodes of these rows; None if digests cannot be stored."""
         if self._insertable is None:
-            self._insertable = await has_digests(self._dialect, connection, insert=True)
+            self._insertable = (await self._dialect.table_state(connection, schema.DIGEST)).insertable
         if not self._insertable:
             return None
         return Extension({each.number: await self._at_head(connection, each) for each in rows})
@@ -278,9 +269,8 @@ class RunningDigests:
         """Insert the digests in the transaction that appends the events."""
         if not extension.rows:
             return
-        rows = msgspec.json.encode(extension.rows).decode()
         try:
-            await connection.exec_driver_sql(self._dialect.digest_statements.insert, (rows,))
+            await self._dialect.execute(connection, schema.INSERT_DIGESTS, digests=extension.rows)
         except BaseException:
             self._insertable = None  # a database that was restored meanwhile may lack the table
             raise
@@ -301,34 +291,14 @@ class RunningDigests:
         if start == 0:
             running = RunningDigest.at_start(row.identity)
         else:
-            at_start = (await connection.execute(_AT, {"number": row.number, "sequence": start})).scalar()
+            at = {"number": row.number, "sequence": start}
+            at_start = (await self._dialect.execute(connection, schema.SELECT_DIGEST, **at)).scalar()
             if at_start is None:
                 return None
             running = RunningDigest(bytes.fromhex(at_start), start)
         if row.head > start:
-            events = await self._dialect.events(connection, row.number, after=start, limit=row.head - start)
-            running.add(events)
+            running.add(await self._dialect.spans(connection, [Span(row.number, start, row.head)]))
         return running if running.sequence == row.head else None  # else events are missing, which `verify` reports
-
-
-async def create_digest_table(dialect: Dialect, connection: AsyncConnection) -> None:
-    """Create the table in the transaction that opens the log, unless it exists or this login may not."""
-    if (await connection.exec_driver_sql(dialect.digest_statements.creatable)).scalar_one():
-        await dialect.execute_all(connection, dialect.digest_statements.table)
-
-
-async def has_digests(dialect: Dialect, connection: AsyncConnection, *, insert: bool = False) -> bool:
-    """Return whether the table exists and this login may read it, and with `insert` also extend it."""
-    row = (await connection.exec_driver_sql(dialect.digest_statements.usable)).one()
-    return bool(row[1 if insert else 0])
-
-
-async def last_digests(dialect: Dialect, connection: AsyncConnection, first: int, last: int) -> dict[int, DigestRow]:
-    """Read the last digest of each episode from number `first` to `last`, by number."""
-    if not await has_digests(dialect, connection):
-        return {}
-    rows = await connection.execute(_LAST, {"first": first, "last": last})
-    return {each.episode: DigestRow(*each) for each in rows}
 
 
 # === append ===================================================================================================
@@ -385,8 +355,7 @@ class Appending:
         """
         batch, dialect = self._batch, self._dialect
         if batch.declarations:
-            named = [(name, payload.decode()) for name, payload in batch.declarations.items()]
-            await dialect.insert_declarations(connection, named)
+            await _insert_declarations(dialect, connection, batch.declarations)
         if not batch.episodes:
             await dialect.force_durable_commit(connection)  # all declarations may be repeats
             return Stored({}, {})
@@ -396,10 +365,14 @@ class Appending:
             plan = await self._make_plan(connection, known_rows)
         changed = [each.after for identity, each in plan.steps.items() if each.after != known_rows[identity]]
         if changed:
-            await dialect.upsert_episodes(connection, changed)
+            rows = [(*row[:3], row.started_wall_ns, row.ended_wall_ns, row.refused) for row in sorted(changed)]
+            await dialect.execute(connection, schema.UPSERT_EPISODES, rows=rows)
             self.warnings = warnings_of(changed)
         if any(each.fresh for each in plan.steps.values()):
-            await dialect.insert_events(connection, plan.insertion)
+            try:
+                await dialect.insert(connection, plan.insertion)
+            except RowRefused as error:
+                raise InternalError(f"events behind the head of their episode are stored already: {error}") from error
             if self._digests is not None and plan.digests is not None:
                 await self._digests.insert(connection, plan.digests)
                 self.extension = plan.digests
@@ -416,19 +389,22 @@ class Appending:
         steps = {each: step(self._batch.episodes[each], row) for each, row in known_rows.items()}
         extending = [known_rows[each] for each, change in steps.items() if change.fresh]
         digests = None if self._digests is None else await self._digests.begin(connection, extending)
-        insertion = await self._dialect.event_insertion(_rows(steps.values(), digests))
+        insertion = await self._dialect.insertion({("event", schema.EVENT_COLUMNS): _rows(steps.values(), digests)})
         return _Plan(known_rows, steps, insertion, digests)
 
     async def _read_rows(self, connection: AsyncConnection) -> dict[EpisodeId, EpisodeRow]:
         """Read the rows of the batch's episodes, without `folded` and `parked`, which folding changes meanwhile."""
         names = {episode_text(each): each for each in self._batch.episodes}
         witness, confirmed = self._witness or (None, 0)
-        witness_name = None if witness is None else episode_text(witness)
-        rows = await self._dialect.episodes_by_id(connection, list(names), witness=witness_name)
-        if witness_name is not None:
-            head = max((row.head for row in rows if row.id == witness_name), default=0)
+        ids = [(each,) for each in names]
+        if witness is None:
+            rows = await self._dialect.rows(connection, EpisodeRow, schema.LOCK_EPISODES, ids=ids)
+        else:
+            name, statement = episode_text(witness), schema.LOCK_EPISODES_AND_READ_WITNESS
+            rows = await self._dialect.rows(connection, EpisodeRow, statement, ids=ids, witness=name)
+            head = max((row.head for row in rows if row.id == name), default=0)
             if head < confirmed:
-                raise LogWentBack(witness_name, confirmed, head)
+                raise LogWentBack(name, confirmed, head)
         return {names[row.id]: row._replace(folded=0, parked=None) for row in rows if row.id in names}
 
     async def _read_or_create_rows(
@@ -448,7 +424,10 @@ class Appending:
 
     async def _assign_numbers(self, connection: AsyncConnection, missing: Sequence[EpisodeId]) -> dict[EpisodeId, int]:
         own = {each: self._numbers[each] for each in missing if each in self._numbers}
-        taken = await self._dialect.numbers_taken(connection, list(own.values())) if own else set()
+        taken: set[int] = set()
+        if own:
+            asked = [(number,) for number in own.values()]
+            taken.update((await self._dialect.execute(connection, schema.SELECT_NUMBERS, numbers=asked)).scalars())
         numbers = {each: number for each, number in own.items() if number not in taken}
         new = [each for each in missing if each not in numbers]
         if new:
@@ -486,12 +465,27 @@ def _has_unstored(batch: SortedBatch, episode: EpisodeId, change: EpisodeStep) -
     return len(change.fresh) + len(change.again) + change.skipped_ends < len(batch.episodes[episode])
 
 
+async def _insert_declarations(
+    dialect: Dialect, connection: AsyncConnection, declarations: Mapping[str, bytes]
+) -> None:
+    """Insert the declarations that are not stored yet.
+
+    Transactions with new declarations take turns, so that their order by `ordinal` is that of their commits. Otherwise
+    a fold could read the second before the first, and name contradicting fields otherwise than a rebuild.
+    """
+    named = [(place, name, payload.decode()) for place, (name, payload) in enumerate(declarations.items())]
+    stored = set((await dialect.execute(connection, schema.SELECT_DECLARED, named=named)).scalars())
+    if len(stored) < len(named):
+        await dialect.lock_log_changes(connection, DECLARATIONS)
+        await dialect.execute(connection, schema.INSERT_DECLARATIONS, named=named)
+
+
 async def _compare(dialect: Dialect, connection: AsyncConnection, steps: Sequence[EpisodeStep]) -> None:
     if not steps:
         return
     keys = [(each.after.number, record.sequence) for each in steps for record in each.again]
     stored: dict[int, dict[int, StoredEvent]] = {}
-    for event in await dialect.events_by_key(connection, keys):
+    for event in await dialect.rows(connection, StoredEvent, schema.SELECT_EVENTS_BY_KEY, keys=keys):
         stored.setdefault(event.number, {})[event.sequence] = event
     for each in steps:
         sequence = differing(each.again, stored.get(each.after.number, {}))
@@ -562,19 +556,6 @@ def warnings_of(episodes: Sequence[EpisodeRow]) -> dict[str, str]:
 
 PART_BYTES: Final = 4 * 2**20
 """Bounds one row and transaction: SQLite's write lock is held for some ten milliseconds."""
-_HASHES_MAX: Final = 500
-"""Bounds the blobs that one statement asks for."""
-
-_EXISTS: Final = "pycrorm_blob"
-_INSERT = text(
-    "INSERT INTO pycrorm_blob (hash, part, parts, media_type, size, content)"
-    " VALUES (:hash, :part, :parts, :media_type, :size, :content) ON CONFLICT DO NOTHING"
-)
-_COMPLETE = text("SELECT hash FROM pycrorm_blob WHERE hash IN :hashes AND part = parts - 1").bindparams(
-    bindparam("hashes", expanding=True)
-)
-_SELECT = text("SELECT parts, media_type, content FROM pycrorm_blob WHERE hash = :hash AND part = :part")
-
 _log = logging.getLogger("pycrorm_async")
 
 
@@ -618,29 +599,28 @@ class Blobs:
     async def add(self, reference: BlobReference, content: bytes) -> None:
         """Store a blob; its parts that are stored already stay unchanged."""
         parts = max(1, -(-len(content) // PART_BYTES))
-        await self._create_table()
         for part in range(parts):
-            row = {
-                "hash": reference.hash,
-                "part": part,
-                "parts": parts,
-                "media_type": reference.media_type.replace("\0", ""),
-                "size": len(content),
-                "content": content[part * PART_BYTES : (part + 1) * PART_BYTES],
-            }
             async with self._writing() as connection:
-                await connection.execute(_INSERT, row)
+                if part == 0:
+                    await self._dialect.create_if_missing(connection, schema.BLOB)
+                await self._dialect.execute(
+                    connection,
+                    schema.INSERT_BLOB,
+                    hash=reference.hash,
+                    part=part,
+                    parts=parts,
+                    media_type=reference.media_type.replace("\0", ""),
+                    size=len(content),
+                    content=content[part * PART_BYTES : (part + 1) * PART_BYTES],
+                )
 
     async def complete(self, hashes: Iterable[str]) -> set[str]:
         """Return those of these blobs that are stored completely."""
-        names = list(hashes)
-        stored: set[str] = set()
         async with self._reading() as connection:
-            if await _has_table(connection):
-                for start in range(0, len(names), _HASHES_MAX):
-                    part = {"hashes": names[start : start + _HASHES_MAX]}
-                    stored.update((await connection.execute(_COMPLETE, part)).scalars())
-        return stored
+            if not await self._exists(connection):
+                return set()
+            asked = [(each,) for each in hashes]
+            return set((await self._dialect.execute(connection, schema.SELECT_COMPLETE_BLOBS, hashes=asked)).scalars())
 
     async def read(self, name: str) -> Blob | None:
         """Return a stored blob; None if it is missing or incomplete."""
@@ -670,28 +650,19 @@ class Blobs:
         part, parts = 0, 1
         while part < parts:
             async with self._reading() as connection:
-                if not await _has_table(connection):
+                if not await self._exists(connection):
                     return
-                row = (await connection.execute(_SELECT, {"hash": name, "part": part})).first()
+                row = (await self._dialect.execute(connection, schema.SELECT_BLOB, hash=name, part=part)).first()
             if row is None:
                 return
             parts, part = row.parts, part + 1
             yield _Part(parts, row.media_type, bytes(row.content))
 
-    async def _create_table(self) -> None:
-        async with self._reading() as connection:
-            if await _has_table(connection):
-                return
-        async with self._writing() as connection:
-            await self._dialect.lock_log_changes(connection)
-            await self._dialect.execute_all(connection, self._dialect.blob_table)
+    async def _exists(self, connection: AsyncConnection) -> bool:
+        return (await self._dialect.table_state(connection, schema.BLOB)).exists
 
 
 class _Part(NamedTuple):
     parts: int
     media_type: str
     content: bytes
-
-
-async def _has_table(connection: AsyncConnection) -> bool:
-    return await connection.run_sync(lambda each: inspect(each).has_table(_EXISTS))

@@ -2,19 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager
-from typing import Any, NamedTuple, Protocol, TypeAlias
+from functools import cached_property
+from itertools import chain
+from typing import Any, ClassVar, NamedTuple, TypeAlias
 
+import msgspec
+from sqlalchemy import CursorResult, Executable, Select, Table
+from sqlalchemy.engine.interfaces import Compiled
+from sqlalchemy.engine.interfaces import Dialect as Syntax
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
+from sqlalchemy.schema import CreateIndex, CreateTable
 
+from pycrorm_async.bulk_records import make
 from pycrorm_async.errors import PycrormError
-from pycrorm_async.store.stored import EpisodeRow, Incarnation, Span, StoredEvent
+from pycrorm_async.store import schema
+from pycrorm_async.store.stored import Span, StoredEvent
 
 Migrations: TypeAlias = Sequence[Sequence[str]]
 """Numbered steps; the first N of them create format N."""
 
-RowsByTable: TypeAlias = Mapping[tuple[str, tuple[str, ...]], Sequence[tuple[Any, ...]]]
+RowsByTable: TypeAlias = Mapping[tuple[str, tuple[str, ...]], Iterable[tuple[Any, ...]]]
 """Rows to insert, by table and its columns."""
 
 Insertion: TypeAlias = Any
@@ -22,6 +32,11 @@ Insertion: TypeAlias = Any
 
 Progress: TypeAlias = tuple[int, int, int]
 """An episode's number, its folded sequence before, and its folded sequence now."""
+
+LOG_CHANGES = 7266203370152417861
+"""Key of the lock that creations and migrations of a log, and changes of its tables, take. It encodes our name."""
+DECLARATIONS = LOG_CHANGES + 2
+"""Key of the lock that transactions with new declarations take."""
 
 
 class Birth(NamedTuple):
@@ -38,20 +53,13 @@ class LogIdentity(NamedTuple):
     format: int
 
 
-class DigestStatements(NamedTuple):
-    """The SQL of the table of digests, for the driver.
+class TableState(NamedTuple):
+    """Whether a table of the log exists, and whether this login may create it, read it and insert into it."""
 
-    Attributes:
-        table: creates the table and its triggers.
-        creatable: selects whether the table is missing and this login may create it.
-        usable: selects whether this login may read it, and whether it may insert into it.
-        insert: inserts rows, given as a JSON array of arrays, and skips keys that exist.
-    """
-
-    table: Sequence[str]
-    creatable: str
-    usable: str
-    insert: str
+    exists: bool
+    creatable: bool
+    readable: bool
+    insertable: bool
 
 
 class StoredOn(NamedTuple):
@@ -74,259 +82,230 @@ class Expected(NamedTuple):
     alike: Mapping[str, Sequence[int]]
 
 
-class Dialect(Protocol):
-    """One kind of database. Methods with a connection run in the caller's transaction, with one statement per table."""
+class Dialect(ABC):
+    """One kind of database. Methods with a connection run in the caller's transaction, with one statement per table.
 
-    # --- finding and creating a log -------------------------------------------------------------------------
+    Attributes:
+        syntax: SQLAlchemy's dialect, with which statements are compiled.
+        log_schema: the schema of the log's tables.
+        episode_id: SQL that reads an id from the table `episode`, as valid text even where it is damaged.
+        select_declarations: the query of the designator types' payloads, in the order of arrival.
+        begin_snapshot: the statement that makes a transaction that begins a snapshot, where it is none by itself.
+        place: the statements that create the schema of the tables made from the log, where there are schemas.
+        faults: the exceptions of the driver, and those SQLAlchemy raises for it.
+    """
 
-    migrations: Migrations
-    digest_statements: DigestStatements
-    blob_table: Sequence[str]
-    """Statements that create the table of the blobs unless it exists."""
-    episode_id: str
-    """SQL that reads an id from the table `episode`, as valid text even where it is damaged."""
+    syntax: Syntax
+    log_schema: ClassVar[str | None] = None
+    episode_id: ClassVar[str]
+    select_declarations: ClassVar[Select[Any]]
+    begin_snapshot: ClassVar[str | None] = None
+    place: ClassVar[Sequence[str]] = ()
+    faults: ClassVar[tuple[type[Exception], ...]]
 
-    async def prepare(self, engine: AsyncEngine, name: str) -> None:
+    def __init__(self) -> None:
+        self._compiled: dict[Executable, tuple[str, list[str], dict[str, Any]]] = {}
+
+    @cached_property
+    def migrations(self) -> Migrations:
+        """The statements that create the log, and those that bring it from each format to the next."""
+        return (tuple(chain.from_iterable(map(self.definition, schema.FORMAT_1))),)
+
+    # --- statements of the schema ---------------------------------------------------------------------------------
+
+    async def execute(self, connection: AsyncConnection, statement: Executable, **values: Any) -> CursorResult[Any]:
+        """Execute a constant of `store.schema`; a list is passed as a JSON array."""
+        compiled = self._compiled.get(statement)
+        if compiled is None:
+            text = self.compile(statement)
+            compiled = str(text), list(getattr(text, "positiontup", None) or ()), dict(text.params)
+            self._compiled[statement] = compiled
+        sql, names, constants = compiled
+        batches = {name: msgspec.json.encode(each).decode() for name, each in values.items() if isinstance(each, list)}
+        parameters = constants | values | batches
+        return await connection.exec_driver_sql(sql, tuple([parameters[each] for each in names]))
+
+    async def rows(self, connection: AsyncConnection, kind: Any, statement: Executable, **values: Any) -> list[Any]:
+        """Execute a query whose rows have the fields of this NamedTuple."""
+        return [make(kind, row) for row in await self.execute(connection, statement, **values)]
+
+    async def payloads(self, connection: AsyncConnection, statement: Executable, **values: Any) -> list[bytes]:
+        """Execute a query of payloads."""
+        return [bytes(row[0]) for row in await self.execute(connection, statement, **values)]
+
+    def compile(self, element: Any) -> Compiled:
+        """Compile a statement or the definition of a table of the log."""
+        names = {None: self.log_schema} if self.log_schema else None
+        compiled: Compiled = element.compile(
+            dialect=self.syntax, schema_translate_map=names, render_schema_translate=names is not None
+        )
+        return compiled
+
+    def definition(self, table: Table, *, if_missing: bool = False) -> list[str]:
+        """Return the statements that create a table of the log, with its indexes and triggers."""
+        indexes = sorted(table.indexes, key=lambda each: str(each.name))
+        creations = [CreateTable(table, if_not_exists=if_missing), *map(CreateIndex, indexes)]
+        return [*(str(self.compile(each)) for each in creations), *self.completion(table, if_missing=if_missing)]
+
+    async def create_if_missing(self, connection: AsyncConnection, table: Table) -> None:
+        """Create a table that is not part of the log's format. Raises for a login that may not, where it is missing."""
+        if not (await self.table_state(connection, table)).exists:
+            await self.lock_log_changes(connection)
+            await self.execute_all(connection, self.definition(table, if_missing=True))
+
+    async def declarations(self, connection: AsyncConnection) -> list[bytes]:
+        """Read the payloads of the designator types, in the order of arrival."""
+        return await self.payloads(connection, self.select_declarations)
+
+    async def descriptions(self, connection: AsyncConnection, fingerprints: Iterable[str]) -> list[bytes]:
+        """Read the payloads of those of these descriptions that are stored."""
+        named = [(each,) for each in fingerprints]
+        return await self.payloads(connection, schema.SELECT_DESCRIPTIONS, fingerprints=named)
+
+    # --- the log --------------------------------------------------------------------------------------------------
+
+    @abstractmethod
+    def completion(self, table: Table, *, if_missing: bool) -> list[str]:
+        """Return the statements behind the creation of a table, such as what refuses to change or delete its rows."""
+
+    async def prepare(self, engine: AsyncEngine, name: str) -> None:  # noqa: B027
         """Prepare a database, outside a transaction, for creating or migrating a log. Raises `DatabaseForeign`."""
-        ...
 
-    async def lock_log_changes(self, connection: AsyncConnection) -> None:
-        """Lock out other creations and migrations of a log here until the transaction ends."""
-        ...
+    async def lock_log_changes(self, connection: AsyncConnection, key: int = LOG_CHANGES) -> None:  # noqa: B027
+        """Lock out other holders of this lock until the transaction ends; on SQLite a writing transaction does so."""
 
+    @abstractmethod
     async def find_log(self, connection: AsyncConnection, name: str) -> LogIdentity | None:
         """Find the log in this database; None if it is empty. Raises `DatabaseForeign` and `DatabaseUnavailable`."""
-        ...
 
+    @abstractmethod
     async def execute_all(self, connection: AsyncConnection, statements: Sequence[str]) -> None:
         """Execute statements without parameters or results, in order; in one round trip if possible."""
-        ...
 
-    async def insert_log(self, connection: AsyncConnection, birth: Birth, format_now: int) -> None: ...
+    @abstractmethod
+    async def table_state(self, connection: AsyncConnection, table: Table) -> TableState:
+        """Return the state of a table of the log."""
 
-    async def set_format(self, connection: AsyncConnection, format_now: int) -> None: ...
-
-    # --- appending ----------------------------------------------------------------------------------------------
-
-    async def insert_declarations(self, connection: AsyncConnection, named: Sequence[tuple[str, str]]) -> None:
-        """Insert (fingerprint, payload) pairs; existing ones stay unchanged."""
-        ...
-
-    async def episodes_by_id(
-        self, connection: AsyncConnection, ids: Sequence[str], *, witness: str | None = None
-    ) -> list[EpisodeRow]:
-        """Read and lock these episodes' rows until the transaction ends, and read the witness's row without a lock.
-
-        If the witness is one of the episodes, its row may appear twice.
-        """
-        ...
-
+    @abstractmethod
     async def new_numbers(self, connection: AsyncConnection, count: int, *, above: int = 0) -> list[int]:
         """Return numbers above `above` that no episode has."""
-        ...
 
-    async def skip_numbers(self, connection: AsyncConnection, above: int) -> None:
+    async def skip_numbers(self, connection: AsyncConnection, above: int) -> None:  # noqa: B027
         """Skip the numbers up to `above` in a database that assigns numbers itself."""
-        ...
 
-    async def numbers_taken(self, connection: AsyncConnection, numbers: Sequence[int]) -> set[int]:
-        """Return those of these numbers that an episode has."""
-        ...
-
-    async def heads(self, connection: AsyncConnection, ids: Sequence[str]) -> list[EpisodeRow]:
-        """Read these episodes' rows without locks."""
-        ...
-
-    async def note_incarnation(self, connection: AsyncConnection, incarnation: Incarnation) -> None:
-        """Record that the log went back, in a table that is created if missing."""
-        ...
-
-    async def incarnations(self, connection: AsyncConnection) -> list[Incarnation]:
-        """Read each time the log went back, the oldest first; none if the table is missing."""
-        ...
-
-    async def stored_on(self, connection: AsyncConnection) -> StoredOn:
-        """Return the number of machines that hold an event when its COMMIT returns."""
-        ...
-
-    async def event_insertion(self, rows: Iterator[tuple[Any, ...]]) -> Insertion:
-        """Prepare the insertion of these events. A row has the fields of a `StoredEvent`, with the payload as text.
-
-        The rows are read now, or once while they are inserted.
-        """
-        ...
-
-    async def insert_events(self, connection: AsyncConnection, insertion: Insertion) -> None: ...
-
-    async def upsert_episodes(self, connection: AsyncConnection, episodes: Sequence[EpisodeRow]) -> None:
-        """Insert or update these rows, without `folded` and `parked`."""
-        ...
-
-    async def force_durable_commit(self, connection: AsyncConnection) -> None:
+    async def force_durable_commit(self, connection: AsyncConnection) -> None:  # noqa: B027
         """Make the COMMIT of a transaction without changes as durable as that of one with changes."""
-        ...
 
     async def commit(self, connection: AsyncConnection) -> None:
         """Commit. Raises `DatabaseUnavailable` if the commit may not be durable."""
-        ...
+        await connection.commit()
 
-    async def events_by_key(self, connection: AsyncConnection, keys: Sequence[tuple[int, int]]) -> list[StoredEvent]:
-        """Read the stored events under these keys (episode number, sequence)."""
-        ...
+    async def stored_on(self, connection: AsyncConnection) -> StoredOn:  # noqa: ARG002
+        """Return the number of machines that hold an event when its COMMIT returns."""
+        return StoredOn(1)
 
-    # --- reading ------------------------------------------------------------------------------------------------
-
-    async def episode(self, connection: AsyncConnection, identity: str) -> EpisodeRow | None: ...
-
-    async def episodes(self, connection: AsyncConnection, first: int, last: int) -> list[EpisodeRow]:
-        """Read the episodes with these numbers and those between them, by number."""
-        ...
-
-    async def behind(self, connection: AsyncConnection, *, after: int, limit: int) -> list[EpisodeRow]:
-        """Read the episodes with unfolded events whose number is above `after`, by number, without parked ones."""
-        ...
-
-    async def stopped(self, connection: AsyncConnection) -> list[EpisodeRow]: ...
-
-    async def last_number(self, connection: AsyncConnection) -> int:
-        """Return the highest episode number; 0 without episodes."""
-        ...
-
-    async def long_episodes(self, connection: AsyncConnection, events_min: int) -> list[EpisodeRow]:
-        """Read the episodes that have not ended and hold at least this many events."""
-        ...
-
-    async def events(
-        self, connection: AsyncConnection, number: int, *, after: int, limit: int
-    ) -> list[StoredEvent]: ...
-
+    @abstractmethod
     async def spans(self, connection: AsyncConnection, spans: Sequence[Span]) -> list[StoredEvent]:
         """Read the events of each span, in the order of the spans."""
-        ...
 
-    async def declarations(self, connection: AsyncConnection) -> list[bytes]:
-        """Read the designator types, in the order of arrival."""
-        ...
-
-    async def descriptions(self, connection: AsyncConnection, fingerprints: Sequence[str]) -> list[bytes]:
-        """Read those of these descriptions that are stored."""
-        ...
-
-    async def begin_snapshot(self, connection: AsyncConnection) -> None:
-        """Make the transaction that begins now a snapshot."""
-        ...
-
+    @abstractmethod
     async def keep(self, connection: AsyncConnection, tables: Sequence[str]) -> bool:
         """Protect these tables from being dropped until the transaction ends.
 
         Returns False if one is missing; the caller must not use the transaction any more then.
         """
-        ...
 
-    async def faults_of_file(self, connection: AsyncConnection) -> list[str]:
+    async def faults_of_file(self, connection: AsyncConnection) -> list[str]:  # noqa: ARG002
         """Return the errors that the database finds in its own pages, if it can check them."""
-        ...
-
-    # --- what a projector adds ----------------------------------------------------------------------------------
-
-    async def advance_folded(self, connection: AsyncConnection, steps: Sequence[Progress]) -> int:
-        """Advance `folded`; return the number of episodes that were at the given sequence before."""
-        ...
-
-    async def park(self, connection: AsyncConnection, number: int, reason: str | None) -> None: ...
+        return []
 
     # --- tables and views made from the log ---------------------------------------------------------------------
 
-    async def make_place(self, connection: AsyncConnection) -> None:
-        """Create the schema for tables and views, if the database has schemas."""
-        ...
-
+    @abstractmethod
     async def has_table(self, connection: AsyncConnection, name: str, *, to_change: bool = False) -> bool:
         """Return whether a derived table of this name exists.
 
         Raises `TablesUntrusted`, and `TablesWithheld` for a login that appends and may not read or change the tables.
         """
-        ...
 
-    async def expect(self, connection: AsyncConnection, tables: Sequence[Expected]) -> None:
-        """Give the query planner statistics of tables that are still empty."""
-        ...
+    async def expect(self, connection: AsyncConnection, tables: Sequence[Expected]) -> None:  # noqa: B027
+        """Give the query planner statistics of tables that are still empty, if it gathers none itself."""
 
-    async def gather_statistics(self, connection: AsyncConnection, tables: Sequence[str]) -> None:
+    async def gather_statistics(self, connection: AsyncConnection, tables: Sequence[str]) -> None:  # noqa: B027
         """Count and sample the rows of tables that have been filled, for the query planner, if it needs that."""
-        ...
 
     def stored_column(self, name: str) -> str:
         """Return the table's column for a view's column: another name if the database reserves this one."""
-        ...
+        return name
 
+    @abstractmethod
     async def add_column(self, connection: AsyncConnection, table: str, definition: str) -> None:
         """Add a column; fail soon if a reader holds a lock, because later readers queue behind this statement."""
-        ...
 
-    async def only_views(self, connection: AsyncConnection, views: Collection[str]) -> None:
+    async def only_views(self, connection: AsyncConnection, views: Collection[str]) -> None:  # noqa: B027
         """Raise `DatabaseError` if the views' schema contains other objects, which `replace_views` would drop."""
-        ...
 
+    @abstractmethod
     async def replace_views(
         self, connection: AsyncConnection, before: Mapping[str, str], after: Mapping[str, str]
     ) -> None:
         """Replace views, by name and SQL, without affecting running queries. A view may use earlier ones of `after`."""
-        ...
 
-    async def comment_views(self, connection: AsyncConnection, comments: Mapping[str, Mapping[str, str]]) -> None:
+    async def comment_views(  # noqa: B027
+        self, connection: AsyncConnection, comments: Mapping[str, Mapping[str, str]]
+    ) -> None:
         """Describe views and columns in the database, if it keeps comments: texts by column, the view's own by "".
 
         Views and columns that do not exist are skipped.
         """
-        ...
 
-    async def sweep(self, connection: AsyncConnection) -> None:
+    async def sweep(self, connection: AsyncConnection) -> None:  # noqa: B027
         """Drop replaced views that no query reads and no other view uses. Does not wait for locks."""
-        ...
 
-    async def empty(self, connection: AsyncConnection, table: str, *, rows_max: int) -> bool:
+    async def empty(self, connection: AsyncConnection, table: str, *, rows_max: int) -> bool:  # noqa: ARG002
         """Delete some rows of a table before it is dropped; False when dropping it is fast enough now."""
-        ...
+        return False
 
+    @abstractmethod
     async def drop(self, connection: AsyncConnection, table: str) -> None:
         """Drop a table. Fails soon if a lock is held, and if a foreign view uses the table."""
-        ...
 
+    @abstractmethod
     def claim(self, engine: AsyncEngine) -> AbstractAsyncContextManager[bool]:
         """Claim the right to rebuild tables until the context ends or the process dies; yields False if it is taken."""
-        ...
 
+    @abstractmethod
     async def shadow_views(self, connection: AsyncConnection, views: Mapping[str, str]) -> None:
         """Create views that hide those of the same names, for this connection only, until it is closed.
 
         Must be first in the transaction. A view may use those before it.
         """
-        ...
 
+    # --- rows -------------------------------------------------------------------------------------------------------
+
+    @abstractmethod
     async def insertion(self, rows: RowsByTable) -> Insertion:
-        """Prepare the insertion of these rows, before the transaction, so that it is short. Yields to other tasks."""
-        ...
+        """Prepare the insertion of these rows, before the transaction, so that it is short. Yields to other tasks.
 
+        The rows are read now, or once while they are inserted. Those of the table `event` have their payload as text.
+        """
+
+    @abstractmethod
     async def insert(self, connection: AsyncConnection, insertion: Insertion) -> None:
         """Insert the prepared rows. Raises `RowRefused`."""
-        ...
 
+    @abstractmethod
     async def update_rows(
         self, connection: AsyncConnection, table: str, columns: Mapping[str, str], rows: Sequence[tuple[Any, ...]]
     ) -> None:
         """Update rows by id. `columns` maps names to SQL types; the first is the id. Raises `RowRefused`."""
-        ...
 
     # --- faults -------------------------------------------------------------------------------------------------
 
-    faults: tuple[type[Exception], ...]
-    """The exceptions of the driver, and those SQLAlchemy raises for it."""
-
+    @abstractmethod
     def refusal(self, error: Exception) -> str | None:
         """Return the reason why the database can never create such a table or view; None for a temporary error."""
-        ...
 
+    @abstractmethod
     def translate_error(self, error: Exception, name: str) -> PycrormError:
         """Return the error of this package to raise instead."""
-        ...

@@ -21,7 +21,7 @@ from types import MappingProxyType
 from typing import Any
 
 import msgspec
-from sqlalchemy import BindParameter, ColumnElement, Select, bindparam, column, func, select, table, text
+from sqlalchemy import ColumnElement, Executable, Select, func, select
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.clock import SYSTEM_CLOCK, Clock
@@ -30,15 +30,14 @@ from pycrorm_async.events.codec import Record, declared_dtype, fingerprint
 from pycrorm_async.events.fields import retagged
 from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, EpisodeId, episode_text, is_episode_id
 from pycrorm_async.settings import FILE_MODES, FileAccess
+from pycrorm_async.store import schema
 from pycrorm_async.store.address import BUSY_TIMEOUT_S, DatabaseAddress
 from pycrorm_async.store.append import (
     EVENTS_MANY,
     Appending,
     Blobs,
     RunningDigests,
-    create_digest_table,
     events_warning,
-    last_digests,
     number_warning,
 )
 from pycrorm_async.store.dialect import Birth, Dialect, LogIdentity, Migrations, Progress, StoredOn
@@ -51,9 +50,7 @@ from pycrorm_async.store.stored import (
     Span,
     Stored,
     StoredEvent,
-    beyond,
     consecutive,
-    share_out,
 )
 
 _log = logging.getLogger("pycrorm_async")
@@ -186,8 +183,8 @@ class EventLog:
     async def heads(self, episodes: Sequence[EpisodeId]) -> dict[EpisodeId, EpisodeRow]:
         """Read the rows of these episodes, without those that have no stored event."""
         names = {episode_text(each): each for each in episodes}
-        async with self.reading() as connection:
-            return {names[row.id]: row for row in await self._dialect.heads(connection, list(names))}
+        rows = await self.read(EpisodeRow, schema.SELECT_HEADS, ids=[(each,) for each in names])
+        return {names[row.id]: row for row in rows}
 
     async def skip_numbers(self, above: int) -> None:
         """Never assign the numbers up to `above` to new episodes."""
@@ -199,12 +196,16 @@ class EventLog:
         """Record that the log went back. Raises `DatabaseError` also if this role lacks the privilege."""
         with self.translated():
             async with self.writing() as connection:
-                await self._dialect.note_incarnation(connection, Incarnation(noticed_wall_ns, noticed_by, reason))
+                await self._dialect.create_if_missing(connection, schema.INCARNATION)
+                incarnation = Incarnation(noticed_wall_ns, noticed_by, reason)
+                await self._dialect.execute(connection, schema.INSERT_INCARNATION, **incarnation._asdict())
 
     async def incarnations(self) -> list[Incarnation]:
         """Read each time the log went back, the oldest first."""
         async with self.reading() as connection:
-            return await self._dialect.incarnations(connection)
+            if not (await self._dialect.table_state(connection, schema.INCARNATION)).exists:
+                return []
+            return await self._dialect.rows(connection, Incarnation, schema.SELECT_INCARNATIONS)
 
     async def stored_on(self) -> StoredOn:
         """Return the number of machines that hold a stored event."""
@@ -223,25 +224,31 @@ class EventLog:
 
     # --- read -------------------------------------------------------------------------------------------------
 
+    async def read(self, kind: Any, statement: Executable, **values: Any) -> list[Any]:
+        """Execute a query of `store.schema` whose rows have the fields of this NamedTuple."""
+        async with self.reading() as connection:
+            return await self._dialect.rows(connection, kind, statement, **values)
+
     async def episodes(self, first: int = 1, last: int = EPISODE_NUMBER_MAX) -> list[EpisodeRow]:
         """Read every episode from number `first` to `last`, by number."""
-        async with self.reading() as connection:
-            return await self._dialect.episodes(connection, first, last)
+        return await self.read(EpisodeRow, schema.SELECT_EPISODES, first=first, last=last, limit=EPISODE_NUMBER_MAX)
 
     async def last_number(self) -> int:
         """Return the highest episode number; 0 for a log without episodes."""
-        async with self.reading() as connection:
-            return await self._dialect.last_number(connection)
+        [(number,)] = await self.read(tuple, schema.SELECT_NUMBER_MAX)
+        return int(number)
 
     async def episode(self, episode: EpisodeId) -> EpisodeRow | None:
         """Read an episode's row; None if no event of it is stored."""
-        async with self.reading() as connection:
-            return await self._dialect.episode(connection, episode_text(episode))
+        return (await self.heads([episode])).get(episode)
 
     async def last_digests(self, first: int = 1, last: int = EPISODE_NUMBER_MAX) -> dict[int, DigestRow]:
         """Read the last kept digest of each episode from number `first` to `last` that has one, by number."""
         async with self.reading() as connection:
-            return await last_digests(self._dialect, connection, first, last)
+            if not (await self._dialect.table_state(connection, schema.DIGEST)).readable:
+                return {}
+            rows = await self._dialect.rows(connection, DigestRow, schema.SELECT_LAST_DIGESTS, first=first, last=last)
+        return {each.number: each for each in rows}
 
     async def episode_number(self, episode: EpisodeId) -> int | None:
         """Return an episode's number; None if no event of it is stored."""
@@ -250,8 +257,7 @@ class EventLog:
 
     async def events(self, number: int, *, after: int = 0, limit: int = 10_000) -> list[StoredEvent]:
         """Read at most `limit` events of an episode, behind sequence `after`."""
-        async with self.reading() as connection:
-            return await self._dialect.events(connection, number, after=after, limit=limit)
+        return await self.read(StoredEvent, schema.SELECT_EVENTS, number=number, after=after, limit=limit)
 
     async def pages(self, episode: EpisodeRow, *, after: int = 0) -> AsyncIterator[Sequence[StoredEvent]]:
         """Yield the events up to the episode's head in pages. Raises `LogDamaged` at the first missing event."""
@@ -269,35 +275,18 @@ class EventLog:
         async with self.reading() as connection:
             return await self._dialect.spans(connection, spans)
 
-    async def unfolded(
-        self, limit: int = 10_000, *, after: int = 0, reached: Mapping[int, int] = MappingProxyType({})
-    ) -> list[Span]:
-        """Return spans of unfolded events, at most `limit` in total, some of each episode; without parked episodes.
-
-        Begins with the episodes whose number is above `after`, or with the first if there are none. `reached` is the
-        last sequence, by number, of a fold that is running.
-        """
-        async with self.reading() as connection:
-            behind = beyond(await self._dialect.behind(connection, after=after, limit=limit), reached)
-            if not behind and after:
-                behind = beyond(await self._dialect.behind(connection, after=0, limit=limit), reached)
-            return share_out(behind, limit)
-
-    async def behind(self) -> list[EpisodeRow]:
-        """Read the episodes with unfolded events, without parked ones."""
-        async with self.reading() as connection:
-            return await self._dialect.behind(connection, after=0, limit=EPISODE_NUMBER_MAX)
+    async def behind(self, after: int = 0, limit: int = EPISODE_NUMBER_MAX) -> list[EpisodeRow]:
+        """Read the episodes with unfolded events whose number is above `after`, by number, without parked ones."""
+        return await self.read(EpisodeRow, schema.SELECT_BEHIND, after=after, limit=limit)
 
     async def stopped(self) -> list[EpisodeRow]:
         """Read the refused and parked episodes; the rows hold the reasons."""
-        async with self.reading() as connection:
-            return await self._dialect.stopped(connection)
+        return await self.read(EpisodeRow, schema.SELECT_STOPPED)
 
     async def limits_near(self) -> list[str]:
         """Return a warning for each limit of numbers that the memory, or an episode that has not ended, comes near."""
-        async with self.reading() as connection:
-            last = await self._dialect.last_number(connection)
-            episodes = await self._dialect.long_episodes(connection, EVENTS_MANY)
+        last = await self.last_number()
+        episodes = await self.read(EpisodeRow, schema.SELECT_LONG, events_min=EVENTS_MANY)
         return [each for each in (number_warning(last), *map(events_warning, episodes)) if each is not None]
 
     async def declarations(self) -> list[bytes]:
@@ -315,7 +304,7 @@ class EventLog:
         if not fingerprints:
             return {}
         async with self.reading() as connection:
-            payloads = await self._dialect.descriptions(connection, sorted(fingerprints))
+            payloads = await self._dialect.descriptions(connection, fingerprints)
         return {fingerprint(payload, "DescriptionDeclared"): payload for payload in payloads}
 
     @asynccontextmanager
@@ -340,7 +329,8 @@ class EventLog:
     async def snapshot(self) -> AsyncIterator[AsyncConnection]:
         """Open a connection whose transaction is a snapshot."""
         async with self.reading() as connection:
-            await self._dialect.begin_snapshot(connection)
+            if (statement := self._dialect.begin_snapshot) is not None:
+                await connection.exec_driver_sql(statement)
             yield connection
 
     @asynccontextmanager
@@ -375,12 +365,13 @@ async def advance_folded(connection: AsyncConnection, steps: Sequence[Progress])
 
     Returns False if another process has folded one of them meanwhile; the caller must then roll back.
     """
-    return await dialect_of(connection).advance_folded(connection, steps) == len(steps)
+    advanced = await dialect_of(connection).rows(connection, tuple, schema.ADVANCE_FOLDED, steps=list(steps))
+    return len(advanced) == len(steps)
 
 
 async def park(connection: AsyncConnection, number: int, reason: str | None) -> None:
     """Stop folding an episode, with the reason; None releases it. The log still accepts its events."""
-    await dialect_of(connection).park(connection, number, reason)
+    await dialect_of(connection).execute(connection, schema.PARK, of=number, reason=reason)
 
 
 # === schema ===================================================================================================
@@ -427,12 +418,14 @@ async def make_or_migrate(
             raise DatabaseUnavailable(f"{name} {_missing_log(belongs_to)}")
         for statements in migrations[identity.format if identity else 0 :]:
             await dialect.execute_all(connection, statements)
-        await create_digest_table(dialect, connection)
+        if (await dialect.table_state(connection, schema.DIGEST)).creatable:
+            await dialect.execute_all(connection, dialect.definition(schema.DIGEST, if_missing=True))
         if identity is None:
-            await dialect.insert_log(connection, birth, len(migrations))
+            values = {"id": birth.log_id, "format": len(migrations), "created_wall_ns": birth.created_wall_ns}
+            await dialect.execute(connection, schema.INSERT_LOG, one=1, **values)
             return birth.log_id
         if identity.format < len(migrations):
-            await dialect.set_format(connection, len(migrations))
+            await dialect.execute(connection, schema.SET_FORMAT, to=len(migrations))
         return identity.log_id
 
 
@@ -513,7 +506,6 @@ _LOOKED_AT = 100
 """The episodes that are read at once in search of the last one that is not a simulation."""
 
 _NO_ID, _LAST_ID = (str(uuid.UUID(32 * each)) for each in "0f")
-_EPISODE = table("episode", column("number"), column("id"))
 
 
 async def number_named(
@@ -557,45 +549,27 @@ async def episode_named(log: EventLog, name: str) -> EpisodeRow:
                 return row
         last = first - 1
     async with log.reading() as connection:
-        listed = select(func.count()).select_from(_EPISODE)
-        number = await number_named(connection, name, _EPISODE.c.number, _EPISODE.c.id, listed)
+        episodes = schema.EPISODE.c
+        listed = select(func.count(episodes.number))
+        number = await number_named(connection, name, episodes.number, episodes.id, listed)
     (row,) = await log.episodes(number, number)
     return row
 
 
-_GROWN = "WHERE number > :above OR ended_wall_ns IS NULL OR number IN :numbers ORDER BY number"
-
-
 async def grown_episodes(log: EventLog, *, above: int, numbers: Collection[int]) -> list[EpisodeRow]:
     """Read the episodes that may have grown: with a number above `above`, not ended, or with one of these numbers."""
-    async with log.reading() as connection:
-        return await read_episodes(connection, _GROWN, above=above, numbers=sorted(numbers))
-
-
-async def read_episodes(connection: AsyncConnection, clauses: str, **values: object) -> list[EpisodeRow]:
-    """Read the rows of episodes with these clauses of SQL; an id that is not UTF-8 as its hexadecimal digits."""
-    columns = f"number, {dialect_of(connection).episode_id}, head, folded, started_wall_ns, ended_wall_ns"
-    query = text(f"SELECT {columns}, refused, parked FROM episode {clauses}")  # noqa: S608
-    lists: list[BindParameter[object]] = [
-        bindparam(name, expanding=True) for name, value in values.items() if isinstance(value, list)
-    ]
-    return [EpisodeRow(*row) for row in await connection.execute(query.bindparams(*lists), values)]
+    return await log.read(EpisodeRow, schema.SELECT_GROWN, above=above, numbers=[(each,) for each in numbers])
 
 
 async def tags_of(log: EventLog, row: EpisodeRow) -> tuple[str, ...]:
     """Return the tags of an episode according to its events. Raises `LogDamaged` if one of these cannot be read."""
     tags: tuple[str, ...] = ()
-    query = text(
-        "SELECT sequence, payload FROM event WHERE episode = :number AND type IN ('EpisodeStarted', 'EpisodeTagged')"
-        " ORDER BY sequence"
-    )
-    async with log.reading() as connection:
-        for sequence, payload in await connection.execute(query, {"number": row.number}):
-            try:
-                change = msgspec.json.decode(payload, type=_Tagging)
-            except msgspec.DecodeError as error:
-                raise LogDamaged(row.id, sequence, f"its payload cannot be read: {error}") from error
-            tags = retagged(tags, (*change.tags, *change.added), change.removed)
+    for sequence, payload in await log.read(tuple, schema.SELECT_TAGGING, number=row.number):
+        try:
+            change = msgspec.json.decode(payload, type=_Tagging)
+        except msgspec.DecodeError as error:
+            raise LogDamaged(row.id, sequence, f"its payload cannot be read: {error}") from error
+        tags = retagged(tags, (*change.tags, *change.added), change.removed)
     return tags
 
 

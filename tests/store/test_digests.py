@@ -133,7 +133,7 @@ async def test_an_append_that_was_rolled_back_leaves_the_running_digest(
         with pytest.raises(RuntimeError):
             await log.append(records[100:400])
     with monkeypatch.context() as patch:
-        patch.setattr(type(dialect_of(log.engine)), "events", fail)  # no stored event is read again
+        patch.setattr(type(dialect_of(log.engine)), "spans", fail)  # no stored event is read again
         await log.append(records[100:])
     assert [tuple(row[1:]) for row in ask(database_url, KEPT)] == expected(episode(1), records)
 

@@ -149,10 +149,10 @@ async def test_a_server_that_is_too_old_is_refused(
     url = server.new_database()
     [[version]] = ask(url, "SELECT current_setting('server_version_num')::int / 10000")
     # A server of today's version, checked by a program that requires the next one.
-    monkeypatch.setattr(postgresql, "_SERVER_MIN", (version + 1) * 10_000)
+    monkeypatch.setattr(postgresql, "_VERSION_MIN", version + 1)
     error = await refused(url, caplog)
     assert type(error) is DatabaseUnavailable
-    assert str(error).endswith(f"PostgreSQL 14 or newer is needed, this is {version}")
+    assert str(error).endswith(f"PostgreSQL {version + 1} or newer is needed, this is {version}")
     ours = "('pycrorm', 'memory', 'memory_tables')"
     assert ask(url, f"SELECT count(*) FROM pg_namespace WHERE nspname IN {ours}") == [(0,)]
 

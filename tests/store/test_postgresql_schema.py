@@ -17,7 +17,7 @@ from pycrorm_async.store.append import Appending
 from pycrorm_async.store.dialect import Birth
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog, make_or_migrate
-from pycrorm_async.store.postgresql import GRANTS, MIGRATIONS
+from pycrorm_async.store.postgresql import GRANTS, PostgreSQL
 from tests.databases import Server, ask, change_each
 from tests.store.concurrent_openers import open_at_once
 from tests.store.factories import declaration, episode, record, run_of
@@ -86,7 +86,7 @@ async def test_an_older_log_is_migrated_and_equals_a_new_one(server: Server) -> 
     await log.append(run_of(episode(1), 1, 3))
     await log.close()
     second = ("ALTER TABLE pycrorm.episode ADD COLUMN robot text", "CREATE INDEX by_robot ON pycrorm.episode (robot)")
-    grown = (*MIGRATIONS, second)
+    grown = (*PostgreSQL().migrations, second)
     ids = []
     for url in urls:
         engine = DatabaseAddress.parse(url).engine()
@@ -103,7 +103,7 @@ async def test_an_older_log_is_migrated_and_equals_a_new_one(server: Server) -> 
 async def test_a_migration_that_fails_leaves_the_log_as_it_was(database_url: str) -> None:
     await (await EventLog.open(DatabaseAddress.parse(database_url), create=True)).close()
     before = ask(database_url, TABLES)
-    broken = (*MIGRATIONS, ("CREATE TABLE pycrorm.robot (id int)", "CREATE TABLE pycrorm.event (a int)"))
+    broken = (*PostgreSQL().migrations, ("CREATE TABLE pycrorm.robot (id int)", "CREATE TABLE pycrorm.event (a int)"))
     engine = DatabaseAddress.parse(database_url).engine()
     with pytest.raises(Exception, match='relation "event" already exists'):
         await make_or_migrate(engine, "name", birth=Birth("a", 5), migrations=broken)

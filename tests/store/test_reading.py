@@ -11,7 +11,7 @@ from sqlalchemy import text
 
 from pycrorm_async.errors import DatabaseUnavailable, LogDamaged
 from pycrorm_async.events.codec import Record
-from pycrorm_async.store import sqlite
+from pycrorm_async.store import schema, sqlite
 from pycrorm_async.store.append import EPISODES_MANY, EVENTS_MANY
 from pycrorm_async.store.dialects import dialect_of
 from pycrorm_async.store.log import EventLog, advance_folded, park
@@ -50,10 +50,10 @@ async def test_the_list_of_unfolded_episodes_shrinks_as_they_are_folded(log: Eve
     async with log.engine.begin() as connection:
         assert await advance_folded(connection, [(1, 0, 2), (2, 0, 2)])
     assert [(row.number, row.folded, row.head) for row in await log.behind()] == [(1, 2, 3)]
-    assert await log.unfolded() == [(1, 2, 3)]
     await log.append(run_of(episode(2), 3, 4))
-    assert await log.unfolded() == [(1, 2, 3), (2, 2, 4)]
-    assert await log.unfolded(2) == [(1, 2, 3), (2, 2, 3)]
+    assert [row.number for row in await log.behind()] == [1, 2]
+    assert [row.number for row in await log.behind(1)] == [2]
+    assert [row.number for row in await log.behind(0, 1)] == [1]
 
 
 async def test_progress_of_another_process_is_noticed(log: EventLog) -> None:
@@ -79,7 +79,6 @@ async def test_a_parked_episode_is_not_behind_and_still_takes_events(log: EventL
         await park(connection, 1, "column height is an integer and a text")
     assert await log.append(run_of(episode(1), 4, 5)) == {}
     assert [row.number for row in await log.behind()] == [2]
-    assert [each.number for each in await log.unfolded()] == [2]
     assert [(row.number, row.refused, row.parked) for row in await log.stopped()] == [
         (1, None, "column height is an integer and a text")
     ]
@@ -125,18 +124,22 @@ async def test_an_episode_row_holds_all_its_columns(log: EventLog) -> None:
 
 
 async def test_the_query_for_unfolded_episodes_reads_no_other_episode(file_log: EventLog) -> None:
-    behind = " | ".join(
-        row[3] for row in ask(file_log.address.path, f"EXPLAIN QUERY PLAN {sqlite.SELECT_BEHIND}", (0, 9))
-    )
+    def plan_of(statement: object, *parameters: object) -> str:
+        steps = ask(file_log.address.path, f"EXPLAIN QUERY PLAN {statement}", parameters)
+        return " | ".join(row[3] for row in steps)
+
+    compiled = dialect_of(file_log.engine).compile
+    behind = plan_of(compiled(schema.SELECT_BEHIND), 0, 9, 0)
     assert "episode_behind" in behind
     assert "TEMP B-TREE" not in behind
-    spans = " | ".join(
-        row[3] for row in ask(file_log.address.path, f"EXPLAIN QUERY PLAN {sqlite.SELECT_SPAN}", (1, 0, 9))
-    )
+    spans = plan_of(sqlite.SELECT_SPAN, 1, 0, 9)
     assert "SEARCH event USING INDEX" in spans
     assert "SCAN event" not in spans
-    stopped = ask(file_log.address.path, f"EXPLAIN QUERY PLAN {sqlite.SELECT_STOPPED}")
-    assert "episode_stopped" in stopped[0][3]
+    assert "episode_stopped" in plan_of(compiled(schema.SELECT_STOPPED))
+    again = plan_of(compiled(schema.SELECT_EVENTS_BY_KEY), "[]")
+    assert "SEARCH event USING INDEX" in again
+    assert "SEARCH episode USING INTEGER PRIMARY KEY" in plan_of(compiled(schema.ADVANCE_FOLDED), "[]")
+    assert "SEARCH episode USING INDEX" in plan_of(compiled(schema.LOCK_EPISODES), "[]")
 
 
 async def test_events_are_read_even_if_together_they_exceed_the_limit_of_one_value(file_log: EventLog) -> None:

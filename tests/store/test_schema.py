@@ -13,12 +13,14 @@ from pycrorm_async.errors import DatabaseForeign, DatabaseUnavailable
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.dialect import Birth
 from pycrorm_async.store.log import EventLog, make_or_migrate, recognise
-from pycrorm_async.store.sqlite import MIGRATIONS
+from pycrorm_async.store.sqlite import SQLite
 from tests.databases import ask
 from tests.store.concurrent_openers import open_at_once
 from tests.store.factories import declaration, episode, run_of
 
 pytestmark = pytest.mark.slow
+
+MIGRATIONS = SQLite().migrations
 
 ALL_OF_IT = "SELECT type, name, sql FROM sqlite_master ORDER BY type, name"
 
