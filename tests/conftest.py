@@ -121,6 +121,35 @@ def pytest_collection(session: pytest.Session) -> None:
             import_module(name)
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_pycollect_makeitem(collector: pytest.Module | pytest.Class, obj: object) -> list[pytest.Item] | None:
+    """Make no items of the tests that the marks of this run leave out: each process would only deselect them."""
+    own = getattr(obj, "pytestmark", ())
+    names = {each.name for each in (*collector.iter_markers(), *(own if isinstance(own, list) else ()))}
+    if "slow" in names and collector.path.parent.name in SLOW_IN_TURNS:
+        names.add("soak")
+    return [] if names & _left_out(collector.config) else None
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Likewise make no items of parameters that are left out, such as the seeds of the soak."""
+    left_out = _left_out(metafunc.config)
+    for mark in metafunc.definition.iter_markers("parametrize"):
+        values = mark.args[1]
+        kept = [each for each in values if not {own.name for own in getattr(each, "marks", ())} & left_out]
+        if kept and isinstance(values, list) and "ids" not in mark.kwargs:
+            values[:] = kept
+
+
+def _left_out(config: pytest.Config) -> set[str]:
+    """Return the marks that `-m` leaves out, unless a test is named on the command line, which is then deselected."""
+    expression = config.option.markexpr
+    if " or " in expression or any("::" in each for each in config.args):
+        return set()
+    return {each.removeprefix("not ") for each in expression.split(" and ") if each.startswith("not ")}
+
+
 def pytest_configure() -> None:
     # Without stored bytecode each of several hundred processes that tests start would compile the package.
     sys.dont_write_bytecode = False

@@ -44,7 +44,9 @@ def long_modules_first(items: Sequence[pytest.Item], processes: int) -> list[pyt
         for module in own:
             ordered += [*module, *islice(rest, between)]
         ordered += islice(rest, max(start + size - len(ordered), 0))
-    return [*ordered, *rest]
+    ordered += rest
+    assert len({*map(id, ordered)}) == len(items) == len(ordered), "no test is lost or doubled"
+    return ordered
 
 
 def _name(path: Path) -> str:

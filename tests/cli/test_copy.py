@@ -14,12 +14,11 @@ import pytest
 
 from tests.commands import COMMAND, Started, answer, environment, one_line_of, pycrorm
 from tests.databases import Server
+from tests.hand_written import fill, hand_written
 from tests.operations.memories import assert_same
 from tests.projections.event_script import append_and_fold
 from tests.store.factories import episode, record, run_of
 from tests.table_comparison import logs_of
-from tests.test_table_comparison import episode as hand_written
-from tests.test_table_comparison import fill
 
 pytestmark = [pytest.mark.soak_on("postgresql"), pytest.mark.slow]
 """These tests take long on a server, where they run in turns; other modules show that the server behaves alike."""

@@ -15,9 +15,9 @@ from pycrorm_async.events.codec import Record
 from pycrorm_async.world import Pose
 from tests.commands import COMMAND, answer, environment, one_line_of, pycrorm
 from tests.databases import ask, ask_to_change
+from tests.hand_written import hand_written
 from tests.projections.event_script import Script, append_and_fold
 from tests.store.factories import episode, run_of
-from tests.test_table_comparison import episode as hand_written
 
 pytestmark = pytest.mark.slow
 

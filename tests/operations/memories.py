@@ -13,14 +13,13 @@ from pycrorm_async.plan import NavigateAction, ParkArmsAction, SimulatedTaskTree
 from pycrorm_async.settings import Settings
 from pycrorm_async.world import Arms, Pose
 from tests.databases import ask
+from tests.hand_written import fill, hand_written
 from tests.memory.note_actions import NoteActionPerformable
 from tests.plan.conftest import kitchen
 from tests.projections.event_script import Script, append_and_fold
 from tests.promises.test_random_plans import play
 from tests.store.factories import declaration
 from tests.table_comparison import declarations_of, differences, logs_of, tables_of, united
-from tests.test_table_comparison import episode as hand_written
-from tests.test_table_comparison import fill
 from tests.upstream.conftest import common_plan
 
 New = Callable[[], str]

@@ -25,6 +25,7 @@ from pycrorm_async.settings import Settings
 from pycrorm_async.writer.drain import Backoff
 from tests.crash.forked_processes import ForkedProcess
 from tests.databases import Server, ask, ask_to_change
+from tests.hand_written import fill, hand_written
 from tests.memory.note_actions import NoteActionPerformable, texts
 from tests.operations.memories import (
     PATIENT,
@@ -42,8 +43,6 @@ from tests.projections.event_script import Script, append_and_fold, declarations
 from tests.projections.rebuild_cases import traces
 from tests.store.factories import episode, record, run_of
 from tests.table_comparison import Logs, declarations_of, differences, logs_of, tables_of
-from tests.test_table_comparison import episode as hand_written
-from tests.test_table_comparison import fill
 
 pytestmark = pytest.mark.slow
 

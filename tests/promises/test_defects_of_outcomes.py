@@ -41,15 +41,6 @@ from tests.promises.lab import (
 
 pytestmark = pytest.mark.slow
 
-DEFECTS = {
-    "6": "test_an_error_in_an_action_differs_from_a_plan_failure_and_from_an_action_that_never_ran",
-    "7": "test_a_failure_keeps_its_message_and_its_arguments",
-    "8": "test_concurrent_plans_never_nest_into_each_other",
-    "11": "test_a_node_is_running_until_it_ends_and_the_root_ends_too",
-    "12": "test_all_times_are_moments_in_utc_whatever_the_local_time_is",
-    "16": "test_every_class_of_failure_can_be_raised_and_is_recorded",
-}
-
 
 async def test_an_error_in_an_action_differs_from_a_plan_failure_and_from_an_action_that_never_ran(
     tmp_path: Path,

@@ -72,14 +72,6 @@ from tests.promises.lab import (
 
 pytestmark = pytest.mark.slow
 
-DEFECTS = {
-    "1": "test_an_object_is_stored_where_it_was_when_the_action_started",
-    "4": "test_an_action_on_a_believed_object_is_stored_with_its_believed_pose",
-    "13": "test_joint_targets_places_detections_and_attachments_are_recorded",
-    "14": "test_an_action_without_a_mapped_class_is_stored_with_the_rest_of_the_tree",
-    "15": "test_opening_and_closing_keep_their_object",
-}
-
 
 @dataclass
 class MoveAsideActionPerformable(ActionAbstract):

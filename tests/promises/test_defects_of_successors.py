@@ -54,17 +54,6 @@ from tests.promises.lab import (
 
 pytestmark = pytest.mark.slow
 
-DEFECTS = {
-    "s1": "test_every_node_of_a_sequence_has_its_own_status_and_times",
-    "s2": "test_the_state_after_an_action_is_not_the_state_before_it",
-    "s3": "test_an_observer_of_a_plan_is_notified_of_every_start_and_end",
-    "s4": "test_a_stored_episode_can_be_replayed_in_a_new_world",
-    "s5": "test_every_stored_node_can_be_turned_back_into_its_designator",
-    "s6": "test_alternatives_that_all_fail_are_a_failure",
-    "s7": "test_expressions_have_times",
-    "s8": "test_all_imports_are_declared_and_no_code_is_generated",
-}
-
 
 async def test_every_node_of_a_sequence_has_its_own_status_and_times(tmp_path: Path) -> None:
     async with recorded(tmp_path):

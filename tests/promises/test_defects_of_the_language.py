@@ -20,14 +20,6 @@ from tests.promises.lab import FailingActionPerformable, lab, nodes_of, recorded
 
 pytestmark = pytest.mark.slow
 
-DEFECTS = {
-    "a": "test_a_failure_deep_inside_an_expression_fails_all_of_it",
-    "b": "test_a_sequence_runs_in_the_order_in_which_it_is_written_however_it_is_nested",
-    "c": "test_a_repetition_returns_its_rounds_and_failures",
-    "d": "test_every_branch_performs_its_own_operand",
-    "e": "test_expressions_are_nodes_of_the_recorded_tree",
-}
-
 
 def succeeding(text: str = "well") -> NoteActionPerformable:
     return NoteActionPerformable(text)

@@ -12,27 +12,22 @@ import pytest
 from sqlalchemy import select
 
 from pycrorm_async import Memory, Reading
-from pycrorm_async.orm import JointChange, ProcessMetaData, TaskTreeNode
 from pycrorm_async.orm import Object as ObjectRow
+from pycrorm_async.orm import ProcessMetaData
 from pycrorm_async.plan import (
     ActionAbstract,
-    IKError,
     MoveTorsoActionPerformable,
     NavigateActionPerformable,
-    ParkArmsAction,
-    PickUpAction,
     PickUpActionPerformable,
     PlaceActionPerformable,
-    SetGripperAction,
     SimulatedTaskTree,
 )
 from pycrorm_async.plan.objects import designator_of
-from pycrorm_async.task_status import TaskStatus
-from pycrorm_async.world import Arms, Grasp, GripperState, Object, ObjectType, Pose, current_world
+from pycrorm_async.world import Arms, Grasp, Object, ObjectType, Pose, current_world
 from pycrorm_async.world.pose import yaw_quaternion
 from tests.memory.note_actions import NoteActionPerformable
 from tests.promises.chronicle import Chronicle, assert_same, read_from_memory
-from tests.promises.lab import WITHIN_REACH, Lab, at, every, lab, recorded, url_of
+from tests.promises.lab import WITHIN_REACH, Lab, every, lab, recorded, url_of
 
 pytestmark = pytest.mark.slow
 
@@ -98,34 +93,6 @@ async def test_every_change_by_a_plan_is_recorded_with_its_cause(tmp_path: Path)
         ]
 
 
-async def test_changes_by_an_action_that_failed_later_are_recorded(tmp_path: Path) -> None:
-    async with recorded(tmp_path) as memory:
-        chronicle = Chronicle()
-        with lab(chronicle) as scene:
-            # From 0.32 m the arm reaches to the milk and not around it; at 1.22 m it grasps the milk and cannot lift
-            # it.
-            for stand, height in ((0.32, 0.9), (0.6, 1.22)):
-                scene.world.reset()
-                scene.milk.set_pose(Pose([1.3, 1, height]))
-                await NavigateActionPerformable(Pose([stand, 0.9, 0])).perform()
-                with pytest.raises(IKError):
-                    await PickUpActionPerformable(scene.milk, Arms.LEFT, Grasp.FRONT).perform()
-            assert scene.robot.attachments == {scene.milk: ARM}
-        await memory.flush()
-        assert [each for each in chronicle.short() if each[2] not in (None, "MoveMotion")] == [
-            ("joints", "pr2", "MoveTCPMotion"),
-            ("joints", "pr2", "MoveGripperMotion"),
-            ("joints", "pr2", "MoveTCPMotion"),
-            ("joints", "pr2", "MoveGripperMotion"),
-            ("joints", "pr2", "MoveTCPMotion"),
-            ("joints", "pr2", "MoveGripperMotion"),
-            ("attached", "pr2", "PickUpAction"),
-        ]
-        assert_same((await read_from_memory(memory))[: len(chronicle.entries)], chronicle.entries)
-        failed = select(TaskTreeNode.dtype).where(TaskTreeNode.status == TaskStatus.FAILED).order_by(TaskTreeNode.id)
-        assert await every(memory, failed) == ["PickUpAction", "MoveTCPMotion"] * 2
-
-
 @dataclass
 class BranchActionPerformable(ActionAbstract):
     label: str
@@ -167,39 +134,6 @@ async def test_concurrent_branches_each_cause_their_own_changes(tmp_path: Path) 
         assert [(f"moves {row.name}", row.pose.x) for row in rows] == [(step.label, step.step) for step in caused]
 
 
-async def test_an_expression_names_the_branch_that_caused_a_change(tmp_path: Path) -> None:
-    async with recorded(tmp_path) as memory:
-        chronicle = Chronicle()
-        with lab(chronicle) as scene:
-            # The left hand carries the milk while the right one opens, base and torso first: all of them change the
-            # world.
-            await NavigateActionPerformable(WITHIN_REACH).perform()
-            take = PickUpAction(scene.milk, [Arms.LEFT], [Grasp.FRONT])
-            wave = ParkArmsAction([Arms.RIGHT]) + SetGripperAction([Arms.RIGHT], [GripperState.OPEN])
-            push = BranchActionPerformable("moves cereal", scene.cereal)
-            await (take | wave | push).perform()
-        await memory.flush()
-        assert_same((await read_from_memory(memory))[: len(chronicle.entries)], chronicle.entries)
-        rows = {node.id: node for node in await every(memory, select(TaskTreeNode))}
-
-        def branch(node: TaskTreeNode) -> str | None:
-            """Return the type of the branch that contains the node."""
-            while node.parent_id is not None and rows[node.parent_id].dtype != "Parallel":
-                node = rows[node.parent_id]
-            return node.dtype
-
-        causes = {
-            (each.object.name, each.joint[:1], branch(rows[each.node_id]))
-            for each in await every(memory, select(JointChange))
-        }
-        assert causes == {("pr2", "l", "PickUpAction"), ("pr2", "r", "Sequential")}
-        moved = select(ObjectRow).where(ObjectRow.id != ObjectRow.identity_id, ObjectRow.name != "pr2")
-        assert {(each.name, branch(rows[each.node_id])) for each in await every(memory, moved)} == {
-            ("milk", "PickUpAction"),
-            ("cereal", "BranchAction"),
-        }
-
-
 async def test_a_simulation_changes_nothing_that_is_recorded_as_real(tmp_path: Path) -> None:
     async with recorded(tmp_path) as memory:
         real, imagined = Chronicle(), Chronicle()
@@ -222,36 +156,6 @@ async def test_a_simulation_changes_nothing_that_is_recorded_as_real(tmp_path: P
         assert await read_from_memory(memory, 2) == []
         episodes = await every(memory, select(ProcessMetaData).order_by(ProcessMetaData.id), simulated=True)
         assert [(each.simulated, each.status) for each in episodes] == [(False, "RUNNING"), (True, "SUCCEEDED")]
-
-
-async def test_a_reset_between_rollouts_is_recorded_without_a_node(tmp_path: Path) -> None:
-    async with recorded(tmp_path) as memory:
-        chronicle = Chronicle()
-        with lab(chronicle) as scene:
-            for _ in range(2):
-                await NavigateActionPerformable(WITHIN_REACH).perform()
-                await PickUpActionPerformable(scene.milk, Arms.LEFT, Grasp.FRONT).perform()
-                held = scene.milk.pose
-                begun = len(chronicle.entries)
-                scene.world.reset()
-                reset = chronicle.short()[begun:]
-                assert sorted(set(reset)) == [
-                    ("detached", "pr2", None),
-                    ("joints", "pr2", None),
-                    ("moved", "milk", None),
-                    ("moved", "pr2", None),
-                ]
-        await memory.flush()
-        assert_same((await read_from_memory(memory))[: len(chronicle.entries)], chronicle.entries)
-        milk = await every(memory, select(ObjectRow).where(ObjectRow.name == "milk").order_by(ObjectRow.id))
-        assert [at(row.pose) for row in milk] == [
-            (1.3, 1.0, 0.9),
-            held.position,
-            (1.3, 1.0, 0.9),
-            held.position,
-            (1.3, 1.0, 0.9),
-        ]
-        assert [row.node_id is None for row in milk] == [True, False, True, False, True]
 
 
 async def test_each_episode_in_one_world_begins_with_all_its_objects(tmp_path: Path) -> None:

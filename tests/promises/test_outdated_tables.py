@@ -6,7 +6,6 @@ import asyncio
 import json
 import logging
 import subprocess
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,7 +22,7 @@ from pycrorm_async.projections.verify import verify
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
-from tests.commands import environment
+from tests.commands import run_script
 from tests.databases import ask, ask_to_change, put_memory
 from tests.golden.unpacking import unpack_memory_v1
 
@@ -209,7 +208,4 @@ def pycrorm(*arguments: str, small: int = 5) -> subprocess.CompletedProcess[str]
         f"from pycrorm_async.operations import rebuild; rebuild.SMALL_EVENTS_MAX = {small}\n"
         "from pycrorm_async.__main__ import main; main()"
     )
-    return subprocess.run(
-        [sys.executable, "-c", program, *arguments],
-        env=environment(), capture_output=True, text=True, timeout=60, check=False,
-    )  # fmt: skip
+    return run_script(program, *arguments)

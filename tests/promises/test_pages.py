@@ -6,7 +6,6 @@ import json
 import re
 import shlex
 from collections.abc import Callable, Iterator, Mapping
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Final
 
@@ -18,7 +17,7 @@ from typer.testing import CliRunner
 from pycrorm_async.cli.main import app
 from tests.commands import answer, pycrorm
 from tests.databases import Server, ask, await_events, server_in_memory
-from tests.promises.pages import NOT_RUN, PAGES, ROOT, PageReader, blocks_of, output_pattern
+from tests.promises.pages import PAGES, ROOT, PageReader, blocks_of
 
 # === pages ====================================================================================================
 #
@@ -379,11 +378,9 @@ def test_a_reader_can_follow_the_page_from_top_to_bottom(
 
 README = PAGES["README.md"]
 BLOCKS = [block for page in PAGES for block in blocks_of(page)]
-INLINE = re.compile(r"`([^`\n]+)`")
 
 
-def test_the_readme_is_short_and_every_link_of_a_page_leads_to_a_file() -> None:
-    assert len(README.splitlines()) <= 220
+def test_every_link_of_a_page_leads_to_a_file() -> None:
     for page, content in PAGES.items():
         for link in re.findall(r"\]\((?!https?:)([^)#]+)\)", content):
             assert (ROOT / page).parent.joinpath(link).exists(), f"{page} links to {link}"
@@ -392,20 +389,6 @@ def test_the_readme_is_short_and_every_link_of_a_page_leads_to_a_file() -> None:
 def test_every_block_of_every_page_is_run_or_has_a_reason_not_to() -> None:
     assert sum(content.count("```") for content in PAGES.values()) == 2 * len(BLOCKS)
     assert [block.place for block in BLOCKS if block.kind is None] == []
-
-
-@pytest.mark.parametrize("start", NOT_RUN)
-def test_every_reason_not_to_run_a_command_belongs_to_one_on_a_page_and_names_a_test_that_exists(start: str) -> None:
-    assert [block.place for block in BLOCKS if start in block.reasons] != []
-    for test in re.findall(r"`(test_\w+\.py)`", NOT_RUN[start]):
-        assert [*(ROOT / "tests").rglob(test)] != []
-
-
-def test_every_file_that_a_page_has_saved_is_used_by_a_command() -> None:
-    for block in BLOCKS:
-        if block.file is not None:
-            later = [each.text for each in blocks_of(block.page) if each.line > block.line]
-            assert any(block.file.removesuffix(".py") in text for text in later), block.place
 
 
 def test_the_configurations_on_the_pages_can_be_read() -> None:
@@ -417,27 +400,6 @@ def test_the_configurations_on_the_pages_can_be_read() -> None:
     check_options(shlex.split(units["Service"]["ExecStart"].replace("/opt/robot/venv/bin/", "")))
     for server in servers["mcpServers"].values():
         check_options([Path(server["command"]).name, *server["args"]])
-
-
-@pytest.mark.parametrize(
-    ("page", "output", "is_equal"),
-    [
-        ("1 of 2\n", "1 of 2\n", True),
-        ("1 of 2\n", "1 of 3\n", False),
-        ("1 of 2\n", "1 of 2\nmore\n", False),
-        ("1 of 2\nmore\n", "1 of 2\n", False),
-        ("took 12.5 ms at 2026-11-25 22:12:18\n", "took 3 s at 2027-01-01 00:00:00\n", True),
-        ("took 12.5 ms\n", "took long\n", False),
-        ("first\n…\nlast\n", "first\nlast\n", True),
-        ("first\n…\nlast\n", "first\n2\n3\nlast\n", True),
-        ("by … (root)\n", "by ada (root)\n", True),
-        ("by … (root)\n", "by ada\n", False),
-    ],
-)
-def test_an_output_equals_that_of_a_page_but_for_times_durations_ids_and_dots(
-    page: str, output: str, is_equal: bool
-) -> None:
-    assert (output_pattern(page).fullmatch(output) is not None) == is_equal
 
 
 def options_of(words: list[str]) -> set[str]:
@@ -467,18 +429,6 @@ def test_every_block_of_python_compiles_and_every_command_of_a_block_has_its_ver
             words = shlex.split(re.split(r" (?:[|>&#]|\|\|)", line)[0])
             if words[:1] == ["pycrorm"]:
                 check_options(words)
-
-
-@pytest.mark.slow
-def test_every_command_in_the_prose_has_its_verb_its_options_and_its_module() -> None:
-    commands = [shlex.split(each) for page in PAGES.values() for each in INLINE.findall(page) if each.startswith("pyc")]
-    named = [words for words in commands if words[0] == "pycrorm" and len(words) > 1 and words[1].islower()]
-    assert len(named) > 50
-    for words in named:
-        for alternative in words[1].split("|"):
-            check_options(["pycrorm", alternative, *words[2:]])
-    for module in {each for page in PAGES.values() for each in re.findall(r"python -m ([\w.]+)", page)}:
-        assert find_spec(module) is not None, module
 
 
 @pytest.mark.slow
