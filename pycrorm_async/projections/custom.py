@@ -41,7 +41,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Final, Literal, NamedTuple, Protocol, TypeAlias, final, get_args
 
 import msgspec
-from sqlalchemy import Dialect, text
+from sqlalchemy import Dialect
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
 
 from pycrorm_async.bulk_records import make
@@ -705,9 +705,6 @@ _SCAN_SHARE_MAX = 0.02
 """Bounds the share of time in which all episodes are checked, and not the newest only: 100,000 take 25 ms."""
 _SCAN_S_MAX = 10.0
 """Bounds the time until all episodes are checked again, also after a check that a busy machine made slow."""
-_NEWEST_EPISODES = 1_000
-"""The episodes that a check of the newest reads, in 0.3 ms: more than record at a time."""
-_NEWEST = text("SELECT coalesce(max(number), 0) FROM episode")
 
 
 def learner_of(projection: Projection) -> Learn:
@@ -872,13 +869,12 @@ class CustomTables:
             return False
         is_scan = until_visible or time_s >= self._scan_due_s
         packed = is_scan or time_s >= self._packed_s + _CHECK_S
-        first = 0 if is_scan else await self._first_of_newest()
         count = most_events = 0
         for fold in [each for each in self._folds if packed or not each.projection.is_packed]:
             projection, target, runner = fold
-            if is_scan and target.first:
+            if is_scan and target.newest_only:
                 runner.last_number = 0  # begin with the oldest, which have waited
-            target.first = first
+            target.newest_only = not is_scan
             try:
                 events = await runner.fold_next()
                 count += events is not None
@@ -897,10 +893,6 @@ class CustomTables:
         if not count:
             self._checked_s = time_s
         return count > 0
-
-    async def _first_of_newest(self) -> int:
-        async with self._log.reading() as connection:
-            return max(1, int((await connection.execute(_NEWEST)).scalar_one()) - _NEWEST_EPISODES + 1)
 
     async def _note_fault(self, fold: _CustomFold, reason: str) -> None:
         """Write the reason into the projection's generation, where `pycrorm status` reads it until it is set up again.

@@ -532,6 +532,9 @@ _log = logging.getLogger("pycrorm_async.projections")
 
 _BEHIND_EPISODES_MAX = 400
 """Bounds the episodes in one batch, because reading each of them costs as much as folding some of its events."""
+_NEWEST_EPISODES = 1_000
+"""The episodes that a check of the newest reads, in 0.3 ms: more than record at a time."""
+_NEWEST = text("SELECT coalesce(max(number), 0) FROM episode")
 
 
 class Share(NamedTuple):
@@ -607,7 +610,7 @@ class SideTarget:
         share: the episodes that this process folds.
 
     Attributes:
-        first: `behind` leaves out the episodes below this number.
+        newest_only: whether `behind` leaves out all but the newest episodes.
     """
 
     def __init__(
@@ -621,7 +624,7 @@ class SideTarget:
         share: Share = WHOLE,
     ) -> None:
         self.log = log
-        self.first = 0
+        self.newest_only = False
         self._key = key
         self._projection = projection
         self._version = version
@@ -632,10 +635,13 @@ class SideTarget:
     async def behind(self, after: int, limit: int) -> list[EpisodeRow]:
         async with self.log.reading() as connection:
             await self.generation(connection, "share")  # locked, so that no rebuild drops its tables
+            if self.newest_only:
+                newest = (await connection.execute(_NEWEST)).scalar_one()
+                after = max(after, newest - _NEWEST_EPISODES)
             return await episodes_behind(
                 connection,
                 self._place,
-                after=max(after, self.first - 1),
+                after=after,
                 limit=min(limit, _BEHIND_EPISODES_MAX),
                 share=self._share,
                 after_tables=self._projection is not None,

@@ -149,7 +149,7 @@ async def test_rows_follow_event_by_event_as_the_daemon_folds(log: EventLog) -> 
 async def test_the_newest_episodes_are_checked_often_and_all_of_them_seldom(
     log: EventLog, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(custom, "_NEWEST_EPISODES", 1)
+    monkeypatch.setattr(pipeline, "_NEWEST_EPISODES", 1)
     for name in ("_CHECK_S", "_SCAN_S_MAX"):
         monkeypatch.setattr(custom, name, 1e9)
     begun = [each for number in (1, 2, 3) for each in tries(number).records[:4]]
