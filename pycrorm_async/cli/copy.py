@@ -1,4 +1,7 @@
-"""`pycrorm copy --from URL --to URL` appends the episodes of one memory to another."""
+"""Append the episodes of one memory to another.
+
+Panel: Hand over, 2.
+"""
 
 from __future__ import annotations
 
@@ -8,13 +11,14 @@ from typing import Annotated
 import typer
 
 from pycrorm_async.bulk_records import collect_seldom
-from pycrorm_async.cli.output import DEFAULT_URL, CsvOption, JsonOption, SpoolOption, print_json, print_table, problem
-from pycrorm_async.cli.reading import note_pending_events
+from pycrorm_async.cli.output import Form, print_rows, problem
+from pycrorm_async.cli.reading import DEFAULT_URL, Place, SpoolOption
 from pycrorm_async.operations.copy import CopySummary, copy_episodes
 from pycrorm_async.progress_bar import progress_bar
 
 
 def copy(
+    *,
     target: Annotated[str, typer.Option("--to", metavar="URL", help="Memory to append to; created if missing.")],
     source: Annotated[
         str,
@@ -29,8 +33,7 @@ def copy(
         ),
     ] = None,
     spool: SpoolOption = None,
-    as_json: JsonOption = False,
-    as_csv: CsvOption = None,
+    form: Form,
 ) -> int:
     """Append the episodes of one memory to another, in SQLite or PostgreSQL. It is safe to repeat.
 
@@ -40,16 +43,14 @@ def copy(
     """
     collect_seldom()
     summary = asyncio.run(_copy(source, target, episode or []))
-    note_pending_events(source, spool)
-    if as_json:
-        print_json(summary)
-    else:
-        print_table(
-            f"From {summary.source} to {summary.target}",
-            ("episode", "id", "already present", "copied", "last event"),
-            [(each.number, each.id, each.were_there, each.copied, each.head) for each in summary.episodes],
-            as_csv=as_csv,
-        )
+    Place(source, spool).note_pending_events()
+    print_rows(
+        form,
+        summary,
+        f"From {summary.source} to {summary.target}",
+        ("episode", "id", "already present", "copied", "last event"),
+        [(each.number, each.id, each.were_there, each.copied, each.head) for each in summary.episodes],
+    )
     damaged = [each.damage for each in summary.episodes if each.damage]
     stopped = [f"episode {each.id} is stopped: {each.stopped}" for each in summary.episodes if each.stopped]
     for line in (*damaged, *stopped):

@@ -1,16 +1,18 @@
-"""`pycrorm datasette-metadata` prints Datasette's metadata of a memory: hidden tables, descriptions, questions."""
+"""Print Datasette's metadata of a SQLite memory.
+
+Panel: Hand over, 3.
+"""
 
 from __future__ import annotations
 
-from pycrorm_async.cli.output import DEFAULT_URL, JsonOption, SpoolOption, UrlOption, print_json
-from pycrorm_async.cli.reading import read_memory
+from pycrorm_async.cli.output import JsonOption, print_json
+from pycrorm_async.cli.reading import Place
 from pycrorm_async.export.export import datasette_metadata as describe
 
 
 def datasette_metadata(
-    url: UrlOption = DEFAULT_URL,
-    spool: SpoolOption = None,
+    place: Place,
     as_json: JsonOption = False,  # noqa: ARG001  it always prints JSON
 ) -> None:
     """Print Datasette's metadata of a SQLite memory: hidden tables, descriptions, facets, named questions."""
-    print_json(read_memory(url, spool, describe))
+    print_json(place.read(describe))

@@ -1,4 +1,6 @@
-"""`pycrorm demo` runs the demonstration of the thesis (5.1): it records a plan in a kitchen and queries it.
+"""Run and record the thesis' example plan, then query it.
+
+Panel: Record, 1.
 
 The robot parks its arms, raises its torso, finds a base pose, picks up the cereal, finds a place on the kitchen island
 and puts the cereal there. The demo then runs five queries on the memory in plain Python.
@@ -15,16 +17,8 @@ from typing import Any
 
 from sqlalchemy import select
 
-from pycrorm_async.cli.output import (
-    DEFAULT_URL,
-    JsonOption,
-    SpoolOption,
-    UrlOption,
-    note,
-    print_json,
-    print_table,
-    stdout,
-)
+from pycrorm_async.cli.output import JsonOption, note, print_json, print_table, stdout
+from pycrorm_async.cli.reading import DEFAULT_URL, Place
 from pycrorm_async.cli.show import print_tree
 from pycrorm_async.memory import Memory
 from pycrorm_async.orm import Action, NavigateAction, Object, PickUpAction, ProcessMetaData
@@ -41,9 +35,8 @@ from pycrorm_async.plan import (
 )
 from pycrorm_async.plan import NavigateAction as Navigate
 from pycrorm_async.plan import PickUpAction as PickUp
-from pycrorm_async.plan import PlaceAction as Place
+from pycrorm_async.plan import PlaceAction as PutDown
 from pycrorm_async.query.named_queries import NodeSummary
-from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.world import Arms, BulletWorld, Grasp, ObjectType, Pose
 from pycrorm_async.world import Object as WorldObject
 from pycrorm_async.world.bullet_body import engine
@@ -75,23 +68,23 @@ async def breakfast() -> None:
         place = SemanticCostmapLocation("kitchen_island_surface", kitchen, cereal.resolve()).resolve()
         base_pose = CostmapLocation(place.pose, reachable_for=robot, reachable_arm=arm).resolve()
         await Navigate([base_pose.pose]).resolve().perform()
-        await Place(cereal, [place.pose], [arm]).resolve().perform()
+        await PutDown(cereal, [place.pose], [arm]).resolve().perform()
         await ParkArmsActionPerformable(Arms.BOTH).perform()
 
 
-def demo(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None, as_json: JsonOption = False) -> None:
+def demo(place: Place, as_json: JsonOption = False) -> None:
     """Run and record the thesis' example plan, then query it."""
     engine()  # raises `BulletMissing` before a database is created
-    answers = asyncio.run(_run_and_query(url, spool))
+    answers = asyncio.run(_run_and_query(*place))
     if as_json:
         print_json(answers.document())
         return
     answers.print()
-    address = DatabaseAddress.parse(url)
+    address = place.address
     if address.is_private:
         note(f"The database was {address}, which ended with this process; without --url the demonstration is kept.")
         return
-    option = "" if url == DEFAULT_URL else f" --url {shlex.quote(address.to_type)}"
+    option = "" if place.url == DEFAULT_URL else f" --url {shlex.quote(address.to_type)}"
     verbs = ("episodes", f"show {answers.episode}", f"report {answers.episode}")
     note(f"The database is {address}. Next: {' | '.join(f'pycrorm {verb}{option}' for verb in verbs)}")
 

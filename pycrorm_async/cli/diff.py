@@ -1,4 +1,7 @@
-"""`pycrorm diff A B` compares two episodes: facts, task trees, last places of objects."""
+"""Compare two episodes: facts, task trees, last places of objects.
+
+Panel: Ask, 3.
+"""
 
 from __future__ import annotations
 
@@ -6,20 +9,8 @@ from typing import Annotated
 
 import typer
 
-from pycrorm_async.cli.output import (
-    DEFAULT_URL,
-    CsvOption,
-    JsonOption,
-    SpoolOption,
-    UrlOption,
-    counted,
-    note,
-    print_json,
-    print_line,
-    print_table,
-    stdout,
-)
-from pycrorm_async.cli.reading import read_memory
+from pycrorm_async.cli.output import Form, counted, note, print_json, print_line, print_table, stdout
+from pycrorm_async.cli.reading import Place
 from pycrorm_async.query.named_queries import EpisodeSummary
 from pycrorm_async.query.text import duration
 
@@ -29,10 +20,8 @@ _HELP = "The episode's number, its id or first digits of the id, or `last`."
 def diff(
     first: Annotated[str, typer.Argument(metavar="A", help=_HELP)],
     second: Annotated[str, typer.Argument(metavar="B", help=_HELP)],
-    url: UrlOption = DEFAULT_URL,
-    spool: SpoolOption = None,
-    as_json: JsonOption = False,
-    as_csv: CsvOption = None,
+    place: Place,
+    form: Form,
     sql: Annotated[bool, typer.Option("--sql", help="Print the SQL of the rows that are compared.")] = False,
 ) -> None:
     """Compare two episodes: their circumstances, their task trees, and the last places of their objects.
@@ -40,14 +29,14 @@ def diff(
     Nodes correspond by the types from the root down. A node that only one episode has is listed without its children.
     SQL reads the rows (`--sql`); the comparison is made in Python.
     """
-    compared = read_memory(url, spool, lambda reading: reading.diff(first, second))
+    compared = place.read(lambda reading: reading.diff(first, second))
     if sql:
         print_line(compared.sql)
         return
-    if as_json:
+    if form.as_json:
         print_json(compared)
         return
-    for letter, episode in (("A", compared.first), ("B", compared.second)) if as_csv is None else ():
+    for letter, episode in (("A", compared.first), ("B", compared.second)) if form.is_table else ():
         stdout.print(f"{letter}: {_line(episode)}", markup=False)
     rows = [
         (
@@ -59,8 +48,8 @@ def diff(
         )
         for each in compared.differences
     ]
-    if rows or as_csv is not None:
-        print_table("Differences", ("of", "where", "what", "A", "B"), rows, as_csv=as_csv)
+    if rows or not form.is_table:
+        print_table("Differences", ("of", "where", "what", "A", "B"), rows, as_csv=form.as_csv)
     note(f"{counted(len(rows), 'difference')}; nodes that are the same: {compared.same_nodes:,}")
 
 

@@ -1,4 +1,7 @@
-"""`pycrorm episodes` lists the recorded episodes, one per line; simulated ones on request."""
+"""List the recorded episodes, the oldest first.
+
+Panel: Look at episodes, 1.
+"""
 
 from __future__ import annotations
 
@@ -8,31 +11,20 @@ from typing import Annotated
 import typer
 
 from pycrorm_async.cli.output import (
-    DEFAULT_URL,
-    CsvOption,
-    JsonOption,
-    LimitOption,
-    RobotOption,
-    SinceOption,
-    SpoolOption,
-    StatusOption,
-    TagOption,
-    TextOption,
-    UrlOption,
+    Chosen,
+    Form,
     moment,
     note,
-    parse_since,
     print_json,
     print_table,
     stdout,
 )
-from pycrorm_async.cli.reading import read_memory
+from pycrorm_async.cli.reading import Place
 from pycrorm_async.cli.show import simulated_by
-from pycrorm_async.query.named_queries import EpisodeChoice, EpisodeSummary
+from pycrorm_async.query.named_queries import EpisodeSummary
 from pycrorm_async.query.question import absence_of_episodes
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.text import duration
-from pycrorm_async.store.address import DatabaseAddress
 
 _LISTED = 50
 """The episodes that are listed without --limit or --all: about as many as a terminal has lines."""
@@ -42,47 +34,40 @@ to spare."""
 
 
 def episodes(
-    url: UrlOption = DEFAULT_URL,
-    spool: SpoolOption = None,
+    *,
+    place: Place,
     simulated: Annotated[
         bool, typer.Option("--simulated", help="Also list simulated episodes (SimulatedTaskTree).")
     ] = False,
-    status: StatusOption = None,
-    since: SinceOption = None,
-    tag: TagOption = None,
-    robot: RobotOption = None,
-    text: TextOption = None,
-    limit: LimitOption = None,
+    chosen: Chosen,
     every: Annotated[bool, typer.Option("--all", help=f"All of them, instead of the newest {_LISTED}.")] = False,
-    as_json: JsonOption = False,
-    as_csv: CsvOption = None,
+    form: Form,
 ) -> None:
     """List the newest 50 of the recorded episodes, the oldest of them first, and say how many there are."""
-    listed = None if every else _LISTED
-    choice = EpisodeChoice(status, parse_since(since), tuple(tag or ()), robot, text, limit or listed)
+    choice = chosen.choice(None if every else _LISTED)
 
     async def read(reading: Reading) -> tuple[list[EpisodeSummary], int, str]:
-        chosen = await reading.episodes(choice, simulated=simulated)
-        if len(chosen) != choice.limit:
-            return chosen, len(chosen), "" if chosen else await absence_of_episodes(reading, choice)
+        listed = await reading.episodes(choice, simulated=simulated)
+        if len(listed) != choice.limit:
+            return listed, len(listed), "" if listed else await absence_of_episodes(reading, choice)
         [(total,)] = await reading.rows(choice.counted(), simulated=simulated)
-        return chosen, total, ""
+        return listed, total, ""
 
-    summaries, total, absence = read_memory(url, spool, read)
-    if as_json:
+    summaries, total, absence = place.read(read)
+    if form.as_json:
         print_json(summaries)
     if total > len(summaries):
         note(f"the newest {len(summaries)} of {total:,} episodes; --all lists all, --limit N the newest N")
-    if as_json:
+    if form.as_json:
         return
     if not summaries:
         note(absence)
-    if not summaries and as_csv is None:
-        return
+        if form.is_table:
+            return
     numbers = {e.id: e.number for e in summaries}
     columns: tuple[str, ...] = ("episode", "started", "took", "status", "nodes", "failed", "description")
     rows: list[tuple[object, ...]] = [
-        (e.number, moment(e.started_at), _took(e, as_csv=as_csv), e.status_text, e.nodes, e.failed, text)
+        (e.number, moment(e.started_at), _took(e, form), e.status_text, e.nodes, e.failed, text)
         for e, text in ((each, _description(each, numbers)) for each in summaries)
     ]
     if stdout.width >= _WIDTH_WITH_ROBOTS and any(each.robots for each in summaries):
@@ -95,12 +80,12 @@ def episodes(
     if simulated:
         columns = (*columns, "simulated")
         rows = [(*row, simulated_by(e) if e.simulated else "") for row, e in zip(rows, summaries, strict=True)]
-    print_table(f"Episodes of {DatabaseAddress.parse(url)}", columns, rows, as_csv=as_csv)
+    print_table(f"Episodes of {place.address}", columns, rows, as_csv=form.as_csv)
 
 
-def _took(episode: EpisodeSummary, *, as_csv: bool | None) -> object:
+def _took(episode: EpisodeSummary, form: Form) -> object:
     """Return the duration: of CSV in s, for programs."""
-    if as_csv is None or episode.duration_ns is None:
+    if form.is_table or episode.duration_ns is None:
         return duration(episode.duration_ns)
     return episode.duration_ns / 1e9
 

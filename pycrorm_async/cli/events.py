@@ -1,4 +1,7 @@
-"""`pycrorm events EPISODE` prints the log of an episode, one JSON object per line."""
+"""Print the events of an episode in their order, one JSON object per line.
+
+Panel: Look at episodes, 6.
+"""
 
 from __future__ import annotations
 
@@ -10,38 +13,37 @@ from typing import Annotated
 import msgspec
 import typer
 
-from pycrorm_async.cli.output import DEFAULT_URL, EpisodeArgument, JsonOption, SpoolOption, UrlOption
-from pycrorm_async.cli.reading import note_pending_events
+from pycrorm_async.cli.output import EpisodeArgument, JsonOption
+from pycrorm_async.cli.reading import Place
 from pycrorm_async.errors import CallerError, LogDamaged
 from pycrorm_async.events.types import EVENT_TYPES
-from pycrorm_async.operations.destination import shared_address
 from pycrorm_async.store.log import EventLog, episode_named
 from pycrorm_async.store.stored import StoredEvent
 from pycrorm_async.visible_text import escaped_json
 
 
 def events(
+    *,
     episode: EpisodeArgument,
     after: Annotated[int, typer.Option(min=0, metavar="SEQUENCE", help="Print only events after this one.")] = 0,
     event_types: Annotated[
         list[str] | None, typer.Option("--type", help="Print only events of this type; repeatable.")
     ] = None,
-    url: UrlOption = DEFAULT_URL,
-    spool: SpoolOption = None,
+    place: Place,
     as_json: JsonOption = False,  # noqa: ARG001  the output is always JSON
 ) -> None:
     """Print the events of an episode in their order, one JSON object per line."""
     unknown = sorted(set(event_types or ()) - EVENT_TYPES.keys())
     if unknown:
         raise CallerError(f"unknown event type {unknown[0]!r}; known types: {', '.join(sorted(EVENT_TYPES))}")
-    asyncio.run(_print(url, episode, after, frozenset(event_types or ())))
+    asyncio.run(_print(place, episode, after, frozenset(event_types or ())))
     sys.stdout.flush()
-    note_pending_events(url, spool)
+    place.note_pending_events()
 
 
-async def _print(url: str, episode: str, after: int, event_types: frozenset[str]) -> None:
+async def _print(place: Place, episode: str, after: int, event_types: frozenset[str]) -> None:
     """Print the events of these types; without one print all, also those of a type that this version does not know."""
-    log = await EventLog.open(shared_address(url), create=False)
+    log = await EventLog.open(place.shared_address, create=False)
     try:
         row = await episode_named(log, episode)
         async for page in log.pages(row, after=after):

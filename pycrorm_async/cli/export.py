@@ -1,10 +1,13 @@
-"""`pycrorm export` writes episodes and views to files in the formats of other programs."""
+"""Write episodes, or the rows of a view or a question, to files of other programs.
+
+Panel: Hand over, 1.
+"""
 
 from __future__ import annotations
 
 import asyncio
-import inspect
 from collections.abc import Callable, Mapping
+from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -12,12 +15,9 @@ import typer
 
 from pycrorm_async.cli.interruption import interrupt_on_termination
 from pycrorm_async.cli.output import (
-    DEFAULT_URL,
     JsonOption,
-    SpoolOption,
     StatusOption,
     TagOption,
-    UrlOption,
     counted,
     note,
     parse_since,
@@ -25,7 +25,7 @@ from pycrorm_async.cli.output import (
     print_line,
     problem,
 )
-from pycrorm_async.cli.reading import note_pending_events
+from pycrorm_async.cli.reading import Place
 from pycrorm_async.errors import CallerError
 from pycrorm_async.export.export import EPISODE_FORMATS, ExportComparison, Exported, export_again, format_of
 from pycrorm_async.export.export import export as write_export
@@ -34,19 +34,20 @@ from pycrorm_async.operations.destination import shared_address
 from pycrorm_async.progress_bar import ProgressCallback, progress_bar, stderr
 from pycrorm_async.query.named_queries import EpisodeChoice
 from pycrorm_async.query.question import absence_of_episodes
-from pycrorm_async.query.questions import QUESTIONS, Ask
+from pycrorm_async.query.questions import QUESTIONS, arguments_of
 from pycrorm_async.query.reading import Reading
 
-_READ: Mapping[str, Callable[[str], Any]] = {
-    "bool": lambda text: {"true": True, "false": False}[text.lower()],
-    "int": int,
-    "float": float,
-    "datetime": parse_since,
+_READ: Mapping[Any, Callable[[str], Any]] = {
+    bool: lambda text: {"true": True, "false": False}[text.lower()],
+    int: int,
+    float: float,
+    datetime: parse_since,
 }
 """Reads an argument of this type; others are texts."""
 
 
 def export(
+    *,
     what: Annotated[
         list[str] | None,
         typer.Argument(
@@ -92,8 +93,7 @@ def export(
         bool, typer.Option("--no-formulas", help="Of csv: an apostrophe before each text that a spreadsheet would run.")
     ] = False,
     force: Annotated[bool, typer.Option("--force", help="Replace the file and its manifest if they exist.")] = False,
-    url: UrlOption = DEFAULT_URL,
-    spool: SpoolOption = None,
+    place: Place,
     as_json: JsonOption = False,
 ) -> int:
     """Write episodes, or the rows of a view, to a file, with a manifest from which it can be made again.
@@ -102,7 +102,7 @@ def export(
     rows; without a name each node of them is a row. Exit code 1 if an episode cannot be read and is left out of a
     lerobot data set.
     """
-    shared_address(url)
+    shared_address(place.url)
     if again is not None and what:
         raise CallerError(f"name {' '.join(what)} or make an export again with --again, not both")
     choice = EpisodeChoice(status, tags=tuple(tag or ()), without_tags=tuple(without_tag or ()))
@@ -112,7 +112,7 @@ def export(
         given = file_format, clock, fps
         if given != (None, None, None) or episode or arguments or images or no_formulas or choice != EpisodeChoice():
             raise CallerError("--again takes all but --out and --force from the manifest: leave the other options out")
-        return _again(again, out, url, spool, force=force, as_json=as_json)
+        return _again(again, out, place, force=force, as_json=as_json)
     if choice != EpisodeChoice() and episode:
         raise CallerError("--episode names episodes, and --status, --tag and --without-tag choose them: leave one out")
     if out is None:
@@ -123,7 +123,7 @@ def export(
     options["arguments"] = _arguments(what[0], arguments or []) if what else {}
 
     async def write(report_progress: ProgressCallback | None) -> Exported:
-        async with Reading.open(url) as reading:
+        async with Reading.open(place.url) as reading:
             chosen = episode or []
             if choice != EpisodeChoice():
                 chosen = [str(each.number) for each in await reading.episodes(choice) if each.status != "RUNNING"]
@@ -137,7 +137,7 @@ def export(
     interrupt_on_termination()
     with progress_bar("exporting", unit=_unit(file_format or format_of(out))) as report_progress:
         exported = asyncio.run(write(report_progress if stderr.is_terminal else None))
-    note_pending_events(url, spool)
+    place.note_pending_events()
     _print(exported, as_json=as_json)
     for number, reason in exported.unreadable.items():
         problem(f"episode {number} is not in it: {reason}")
@@ -161,30 +161,30 @@ def _size(text: str | None) -> tuple[int, int] | None:
 def _arguments(question: str, pairs: list[str]) -> dict[str, Any]:
     """Return the arguments of a question by name, as the types that it declares."""
     arguments: dict[str, Any] = {}
-    valid = inspect.signature(getattr(Ask, question)).parameters if question in QUESTIONS else {}
+    valid = arguments_of(question) if question in QUESTIONS else {}
     for each in pairs:
         name, separator, text = each.partition("=")
         if not separator:
             raise CallerError(f"--with must be NAME=VALUE, as in object=milk, got {each!r}")
         if name in arguments:
             raise CallerError(f"{name} of {question} is given twice: give one value")
-        types = str(valid[name].annotation).split(" | ") if name in valid else []
+        type_ = valid[name].type if name in valid else str
         try:
-            arguments[name] = next((read(text) for type_, read in _READ.items() if type_ in types), text)
+            arguments[name] = _READ.get(type_, str)(text)
         except (KeyError, ValueError):
-            raise CallerError(f"{name} of {question} must be of the type {types[0]}, got {text!r}") from None
+            raise CallerError(f"{name} of {question} must be of the type {type_.__name__}, got {text!r}") from None
     return arguments
 
 
-def _again(manifest: Path, out: Path | None, url: str, spool: Path | None, *, force: bool, as_json: bool) -> int:
+def _again(manifest: Path, out: Path | None, place: Place, *, force: bool, as_json: bool) -> int:
     async def write(report_progress: ProgressCallback | None) -> ExportComparison:
-        async with Reading.open(url) as reading:
+        async with Reading.open(place.url) as reading:
             return await export_again(reading, manifest, out, force=force, report_progress=report_progress)
 
     interrupt_on_termination()
     with progress_bar("exporting", unit=_unit(read_manifest(manifest).file_format)) as report_progress:
         comparison = asyncio.run(write(report_progress if stderr.is_terminal else None))
-    note_pending_events(url, spool)
+    place.note_pending_events()
     if as_json:
         file = comparison.exported and out
         outcome = {"same": comparison.same, "by_bytes": comparison.by_bytes, "differences": comparison.differences}

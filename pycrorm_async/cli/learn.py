@@ -1,4 +1,7 @@
-"""`pycrorm learn` runs the learning experiment of the thesis (5.2): it learns to pick up from recorded rollouts."""
+"""Record random pick-ups, learn a policy from the successful ones, and evaluate it.
+
+Panel: Record, 4.
+"""
 
 from __future__ import annotations
 
@@ -15,16 +18,8 @@ from typing import Annotated, Any
 import typer
 
 from pycrorm_async.cli.interruption import Interruption
-from pycrorm_async.cli.output import (
-    DEFAULT_URL,
-    JsonOption,
-    SpoolOption,
-    UrlOption,
-    note,
-    print_facts,
-    print_json,
-    print_table,
-)
+from pycrorm_async.cli.output import JsonOption, note, print_facts, print_json, print_table
+from pycrorm_async.cli.reading import DEFAULT_URL, Place
 from pycrorm_async.errors import CallerError, MissingExtra
 from pycrorm_async.learning import experiment as experiments
 from pycrorm_async.learning.experiment import (
@@ -49,6 +44,7 @@ _FIGURE_SUFFIXES = (".png", ".svg", ".pdf")
 
 
 def learn(
+    *,
     rollouts: Annotated[int, typer.Option(min=1, help="Rollouts to learn from in each round.")] = 5_000,
     rounds: Annotated[
         int, typer.Option(min=1, help="Rounds: the first acts at random, each further one by the latest policy.")
@@ -87,8 +83,7 @@ def learn(
     figure: Annotated[Path, typer.Option(help="File for the figure of both policies: .png, .svg or .pdf.")] = Path(
         "policies.png"
     ),
-    url: UrlOption = DEFAULT_URL,
-    spool: SpoolOption = None,
+    place: Place,
     as_json: JsonOption = False,
 ) -> None:
     """Record random pick-ups, learn a policy from the successful ones, and evaluate it.
@@ -97,7 +92,7 @@ def learn(
     """
     # These checks come first, so that a missing package or a bad path does not fail after an hour of rollouts; of them
     # that of the packages comes last, because importing them takes half a second.
-    DatabaseAddress.parse(url)
+    DatabaseAddress.parse(place.url)
     _check_files(policy, figure)
     experiment = Experiment(
         rollouts=rollouts,
@@ -112,14 +107,14 @@ def learn(
         resume=resume,
     )
     _check_packages()
-    place = MemoryLocation(url, spool)
+    location = MemoryLocation(*place)
     with progress_bar("rollouts", unit="rollouts") as bar:
 
         def report_progress(name: str, done: int, total: int, tally: Tally) -> None:
             rate = f" ({tally.success_rate:.1%} succeed)" if tally.rollouts else ""
             bar(done, total, f"{name}{rate}")
 
-        learned, in_kitchen, studied = asyncio.run(_run(experiment, place, study_rollouts, report_progress))
+        learned, in_kitchen, studied = asyncio.run(_run(experiment, location, study_rollouts, report_progress))
     save_policy(learned.policy, policy)
     titles = {
         f"default policy: {_percent(learned.default.tally)} succeed": default_policy(),
@@ -130,7 +125,7 @@ def learn(
         print_json(_document(experiment, learned, in_kitchen, studied, policy, figure))
         return
     _print(learned, in_kitchen, studied)
-    option = "" if url == DEFAULT_URL else f" --url {shlex.quote(DatabaseAddress.parse(url).to_type)}"
+    option = "" if place.url == DEFAULT_URL else f" --url {shlex.quote(place.address.to_type)}"
     note(f"The policy is in {policy}, its figure in {figure}. Next: pycrorm episodes{option}")
 
 

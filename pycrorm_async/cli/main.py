@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import functools
 import gc
+import inspect
 import io
 import logging
 import os
@@ -22,7 +23,7 @@ import sys
 from collections.abc import Callable, Mapping
 from importlib import import_module
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, get_type_hints
 
 import typer
 from typer.exceptions import TyperException
@@ -45,15 +46,23 @@ def exit_code(error: PycrormError) -> int:
     return 1
 
 
-def _with_exit_code(verb: Callable[..., int | None]) -> Callable[..., None]:
-    """Wrap a verb so that it exits with the code it returns, or with one line and the code of its exception."""
+def _as_command(verb: Callable[..., int | None]) -> Callable[..., None]:
+    """Return a verb as typer calls it: with one parameter for each option, and a code with which it exits.
+
+    A parameter whose type is a group of options, such as `Place`, is replaced by these. An exception is printed as one
+    line and has a code.
+    """
+    own = inspect.signature(verb, eval_str=True)
+    groups = {name: each.annotation for name, each in own.parameters.items() if hasattr(each.annotation, "_fields")}
 
     @functools.wraps(verb)
-    def run(*arguments: Any, **options: Any) -> None:
+    def run(**options: Any) -> None:
         try:
             if options.get("as_json") and options.get("as_csv") is not None:
                 raise errors.CallerError("--json and --csv exclude each other")
-            code = verb(*arguments, **options) or 0
+            for name, group in groups.items():
+                options[name] = group(*(options.pop(each) for each in group._fields))
+            code = verb(**options) or 0
             sys.stdout.flush()
         except PycrormError as error:
             _problem(str(error))
@@ -67,7 +76,18 @@ def _with_exit_code(verb: Callable[..., int | None]) -> Callable[..., None]:
             code = 1
         raise typer.Exit(code)
 
+    parameters: list[inspect.Parameter] = []
+    for name, each in own.parameters.items():
+        parameters += _options_of(groups[name]) if name in groups else [each]
+    keywords = [each.replace(kind=inspect.Parameter.KEYWORD_ONLY) for each in parameters]
+    run.__signature__ = own.replace(parameters=keywords)  # type: ignore[attr-defined]  # typer reads it
     return run
+
+
+def _options_of(group: Any) -> list[inspect.Parameter]:
+    """Return the parameters of a group of options, a class of named tuples."""
+    hints = get_type_hints(group, include_extras=True)
+    return [each.replace(annotation=hints[name]) for name, each in inspect.signature(group).parameters.items()]
 
 
 def _problem(line: str) -> None:
@@ -90,54 +110,29 @@ _UNKNOWN = re.compile(
 """Finds the names that typer suggests: their form differs from that of our lines, and --json is not near --since."""
 _INTERRUPTED = 130
 _HELP = "Episodic memory for robots: record plans as events and query them as tables."
-_VERBS: Mapping[str, Mapping[str, str]] = {
-    "Record": {
-        "demo": "Run and record the thesis' example plan, then query it.",
-        "run": "Run a plan and record it.",
-        "tag": "Add tags to an episode that has ended, and remove others.",
-        "learn": "Record random pick-ups, learn a policy from the successful ones, and evaluate it.",
-    },
-    "Look at episodes": {
-        "episodes": "List the recorded episodes, the oldest first.",
-        "show": "Show the task tree of an episode; with --at, tree and world at one moment.",
-        "watch": "Follow running episodes live, on a page or in the terminal.",
-        "report": "Write an episode, or a table of all of them, as HTML that opens offline.",
-        "picture": "Write the scene at a moment as PNG.",
-        "events": "Print the events of an episode in their order, one JSON object per line.",
-    },
-    "Ask": {
-        "ask": "Answer a named question; `pycrorm ask NAME --help` lists its options.",
-        "recall": "List the past actions most like a cue, with their outcomes.",
-        "diff": "Compare two episodes: facts, task trees, last places of objects.",
-        "plot": "Draw how often actions succeeded over two columns of a view.",
-        "query": "Run one read-only query in SQL.",
-        "schema": "Describe the views of a memory and their columns.",
-        "mcp": "Serve the memory to an agent by the Model Context Protocol.",
-    },
-    "Hand over": {
-        "export": "Write episodes, or the rows of a view or a question, to files of other programs.",
-        "copy": "Append the episodes of one memory to another.",
-        "datasette-metadata": "Print Datasette's metadata of a SQLite memory.",
-    },
-    "Operate": {
-        "status": "Report recorders, writers, running episodes, and the lag of database and tables.",
-        "writer": "Drain a spool continuously: append its events and fold them into the tables.",
-        "rebuild": "Rebuild all tables and views from the log, while recording continues.",
-        "verify": "Check the log for damage, and compare the tables with it.",
-        "roles": "Show the roles of a memory on PostgreSQL; with --create, make them.",
-        "spool": "The write-ahead queue's files: inspect, repair, or store them in another database.",
-    },
-}
-"""The verbs with their lines in `pycrorm --help`, which loads no verb."""
-_GROUPS: Mapping[str, tuple[str, ...]] = {"ask": (), "spool": ("inspect", "repair", "rebind")}
-_NAMES: Mapping[str, str] = {name: line for panel in _VERBS.values() for name, line in panel.items()}
+_PANELS = ("Record", "Look at episodes", "Ask", "Hand over", "Operate")
+"""The panels of `pycrorm --help`, in their order."""
+_MODULE = re.compile(r'"""(?P<line>.+)\n\nPanel: (?P<panel>.+), (?P<place>\d+)\.\n')
+"""The begin of a verb's module: its line in `pycrorm --help`, the panel, and its place there."""
+
+
+@functools.cache
+def panels() -> Mapping[str, Mapping[str, str]]:
+    """Return the verbs with their lines, by panel. They are read from the files' begins, because loading takes long."""
+    begins = {each.stem: _MODULE.match(each.read_text(encoding="utf-8")) for each in Path(__file__).parent.glob("*.py")}
+    verbs = sorted(
+        (int(begin["place"]), begin["panel"], stem.replace("_", "-"), begin["line"])
+        for stem, begin in begins.items()
+        if begin is not None
+    )
+    return {panel: {name: line for _, of, name, line in verbs if of == panel} for panel in _PANELS}
 
 
 def app(requested: str | None = None) -> typer.Typer:
     """Build the command with the requested verb, with all verbs, or with the names of all if it is not a verb.
 
-    Each verb is a function in the module of the same name, with `_` for `-` (for a group, of the group's name). Only
-    requested modules are loaded, because loading all takes two seconds, and most single ones take half of that.
+    Each verb is a function in the module of the same name, with `_` for `-`; a module with `VERBS` is a group of these.
+    Only requested modules are loaded, because loading all takes two seconds, and most single ones take half of that.
     """
     command = typer.Typer(
         name="pycrorm",
@@ -147,33 +142,37 @@ def app(requested: str | None = None) -> typer.Typer:
         context_settings={"help_option_names": ["-h", "--help"]},
     )
     command.callback()(_options)  # without a callback, typer would make a single verb the command itself
-    for verb in [each for each in _NAMES if each == requested] or _NAMES:
-        if requested is not None and requested != verb:
-            command.command(verb, help=_NAMES[verb])(lambda: None)
-        elif verb not in _GROUPS:
-            command.command(verb)(_load_verb(verb.replace("-", "_"), verb.replace("-", "_")))
-        else:
-            verbs = _GROUPS[verb]
-            group = typer.Typer(help=_NAMES[verb], no_args_is_help=bool(verbs))
-            for each in verbs or import_module(f"pycrorm_async.cli.{verb}").verbs():
-                group.command(each)(_load_verb(verb, each))
-            if not verbs:
-                group.callback(invoke_without_command=True)(_list_verbs)
-            command.add_typer(group, name=verb)
+    lines = {name: line for verbs in panels().values() for name, line in verbs.items()}
+    for name in [requested] if requested in lines else lines:
+        if requested not in (None, name):
+            command.command(name, help=lines[name])(lambda: None)
+            continue
+        module = import_module(f"pycrorm_async.cli.{name.replace('-', '_')}")
+        verbs: Mapping[str, Callable[..., int | None]] | None = getattr(module, "VERBS", None)
+        if verbs is None:
+            command.command(name)(_as_command(getattr(module, name.replace("-", "_"))))
+            continue
+        without_verb = getattr(module, "without_verb", None)
+        group = typer.Typer(help=lines[name], no_args_is_help=without_verb is None)
+        for each, verb in verbs.items():
+            group.command(each)(_as_command(verb))
+        if without_verb is not None:
+            group.callback(invoke_without_command=True)(without_verb)
+        command.add_typer(group, name=name)
     return command
 
 
 def _help() -> str:
     """Return the lines of `pycrorm --help`, as plain text: loading what draws frames would take twice the time."""
-    panels = (
+    listed = (
         "\n".join([f"{panel}:", *(f"  {name:<20}{line}" for name, line in verbs.items())])
-        for panel, verbs in _VERBS.items()
+        for panel, verbs in panels().items()
     )
     options = "--version             Print the version and exit.\n  -h, --help            Show this message and exit."
     shell = "--install-completion  Install completion for the current shell; --show-completion prints it."
     words = 'The section "Words" of the README explains episode, node, event, spool, fold and generation.'
     usage = "Usage: pycrorm VERB [OPTIONS] [ARGUMENTS]...    (`pycrorm VERB --help` lists those of a verb)"
-    return "\n\n".join([usage, _HELP, *panels, f"Options:\n  {options}\n  {shell}", words]) + "\n"
+    return "\n\n".join([usage, _HELP, *listed, f"Options:\n  {options}\n  {shell}", words]) + "\n"
 
 
 def _options(
@@ -182,16 +181,6 @@ def _options(
     ] = False,
 ) -> None:
     """Parse the options of the command itself."""
-
-
-def _list_verbs(context: typer.Context) -> None:
-    """Print the verbs of a group, when it is called without one."""
-    if context.invoked_subcommand is None:
-        sys.stdout.write(f"{context.get_help()}\n")
-
-
-def _load_verb(module: str, name: str) -> Callable[..., None]:
-    return _with_exit_code(getattr(import_module(f"pycrorm_async.cli.{module}"), name))
 
 
 def _words() -> list[str]:

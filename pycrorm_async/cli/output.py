@@ -10,8 +10,7 @@ import sys
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime, timedelta
-from pathlib import Path
-from typing import Annotated, Any, overload
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, overload
 
 import msgspec
 import typer
@@ -23,6 +22,9 @@ from pycrorm_async.errors import CallerError
 from pycrorm_async.progress_bar import VisibleConsole, stderr
 from pycrorm_async.settings import FileAccess, Writer
 from pycrorm_async.visible_text import escaped_json, visible, without_formula
+
+if TYPE_CHECKING:
+    from pycrorm_async.query.named_queries import EpisodeChoice
 
 _WIDTH_PIPED = 10_000
 """Width in characters if stdout is not a terminal, so that `grep` finds whole lines; more would make huge tables."""
@@ -160,24 +162,6 @@ def _cell(value: object) -> str:
 #
 # Define the command-line options that several verbs share.
 
-DEFAULT_URL = "sqlite:///pycrorm.db"
-
-UrlOption = Annotated[
-    str,
-    typer.Option(
-        "--url",
-        envvar="PYCRORM_URL",
-        help="The database: sqlite:///memory.db, sqlite:////absolute/path.db, postgresql://user@host/database."
-        " The list of processes shows a password in this option; put it into the environment variable or ~/.pgpass.",
-        show_envvar=True,
-    ),
-]
-SpoolOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--spool", envvar="PYCRORM_SPOOL", help="Folder of the write-ahead queue; default: beside the database."
-    ),
-]
 WriterOption = Annotated[
     Writer,
     typer.Option(
@@ -210,26 +194,8 @@ EpisodeArgument = Annotated[
 StatusOption = Annotated[
     str | None, typer.Option("--status", metavar="STATUS", help="Only episodes of this status: RUNNING, SUCCEEDED, …")
 ]
-SinceOption = Annotated[
-    str | None,
-    typer.Option(
-        "--since",
-        metavar="WHEN",
-        help="Only episodes that started then or later: 2026-11-23, 2026-11-23T14:30, 90min, 7d.",
-    ),
-]
 TagOption = Annotated[
     list[str] | None, typer.Option("--tag", metavar="TAG", help="Only episodes with this tag; repeatable: with all.")
-]
-RobotOption = Annotated[
-    str | None, typer.Option("--robot", metavar="ROBOT", help="Only episodes with a robot of this name or model.")
-]
-TextOption = Annotated[
-    str | None,
-    typer.Option("--text", metavar="TEXT", help="Only episodes whose description, plan or a tag has this text."),
-]
-LimitOption = Annotated[
-    int | None, typer.Option("--limit", metavar="N", min=1, help="Only the newest N of these episodes.")
 ]
 CsvOption = Annotated[
     bool | None,
@@ -240,6 +206,54 @@ CsvOption = Annotated[
     ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON document.")]
+
+
+class Chosen(NamedTuple):
+    """The options that choose among episodes."""
+
+    status: StatusOption = None
+    since: Annotated[
+        str | None,
+        typer.Option(
+            metavar="WHEN",
+            help="Only episodes that started then or later: 2026-11-23, 2026-11-23T14:30, 90min, 7d.",
+        ),
+    ] = None
+    tag: TagOption = None
+    robot: Annotated[
+        str | None, typer.Option(metavar="ROBOT", help="Only episodes with a robot of this name or model.")
+    ] = None
+    text: Annotated[
+        str | None, typer.Option(metavar="TEXT", help="Only episodes whose description, plan or a tag has this text.")
+    ] = None
+    limit: Annotated[int | None, typer.Option(metavar="N", min=1, help="Only the newest N of these episodes.")] = None
+
+    def choice(self, limit: int | None = None) -> EpisodeChoice:
+        """Return the choice, by default of at most this many."""
+        from pycrorm_async.query.named_queries import EpisodeChoice  # loads the mapped classes
+
+        since, tags = parse_since(self.since), tuple(self.tag or ())
+        return EpisodeChoice(self.status, since, tags, self.robot, self.text, self.limit or limit)
+
+
+class Form(NamedTuple):
+    """The form in which a verb prints its rows: a table, one JSON document, or CSV, also without formulas."""
+
+    as_json: JsonOption = False
+    as_csv: CsvOption = None
+
+    @property
+    def is_table(self) -> bool:
+        """True if it is for a person to read."""
+        return not self.as_json and self.as_csv is None
+
+
+def print_rows(form: Form, document: Any, title: str, columns: Sequence[str], rows: Iterable[Sequence[object]]) -> None:
+    """Print rows in their form: the document as JSON, or a table with a title, or CSV."""
+    if form.as_json:
+        print_json(document)
+    else:
+        print_table(title, columns, rows, as_csv=form.as_csv)
 
 
 # === since ====================================================================================================

@@ -1,4 +1,7 @@
-"""`pycrorm picture EPISODE` writes the scene of an episode at a moment as a PNG file."""
+"""Write the scene at a moment as PNG.
+
+Panel: Look at episodes, 5.
+"""
 
 from __future__ import annotations
 
@@ -7,16 +10,8 @@ from typing import Annotated
 
 import typer
 
-from pycrorm_async.cli.output import (
-    DEFAULT_URL,
-    EpisodeArgument,
-    JsonOption,
-    SpoolOption,
-    UrlOption,
-    print_json,
-    print_line,
-)
-from pycrorm_async.cli.reading import read_memory
+from pycrorm_async.cli.output import EpisodeArgument, JsonOption, print_json, print_line
+from pycrorm_async.cli.reading import Place
 from pycrorm_async.errors import CallerError
 from pycrorm_async.query.picture import picture as draw
 from pycrorm_async.query.reading import Reading
@@ -25,6 +20,7 @@ from pycrorm_async.report.output_files import refuse_existing, write_file
 
 
 def picture(
+    *,
     episode: EpisodeArgument,
     at: Annotated[
         str | None,
@@ -47,8 +43,7 @@ def picture(
         typer.Option(metavar="DEGREES", help="Look from this side, 0 from +x, 90 from +y; default: the best view."),
     ] = None,
     pitch: Annotated[float, typer.Option(metavar="DEGREES", help="Look from this angle above the scene.")] = 32.0,
-    url: UrlOption = DEFAULT_URL,
-    spool: SpoolOption = None,
+    place: Place,
     as_json: JsonOption = False,
 ) -> None:
     """Write the scene at a moment as PNG, drawn from the recorded geometry without a display."""
@@ -68,7 +63,7 @@ def picture(
         write_file(png, path, force=force)
         return path
 
-    path = read_memory(url, spool, write)
+    path = place.read(write)
     if as_json:
         print_json({"file": path, "bytes": path.stat().st_size, "width": width, "height": height})
     else:

@@ -1,4 +1,7 @@
-"""`pycrorm plot X Y` draws how often actions succeeded over two columns of a view."""
+"""Draw how often actions succeeded over two columns of a view.
+
+Panel: Ask, 4.
+"""
 
 from __future__ import annotations
 
@@ -8,8 +11,8 @@ from typing import Annotated, Any
 
 import typer
 
-from pycrorm_async.cli.output import DEFAULT_URL, JsonOption, SpoolOption, UrlOption, note, print_json, print_line
-from pycrorm_async.cli.reading import read_memory
+from pycrorm_async.cli.output import JsonOption, note, print_json, print_line
+from pycrorm_async.cli.reading import Place
 from pycrorm_async.errors import CallerError
 from pycrorm_async.query.success import Kind, SuccessTable, success_figure, success_samples, success_table
 from pycrorm_async.report.output_files import refuse_existing, write_file
@@ -18,6 +21,7 @@ _SUFFIXES = (".png", ".svg", ".pdf")
 
 
 def plot(
+    *,
     x: Annotated[str, typer.Argument(help="The column along the bottom: numbers, times, texts or enums.")],
     y: Annotated[str, typer.Argument(help="The column along the side.")],
     of: Annotated[
@@ -37,8 +41,7 @@ def plot(
         "success.png"
     ),
     force: Annotated[bool, typer.Option("--force", help="Replace the file if it exists.")] = False,
-    url: UrlOption = DEFAULT_URL,
-    spool: SpoolOption = None,
+    place: Place,
     as_json: JsonOption = False,
 ) -> None:
     """Draw how often actions succeeded over two columns of a view: where, with which arm, how long.
@@ -48,7 +51,7 @@ def plot(
     if out.suffix not in _SUFFIXES:
         raise CallerError(f"--out {out} must end in one of {', '.join(_SUFFIXES)}")
     refuse_existing(out, force=force)
-    samples = read_memory(url, spool, lambda reading: success_samples(reading, x, y, of))
+    samples = place.read(lambda reading: success_samples(reading, x, y, of))
     buffer = io.BytesIO()
     success_figure(samples, kind=kind, bins=bins).savefig(buffer, format=out.suffix[1:], dpi=120)
     write_file(buffer.getvalue(), out, force=force)

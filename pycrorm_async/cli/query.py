@@ -1,4 +1,7 @@
-"""`pycrorm query "SELECT …"` runs SQL by hand; the database lets it only read."""
+"""Run one read-only query in SQL.
+
+Panel: Ask, 5.
+"""
 
 from __future__ import annotations
 
@@ -9,19 +12,8 @@ from typing import Annotated, Any, Literal
 
 import typer
 
-from pycrorm_async.cli.output import (
-    DEFAULT_URL,
-    CsvOption,
-    JsonOption,
-    SpoolOption,
-    UrlOption,
-    counted,
-    csv_cell,
-    note,
-    print_json,
-    print_table,
-)
-from pycrorm_async.cli.reading import read_memory
+from pycrorm_async.cli.output import Form, counted, csv_cell, note, print_rows
+from pycrorm_async.cli.reading import Place
 from pycrorm_async.errors import CallerError
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.sql import SqlLimits, SqlResult, json_rows
@@ -32,8 +24,9 @@ _MEGABYTE = 1_000_000
 
 
 def query(
+    *,
     sql: Annotated[str, typer.Argument(metavar="SQL", help="One SELECT; `-` reads it from stdin.")],
-    form: Annotated[
+    layout: Annotated[
         Literal["table", "csv", "json"], typer.Option("--format", help="csv prints the rows while the query runs.")
     ] = "table",
     limit: Annotated[
@@ -41,10 +34,8 @@ def query(
     ] = _ROWS,
     megabytes: Annotated[float, typer.Option(metavar="MB", help="Return at most this size of rows.")] = 16.0,
     seconds: Annotated[float, typer.Option(metavar="S", help="Time that the database may take.")] = 10.0,
-    url: UrlOption = DEFAULT_URL,
-    spool: SpoolOption = None,
-    as_json: JsonOption = False,
-    as_csv: CsvOption = None,
+    place: Place,
+    form: Form,
 ) -> None:
     """Run one read-only query in SQL: no statement can change the memory or the machine.
 
@@ -56,17 +47,16 @@ def query(
     if not 0 < megabytes < math.inf:
         raise CallerError(f"--megabytes must be > 0 and finite, got {megabytes}")
     limits = SqlLimits(rows=limit or None, bytes=max(int(megabytes * _MEGABYTE), 1), seconds=seconds)
-    if as_json and form == "csv":
+    if form.as_json and layout == "csv":
         raise CallerError("--json and --format csv exclude each other")
-    if form == "csv" or as_csv is not None:
-        more = read_memory(url, spool, lambda reading: _write_csv(reading, text, limits, no_formulas=as_csv is False))
+    if layout == "csv" or form.as_csv is not None:
+        more = place.read(lambda reading: _write_csv(reading, text, limits, no_formulas=form.as_csv is False))
     else:
-        result = read_memory(url, spool, lambda reading: reading.query(text, limits))
+        result = place.read(lambda reading: reading.query(text, limits))
         more = result.more
-        if as_json or form == "json":
-            print_json(_document(result))
-        else:
-            print_table(counted(len(result.rows), "row"), result.columns, ([*map(_cell, row)] for row in result.rows))
+        form = Form(form.as_json or layout == "json")
+        rows = ([*map(_cell, row)] for row in result.rows)
+        print_rows(form, _document(result), counted(len(result.rows), "row"), result.columns, rows)
     if more:
         note(
             f"the query has more rows: these are the first, up to {limit or 'any number of'} rows and {megabytes:g} MB;"

@@ -1,11 +1,13 @@
-"""Open a memory for a verb that reads one answer from it, and warn about events that the answer cannot contain yet."""
+"""Name the memory that a verb opens, read from it, and warn about events that the answer cannot contain yet."""
 
 from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Annotated, NamedTuple, TypeVar
+
+import typer
 
 from pycrorm_async.cli.output import note
 from pycrorm_async.operations.destination import shared_address
@@ -17,42 +19,69 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
+DEFAULT_URL = "sqlite:///pycrorm.db"
 
-def read_memory(url: str, spool: Path | None, read: Callable[[Reading], Awaitable[T]]) -> T:
-    """Open the memory at the URL, call `read` with it, and return the result; then note pending events.
-
-    Raises `CallerError` for `sqlite://`, as every verb that opens the memory of another process.
-    """
-    from pycrorm_async.query.reading import Reading  # loads the mapped classes, which not every verb needs
-
-    shared_address(url)
-
-    async def run() -> T:
-        async with Reading.open(url) as reading:
-            return await read(reading)
-
-    answer = asyncio.run(run())
-    note_pending_events(url, spool)
-    return answer
-
-
-# === pending events ===========================================================================================
-#
-# Warn when a spool holds events that its database does not; reading verbs never store them themselves.
+UrlOption = Annotated[
+    str,
+    typer.Option(
+        "--url",
+        envvar="PYCRORM_URL",
+        help="The database: sqlite:///memory.db, sqlite:////absolute/path.db, postgresql://user@host/database."
+        " The list of processes shows a password in this option; put it into the environment variable or ~/.pgpass.",
+        show_envvar=True,
+    ),
+]
+SpoolOption = Annotated[
+    Path | None,
+    typer.Option(
+        "--spool", envvar="PYCRORM_SPOOL", help="Folder of the write-ahead queue; default: beside the database."
+    ),
+]
 
 
-def note_pending_events(url: str, spool: Path | None) -> None:
-    """Print one line on stderr for dead recorders with events left to store, and one for living recorders."""
-    address = DatabaseAddress.parse(url)
-    folders = Spool(spool or address.default_spool).recorders()
-    recorders = [each for each in folders if each.refused is None]  # `pycrorm status` reports dead letters
-    alive = sum(each.alive for each in recorders)
-    dead = len(recorders) - alive
-    if dead:
-        option = f" --spool {spool}" if spool else ""
-        note(
-            f"{dead} dead recorder{'s' * (dead > 1)} left events that are not in the database:"
-            f" run `pycrorm writer --once --url {address.to_type}{option}` to store them."
-        )
-    if alive:
-        note(f"{alive} recorder{'s are' if alive > 1 else ' is'} running: the latest events may not be stored yet.")
+class Place(NamedTuple):
+    """The memory that a verb opens: the URL of its database, and the folder of its write-ahead queue."""
+
+    url: UrlOption = DEFAULT_URL
+    spool: SpoolOption = None
+
+    @property
+    def address(self) -> DatabaseAddress:
+        """The address of the database, of any kind."""
+        return DatabaseAddress.parse(self.url)
+
+    @property
+    def shared_address(self) -> DatabaseAddress:
+        """The address. Raises `CallerError` for `sqlite://`, as every verb that opens the memory of another process."""
+        return shared_address(self.url)
+
+    def read(self, read: Callable[[Reading], Awaitable[T]]) -> T:
+        """Open the memory, call `read` with it, and return the result; then note pending events."""
+        from pycrorm_async.query.reading import Reading  # loads the mapped classes, which not every verb needs
+
+        async def run() -> T:
+            async with Reading.open(self.url) as reading:
+                return await read(reading)
+
+        shared_address(self.url)
+        answer = asyncio.run(run())
+        self.note_pending_events()
+        return answer
+
+    def note_pending_events(self) -> None:
+        """Print a line on stderr for dead recorders with events left to store, and one for living recorders.
+
+        Verbs that read never store these events themselves.
+        """
+        folders = Spool(self.spool or self.address.default_spool).recorders()
+        recorders = [each for each in folders if each.refused is None]  # `pycrorm status` reports dead letters
+        alive = sum(each.alive for each in recorders)
+        dead = len(recorders) - alive
+        if dead:
+            option = f" --spool {self.spool}" if self.spool else ""
+            note(
+                f"{dead} dead recorder{'s' * (dead > 1)} left events that are not in the database:"
+                f" run `pycrorm writer --once --url {self.address.to_type}{option}` to store them."
+            )
+        if alive:
+            note(f"{alive} recorder{'s are' if alive > 1 else ' is'} running: the latest events may not be stored yet.")

@@ -1,4 +1,7 @@
-"""`pycrorm rebuild` rebuilds the tables from the log."""
+"""Rebuild all tables and views from the log, while recording continues.
+
+Panel: Operate, 3.
+"""
 
 from __future__ import annotations
 
@@ -9,19 +12,8 @@ from typing import Annotated
 import typer
 
 from pycrorm_async.bulk_records import collect_seldom
-from pycrorm_async.cli.output import (
-    DEFAULT_URL,
-    JsonOption,
-    ProjectionOption,
-    SpoolOption,
-    UrlOption,
-    counted,
-    note,
-    print_json,
-    problem,
-    stdout,
-)
-from pycrorm_async.cli.reading import note_pending_events
+from pycrorm_async.cli.output import JsonOption, ProjectionOption, counted, note, print_json, problem, stdout
+from pycrorm_async.cli.reading import Place
 from pycrorm_async.errors import CallerError
 from pycrorm_async.operations.rebuild import RebuildSummary, projections_of, rebuild_memory, rebuild_projection
 from pycrorm_async.progress_bar import progress_bar
@@ -32,12 +24,12 @@ _TABLES = "tables"
 
 
 def rebuild(
+    *,
     names: Annotated[
         list[str] | None,
         typer.Argument(metavar="[NAME]...", help="`tables`, or the name of a projection; default: all."),
     ] = None,
-    url: UrlOption = DEFAULT_URL,
-    spool: SpoolOption = None,
+    place: Place,
     workers: Annotated[
         int | None,
         typer.Option(
@@ -62,8 +54,8 @@ def rebuild(
     given_projections = load_projections(projection or ())
     projections = {each.name: each for each in (*given_projections, *installed_projections(given_projections))}
     collect_seldom()
-    chosen = asyncio.run(_choose(url, names or [], projections))
-    summaries = {name: asyncio.run(_rebuild(url, workers, projections.get(name))) for name in chosen}
+    chosen = asyncio.run(_choose(place.url, names or [], projections))
+    summaries = {name: asyncio.run(_rebuild(place.url, workers, projections.get(name))) for name in chosen}
     # Projections of this package are rebuilt with the tables, so they are listed only if the user names them.
     built_in = {name for name, each in projections.items() if isinstance(each, PackedProjection)}
     shown = [name for name in summaries if name not in built_in or name in (names or ())]
@@ -89,7 +81,7 @@ def rebuild(
     damaged = {number: each for summary in summaries.values() for number, each in summary.damaged.items()}
     for number, identity in damaged.items():
         problem(f"episode {number}: its id {identity!r:.100} was changed after it was stored: it is not a UUID")
-    note_pending_events(url, spool)
+    place.note_pending_events()
     return 4 if damaged else 1 if any(each.parked for each in summaries.values()) else 0
 
 

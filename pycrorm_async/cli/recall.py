@@ -1,25 +1,17 @@
-"""`pycrorm recall` lists the past actions most like a cue, with their outcomes."""
+"""List the past actions most like a cue, with their outcomes.
+
+Panel: Ask, 2.
+"""
 
 from __future__ import annotations
 
 import re
-from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import typer
 
-from pycrorm_async.cli.output import (
-    DEFAULT_URL,
-    CsvOption,
-    JsonOption,
-    SpoolOption,
-    UrlOption,
-    note,
-    print_json,
-    print_table,
-    stdout,
-)
-from pycrorm_async.cli.reading import read_memory
+from pycrorm_async.cli.output import Form, note, print_rows, print_table, stdout
+from pycrorm_async.cli.reading import Place
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.ids import SEQUENCE_MAX, row_id
 from pycrorm_async.query.reading import Reading
@@ -34,6 +26,7 @@ _K = 10
 
 
 def recall(
+    *,
     cue: Annotated[
         list[str] | None,
         typer.Argument(
@@ -68,10 +61,8 @@ def recall(
     why: Annotated[
         bool, typer.Option("--why", help="Explain each action: what is alike, what differs and by how much.")
     ] = False,
-    url: UrlOption = DEFAULT_URL,
-    spool: SpoolOption = None,
-    as_json: JsonOption = False,
-    as_csv: CsvOption = None,
+    place: Place,
+    form: Form,
 ) -> None:
     """List the past actions most like a cue, with their outcomes."""
     parsed = _parse(cue or [])
@@ -86,7 +77,7 @@ def recall(
             conditions, "--follows" if follows else "--like", taken=() if follows else ("simulated", "k")
         )
     if follows:
-        _follows(parsed, like, url, spool, status=status, reason=reason, as_json=as_json, as_csv=as_csv)
+        _follows(parsed, like, place, form, status=status, reason=reason)
         return
     if like is None and not any(parsed[:-1]):  # `only:` chooses among the cases of a cue
         raise CallerError("name a type or features, for example `pycrorm recall PickUpAction arm=LEFT`, or add --like")
@@ -105,13 +96,13 @@ def recall(
             await EpisodeNames(reading).check_robot(robot)
         return answer, await memory.types(), await answer.outcomes()
 
-    answer, types, outcomes = read_memory(url, spool, query)
-    if as_json or as_csv is not None:  # else the answer itself has the line
+    answer, types, outcomes = place.read(query)
+    if not form.is_table:  # else the answer itself has the line
         _note_unknown(answer.cue.type, types)
-    if as_json:
-        print_json(_document(answer, outcomes))
+    if form.is_table:
+        _print(answer, outcomes, why=why)
     else:
-        _print(answer, outcomes, why=why, as_csv=as_csv)
+        print_rows(form, _document(answer, outcomes), "", *answer.table())
 
 
 class _Parsed(NamedTuple):
@@ -189,10 +180,7 @@ def _note_unknown(dtype: str | None, types: tuple[str, ...]) -> None:
 # --- printing -------------------------------------------------------------------------------------------------
 
 
-def _print(answer: Answer, outcomes: list[tuple[str, int]], *, why: bool, as_csv: bool | None) -> None:
-    if as_csv is not None:
-        print_table("", *answer.table(), as_csv=as_csv)
-        return
+def _print(answer: Answer, outcomes: list[tuple[str, int]], *, why: bool) -> None:
     if why:
         for each in answer:
             stdout.print(each.why(), markup=False, highlight=False)
@@ -252,15 +240,7 @@ def _case(recalled: RecalledCase) -> dict[str, Any]:
 
 
 def _follows(
-    parsed: _Parsed,
-    like: str | None,
-    url: str,
-    spool: Path | None,
-    *,
-    status: str | None,
-    reason: str | None,
-    as_json: bool,
-    as_csv: bool | None,
+    parsed: _Parsed, like: str | None, place: Place, form: Form, *, status: str | None, reason: str | None
 ) -> None:
     dtype = parsed.type
     if dtype is None or like is not None or any(parsed[1:]):
@@ -271,19 +251,15 @@ def _follows(
         following = await memory.follows(dtype, status=status, reason=reason)
         return following, await memory.types(), await memory.reasons(dtype)
 
-    following, types, reasons = read_memory(url, spool, query)
+    following, types, reasons = place.read(query)
     _note_unknown(dtype, types)
     if reason is not None and dtype in types and reason not in reasons:
         note(f"no {dtype} has ended with the reason {reason}{closest(reason, reasons)}")
-    if as_json:
-        followers = [
-            each._asdict() | {"success": each.success and each.success._asdict()} for each in following.followers
-        ]
-        print_json({"cases": following.cases, "followers": followers})
-        return
+    followers = [each._asdict() | {"success": each.success and each.success._asdict()} for each in following.followers]
+    document = {"cases": following.cases, "followers": followers}
     rows = [
         (each.type or "(nothing)", each.cases, f"{100 * each.share:.0f} %", str(each.success) if each.success else "")
         for each in following.followers
     ]
     after = " ".join([dtype, *([status] if status else []), *([f"({reason})"] if reason else [])])
-    print_table(f"After {following.cases:,} {after}", ("next", "times", "share", "success"), rows, as_csv=as_csv)
+    print_rows(form, document, f"After {following.cases:,} {after}", ("next", "times", "share", "success"), rows)

@@ -1,4 +1,7 @@
-"""`pycrorm report EPISODE` writes an episode as one HTML page; `pycrorm report --all` a table and pages of many."""
+"""Write an episode, or a table of all of them, as HTML that opens offline.
+
+Panel: Look at episodes, 4.
+"""
 
 from __future__ import annotations
 
@@ -8,24 +11,15 @@ from typing import Annotated
 import typer
 
 from pycrorm_async.cli.output import (
-    DEFAULT_URL,
+    Chosen,
     JsonOption,
-    LimitOption,
-    RobotOption,
-    SinceOption,
-    SpoolOption,
-    StatusOption,
-    TagOption,
-    TextOption,
-    UrlOption,
     counted,
     note,
-    parse_since,
     print_json,
     print_line,
     problem,
 )
-from pycrorm_async.cli.reading import read_memory
+from pycrorm_async.cli.reading import Place
 from pycrorm_async.errors import CallerError
 from pycrorm_async.query.named_queries import EpisodeChoice
 from pycrorm_async.report.write import Plot, overview
@@ -33,18 +27,14 @@ from pycrorm_async.report.write import report as write_report
 
 
 def report(
+    *,
     episode: Annotated[
         str | None, typer.Argument(help="The episode's number, its id or first digits of the id, or `last`.")
     ] = None,
     every: Annotated[
         bool, typer.Option("--all", help="Write a table of the episodes, and pages of the newest 200 behind it.")
     ] = False,
-    status: StatusOption = None,
-    since: SinceOption = None,
-    tag: TagOption = None,
-    robot: RobotOption = None,
-    text: TextOption = None,
-    limit: LimitOption = None,
+    chosen: Chosen,
     plot: Annotated[
         list[str] | None,
         typer.Option(
@@ -65,8 +55,7 @@ def report(
     last: Annotated[
         int | None, typer.Option("--to", min=1, metavar="SEQUENCE", help="Show events up to this one.")
     ] = None,
-    url: UrlOption = DEFAULT_URL,
-    spool: SpoolOption = None,
+    place: Place,
     as_json: JsonOption = False,
 ) -> int:
     """Write an episode as one HTML page that opens offline: task tree, Gantt chart, 3D scene, failures.
@@ -78,7 +67,7 @@ def report(
         raise CallerError(f"name the episode {episode} or write all of them with --all, not both")
     if not every and episode is None:
         raise CallerError("name an episode, for example `pycrorm report last`, or write all of them with --all")
-    choice = EpisodeChoice(status, parse_since(since), tuple(tag or ()), robot, text, limit)
+    choice = chosen.choice()
     if not every and choice != EpisodeChoice():
         raise CallerError(f"an option chooses among all episodes ({choice}): add --all")
     if not every and plot:
@@ -86,16 +75,9 @@ def report(
     if every and (first is not None or last is not None):
         raise CallerError("--from and --to choose events of one episode: name it instead of --all")
     if episode is None:
-        return _write_overview(
-            out or Path("episodes.html"),
-            choice,
-            [_plot(each) for each in plot or ()],
-            url,
-            spool,
-            force=force,
-            as_json=as_json,
-        )
-    _write_episode(episode, out, (first, last), url, spool, force=force, as_json=as_json)
+        plots = [_plot(each) for each in plot or ()]
+        return _write_overview(out or Path("episodes.html"), choice, plots, place, force=force, as_json=as_json)
+    _write_episode(episode, out, (first, last), place, force=force, as_json=as_json)
     return 0
 
 
@@ -107,9 +89,9 @@ def _plot(text: str) -> Plot:
 
 
 def _write_overview(
-    out: Path, choice: EpisodeChoice, plots: list[Plot], url: str, spool: Path | None, *, force: bool, as_json: bool
+    out: Path, choice: EpisodeChoice, plots: list[Plot], place: Place, *, force: bool, as_json: bool
 ) -> int:
-    written = read_memory(url, spool, lambda reading: overview(reading, out, choice=choice, plots=plots, force=force))
+    written = place.read(lambda reading: overview(reading, out, choice=choice, plots=plots, force=force))
     if as_json:
         counts = {"episodes": written.episodes, "pages": written.pages, "left_out": written.left_out}
         print_json({"file": written.path, **counts, "unreadable": written.unreadable})
@@ -126,16 +108,13 @@ def _write_episode(
     episode: str,
     out: Path | None,
     window: tuple[int | None, int | None],
-    url: str,
-    spool: Path | None,
+    place: Place,
     *,
     force: bool,
     as_json: bool,
 ) -> None:
     first, last = window
-    written = read_memory(
-        url, spool, lambda reading: write_report(reading, episode, out, force=force, first=first, last=last)
-    )
+    written = place.read(lambda reading: write_report(reading, episode, out, force=force, first=first, last=last))
     size = written.path.stat().st_size
     if as_json:
         shown = {"first": written.first, "last": written.last, "events": written.events}

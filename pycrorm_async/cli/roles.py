@@ -1,4 +1,7 @@
-"""`pycrorm roles` shows the roles of a memory on PostgreSQL, and makes them."""
+"""Show the roles of a memory on PostgreSQL; with --create, make them.
+
+Panel: Operate, 5.
+"""
 
 from __future__ import annotations
 
@@ -7,35 +10,23 @@ from typing import Annotated
 
 import typer
 
-from pycrorm_async.cli.output import (
-    DEFAULT_URL,
-    CsvOption,
-    JsonOption,
-    SpoolOption,
-    UrlOption,
-    note,
-    print_json,
-    print_line,
-    print_table,
-)
-from pycrorm_async.cli.reading import note_pending_events
+from pycrorm_async.cli.output import Form, note, print_line, print_rows
+from pycrorm_async.cli.reading import Place
 from pycrorm_async.errors import CallerError
-from pycrorm_async.operations.destination import shared_address
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.log import EventLog
 from pycrorm_async.store.postgresql import RoleState, make_roles, roles_of
 
 
 def roles(
+    *,
     create: Annotated[bool, typer.Option("--create", help="Make the roles; may be repeated.")] = False,
     shared: Annotated[
         bool,
         typer.Option("--shared", help="With --create: hand the tables over to pycrorm_folder, for several logins."),
     ] = False,
-    url: UrlOption = DEFAULT_URL,
-    spool: SpoolOption = None,
-    as_json: JsonOption = False,
-    as_csv: CsvOption = None,
+    place: Place,
+    form: Form,
 ) -> None:
     """Show the roles of a memory on PostgreSQL and the logins that have them; with --create, make them.
 
@@ -43,19 +34,19 @@ def roles(
     run as pycrorm_reader. With --shared the tables belong to pycrorm_folder, whose members fold; the owner then reads
     and folds with another login (operations/README.md, PostgreSQL).
     """
-    address = shared_address(url)
+    address = place.shared_address
     if address.is_sqlite:
         raise CallerError("SQLite has no roles: the permissions of the file say who may read and write it")
     if shared and not create:
         raise CallerError("--shared says how the roles are made: add --create")
     states = asyncio.run(_roles(address, create=create, shared=shared))
-    note_pending_events(url, spool)
-    if as_json:
-        print_json([each._asdict() for each in states])
-        return
+    place.note_pending_events()
     rows = [(each.name, "yes" if each.exists else "no", ", ".join(each.members)) for each in states]
-    print_table(f"Roles of {address}", ("role", "exists", "logins"), rows, as_csv=as_csv)
-    (print_line if as_csv is None else note)(
+    document = [each._asdict() for each in states]
+    print_rows(form, document, f"Roles of {address}", ("role", "exists", "logins"), rows)
+    if form.as_json:
+        return
+    (print_line if form.is_table else note)(
         f"The tables belong to {states[0].tables_owner or 'no role yet'}; this login is {states[0].login}."
     )
 

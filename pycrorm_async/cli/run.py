@@ -1,4 +1,7 @@
-"""`pycrorm run PLAN.py[:function]` runs a plan and records it."""
+"""Run a plan and record it.
+
+Panel: Record, 2.
+"""
 
 from __future__ import annotations
 
@@ -21,20 +24,8 @@ from typing import Annotated, Any, NamedTuple, get_args
 import typer
 
 from pycrorm_async.cli.interruption import Interruption
-from pycrorm_async.cli.output import (
-    DEFAULT_URL,
-    CsvOption,
-    FileAccessOption,
-    JsonOption,
-    ProjectionOption,
-    SpoolOption,
-    UrlOption,
-    WriterOption,
-    note,
-    print_json,
-    print_table,
-    problem,
-)
+from pycrorm_async.cli.output import FileAccessOption, Form, ProjectionOption, WriterOption, note, print_rows, problem
+from pycrorm_async.cli.reading import Place
 from pycrorm_async.errors import CallerError, EpisodeParked, TablesPending
 from pycrorm_async.events.fields import checked_tags
 from pycrorm_async.memory import Memory
@@ -44,7 +35,6 @@ from pycrorm_async.query.named_queries import EpisodeChoice, EpisodeSummary
 from pycrorm_async.record.episode_writer import PlanSource
 from pycrorm_async.record.values import message_of
 from pycrorm_async.settings import OnFull, OnUnrecordable, RecordMeshes, Settings
-from pycrorm_async.store.address import DatabaseAddress
 
 _DRAIN_WAIT_S = 2
 """Bounds the wait until a daemon drains the new recorder; a running daemon scans the spool more often than that."""
@@ -53,14 +43,14 @@ _SAMPLE_INTERVAL_MS = range(1, 86_400_001)
 
 
 def run(
+    *,
     plan: Annotated[
         str,
         typer.Argument(
             metavar="PLAN.py[:function]", help="File and async function of the plan; default function: `plan`."
         ),
     ],
-    url: UrlOption = DEFAULT_URL,
-    spool: SpoolOption = None,
+    place: Place,
     description: Annotated[
         str | None, typer.Option(help="Description of the episode; default: the function's docstring, or its name.")
     ] = None,
@@ -104,8 +94,7 @@ def run(
     show_traceback: Annotated[
         bool, typer.Option("--traceback", help="Print the traceback of a failed plan on stderr.")
     ] = False,
-    as_json: JsonOption = False,
-    as_csv: CsvOption = None,
+    form: Form,
 ) -> int:
     """Run a plan and record it.
 
@@ -128,39 +117,32 @@ def run(
             " `memory.episode(tags=[...])` there, or tag them afterwards with `pycrorm tag`"
         )
     memory = Memory.open(
-        url,
-        spool=spool,
+        place.url,
+        spool=place.spool,
         settings=settings,
         projections=load_projections(projection or ()),
         plan_source=plan_source(loaded.path, loaded.sha256),
     )
     outcome = _Outcome()
-    with redirect_stdout(sys.stderr) if as_json or as_csv is not None else nullcontext():
+    with redirect_stdout(sys.stderr) if not form.is_table else nullcontext():
         try:
-            recorded = _run_and_record(loaded, memory, url, description or loaded.description, seed, tags, outcome)
+            recorded = _run_and_record(loaded, memory, place, description or loaded.description, seed, tags, outcome)
             asyncio.run(recorded)
         except asyncio.CancelledError as cancelled:  # the plan cancelled itself; Ctrl-C is a KeyboardInterrupt here
             outcome.failure = cancelled
         except SystemExit as system_exit:  # raised in a task of the plan, where it ends the event loop
             outcome.note_exit(system_exit)
     failure, episodes = outcome.failure, outcome.episodes
-    if as_json:
-        print_json(
-            {
-                "plan": loaded.name,
-                "failure": _one_line(failure),
-                "left": _one_line(outcome.left),
-                "unawaited": outcome.unawaited,
-                "episodes": episodes,
-            }
-        )
-    elif outcome.is_written:
-        print_table(
-            loaded.name,
-            ("episode", "description", "status", "nodes"),
-            [(each.number, each.description, each.status_text, each.nodes) for each in episodes],
-            as_csv=as_csv,
-        )
+    document = {
+        "plan": loaded.name,
+        "failure": _one_line(failure),
+        "left": _one_line(outcome.left),
+        "unawaited": outcome.unawaited,
+        "episodes": episodes,
+    }
+    if form.as_json or outcome.is_written:
+        rows = [(each.number, each.description, each.status_text, each.nodes) for each in episodes]
+        print_rows(form, document, loaded.name, ("episode", "description", "status", "nodes"), rows)
     if outcome.left is not None:
         where = _place(outcome.left)
         note(f"the plan {loaded.name} called sys.exit(0){where}; all events recorded before are kept")
@@ -222,13 +204,13 @@ class _Outcome:
 async def _run_and_record(
     loaded: LoadedPlan,
     opened: Memory,
-    url: str,
+    place: Place,
     description: str,
     seed: int | None,
     tags: tuple[str, ...],
     outcome: _Outcome,
 ) -> None:
-    interruption = Interruption(is_private=DatabaseAddress.parse(url).is_private)
+    interruption = Interruption(is_private=place.address.is_private)
     with interruption.handled():
         async with opened as memory:
             try:

@@ -1,4 +1,7 @@
-"""`pycrorm schema` describes the views of a memory and their columns, as text or as a diagram."""
+"""Describe the views of a memory and their columns.
+
+Panel: Ask, 6.
+"""
 
 from __future__ import annotations
 
@@ -7,14 +10,15 @@ from typing import Annotated, Literal
 
 import typer
 
-from pycrorm_async.cli.output import DEFAULT_URL, JsonOption, SpoolOption, UrlOption, print_json
-from pycrorm_async.cli.reading import read_memory
+from pycrorm_async.cli.output import JsonOption, print_json
+from pycrorm_async.cli.reading import Place
 from pycrorm_async.errors import CallerError
 from pycrorm_async.query.memory_schema import CORE_VIEWS, as_mermaid, as_text, read_schema
 from pycrorm_async.visible_text import visible
 
 
 def schema(
+    *,
     views: Annotated[
         list[str] | None, typer.Argument(metavar="VIEW...", help="Only these views; by default all of them.")
     ] = None,
@@ -22,15 +26,14 @@ def schema(
         Literal["text", "mermaid"],
         typer.Option("--format", help="mermaid: a diagram, by default of the views that most queries read."),
     ] = "text",
-    url: UrlOption = DEFAULT_URL,
-    spool: SpoolOption = None,
+    place: Place,
     as_json: JsonOption = False,
 ) -> None:
     """Describe the views of a memory: the meaning of a row, and each column with its type, unit and reference."""
     if as_json and form == "mermaid":
         raise CallerError("--json and --format mermaid exclude each other")
     names = tuple(views or (CORE_VIEWS if form == "mermaid" else ()))
-    described = read_memory(url, spool, lambda reading: read_schema(reading, names))
+    described = place.read(lambda reading: read_schema(reading, names))
     if as_json:
         print_json(described)
     else:

@@ -1,30 +1,20 @@
-"""`pycrorm show EPISODE` shows one episode and its task tree; with `--at`, tree and world at one moment."""
+"""Show the task tree of an episode; with --at, tree and world at one moment.
+
+Panel: Look at episodes, 2.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import Annotated, TypeAlias
 
 import typer
 from rich.text import Text
 from rich.tree import Tree
 
-from pycrorm_async.cli.output import (
-    DEFAULT_URL,
-    EpisodeArgument,
-    JsonOption,
-    SpoolOption,
-    UrlOption,
-    moment,
-    print_facts,
-    print_json,
-    print_table,
-    stdout,
-)
-from pycrorm_async.cli.output import moment as wall_clock
-from pycrorm_async.cli.reading import read_memory
+from pycrorm_async.cli.output import EpisodeArgument, JsonOption, moment, print_facts, print_json, print_table, stdout
+from pycrorm_async.cli.reading import Place
 from pycrorm_async.events.ids import row_key
 from pycrorm_async.events.types import BLOB_KEY
 from pycrorm_async.query.named_queries import (
@@ -48,6 +38,7 @@ _DIGITS_MAX = 12
 
 
 def show(
+    *,
     episode: EpisodeArgument,
     at: Annotated[
         str | None,
@@ -66,18 +57,17 @@ def show(
             help="Print texts, lists, hashes and numbers in full, and all percepts and places; --json always does.",
         ),
     ] = False,
-    url: UrlOption = DEFAULT_URL,
-    spool: SpoolOption = None,
+    place: Place,
     as_json: JsonOption = False,
 ) -> None:
     """Show an episode's task tree with statuses and durations; with --at, tree and world at one moment."""
     if at is None:
-        _show(episode, url, spool, events=events, full=full, as_json=as_json)
+        _show(episode, place, events=events, full=full, as_json=as_json)
     else:
-        _show_moment(episode, at, url, spool, events=events, full=full, as_json=as_json)
+        _show_moment(episode, at, place, events=events, full=full, as_json=as_json)
 
 
-def _show(episode: str, url: str, spool: Path | None, *, events: bool, full: bool, as_json: bool) -> None:
+def _show(episode: str, place: Place, *, events: bool, full: bool, as_json: bool) -> None:
     async def query(reading: Reading) -> tuple[EpisodeSummary, list[NodeSummary], _Answers]:
         summary = await reading.episode(episode)
         tree = await reading.tree(summary)
@@ -87,7 +77,7 @@ def _show(episode: str, url: str, spool: Path | None, *, events: bool, full: boo
             number = summary.number
             return summary, tree, (await percepts_of(session, number), await searches_of(session, number))
 
-    summary, tree, (percepts, places) = read_memory(url, spool, query)
+    summary, tree, (percepts, places) = place.read(query)
     if as_json:
         print_json({"episode": summary, "tree": tree, "percepts": percepts, "places": places})
         return
@@ -136,11 +126,9 @@ def _pairs(values: Mapping[str, object] | None) -> str | None:
     return ", ".join(f"{name} {value}" for name, value in values.items()) if values else None
 
 
-def _show_moment(
-    episode: str, at: str, url: str, spool: Path | None, *, events: bool, full: bool, as_json: bool
-) -> None:
+def _show_moment(episode: str, at: str, place: Place, *, events: bool, full: bool, as_json: bool) -> None:
     time, sequence = parse_moment(at, "--at")
-    snapshot = read_memory(url, spool, lambda reading: reading.as_of(episode, time=time, sequence=sequence))
+    snapshot = place.read(lambda reading: reading.as_of(episode, time=time, sequence=sequence))
     if as_json:
         print_json(snapshot)
     else:
@@ -167,11 +155,9 @@ def print_snapshot(snapshot: Moment, requested: str, *, events: bool = False, fu
         f"Episode {snapshot.number}: {snapshot.description}",
         {
             "id": snapshot.id,
-            "started": f"{wall_clock(snapshot.started_at)} UTC",
+            "started": f"{moment(snapshot.started_at)} UTC",
             "by": snapshot.created_by,
-            "at": (
-                f"{requested}: after event {snapshot.sequence}, {snapshot.time_s:.6f} s, {wall_clock(snapshot.at)} UTC"
-            ),
+            "at": (f"{requested}: after event {snapshot.sequence}, {snapshot.time_s:.6f} s, {moment(snapshot.at)} UTC"),
             "status": snapshot.status,
             "simulated": "yes" if snapshot.simulated else None,
             "running": _running_text(snapshot),

@@ -1,4 +1,7 @@
-"""`pycrorm spool` inspects a spool's files, repairs damaged ones, and rebinds the spool to another database."""
+"""The write-ahead queue's files: inspect, repair, or store them in another database.
+
+Panel: Operate, 6.
+"""
 
 from __future__ import annotations
 
@@ -12,12 +15,9 @@ from typing import Annotated
 import typer
 
 from pycrorm_async.cli.output import (
-    DEFAULT_URL,
     FileAccessOption,
     JsonOption,
     ProjectionOption,
-    SpoolOption,
-    UrlOption,
     moment,
     note,
     print_facts,
@@ -26,10 +26,10 @@ from pycrorm_async.cli.output import (
     print_table,
     problem,
 )
+from pycrorm_async.cli.reading import Place
 from pycrorm_async.cli.writer import store_once
 from pycrorm_async.errors import PycrormError
 from pycrorm_async.operations import recovery
-from pycrorm_async.operations.destination import shared_address
 from pycrorm_async.operations.recovery import Rebinding
 from pycrorm_async.projections.custom import load_projections
 from pycrorm_async.queue.locks import REFUSED
@@ -51,27 +51,25 @@ FolderArgument = Annotated[
 ]
 
 
-def inspect(
-    folder: FolderArgument = None, url: UrlOption = DEFAULT_URL, spool: SpoolOption = None, as_json: JsonOption = False
-) -> int:
+def inspect(*, folder: FolderArgument = None, place: Place, as_json: JsonOption = False) -> int:
     """List the contents of a spool, reading only its files. Changes nothing.
 
     Exit code 4 if a file is damaged, 3 if a folder cannot be read, 1 if the spool contains files of other programs.
     """
-    place = _spool_folder(folder, url, spool)
-    report = inspect_spool(place)
+    spool = _spool_folder(folder, place)
+    report = inspect_spool(spool)
     if as_json:
         print_json(_document(report))
     else:
         _print(report)
     for each in report.recorders:
         if each.damage is not None:
-            remedy = "stop its process first" if each.alive else f"repair it with: pycrorm spool repair {place}"
+            remedy = "stop its process first" if each.alive else f"repair it with: pycrorm spool repair {spool}"
             problem(f"{_damage_text(each.damage)}; {remedy}")
         if each.refused is not None:
             problem(each.refused)
     for name in report.strangers:
-        problem(f"{place / name} does not belong to a spool and is ignored")
+        problem(f"{spool / name} does not belong to a spool and is ignored")
     if any(each.damage for each in report.recorders):
         return 4
     if any(each.refused for each in report.recorders):
@@ -79,20 +77,18 @@ def inspect(
     return 1 if report.strangers or any(each.foreign for each in report.recorders) else 0
 
 
-def repair(
-    folder: FolderArgument = None, url: UrlOption = DEFAULT_URL, spool: SpoolOption = None, as_json: JsonOption = False
-) -> int:
+def repair(*, folder: FolderArgument = None, place: Place, as_json: JsonOption = False) -> int:
     """Repair damaged folders of dead recorders, so that their readable records can be stored.
 
     The original of a repaired folder is kept beside it under the name that is printed. Exit code 1 if records could
     not be kept, 3 if a damaged folder cannot be repaired.
     """
-    place = _spool_folder(folder, url, spool)
-    inspect_spool(place)
-    finished = finish_repairs(place)
+    spool = _spool_folder(folder, place)
+    inspect_spool(spool)
+    finished = finish_repairs(spool)
     repaired: list[RepairReport] = []
     refused: dict[str, PycrormError] = {}
-    for each in inspect_spool(place).recorders:
+    for each in inspect_spool(spool).recorders:
         if each.damage is None and each.refused is None:
             continue
         try:
@@ -113,19 +109,18 @@ def repair(
     for error in refused.values():
         problem(str(error))
     if repaired and not as_json:
-        note(f"Store the kept records with: pycrorm writer --once --url DATABASE --spool {place}")
+        note(f"Store the kept records with: pycrorm writer --once --url DATABASE --spool {spool}")
     if refused:
         return 3
     return 0 if all(each.complete for each in repaired) else 1
 
 
-def _spool_folder(folder: Path | None, url: str, spool: Path | None) -> Path:
-    return folder or spool or shared_address(url).default_spool
+def _spool_folder(folder: Path | None, place: Place) -> Path:
+    return folder or place.spool or place.shared_address.default_spool
 
 
 def rebind(
-    url: UrlOption = DEFAULT_URL,
-    spool: SpoolOption = None,
+    place: Place,
     projection: ProjectionOption = None,
     file_access: FileAccessOption = "owner",
     as_json: JsonOption = False,
@@ -138,9 +133,9 @@ def rebind(
     --once`.
     """
     projections, settings = load_projections(projection or ()), Settings(file_access=file_access)
-    done = asyncio.run(recovery.rebind(url, spool=spool, settings=settings, on_rebinding=_print_rebinding))
+    done = asyncio.run(recovery.rebind(place.url, spool=place.spool, settings=settings, on_rebinding=_print_rebinding))
     extra = {"spool": str(done.spool), "log_before": done.before, "log": done.after, "events_found": done.events}
-    return store_once(url, spool, projections, settings, as_json=as_json, extra=extra)
+    return store_once(place, projections, settings, as_json=as_json, extra=extra)
 
 
 def _print_rebinding(planned: Rebinding) -> None:
@@ -258,3 +253,6 @@ def _repair_document(
         "finished": [path.name for path in finished],
         "refused": {name: str(error) for name, error in refused.items()},
     }
+
+
+VERBS = {"inspect": inspect, "repair": repair, "rebind": rebind}

@@ -1,4 +1,7 @@
-"""`pycrorm status` reports recorders, running and stopped episodes, and the lag of database and tables."""
+"""Report recorders, writers, running episodes, and the lag of database and tables.
+
+Panel: Operate, 1.
+"""
 
 from __future__ import annotations
 
@@ -10,22 +13,10 @@ from pathlib import Path
 
 import msgspec
 
-from pycrorm_async.cli.output import (
-    DEFAULT_URL,
-    JsonOption,
-    SpoolOption,
-    UrlOption,
-    moment,
-    note,
-    print_json,
-    print_table,
-    problem,
-    stdout,
-)
-from pycrorm_async.cli.reading import note_pending_events
+from pycrorm_async.cli.output import JsonOption, moment, note, print_json, print_table, problem, stdout
+from pycrorm_async.cli.reading import Place
 from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import DatabaseError, DatabaseForeign
-from pycrorm_async.operations.destination import shared_address
 from pycrorm_async.operations.workers import DaemonNote, FoldWorkerState
 from pycrorm_async.projections.custom import ProjectionState, installed_projections, states
 from pycrorm_async.projections.generations import (
@@ -218,7 +209,7 @@ class DatabaseState:
     are_tables_outdated: bool = False
 
 
-def status(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None, as_json: JsonOption = False) -> int:
+def status(place: Place, as_json: JsonOption = False) -> int:
     """Report recorders, writers, running episodes with their robots, and the lag of database and tables.
 
     Changes nothing.
@@ -226,18 +217,18 @@ def status(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None, as_json: Jso
     Exit code 1 if an episode or a recorder is stopped or a designator type has no tables or a view is left out, 3
     if the database or the spool is unavailable.
     """
-    address = shared_address(url)
-    place = Spool(spool or address.default_spool)
-    folders = place.recorders()
+    address = place.shared_address
+    spool = Spool(place.spool or address.default_spool)
+    folders = spool.recorders()
     recorders = [_recorder(each) for each in folders if each.refused is None]
     refused = [
         RefusedState(each.refused, each.path, inspect_folder(each).bytes_spooled)
         for each in folders
         if each.refused is not None
     ]
-    has_daemon = place.has_writer
-    workers = _workers(place.writer_note())
-    kept, state, fault = summarise_kept_segments(place.path), DatabaseState(), None
+    has_daemon = spool.has_writer
+    workers = _workers(spool.writer_note())
+    kept, state, fault = summarise_kept_segments(spool.path), DatabaseState(), None
     try:
         state = asyncio.run(_query(address))
     except DatabaseError as error:
@@ -246,7 +237,7 @@ def status(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None, as_json: Jso
         print_json(
             {
                 "url": address.to_type,
-                "spool": place.path,
+                "spool": spool.path,
                 "daemon": has_daemon,
                 "fold_workers": workers,
                 "database": fault or "ok",
@@ -266,7 +257,7 @@ def status(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None, as_json: Jso
         )
     else:
         is_shown = fault is None and not state.are_tables_outdated
-        _print(place, recorders, state.episodes, has_daemon=has_daemon, is_shown=is_shown)
+        _print(spool, recorders, state.episodes, has_daemon=has_daemon, is_shown=is_shown)
         _print_running(state.running, state.running_total)
         _print_workers(workers)
         print_durability(kept, state.durability)
@@ -276,7 +267,7 @@ def status(url: UrlOption = DEFAULT_URL, spool: SpoolOption = None, as_json: Jso
         for warning in state.warnings:
             note(f"warning: {warning}")
         if not has_daemon:
-            note_pending_events(url, spool)
+            place.note_pending_events()
     if fault is not None:
         problem(fault)
         return 3
@@ -434,7 +425,7 @@ async def _running(log: EventLog) -> tuple[list[RunningEpisode], int]:
 
 
 def _print(
-    place: Spool,
+    spool: Spool,
     recorders: list[RecorderState],
     episodes: Sequence[EpisodeState],
     *,
@@ -443,7 +434,7 @@ def _print(
 ) -> None:
     if recorders:
         print_table(
-            f"Recorders below {place.path}",
+            f"Recorders below {spool.path}",
             ("recorder", "process", "drained by", "synced", "stored", "folded", "bytes", "database"),
             [
                 (
@@ -460,8 +451,8 @@ def _print(
             ],
         )
     else:
-        absence = "" if place.path.is_dir() else ", which does not exist"
-        stdout.print(f"No recorders below {place.path}{absence}", markup=False)
+        absence = "" if spool.path.is_dir() else ", which does not exist"
+        stdout.print(f"No recorders below {spool.path}{absence}", markup=False)
     stdout.print("A daemon drains this spool." if has_daemon else "No daemon drains this spool.")
     if episodes:
         print_table(

@@ -1,4 +1,7 @@
-"""`pycrorm tag EPISODE TAG...` adds tags to an episode that has ended, and removes others."""
+"""Add tags to an episode that has ended, and remove others.
+
+Panel: Record, 3.
+"""
 
 from __future__ import annotations
 
@@ -7,29 +10,19 @@ from typing import Annotated
 
 import typer
 
-from pycrorm_async.cli.output import (
-    DEFAULT_URL,
-    EpisodeArgument,
-    JsonOption,
-    SpoolOption,
-    UrlOption,
-    note,
-    print_json,
-    print_line,
-)
-from pycrorm_async.cli.reading import note_pending_events
+from pycrorm_async.cli.output import EpisodeArgument, JsonOption, note, print_json, print_line
+from pycrorm_async.cli.reading import Place
 from pycrorm_async.errors import CallerError
 from pycrorm_async.events.fields import checked_tags
 from pycrorm_async.operations.copy import tag_episode
-from pycrorm_async.operations.destination import shared_address
 
 
 def tag(
+    *,
     episode: EpisodeArgument,
     tags: Annotated[list[str] | None, typer.Argument(metavar="TAG...", help="Tags to add.")] = None,
     remove: Annotated[list[str] | None, typer.Option(metavar="TAG", help="Tag to remove; repeatable.")] = None,
-    url: UrlOption = DEFAULT_URL,
-    spool: SpoolOption = None,
+    place: Place,
     as_json: JsonOption = False,
 ) -> None:
     """Add tags to an episode that has ended, and remove others; `pycrorm episodes --tag TAG` finds it.
@@ -40,9 +33,9 @@ def tag(
     added, removed = checked_tags(tags or ()), checked_tags(remove or ())
     if not added and not removed:
         raise CallerError("name a tag to add, or one to remove with --remove")
-    with shared_address(url).located() as address:
+    with place.shared_address.located() as address:
         done = asyncio.run(tag_episode(address, episode, added, removed))
-    note_pending_events(url, spool)
+    place.note_pending_events()
     if not done.visible:
         note("the tags are stored; the tables show them after the next fold (`pycrorm writer --once`)")
     if as_json:

@@ -1,4 +1,7 @@
-"""`pycrorm verify` checks that the log is undamaged and that the tables equal a new fold of it."""
+"""Check the log for damage, and compare the tables with it.
+
+Panel: Operate, 4.
+"""
 
 from __future__ import annotations
 
@@ -12,20 +15,9 @@ import msgspec
 import typer
 
 from pycrorm_async.bulk_records import collect_seldom
-from pycrorm_async.cli.output import (
-    DEFAULT_URL,
-    JsonOption,
-    ProjectionOption,
-    SpoolOption,
-    UrlOption,
-    counted,
-    note,
-    print_json,
-    stdout,
-)
-from pycrorm_async.cli.reading import note_pending_events
+from pycrorm_async.cli.output import JsonOption, ProjectionOption, counted, note, print_json, stdout
+from pycrorm_async.cli.reading import Place
 from pycrorm_async.errors import CallerError
-from pycrorm_async.operations.destination import shared_address
 from pycrorm_async.progress_bar import progress_bar
 from pycrorm_async.projections.custom import Projection, installed_projections, load_projections
 from pycrorm_async.projections.findings import VerifyResult
@@ -38,10 +30,11 @@ _FINDINGS_MAX = 20
 
 
 def verify(
+    *,
     episode: Annotated[
         str | None, typer.Option("--episode", help="Verify only this episode: its number, its id, or `last`.")
     ] = None,
-    url: UrlOption = DEFAULT_URL,
+    place: Place,
     digests: Annotated[
         Path | None,
         typer.Option(
@@ -51,7 +44,6 @@ def verify(
             dir_okay=False,
         ),
     ] = None,
-    spool: SpoolOption = None,
     projection: ProjectionOption = None,
     as_json: JsonOption = False,
 ) -> int:
@@ -66,8 +58,8 @@ def verify(
     given_projections = load_projections(projection or ())
     projections = [*given_projections, *installed_projections(given_projections)]
     collect_seldom()
-    result, ids = asyncio.run(_verify(url, episode, projections, outside))
-    note_pending_events(url, spool)
+    result, ids = asyncio.run(_verify(place, episode, projections, outside))
+    place.note_pending_events()
     for name, reason in result.not_compared.items():
         note(f"the projection {name} was not verified: {reason}")
     if as_json:
@@ -106,9 +98,9 @@ def _read_digests(path: Path) -> list[OutsideDigest]:
 
 
 async def _verify(
-    url: str, episode: str | None, projections: Sequence[Projection], digests: Sequence[OutsideDigest]
+    place: Place, episode: str | None, projections: Sequence[Projection], digests: Sequence[OutsideDigest]
 ) -> tuple[VerifyResult, dict[int, str]]:
-    log = await EventLog.open(shared_address(url), create=False)
+    log = await EventLog.open(place.shared_address, create=False)
     try:
         only = None if episode is None else await episode_named(log, episode)
         with progress_bar("verifying") as report_progress:

@@ -1,4 +1,7 @@
-"""`pycrorm watch` serves the live page of an episode, or of all of them, on this machine; or draws in the terminal."""
+"""Follow running episodes live, on a page or in the terminal.
+
+Panel: Look at episodes, 3.
+"""
 
 from __future__ import annotations
 
@@ -18,22 +21,12 @@ from rich.markup import escape
 from rich.table import Table
 from rich.text import Text
 
-from pycrorm_async.cli.output import (
-    DEFAULT_URL,
-    JsonOption,
-    SpoolOption,
-    UrlOption,
-    note,
-    print_json,
-    print_line,
-    stdout,
-)
-from pycrorm_async.cli.reading import note_pending_events
+from pycrorm_async.cli.output import JsonOption, note, print_json, print_line, stdout
+from pycrorm_async.cli.reading import Place
 from pycrorm_async.cli.show import tree_of
 from pycrorm_async.errors import CallerError, DatabaseUnavailable, UnknownEpisode
 from pycrorm_async.live.access import kept_token
 from pycrorm_async.live.follower import LogFollower
-from pycrorm_async.operations.destination import shared_address
 from pycrorm_async.query.replay import EpisodeReplay
 from pycrorm_async.query.snapshot import Moment, NodeThen, moment_of
 from pycrorm_async.store.log import episode_named
@@ -42,6 +35,7 @@ from pycrorm_async.visible_text import visible
 
 
 def watch(
+    *,
     episode: Annotated[
         str | None,
         typer.Argument(help="The episode's number, its id or first digits of the id, or `last`; default: all of them."),
@@ -52,8 +46,7 @@ def watch(
         typer.Option(min=0, max=65535, help="Port of the page; default: 8137, or a free one if that is in use."),
     ] = None,
     open_it: Annotated[bool, typer.Option("--open", help="Open the page in this machine's browser.")] = False,
-    url: UrlOption = DEFAULT_URL,
-    spool: SpoolOption = None,
+    place: Place,
     as_json: JsonOption = False,
 ) -> None:
     """Follow running episodes live: the page of the report, served on this machine and read-only, until Ctrl-C.
@@ -65,8 +58,8 @@ def watch(
     """
     if terminal and (port is not None or open_it or as_json):
         raise CallerError("--terminal serves no page: leave out --port, --open and --json")
-    address = shared_address(url)
-    note_pending_events(url, spool)
+    address = place.shared_address
+    place.note_pending_events()
     follower = LogFollower(address)
     follow = _draw(follower, episode) if terminal else _serve(follower, episode, port, open_it=open_it, as_json=as_json)
     asyncio.run(_closed_after(follower, follow))

@@ -1,4 +1,7 @@
-"""`pycrorm writer` runs the daemon that drains a spool into its database; with `--once` it drains it once."""
+"""Drain a spool continuously: append its events and fold them into the tables.
+
+Panel: Operate, 2.
+"""
 
 from __future__ import annotations
 
@@ -16,18 +19,16 @@ import typer
 
 from pycrorm_async.bulk_records import collect_seldom
 from pycrorm_async.cli.output import (
-    DEFAULT_URL,
     FileAccessOption,
     JsonOption,
     ProjectionOption,
-    SpoolOption,
-    UrlOption,
     counted,
     note,
     print_json,
     problem,
     stdout,
 )
+from pycrorm_async.cli.reading import Place
 from pycrorm_async.errors import DamageError, SpoolDamaged
 from pycrorm_async.operations.daemon import serve
 from pycrorm_async.operations.recovery import RecoveryReport, recover
@@ -42,11 +43,11 @@ _WATCHDOG_MARGIN_S = 5.0
 
 
 def writer(
+    *,
     once: Annotated[
         bool, typer.Option("--once", help="Recover, append and fold all events present now, then exit.")
     ] = False,
-    url: UrlOption = DEFAULT_URL,
-    spool: SpoolOption = None,
+    place: Place,
     projection: ProjectionOption = None,
     file_access: FileAccessOption = "owner",
     recall: Annotated[
@@ -67,9 +68,9 @@ def writer(
     projections, settings = load_projections(projection or ()), Settings(file_access=file_access, recall=recall)
     collect_seldom()
     if once:
-        return store_once(url, spool, projections, settings, as_json=as_json)
-    with forked(WORKERS, url) as processes:
-        summary = asyncio.run(_serve_until_signal(url, spool, projections, settings, processes))
+        return store_once(place, projections, settings, as_json=as_json)
+    with forked(WORKERS, place.url) as processes:
+        summary = asyncio.run(_serve_until_signal(place, projections, settings, processes))
     if as_json:
         print_json(summary._asdict())
     else:
@@ -78,8 +79,7 @@ def writer(
 
 
 async def _serve_until_signal(
-    url: str,
-    spool: Path | None,
+    place: Place,
     projections: Sequence[Projection],
     settings: Settings,
     processes: Sequence[ChildProcess],
@@ -97,8 +97,8 @@ async def _serve_until_signal(
     for each in (signal.SIGTERM, signal.SIGINT):
         asyncio.get_running_loop().add_signal_handler(each, handle_signal)
     return await serve(
-        url,
-        spool=spool,
+        place.url,
+        spool=place.spool,
         stop=stop,
         report=note,
         settings=settings,
@@ -109,8 +109,7 @@ async def _serve_until_signal(
 
 
 def store_once(
-    url: str,
-    spool: Path | None,
+    place: Place,
     projections: Sequence[Projection],
     settings: Settings,
     *,
@@ -124,7 +123,7 @@ def store_once(
     logging.getLogger("pycrorm_async").setLevel(logging.CRITICAL)  # the report contains all of these errors
     logging.getLogger("pycrorm_async.projections").setLevel(logging.WARNING)  # the report omits those of projections
     with stderr.status("recovering the events of dead processes …"):
-        report = asyncio.run(recover(url, spool=spool, settings=settings, projections=projections))
+        report = asyncio.run(recover(place.url, spool=place.spool, settings=settings, projections=projections))
     if as_json:
         print_json({**extra, **_document(report)})
     else:

@@ -51,7 +51,7 @@ from pycrorm_async.orm.documentation import ViewDescription, described
 from pycrorm_async.projections.generations import PROJECTION_VERSION
 from pycrorm_async.query.frames import columns_of, needed_pyarrow
 from pycrorm_async.query.question import Question
-from pycrorm_async.query.questions import QUESTIONS, Ask
+from pycrorm_async.query.questions import QUESTIONS, Ask, arguments_of
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.text import nearest
 from pycrorm_async.report.output_files import new_file, new_folder, refuse_existing
@@ -689,9 +689,8 @@ def _table(name: str, columns: list[str], view: ViewDescription | None) -> dict[
 
 def _query(reading: Reading, name: str) -> dict[str, str]:
     """Return a question as a canned query of Datasette; its required arguments are parameters of the query."""
-    parameters = [*inspect.signature(getattr(Ask, name)).parameters.values()][1:]
-    needed = {each.name: str(each.annotation) for each in parameters if each.default is each.empty}
-    numbers = {each: _NUMBER * (index + 1) for index, each in enumerate(needed) if needed[each] == "float"}
+    needed = {each.name: each.type for each in arguments_of(name).values() if each.is_required}
+    numbers = {each: _NUMBER * (index + 1) for index, each in enumerate(needed) if needed[each] is float}
     texts = {each: f"{_TEXT}{each}" for each in needed if each not in numbers}
     sql = getattr(reading.ask, name)(**numbers, **texts).sql
     for each, text in texts.items():

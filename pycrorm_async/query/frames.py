@@ -52,6 +52,7 @@ from sqlalchemy import (
     literal,
     or_,
     select,
+    true,
     type_coerce,
 )
 from sqlalchemy.ext.asyncio import AsyncConnection
@@ -91,11 +92,14 @@ NORMAL_95 = 1.959964
 """95 % of a normal distribution are within this many standard deviations."""
 
 
-def of_episode(column: Any, episode: EpisodeNumber) -> ColumnElement[bool]:
-    """Return the condition that a row is of this episode, or of one of these, by the column of their numbers.
+def of_episode(column: Any, episode: Any) -> ColumnElement[bool]:
+    """Return the condition that a row is of an episode, or of one of several, by the column of their numbers.
 
-    Several are ranges, because most numbers have no gaps.
+    `episode` is an `EpisodeNumber`; for None every row fulfils the condition. Several are ranges, because most numbers
+    have no gaps.
     """
+    if episode is None:
+        return true()
     if not isinstance(episode, Sequence):
         same: ColumnElement[bool] = column == episode
         return same
@@ -106,6 +110,12 @@ def of_episode(column: Any, episode: EpisodeNumber) -> ColumnElement[bool]:
         else:
             ranges.append([number, number])
     return or_(false(), *(column == first if first == last else column.between(first, last) for first, last in ranges))
+
+
+def equal(column: Any, value: Any) -> ColumnElement[bool]:
+    """Return the condition that the column has this value; for None every row fulfils it."""
+    same: ColumnElement[bool] = true() if value is None else column == value
+    return same
 
 
 def json_text(document: Any, name: str) -> ColumnElement[str]:

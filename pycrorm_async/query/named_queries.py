@@ -31,7 +31,6 @@ from pycrorm_async.orm import (
 )
 from pycrorm_async.orm.base import same_row
 from pycrorm_async.query.frames import (
-    EpisodeNumber,
     check_texts,
     containing,
     limited,
@@ -450,7 +449,7 @@ class EpisodeChoice:
         )
 
 
-def episode_list(episode: EpisodeNumber | None, choice: EpisodeChoice) -> Select[*tuple[Any, ...]]:
+def episode_list(episode: Any, choice: EpisodeChoice) -> Select[*tuple[Any, ...]]:
     """Select the chosen episodes with their outcomes, the newest first."""
     listed = ProcessMetaData
     statement = select(
@@ -468,9 +467,8 @@ def episode_list(episode: EpisodeNumber | None, choice: EpisodeChoice) -> Select
         listed.failure_message,
         listed.continues,
     )
-    if episode is not None:
-        statement = statement.where(of_episode(listed.id, episode))
-    return limited(statement.where(*choice.conditions()).order_by(listed.id.desc()), choice.limit)
+    conditions = of_episode(listed.id, episode), *choice.conditions()
+    return limited(statement.where(*conditions).order_by(listed.id.desc()), choice.limit)
 
 
 # === percepts and places ======================================================================================

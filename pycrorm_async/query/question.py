@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Callable, Coroutine, Generator, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Any, Protocol, TypeAlias, TypeVar, Union
 
 from sqlalchemy import CompoundSelect, Dialect, Row, Select, func, select
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-AskedEpisode: TypeAlias = "int | str | Episode | EpisodeSummary"
+AskedEpisode: TypeAlias = Union[int, str, "Episode", EpisodeSummary]
 """An episode by its number, its id or the first digits of it, `last`, or as an `Episode` or `EpisodeSummary`."""
 FrameQuery: TypeAlias = (
     "Select[*tuple[Any, ...]] | CompoundSelect[*tuple[Any, ...]] | type[Any] | Question | SyncQuestion"

@@ -1,12 +1,38 @@
-"""The questions that every memory answers: `memory.ask`, `reading.ask`, `pycrorm ask`."""
+"""The questions that every memory answers: `memory.ask`, `reading.ask`, `pycrorm ask`, the tools of `pycrorm mcp`.
+
+A question is a function of `Ask` that returns a select. Its signature and its docstring are all there is to it: the
+command makes options of its arguments, an agent's tool a schema, and `memory.ask` checks them. An argument's help, and
+what its values are, is in its annotation.
+
+`episode` is any `AskedEpisode` for a caller; the function gets an `EpisodeNumber`, or None for all episodes.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import datetime
-from functools import partial, wraps
-from inspect import signature
-from typing import TYPE_CHECKING, Any, Generic, Literal, NoReturn, TypeVar
+from enum import Enum
+from functools import cached_property, partial, wraps
+from inspect import Parameter, Signature, signature, unwrap
+from types import UnionType
+from typing import (
+    TYPE_CHECKING,
+    Annotated,
+    Any,
+    Generic,
+    Literal,
+    NamedTuple,
+    NoReturn,
+    ParamSpec,
+    Self,
+    TypeAlias,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+    overload,
+)
 
 from sqlalchemy import (
     CTE,
@@ -45,15 +71,14 @@ from pycrorm_async.orm import (
 )
 from pycrorm_async.orm.base import same_row
 from pycrorm_async.projections.derived_views import OUTCOMES, RECOVERED, sql_of
-from pycrorm_async.query import named_queries
 from pycrorm_async.query.frames import (
     FAILED,
     TRIED,
-    EpisodeNumber,
     check_texts,
     checked_count,
     checked_metres,
     containing,
+    equal,
     is_named,
     json_text,
     limited,
@@ -62,192 +87,152 @@ from pycrorm_async.query.frames import (
     success_rate,
     times_with,
 )
+from pycrorm_async.query.named_queries import EpisodeChoice, episode_list
 from pycrorm_async.query.question import CHECKED, AskedEpisode, QuestionPlan, classes_meant_by
 from pycrorm_async.query.text import nearest
 from pycrorm_async.task_status import TaskStatus
 from pycrorm_async.world.pose import Arms, Grasp, ObjectType
 
-# === actions ==================================================================================================
+Rows: TypeAlias = "Select[*tuple[Any, ...]]"
+
+# === arguments ================================================================================================
 #
-# Selects about actions: durations, arms, pick-ups, and the experience at a place.
+# Describe the arguments of questions: each has a type and a help, which the command and agents show.
+
+Arm = Annotated[Arms | str | None, "Name of the arm, such as LEFT."]
+Dtype = Annotated[str | None, "Only this type, such as PickUpAction."]
+Of = Annotated[AskedEpisode | None, "Only this episode: its number, its id or first digits of the id, or `last`."]
+Kind = Annotated[Literal["action", "motion", "language"], "Kind of the nodes."]
+Limit = Annotated[int | None, "Rows at most."]
+Message = Annotated[str | None, "A part of the failure's message."]
+Name = Annotated[str, "Name of the object."]
+Named = Annotated[str | None, "Name of the object, or a part of it."]
+Reason = Annotated[str | None, "Class of the failure or a part of it, or words for it, such as unreachable."]
+Recovered = Annotated[bool | None, "Only failures after which the same, or an alternative, succeeded; or only others."]
+Robot = Annotated[str | None, "Name of the robot; for episodes also its model."]
+Status = Annotated[TaskStatus | str | None, "Status, such as SUCCEEDED or FAILED."]
+Words = Annotated[str | None, "Words that are all there, as in 'milk unreachable'."]
+
+
+class Argument(NamedTuple):
+    """An argument of a question.
+
+    Attributes:
+        type: of its values as a command line or an agent writes them: bool, int, float, str, datetime or a `Literal`.
+        default: `Parameter.empty` if a value is required.
+    """
+
+    name: str
+    type: Any
+    help: str
+    default: Any
+
+    @property
+    def is_required(self) -> bool:
+        """True if it has no default."""
+        return self.default is Parameter.empty
+
+
+def _simple(annotation: Any) -> Any:
+    """Return the type as which texts name a value: that of a member of an enum or an episode is str."""
+    if get_origin(annotation) not in (Union, UnionType):
+        return annotation
+    types = get_args(annotation)
+    return str if str in types else next(each for each in types if each is not type(None))
+
+
+P = ParamSpec("P")
+Q = TypeVar("Q")
+
+
+class _Question(Generic[P]):
+    """A question in the class `Ask`; as an attribute of an instance, the function that asks it."""
+
+    name: str
+
+    def __init__(self, select_of: Callable[P, Rows]) -> None:
+        self.select_of = unwrap(select_of)  # of the staticmethod
+        self.__doc__ = select_of.__doc__
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self.name = name
+
+    @cached_property
+    def _annotations(self) -> Mapping[str, Any]:
+        """The annotations by argument: a type and a help. An `Episode` counts as a text."""
+        return get_type_hints(self.select_of, localns={"Episode": str}, include_extras=True)
+
+    @cached_property
+    def arguments(self) -> Mapping[str, Argument]:
+        """The arguments by name, in the order of the signature."""
+        described = {name: (get_args(self._annotations[name]), each.default) for name, each in self._parameters()}
+        return {name: Argument(name, _simple(type_), words, each) for name, ((type_, words), each) in described.items()}
+
+    @cached_property
+    def signature(self) -> Signature:
+        """The signature, with types in place of the names of annotations."""
+        types = {name: get_args(each)[0] for name, each in self._annotations.items() if name != "return"}
+        return Signature([each.replace(annotation=types[name]) for name, each in self._parameters()])
+
+    def _parameters(self) -> Iterable[tuple[str, Parameter]]:
+        return signature(self.select_of).parameters.items()
+
+    @overload
+    def __get__(self, ask: None, owner: Any) -> Self: ...
+    @overload
+    def __get__(self, ask: Ask[Q], owner: Any) -> Callable[P, Q]: ...
+    def __get__(self, ask: Ask[Q] | None, owner: Any) -> Any:
+        if ask is None:
+            return self
+        make = ask._make
+
+        @wraps(self.select_of)
+        def asked(*values: P.args, **options: P.kwargs) -> Q:
+            for each in options.keys() - self.arguments.keys():
+                raise CallerError(f"{self.name} has no argument {each}{nearest(each, sorted(self.arguments))}")
+            return make(self._plan(self.signature.bind(*values, **options).arguments))
+
+        asked.__signature__ = self.signature  # type: ignore[attr-defined]  # help() prints it
+        return asked
+
+    def _plan(self, values: Mapping[str, Any]) -> QuestionPlan:
+        """Check the values of arguments and return the plan of the question about them. Raises `CallerError`."""
+        arguments = {name: each.name if isinstance(each, Enum) else each for name, each in values.items()}
+        episode = arguments.pop("episode", None)
+        check_texts({name: each for name, each in arguments.items() if self.arguments[name].type not in _NO_TEXTS})
+        for name, each in arguments.items():
+            if self.arguments[name].type is bool and not isinstance(each, bool | None):
+                raise CallerError(f"{name} must be True or False, got {each!r}")
+        select_of = partial[Rows](self.select_of, **arguments)
+        select_of()  # so that a wrong argument is refused at once
+        names = {name: each for name, each in arguments.items() if isinstance(each, str) and name in CHECKED}
+        return QuestionPlan(self.name, episode, select_of, names)
+
+
+_NO_TEXTS = (bool, int, float, datetime)
+"""The types of arguments that are checked where they are used."""
+
+# === actions ==================================================================================================
 
 _NODE, _DESIGNATOR = TaskTreeNode.__table__, Designator.__table__
 
 
-def longest_actions(
-    episode: EpisodeNumber | None, dtype: str | None, status: str | None, limit: int | None
-) -> Select[*tuple[Any, ...]]:
-    node = TaskTreeNode
-    statement = select(
-        node.process_metadata_id.label("episode"),
-        node.sequence.label("sequence"),
-        node.dtype,
-        node.duration.label("duration_s"),
-        node.status,
-        node.reason,
-        node.start_time.label("time"),
-        node.id.label("node_id"),
-    ).where(node.kind == "action", node.end_ns.is_not(None))
-    if episode is not None:
-        statement = statement.where(of_episode(node.process_metadata_id, episode))
-    if dtype is not None:
-        statement = statement.where(node.dtype == dtype)
-    if status is not None:
-        statement = statement.where(node.status == member_of(TaskStatus, status, "status"))
-    return limited(statement.order_by((node.end_ns - node.start_ns).desc(), node.id), limit)
-
-
-def success_rates(episode: EpisodeNumber | None, *, limit: int | None, **types: Any) -> Select[*tuple[Any, ...]]:
-    node = TaskTreeNode
-    episodes = func.count(node.process_metadata_id.distinct()).label("episodes")
-    statement = _by_type(episode, (*success_rate(node.status, node.status.in_(TRIED)), episodes), **types)
-    return limited(statement.order_by(func.count().desc(), node.dtype), limit)
-
-
-def durations(episode: EpisodeNumber | None, *, limit: int | None, **types: Any) -> Select[*tuple[Any, ...]]:
-    node = TaskTreeNode
-    sums: dict[str, Any] = {"total_s": func.sum, "mean_s": func.avg, "shortest_s": func.min, "longest_s": func.max}
-    statement = _by_type(episode, [each(node.duration).label(name) for name, each in sums.items()], **types)
-    return limited(statement.order_by(func.sum(node.duration).desc(), node.dtype), limit)
-
-
-def _by_type(
-    episode: EpisodeNumber | None, columns: Iterable[Any], *, dtype: str | None, kind: str
-) -> Select[*tuple[Any, ...]]:
+def _by_type(episode: Any, columns: Iterable[Any], *, dtype: str | None, kind: str) -> Rows:
     """Count the nodes of each type, with their successes and failures and further columns."""
     node = TaskTreeNode
     if kind not in ("action", "motion", "language"):
         raise CallerError(f"kind must be action, motion or language, got {kind!r}")
-    statement = select(
-        node.dtype,
-        func.count().label("times"),
-        times_with(node.status == TaskStatus.SUCCEEDED).label("succeeded"),
-        times_with(node.status.in_(FAILED)).label("failed"),
-        *columns,
-    ).where(node.kind == kind)
-    if episode is not None:
-        statement = statement.where(of_episode(node.process_metadata_id, episode))
-    if dtype is not None:
-        statement = statement.where(node.dtype == dtype)
-    return statement.group_by(node.dtype)
+    conditions = node.kind == kind, of_episode(node.process_metadata_id, episode), equal(node.dtype, dtype)
+    return select(node.dtype, *_counts(node.status), *columns).where(*conditions).group_by(node.dtype)
 
 
-def arms_used(episode: EpisodeNumber | None, dtype: str | None, limit: int | None) -> Select[*tuple[Any, ...]]:
-    node, parameters = TaskTreeNode, _DESIGNATOR.c.parameters
-    arm = func.coalesce(json_text(parameters, "arm"), json_text(parameters, "gripper")).label("arm")
-    statement = (
-        select(
-            arm,
-            node.dtype,
-            func.count().label("times"),
-            times_with(node.status == TaskStatus.SUCCEEDED).label("succeeded"),
-            times_with(node.status.in_(FAILED)).label("failed"),
-        )
-        .join(_DESIGNATOR, same_row(_DESIGNATOR, _NODE))
-        .where(node.kind == "action", arm.is_not(None))
-    )
-    if episode is not None:
-        statement = statement.where(of_episode(node.process_metadata_id, episode))
-    if dtype is not None:
-        statement = statement.where(node.dtype == dtype)
-    return limited(statement.group_by(arm, node.dtype).order_by(arm, func.count().desc(), node.dtype), limit)
-
-
-def successful_pick_ups(
-    episode: EpisodeNumber | None,
-    object_: str | None,
-    object_type: ObjectType | str | None,
-    arm: str | None,
-    grasp: Grasp | str | None,
-    robot: str | None,
-    limit: int | None,
-) -> Select[*tuple[Any, ...]]:
-    node, taken, pick_up = TaskTreeNode, Object.__table__, PickUpAction.__table__
-    pose = Pose.__table__
-    statement = (
-        select(
-            node.process_metadata_id.label("episode"),
-            node.sequence.label("sequence"),
-            taken.c.name.label("object"),
-            taken.c.obj_type.label("object_type"),
-            pick_up.c.arm,
-            pick_up.c.grasp,
-            node.duration.label("duration_s"),
-            pose.c.x.label("robot_x"),
-            pose.c.y.label("robot_y"),
-            node.torso_height,
-            node.robot,
-            node.start_time.label("time"),
-            node.id.label("node_id"),
-        )
-        .join(pick_up, same_row(pick_up, _NODE))
-        .outerjoin(
-            taken,
-            (taken.c.id == pick_up.c.object_designator_id)
-            & (taken.c.process_metadata_id == pick_up.c.process_metadata_id),
-        )
-        .outerjoin(pose, (pose.c.id == node.robot_pose_id) & (pose.c.process_metadata_id == node.process_metadata_id))
-        .where(node.status == TaskStatus.SUCCEEDED)
-        .order_by(node.id)
-    )
-    if episode is not None:
-        statement = statement.where(of_episode(node.process_metadata_id, episode))
-        if not isinstance(episode, Sequence):  # a range of ids, because the pick-ups have no index of episodes
-            statement = statement.where(pick_up.c.id.between(_first_id(episode), _first_id(episode + 1)))
-    if object_ is not None:
-        statement = statement.where(containing(object_, taken.c.name))
-    if object_type is not None:
-        statement = statement.where(taken.c.obj_type == member_of(ObjectType, object_type, "object_type"))
-    if arm is not None:
-        statement = statement.where(pick_up.c.arm == member_of(Arms, arm, "arm"))
-    if grasp is not None:
-        statement = statement.where(pick_up.c.grasp == member_of(Grasp, grasp, "grasp"))
-    if robot is not None:
-        statement = statement.where(node.robot == robot)
-    return limited(statement, limit)
-
-
-def experience_at(
-    episode: EpisodeNumber | None, x: float, y: float, radius_m: float, dtype: str | None, limit: int | None
-) -> Select[*tuple[Any, ...]]:
-    x, y, radius_m = (checked_metres(*each) for each in (("x", x), ("y", y), ("radius_m", radius_m)))
-    if radius_m <= 0:
-        raise CallerError(f"radius_m must be > 0, got {radius_m}")
-    node, pose = TaskTreeNode, Pose
-    arm = json_text(_DESIGNATOR.c.parameters, "arm").label("arm")
-    east, north = pose.x - x, pose.y - y
-    statement = (
-        select(
-            node.dtype,
-            arm,
-            func.count().label("times"),
-            times_with(node.status == TaskStatus.SUCCEEDED).label("succeeded"),
-            times_with(node.status.in_(FAILED)).label("failed"),
-            *success_rate(node.status, node.status.in_(TRIED)),
-            func.avg(node.duration).label("mean_s"),
-            func.max(node.start_time).label("last_time"),
-        )
-        .join(_DESIGNATOR, same_row(_DESIGNATOR, _NODE))
-        .join(pose, (pose.id == node.robot_pose_id) & (pose.process_metadata_id == node.process_metadata_id))
-        .where(
-            node.kind == "action",
-            node.end_sequence.is_not(None),
-            pose.x.between(x - radius_m, x + radius_m),
-            east * east + north * north <= radius_m * radius_m,
-        )
-        .group_by(node.dtype, arm)
-        .order_by(func.count().desc(), node.dtype, arm)
-    )
-    if episode is not None:
-        statement = statement.where(of_episode(node.process_metadata_id, episode))
-    if dtype is not None:
-        statement = statement.where(node.dtype == dtype)
-    return limited(statement, limit)
+def _counts(status: Any) -> tuple[ColumnElement[int], ...]:
+    """Return the numbers of rows, of successes and of failures in a group."""
+    succeeded, failed = times_with(status == TaskStatus.SUCCEEDED), times_with(status.in_(FAILED))
+    return func.count().label("times"), succeeded.label("succeeded"), failed.label("failed")
 
 
 # === failures =================================================================================================
-#
-# Selects about failures: their nodes, their causes, and the actions before them.
 
 _NUMBER_BITS = SEQUENCE_MAX.bit_length() + SLOT_MAX.bit_length()
 """The bits of an id below the episode's number."""
@@ -255,21 +240,23 @@ _WORDS_MAX = 30
 """Bounds the words of a search: each is a condition on four columns, and SQLite takes a thousand."""
 
 
-def matching(
-    episode: EpisodeNumber | None,
+def _matching(
+    episode: Any,
     *,
-    object: str | None,  # noqa: A002  the column's name
-    arm: str | None,
-    reason: str | None,
-    message: str | None,
-    text: str | None,
-    recovered: bool | None,
+    object: Any,  # noqa: A002  the column's name
+    arm: Any,
+    reason: Any,
+    message: Any,
+    text: Any,
+    recovered: Any,
 ) -> list[ColumnElement[bool]]:
-    """Return the conditions on `RootFailure`."""
+    """Return the conditions on `RootFailure`.
+
+    A failure is searched by its columns, not by one bag of words: the milk's failure must not answer to `cereal`
+    because the episode's description names both.
+    """
     failure = RootFailure
-    conditions: list[ColumnElement[bool]] = []
-    if episode is not None:
-        conditions.append(of_episode(failure.process_metadata_id, episode))
+    conditions = [of_episode(failure.process_metadata_id, episode)]
     if object is not None:
         conditions.append(containing(object, failure.object))
     if arm is not None:
@@ -285,109 +272,13 @@ def matching(
         if len(words) > _WORDS_MAX:
             raise CallerError(f"text has {len(words)} words, and at most {_WORDS_MAX} are searched for")
         conditions += [or_(containing(each, *columns), _is_reason(each)) for each in words]
-    if recovered is not None:
-        conditions.append(failure.recovered == recovered)
-    return conditions
+    return [*conditions, equal(failure.recovered, recovered)]
 
 
 def _is_reason(words: str) -> ColumnElement[bool]:
     classes = classes_meant_by(words)
     named = containing(words, RootFailure.reason)
     return or_(named, RootFailure.reason.in_(classes)) if classes else named
-
-
-def root_failures(episode: EpisodeNumber | None, limit: int | None, **search: Any) -> Select[*tuple[Any, ...]]:
-    failure = RootFailure
-    statement = select(
-        failure.process_metadata_id.label("episode"),
-        failure.sequence.label("sequence"),
-        failure.dtype,
-        failure.object,
-        failure.arm,
-        failure.reason,
-        failure.message,
-        failure.recovered,
-        failure.path,
-        failure.start_time.label("time"),
-        failure.id.label("node_id"),
-        failure.outcome,
-    )
-    # Not `order_by(failure.id)`, for which SQLite reads all nodes in order instead of the failed ones by an index.
-    return limited(statement.where(*matching(episode, **search)).order_by(failure.id + 0), limit)
-
-
-def failures_by_cause(episode: EpisodeNumber | None, limit: int | None, **search: Any) -> Select[*tuple[Any, ...]]:
-    names = "reason dtype object process_metadata_id start_time message outcome".split()
-    chosen = select(*(getattr(RootFailure, each) for each in names)).where(*matching(episode, **search))
-    # With a limit no database replaces the columns by their expressions, and computes an outcome for each of them. For
-    # one with a number PostgreSQL would rather have the first row early than read fewer nodes, and read all of them.
-    failed = chosen.limit(sql_of(BigInteger(), "-1", "ALL")).subquery("failed").c
-    causes = failed.reason, failed.dtype, failed.object
-    statement = (
-        select(
-            *causes,
-            func.count().label("times"),
-            times_with(failed.outcome == RECOVERED).label(RECOVERED),
-            func.count(failed.process_metadata_id.distinct()).label("episodes"),
-            func.max(failed.start_time).label("last_time"),
-            func.min(failed.message).label("a_message"),
-            *(times_with(failed.outcome == each).label(each) for each in OUTCOMES if each != RECOVERED),
-        )
-        .group_by(*causes)
-        .order_by(func.count().desc(), *causes)
-    )
-    return limited(statement, limit)
-
-
-def steps_before_failures(
-    episode: EpisodeNumber | None, steps: int, limit: int | None, **search: Any
-) -> Select[*tuple[Any, ...]]:
-    failure, step, count = RootFailure, TaskTreeNode, checked_count("steps", steps, 100)
-    latest = (
-        select(
-            failure.process_metadata_id.label("episode"),
-            failure.sequence.label("failure_sequence"),
-            failure.dtype.label("failed"),
-            failure.reason,
-            cast(literal_column("1"), BigInteger).label("steps_before"),
-            _ended_before(failure.id, failure.process_metadata_id, failure.sequence).label("node_id"),
-            failure.id.label("failure_id"),
-        )
-        .where(*matching(episode, **search))
-        .cte("latest", recursive=True)
-    )
-    named = () if episode is None else (of_episode(step.process_metadata_id, episode),)
-    # One step after the other is looked up by its id, as a plan by any other way depends on statistics.
-    same = "episode", "failure_sequence", "failed", "reason"
-    latest = latest.union_all(
-        select(
-            *(latest.c[each] for each in same),
-            latest.c.steps_before + 1,
-            _ended_before(latest.c.node_id, latest.c.episode, latest.c.failure_sequence),
-            latest.c.failure_id,
-        ).where(latest.c.steps_before < count, latest.c.node_id.is_not(None))
-    )
-    statement = (
-        select(
-            *(latest.c[each] for each in same),
-            latest.c.steps_before,
-            step.sequence.label("sequence"),
-            step.dtype,
-            step.kind,
-            step.status,
-            step.duration.label("duration_s"),
-            step.id.label("node_id"),
-        )
-        .join(step, and_(step.id == latest.c.node_id, step.process_metadata_id == latest.c.episode, *named))
-        # Both hold of every step. PostgreSQL expects ten times as many steps as there are, and would read all nodes to
-        # join them; with each range it expects a two-hundredth of that, and looks the steps up by their ids.
-        .where(
-            latest.c.steps_before.between(literal_column("1"), literal_column(str(count))),
-            latest.c.node_id.between(_first_id(latest.c.episode), _first_id(latest.c.episode + 1)),
-        )
-        .order_by(latest.c.failure_id, latest.c.steps_before)
-    )
-    return limited(statement, limit)
 
 
 def _ended_before(node_id: Any, episode: Any, sequence: Any) -> Any:
@@ -414,10 +305,8 @@ def _first_id(episode: Any) -> Any:
 
 
 # === object courses ===========================================================================================
-#
-# Selects about one object: the events of its history, and the actions that moved it.
 
-_OBJECT, _POSE, _TREE_NODE = Object.__table__, Pose.__table__, TaskTreeNode.__table__
+_OBJECT, _POSE = Object.__table__, Pose.__table__
 
 
 def _course(
@@ -431,7 +320,8 @@ def _course(
     place: Any = None,
     node_id: Any = None,
     time: Any = None,
-) -> Select[*tuple[Any, ...]]:
+) -> Rows:
+    """Select one kind of event of an object's history: its columns, in the order of the answer."""
     return select(
         table.c.process_metadata_id.label("episode"),
         sequence.label("sequence"),
@@ -445,80 +335,16 @@ def _course(
     )
 
 
-def _joined(episode: EpisodeNumber | None, id_: Any, row: Any, other: Any) -> ColumnElement[bool]:
+def _joined(episode: Any, id_: Any, row: Any, other: Any) -> ColumnElement[bool]:
     """Return the condition that `row` has this id, which a row of `other` names.
 
     With `episode` it names the episode itself, so that one part of a divided table is read wherever the row is joined.
     """
-    same = and_(row.c.id == id_, row.c.process_metadata_id == other.c.process_metadata_id)
-    return same if episode is None else and_(same, of_episode(row.c.process_metadata_id, episode))
+    same = row.c.id == id_, row.c.process_metadata_id == other.c.process_metadata_id
+    return and_(*same, of_episode(row.c.process_metadata_id, episode))
 
 
-def object_history(episode: EpisodeNumber | None, *, name: str, limit: int | None) -> Select[*tuple[Any, ...]]:
-    """Select the history of the objects of this name, in the order of the events."""
-    attached, removed, joints = Attachment.__table__, ObjectRemoval.__table__, JointChange.__table__
-    seen, other = Detection.__table__, _OBJECT.alias("other")
-    is_added = _OBJECT.c.id == _OBJECT.c.identity_id
-    begins = Attachment.kind == "attached"
-    named = select(_OBJECT.c.id, _OBJECT.c.process_metadata_id).where(is_named(_OBJECT.c.name, name))
-    if episode is not None:
-        named = named.where(of_episode(_OBJECT.c.process_metadata_id, episode))
-
-    joined = partial(_joined, episode)
-
-    def is_one(table: Any, id_: Any) -> ColumnElement[bool]:
-        return tuple_(id_, table.c.process_metadata_id).in_(named)
-
-    failed = _failures(episode)
-    # IN chooses the rows, and what is joined to them is joined outside: of inner joins that share the episode
-    # PostgreSQL, where it has no statistics, begins with one that joins all objects of an episode with each other.
-    courses = [
-        _course(_OBJECT, Object.sequence, case((is_added, "added"), else_="moved"), place=_POSE)
-        .outerjoin(_POSE, joined(_OBJECT.c.pose_id, _POSE, _OBJECT))
-        .where(is_named(_OBJECT.c.name, name), _OBJECT.c.identity_id.is_not(None), _OBJECT.c.dtype == "Object"),
-        _course(attached, Attachment.sequence, attached.c.kind, other=other.c.name, detail=attached.c.link)
-        .outerjoin(other, joined(attached.c.parent_id, other, attached))
-        .where(is_one(attached, attached.c.child_id)),
-        _course(
-            attached,
-            Attachment.sequence,
-            case((begins, "holds"), else_="releases"),
-            other=other.c.name,
-            detail=attached.c.link,
-        )
-        .outerjoin(other, joined(attached.c.child_id, other, attached))
-        .where(is_one(attached, attached.c.parent_id)),
-        _course(removed, ObjectRemoval.sequence, "removed").where(is_one(removed, removed.c.object_id)),
-        _course(joints, JointChange.sequence, "joint moved", detail=joints.c.joint, value=joints.c.position).where(
-            is_one(joints, joints.c.object_id)
-        ),
-        _course(seen, Detection.sequence, "detected", detail=seen.c.source, value=seen.c.confidence, place=seen).where(
-            is_named(seen.c.name, name)
-        ),
-        _course(
-            failed,
-            failed.c.sequence,
-            "an action failed",
-            detail=failed.c.reason,
-            node_id=failed.c.id,
-            time=failed.c.start_time,
-        ).where(is_named(failed.c.object, name)),
-    ]
-    if episode is not None:
-        courses = [each.where(of_episode(each.selected_columns.episode, episode)) for each in courses]
-    course = union_all(*courses).subquery("course")
-    of_course = _TREE_NODE.c.process_metadata_id == course.c.episode
-    if episode is not None:
-        of_course = and_(of_course, of_episode(_TREE_NODE.c.process_metadata_id, episode))
-    statement = (
-        select(*course.c[:-1], _TREE_NODE.c.dtype.label("by"), _TREE_NODE.c.status.label("status"), course.c.node_id)
-        .outerjoin(_TREE_NODE, and_(_TREE_NODE.c.id == course.c.node_id, of_course))
-        .order_by(course.c.episode, course.c.sequence, course.c.what, course.c.detail)
-    )
-    return limited(statement, limit)
-
-
-def _failures(episode: EpisodeNumber | None) -> CTE:
+def _failures(episode: Any) -> CTE:
     """Return the failures as a subquery that is evaluated before they are filtered by object.
 
     Without statistics PostgreSQL expects one failure of an object, and would read all nodes of the episode to find out
@@ -527,69 +353,11 @@ def _failures(episode: EpisodeNumber | None) -> CTE:
     failed = RootFailure.__table__
     columns = failed.c.id, failed.c.process_metadata_id, failed.c.start_time, failed.c.reason, failed.c.object
     statement = select(*columns, RootFailure.sequence.label("sequence"))
-    if episode is not None:
-        statement = statement.where(of_episode(failed.c.process_metadata_id, episode))
+    statement = statement.where(of_episode(failed.c.process_metadata_id, episode))
     return statement.cte("failed").prefix_with("MATERIALIZED", dialect="postgresql")
 
 
-def moves_of(episode: EpisodeNumber | None, *, name: str, limit: int | None) -> Select[*tuple[Any, ...]]:
-    """Return each move of the objects of this name, the node that moved it, and the nearest action around that."""
-    by, joined = _TREE_NODE.alias("by"), partial(_joined, episode)
-    moved = select(
-        _OBJECT.c.id,
-        _OBJECT.c.process_metadata_id,
-        Object.sequence.label("sequence"),
-        _OBJECT.c.time,
-        _OBJECT.c.name,
-        _OBJECT.c.pose_id,
-        _OBJECT.c.node_id,
-    ).where(
-        is_named(_OBJECT.c.name, name),
-        _OBJECT.c.id != _OBJECT.c.identity_id,
-        _OBJECT.c.dtype == "Object",
-    )
-    if episode is not None:
-        moved = moved.where(of_episode(_OBJECT.c.process_metadata_id, episode))
-    moves = moved.cte("moves")
-    columns = ("id", "parent_id", "process_metadata_id", "kind", "dtype", "status")
-    up = (
-        select(moves.c.id.label("move"), *(by.c[each] for each in columns))
-        .join(by, joined(moves.c.node_id, by, moves))
-        .cte("up", recursive=True)
-    )
-    above = _TREE_NODE.alias("above")
-    up = up.union_all(
-        select(up.c.move, *(above.c[each] for each in columns)).where(
-            up.c.kind != "action",
-            joined(up.c.parent_id, above, up),
-        )
-    )
-    mover = _TREE_NODE.alias("mover")
-    statement = (
-        select(
-            moves.c.process_metadata_id.label("episode"),
-            moves.c.sequence,
-            moves.c.time,
-            moves.c.name.label("object"),
-            *(_POSE.c[axis] for axis in "xyz"),
-            mover.c.dtype.label("moved_by"),
-            up.c.dtype.label("action"),
-            up.c.status.label("action_status"),
-            up.c.id.label("action_id"),
-        )
-        .outerjoin(up, and_(up.c.move == moves.c.id, up.c.kind == "action"))
-        .outerjoin(mover, joined(moves.c.node_id, mover, moves))
-        .outerjoin(_POSE, joined(moves.c.pose_id, _POSE, moves))
-        .order_by(moves.c.id)
-    )
-    return limited(statement, limit)
-
-
 # === ask ======================================================================================================
-
-Q = TypeVar("Q")
-_TEXTS = frozenset(("arm", "dtype", "kind", "message", "name", "object", "object_", "reason", "robot", "text"))
-"""The arguments that are texts; others are checked where they are used."""
 
 
 class Ask(Generic[Q]):
@@ -616,20 +384,26 @@ class Ask(Generic[Q]):
         """Name the questions, for an interpreter."""
         return f"<Ask: {', '.join(QUESTIONS)}; help(memory.ask.NAME) describes one>"
 
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> NoReturn:
+            raise AttributeError(f"there is no question {name}{nearest(name, QUESTIONS)}")
+
     # --- failures ---------------------------------------------------------------------------------------------
 
+    @_Question
+    @staticmethod
     def root_failures(
-        self,
         *,
-        episode: AskedEpisode | None = None,
-        object: str | None = None,  # noqa: A002  the column's name
-        arm: Arms | str | None = None,
-        reason: str | None = None,
-        message: str | None = None,
-        text: str | None = None,
-        recovered: bool | None = None,
-        limit: int | None = None,
-    ) -> Q:
+        episode: Of = None,
+        object: Named = None,  # noqa: A002  the column's name
+        arm: Arm = None,
+        reason: Reason = None,
+        message: Message = None,
+        text: Words = None,
+        recovered: Recovered = None,
+        limit: Limit = None,
+    ) -> Rows:
         """List the nodes at which failures began.
 
         `outcome` says how the plan went on: recovered, tolerated, ignored, failed or open (`RootFailure.outcome`).
@@ -644,151 +418,427 @@ class Ask(Generic[Q]):
             recovered: whether the same was tried again and succeeded, or an alternative did.
             limit: of rows.
         """
-        search = _search(object, arm, reason, message, text, recovered)
-        return self._ask("root_failures", episode, partial(root_failures, limit=limit, **search))
+        failure = RootFailure
+        statement = select(
+            failure.process_metadata_id.label("episode"),
+            failure.sequence.label("sequence"),
+            failure.dtype,
+            failure.object,
+            failure.arm,
+            failure.reason,
+            failure.message,
+            failure.recovered,
+            failure.path,
+            failure.start_time.label("time"),
+            failure.id.label("node_id"),
+            failure.outcome,
+        )
+        search = _matching(
+            episode, object=object, arm=arm, reason=reason, message=message, text=text, recovered=recovered
+        )
+        # Not `order_by(failure.id)`, for which SQLite reads all nodes in order instead of the failed ones by an index.
+        return limited(statement.where(*search).order_by(failure.id + 0), limit)
 
+    @_Question
+    @staticmethod
     def failures_by_cause(
-        self,
         *,
-        episode: AskedEpisode | None = None,
-        object: str | None = None,  # noqa: A002  the column's name
-        arm: Arms | str | None = None,
-        reason: str | None = None,
-        message: str | None = None,
-        text: str | None = None,
-        recovered: bool | None = None,
-        limit: int | None = None,
-    ) -> Q:
+        episode: Of = None,
+        object: Named = None,  # noqa: A002  the column's name
+        arm: Arm = None,
+        reason: Reason = None,
+        message: Message = None,
+        text: Words = None,
+        recovered: Recovered = None,
+        limit: Limit = None,
+    ) -> Rows:
         """Count failures by reason, type of the failed node and object, the most frequent first.
 
         The arguments are those of `root_failures`. A failure counts once, where it began, and in the column of its
         outcome.
         """
-        search = _search(object, arm, reason, message, text, recovered)
-        return self._ask("failures_by_cause", episode, partial(failures_by_cause, limit=limit, **search))
+        search = _matching(
+            episode, object=object, arm=arm, reason=reason, message=message, text=text, recovered=recovered
+        )
+        names = "reason dtype object process_metadata_id start_time message outcome".split()
+        chosen = select(*(getattr(RootFailure, each) for each in names)).where(*search)
+        # With a limit no database replaces the columns by their expressions, and computes an outcome for each of them.
+        # For one with a number PostgreSQL would rather have the first row early than read fewer nodes, and read all of
+        # them.
+        failed = chosen.limit(sql_of(BigInteger(), "-1", "ALL")).subquery("failed").c
+        causes = failed.reason, failed.dtype, failed.object
+        statement = (
+            select(
+                *causes,
+                func.count().label("times"),
+                times_with(failed.outcome == RECOVERED).label(RECOVERED),
+                func.count(failed.process_metadata_id.distinct()).label("episodes"),
+                func.max(failed.start_time).label("last_time"),
+                func.min(failed.message).label("a_message"),
+                *(times_with(failed.outcome == each).label(each) for each in OUTCOMES if each != RECOVERED),
+            )
+            .group_by(*causes)
+            .order_by(func.count().desc(), *causes)
+        )
+        return limited(statement, limit)
 
+    @_Question
+    @staticmethod
     def steps_before_failures(
-        self,
         *,
-        steps: int = 5,
-        episode: AskedEpisode | None = None,
-        object: str | None = None,  # noqa: A002  the column's name
-        arm: Arms | str | None = None,
-        reason: str | None = None,
-        message: str | None = None,
-        text: str | None = None,
-        recovered: bool | None = None,
-        limit: int | None = None,
-    ) -> Q:
+        steps: Annotated[int, "Steps before each failure."] = 5,
+        episode: Of = None,
+        object: Named = None,  # noqa: A002  the column's name
+        arm: Arm = None,
+        reason: Reason = None,
+        message: Message = None,
+        text: Words = None,
+        recovered: Recovered = None,
+        limit: Limit = None,
+    ) -> Rows:
         """List the last actions and motions that had ended before each failed node started, the latest first.
 
         `steps` is their number for each failure, 1 to 100; the other arguments are those of `root_failures`.
         """
-        search = _search(object, arm, reason, message, text, recovered)
-        make = partial(steps_before_failures, steps=steps, limit=limit, **search)
-        return self._ask("steps_before_failures", episode, make)
+        failure, step, count = RootFailure, TaskTreeNode, checked_count("steps", steps, 100)
+        search = _matching(
+            episode, object=object, arm=arm, reason=reason, message=message, text=text, recovered=recovered
+        )
+        latest = (
+            select(
+                failure.process_metadata_id.label("episode"),
+                failure.sequence.label("failure_sequence"),
+                failure.dtype.label("failed"),
+                failure.reason,
+                cast(literal_column("1"), BigInteger).label("steps_before"),
+                _ended_before(failure.id, failure.process_metadata_id, failure.sequence).label("node_id"),
+                failure.id.label("failure_id"),
+            )
+            .where(*search)
+            .cte("latest", recursive=True)
+        )
+        # One step after the other is looked up by its id, as a plan by any other way depends on statistics.
+        same = "episode", "failure_sequence", "failed", "reason"
+        latest = latest.union_all(
+            select(
+                *(latest.c[each] for each in same),
+                latest.c.steps_before + 1,
+                _ended_before(latest.c.node_id, latest.c.episode, latest.c.failure_sequence),
+                latest.c.failure_id,
+            ).where(latest.c.steps_before < count, latest.c.node_id.is_not(None))
+        )
+        is_step = step.id == latest.c.node_id, step.process_metadata_id == latest.c.episode
+        statement = (
+            select(
+                *(latest.c[each] for each in same),
+                latest.c.steps_before,
+                step.sequence.label("sequence"),
+                step.dtype,
+                step.kind,
+                step.status,
+                step.duration.label("duration_s"),
+                step.id.label("node_id"),
+            )
+            .join(step, and_(*is_step, of_episode(step.process_metadata_id, episode)))
+            # Both hold of every step. PostgreSQL expects ten times as many steps as there are, and would read all nodes
+            # to join them; with each range it expects a two-hundredth of that, and looks the steps up by their ids.
+            .where(
+                latest.c.steps_before.between(literal_column("1"), literal_column(str(count))),
+                latest.c.node_id.between(_first_id(latest.c.episode), _first_id(latest.c.episode + 1)),
+            )
+            .order_by(latest.c.failure_id, latest.c.steps_before)
+        )
+        return limited(statement, limit)
 
     # --- actions ----------------------------------------------------------------------------------------------
 
-    def success_rates(
-        self,
-        *,
-        episode: AskedEpisode | None = None,
-        dtype: str | None = None,
-        kind: Literal["action", "motion", "language"] = "action",
-        limit: int | None = None,
-    ) -> Q:
+    @_Question
+    @staticmethod
+    def success_rates(*, episode: Of = None, dtype: Dtype = None, kind: Kind = "action", limit: Limit = None) -> Rows:
         """Count successes and failures of each type, with the share of successes and its 95 % interval, low to high.
 
         A share counts what succeeded, failed or ended in an error; not what was cancelled, interrupted or lost.
         """
-        return self._ask("success_rates", episode, partial(success_rates, dtype=dtype, kind=kind, limit=limit))
+        node = TaskTreeNode
+        episodes = func.count(node.process_metadata_id.distinct()).label("episodes")
+        columns = *success_rate(node.status, node.status.in_(TRIED)), episodes
+        statement = _by_type(episode, columns, dtype=dtype, kind=kind)
+        return limited(statement.order_by(func.count().desc(), node.dtype), limit)
 
-    def longest_actions(
-        self,
-        *,
-        episode: AskedEpisode | None = None,
-        dtype: str | None = None,
-        status: TaskStatus | str | None = None,
-        limit: int | None = 10,
-    ) -> Q:
+    @_Question
+    @staticmethod
+    def longest_actions(*, episode: Of = None, dtype: Dtype = None, status: Status = None, limit: Limit = 10) -> Rows:
         """List the ended actions that took longest, also only those of one type (`dtype`) or status."""
-        state = status.name if isinstance(status, TaskStatus) else status
-        make = partial(longest_actions, dtype=dtype, status=state, limit=limit)
-        return self._ask("longest_actions", episode, make)
-
-    def durations(
-        self,
-        *,
-        episode: AskedEpisode | None = None,
-        dtype: str | None = None,
-        kind: Literal["action", "motion", "language"] = "action",
-        limit: int | None = None,
-    ) -> Q:
-        """Sum up the durations of each type: number, successes, failures, total, mean, shortest, longest."""
-        return self._ask("durations", episode, partial(durations, dtype=dtype, kind=kind, limit=limit))
-
-    def arms_used(
-        self, *, episode: AskedEpisode | None = None, dtype: str | None = None, limit: int | None = None
-    ) -> Q:
-        """Count the actions of each arm and type, with their successes and failures."""
-        return self._ask("arms_used", episode, partial(arms_used, dtype=dtype, limit=limit))
-
-    def successful_pick_ups(
-        self,
-        *,
-        episode: AskedEpisode | None = None,
-        object: str | None = None,  # noqa: A002  the column's name
-        object_type: ObjectType | str | None = None,
-        arm: Arms | str | None = None,
-        grasp: Grasp | str | None = None,
-        robot: str | None = None,
-        limit: int | None = None,
-    ) -> Q:
-        """List the pick-ups that succeeded: object, arm, grasp, and the robot's base pose."""
-        make = partial(
-            successful_pick_ups,
-            object_=object,
-            object_type=object_type,
-            arm=arm.name if isinstance(arm, Arms) else arm,
-            grasp=grasp,
-            robot=robot,
-            limit=limit,
+        node = TaskTreeNode
+        state = None if status is None else member_of(TaskStatus, status, "status")
+        statement = select(
+            node.process_metadata_id.label("episode"),
+            node.sequence.label("sequence"),
+            node.dtype,
+            node.duration.label("duration_s"),
+            node.status,
+            node.reason,
+            node.start_time.label("time"),
+            node.id.label("node_id"),
+        ).where(
+            node.kind == "action",
+            node.end_ns.is_not(None),
+            of_episode(node.process_metadata_id, episode),
+            equal(node.dtype, dtype),
+            equal(node.status, state),
         )
-        return self._ask("successful_pick_ups", episode, make)
+        return limited(statement.order_by((node.end_ns - node.start_ns).desc(), node.id), limit)
 
+    @_Question
+    @staticmethod
+    def durations(*, episode: Of = None, dtype: Dtype = None, kind: Kind = "action", limit: Limit = None) -> Rows:
+        """Sum up the durations of each type: number, successes, failures, total, mean, shortest, longest."""
+        node = TaskTreeNode
+        sums: dict[str, Any] = {"total_s": func.sum, "mean_s": func.avg, "shortest_s": func.min, "longest_s": func.max}
+        columns = [each(node.duration).label(name) for name, each in sums.items()]
+        statement = _by_type(episode, columns, dtype=dtype, kind=kind)
+        return limited(statement.order_by(func.sum(node.duration).desc(), node.dtype), limit)
+
+    @_Question
+    @staticmethod
+    def arms_used(*, episode: Of = None, dtype: Dtype = None, limit: Limit = None) -> Rows:
+        """Count the actions of each arm and type, with their successes and failures."""
+        node, parameters = TaskTreeNode, _DESIGNATOR.c.parameters
+        arm = func.coalesce(json_text(parameters, "arm"), json_text(parameters, "gripper")).label("arm")
+        statement = (
+            select(arm, node.dtype, *_counts(node.status))
+            .join(_DESIGNATOR, same_row(_DESIGNATOR, _NODE))
+            .where(
+                node.kind == "action",
+                arm.is_not(None),
+                of_episode(node.process_metadata_id, episode),
+                equal(node.dtype, dtype),
+            )
+        )
+        return limited(statement.group_by(arm, node.dtype).order_by(arm, func.count().desc(), node.dtype), limit)
+
+    @_Question
+    @staticmethod
+    def successful_pick_ups(
+        *,
+        episode: Of = None,
+        object: Named = None,  # noqa: A002  the column's name
+        object_type: Annotated[ObjectType | str | None, "Type of the object, such as MILK."] = None,
+        arm: Arm = None,
+        grasp: Annotated[Grasp | str | None, "Name of the grasp, such as TOP."] = None,
+        robot: Robot = None,
+        limit: Limit = None,
+    ) -> Rows:
+        """List the pick-ups that succeeded: object, arm, grasp, and the robot's base pose."""
+        node, taken, pick_up, pose = TaskTreeNode, Object.__table__, PickUpAction.__table__, Pose.__table__
+        is_taken = taken.c.id == pick_up.c.object_designator_id
+        statement = (
+            select(
+                node.process_metadata_id.label("episode"),
+                node.sequence.label("sequence"),
+                taken.c.name.label("object"),
+                taken.c.obj_type.label("object_type"),
+                pick_up.c.arm,
+                pick_up.c.grasp,
+                node.duration.label("duration_s"),
+                pose.c.x.label("robot_x"),
+                pose.c.y.label("robot_y"),
+                node.torso_height,
+                node.robot,
+                node.start_time.label("time"),
+                node.id.label("node_id"),
+            )
+            .join(pick_up, same_row(pick_up, _NODE))
+            .outerjoin(taken, is_taken & (taken.c.process_metadata_id == pick_up.c.process_metadata_id))
+            .outerjoin(
+                pose, (pose.c.id == node.robot_pose_id) & (pose.c.process_metadata_id == node.process_metadata_id)
+            )
+            .where(node.status == TaskStatus.SUCCEEDED, of_episode(node.process_metadata_id, episode))
+            .order_by(node.id)
+        )
+        if episode is not None and not isinstance(episode, Sequence):
+            # a range of ids, because the pick-ups have no index of episodes
+            numbers: Any = episode
+            statement = statement.where(pick_up.c.id.between(_first_id(numbers), _first_id(numbers + 1)))
+        if object is not None:
+            statement = statement.where(containing(object, taken.c.name))
+        members = (
+            (taken.c.obj_type, ObjectType, object_type, "object_type"),
+            (pick_up.c.arm, Arms, arm, "arm"),
+            (pick_up.c.grasp, Grasp, grasp, "grasp"),
+        )
+        for column, enum, value, argument in members:
+            if value is not None:
+                statement = statement.where(column == member_of(enum, value, argument))
+        return limited(statement.where(equal(node.robot, robot)), limit)
+
+    @_Question
+    @staticmethod
     def experience_at(
-        self, x: float, y: float, *, radius_m: float = 0.5, dtype: str | None = None, limit: int | None = None
-    ) -> Q:
+        x: Annotated[float, "Place in the map, m."],
+        y: Annotated[float, "Place in the map, m."],
+        *,
+        radius_m: Annotated[float, "Distance from the place, m."] = 0.5,
+        episode: Of = None,
+        dtype: Dtype = None,
+        limit: Limit = None,
+    ) -> Rows:
         """Sum up the actions that a robot started within `radius_m` of a place: by type and arm, with successes.
 
         A share counts what `success_rates` counts.
         """
-        make = partial(experience_at, x=x, y=y, radius_m=radius_m, dtype=dtype, limit=limit)
-        return self._ask("experience_at", None, make)
+        x, y, radius_m = (checked_metres(*each) for each in (("x", x), ("y", y), ("radius_m", radius_m)))
+        if radius_m <= 0:
+            raise CallerError(f"radius_m must be > 0, got {radius_m}")
+        node, pose = TaskTreeNode, Pose
+        arm = json_text(_DESIGNATOR.c.parameters, "arm").label("arm")
+        east, north = pose.x - x, pose.y - y
+        statement = (
+            select(
+                node.dtype,
+                arm,
+                *_counts(node.status),
+                *success_rate(node.status, node.status.in_(TRIED)),
+                func.avg(node.duration).label("mean_s"),
+                func.max(node.start_time).label("last_time"),
+            )
+            .join(_DESIGNATOR, same_row(_DESIGNATOR, _NODE))
+            .join(pose, (pose.id == node.robot_pose_id) & (pose.process_metadata_id == node.process_metadata_id))
+            .where(
+                node.kind == "action",
+                node.end_sequence.is_not(None),
+                pose.x.between(x - radius_m, x + radius_m),
+                east * east + north * north <= radius_m * radius_m,
+                of_episode(node.process_metadata_id, episode),
+                equal(node.dtype, dtype),
+            )
+            .group_by(node.dtype, arm)
+            .order_by(func.count().desc(), node.dtype, arm)
+        )
+        return limited(statement, limit)
 
     # --- objects ----------------------------------------------------------------------------------------------
 
-    def object_history(self, name: str, *, episode: AskedEpisode | None = None, limit: int | None = None) -> Q:
+    @_Question
+    @staticmethod
+    def object_history(name: Name, *, episode: Of = None, limit: Limit = None) -> Rows:
         """List all that happened to the object of this name: added, moved, attached, seen, failed with, removed."""
-        return self._ask("object_history", episode, partial(object_history, name=name, limit=limit))
+        attached, removed, joints = Attachment.__table__, ObjectRemoval.__table__, JointChange.__table__
+        seen, other = Detection.__table__, _OBJECT.alias("other")
+        is_added = _OBJECT.c.id == _OBJECT.c.identity_id
+        begins = Attachment.kind == "attached"
+        named = select(_OBJECT.c.id, _OBJECT.c.process_metadata_id).where(
+            is_named(_OBJECT.c.name, name), of_episode(_OBJECT.c.process_metadata_id, episode)
+        )
+        joined = partial(_joined, episode)
 
-    def moves_of(self, name: str, *, episode: AskedEpisode | None = None, limit: int | None = None) -> Q:
+        def is_one(table: Any, id_: Any) -> ColumnElement[bool]:
+            return tuple_(id_, table.c.process_metadata_id).in_(named)
+
+        failed = _failures(episode)
+        # IN chooses the rows, and what is joined to them is joined outside: of inner joins that share the episode
+        # PostgreSQL, where it has no statistics, begins with one that joins all objects of an episode with each other.
+        courses = [
+            _course(_OBJECT, Object.sequence, case((is_added, "added"), else_="moved"), place=_POSE)
+            .outerjoin(_POSE, joined(_OBJECT.c.pose_id, _POSE, _OBJECT))
+            .where(is_named(_OBJECT.c.name, name), _OBJECT.c.identity_id.is_not(None), _OBJECT.c.dtype == "Object"),
+            *(
+                _course(attached, Attachment.sequence, happening, other=other.c.name, detail=attached.c.link)
+                .outerjoin(other, joined(partner, other, attached))
+                .where(is_one(attached, own))
+                for happening, own, partner in (
+                    (attached.c.kind, attached.c.child_id, attached.c.parent_id),
+                    (case((begins, "holds"), else_="releases"), attached.c.parent_id, attached.c.child_id),
+                )
+            ),
+            _course(removed, ObjectRemoval.sequence, "removed").where(is_one(removed, removed.c.object_id)),
+            _course(joints, JointChange.sequence, "joint moved", detail=joints.c.joint, value=joints.c.position).where(
+                is_one(joints, joints.c.object_id)
+            ),
+            _course(
+                seen, Detection.sequence, "detected", detail=seen.c.source, value=seen.c.confidence, place=seen
+            ).where(is_named(seen.c.name, name)),
+            _course(
+                failed,
+                failed.c.sequence,
+                "an action failed",
+                detail=failed.c.reason,
+                node_id=failed.c.id,
+                time=failed.c.start_time,
+            ).where(is_named(failed.c.object, name)),
+        ]
+        courses = [each.where(of_episode(each.selected_columns.episode, episode)) for each in courses]
+        course = union_all(*courses).subquery("course")
+        of_course = _NODE.c.id == course.c.node_id, _NODE.c.process_metadata_id == course.c.episode
+        statement = (
+            select(*course.c[:-1], _NODE.c.dtype.label("by"), _NODE.c.status.label("status"), course.c.node_id)
+            .outerjoin(_NODE, and_(*of_course, of_episode(_NODE.c.process_metadata_id, episode)))
+            .order_by(course.c.episode, course.c.sequence, course.c.what, course.c.detail)
+        )
+        return limited(statement, limit)
+
+    @_Question
+    @staticmethod
+    def moves_of(name: Name, *, episode: Of = None, limit: Limit = None) -> Rows:
         """List each move of an object with the node that moved it and the nearest action around that node."""
-        return self._ask("moves_of", episode, partial(moves_of, name=name, limit=limit))
+        by, joined = _NODE.alias("by"), partial(_joined, episode)
+        moved = "id", "process_metadata_id", "time", "name", "pose_id", "node_id"
+        moves = (
+            select(*(_OBJECT.c[each] for each in moved), Object.sequence.label("sequence"))
+            .where(
+                is_named(_OBJECT.c.name, name),
+                _OBJECT.c.id != _OBJECT.c.identity_id,
+                _OBJECT.c.dtype == "Object",
+                of_episode(_OBJECT.c.process_metadata_id, episode),
+            )
+            .cte("moves")
+        )
+        columns = ("id", "parent_id", "process_metadata_id", "kind", "dtype", "status")
+        up = (
+            select(moves.c.id.label("move"), *(by.c[each] for each in columns))
+            .join(by, joined(moves.c.node_id, by, moves))
+            .cte("up", recursive=True)
+        )
+        above = _NODE.alias("above")
+        up = up.union_all(
+            select(up.c.move, *(above.c[each] for each in columns)).where(
+                up.c.kind != "action", joined(up.c.parent_id, above, up)
+            )
+        )
+        mover = _NODE.alias("mover")
+        statement = (
+            select(
+                moves.c.process_metadata_id.label("episode"),
+                moves.c.sequence,
+                moves.c.time,
+                moves.c.name.label("object"),
+                *(_POSE.c[axis] for axis in "xyz"),
+                mover.c.dtype.label("moved_by"),
+                up.c.dtype.label("action"),
+                up.c.status.label("action_status"),
+                up.c.id.label("action_id"),
+            )
+            .outerjoin(up, and_(up.c.move == moves.c.id, up.c.kind == "action"))
+            .outerjoin(mover, joined(moves.c.node_id, mover, moves))
+            .outerjoin(_POSE, joined(moves.c.pose_id, _POSE, moves))
+            .order_by(moves.c.id)
+        )
+        return limited(statement, limit)
 
     # --- episodes ---------------------------------------------------------------------------------------------
 
+    @_Question
+    @staticmethod
     def episodes(
-        self,
         *,
-        status: TaskStatus | str | None = None,
-        since: datetime | None = None,
-        tag: str | None = None,
-        robot: str | None = None,
-        text: str | None = None,
-        limit: int | None = None,
-    ) -> Q:
+        status: Status = None,
+        since: Annotated[datetime | None, "Started then or later: 2026-11-23, 2026-11-23T14:30, 90min, 7d."] = None,
+        tag: Annotated[str | None, "With this tag."] = None,
+        robot: Robot = None,
+        text: Words = None,
+        episode: Of = None,
+        limit: Limit = None,
+    ) -> Rows:
         """List the episodes, the newest first; also only some of them.
 
         Args:
@@ -797,60 +847,18 @@ class Ask(Generic[Q]):
             tag: that they have now.
             robot: name or model of a robot that took part.
             text: a part of the description, the plan's name or a tag.
+            episode: only this one.
             limit: of rows.
         """
         state = status.name if isinstance(status, TaskStatus) else status
-        choice = named_queries.EpisodeChoice(state, since, () if tag is None else (tag,), robot, text, limit)
-        select_of = partial(named_queries.episode_list, choice=choice)
-        return self._make(QuestionPlan("episodes", None, select_of, _names({"tag": tag, "robot": robot})))
-
-    def _ask(self, name: str, episode: AskedEpisode | None, select_of: partial[Select[*tuple[Any, ...]]]) -> Q:
-        check_texts({key: value for key, value in select_of.keywords.items() if key in _TEXTS})
-        recovered = select_of.keywords.get("recovered")
-        if recovered is not None and not isinstance(recovered, bool):
-            raise CallerError(f"recovered must be True or False, got {recovered!r}")
-        select_of(episode=None)  # so that a wrong argument is refused at once
-        return self._make(QuestionPlan(name, episode, select_of, _names(select_of.keywords)))
-
-    if not TYPE_CHECKING:
-
-        def __getattr__(self, name: str) -> NoReturn:
-            raise AttributeError(f"there is no question {name}{nearest(name, QUESTIONS)}")
+        return episode_list(episode, EpisodeChoice(state, since, () if tag is None else (tag,), robot, text, limit))
 
 
-def _names(arguments: Mapping[str, Any]) -> dict[str, str]:
-    texts = {key.removesuffix("_"): value for key, value in arguments.items() if isinstance(value, str)}
-    return {key: value for key, value in texts.items() if key in CHECKED}
-
-
-def _search(
-    object_: str | None,
-    arm: Arms | str | None,
-    reason: str | None,
-    message: str | None,
-    text: str | None,
-    recovered: bool | None,  # noqa: FBT001  passed on only
-) -> dict[str, Any]:
-    name = arm.name if isinstance(arm, Arms) else arm
-    return {"object": object_, "arm": name, "reason": reason, "message": message, "text": text, "recovered": recovered}
-
-
-QUESTIONS: tuple[str, ...] = tuple(name for name in vars(Ask) if not name.startswith("_"))
+QUESTIONS: tuple[str, ...] = tuple(name for name, each in vars(Ask).items() if isinstance(each, _Question))
 """The names of all questions."""
 
 
-def _with_suggestions(question: Callable[..., Any]) -> Callable[..., Any]:
-    """Return the question so that an unknown argument is refused with the nearest one."""
-    arguments = frozenset(signature(question).parameters) - {"self"}
-
-    @wraps(question)
-    def ask(*values: Any, **options: Any) -> Any:
-        for each in options.keys() - arguments:
-            raise CallerError(f"{question.__name__} has no argument {each}{nearest(each, sorted(arguments))}")
-        return question(*values, **options)
-
-    return ask
-
-
-for _name in QUESTIONS:
-    setattr(Ask, _name, _with_suggestions(getattr(Ask, _name)))
+def arguments_of(question: str) -> Mapping[str, Argument]:
+    """Return the arguments of a question by name."""
+    arguments: Mapping[str, Argument] = getattr(Ask, question).arguments
+    return arguments

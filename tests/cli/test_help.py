@@ -10,7 +10,7 @@ import pytest
 import typer
 from typer.core import TyperGroup
 
-from pycrorm_async.cli.main import _NAMES, _VERBS, app
+from pycrorm_async.cli.main import app, panels
 from tests.commands import COMMAND, environment, pycrorm
 
 pytestmark = pytest.mark.slow
@@ -41,12 +41,11 @@ def test_the_help_names_each_verb_once_in_groups(tmp_path: Path) -> None:
     shown = pycrorm("--help", cwd=tmp_path).stdout
     group = typer.main.get_command(app())
     assert isinstance(group, TyperGroup)
-    assert set(group.commands) == set(_NAMES)
-    assert [line.split()[0] for line in shown.splitlines() if line.startswith("  ") and "-" not in line[:3]] == [
-        name for verbs in _VERBS.values() for name in verbs
-    ]
-    assert [line[:-1] for line in shown.splitlines() if line.endswith(":")] == [*_VERBS, "Options"]
-    for name, line in _NAMES.items():
+    lines = {name: line for verbs in panels().values() for name, line in verbs.items()}
+    assert set(group.commands) == set(lines)
+    assert [line.split()[0] for line in shown.splitlines() if line.startswith("  ") and "-" not in line[:3]] == [*lines]
+    assert [line[:-1] for line in shown.splitlines() if line.endswith(":")] == [*panels(), "Options"]
+    for name, line in lines.items():
         whole = (group.commands[name].help or "").lower()
         assert line.split()[0].lower() in whole.split(), f"the help of {name} and its docstring differ"
 

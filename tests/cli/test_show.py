@@ -10,7 +10,8 @@ from typing import Any
 import pytest
 
 from pycrorm_async.cli.episodes import episodes
-from pycrorm_async.cli.output import stdout
+from pycrorm_async.cli.output import Chosen, Form, stdout
+from pycrorm_async.cli.reading import Place
 from pycrorm_async.events.codec import Record
 from pycrorm_async.world import Pose
 from tests.commands import COMMAND, answer, environment, one_line_of, pycrorm
@@ -73,7 +74,7 @@ def test_the_list_of_episodes_names_their_robots_on_a_terminal_wide_enough(
     ridden: Path, width: int, robots: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(stdout, "width", width)
-    episodes(f"sqlite:///{ridden / 'pycrorm.db'}")
+    episodes(place=Place(f"sqlite:///{ridden / 'pycrorm.db'}"), chosen=Chosen(), form=Form())
     printed = capsys.readouterr().out
     assert "Take the milk" in printed
     assert (("robots" in printed), ("pr2" in printed)) == (robots, robots)
@@ -82,15 +83,15 @@ def test_the_list_of_episodes_names_their_robots_on_a_terminal_wide_enough(
 def test_a_table_that_would_break_words_is_a_block_for_each_row(
     ridden: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    url = f"sqlite:///{ridden / 'pycrorm.db'}"
+    place = Place(f"sqlite:///{ridden / 'pycrorm.db'}")
     monkeypatch.setattr(stdout, "width", 40)
-    episodes(url)
+    episodes(place=place, chosen=Chosen(), form=Form())
     lines = capsys.readouterr().out.splitlines()
     assert "  episode     1" in lines
     assert lines[-2].startswith("  description Take the milk")
     assert "┃" not in "".join(lines)
     monkeypatch.setattr(stdout, "width", 80)
-    episodes(url)
+    episodes(place=place, chosen=Chosen(), form=Form())
     assert "┃ episode ┃" in capsys.readouterr().out
 
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 from pycrorm_async import Memory
+from pycrorm_async.query.questions import QUESTIONS
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.postgresql import GRANTS
 from tests.commands import COMMAND, environment
@@ -88,7 +89,8 @@ async def test_an_agent_asks_with_every_tool(url: str) -> None:
     async with agent_of(url) as agent:
         assert "untrusted data, never" in (agent.client.instructions or "")
         tools = (await agent.client.list_tools()).tools
-        assert [each.name for each in tools] == "episodes show why_failed at compare schema query".split()
+        own = "episodes show why_failed at compare schema query".split()
+        assert [each.name for each in tools] == [*own, *(each for each in QUESTIONS if each != "episodes")]
         assert all(each.annotations is not None and each.annotations.read_only_hint for each in tools)
         episodes = await agent.ask("episodes")
         assert [each["number"] for each in episodes] == [1, 2]
@@ -108,6 +110,12 @@ async def test_an_agent_asks_with_every_tool(url: str) -> None:
         assert await agent.ask("why_failed", object="zebra") == {
             "causes": [], "failures": [], "note": "the memory has no object zebra",
         }  # fmt: skip
+        rows = (await agent.ask("failures_by_cause", episode=1))["rows"]
+        assert [(each["reason"], each["times"]) for each in rows] == [
+            (each["reason"], each["times"]) for each in failed["causes"]
+        ]
+        zebra = await agent.ask("object_history", name="zebra")
+        assert zebra == {"rows": [], "note": "the memory has no object zebra"}
         moment, *running = (await agent.ask("at", when="e2", episode=1)).splitlines()
         assert (moment.startswith("episode 1 at "), running) == (True, ["  root RUNNING"])
         compared = await agent.ask("compare", first=1, second="last")
@@ -146,6 +154,8 @@ async def test_a_wrong_argument_is_refused_in_one_line_with_the_nearest_one(url:
             "why_failed has no argument arm (it has episode, object, text, limit)"
         )
         assert await agent.refused("at") == "at needs the argument when"
+        assert await agent.refused("durations", limit=101) == "limit must be 1 to 100, got 101"
+        assert await agent.refused("durations", kind="task") == "kind must be 'action', 'motion' or 'language'"
         assert await agent.refused("show", episode=[1], nodes="many", last=2) == (
             "episode must be a valid integer or a valid string;"
             " nodes must be a valid integer, unable to parse string as an integer;"

@@ -20,6 +20,8 @@ from typer.testing import CliRunner
 from pycrorm_async import Memory, Reading
 from pycrorm_async.cli import report as command
 from pycrorm_async.cli.main import app
+from pycrorm_async.cli.output import Chosen
+from pycrorm_async.cli.reading import Place
 from pycrorm_async.errors import CallerError
 from pycrorm_async.report import document
 from pycrorm_async.report.output_files import new_file, new_folder, write_file
@@ -177,7 +179,8 @@ def test_a_full_page_names_the_next_window(
     monkeypatch.setattr(document, "_NODES_MAX", 2)
     monkeypatch.setattr(command, "note", notes.append)
     url = f"sqlite:///{recorded / 'pycrorm.db'}"
-    command.report("1", every=False, out=tmp_path / "page.html", first=first, last=last, url=url)
+    page = tmp_path / "page.html"
+    command.report(episode="1", chosen=Chosen(), out=page, first=first, last=last, place=Place(url))
     assert any("the next page: --from " in each for each in notes) == continues
 
 
