@@ -44,6 +44,7 @@ from sqlalchemy import (
     Text,
     TextClause,
     TextualSelect,
+    True_,
     case,
     cast,
     false,
@@ -116,6 +117,11 @@ def equal(column: Any, value: Any) -> ColumnElement[bool]:
     """Return the condition that the column has this value; for None every row fulfils it."""
     same: ColumnElement[bool] = true() if value is None else column == value
     return same
+
+
+def needed(*conditions: ColumnElement[bool]) -> list[ColumnElement[bool]]:
+    """Return the conditions without those that every row fulfils, for a select that may have no others."""
+    return [each for each in conditions if not isinstance(each, True_)]
 
 
 def json_text(document: Any, name: str) -> ColumnElement[str]:

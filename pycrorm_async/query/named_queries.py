@@ -35,6 +35,7 @@ from pycrorm_async.query.frames import (
     containing,
     limited,
     member_of,
+    needed,
     of_episode,
     times_with,
 )
@@ -467,7 +468,7 @@ def episode_list(episode: Any, choice: EpisodeChoice) -> Select[*tuple[Any, ...]
         listed.failure_message,
         listed.continues,
     )
-    conditions = of_episode(listed.id, episode), *choice.conditions()
+    conditions = needed(of_episode(listed.id, episode), *choice.conditions())
     return limited(statement.where(*conditions).order_by(listed.id.desc()), choice.limit)
 
 

@@ -14,7 +14,7 @@ from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary
 from pycrorm_async.query.question import Question, SyncQuestion
 from pycrorm_async.query.snapshot import Moment, WorldThen
 from pycrorm_async.query.sql import SqlResult
-from pycrorm_async.query.text import duration, folding_text, one_line, parameters_text, value_html
+from pycrorm_async.query.text import folding_text, node_text, one_line, value_html
 
 if TYPE_CHECKING:
     from pycrorm_async.query.notebook_html import Axis
@@ -75,7 +75,7 @@ class Episodes(_Listing[EpisodeSummary]):
 
 
 class TaskTree(_Listing[NodeSummary]):
-    """The nodes of an episode, each before its children. A list that a notebook draws as a chart and nested lists.
+    """The nodes of an episode, each before its children. A list that a notebook draws as a chart and lines of text.
 
     Attributes:
         episode: to which they belong; None in a list that was not read from a memory.
@@ -95,12 +95,7 @@ class TaskTree(_Listing[NodeSummary]):
         return type(self)(items, self.episode)
 
     def __repr__(self) -> str:
-        lines = (
-            f"{'  ' * each.depth}{each.dtype or each.kind} {parameters_text(each.parameters)} {each.status}"
-            f" {duration(each.duration_ns)} {f'{each.reason}: {each.failure_message}' if each.reason else ''}"
-            for each in self
-        )
-        return _text(lines, len(self))
+        return _text((f"{'  ' * each.depth}{node_text(each)}" for each in self), len(self))
 
     def _repr_html_(self) -> str:
         from pycrorm_async.query.notebook_html import task_tree_html
@@ -111,50 +106,26 @@ class TaskTree(_Listing[NodeSummary]):
 # === the views of values ======================================================================================
 
 
-@value_html.register(EpisodeSummary)
-def _(episode: EpisodeSummary) -> str:
-    from pycrorm_async.query.notebook_html import episode_html
+def _view(value: object) -> str:
+    from pycrorm_async.query import notebook_html as views
 
-    return episode_html(episode)
-
-
-@value_html.register(Moment)
-def _(moment: Moment) -> str:
-    from pycrorm_async.query.notebook_html import moment_html
-
-    return moment_html(moment)
-
-
-@value_html.register(WorldThen)
-def _(world: WorldThen) -> str:
-    from pycrorm_async.query.notebook_html import world_html
-
-    return world_html(world)
-
-
-@value_html.register(Question)
-def _(question: Question) -> str:
-    from pycrorm_async.query.notebook_html import question_html
-
-    return question_html(question.name, question.sql, "await it for a frame")
+    match value:
+        case EpisodeSummary():
+            return views.episode_html(value)
+        case Moment():
+            return views.moment_html(value)
+        case WorldThen():
+            return views.world_html(value)
+        case Question():
+            return views.question_html(value.name, value.sql, "await it for a frame")
+        case SyncQuestion():
+            return views.question_html(value.name, value.sql, "call frame() or rows()")
+        case EpisodeDiff():
+            return views.diff_html(value)
+        case SqlResult():
+            return views.sql_result_html(value)
+    raise AssertionError(f"{value!r} is of none of the registered classes")
 
 
-@value_html.register(SyncQuestion)
-def _(question: SyncQuestion) -> str:
-    from pycrorm_async.query.notebook_html import question_html
-
-    return question_html(question.name, question.sql, "call frame() or rows()")
-
-
-@value_html.register(EpisodeDiff)
-def _(diff: EpisodeDiff) -> str:
-    from pycrorm_async.query.notebook_html import diff_html
-
-    return diff_html(diff)
-
-
-@value_html.register(SqlResult)
-def _(result: SqlResult) -> str:
-    from pycrorm_async.query.notebook_html import sql_result_html
-
-    return sql_result_html(result)
+for _kind in (EpisodeSummary, Moment, WorldThen, Question, SyncQuestion, EpisodeDiff, SqlResult):
+    value_html.register(_kind, _view)

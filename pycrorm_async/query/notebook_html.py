@@ -1,6 +1,6 @@
-"""Draw episodes, task trees, charts, moments and answers as HTML and SVG for notebooks.
+"""Draw episodes, task trees, charts, moments and answers for notebooks: tables, lines of text, and charts as SVG.
 
-HTML and SVG are without scripts, styles of their own or requests. Text takes the colour of the notebook, signs and bars
+The views are without scripts, styles of their own or requests. Text takes the colour of the notebook, signs and bars
 have colours that contrast with light and dark pages, and every status has a sign. Everything recorded is escaped and
 isolated from the direction of the text around it.
 """
@@ -10,7 +10,6 @@ from __future__ import annotations
 import html
 import math
 from collections.abc import Mapping, Sequence
-from collections.abc import Set as AbstractSet
 from random import Random
 from typing import Literal, NamedTuple, TypeAlias, get_args
 
@@ -19,7 +18,7 @@ import msgspec
 from pycrorm_async.errors import CallerError
 from pycrorm_async.query.episode_diff import EpisodeDiff
 from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary, counts_text
-from pycrorm_async.query.snapshot import Moment, ObjectThen, WorldThen, world_map
+from pycrorm_async.query.snapshot import Moment, ObjectThen, WorldThen
 from pycrorm_async.query.sql import SqlResult
 from pycrorm_async.query.text import (
     FAILED,
@@ -30,6 +29,7 @@ from pycrorm_async.query.text import (
     folding_text,
     left_out,
     moment,
+    node_text,
     one_line,
     parameters_text,
     quiet,
@@ -114,23 +114,16 @@ def task_tree_html(nodes: Sequence[NodeSummary], episode: EpisodeSummary | None)
         title = f"{_title(episode)}{took} · {count}"
     if not nodes:
         return view(title)
-    more = f"<div>{left_out(len(nodes) - NODES_MAX, 'nodes than drawn')}</div>" if len(nodes) > NODES_MAX else ""
     chart = f'<div style="max-height:340px;overflow:auto;margin:6px 0">{gantt(nodes).svg}</div>'
-    return view(title, more, chart, tree_html(nodes))
+    return view(title, chart, tree_html(nodes))
 
 
 # === tree view ================================================================================================
 #
-# Draw a task tree as nested lists that are opened at its failures.
+# Draw a task tree as lines of text.
 
 NODES_MAX = 500
 """Bounds the nodes of a view, so that a notebook with many of them stays small."""
-_NODES_OPEN = 100
-"""Opens the first two levels of a tree of up to this many nodes, and the first one of a larger tree."""
-_FAILURES_OPEN = 20
-"""Bounds the failures at which a tree is opened, so that a view of hundreds of them is not long."""
-_PARAMETERS_MAX = 160
-"""Bounds the characters of a node's parameters."""
 
 
 def shown_nodes(nodes: Sequence[NodeSummary]) -> list[NodeSummary]:
@@ -162,90 +155,20 @@ def root_failures(nodes: Sequence[NodeSummary]) -> list[NodeSummary]:
 
 
 def tree_html(nodes: Sequence[NodeSummary]) -> str:
-    """Return the nodes as nested lists; `nodes` lists each parent before its children, as `TaskTree` does."""
+    """Return the nodes as indented lines; `nodes` lists each parent before its children, as `TaskTree` does."""
     shown = shown_nodes(nodes)
-    parents = _parents(nodes, {each.id for each in shown})
-    shown_ids = {each.id for each in shown}
-    hidden: dict[int | None, int] = {}
-    for each in nodes:
-        if each.id not in shown_ids:
-            hidden[parents[each.id]] = hidden.get(parents[each.id], 0) + 1
-    with_children = {parents[each.id] for each in nodes}
-    from_below = {(each.parent_id, each.failure_message) for each in nodes}
-    opened = _opened(shown, parents)
-    parts: list[str] = []
-    path: list[int] = []
-
-    def close(parent: int | None) -> None:
-        while path and path[-1] != parent:
-            parts.append(f"{_more_nodes(hidden.get(path.pop(), 0))}</details>")
-
-    for each in shown:
-        close(parents[each.id])
-        if each.id in with_children:
-            is_open = " open" if each.id in opened else ""
-            parts.append(f'<details{is_open} style="margin-left:16px"><summary>{_line(each, from_below)}</summary>')
-            path.append(each.id)
-        else:
-            parts.append(f'<div style="margin-left:30px">{_line(each, from_below)}</div>')
-    close(None)
-    return f'<div style="margin-left:-16px">{"".join(parts)}{_more_nodes(hidden.get(None, 0))}</div>'
+    lines = "\n".join(f"{'  ' * each.depth}{_line(each)}" for each in shown)
+    more = f"<div>{left_out(len(nodes) - len(shown), 'nodes')}</div>" if len(nodes) > len(shown) else ""
+    return f'<div style="font-family:monospace;white-space:pre;overflow-x:auto">{lines}</div>{more}'
 
 
-def _parents(nodes: Sequence[NodeSummary], shown: set[int]) -> dict[int, int | None]:
-    """Return for each node its nearest shown ancestor; None if no ancestor is shown."""
-    parents: dict[int, int | None] = {}
-    for each in nodes:
-        parent = each.parent_id
-        parents[each.id] = parent if parent in shown else parents.get(parent) if parent is not None else None
-    return parents
+def _line(node: NodeSummary) -> str:
+    counts = counts_text(node), *(f"{number} {noun}s" for number, noun in _made_at(node) if number)
+    return f"{status(node.status, with_name=False)} {recorded(' '.join(filter(None, (node_text(node), *counts))))}"
 
 
-def _opened(shown: Sequence[NodeSummary], parents: Mapping[int, int | None]) -> set[int]:
-    """Return the nodes to open: the first levels, and those with one of the first failed or running nodes below."""
-    opened: set[int] = set()
-    levels = 2 if len(shown) <= _NODES_OPEN else 1
-    leading = root_failures(shown)[:_FAILURES_OPEN]
-    ends = {each.id for each in (*leading, *(each for each in shown if each.status == "RUNNING"))}
-    depths: dict[int | None, int] = {None: -1}
-    for each in shown:
-        depths[each.id] = depths[parents[each.id]] + 1
-        if depths[each.id] < levels:
-            opened.add(each.id)
-        if each.id in ends:
-            above = parents[each.id]
-            while above is not None and above not in opened:
-                opened.add(above)
-                above = parents[above]
-    return opened
-
-
-def _line(node: NodeSummary, from_below: AbstractSet[tuple[int | None, str | None]]) -> str:
-    """Return the text of a node; a failure that came from a child has its message there."""
-    end = node.end_sequence if node.end_sequence is not None else ""
-    name = f'<b title="events {node.sequence} to {end}">{recorded(node.dtype or node.kind)}</b>'
-    parts = [status(node.status, with_name=False), name]
-    if node.parameters:
-        parts.append(quiet(recorded(parameters_text(node.parameters), _PARAMETERS_MAX)))
-    if node.status not in ("SUCCEEDED", "FAILED"):
-        parts.append(recorded(node.status))
-    if node.duration_ns is not None:
-        parts.append(quiet(duration(node.duration_ns)))
-    if node.reason:
-        has_message = node.failure_message and (node.id, node.failure_message) not in from_below
-        message = f": {recorded(node.failure_message)}" if has_message else ""
-        parts.append(f"<b>{recorded(node.reason)}</b>{message}")
-    if node.observations:
-        parts.append(quiet(f"{node.observations} observation{'s' * (node.observations > 1)}"))
-    if counts := counts_text(node):
-        parts.append(quiet(counts))
-    if node.thoughts:
-        parts.append(quiet(f"{len(node.thoughts)} simulation{'s' * (len(node.thoughts) > 1)}"))
-    return " ".join(parts)
-
-
-def _more_nodes(count: int) -> str:
-    return f'<div style="margin-left:30px">{left_out(count)}</div>' if count else ""
+def _made_at(node: NodeSummary) -> tuple[tuple[int, str], ...]:
+    return (node.observations, "observation"), (len(node.thoughts), "simulation")
 
 
 # === gantt ====================================================================================================
@@ -467,61 +390,42 @@ def _omitted(count: int) -> str:
 
 # === moment view ==============================================================================================
 #
-# Draw the state of an episode at a moment: running nodes, the world from above, objects, observations and the tree.
+# Draw the state of an episode at a moment: running nodes, objects, observations and the tree.
 
 
 def moment_html(then: Moment) -> str:
-    """Return the views of a moment below each other; the tree is closed."""
+    """Return the views of a moment below each other."""
     simulated = f" {quiet('simulated')}" if then.simulated else ""
     title = (
         f"<b>Episode {then.number} · {recorded(then.description)}</b> at {then.time_s:.3f} s, event {then.sequence}"
         f" {quiet(f'({moment(then.at)} UTC)')} · {status(then.status)}{simulated}"
     )
-    running = " → ".join(
-        f"<b>{recorded(each.dtype or each.kind)}</b> {quiet(recorded(parameters_text(each.parameters), 80))}"
-        for each in then.running
-    )
+    running = " → ".join(f"<b>{recorded(each.dtype or each.kind)}</b>" for each in then.running)
     seen = list(then.observations.items())
     rows = [(recorded(name), recorded(_json(each.values)), f"e{each.sequence}") for name, each in seen[:_ROWS_MAX]]
-    observed = [table(("observation", "values", "event"), rows), _and_others(len(seen), "observations")] if seen else []
-    tree = f"<details><summary>{len(then.tree):,} nodes had started</summary>{tree_html(then.tree)}</details>"
+    observed = [table(("observation", "values", "event"), rows), _omitted(len(seen))] if seen else []
     doing = f"<div>{running or quiet('nothing was running')}</div>"
-    return view(title, doing, _world(then.world), *observed, tree)
+    return view(title, doing, _objects(then.world), *observed, tree_html(then.tree))
 
 
 def world_html(world: WorldThen) -> str:
-    """Return the map of a world and the table of its objects."""
-    return view(f"<b>{len(world.objects):,} object{'s' * (len(world.objects) != 1)}</b>", _world(world))
+    """Return the table of the objects of a world."""
+    return view(f"<b>{len(world.objects):,} object{'s' * (len(world.objects) != 1)}</b>", _objects(world))
 
 
-def _world(world: WorldThen) -> str:
+def _objects(world: WorldThen) -> str:
     if not world.objects:
         return f"<div>{quiet('the world was empty at this moment')}</div>"
     columns = ("object", "type", "x, m", "y, m", "z, m", "heading", "attached to")
-    rows = table(columns, map(_object_row, world.objects[:_ROWS_MAX]))
-    return (
-        '<div style="display:flex;flex-wrap:wrap;gap:16px;align-items:flex-start">'
-        f'<div style="flex:1 1 300px;max-width:420px">{world_map(world).svg}</div>'
-        f'<div style="flex:1 1 560px;min-width:0">{rows}{_and_others(len(world.objects), "objects")}</div></div>'
-    )
+    return table(columns, map(_object_row, world.objects[:_ROWS_MAX])) + _omitted(len(world.objects))
 
 
 def _object_row(each: ObjectThen) -> Sequence[str]:
-    attached = ""
-    if each.attached_to is not None:
-        name, link = each.attached_to
-        attached = recorded(name if link is None else f"{name}, {link}")
+    attached = recorded(", ".join(filter(None, each.attached_to))) if each.attached_to is not None else ""
     position = (f"{value:.3f}" for value in each.pose.position)
-    return recorded(each.name, 40), recorded(each.object_type), *position, _degrees(each.pose.yaw), attached
-
-
-def _degrees(radians: float) -> str:
-    return f"{round(math.degrees(radians)) + 0}°"
+    heading = f"{round(math.degrees(each.pose.yaw)) + 0}°"
+    return recorded(each.name, 40), recorded(each.object_type), *position, heading, attached
 
 
 def _json(values: object) -> str:
     return msgspec.json.encode(values).decode()
-
-
-def _and_others(count: int, noun: str) -> str:
-    return f"<div>{left_out(count - _ROWS_MAX, noun)}</div>" if count > _ROWS_MAX else ""

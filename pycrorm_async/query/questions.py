@@ -83,6 +83,7 @@ from pycrorm_async.query.frames import (
     json_text,
     limited,
     member_of,
+    needed,
     of_episode,
     success_rate,
     times_with,
@@ -272,7 +273,7 @@ def _matching(
         if len(words) > _WORDS_MAX:
             raise CallerError(f"text has {len(words)} words, and at most {_WORDS_MAX} are searched for")
         conditions += [or_(containing(each, *columns), _is_reason(each)) for each in words]
-    return [*conditions, equal(failure.recovered, recovered)]
+    return needed(*conditions, equal(failure.recovered, recovered))
 
 
 def _is_reason(words: str) -> ColumnElement[bool]:
@@ -353,7 +354,7 @@ def _failures(episode: Any) -> CTE:
     failed = RootFailure.__table__
     columns = failed.c.id, failed.c.process_metadata_id, failed.c.start_time, failed.c.reason, failed.c.object
     statement = select(*columns, RootFailure.sequence.label("sequence"))
-    statement = statement.where(of_episode(failed.c.process_metadata_id, episode))
+    statement = statement.where(*needed(of_episode(failed.c.process_metadata_id, episode)))
     return statement.cte("failed").prefix_with("MATERIALIZED", dialect="postgresql")
 
 

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 from xml.etree.ElementTree import ParseError
 
 import numpy as np
 import numpy.typing as npt
-from numpy.typing import NDArray
 
 from pycrorm_async.events.types import DescriptionDeclared
-from pycrorm_async.world.bounding_boxes import BoundingBox, rotation_matrix
+from pycrorm_async.world.bounding_boxes import BoundingBox
 from pycrorm_async.world.meshes import read_mesh
 from pycrorm_async.world.model_boxes import with_boxes
 from pycrorm_async.world.models import built_in_that_fits
@@ -22,9 +21,6 @@ from pycrorm_async.world.urdf_model import ENDLESS, Joint, Mimic, Model, Shape, 
 # === link frames ==============================================================================================
 #
 # Compute the frame of every link of a model from an object's pose and joint positions: forward kinematics.
-
-Frame: TypeAlias = NDArray[np.float64]
-"""A pose as a matrix of 4 rows and 4 columns."""
 
 
 def link_poses(
@@ -39,21 +35,9 @@ def link_poses(
     return {link: root @ each for link, each in poses.items()}
 
 
-def link_frames(
-    model: Mapping[str, Any], pose: Pose, joints: Mapping[str, float], base_link: str | None = None
-) -> dict[str, Frame]:
-    """Return the poses of `link_poses` as matrices."""
-    return {link: _frame(each) for link, each in link_poses(model, pose, joints, base_link).items()}
-
-
 def joint_pose(joint: Sequence[Any], joints: Mapping[str, float]) -> Pose:
     """Return the pose of a joint's child link in its parent link, at these positions."""
     return along([_joint_of(joint)], joints)
-
-
-def placed(xyz: Sequence[float], rpy: Sequence[float]) -> Frame:
-    """Return the frame at a position, turned by roll, pitch and yaw as in URDF."""
-    return _frame(origin(xyz, rpy))
 
 
 def _joint_of(row: Sequence[Any]) -> Joint:
@@ -62,12 +46,6 @@ def _joint_of(row: Sequence[Any]) -> Joint:
     unit = Vector(*(each / length for each in axis))
     follows = None if mimic is None or kind == "fixed" else Mimic(*mimic)
     return Joint(name, JointType[kind.upper()], parent, child, origin(xyz, rpy), tuple(rpy), unit, ENDLESS, follows)
-
-
-def _frame(pose: Pose) -> Frame:
-    frame = np.eye(4)
-    frame[:3, :3], frame[:3, 3] = rotation_matrix(pose.orientation), pose.position
-    return frame
 
 
 # === mesh triangles ===========================================================================================

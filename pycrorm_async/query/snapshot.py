@@ -13,19 +13,12 @@ Pose(position=[1.3, 1.0, 0.9], orientation=[0.0, 0.0, 0.0, 1.0], frame='map')
 
 from __future__ import annotations
 
-import html
-import itertools
-import math
 from collections.abc import AsyncIterator, Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from numbers import Integral, Real
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeAlias
-
-import numpy as np
-from numpy.typing import NDArray
 
 from pycrorm_async.errors import CallerError, LogDamaged, UnknownEpisode
 from pycrorm_async.events.codec import description_of
@@ -33,8 +26,7 @@ from pycrorm_async.events.ids import SLOT_NODE, row_id
 from pycrorm_async.events.types import DescriptionDeclared
 from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary, Percept, PlaceSearch, percepts_in, search_in
 from pycrorm_async.query.replay import LATEST_MAX, EpisodeReplay, ReplayedNode, WorldObject
-from pycrorm_async.query.scene import Frame, assumed_model, link_frames, object_model, placed, triangles_of
-from pycrorm_async.query.text import Drawing, NotebookValue, one_line
+from pycrorm_async.query.text import NotebookValue
 from pycrorm_async.store.log import EventLog, episode_named
 from pycrorm_async.store.stored import StoredEvent
 from pycrorm_async.visible_text import visible
@@ -148,11 +140,6 @@ class WorldThen(NotebookValue):
         """The world's state for `BulletWorld.restore_state`."""
         return WorldState({each.name: ObjectState(each.pose, each.joints, each.attached_to) for each in self.objects})
 
-    def map(self) -> Drawing:
-        """Return the world from above, as SVG that a notebook draws."""
-
-        return world_map(self)
-
 
 @dataclass(frozen=True)
 class ObservationThen:
@@ -220,10 +207,6 @@ class Moment(NotebookValue):
         return "\n".join(visible(each, kept="") for each in lines)
 
     __repr__ = __str__
-
-    def map(self) -> Drawing:
-        """Return the world from above, as SVG that a notebook draws."""
-        return self.world.map()
 
 
 # === as of ====================================================================================================
@@ -349,209 +332,6 @@ def _number(value: Any, kind: type) -> float | None:
     """Return a Python or NumPy number as a float; None if it is not finite or of another kind."""
     is_number = isinstance(value, kind) and not isinstance(value, bool)
     return float(value) if is_number and abs(value) < _NUMBERS_END else None
-
-
-# === world map ================================================================================================
-#
-# Draw the world of a moment from above, as SVG on a light ground.
-
-_SIZE_PX = 460.0
-"""The longer side of a map in pixels."""
-_SIZE_MIN_M = 2.0
-"""The least longer side of a map in m, so that a single small object does not fill it."""
-_MARGIN_M = 0.3
-"""The least margin around the objects, in m."""
-_LINES_MAX = 40
-"""Bounds the lines of the grid along an axis."""
-_OUTLINES_MAX = 3_000
-"""Bounds the shapes of a map; of more, the highest are drawn."""
-_NAMES_MAX = 60
-"""Bounds the objects whose names are drawn."""
-
-
-def world_map(world: WorldThen) -> Drawing:
-    """Return the outlines of all objects from above, with the names of those that are not the environment."""
-    shapes = outlines(world)[-_OUTLINES_MAX:]
-    left, right, low, high = _extent([point for each in shapes for point in each.corners])
-    scale = _SIZE_PX / max(right - left, high - low)
-    width, height = (right - left) * scale, (high - low) * scale
-
-    def at(point: Point) -> Point:
-        return (point[0] - left) * scale, (high - point[1]) * scale
-
-    parts = [f'<rect width="{width:.0f}" height="{height:.0f}" fill="#f4f6f9"/>']
-    parts += [f'<path d="{_line(at((x, low)), at((x, high)))}" stroke="#d3d9e2"/>' for x in _grid(left, right)]
-    parts += [f'<path d="{_line(at((left, y)), at((right, y)))}" stroke="#d3d9e2"/>' for y in _grid(low, high)]
-    parts += [_polygon(each, [at(corner) for corner in each.corners]) for each in shapes]
-    named = [each for each in world.objects if each.object_type != "ENVIRONMENT"][:_NAMES_MAX]
-    parts += _names(named, [at((each.pose.position.x, each.pose.position.y)) for each in named])
-    step = _step(right - left)
-    parts.append(f'<text x="6" y="{height - 6:.0f}" fill="#5a6675" stroke="none">grid of {step:g} m</text>')
-    return Drawing(
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:.0f} {height:.0f}" role="img"'
-        f' aria-label="map of {len(world.objects)} objects from above" font-family="system-ui,sans-serif"'
-        f' font-size="12" style="width:100%;max-width:{width:.0f}px">{"".join(parts)}</svg>'
-    )
-
-
-def _extent(points: Sequence[Point]) -> tuple[float, float, float, float]:
-    if not points:
-        return -1.0, 1.0, -1.0, 1.0
-    (left, right), (low, high) = ((min(each), max(each)) for each in zip(*points, strict=True))
-    margin = max(_MARGIN_M, (_SIZE_MIN_M - max(right - left, high - low)) / 2)
-    return left - margin, right + margin, low - margin, high + margin
-
-
-def _step(width: float) -> float:
-    return float(10 ** max(0, math.ceil(math.log10(width / _LINES_MAX))))
-
-
-def _grid(low: float, high: float) -> Iterator[float]:
-    step = _step(high - low)
-    yield from (index * step for index in range(math.ceil(low / step), math.floor(high / step) + 1))
-
-
-def _line(start: Point, end: Point) -> str:
-    return f"M{start[0]:.1f} {start[1]:.1f}L{end[0]:.1f} {end[1]:.1f}"
-
-
-def _polygon(shape: Outline, corners: Iterable[Point]) -> str:
-    red, green, blue, opacity = (min(max(each, 0.0), 1.0) for each in shape.color)
-    points = " ".join(f"{x:.1f},{y:.1f}" for x, y in corners)
-    color = f"#{round(red * 255):02x}{round(green * 255):02x}{round(blue * 255):02x}"
-    paint = f'fill="{color}" fill-opacity="{opacity:.2g}" stroke="#1a2330" stroke-opacity=".55" stroke-width=".7"'
-    return f'<polygon points="{points}" {paint}/>'
-
-
-def _names(objects: Sequence[ObjectThen], positions: Sequence[Point]) -> Iterator[str]:
-    """Yield the names above the objects, each moved up until it covers no other name."""
-    taken: list[tuple[float, float, float]] = []
-    for each, (x, y) in zip(objects, positions, strict=True):
-        name = one_line(each.name, 30)
-        half, y = len(name) * 3.4, y - 8
-        while any(abs(x - other) < half + width and abs(y - top) < 13 for other, top, width in taken):
-            y -= 13
-        taken.append((x, y, half))
-        paint = 'fill="#1a2330" stroke="#f4f6f9" stroke-width="3" paint-order="stroke" text-anchor="middle"'
-        yield f'<text x="{x:.1f}" y="{y:.1f}" {paint}>{html.escape(name)}</text>'
-
-
-# === outlines =================================================================================================
-#
-# Compute the outlines from above of the objects of a moment: the convex hull of each shape.
-#
-# A mesh has the hull of its vertices where the moment has its file, otherwise that of the box around its link.
-
-Point: TypeAlias = tuple[float, float]
-_Points: TypeAlias = NDArray[np.floating]
-
-_GREY = (0.62, 0.64, 0.68, 1.0)
-_CORNERS = np.array(list(itertools.product((-0.5, 0.5), repeat=3)))
-_DIRECTIONS = np.array([(math.cos(angle), math.sin(angle)) for angle in np.arange(128) * math.tau / 128])
-"""The directions in which a mesh's outermost vertices are sought: a drawing of 460 pixels shows no more."""
-_CIRCLE = np.c_[_DIRECTIONS[::4], np.zeros(len(_DIRECTIONS[::4]))]
-"""The corners of a circle of radius 1 m."""
-_DECIMALS = 6
-"""Rounds corners to 1 µm, so that those above each other are one."""
-
-
-class Outline(NamedTuple):
-    """The outline of one shape: its corners and its highest point in "map", m, and red, green, blue, opacity."""
-
-    object: ObjectThen
-    corners: tuple[Point, ...]
-    top: float
-    color: tuple[float, ...]
-
-
-class _Model(NamedTuple):
-    """A model from `object_model`, and the vertices of the meshes that it draws, by their references."""
-
-    model: Mapping[str, Any]
-    meshes: Mapping[str, _Points]
-
-
-def outlines(world: WorldThen) -> list[Outline]:
-    """Return the outlines of all shapes of a world, the lowest first, so that higher ones are drawn over them."""
-    models: dict[str, _Model] = {}
-    every: list[Outline] = []
-    for then in world.objects:
-        fingerprint = then.description_fingerprint
-        if fingerprint is None or fingerprint not in world.descriptions:
-            model = _Model(assumed_model(then.name, then.object_type, set(then.joints)), {})
-        else:
-            if fingerprint not in models:
-                models[fingerprint] = _recorded_model(world.descriptions[fingerprint], world.meshes)
-            model = models[fingerprint]
-        every.extend(_outlines(then, model))
-    return sorted(every, key=lambda each: each.top)
-
-
-def _recorded_model(description: DescriptionDeclared, contents: Mapping[str, bytes]) -> _Model:
-    meshes: dict[str, _Points] = {}
-    for mesh in description.meshes:
-        if mesh.content is None or mesh.content.hash not in contents:
-            continue
-        with suppress(ValueError):  # a file that cannot be read is drawn as the box
-            meshes[mesh.reference] = triangles_of(mesh.name, contents[mesh.content.hash]).vertices
-    return _Model(object_model(description, drawn=frozenset(meshes)), meshes)
-
-
-def _outlines(then: ObjectThen, model: _Model) -> Iterator[Outline]:
-    frames = link_frames(model.model, then.pose, then.joints, then.base_link)
-    for link, shapes in model.model["shapes"].items():
-        if link not in frames:  # a description with two root links
-            continue
-        for kind, sizes, xyz, rpy, color in shapes:
-            points = _points(kind, sizes, frames[link] @ placed(xyz, rpy), model.meshes)
-            top = float(points[:, 2].max())
-            yield Outline(then, _hull(_outermost(points[:, :2])), top, tuple(then.color or color or _GREY))
-
-
-def _points(kind: str, sizes: Sequence[Any], frame: Frame, meshes: Mapping[str, _Points]) -> _Points:
-    """Return points in "map" whose outline from above is that of the shape, the highest one among them."""
-    points: _Points
-    if kind in ("sphere", "capsule"):
-        radius, half = sizes[0], sizes[1] / 2 if kind == "capsule" else 0.0
-        ends = _moved(np.array([(0, 0, -half), (0, 0, half)]), frame)
-        ball = radius * np.vstack([_CIRCLE, (0, 0, 1)])
-        points = (ends[:, None] + ball).reshape(-1, 3)
-        return points
-    if kind == "cylinder":
-        radius, height = sizes
-        ends = np.array([(0, 0, -height / 2), (0, 0, height / 2)])
-        return _moved((ends[:, None] + radius * _CIRCLE).reshape(-1, 3), frame)
-    points = meshes[sizes[0]] * sizes[1:] if kind == "mesh" else _CORNERS * sizes
-    return _moved(points, frame)
-
-
-def _moved(points: _Points, frame: Frame) -> _Points:
-    return np.asarray(points @ frame[:3, :3].T + frame[:3, 3])
-
-
-def _outermost(points: _Points) -> list[Point]:
-    """Return the points in the plane, each once; of many, those that lie outermost in one of some directions."""
-    if len(points) > len(_DIRECTIONS):
-        points = points[(points @ _DIRECTIONS.T).argmax(axis=0)]
-    return [(float(x), float(y)) for x, y in np.unique(points.round(_DECIMALS), axis=0)]
-
-
-def _hull(points: Sequence[Point]) -> tuple[Point, ...]:
-    """Return the corners of the convex hull of points in the plane, counterclockwise (Andrew's monotone chain)."""
-    ordered = sorted(points)
-
-    def chain(passed: Sequence[Point]) -> list[Point]:
-        corners: list[Point] = []
-        for x, y in passed:
-            while len(corners) > 1:
-                (a, b), (c, d) = corners[-2:]
-                if (c - a) * (y - b) - (d - b) * (x - a) > 0:
-                    break
-                corners.pop()
-            corners.append((x, y))
-        return corners[:-1]
-
-    return (*chain(ordered), *chain(ordered[::-1]))
 
 
 # === moment ===================================================================================================

@@ -81,6 +81,13 @@ def with_object_names(
     return named
 
 
+def node_text(node: Any) -> str:
+    """Format a `NodeSummary` on one line: type, parameters, status, duration and failure."""
+    failure = f"{node.reason}: {node.failure_message}" if node.reason else ""
+    parts = node.dtype or node.kind, parameters_text(node.parameters), node.status, duration(node.duration_ns), failure
+    return " ".join(parts)
+
+
 def one_line(text: object, characters_max: int | None) -> str:
     """Format a text on one line; an ellipsis marks the cut."""
     line = " ".join(str(text).split())

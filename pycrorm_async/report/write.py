@@ -64,6 +64,11 @@ class Report(NamedTuple):
     last: int
     events: int
 
+    def _repr_html_(self) -> str:
+        """Return the page in a frame, for a notebook: its scripts cannot reach the notebook."""
+        page = html.escape(self.path.read_text(encoding="utf-8"))
+        return f'<iframe sandbox="allow-scripts" style="width:100%;height:640px;border:0" srcdoc="{page}"></iframe>'
+
 
 class Overview(NamedTuple):
     """A written overview: its file, and the numbers of episodes that it counts, has pages for, and leaves out.

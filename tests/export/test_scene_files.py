@@ -18,7 +18,7 @@ from pycrorm_async.errors import CallerError, MissingExtra
 from pycrorm_async.export import export as episode_files
 from pycrorm_async.export.export import export, export_again
 from pycrorm_async.orm import TaskTreeNode
-from pycrorm_async.query.scene import link_frames, object_model
+from pycrorm_async.query.scene import link_poses, object_model
 from pycrorm_async.world.bounding_boxes import rotation_matrix
 from tests.full_disk import files_of_at_most
 
@@ -54,7 +54,9 @@ async def check_frames(reading: Reading, sequence: int, frames: Frames) -> None:
     for each in then.world.objects:
         assert each.description_fingerprint is not None
         model = object_model(then.world.descriptions[each.description_fingerprint])
-        for link, frame in link_frames(model, each.pose, each.joints, each.base_link).items():
+        for link, pose in link_poses(model, each.pose, each.joints, each.base_link).items():
+            frame = np.eye(4)
+            frame[:3, :3], frame[:3, 3] = rotation_matrix(pose.orientation), pose.position
             name = each.name if link == model["root"] else f"{each.name}/{link}"
             np.testing.assert_allclose(placed(frames, name), frame, atol=2e-5)
 

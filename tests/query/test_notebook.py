@@ -2,24 +2,16 @@
 
 from __future__ import annotations
 
-import math
 import re
-import zlib
-from base64 import b64encode
-from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from html.parser import HTMLParser
-from itertools import pairwise
 from pathlib import Path
 
-import msgspec
-import numpy as np
 import pytest
 
-from pycrorm_async import Memory, world_of
+from pycrorm_async import Memory
 from pycrorm_async.errors import CallerError
-from pycrorm_async.events.types import BlobReference, BoxValue, DescriptionDeclared, MeshValue
 from pycrorm_async.plan import NavigateAction, simulated_robot
 from pycrorm_async.query.episode_diff import Difference, EpisodeDiff
 from pycrorm_async.query.named_queries import EpisodeSummary, NodeSummary
@@ -27,14 +19,11 @@ from pycrorm_async.query.notebook import Episodes, TaskTree
 from pycrorm_async.query.notebook_html import cases_html
 from pycrorm_async.query.reading import memory_html
 from pycrorm_async.query.running_episodes import RobotSummary
-from pycrorm_async.query.scene import link_frames, object_model
-from pycrorm_async.query.snapshot import Moment, ObjectThen, ObservationThen, WorldThen, outlines
+from pycrorm_async.query.snapshot import Moment, ObjectThen, ObservationThen, WorldThen
 from pycrorm_async.query.sql import SqlResult
 from pycrorm_async.query.text import NotebookValue, value_html
 from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose
-from pycrorm_async.world.models import built_in_model
-from tests.mesh_files import binary_stl
 
 START = datetime(2026, 3, 1, 12, tzinfo=UTC)
 HOSTILE = "</details></script><script>alert(1)</script>\u202e\"'& <img src=x onerror=alert(1)>"
@@ -111,12 +100,8 @@ def harmless(view: str) -> Page:
     return page
 
 
-def described(urdf: str) -> DescriptionDeclared:
-    return DescriptionDeclared(urdf=b64encode(zlib.compress(urdf.encode())).decode())
-
-
 def moment(*objects: ObjectThen, **fields: object) -> Moment:
-    world = WorldThen(objects, None, {"described": described(built_in_model("courier"))})
+    world = WorldThen(objects, None)
     plain = Moment(1, "id", "Set the table", "ada", START, False, 7, 1.5, START, "RUNNING", (), world)
     return replace(plain, **fields)  # type: ignore[arg-type]
 
@@ -136,7 +121,7 @@ def test_everything_recorded_is_escaped_and_nothing_runs_or_is_requested() -> No
     views.append(EpisodeDiff(hostile, hostile, (difference,), 1)._repr_html_())
     views.append(SqlResult((HOSTILE,), [(HOSTILE,), (None,)], more=True)._repr_html_())
     views.append(cases_html((HOSTILE, HOSTILE), ("type", "status"), [(HOSTILE, "FAILED"), (None, HOSTILE)]))
-    views += [then.world._repr_html_(), then.map()._repr_html_(), tree.gantt("time")._repr_html_()]
+    views += [then.world._repr_html_(), tree.gantt("time")._repr_html_()]
     for view in views:
         assert "</script><script>" in harmless(view).text
 
@@ -156,29 +141,6 @@ def test_a_value_without_a_view_is_drawn_as_its_escaped_text() -> None:
     assert Unregistered()._repr_html_() == "<pre>&lt;unregistered&gt;</pre>"
 
 
-def test_a_tree_is_opened_at_its_failures_and_closed_elsewhere() -> None:
-    steps = [node(1, kind="root", dtype=None)]
-    for branch in (2, 6):
-        steps += [node(branch, 1), node(branch + 1, branch), node(branch + 2, branch + 1), node(branch + 3, branch + 2)]
-    steps[-1] = replace(steps[-1], status="FAILED", reason="IKError", failure_message="too far")
-    page = harmless(TaskTree(steps)._repr_html_())
-    branches = [("open" in attributes) for tag, attributes in page.elements if tag == "details"]
-    assert branches == [True, True, False, False, True, True, True]
-    assert "✗ Step9Action" in page.text
-    assert "IKError: too far" in page.text
-
-
-def test_the_message_of_a_failure_is_where_it_began_and_the_first_failures_are_open() -> None:
-    steps = [node(1)]
-    for branch in range(2, 202, 2):
-        for number, parent in ((branch, 1), (branch + 1, branch)):
-            steps.append(node(number, parent, "FAILED", reason="IKError", failure_message=f"too far {branch}!"))
-    page = harmless(TaskTree(steps)._repr_html_())
-    assert (page.text.count("too far 2!"), page.text.count("too far 200!")) == (1, 1)
-    assert page.text.count("IKError") == 200
-    assert sum("open" in attributes for tag, attributes in page.elements if tag == "details") == 1 + 20
-
-
 def test_a_large_tree_shows_five_hundred_nodes_with_the_failures_among_them_and_counts_the_others() -> None:
     steps = [node(1)]
     for branch in range(2, 5_002, 2):
@@ -187,11 +149,10 @@ def test_a_large_tree_shows_five_hundred_nodes_with_the_failures_among_them_and_
     tree = TaskTree(steps)
     page = harmless(tree._repr_html_())
     assert page.count("g") == 500  # a bar for each
-    assert page.count("b") == 500 + 2  # a name for each, the title and the reason
+    assert page.count("bdi") == 500  # a line for each
+    assert "✗ Step4001Action" in page.text
     assert "IKError" in page.text
-    left_out = [int(each.replace(",", "")) for each in re.findall(r"… ([\d,]+) more(?! nodes)", page.text)]
-    assert sum(left_out) == 4_501
-    assert "… 4,501 more nodes than drawn" in page.text
+    assert "… 4,501 more nodes" in page.text
     assert len(tree._repr_html_()) < 500_000
     assert len(repr(tree).splitlines()) == 201
     assert repr(tree).endswith("… 4,801 more")
@@ -280,82 +241,9 @@ def test_a_moment_shows_what_runs_where_everything_is_and_what_was_observed() ->
     page = harmless(moment(milk, observations=seen)._repr_html_())
     for text in ("Set the table", "at 1.500 s, event 7", "▶ RUNNING", "pr2, hand", "0.900", '{"x":1.5}'):
         assert text in page.text
-    assert page.count("polygon") == 1
     empty = harmless(moment()._repr_html_())
     assert "the world was empty at this moment" in empty.text
     assert repr(moment(milk)).startswith("episode 1 at 1.500 s, event 7: RUNNING\nmilk Pose(")
-
-
-def test_links_are_drawn_where_bullet_has_them() -> None:
-    pose, link = Pose([0.3, 0.2, 0.8], [0, 0, 0.6, 0.8]), "forearm_link"
-    with BulletWorld():
-        courier = Object("courier", ObjectType.ROBOT, built_in_model("courier"))
-        joints = {each: 0.03 * (index + 1) for index, each in enumerate(courier.joints)}
-    then = moment(ObjectThen(1, 1, "courier", "ROBOT", pose, joints, None, "described", base_link=link))
-    frames = link_frames(object_model(then.world.descriptions["described"]), pose, joints, link)
-    with world_of(then) as world:
-        robot = world.object("courier")
-        for name in robot.links:
-            assert np.allclose(frames[name][:3, 3], robot.link_pose(name).position, atol=1e-5)
-    drawn = outlines(then.world)
-    assert [each.top for each in drawn] == sorted(each.top for each in drawn)
-    for each in drawn:
-        turns = [
-            (b[0] - a[0]) * (c[1] - b[1]) - (b[1] - a[1]) * (c[0] - b[0])
-            for (a, b), c in zip(pairwise(each.corners), each.corners[2:], strict=False)
-        ]
-        assert min(turns) > 0  # counterclockwise and convex
-
-
-ROUND = """<robot name="round">
-  <link name="tube"><visual><geometry><cylinder radius="0.5" length="2"/></geometry></visual></link>
-  <link name="ball"><visual><geometry><sphere radius="0.25"/></geometry></visual></link>
-  <link name="pill"><visual><geometry><capsule radius="0.5" length="2"/></geometry></visual></link>
-  <joint name="a" type="fixed"><parent link="tube"/><child link="ball"/><origin xyz="0 0 3"/></joint>
-  <joint name="b" type="fixed"><parent link="tube"/><child link="pill"/><origin xyz="0 0 6"/></joint>
-</robot>"""
-
-
-def area(corners: Sequence[tuple[float, float]]) -> float:
-    return math.fsum(a * d - c * b for (a, b), (c, d) in pairwise([*corners, corners[0]])) / 2
-
-
-@pytest.mark.parametrize(
-    ("turn", "areas"),
-    [
-        ([0, 0, 0, 1], [(1.0, 0.25 * math.pi), (3.25, math.pi / 16), (7.5, 0.25 * math.pi)]),
-        ([0.5**0.5, 0, 0, 0.5**0.5], [(0.25, math.pi / 16), (0.5, 2.0), (0.5, 2 + 0.25 * math.pi)]),
-    ],
-    ids=["upright", "lying"],
-)
-def test_round_shapes_have_round_outlines(turn: list[float], areas: list[tuple[float, float]]) -> None:
-    then = moment(ObjectThen(1, 1, "round", "GENERIC_OBJECT", Pose([1, 2, 0], turn), {}, None, "round"))
-    world = replace(then.world, descriptions={"round": described(ROUND)})
-    drawn = [(round(each.top, 6), area(each.corners)) for each in outlines(world)]
-    assert sorted(drawn) == [pytest.approx(each, rel=0.01) for each in areas]
-
-
-@pytest.mark.parametrize("content", [binary_stl(), b"torn"], ids=["read", "unreadable"])
-def test_a_mesh_has_its_own_outline_where_the_moment_has_its_file(content: bytes) -> None:
-    blob = BlobReference("ab", "model/stl", len(content))
-    mesh = MeshValue("part.stl", sha256="ab", size=len(content), content=blob)
-    geometry = f'<geometry><mesh filename="{mesh.reference}"/></geometry>'
-    urdf = f'<robot name="p"><link name="p"><visual>{geometry}</visual></link></robot>'
-    boxes = {"p": BoxValue((0, 0, 0), (1, 1, 1))}
-    description = msgspec.structs.replace(described(urdf), meshes=(mesh,), boxes=boxes)
-    lying = Pose([0, 0, 0], [0.5**0.5, 0, 0, 0.5**0.5])
-    then = moment(ObjectThen(1, 1, "pyramid", "GENERIC_OBJECT", lying, {}, None, "p"))
-    world = replace(then.world, descriptions={"p": description})
-    with_file = replace(world, meshes={"ab": content})
-    areas = [area(each.corners) for every in (world, with_file) for each in outlines(every)]
-    assert areas == [pytest.approx(1.0), pytest.approx(0.5 if content != b"torn" else 1.0)]
-
-
-def test_a_map_of_a_world_of_any_size_is_bounded() -> None:
-    far = [ObjectThen(n, n, f"far {n}", "MILK", Pose([10.0**n, 0, 0]), {}, None) for n in range(9)]
-    page = harmless(moment(*far).map().svg)
-    assert len(page.elements) < 300
-    assert "grid of 1e+07 m" in page.text
 
 
 @pytest.mark.slow

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from pycrorm_async.query.scene import link_frames
+from pycrorm_async.query.scene import link_poses
 from pycrorm_async.query.scene import object_model as page_model
 from pycrorm_async.world import BulletWorld, Object, ObjectType, Pose, describe_robot
 from pycrorm_async.world.bounding_boxes import rotation_matrix
@@ -137,13 +137,12 @@ def test_a_real_robot_has_the_frames_of_an_independent_computation_or_is_refused
     for _ in range(3):
         positions = random_positions(robot, rng)
         robot.set_joint_positions(positions)
-        page = link_frames(model, Pose(), robot.joint_positions())
+        page = link_poses(model, Pose(), robot.joint_positions())
         for link, frame in frames_of(fromstring(robot.description_text), positions).items():
-            pose = robot.link_pose(link)
-            placed = np.eye(4)
-            placed[:3, :3], placed[:3, 3] = rotation_matrix(pose.orientation), pose.position
-            np.testing.assert_allclose(placed, frame, atol=1e-6, err_msg=f"the world: {link}")
-            np.testing.assert_allclose(page[link], frame, atol=1e-6, err_msg=f"page and exports: {link}")
+            for where, pose in (("the world", robot.link_pose(link)), ("page and exports", page[link])):
+                placed = np.eye(4)
+                placed[:3, :3], placed[:3, 3] = rotation_matrix(pose.orientation), pose.position
+                np.testing.assert_allclose(placed, frame, atol=1e-6, err_msg=f"{where}: {link}")
 
 
 @pytest.mark.skipif(not any(BULLET.rglob("*.urdf")), reason="this wheel of Bullet has no models")

@@ -13,7 +13,7 @@ import pytest
 from pycrorm_async.errors import CallerError
 from pycrorm_async.memory import Memory
 from pycrorm_async.query.again import world_of
-from pycrorm_async.query.scene import link_frames, object_model
+from pycrorm_async.query.scene import link_poses, object_model
 from pycrorm_async.world import (
     Arms,
     BulletWorld,
@@ -69,8 +69,8 @@ async def test_followers_follow_in_the_world_as_of_on_the_page_and_in_exports(tm
         with world_of(then) as again:
             assert again.object("gripper").link_pose("tip").distance(Pose([0, -0.09, 0])) < 1e-9
     for joints in ({"drive": 0.04}, {"drive": 0.04, "follower": 0.0, "second": 0.0}):
-        frames = link_frames(object_model(described(GRIPPER)), Pose(), joints)
-        np.testing.assert_allclose(frames["tip"][:3, 3], [0, -0.09, 0], atol=1e-9)
+        poses = link_poses(object_model(described(GRIPPER)), Pose(), joints)
+        np.testing.assert_allclose(poses["tip"].position, [0, -0.09, 0], atol=1e-9)
 
 
 def test_a_follower_needs_no_limits_and_cannot_leave_its_leader(world: BulletWorld) -> None:
@@ -125,8 +125,8 @@ def test_an_axis_has_length_one_in_the_world_and_in_chains(world: BulletWorld, k
         each.set_joint_position("hinge", 0.5)
     assert arm.link_pose("arm").distance(unit.link_pose("arm")) < 1e-12
     np.testing.assert_allclose(arm.link_pose("arm").orientation, unit.link_pose("arm").orientation, atol=1e-12)
-    page = link_frames(object_model(described(arm.description_text)), Pose(), {"hinge": 0.5})["arm"]
-    np.testing.assert_allclose(page[:3, 3], arm.link_pose("arm").position, atol=1e-9)
+    page = link_poses(object_model(described(arm.description_text)), Pose(), {"hinge": 0.5})["arm"]
+    np.testing.assert_allclose(page.position, arm.link_pose("arm").position, atol=1e-9)
 
 
 # --- words and files -------------------------------------------------------------------------------------------
