@@ -27,7 +27,7 @@ from pycrorm_async.cli.output import (
 )
 from pycrorm_async.cli.reading import Place
 from pycrorm_async.errors import CallerError
-from pycrorm_async.export.export import EPISODE_FORMATS, ExportComparison, Exported, export_again, format_of
+from pycrorm_async.export.export import ExportComparison, Exported, export_again, format_named, format_of
 from pycrorm_async.export.export import export as write_export
 from pycrorm_async.export.selection import read_manifest
 from pycrorm_async.operations.destination import shared_address
@@ -145,7 +145,7 @@ def export(
 
 
 def _unit(file_format: str) -> str:
-    return "events" if file_format in EPISODE_FORMATS else "rows"
+    return "rows" if format_named(file_format).holds == "rows" else "events"
 
 
 def _size(text: str | None) -> tuple[int, int] | None:
@@ -205,7 +205,7 @@ def _print(exported: Exported, *, as_json: bool) -> None:
         print_json({"file": exported.path, "format": manifest.file_format, **counts, "files": manifest.files})
         return
     print_line(exported.path)
-    noun = {"lerobot": "frame", "rrd": "change", "mcap": "message"}.get(manifest.file_format, "row")
+    noun = format_named(manifest.file_format).noun
     content = f"{counted(exported.rows, noun)} of {counted(exported.episodes, 'episode')}"
     note(f"It has {content}; {exported.path}.manifest.json describes it.")
     if exported.unknown_name:

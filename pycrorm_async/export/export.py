@@ -14,33 +14,29 @@ The names of hidden tables carry the number of a generation, so the description 
 
 from __future__ import annotations
 
-import asyncio
 import inspect
 import re
 import tempfile
-from base64 import b64encode
-from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, aclosing, contextmanager
+from collections.abc import Mapping, Sequence
+from importlib.metadata import entry_points
 from os import PathLike
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeAlias, get_args
+from typing import TYPE_CHECKING, Any, Final, NamedTuple, TypeAlias
 
 import msgspec
-import numpy as np
-from sqlalchemy import LargeBinary, Select, func, select
+from sqlalchemy import LargeBinary, Select
 from sqlalchemy import inspect as inspect_database
-from sqlalchemy.exc import CompileError
 
-from pycrorm_async.errors import CallerError, DatabaseForeign, LogDamaged
-from pycrorm_async.export.lerobot import DEFAULT_FPS, MARKER, ImageSize, LeRobotFolder, check_size, draw_frames
-from pycrorm_async.export.scenes import Clock, frames_of, read_episode, scene_objects, write_mcap, write_rerun
+from pycrorm_async.errors import CallerError
+from pycrorm_async.export.formats import CSV, GROUP, JSONL, PARQUET, Format, Job, Written
+from pycrorm_async.export.lerobot import LEROBOT, ImageSize, check_size
+from pycrorm_async.export.scenes import MCAP, RERUN, Clock
 from pycrorm_async.export.selection import (
-    CoveredEpisode,
     Exportable,
     Manifest,
-    Selection,
     checksums,
+    covered_episodes,
     episode_differences,
     manifest_path,
     read_manifest,
@@ -49,24 +45,29 @@ from pycrorm_async.export.selection import (
 )
 from pycrorm_async.orm.documentation import ViewDescription, described
 from pycrorm_async.projections.generations import PROJECTION_VERSION
-from pycrorm_async.query.frames import columns_of, needed_pyarrow
 from pycrorm_async.query.question import Question
 from pycrorm_async.query.questions import QUESTIONS, Ask, arguments_of
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.text import nearest
 from pycrorm_async.report.output_files import new_file, new_folder, refuse_existing
-from pycrorm_async.visible_text import without_formula
-from pycrorm_async.writer.drain import run_to_completion
 
 if TYPE_CHECKING:
-    import pyarrow as pa
-
     from pycrorm_async.progress_bar import ProgressCallback
 
 
-FileFormat: TypeAlias = Literal["parquet", "csv", "jsonl", "lerobot", "rrd", "mcap"]
-EPISODE_FORMATS = frozenset(("lerobot", "rrd", "mcap"))
-"""The formats that hold episodes, from their events, instead of rows."""
+FileFormat: TypeAlias = str
+"""The name of a format: `parquet`, `csv` or `jsonl` for rows, `lerobot`, `rrd` or `mcap` for episodes, or one of an
+installed package."""
+
+FORMATS: Final = {"parquet": PARQUET, "csv": CSV, "jsonl": JSONL, "lerobot": LEROBOT, "rrd": RERUN, "mcap": MCAP}
+"""The built-in formats by name."""
+
+_OPTIONS = {
+    "clock": "clock and fps are options",
+    "fps": "clock and fps are options",
+    "images": "images are an option",
+    "no_formulas": "no_formulas is an option",
+}
 
 
 class Exported(NamedTuple):
@@ -110,17 +111,30 @@ class ExportComparison(NamedTuple):
     by_bytes: bool = True
 
 
+def format_names() -> list[str]:
+    """Return the names of the built-in formats, and of those that installed packages offer."""
+    return [*FORMATS, *sorted({each.name for each in entry_points(group=GROUP)} - FORMATS.keys())]
+
+
 def format_of(path: Path) -> FileFormat:
     """Return the format that the suffix of a file names. Raises `CallerError`."""
-    suffix = path.suffix.removeprefix(".").lower()
-    for each in get_args(FileFormat):
-        if suffix == each and each != "lerobot":
-            return each  # type: ignore[no-any-return]
-    raise CallerError(f"the suffix of {path} names no format: add --format (file_format=), one of {_listed()}")
+    suffix, names = path.suffix.removeprefix(".").lower(), format_names()
+    if suffix not in names or format_named(suffix).marker:
+        listed = ", ".join(names)
+        raise CallerError(f"the suffix of {path} names no format: add --format (file_format=), one of {listed}")
+    return suffix
 
 
-def _listed() -> str:
-    return ", ".join(get_args(FileFormat))
+def format_named(name: str) -> Format:
+    """Return the format of this name. Raises `CallerError`."""
+    names = format_names()
+    if name not in names:
+        raise CallerError(f"there is no format {name!r}{nearest(name, names)}; formats: {', '.join(names)}")
+    if name in FORMATS:
+        return FORMATS[name]
+    [offered, *_] = entry_points(group=GROUP, name=name)
+    loaded: Format = offered.load()
+    return loaded
 
 
 async def export(
@@ -145,7 +159,8 @@ async def export(
             class, of all episodes that have ended; a question of `memory.ask` or its name; or a select.
         path: of the file.
         file_format: `parquet`, `csv` or `jsonl` for rows; `lerobot` for episodes, into a folder; `rrd` or `mcap` for
-            one episode, which may be running; by default that of the suffix.
+            one episode, which may be running; one that an installed package offers (`export.formats`); by default that
+            of the suffix.
         episodes: limit a view, or a question about all, to these.
         arguments: of a question that is named.
         force: replace the file if it exists; a folder only if it is such a data set.
@@ -164,39 +179,29 @@ async def export(
     _refuse_other_encodings(target)
     refuse_existing(target, force=force, folder=True)
     refuse_existing(manifest_path(target), force=force)
-    chosen = file_format or format_of(target)
-    if chosen not in get_args(FileFormat):
-        raise CallerError(f"there is no format {chosen!r}{nearest(chosen, get_args(FileFormat))}; formats: {_listed()}")
-    if no_formulas and chosen != "csv":
-        raise CallerError("no_formulas is an option of the format csv")
-    options = _options(chosen, clock, fps, images)
-    left_out, unknown_name, unreadable = 0, "", dict[int, str]()
-    with new_file(manifest_path(target), force=force) as described:
-        match chosen:
-            case "parquet" | "csv" | "jsonl":
-                selection = await select_rows(reading, what, episodes, arguments=arguments)
-                left_out = selection.left_out
-                with new_file(target, force=force) as written:
-                    manifest = await _write_rows(
-                        reading, selection, written, chosen, report_progress, no_formulas=no_formulas
-                    )
-                    manifest = _complete(manifest, {target.name: checksums(written)[written.name]}, described)
-                if selection.question is not None and not manifest.rows:
-                    unknown_name = await selection.question.unknown_name()
-            case "lerobot":
-                covered = await _episodes(reading, what, episodes, chosen)
-                with new_folder(target, force=force, marker=MARKER) as written:
-                    frames = await write_lerobot(reading, covered, written, options, report_progress, unreadable)
-                    covered = tuple(each for each in covered if each.number not in unreadable)
-                    manifest = await _described(reading, covered, chosen, options, frames)
-                    manifest = _complete(manifest, checksums(written), described)
-            case "rrd" | "mcap":
-                covered = await _episodes(reading, what, episodes, chosen, running=True)
-                with new_file(target, force=force) as written:
-                    changes = await write_scene(reading, covered, written, chosen, options, report_progress)
-                    manifest = await _described(reading, covered, chosen, options, changes)
-                    manifest = _complete(manifest, {target.name: checksums(written)[written.name]}, described)
-    return Exported(target, manifest.rows, len(manifest.episodes), left_out, manifest, unknown_name, unreadable)
+    name = file_format or format_of(target)
+    chosen = format_named(name)
+    options = _options(name, chosen, {"clock": clock, "fps": fps, "images": images, "no_formulas": no_formulas})
+    is_of_rows, whole = chosen.holds == "rows", f"the format {name} holds whole episodes"
+    if not is_of_rows and (episodes or isinstance(what, type | Select | Question)):
+        raise CallerError(f"{whole}: name them by number, id or `last`")
+    with new_file(manifest_path(target), force=force) as description:
+        selection = await select_rows(reading, what, episodes, arguments=arguments, running=chosen.holds == "episode")
+        if not is_of_rows and selection.kind != "episodes":
+            raise CallerError(f"{whole}, and {selection.name} is a {selection.kind}")
+        job = Job(reading, name, selection, options, report_progress)
+        folder = new_folder(target, force=force, marker=chosen.marker) if chosen.marker else None
+        with folder or new_file(target, force=force) as unnamed:
+            written = await chosen.write(job, unnamed)
+            log = await reading.log()
+            manifest = _manifest(job, chosen, written, log.log_id, checksums(unnamed, target.name))
+            # Before the files get their names, so that a full disk leaves neither.
+            description.write_bytes(msgspec.json.format(msgspec.json.encode(manifest), indent=1) + b"\n")
+        unknown_name = ""
+        if selection.question is not None and not manifest.rows:
+            unknown_name = await selection.question.unknown_name()
+    counts = manifest.rows, len(manifest.episodes), selection.left_out
+    return Exported(target, *counts, manifest, unknown_name, written.unreadable)
 
 
 async def export_again(
@@ -219,28 +224,22 @@ async def export_again(
     """
     before = read_manifest(Path(manifest))
     log = await reading.log()
-    rows, digests = await log.episodes(), await log.last_digests()
-    present = {
-        each.id: CoveredEpisode(
-            each.number, each.id, "", each.head, digests[each.number].digest if each.number in digests else None
-        )
-        for each in rows
-    }
+    everything = {each.number: "" for each in await log.episodes()}
+    present = {each.id: each for each in await covered_episodes(reading, everything)}
     differences = episode_differences(before.episodes, present)
     if any(each.id not in present for each in before.episodes):
         return ExportComparison(same=False, differences=tuple(differences), exported=None)
     what, episodes = _named_by(before, statement)
     with tempfile.TemporaryDirectory(prefix="pycrorm-export-") as folder:
         target = Path(path) if path is not None else Path(folder, "export")
-        file_format: Any = before.file_format
         options: dict[str, Any] = dict(before.options)
-        if file_format == "mcap" and options["clock"] == "time":
+        if before.file_format == "mcap" and options["clock"] == "time":
             options["fps"] = None  # its manifest has the default, which `export` refuses beside this clock
         exported = await export(
             reading,
             what,
             target,
-            file_format=file_format,
+            file_format=before.file_format,
             episodes=episodes,
             force=force,
             report_progress=report_progress,
@@ -253,7 +252,7 @@ async def export_again(
         differences.append(f"version of the tables: {now.tables} instead of {before.tables}")
     if before.rows != now.rows:
         differences.append(f"rows: {now.rows} instead of {before.rows}")
-    by_bytes = before.file_format != "rrd"
+    by_bytes = format_named(before.file_format).same_bytes
     same = [*before.files.values()] == [*now.files.values()] if by_bytes else not differences
     return ExportComparison(same, tuple(differences), exported if path is not None else None, by_bytes)
 
@@ -291,322 +290,41 @@ def _changes(subject: str, before: dict[str, str], now: dict[str, str]) -> list[
     return [f"{subject} {name}: {now.get(name, 'none')} instead of {before.get(name, 'none')}" for name in names]
 
 
-async def _write_rows(
-    reading: Reading,
-    selection: Selection,
-    path: Path,
-    file_format: RowFormat,
-    report_progress: ProgressCallback | None,
-    *,
-    no_formulas: bool,
-) -> Manifest:
-    log = await reading.log()
-    columns = columns_of(selection.statement, deferred=True)
-    plain = selection.statement.with_only_columns(*(each.expression for each in columns))
-    total = 0
-    if report_progress is not None:
-        counted = await reading.dataframe(
-            select(func.count().label("rows")).select_from(plain.order_by(None).subquery()),
-            to="arrow",
-            simulated=selection.simulated,
-        )
-        total = counted.column("rows")[0].as_py()
-    stream = reading.batches(
-        selection.statement, simulated=selection.simulated, deferred=True, enums_as_text=file_format == "csv"
-    )
-    async with aclosing(stream) as batches:
-        json_columns = frozenset(each.name for each in columns if each.kind == "json")
-        shown = (_guarded(each) async for each in batches) if no_formulas else batches
-        rows, schema = await write_rows(shown, path, file_format, json_columns, _reporting(report_progress, total))
+def _manifest(job: Job, format_: Format, written: Written, memory: str, files: dict[str, str]) -> Manifest:
+    selection = job.selection
+    episodes = tuple(each for each in selection.episodes if each.number not in written.unreadable)
+    arguments = {"arguments": dict(selection.arguments)} if selection.arguments else {}
     return Manifest(
         kind=selection.kind,
-        names=(selection.name,) if selection.name else tuple(each.id for each in selection.episodes),
-        file_format=file_format,
-        options=({"arguments": dict(selection.arguments)} if selection.arguments else {})
-        | ({"no_formulas": True} if no_formulas else {}),
-        query=_sql(plain, log.engine.dialect),
-        columns={each.name: str(each.type) for each in schema},
-        rows=rows,
-        versions=versions_of("pyarrow"),
+        names=(selection.name,) if selection.name else tuple(each.id for each in episodes),
+        file_format=job.file_format,
+        options=arguments | {name: value for name, value in job.options.items() if value is not False},
+        query=written.query,
+        columns=dict(written.columns),
+        rows=written.rows,
+        versions=versions_of(*format_.packages),
         tables=PROJECTION_VERSION,
-        memory=log.log_id,
-        episodes=selection.episodes,
-        files={},
+        memory=memory,
+        episodes=episodes,
+        files=files,
     )
 
 
-def _complete(manifest: Manifest, files: dict[str, str], path: Path) -> Manifest:
-    """Write the manifest with the files, before they get their names, so that a full disk leaves neither."""
-    whole = msgspec.structs.replace(manifest, files=files)
-    path.write_bytes(msgspec.json.format(msgspec.json.encode(whole), indent=1) + b"\n")
-    return whole
-
-
-def _options(file_format: FileFormat, clock: Clock | None, fps: int | None, images: ImageSize | None) -> EpisodeOptions:
-    """Return the options of formats with a clock. Raises `CallerError` for an option that the format does not have."""
-    if file_format not in ("lerobot", "mcap") and (clock, fps) != (None, None):
-        raise CallerError("clock and fps are options of the formats lerobot and mcap")
-    if file_format == "mcap" and clock != "event" and fps is not None:
+def _options(name: str, format_: Format, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options of a format. Raises `CallerError` for one that it does not have, and for a wrong value."""
+    given = {option: value for option, value in values.items() if value is not None and value is not False}
+    for option in [each for each in given if each not in format_.options]:
+        having = [other for other, each in FORMATS.items() if option in each.options]
+        raise CallerError(f"{_OPTIONS[option]} of the format{'s' * (len(having) > 1)} {' and '.join(having)}")
+    if name == "mcap" and given.get("clock") != "event" and "fps" in given:
         raise CallerError("fps of mcap is for events at equal intervals: choose the clock `event`, or leave fps out")
-    if file_format != "lerobot" and images is not None:
-        raise CallerError("images are an option of the format lerobot")
-    options = EpisodeOptions(
-        clock or ("time" if file_format == "mcap" else "event"), DEFAULT_FPS if fps is None else fps, images
-    )
-    options.check()
-    return options
-
-
-async def _episodes(
-    reading: Reading, what: Exportable, limited: Sequence[str | int], file_format: str, *, running: bool = False
-) -> tuple[CoveredEpisode, ...]:
-    """Return the episodes that `what` names. Raises `CallerError` for anything else."""
-    if limited or isinstance(what, type | Select | Question):
-        raise CallerError(f"the format {file_format} holds whole episodes: name them by number, id or `last`")
-    selection = await select_rows(reading, what, running=running)
-    if selection.kind != "episodes":
-        raise CallerError(f"the format {file_format} holds whole episodes, and {selection.name} is a {selection.kind}")
-    return selection.episodes
-
-
-async def _described(
-    reading: Reading, covered: tuple[CoveredEpisode, ...], file_format: FileFormat, options: EpisodeOptions, rows: int
-) -> Manifest:
-    log = await reading.log()
-    packages = {"lerobot": ("pyarrow",), "mcap": ("mcap", "foxglove-sdk"), "rrd": ("rerun-sdk",)}
-    return Manifest(
-        kind="episodes",
-        names=tuple(each.id for each in covered),
-        file_format=file_format,
-        options=options._asdict() if file_format != "rrd" else {},
-        rows=rows,
-        versions=versions_of(*packages[file_format]),
-        tables=PROJECTION_VERSION,
-        memory=log.log_id,
-        episodes=covered,
-        files={},
-    )
-
-
-def _reporting(report_progress: ProgressCallback | None, total: int) -> Callable[[int], object]:
-    return lambda rows: report_progress(rows, total) if report_progress is not None else None
-
-
-def _sql(statement: Select[*tuple[Any, ...]], dialect: Any) -> str:
-    """Return the SQL, with the parameters as literals if they have a literal form."""
-    try:
-        return str(statement.compile(dialect=dialect, compile_kwargs={"literal_binds": True}))
-    except (CompileError, NotImplementedError):
-        return str(statement.compile(dialect=dialect))
-
-
-# === episode files ============================================================================================
-#
-# Write episodes as LeRobot, rerun or MCAP: formats for motion over time, so they are made from events, not tables.
-#
-# A thread does each long step, and a cancelled task waits for its end: a writer that is closed, or a file that is
-# deleted, while a thread still writes would crash the process or leave a file.
-
-
-class EpisodeOptions(NamedTuple):
-    """Choices for the frames of LeRobot and the messages of MCAP; see `export` for the meaning of each clock.
-
-    Attributes:
-        clock: the axis: the events one after the other, or their times.
-        fps: frames or events per second.
-        images: width and height of LeRobot's pictures; None for no pictures.
-    """
-
-    clock: Clock
-    fps: int = DEFAULT_FPS
-    images: ImageSize | None = None
-
-    def check(self) -> None:
-        """Raise `CallerError` for an unknown clock, and for a rate or an image size out of range."""
-        if self.clock not in ("event", "time"):
-            raise CallerError(f"clock must be 'event' or 'time', got {self.clock!r}")
-        if self.images is not None:
-            check_size(self.images)
-        if not 1 <= self.fps <= 1000:
-            raise CallerError(f"fps must be 1 to 1000, got {self.fps}")
-
-
-async def write_lerobot(
-    reading: Reading,
-    episodes: Sequence[CoveredEpisode],
-    folder: Path,
-    options: EpisodeOptions,
-    report_progress: ProgressCallback | None,
-    unreadable: dict[int, str],
-) -> int:
-    """Write the episodes into an empty folder; return the number of frames.
-
-    An episode that cannot be read is left out, with its reason in `unreadable`, unless it is the only one. Raises
-    `CallerError` for episodes that the format cannot hold, and `MissingExtra`.
-    """
-    progress = _Progress(report_progress, sum(each.events for each in episodes))
-    dataset = LeRobotFolder(folder, fps=options.fps)
-    for each in episodes:
-        try:
-            episode = await read_episode(reading, each, progress.of("reading"))
-        except (LogDamaged, DatabaseForeign) as error:
-            unreadable[each.number] = str(error)
-            if len(unreadable) == len(episodes):
-                raise
-            continue
-        frames = await run_to_completion(asyncio.to_thread(frames_of, episode, options.clock, options.fps))
-        pictures = None
-        if options.images is not None:
-            pictures = np.stack(await draw_frames(reading, episode, frames, options.images, progress.of("drawing")))
-        await run_to_completion(asyncio.to_thread(dataset.add, episode, frames, pictures))
-        progress.of("writing")(each.events)
-        progress.before += each.events
-    await run_to_completion(asyncio.to_thread(dataset.finish))
-    return dataset.frames
-
-
-async def write_scene(
-    reading: Reading,
-    episodes: Sequence[CoveredEpisode],
-    path: Path,
-    file_format: Literal["rrd", "mcap"],
-    options: EpisodeOptions,
-    report_progress: ProgressCallback | None,
-) -> int:
-    """Write one episode to a file; return the number of changes (`rrd`) or messages (`mcap`) in it.
-
-    Only MCAP uses the options. Raises as `write_lerobot` does.
-    """
-    if len(episodes) != 1:
-        raise CallerError(f"a file of the format {file_format} holds one episode, got {len(episodes)}: name one")
-    progress = _Progress(report_progress, episodes[0].events)
-    episode = await read_episode(reading, episodes[0], progress.of("reading"))
-    objects = await scene_objects(reading, episode)
-    report = progress.of("writing")
-    if file_format == "rrd":
-        written = await run_to_completion(asyncio.to_thread(write_rerun, episode, objects, path, report))
-    else:
-        clock, fps = options.clock, options.fps
-        written = await run_to_completion(
-            asyncio.to_thread(lambda: write_mcap(episode, objects, path, report, clock=clock, fps=fps))
-        )
-    report(episodes[0].events)
-    return written
-
-
-class _Progress:
-    """Reports how many events of all episodes a phase has done; `before` counts those of the earlier episodes."""
-
-    def __init__(self, report_progress: ProgressCallback | None, total: int) -> None:
-        self.before = 0
-        self._report_progress = report_progress
-        self._total = total
-
-    def of(self, phase: str) -> Callable[[int], None]:
-        """Return a function that takes the number of done events of the current episode; any thread may call it."""
-
-        def report_events(done: int) -> None:
-            if self._report_progress is not None:
-                self._report_progress(self.before + done, self._total, phase)
-
-        return report_events
-
-
-# === row files ================================================================================================
-#
-# Write the rows of a select as Parquet, CSV or JSON lines, one batch after the other.
-
-RowFormat: TypeAlias = Literal["parquet", "csv", "jsonl"]
-_Write: TypeAlias = "Callable[[pa.RecordBatch], object]"
-
-
-def _guarded(batch: pa.RecordBatch) -> pa.RecordBatch:
-    """Return the rows with no text that a spreadsheet would run as a formula."""
-    pa = needed_pyarrow()
-    columns = [
-        pa.array([None if text is None else without_formula(text) for text in each.to_pylist()], each.type)
-        if pa.types.is_string(each.type) or pa.types.is_large_string(each.type)
-        else each
-        for each in batch.columns
-    ]
-    return pa.RecordBatch.from_arrays(columns, schema=batch.schema)
-
-
-async def write_rows(
-    batches: AsyncIterator[pa.RecordBatch],
-    path: Path,
-    file_format: RowFormat,
-    json_columns: frozenset[str],
-    report_rows: Callable[[int], object],
-) -> tuple[int, pa.Schema]:
-    """Write the batches to a file; return the number of rows and their schema. `report_rows` gets the number so far.
-
-    `batches` has at least one, which may be empty.
-    """
-    rows, schema = 0, None
-    with ExitStack() as stack:
-        async for batch in batches:
-            if schema is None:
-                schema = batch.schema
-                write = stack.enter_context(_WRITERS[file_format](path, schema, json_columns))
-            await run_to_completion(asyncio.to_thread(write, batch))
-            rows += batch.num_rows
-            report_rows(rows)
-    return rows, schema
-
-
-@contextmanager
-def _parquet(path: Path, schema: pa.Schema, _json_columns: frozenset[str]) -> Iterator[_Write]:
-    needed_pyarrow()
-    from pyarrow import parquet
-
-    # A batch is a row group, so that a reader that wants some episodes or columns reads no others.
-    with parquet.ParquetWriter(path, schema, compression="zstd") as writer:
-        yield writer.write_batch
-
-
-@contextmanager
-def _csv(path: Path, schema: pa.Schema, _json_columns: frozenset[str]) -> Iterator[_Write]:
-    pa = needed_pyarrow()
-    from pyarrow import csv
-
-    binary = [number for number, each in enumerate(schema) if pa.types.is_binary(each.type)]
-    for number in binary:
-        schema = schema.set(number, schema.field(number).with_type(pa.string()))
-
-    def in_base64(column: Any) -> Any:  # as in JSON lines, because a text file cannot hold bytes
-        return pa.array([None if each is None else b64encode(each).decode() for each in column.to_pylist()], "string")
-
-    def write(batch: Any) -> None:
-        columns = list(batch.columns)
-        for number in binary:
-            columns[number] = in_base64(columns[number])
-        writer.write_batch(pa.RecordBatch.from_arrays(columns, schema=schema))
-
-    with csv.CSVWriter(path, schema) as writer:
-        yield write if binary else writer.write_batch
-
-
-@contextmanager
-def _jsonl(path: Path, _schema: pa.Schema, json_columns: frozenset[str]) -> Iterator[_Write]:
-    def value(name: str, each: Any) -> Any:
-        return msgspec.Raw(each.encode()) if name in json_columns and each is not None else each
-
-    with path.open("wb") as file:
-        encoder = msgspec.json.Encoder()
-
-        def write(batch: pa.RecordBatch) -> None:
-            rows = ({name: value(name, each) for name, each in row.items()} for row in batch.to_pylist())
-            file.write(encoder.encode_lines(rows))
-
-        yield write
-
-
-_WRITERS: dict[str, Callable[[Path, Any, frozenset[str]], AbstractContextManager[_Write]]] = {
-    "parquet": _parquet,
-    "csv": _csv,
-    "jsonl": _jsonl,
-}
+    if given.get("clock") not in (None, "event", "time"):
+        raise CallerError(f"clock must be 'event' or 'time', got {given['clock']!r}")
+    if "images" in given:
+        check_size(given["images"])
+    if not 1 <= given.get("fps", 1) <= 1000:
+        raise CallerError(f"fps must be 1 to 1000, got {given['fps']}")
+    return {**format_.options, **given}
 
 
 # === datasette ================================================================================================

@@ -17,8 +17,9 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from pycrorm_async.errors import CallerError
-from pycrorm_async.export.scenes import ExportedEpisode, Frames
+from pycrorm_async.errors import CallerError, DatabaseForeign, LogDamaged
+from pycrorm_async.export.formats import Format, Job, Written
+from pycrorm_async.export.scenes import ExportedEpisode, Frames, frames_of, read_episode
 from pycrorm_async.query.again import world_of
 from pycrorm_async.query.frames import needed_pyarrow
 from pycrorm_async.query.picture import png
@@ -27,6 +28,7 @@ from pycrorm_async.query.snapshot import Moment, moments
 from pycrorm_async.query.text import parameters_text
 from pycrorm_async.world.pose import Vector
 from pycrorm_async.world.queries import Camera, photograph
+from pycrorm_async.writer.drain import run_to_completion
 
 # === dataset ==================================================================================================
 #
@@ -36,8 +38,7 @@ from pycrorm_async.world.queries import Camera, photograph
 # and the time behind it, and the subtask. `meta/plan.parquet` is ours: every node of the plans, with its first and last
 # frame. LeRobot ignores it.
 
-MARKER = "meta/info.json"
-DEFAULT_FPS = 10
+FPS = 10
 """Frames per second; nominal if there is one frame for each event, because LeRobot requires a value."""
 _CHUNK_FILES = 1000
 """Bounds the files of one folder (`chunk`), the default of LeRobot."""
@@ -58,6 +59,40 @@ _NUMBERS = {
 """The columns of one number; the first and those from `frame_index` to `task_index` are LeRobot's own."""
 
 
+async def write_lerobot(job: Job, folder: Path) -> Written:
+    """Write the episodes into an empty folder.
+
+    An episode that cannot be read is left out, unless it is the only one. Raises `CallerError` for episodes that the
+    format cannot hold, and `MissingExtra`.
+    """
+    dataset = LeRobotFolder(folder, fps=job.options["fps"])
+    episodes, unreadable, before = job.selection.episodes, dict[int, str](), 0
+    for each in episodes:
+        try:
+            episode = await read_episode(job.reading, each, job.reporter("reading", before))
+        except (LogDamaged, DatabaseForeign) as error:
+            unreadable[each.number] = str(error)
+            if len(unreadable) == len(episodes):
+                raise
+            continue
+        # A thread does each long step, and a cancelled task waits for its end: to delete a file to which a thread still
+        # writes would leave a part of it.
+        frames = await run_to_completion(
+            asyncio.to_thread(frames_of, episode, job.options["clock"], job.options["fps"])
+        )
+        pictures = None
+        if job.options["images"] is not None:
+            drawn = await draw_frames(
+                job.reading, episode, frames, job.options["images"], job.reporter("drawing", before)
+            )
+            pictures = np.stack(drawn)
+        await run_to_completion(asyncio.to_thread(dataset.add, episode, frames, pictures))
+        job.reporter("writing", before)(each.events)
+        before += each.events
+    await run_to_completion(asyncio.to_thread(dataset.finish))
+    return Written(dataset.frames, unreadable=unreadable)
+
+
 class LeRobotFolder:
     """Writes a data set into an empty folder: `add` for each episode, then `finish`."""
 
@@ -66,7 +101,8 @@ class LeRobotFolder:
         self._folder = folder
         self._fps = fps
         self._first: tuple[int, Frames] | None = None
-        self._frames = 0
+        self.frames = 0
+        """The number of frames added so far."""
         self._tasks: dict[str, int] = {}
         self._subtasks: dict[str, int] = {}
         self._episodes: list[dict[str, Any]] = []
@@ -76,11 +112,6 @@ class LeRobotFolder:
         self._file_bytes = 0
         self._picture_shape: tuple[int, ...] = ()
         self._writer: Any = None
-
-    @property
-    def frames(self) -> int:
-        """The number of frames added so far."""
-        return self._frames
 
     def add(self, episode: ExportedEpisode, frames: Frames, pictures: NDArray[np.uint8] | None = None) -> None:
         """Write the frames of an episode, with their pictures; either all episodes have pictures or none has.
@@ -103,8 +134,8 @@ class LeRobotFolder:
                 "length": count,
                 "data/chunk_index": chunk,
                 "data/file_index": file,
-                "dataset_from_index": self._frames,
-                "dataset_to_index": self._frames + count,
+                "dataset_from_index": self.frames,
+                "dataset_to_index": self.frames + count,
                 **{
                     f"stats/{name}/{key}": values.tolist()
                     for name, each in statistics.items()
@@ -116,7 +147,7 @@ class LeRobotFolder:
         )
         self._statistics.append(statistics)
         self._add_plan(episode, frames, number)
-        self._frames += count
+        self.frames += count
 
     def finish(self) -> None:
         """Write the files in `meta/`, which describe the episodes."""
@@ -162,7 +193,7 @@ class LeRobotFolder:
             "event": np.array([each.sequence for each in frames.at], dtype=np.int64),
             "frame_index": index,
             "episode_index": np.full(count, number, dtype=np.int64),
-            "index": index + self._frames,
+            "index": index + self.frames,
             "task_index": np.full(count, task_index, dtype=np.int64),
             "subtask_index": np.array(subtasks, dtype=np.int64),
         }
@@ -216,8 +247,8 @@ class LeRobotFolder:
                     "status": node.status,
                     "reason": node.reason,
                     "message": node.message,
-                    "dataset_from_index": self._frames + begin,
-                    "dataset_to_index": self._frames + end,
+                    "dataset_from_index": self.frames + begin,
+                    "dataset_to_index": self.frames + end,
                 }
             )
 
@@ -232,7 +263,7 @@ class LeRobotFolder:
             "codebase_version": "v3.0",
             "robot_type": frames.robot,
             "total_episodes": len(self._episodes),
-            "total_frames": self._frames,
+            "total_frames": self.frames,
             "total_tasks": len(self._tasks),
             "chunks_size": _CHUNK_FILES,
             "data_files_size_in_mb": _FILE_MEGABYTES,
@@ -396,3 +427,12 @@ def joined(parts: Sequence[Statistics]) -> Statistics:
         "count": np.array([int(counts.sum())]),
         **{name: (np.stack([each[name] for each in parts]) * shares).sum(axis=0) for name in _QUANTILES},
     }
+
+
+LEROBOT = Format(
+    write_lerobot,
+    noun="frame",
+    holds="episodes",
+    options={"clock": "event", "fps": FPS, "images": None},
+    marker="meta/info.json",
+)

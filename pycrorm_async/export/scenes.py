@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import heapq
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -25,6 +26,7 @@ from pycrorm_async.events.types import (
     PoseValue,
     StateSampled,
 )
+from pycrorm_async.export.formats import Format, Job, Written
 from pycrorm_async.export.selection import CoveredEpisode
 from pycrorm_async.query.reading import Reading
 from pycrorm_async.query.replay import EpisodeReplay, EventTime, ReplayedNode
@@ -34,6 +36,7 @@ from pycrorm_async.store.address import DatabaseAddress
 from pycrorm_async.store.stored import EpisodeRow, StoredEvent
 from pycrorm_async.world.pose import Pose
 from pycrorm_async.world.urdf_model import origin
+from pycrorm_async.writer.drain import run_to_completion
 
 #
 # Read an episode's events into the history of its world and of its plan, which all formats of robots share.
@@ -49,6 +52,11 @@ class Change(NamedTuple):
     pose: tuple[float, ...] | None
     joints: Mapping[str, float]
     removed: bool
+
+    @property
+    def adds(self) -> bool:
+        """Whether it is the first change of the object, whose identity is the event that added it."""
+        return self.when.sequence == self.object
 
 
 class PlanLine(NamedTuple):
@@ -293,14 +301,10 @@ def _subtasks(episode: ExportedEpisode, at: Sequence[EventTime]) -> Iterator[str
 # or, by event, `fps` events in a second; its sequence is that of the event.
 
 _TOPICS = {"/tf": "FrameTransforms", "/scene": "SceneUpdate", "/plan": "Log"}
-
-
-class _Message(NamedTuple):
-    """A message of a topic. `content` makes the message from its time stamp, which depends on the clock."""
-
-    when: EventTime
-    topic: str
-    content: Callable[[Any], Any]
+_Message: TypeAlias = tuple[EventTime, str, Any]
+"""The event of a message, its topic and its content. Those of one topic come in the order of the events."""
+_Stamp: TypeAlias = Callable[[EventTime], Any]
+"""Makes the time stamp of a message of an event."""
 
 
 def write_mcap(
@@ -308,15 +312,9 @@ def write_mcap(
     objects: dict[int, SceneObject],
     path: Path,
     report_events: Callable[[int], object],
-    *,
-    clock: Clock,
-    fps: int,
+    options: Mapping[str, Any],
 ) -> int:
-    """Write the file and return the number of messages.
-
-    Args:
-        report_events: gets the event up to which the messages are written.
-        clock: the axis of the messages: `time`, the time of each event, or `event`, `fps` events in a second.
+    """Write the file and return the number of messages. `report_events` gets the event of the latest one.
 
     Raises `MissingExtra`.
     """
@@ -326,20 +324,30 @@ def write_mcap(
     except ImportError:
         raise MissingExtra("MCAP files need mcap and foxglove-sdk: pip install 'pycrorm-async[mcap]'") from None
 
+    def time_ns(when: EventTime) -> int:
+        by_event_ns = when.sequence * _SECOND_NS // options["fps"]
+        return episode.begin_wall_ns + (when.since_ns if options["clock"] == "time" else by_event_ns)
+
+    def stamp(when: EventTime) -> Any:
+        seconds, rest_ns = divmod(time_ns(when), _SECOND_NS)
+        return messages.Timestamp(sec=seconds, nsec=rest_ns)
+
     count = 0
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start(profile="", library="pycrorm-async")
         writer.add_metadata("episode", _metadata(episode))
         channels = {topic: _channel(writer, topic, getattr(messages, name)) for topic, name in _TOPICS.items()}
-        for each in sorted(_messages(episode, objects, messages), key=lambda message: message.when.sequence):
-            by_event_ns = each.when.sequence * _SECOND_NS // fps
-            time_ns = episode.begin_wall_ns + (each.when.since_ns if clock == "time" else by_event_ns)
-            stamped = each.content(messages.Timestamp(sec=time_ns // _SECOND_NS, nsec=time_ns % _SECOND_NS))
-            writer.add_message(channels[each.topic], time_ns, stamped.encode(), time_ns, each.when.sequence)
+        of_topics = (
+            _transforms(episode, objects, messages, stamp),
+            _scene(episode, objects, messages, stamp),
+            _plan(episode, messages, stamp),
+        )
+        for when, topic, content in heapq.merge(*of_topics, key=lambda message: message[0].sequence):
+            writer.add_message(channels[topic], time_ns(when), content.encode(), time_ns(when), when.sequence)
             count += 1
             if count % REPORTED_CHANGES == 0:
-                report_events(each.when.sequence)
+                report_events(when.sequence)
         writer.finish()
     return count
 
@@ -360,18 +368,13 @@ def _channel(writer: Any, topic: str, kind: Any) -> int:
     return channel
 
 
-def _messages(episode: ExportedEpisode, objects: dict[int, SceneObject], kinds: Any) -> Iterator[_Message]:
+def _transforms(
+    episode: ExportedEpisode, objects: Mapping[int, SceneObject], kinds: Any, stamp: _Stamp
+) -> Iterator[_Message]:
     for when, changes in groupby(frame_changes(episode, objects), key=lambda each: each.when):
-        yield _Message(when, "/tf", partial(_transforms, kinds, list(changes)))
-    yield from _scene(episode, objects, kinds)
-    yield from _plan(episode, kinds)
-
-
-def _transforms(kinds: Any, changes: list[FrameChange], stamp: Any) -> Any:
-    return kinds.FrameTransforms(
-        transforms=[
+        transforms = [
             kinds.FrameTransform(
-                timestamp=stamp,
+                timestamp=stamp(when),
                 parent_frame_id=each.parent,
                 child_frame_id=each.child,
                 translation=_vector(kinds, each.translation),
@@ -379,26 +382,20 @@ def _transforms(kinds: Any, changes: list[FrameChange], stamp: Any) -> Any:
             )
             for each in changes
         ]
-    )
+        yield when, "/tf", kinds.FrameTransforms(transforms=transforms)
 
 
-def _scene(episode: ExportedEpisode, objects: dict[int, SceneObject], kinds: Any) -> Iterator[_Message]:
-    seen: set[int] = set()
+def _scene(
+    episode: ExportedEpisode, objects: Mapping[int, SceneObject], kinds: Any, stamp: _Stamp
+) -> Iterator[_Message]:
     for change in episode.changes:
         shapes = {frame: each for frame, each in objects[change.object].shapes.items() if each}
         if change.removed:
-            yield _Message(change.when, "/scene", partial(_deletion, kinds, list(shapes)))
-        elif change.object not in seen:
-            seen.add(change.object)
-            yield _Message(change.when, "/scene", partial(_entities, kinds, shapes))
-
-
-def _deletion(kinds: Any, names: list[str], stamp: Any) -> Any:
-    return kinds.SceneUpdate(deletions=[kinds.SceneEntityDeletion(timestamp=stamp, id=name) for name in names])
-
-
-def _entities(kinds: Any, shapes: dict[str, list[Shape]], stamp: Any) -> Any:
-    return kinds.SceneUpdate(entities=[_entity(kinds, stamp, frame, each) for frame, each in shapes.items()])
+            deletions = [kinds.SceneEntityDeletion(timestamp=stamp(change.when), id=name) for name in shapes]
+            yield change.when, "/scene", kinds.SceneUpdate(deletions=deletions)
+        elif change.adds:
+            entities = [_entity(kinds, stamp(change.when), frame, each) for frame, each in shapes.items()]
+            yield change.when, "/scene", kinds.SceneUpdate(entities=entities)
 
 
 def _entity(kinds: Any, stamp: Any, frame: str, shapes: list[Shape]) -> Any:
@@ -417,35 +414,23 @@ def _entity(kinds: Any, stamp: Any, frame: str, shapes: list[Shape]) -> Any:
                 cylinders.append(
                     kinds.CylinderPrimitive(pose=pose, size=size, bottom_scale=1, top_scale=1, color=color)
                 )
-    return kinds.SceneEntity(
-        timestamp=stamp,
-        frame_id=frame,
-        id=frame,
-        frame_locked=True,
-        cubes=cubes,
-        cylinders=cylinders,
-        spheres=spheres,
-    )
+    named = {"timestamp": stamp, "frame_id": frame, "id": frame, "frame_locked": True}
+    return kinds.SceneEntity(**named, cubes=cubes, cylinders=cylinders, spheres=spheres)
 
 
-def _plan(episode: ExportedEpisode, kinds: Any) -> Iterator[_Message]:
+def _plan(episode: ExportedEpisode, kinds: Any, stamp: _Stamp) -> Iterator[_Message]:
     for line in episode.plan_lines():
         level = kinds.LogLevel.Error if line.is_failure else kinds.LogLevel.Info
-        yield _Message(line.when, "/plan", partial(_line, kinds, line.label, level, line.text))
+        log = kinds.Log(timestamp=stamp(line.when), level=level, message=line.text, name=line.label)
+        yield line.when, "/plan", log
 
 
-def _line(kinds: Any, name: str, level: Any, text: str, stamp: Any) -> Any:
-    return kinds.Log(timestamp=stamp, level=level, message=text, name=name)
+def _vector(kinds: Any, values: Sequence[float]) -> Any:
+    return kinds.Vector3(**dict(zip("xyz", values, strict=True)))
 
 
-def _vector(kinds: Any, values: tuple[float, ...]) -> Any:
-    x, y, z = values
-    return kinds.Vector3(x=x, y=y, z=z)
-
-
-def _rotation(kinds: Any, values: tuple[float, ...]) -> Any:
-    x, y, z, w = values
-    return kinds.Quaternion(x=x, y=y, z=z, w=w)
+def _rotation(kinds: Any, values: Sequence[float]) -> Any:
+    return kinds.Quaternion(**dict(zip("xyzw", values, strict=True)))
 
 
 # === rerun file ===============================================================================================
@@ -459,7 +444,11 @@ _APPLICATION = "pycrorm"
 
 
 def write_rerun(
-    episode: ExportedEpisode, objects: dict[int, SceneObject], path: Path, report_events: Callable[[int], object]
+    episode: ExportedEpisode,
+    objects: dict[int, SceneObject],
+    path: Path,
+    report_events: Callable[[int], object],
+    _options: Mapping[str, Any],
 ) -> int:
     """Write the file and return the number of changes in it. `report_events` gets the event of the latest change.
 
@@ -493,10 +482,10 @@ def write_rerun(
                 translation=[each.translation for each in moved], quaternion=[each.rotation for each in moved]
             ),
         )
-    for identity, when in _added(episode).items():
-        recording.set_time("event", sequence=when.sequence)
-        recording.set_time("time", duration=when.since_ns / 1e9)
-        for frame, shapes in objects[identity].shapes.items():
+    for change in (each for each in episode.changes if each.adds):
+        recording.set_time("event", sequence=change.when.sequence)
+        recording.set_time("time", duration=change.when.since_ns / 1e9)
+        for frame, shapes in objects[change.object].shapes.items():
             _log_shapes(rr, recording, entities[frame], shapes)
     recording.reset_time()
     count += _send_removals(rr, recording, episode, objects, entities)
@@ -517,14 +506,6 @@ def _indexes(rr: Any, whens: Sequence[EventTime]) -> list[Any]:
         rr.TimeColumn("event", sequence=[each.sequence for each in whens]),
         rr.TimeColumn("time", duration=[each.since_ns / 1e9 for each in whens]),
     ]
-
-
-def _added(episode: ExportedEpisode) -> dict[int, EventTime]:
-    """Return the event that added each object."""
-    added: dict[int, EventTime] = {}
-    for each in episode.changes:
-        added.setdefault(each.object, each.when)
-    return added
 
 
 def _log_shapes(rr: Any, recording: Any, entity: str, shapes: Sequence[Shape]) -> None:
@@ -645,7 +626,7 @@ class SceneObject:
         """Return the name of the frame of a link; the root link has that of the object."""
         return self.name if link == self._model["root"] else f"{self.name}/{link}"
 
-    def changes(self, change: Change, *, is_first: bool) -> Iterator[FrameChange]:
+    def changes(self, change: Change) -> Iterator[FrameChange]:
         """Yield the frames that a change of this object gives new poses, and for its first one those of all links.
 
         Where the recorded pose is that of another link than the root, a joint between the two also moves the root.
@@ -659,7 +640,7 @@ class SceneObject:
         for joint in self._model["joints"]:
             name, _, parent, child, *_, mimic = joint
             moves = name in change.joints or (mimic is not None and mimic[0] in change.joints)
-            if is_first or moves:
+            if change.adds or moves:
                 frame = joint_pose(joint, self._joints)
                 yield FrameChange(change.when, self.frame(parent), self.frame(child), *_parts(frame))
 
@@ -690,11 +671,9 @@ async def scene_objects(reading: Reading, episode: ExportedEpisode) -> dict[int,
 
 def frame_changes(episode: ExportedEpisode, objects: Mapping[int, SceneObject]) -> Iterator[FrameChange]:
     """Yield every change of a frame, in the order of the events."""
-    seen: set[int] = set()
     for change in episode.changes:
         if not change.removed:
-            yield from objects[change.object].changes(change, is_first=change.object not in seen)
-            seen.add(change.object)
+            yield from objects[change.object].changes(change)
 
 
 def _shape(shape: Sequence[Any], color: Sequence[float] | None) -> Shape:
@@ -708,3 +687,37 @@ def _parts(pose: Pose) -> tuple[tuple[float, float, float], tuple[float, float, 
     """Return translation and quaternion xyzw of a pose, with w >= 0."""
     x, y, z, w = pose.orientation
     return pose.position, (x, y, z, w) if w >= 0 else (-x, -y, -z, -w)
+
+
+# === formats ==================================================================================================
+
+_WriteScene: TypeAlias = Callable[
+    [ExportedEpisode, dict[int, SceneObject], Path, Callable[[int], object], Mapping[str, Any]], int
+]
+
+
+async def write_scene(write: _WriteScene, job: Job, path: Path) -> Written:
+    """Write one episode to a file. Raises `CallerError` for several, and `MissingExtra`."""
+    if len(job.selection.episodes) != 1:
+        count = len(job.selection.episodes)
+        raise CallerError(f"a file of the format {job.file_format} holds one episode, got {count}: name one")
+    [covered] = job.selection.episodes
+    episode = await read_episode(job.reading, covered, job.reporter("reading"))
+    objects = await scene_objects(job.reading, episode)
+    report = job.reporter("writing")
+    # A cancelled task waits for the end of the thread: a file that is deleted while it writes would crash the process.
+    count = await run_to_completion(asyncio.to_thread(write, episode, objects, path, report, job.options))
+    report(covered.events)
+    return Written(count)
+
+
+MCAP = Format(
+    partial(write_scene, write_mcap),
+    noun="message",
+    holds="episode",
+    options={"clock": "time", "fps": 10},
+    packages=("mcap", "foxglove-sdk"),
+)
+RERUN = Format(
+    partial(write_scene, write_rerun), noun="change", holds="episode", packages=("rerun-sdk",), same_bytes=False
+)

@@ -236,7 +236,7 @@ async def _complete(reading: Reading) -> tuple[tuple[CoveredEpisode, ...], int]:
         for number, status in statuses
         if number in rows and rows[number].ended_wall_ns is not None and rows[number].folded == rows[number].head
     }
-    return await _covered(reading, ended), len(statuses) - len(ended)
+    return await covered_episodes(reading, ended), len(statuses) - len(ended)
 
 
 async def _named(reading: Reading, names: Iterable[str], *, running: bool = False) -> _Covered:
@@ -244,11 +244,12 @@ async def _named(reading: Reading, names: Iterable[str], *, running: bool = Fals
     for number, each in summaries.items():
         if each.status == "RUNNING" and not running:
             raise CallerError(f"episode {number} is still running, so its rows change: export it when it has ended")
-    covered = await _covered(reading, {number: each.status for number, each in summaries.items()})
+    covered = await covered_episodes(reading, {number: each.status for number, each in summaries.items()})
     return _Covered(covered, any(each.simulated for each in summaries.values()))
 
 
-async def _covered(reading: Reading, statuses: dict[int, str]) -> tuple[CoveredEpisode, ...]:
+async def covered_episodes(reading: Reading, statuses: dict[int, str]) -> tuple[CoveredEpisode, ...]:
+    """Return the episodes of these numbers, with their statuses."""
     log = await reading.log()
     span = min(statuses, default=1), max(statuses, default=0)
     rows = {each.number: each for each in await log.episodes(*span)}
@@ -356,11 +357,11 @@ def episode_differences(recorded: tuple[CoveredEpisode, ...], present: dict[str,
     return lines
 
 
-def checksums(path: Path) -> dict[str, str]:
-    """Return the SHA-256 of a file, or of each file in a folder, by name inside it."""
-    files = sorted(each for each in path.rglob("*") if each.is_file()) if path.is_dir() else [path]
-    root = path if path.is_dir() else path.parent
-    return {str(each.relative_to(root)): _sha256(each) for each in files}
+def checksums(path: Path, name: str) -> dict[str, str]:
+    """Return the SHA-256 of a file under the name that it will have, or of each file in a folder by name inside it."""
+    if not path.is_dir():
+        return {name: _sha256(path)}
+    return {str(each.relative_to(path)): _sha256(each) for each in sorted(path.rglob("*")) if each.is_file()}
 
 
 def _sha256(path: Path) -> str:

@@ -14,6 +14,8 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import UTC, datetime
+from functools import partial
+from importlib.metadata import EntryPoint
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +29,9 @@ from sqlalchemy.orm import aliased
 from pycrorm_async import Memory, Reading
 from pycrorm_async.errors import CallerError, MissingExtra, UnknownEpisode
 from pycrorm_async.events.types import EpisodeEnded, EpisodeStarted, NodeEnded, NodeStarted
-from pycrorm_async.export import export as row_files
-from pycrorm_async.export.export import datasette_metadata, export, export_again
+from pycrorm_async.export import export as export_module
+from pycrorm_async.export.export import FORMATS, datasette_metadata, export, export_again
+from pycrorm_async.export.formats import CSV, GROUP, Format, Job, Written, _write_rows
 from pycrorm_async.export.selection import read_manifest
 from pycrorm_async.orm import PickUpWithContextView, RootFailure, TaskTreeNode
 from pycrorm_async.query.questions import QUESTIONS
@@ -172,6 +175,27 @@ async def test_every_question_is_exported_with_declared_types_of_episodes_that_h
     assert changed == {*QUESTIONS} - {"successful_pick_ups", "moves_of", "steps_before_failures"}
 
 
+async def _write_count(job: Job, path: Path) -> Written:
+    path.write_text(f"{len(job.selection.episodes)} episodes\n")
+    return Written(len(job.selection.episodes))
+
+
+COUNT = Format(_write_count, noun="episode", holds="episodes", packages=())
+
+
+async def test_a_format_of_an_installed_package_is_found_by_its_suffix_and_has_a_manifest(
+    reading: Reading, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    entry = EntryPoint("count", f"{__name__}:COUNT", GROUP)
+    monkeypatch.setattr(export_module, "entry_points", lambda **_: [entry])
+    monkeypatch.setattr(EntryPoint, "load", lambda _: COUNT)
+    exported = await export(reading, ["1", "2"], tmp_path / "two.count")
+    assert (exported.rows, (tmp_path / "two.count").read_text()) == (2, "2 episodes\n")
+    assert (await export_again(reading, tmp_path / "two.count.manifest.json")).same
+    with pytest.raises(CallerError, match="the format count holds whole episodes, and action is a view"):
+        await export(reading, "action", tmp_path / "a.count")
+
+
 async def test_a_full_disk_leaves_no_file(reading: Reading, tmp_path: Path) -> None:
     for name in ("a.parquet", "a.csv", "a.jsonl"):
         with files_of_at_most(DISK_BYTES), pytest.raises(OSError, match="File too large") as refused:
@@ -199,7 +223,7 @@ async def test_a_cancelled_export_closes_its_file_after_the_last_write(
         finally:
             steps.append("closed")
 
-    monkeypatch.setitem(row_files._WRITERS, "csv", slow_writer)
+    monkeypatch.setitem(FORMATS, "csv", CSV._replace(write=partial(_write_rows, slow_writer)))
     task = asyncio.create_task(export(reading, "1", tmp_path / "a.csv"))
     await begun.wait()
     for _ in range(3):  # as a user who presses Ctrl-C again

@@ -15,8 +15,8 @@ from sqlalchemy import select
 
 from pycrorm_async import Memory, Reading
 from pycrorm_async.errors import CallerError, MissingExtra
-from pycrorm_async.export import export as episode_files
-from pycrorm_async.export.export import export, export_again
+from pycrorm_async.export.export import FORMATS, export, export_again
+from pycrorm_async.export.scenes import write_mcap, write_rerun, write_scene
 from pycrorm_async.orm import TaskTreeNode
 from pycrorm_async.query.scene import link_poses, object_model
 from pycrorm_async.world.bounding_boxes import rotation_matrix
@@ -188,20 +188,19 @@ async def test_the_progress_of_an_episode_is_reported_in_events(reading: Reading
 
 
 @pytest.mark.parametrize(
-    ("suffix", "function", "size"),
-    [("rrd", "write_rerun", 4_000), ("rrd", "write_rerun", 400_000), ("mcap", "write_mcap", 10_000)],
+    ("suffix", "write", "size"),
+    [("rrd", write_rerun, 4_000), ("rrd", write_rerun, 400_000), ("mcap", write_mcap, 10_000)],
 )
 async def test_a_full_disk_leaves_no_file(
-    reading: Reading, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str, function: str, size: int
+    reading: Reading, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str, write: Any, size: int
 ) -> None:
-    write = getattr(episode_files, function)
-
     @functools.wraps(write)
     def write_on_a_small_disk(*args: Any, **options: Any) -> Any:  # only here, because SQLite needs space to read
         with files_of_at_most(size):
             return write(*args, **options)
 
-    monkeypatch.setattr(episode_files, function, write_on_a_small_disk)
+    small = FORMATS[suffix]._replace(write=functools.partial(write_scene, write_on_a_small_disk))
+    monkeypatch.setitem(FORMATS, suffix, small)
     with pytest.raises(OSError, match="File too large"):
         await export(reading, 1, tmp_path / f"a.{suffix}")
     assert list(tmp_path.iterdir()) == []
