@@ -473,11 +473,11 @@ async def _insert_declarations(
     Transactions with new declarations take turns, so that their order by `ordinal` is that of their commits. Otherwise
     a fold could read the second before the first, and name contradicting fields otherwise than a rebuild.
     """
-    named = [(place, name, payload.decode()) for place, (name, payload) in enumerate(declarations.items())]
-    stored = set((await dialect.execute(connection, schema.SELECT_DECLARED, named=named)).scalars())
-    if len(stored) < len(named):
+    names = [(each,) for each in declarations]
+    stored = set((await dialect.execute(connection, schema.SELECT_DECLARED, fingerprints=names)).scalars())
+    if new := [(name, payload.decode()) for name, payload in declarations.items() if name not in stored]:
         await dialect.lock_log_changes(connection, DECLARATIONS)
-        await dialect.execute(connection, schema.INSERT_DECLARATIONS, named=named)
+        await dialect.execute(connection, schema.INSERT_DECLARATIONS, named=new)
 
 
 async def _compare(dialect: Dialect, connection: AsyncConnection, steps: Sequence[EpisodeStep]) -> None:

@@ -144,8 +144,15 @@ class Dialect(ABC):
     def definition(self, table: Table, *, if_missing: bool = False) -> list[str]:
         """Return the statements that create a table of the log, with its indexes and triggers."""
         indexes = sorted(table.indexes, key=lambda each: str(each.name))
-        creations = [CreateTable(table, if_not_exists=if_missing), *map(CreateIndex, indexes)]
-        return [*(str(self.compile(each)) for each in creations), *self.completion(table, if_missing=if_missing)]
+        creations = [
+            self.creation(table, if_missing=if_missing),
+            *(str(self.compile(CreateIndex(each))) for each in indexes),
+        ]
+        return [*creations, *self.completion(table, if_missing=if_missing)]
+
+    def creation(self, table: Table, *, if_missing: bool) -> str:
+        """Return the statement that creates a table of the log."""
+        return str(self.compile(CreateTable(table, if_not_exists=if_missing)))
 
     async def create_if_missing(self, connection: AsyncConnection, table: Table) -> None:
         """Create a table that is not part of the log's format. Raises for a login that may not, where it is missing."""

@@ -10,34 +10,11 @@ the format: they are created when they are first needed, and older programs stil
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Final
 
-from sqlalchemy import (
-    BigInteger,
-    CheckConstraint,
-    Column,
-    ColumnElement,
-    Identity,
-    Index,
-    Integer,
-    LargeBinary,
-    MetaData,
-    Select,
-    Subquery,
-    Table,
-    Text,
-    and_,
-    bindparam,
-    cast,
-    func,
-    literal_column,
-    or_,
-    select,
-    text,
-    true,
-    union_all,
-    update,
-)
+import sqlalchemy as sql
+from sqlalchemy import bindparam, func, select
 from sqlalchemy.dialects.postgresql import insert
 from sqlalchemy.ext.compiler import compiles
 from sqlalchemy.sql.functions import FunctionElement
@@ -47,63 +24,63 @@ from pycrorm_async.events.ids import EPISODE_NUMBER_MAX, SEQUENCE_MAX
 
 # === tables ===================================================================================================
 
-METADATA: Final = MetaData()
-_Long: Final = BigInteger().with_variant(Integer(), "sqlite")
-"""The type of times and counts; a STRICT table of SQLite knows no other name for an integer."""
+METADATA: Final = sql.MetaData()
+_Long: Final = sql.BigInteger().with_variant(sql.Integer(), "sqlite")
+"""The type of times and counts; a STRICT table of SQLite has one name for integers."""
 
 
-def _table(name: str, noun: str, *columns: Any, fixed: str = "", **options: Any) -> Table:
+def _table(name: str, noun: str, *columns: Any, fixed: str = "") -> sql.Table:
     """Define a table whose rows are never deleted; they are never changed either, or their `fixed` columns are not."""
     info = {"noun": noun, "fixed": fixed}
-    return Table(name, METADATA, *columns, info=info, sqlite_strict=True, **options)
+    return sql.Table(name, METADATA, *columns, info=info)
+
+
+def _required(**types: Any) -> list[sql.Column[Any]]:
+    return [sql.Column(name, each, nullable=False) for name, each in types.items()]
+
+
+def _key(name: str, kind: Any, *constraints: Any) -> sql.Column[Any]:
+    return sql.Column(name, kind, *constraints, primary_key=True, autoincrement=False)
 
 
 LOG: Final = _table(
     "pycrorm_log",
     "log",
-    Column("one", Integer, CheckConstraint("one = 1"), primary_key=True, autoincrement=False, nullable=True),
-    Column("id", Text, nullable=False),
-    Column("format", Integer, nullable=False),
-    Column("created_wall_ns", _Long, nullable=False),
+    _key("one", sql.Integer, sql.CheckConstraint("one = 1")),
+    *_required(id=sql.Text, format=sql.Integer, created_wall_ns=_Long),
     fixed="id",
 )
 
 DECLARATION: Final = _table(
     "pycrorm_declaration",
     "declaration",
-    Column("ordinal", _Long, Identity(always=True), primary_key=True),
-    Column("fingerprint", Text, nullable=False, unique=True),
-    Column("payload", Text, nullable=False),
+    sql.Column("ordinal", _Long, sql.Identity(always=True), primary_key=True),
+    sql.Column("fingerprint", sql.Text, nullable=False, unique=True),
+    *_required(payload=sql.Text),
 )
 
+_within_head = sql.CheckConstraint("folded BETWEEN 0 AND head")
 EPISODE: Final = _table(
     "episode",
     "episode",
-    Column(
-        "number",
-        _Long,
-        CheckConstraint(f"number BETWEEN 1 AND {EPISODE_NUMBER_MAX}"),
-        primary_key=True,
-        autoincrement=False,
-        nullable=True,
-    ),
-    Column("id", Text, nullable=False, unique=True),
-    Column("head", _Long, CheckConstraint(f"head BETWEEN 0 AND {SEQUENCE_MAX}"), nullable=False),
-    Column("folded", _Long, CheckConstraint("folded BETWEEN 0 AND head"), nullable=False, server_default=text("0")),
-    Column("started_wall_ns", _Long, nullable=False),
-    Column("ended_wall_ns", _Long),
-    Column("refused", Text),
-    Column("parked", Text),
+    _key("number", _Long, sql.CheckConstraint(f"number BETWEEN 1 AND {EPISODE_NUMBER_MAX}")),
+    sql.Column("id", sql.Text, nullable=False, unique=True),
+    sql.Column("head", _Long, sql.CheckConstraint(f"head BETWEEN 0 AND {SEQUENCE_MAX}"), nullable=False),
+    sql.Column("folded", _Long, _within_head, nullable=False, server_default=sql.text("0")),
+    *_required(started_wall_ns=_Long),
+    sql.Column("ended_wall_ns", _Long),
+    sql.Column("refused", sql.Text),
+    sql.Column("parked", sql.Text),
     fixed="number, id",
 )
 
-_IS_BEHIND: Final = and_(EPISODE.c.folded < EPISODE.c.head, EPISODE.c.parked.is_(None))
-_IS_STOPPED: Final = or_(EPISODE.c.refused.is_not(None), EPISODE.c.parked.is_not(None))
+_IS_BEHIND: Final = sql.and_(EPISODE.c.folded < EPISODE.c.head, EPISODE.c.parked.is_(None))
+_IS_STOPPED: Final = sql.or_(EPISODE.c.refused.is_not(None), EPISODE.c.parked.is_not(None))
 
 # Each append and each fold changes whether an episode is in this index, so no update on PostgreSQL is heap-only,
 # whatever space its page has. In return a poll costs the same with any number of episodes.
-Index("episode_behind", EPISODE.c.number, sqlite_where=_IS_BEHIND, postgresql_where=_IS_BEHIND)
-Index("episode_stopped", EPISODE.c.number, sqlite_where=_IS_STOPPED, postgresql_where=_IS_STOPPED)
+sql.Index("episode_behind", EPISODE.c.number, sqlite_where=_IS_BEHIND, postgresql_where=_IS_BEHIND)
+sql.Index("episode_stopped", EPISODE.c.number, sqlite_where=_IS_STOPPED, postgresql_where=_IS_STOPPED)
 
 # `Integer` holds both parts of the key (`events.ids`), on PostgreSQL in half the bytes of a bigint, which the logs of
 # 0.1.0 have and which reads alike. The payload is text, which keeps the bytes of the queue: jsonb refuses U+0000,
@@ -112,47 +89,36 @@ Index("episode_stopped", EPISODE.c.number, sqlite_where=_IS_STOPPED, postgresql_
 EVENT: Final = _table(
     "event",
     "event",
-    Column("episode", Integer, primary_key=True, autoincrement=False),
-    Column("sequence", Integer, primary_key=True, autoincrement=False),
-    Column("type", Text, nullable=False),
-    Column("version", Integer, nullable=False),
-    Column("wall_ns", _Long, nullable=False),
-    Column("monotonic_ns", _Long, nullable=False),
-    Column("payload", Text, nullable=False),
+    _key("episode", sql.Integer),
+    _key("sequence", sql.Integer),
+    *_required(type=sql.Text, version=sql.Integer, wall_ns=_Long, monotonic_ns=_Long, payload=sql.Text),
 )
 
 FORMAT_1: Final = (LOG, DECLARATION, EPISODE, EVENT)
 
-INCARNATION: Final = Table(
+INCARNATION: Final = sql.Table(
     "pycrorm_incarnation",
     METADATA,
-    Column("number", _Long, Identity(always=True), primary_key=True),
-    Column("noticed_wall_ns", _Long, nullable=False),
-    Column("noticed_by", Text, nullable=False),
-    Column("reason", Text, nullable=False),
-    sqlite_strict=True,
+    sql.Column("number", _Long, sql.Identity(always=True), primary_key=True),
+    *_required(noticed_wall_ns=_Long, noticed_by=sql.Text, reason=sql.Text),
 )
 """Created when a log is first found to have gone back."""
 
 DIGEST: Final = _table(
     "pycrorm_digest",
     "digest",
-    Column("episode", Integer, primary_key=True, autoincrement=False),
-    Column("sequence", Integer, primary_key=True, autoincrement=False),
-    Column("digest", Text, nullable=False),
-    sqlite_with_rowid=False,
+    _key("episode", sql.Integer),
+    _key("sequence", sql.Integer),
+    *_required(digest=sql.Text),
 )
 """Created when a log is opened for writing."""
 
 BLOB: Final = _table(
     "pycrorm_blob",
     "blob",
-    Column("hash", Text, primary_key=True),
-    Column("part", _Long, primary_key=True, autoincrement=False),
-    Column("parts", _Long, nullable=False),
-    Column("media_type", Text, nullable=False),
-    Column("size", _Long, nullable=False),
-    Column("content", LargeBinary, nullable=False),
+    _key("hash", sql.Text),
+    _key("part", _Long),
+    *_required(parts=_Long, media_type=sql.Text, size=_Long, content=sql.LargeBinary),
 )
 """Created with the first blob."""
 
@@ -172,13 +138,27 @@ def _json_each(element: _JsonEach, compiler: Any, **options: Any) -> str:
     return f"json_each({array})" if _is_sqlite(compiler) else f"pg_catalog.json_array_elements({array}::json)"
 
 
-def _batch(name: str, **columns: TypeEngine[Any] | type[TypeEngine[Any]]) -> Subquery:
+def _batch(name: str, **columns: TypeEngine[Any] | type[TypeEngine[Any]]) -> sql.Subquery:
     """The rows of a parameter, a JSON array of arrays, with these columns."""
-    value = _JsonEach(bindparam(name, type_=Text())).table_valued("value", name=f"{name}_json").c.value
-    values = (value.op("->>")(literal_column(str(place))) for place in range(len(columns)))
+    value = _JsonEach(bindparam(name, type_=sql.Text())).table_valued("value", name=f"{name}_json").c.value
+    values = (value.op("->>")(sql.literal_column(str(place))) for place in range(len(columns)))
     return select(
-        *(cast(each, kind).label(column) for each, (column, kind) in zip(values, columns.items(), strict=True))
+        *(sql.cast(each, kind).label(column) for each, (column, kind) in zip(values, columns.items(), strict=True))
     ).subquery(name)
+
+
+def _is_among(column: sql.Column[Any], name: str) -> sql.ColumnElement[bool]:
+    """Whether the column is a value of a parameter, a JSON array of arrays of one value."""
+    return column.in_(select(_batch(name, value=column.type)))
+
+
+def _insert_batch(table: sql.Table, batch: sql.Subquery) -> Any:
+    # Without WHERE, SQLite would take ON CONFLICT for the ON of a join.
+    return insert(table).from_select(list(batch.c.keys()), select(batch).where(sql.true()))
+
+
+def _insert_one(table: sql.Table, columns: Sequence[sql.Column[Any]]) -> Any:
+    return insert(table).values({each.name: bindparam(each.name) for each in columns}).inline()
 
 
 class _Bytes(FunctionElement[bytes]):
@@ -206,7 +186,7 @@ VALID_ID: Final = {
 does not keep the other rows from being read."""
 
 
-class _ValidId(ColumnElement[str]):
+class _ValidId(sql.ColumnElement[str]):
     inherit_cache = True
 
 
@@ -217,32 +197,21 @@ def _valid_id(_element: _ValidId, compiler: Any, **_options: Any) -> str:
 
 # === statements ===============================================================================================
 
-INSERT_LOG: Final = insert(LOG).values({each.name: bindparam(each.name) for each in LOG.c}).inline()
+INSERT_LOG: Final = _insert_one(LOG, list(LOG.c))
 SELECT_LOG: Final = select(LOG.c.id, LOG.c.format)
-SET_FORMAT: Final = update(LOG).values(format=bindparam("to"))
+SET_FORMAT: Final = sql.update(LOG).values(format=bindparam("to"))
 
-_named = _batch("named", place=Integer, fingerprint=Text, payload=Text)
-SELECT_DECLARED: Final = select(DECLARATION.c.fingerprint).where(
-    DECLARATION.c.fingerprint.in_(select(_named.c.fingerprint))
-)
-INSERT_DECLARATIONS: Final = (
-    insert(DECLARATION)
-    .from_select(
-        ["fingerprint", "payload"],
-        select(_named.c.fingerprint, _named.c.payload).where(true()).order_by(_named.c.place),
-    )
-    .on_conflict_do_nothing(index_elements=["fingerprint"])
-)
-_wanted = _batch("fingerprints", fingerprint=Text)
-SELECT_DESCRIPTIONS: Final = select(_Bytes(DECLARATION.c.payload)).where(
-    DECLARATION.c.fingerprint.in_(select(_wanted.c.fingerprint))
-)
+_is_named = _is_among(DECLARATION.c.fingerprint, "fingerprints")
+SELECT_DECLARED: Final = select(DECLARATION.c.fingerprint).where(_is_named)
+SELECT_DESCRIPTIONS: Final = select(_Bytes(DECLARATION.c.payload)).where(_is_named)
+_named = _batch("named", fingerprint=sql.Text, payload=sql.Text)
+INSERT_DECLARATIONS: Final = _insert_batch(DECLARATION, _named).on_conflict_do_nothing(index_elements=["fingerprint"])
 
 
-def select_declarations(condition: str) -> Select[Any]:
+def select_declarations(condition: str) -> sql.Select[Any]:
     """Return the query of the designator types, which meet this condition and descriptions do not."""
     # `+` keeps SQLite from a scan in rowid order.
-    return select(_Bytes(DECLARATION.c.payload)).where(text(condition)).order_by(literal_column("+ordinal"))
+    return select(_Bytes(DECLARATION.c.payload)).where(sql.text(condition)).order_by(sql.literal_column("+ordinal"))
 
 
 EPISODE_ROW: Final = select(
@@ -257,12 +226,11 @@ EPISODE_ROW: Final = select(
 )
 """The query of every `EpisodeRow`."""
 _in_order = EPISODE_ROW.order_by(EPISODE.c.number)
-_ids = _batch("ids", id=Text)
-SELECT_HEADS: Final = EPISODE_ROW.where(EPISODE.c.id.in_(select(_ids.c.id)))
+SELECT_HEADS: Final = EPISODE_ROW.where(_is_among(EPISODE.c.id, "ids"))
 # Locked by number, so that two writers of the same episodes cannot deadlock.
 LOCK_EPISODES: Final = SELECT_HEADS.order_by(EPISODE.c.number).with_for_update()
 # Reads the witness without a lock, so that the appends of two recorders do not wait for each other.
-LOCK_EPISODES_AND_READ_WITNESS: Final = union_all(
+LOCK_EPISODES_AND_READ_WITNESS: Final = sql.union_all(
     select(LOCK_EPISODES.cte("locked")), EPISODE_ROW.where(EPISODE.c.id == bindparam("witness"))
 )
 SELECT_EPISODES: Final = _in_order.where(EPISODE.c.number.between(bindparam("first"), bindparam("last"))).limit(
@@ -271,19 +239,17 @@ SELECT_EPISODES: Final = _in_order.where(EPISODE.c.number.between(bindparam("fir
 SELECT_BEHIND: Final = _in_order.where(_IS_BEHIND, EPISODE.c.number > bindparam("after")).limit(bindparam("limit"))
 SELECT_STOPPED: Final = _in_order.where(_IS_STOPPED)
 SELECT_LONG: Final = _in_order.where(EPISODE.c.head >= bindparam("events_min"), EPISODE.c.ended_wall_ns.is_(None))
-_numbers = _batch("numbers", number=_Long)
+_is_numbered = _is_among(EPISODE.c.number, "numbers")
 SELECT_GROWN: Final = _in_order.where(
-    or_(
-        EPISODE.c.number > bindparam("above"),
-        EPISODE.c.ended_wall_ns.is_(None),
-        EPISODE.c.number.in_(select(_numbers.c.number)),
-    )
+    sql.or_(EPISODE.c.number > bindparam("above"), EPISODE.c.ended_wall_ns.is_(None), _is_numbered)
 )
-SELECT_NUMBERS: Final = select(EPISODE.c.number).where(EPISODE.c.number.in_(select(_numbers.c.number)))
-SELECT_NUMBER_MAX: Final = select(func.coalesce(func.max(EPISODE.c.number), literal_column("0")))
+SELECT_NUMBERS: Final = select(EPISODE.c.number).where(_is_numbered)
+SELECT_NUMBER_MAX: Final = select(func.coalesce(func.max(EPISODE.c.number), sql.literal_column("0")))
 
-_rows = _batch("rows", number=_Long, id=Text, head=_Long, started_wall_ns=_Long, ended_wall_ns=_Long, refused=Text)
-_inserted = insert(EPISODE).from_select(list(_rows.c.keys()), select(_rows).where(true()))
+_rows = _batch(
+    "rows", number=_Long, id=sql.Text, head=_Long, started_wall_ns=_Long, ended_wall_ns=_Long, refused=sql.Text
+)
+_inserted = _insert_batch(EPISODE, _rows)
 UPSERT_EPISODES: Final = _inserted.on_conflict_do_update(
     index_elements=["number"],
     set_={name: _inserted.excluded[name] for name in ("head", "ended_wall_ns", "refused")},
@@ -298,12 +264,12 @@ _taken = (
     .cte("taken")
 )
 ADVANCE_FOLDED: Final = (
-    update(EPISODE)
+    sql.update(EPISODE)
     .where(EPISODE.c.number == _taken.c.number, EPISODE.c.folded == _taken.c.before)
     .values(folded=_taken.c.folded)
     .returning(EPISODE.c.number)
 )
-PARK: Final = update(EPISODE).where(EPISODE.c.number == bindparam("of")).values(parked=bindparam("reason"))
+PARK: Final = sql.update(EPISODE).where(EPISODE.c.number == bindparam("of")).values(parked=bindparam("reason"))
 
 EVENT_COLUMNS: Final = tuple(EVENT.c.keys())
 _event_row = select(*list(EVENT.c)[:-1], _Bytes(EVENT.c.payload))
@@ -312,27 +278,21 @@ SELECT_EVENTS: Final = (
     .order_by(EVENT.c.sequence)
     .limit(bindparam("limit"))
 )
-_keys = _batch("keys", episode=Integer, sequence=Integer)
+_keys = _batch("keys", episode=sql.Integer, sequence=sql.Integer)
 SELECT_EVENTS_BY_KEY: Final = _event_row.join(
-    _keys, and_(EVENT.c.episode == _keys.c.episode, EVENT.c.sequence == _keys.c.sequence)
+    _keys, sql.and_(EVENT.c.episode == _keys.c.episode, EVENT.c.sequence == _keys.c.sequence)
 )
 SELECT_TAGGING: Final = (
     select(EVENT.c.sequence, _Bytes(EVENT.c.payload))
-    .where(EVENT.c.episode == bindparam("number"), text("type IN ('EpisodeStarted', 'EpisodeTagged')"))
+    .where(EVENT.c.episode == bindparam("number"), sql.text("type IN ('EpisodeStarted', 'EpisodeTagged')"))
     .order_by(EVENT.c.sequence)
 )
 
-INSERT_INCARNATION: Final = (
-    insert(INCARNATION).values({each.name: bindparam(each.name) for each in list(INCARNATION.c)[1:]}).inline()
-)
+INSERT_INCARNATION: Final = _insert_one(INCARNATION, list(INCARNATION.c)[1:])
 SELECT_INCARNATIONS: Final = select(*list(INCARNATION.c)[1:]).order_by(INCARNATION.c.number)
 
-_digests = _batch("digests", episode=Integer, sequence=Integer, digest=Text)
-INSERT_DIGESTS: Final = (
-    insert(DIGEST)
-    .from_select(list(_digests.c.keys()), select(_digests).where(true()))
-    .on_conflict_do_nothing(index_elements=["episode", "sequence"])
-)
+_digests = _batch("digests", episode=sql.Integer, sequence=sql.Integer, digest=sql.Text)
+INSERT_DIGESTS: Final = _insert_batch(DIGEST, _digests).on_conflict_do_nothing(index_elements=["episode", "sequence"])
 SELECT_DIGEST: Final = select(DIGEST.c.digest).where(
     DIGEST.c.episode == bindparam("number"), DIGEST.c.sequence == bindparam("sequence")
 )
@@ -345,19 +305,13 @@ _last = (
 )
 SELECT_LAST_DIGESTS: Final = (
     select(DIGEST)
-    .join(_last, and_(DIGEST.c.episode == _last.c.episode, DIGEST.c.sequence == _last.c.sequence))
+    .join(_last, sql.and_(DIGEST.c.episode == _last.c.episode, DIGEST.c.sequence == _last.c.sequence))
     .where(_of_range)
 )
 
-INSERT_BLOB: Final = (
-    insert(BLOB)
-    .values({each.name: bindparam(each.name) for each in BLOB.c})
-    .inline()
-    .on_conflict_do_nothing(index_elements=["hash", "part"])
-)
-_hashes = _batch("hashes", hash=Text)
+INSERT_BLOB: Final = _insert_one(BLOB, list(BLOB.c)).on_conflict_do_nothing(index_elements=["hash", "part"])
 SELECT_COMPLETE_BLOBS: Final = select(BLOB.c.hash).where(
-    BLOB.c.hash.in_(select(_hashes.c.hash)), BLOB.c.part == BLOB.c.parts - literal_column("1")
+    _is_among(BLOB.c.hash, "hashes"), BLOB.c.part == BLOB.c.parts - sql.literal_column("1")
 )
 SELECT_BLOB: Final = select(BLOB.c.parts, BLOB.c.media_type, BLOB.c.content).where(
     BLOB.c.hash == bindparam("hash"), BLOB.c.part == bindparam("part")

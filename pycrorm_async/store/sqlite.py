@@ -20,7 +20,7 @@ from types import NoneType
 from typing import Any, ClassVar, Final
 
 import msgspec
-from sqlalchemy import Select, Table
+from sqlalchemy import CheckConstraint, DefaultClause, Select, Table
 from sqlalchemy.dialects.sqlite.aiosqlite import SQLiteDialect_aiosqlite
 from sqlalchemy.exc import DBAPIError
 from sqlalchemy.ext.asyncio import AsyncConnection, AsyncEngine
@@ -62,6 +62,22 @@ class SQLite(Dialect):
     faults = (DBAPIError, sqlite3.Error, UnicodeDecodeError)  # UnicodeDecodeError: a name in a damaged file
 
     # --- the log --------------------------------------------------------------------------------------------------
+
+    def creation(self, table: Table, *, if_missing: bool) -> str:
+        # Written as in every earlier version, because SQLite keeps the text: a new memory equals a migrated one.
+        key = list(table.primary_key)
+        lines = []
+        for column in table.columns:
+            words = [column.name, self.syntax.type_compiler_instance.process(column.type)]
+            words += ["PRIMARY KEY"] if key == [column] else ["NOT NULL"] if not column.nullable else []
+            words += ["UNIQUE"] * bool(column.unique)
+            words += ["DEFAULT 0"] * isinstance(column.server_default, DefaultClause)
+            words += [f"CHECK ({each.sqltext})" for each in column.constraints if isinstance(each, CheckConstraint)]
+            lines.append(" ".join(words))
+        lines += [f"PRIMARY KEY ({', '.join(each.name for each in key)})"] if len(key) > 1 else []
+        columns = ",\n    ".join(lines)
+        exists, options = "IF NOT EXISTS " * if_missing, ", WITHOUT ROWID" * (table is schema.DIGEST)
+        return f"CREATE TABLE {exists}{table.name} (\n    {columns}\n) STRICT{options}"
 
     def completion(self, table: Table, *, if_missing: bool) -> list[str]:
         if "noun" not in table.info:
