@@ -30,7 +30,7 @@ from pycrorm_async.projections.generations import (
     unmade_types,
 )
 from pycrorm_async.query.running_episodes import RunningEpisode, running_episodes
-from pycrorm_async.queue.maintenance import inspect_folder
+from pycrorm_async.queue.maintenance import inspect_recorder
 from pycrorm_async.queue.spool import RecorderFolder, Spool, wrap_os_errors
 from pycrorm_async.queue.stored_segments import kept_segments
 from pycrorm_async.recall.blocks import WORDS_MAX
@@ -222,7 +222,7 @@ def status(place: Place, as_json: JsonOption = False) -> int:
     folders = spool.recorders()
     recorders = [_recorder(each) for each in folders if each.refused is None]
     refused = [
-        RefusedState(each.refused, each.path, inspect_folder(each).bytes_spooled)
+        RefusedState(each.refused, each.path, inspect_recorder(each, scanning=False).bytes_spooled)
         for each in folders
         if each.refused is not None
     ]
@@ -343,7 +343,7 @@ def _print_workers(workers: Sequence[FoldWorkerState]) -> None:
 
 
 def _recorder(folder: RecorderFolder) -> RecorderState:
-    report = inspect_folder(folder)
+    report = inspect_recorder(folder, scanning=False)
     drained_by = "another" if report.recorded is not None or not folder.alive else "itself"
     status, locked = report.drained, report.being_drained
     return RecorderState(

@@ -3,7 +3,7 @@
     spool/                     one folder, bound to one database
       log                      id of that database's log, one line; fixed while the spool holds a recorder's folder
       writer                   locked by the daemon that drains the spool
-      stored/<log id>/         segments whose records are all stored, and the stored heads (`stored_segments.py`)
+      stored/<log id>/         segments whose records are all stored, and numbers of episodes (`stored_segments.py`)
       <recorder>/              one recorder, one life of a process; the name is its UUID, so names sort by time
         alive                  locked (flock) by the recorder as long as it lives
         drain                  locked by the process that drains the folder
@@ -13,7 +13,7 @@
         00000001.segment.tail  the torn bytes cut off the end of a segment
         blobs/<sha256>         a content too large for an event (`blobs.py`)
       <recorder>.<episode>.refused/   dead letters of this episode (`sources.py`), in the same format
-      <recorder>.damaged/      a damaged folder, unchanged, after `repair` replaced it
+      <recorder>.damaged/      a copy of a damaged folder, which `repair` made before it replaced segments
 
 All numbers in segments are little endian, and every structure begins at a multiple of 8 bytes.
 

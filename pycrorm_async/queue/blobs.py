@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import itertools
 import os
-import shutil
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
@@ -68,22 +67,6 @@ def is_whole(folder: Path, name: str) -> bool:
     except FileNotFoundError:
         return False
     return digest.hexdigest() == name
-
-
-def carry_blobs(source: Path, target: Path) -> None:
-    """Link the blobs of a recorder's folder into another one, or copy them. Durable on return. Raises `OSError`."""
-    blobs = blob_files(source)
-    if not blobs:
-        return
-    with suppress(FileExistsError):
-        create_folder(target / BLOBS)
-    for blob in blobs:
-        with suppress(FileExistsError, FileNotFoundError):
-            try:
-                (target / BLOBS / blob.name).hardlink_to(blob)
-            except PermissionError:  # the file system has no hard links
-                shutil.copyfile(blob, target / BLOBS / blob.name)
-    sync_folder(target / BLOBS)
 
 
 def kept_with(segment: Path) -> Path:

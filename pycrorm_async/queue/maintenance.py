@@ -8,12 +8,13 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
+from itertools import chain, count
 from pathlib import Path
 from typing import Final, TypeAlias
 
 from pycrorm_async.errors import InternalError, SpoolDamaged, SpoolUnavailable
 from pycrorm_async.events.ids import EpisodeId, episode_text
-from pycrorm_async.queue.blobs import blob_bytes, blob_files, carry_blobs
+from pycrorm_async.queue.blobs import blob_bytes, blob_files
 from pycrorm_async.queue.format import (
     COMMIT,
     EPISODE_ENDED,
@@ -40,11 +41,18 @@ from pycrorm_async.queue.locks import (
     PROGRESS,
     TAIL,
     FileLock,
-    create_folder,
     is_locked,
-    open_file,
 )
-from pycrorm_async.queue.scan import Survey, check_record, scan, survey, tails, whole_frames
+from pycrorm_async.queue.scan import (
+    SegmentScanner,
+    Survey,
+    ValidPrefix,
+    check_record,
+    scan,
+    survey,
+    tails,
+    whole_frames,
+)
 from pycrorm_async.queue.spool import (
     DrainStatus,
     Progress,
@@ -100,8 +108,8 @@ class FileDamage:
 
 
 @dataclass(frozen=True)
-class FolderReport:
-    """One recorder's folder, or a folder of dead letters, without the content of its segments.
+class RecorderReport:
+    """One recorder's folder, or a folder of dead letters.
 
     Attributes:
         name: the folder's name: the recorder's id, followed by the episode's id for dead letters.
@@ -112,25 +120,8 @@ class FolderReport:
         blobs: number of blobs that are not deleted yet.
         recorded, drained: the two parts of `progress`; None for a dead recorder and for one that drains itself.
         refused: why the folder could not be examined: another recorder's file, a newer format, an OS error.
-    """
-
-    name: str
-    path: str
-    alive: bool
-    being_drained: bool = False
-    bytes_spooled: int = 0
-    recorded: RecorderStatus | None = None
-    drained: DrainStatus | None = None
-    refused: str | None = None
-    blobs: int = 0
-
-
-@dataclass(frozen=True)
-class RecorderReport(FolderReport):
-    """One recorder's folder, or a folder of dead letters, with the content of its segments.
-
-    Attributes:
-        first, last: positions of the first and the last whole record; last is first - 1 if there is none.
+        first, last: positions of the first and the last whole record; last is first - 1 if there is none. This and the
+            following are known only if the segments were scanned.
         safe: the last position that a commit frame covers.
         segments: the files, in order.
         types: number of records of each event type.
@@ -142,6 +133,15 @@ class RecorderReport(FolderReport):
         damage: where the damage begins; only records before it are counted.
     """
 
+    name: str
+    path: str
+    alive: bool
+    being_drained: bool = False
+    bytes_spooled: int = 0
+    recorded: RecorderStatus | None = None
+    drained: DrainStatus | None = None
+    refused: str | None = None
+    blobs: int = 0
     first: int = 1
     last: int = 0
     safe: int = 0
@@ -223,44 +223,33 @@ def _is_unfinished(path: Path) -> bool:
     return name != path.name or not any(path.iterdir())
 
 
-def inspect_folder(recorder: RecorderFolder) -> FolderReport:
-    """Report the state of a recorder's folder, scanning no segment; an error that prevents it is in `refused`."""
+def inspect_recorder(recorder: RecorderFolder, *, scanning: bool = True) -> RecorderReport:
+    """Report one recorder's folder, with the content of its segments if `scanning`.
+
+    An error that prevents it is in `refused`.
+    """
+    report = RecorderReport(recorder.name, str(recorder.path), recorder.alive)
     try:
         with wrap_os_errors(recorder.path):
-            return _look(recorder)
+            report = _look(recorder, report)
+            return _examine(recorder, report) if scanning else report
     except Exception as error:  # noqa: BLE001 - reported; must not prevent the report on the others
-        fault = str(folder_error(recorder.path, error))
-        return FolderReport(recorder.name, str(recorder.path), recorder.alive, refused=fault)
+        return replace(report, refused=str(folder_error(recorder.path, error)))
 
 
-def inspect_recorder(recorder: RecorderFolder) -> RecorderReport:
-    """Report the content of one recorder's folder; an error that prevents it is in `refused`."""
-    folder = inspect_folder(recorder)
-    try:
-        if folder.refused is None:
-            with wrap_os_errors(recorder.path):
-                return _examine(recorder, folder)
-        fault = folder.refused
-    except Exception as error:  # noqa: BLE001 - reported; must not prevent the report on the others
-        fault = str(folder_error(recorder.path, error))
-    return RecorderReport(folder.name, folder.path, folder.alive, folder.being_drained, refused=fault)
-
-
-def _look(recorder: RecorderFolder) -> FolderReport:
+def _look(recorder: RecorderFolder, report: RecorderReport) -> RecorderReport:
     blobs = blob_files(recorder.path)
-    state = FolderReport(
-        recorder.name,
-        str(recorder.path),
-        recorder.alive,
+    report = replace(
+        report,
         being_drained=is_locked(recorder.path / DRAIN),
         bytes_spooled=_bytes(recorder.path) + blob_bytes(blobs),
         blobs=len(blobs),
     )
     progress = Progress.open(recorder.path, writing=False) if recorder.alive else None
     if progress is None:
-        return state
+        return report
     try:
-        return replace(state, recorded=progress.recorded(), drained=progress.drained())
+        return replace(report, recorded=progress.recorded(), drained=progress.drained())
     finally:
         progress.close()
 
@@ -299,25 +288,25 @@ class _Count:
             self.episodes.add(frame.episode)
 
 
-def _examine(recorder: RecorderFolder, state: FolderReport) -> RecorderReport:
+def _examine(recorder: RecorderFolder, report: RecorderReport) -> RecorderReport:
     folder = recorder.path
-    count, (prefix, damage, _) = _survey_stable(folder, changing=recorder.alive or state.being_drained)
+    counted, (prefix, damage, _) = _survey_stable(folder, changing=recorder.alive or report.being_drained)
     entries = [each.name for each in folder.iterdir()]
     numbers = {*prefix.numbers, *segment_numbers(folder)}  # also those begun or deleted since the scan
     ours = {ALIVE, BLOBS, DRAIN, PROGRESS, *(segment_path(folder, number).name for number in numbers)}
     others = sorted(_text(each) for each in entries if each not in ours)
-    return RecorderReport(
-        **vars(state),
+    return replace(
+        report,
         first=prefix.start.position + 1,
         last=prefix.cut.position,
-        safe=max(count.safe, prefix.start.position),
+        safe=max(counted.safe, prefix.start.position),
         segments=tuple(
-            SegmentReport(path.name, _size(path), prefix.bases.get(number), count.segments[number])
+            SegmentReport(path.name, _size(path), prefix.bases.get(number), counted.segments[number])
             for number in prefix.numbers
             for path in [segment_path(folder, number)]
         ),
-        types=dict(sorted(count.types.items())),
-        episodes=len(count.episodes | set(prefix.open)),
+        types=dict(sorted(counted.types.items())),
+        episodes=len(counted.episodes | set(prefix.open)),
         open=tuple(
             OpenEpisode(episode_text(episode), last.sequence, last.wall_ns)
             for episode, last in sorted(prefix.open.items())
@@ -330,82 +319,86 @@ def _examine(recorder: RecorderFolder, state: FolderReport) -> RecorderReport:
 
 
 def _survey_stable(folder: Path, *, changing: bool) -> tuple[_Count, Survey]:
-    """Scan a folder; repeat the scan of a changing one until it meets no damage, or the same damage twice in a row."""
-    recorder = parse_folder_name(folder.name).recorder
-    before: SpoolDamaged | None = None
-    attempts = _SURVEYS if changing else 1
-    for attempt in range(1, attempts + 1):
+    """Scan a folder; repeat the scan of a changing one until it meets no damage, or the same damage again."""
+    met: set[tuple[Path, int]] = set()
+    for attempt in range(_SURVEYS):
         count = _Count()
         try:
-            result = survey(folder, recorder, on_frame=count.count_frame)
+            result = survey(folder, parse_folder_name(folder.name).recorder, on_frame=count.count_frame)
         except FileNotFoundError:  # stored and deleted between the listing and the reading
-            if attempt == attempts:
+            if not changing or attempt == _SURVEYS - 1:
                 raise
             continue
         damage = result.damage
-        if damage is None or not changing:
+        if damage is None or not changing or (damage.path, damage.offset) in met:
             break
-        if before is not None and (before.path, before.offset) == (damage.path, damage.offset):
-            break
-        before = damage
+        met.add((damage.path, damage.offset))
     return count, result
 
 
-# === salvage ==================================================================================================
+# === repair ===================================================================================================
 #
-# Copy a damaged folder's whole records to a new one: those before the damage, and those that can be kept behind it.
+# Repair a dead recorder's damaged folder, so that its whole records can be drained, and report the records dropped.
 #
-# An episode's records are kept up to its first missing record, because the log accepts no episode with a gap. The
-# records behind the damage get new positions, because positions have no gaps either.
+# A copy of the folder is kept as `<recorder>.damaged`. Then each segment from the damage on is replaced by one with the
+# whole records of the old one that can be kept. An episode's records are kept up to its first missing record, because
+# the log accepts no episode with a gap. Kept records get new positions, because positions have no gaps either.
+#
+# After a kill at any point the folder is whole or damaged, and the next repair begins again, with a copy of its own.
 
 Range: TypeAlias = tuple[int, int]
 """The first and the last of consecutive numbers."""
 
 
-class Salvage:
-    """One copy of the whole records of a damaged folder to a new folder.
+class _Salvage:
+    """One pass over the segments of a damaged folder that keeps their whole records.
 
-    `position` is that of the last record written, `saved` the number of records from behind the damage, `unreadable`
-    the positions in the damaged folder for which no frame decodes.
+    `position` is that of the last record written, `unreadable` the positions in the damaged folder for which no frame
+    decodes, `dropped` the whole records behind a gap in their episode.
     """
 
-    def __init__(self, damaged: Path, repaired: Path, result: Survey) -> None:
-        self._damaged = damaged
-        self._repaired = repaired
-        self._recorder = parse_folder_name(damaged.name).recorder
-        self._survey = result
-        prefix = result.prefix
-        self.headless = not prefix.bases and bool(prefix.numbers) and prefix.numbers[0] > 1
-        self._open = dict(prefix.open)
-        self._number = prefix.cut.number
-        self.position = self._last_position = prefix.cut.position
-        self.saved = 0
+    def __init__(self, folder: Path, prefix: ValidPrefix) -> None:
+        self._folder = folder
+        self._recorder = parse_folder_name(folder.name).recorder
+        self._first = prefix.cut.number or min(prefix.numbers)
+        self._numbers = [each for each in prefix.numbers if each >= self._first]
+        self.headless = not prefix.bases and self._first > 1
         self.unreadable: list[Range] = []
-        self._dropped: dict[EpisodeId, list[Frame]] = {}
+        self.dropped: dict[EpisodeId, list[Frame]] = {}
+        earlier = {each: segment_path(folder, each) for each in prefix.bases if each < self._first}
+        before = SegmentScanner(folder, self._recorder, segments=earlier)
+        while before.step():
+            pass
+        self._open, self.position = dict(before.prefix.open), before.prefix.cut.position
+        self._uncommitted = before.uncommitted  # by the segments that stay: the first new commit frame covers them
+        header = decode_header(read_segment(segment_path(folder, self._first))) if self._first in prefix.bases else None
+        if header is not None:
+            self._open, self.position = dict(header.open), header.base - 1
+        if self.headless:
+            self._reconstruct_header()
+        self.start = self._last_position = self.position
 
     def run(self) -> None:
-        """Write the new folder's blobs and segments. Raises `OSError`."""
-        prefix = self._survey.prefix
-        carry_blobs(self._damaged, self._repaired)
-        if self.headless:
-            self._begin_without_header()
-        for number in sorted(prefix.bases):
-            self._copy(number)
-        if not prefix.bases:
-            self._number -= 1  # the first one written replaces the one with the unreadable header
-        safe = 0
-        for number in (each for each in self._survey.prefix.numbers if each >= self._survey.prefix.cut.number):
-            frames = list(self._frames(number))
+        """Replace the segments. Raises `OSError`."""
+        safe, number = 0, self._first
+        for damaged in self._numbers:
+            before, after = dict(self._open), self.position
+            frames = list(self._frames(damaged))
             safe = max([safe, *(frame.position for frame in frames if frame.kind == COMMIT)])
-            before = dict(self._open)
-            self._write(before, [frame for frame in frames if frame.kind != COMMIT and self._keep(frame)])
+            kept = [frame for frame in frames if frame.kind != COMMIT and self._keep(frame)]
+            if kept or damaged == self._first:
+                header = encode_segment_header(SegmentHeader(self._recorder, number, after + 1, before))
+                salt = salt_of(self._recorder, number)
+                span = encode_span(kept, after=after, salt=salt, uncommitted=self._uncommitted)
+                write_durably(segment_path(self._folder, number), b"".join((header, *span)))
+                self._uncommitted = ()
+                number += 1
+            self.position += len(kept)
+        for damaged in self._numbers:
+            if damaged >= number:
+                segment_path(self._folder, damaged).unlink()
         if safe > self._last_position:
             self.unreadable.append((self._last_position + 1, safe))
-
-    @property
-    def dropped(self) -> dict[EpisodeId, list[Frame]]:
-        """Whole records behind a gap in their episode."""
-        return self._dropped
 
     def kept_to(self, episode: EpisodeId) -> int:
         """Return the sequence of an open episode's last kept record; 0 if none is kept."""
@@ -413,12 +406,9 @@ class Salvage:
         return last.sequence if last is not None else 0
 
     def _frames(self, number: int) -> Iterator[Frame]:
-        """Decode the whole frames of a segment behind the damage."""
-        prefix = self._survey.prefix
-        content = read_segment(segment_path(self._damaged, number))
-        start = prefix.cut.offset if number == prefix.cut.number and prefix.bases else header_bytes(0)
-        path = segment_path(self._damaged, number)
-        for offset, frame in whole_frames(content, start, salt_of(self._recorder, number)):
+        """Decode the whole frames of a segment that a recorder can have written."""
+        path = segment_path(self._folder, number)
+        for offset, frame in whole_frames(read_segment(path), header_bytes(0), salt_of(self._recorder, number)):
             if frame.kind != COMMIT:
                 try:
                     check_record(path, offset, frame)
@@ -426,24 +416,16 @@ class Salvage:
                     continue
             yield frame
 
-    def _begin_without_header(self) -> None:
-        """Reconstruct the open episodes of a lost header from later headers and each episode's first record."""
-        numbers = self._survey.prefix.numbers
-        first: dict[EpisodeId, Frame] = {}
-        for number in numbers:
-            header = decode_header(read_segment(segment_path(self._damaged, number)))
-            for episode, last in header.open.items() if header is not None else ():
-                if episode not in first:
-                    self._open.setdefault(episode, last)
-            for frame in self._frames(number):
-                if frame.kind == EVENT:
-                    first.setdefault(EpisodeId(frame.episode), frame)
-                if not self.position and frame.kind != COMMIT:
-                    self.position = self._last_position = frame.position - 1
-        for episode, frame in first.items():
-            if frame.sequence > 1:
-                self._open[episode] = LastRecord(frame.sequence - 1, frame.wall_ns, frame.monotonic_ns)
-        self._number = numbers[0]
+    def _reconstruct_header(self) -> None:
+        """Find the episodes that were open before the first record: their first sequences here are above 1."""
+        met: set[bytes] = set()
+        for frame in (each for number in self._numbers for each in self._frames(number) if each.kind != COMMIT):
+            self.position = self.position or frame.position - 1
+            if frame.kind == EVENT and frame.episode not in met:
+                met.add(frame.episode)
+                if frame.sequence > 1:
+                    before = LastRecord(frame.sequence - 1, frame.wall_ns, frame.monotonic_ns)
+                    self._open[EpisodeId(frame.episode)] = before
 
     def _keep(self, frame: Frame) -> bool:
         """Return whether this record can be kept; note a dropped record, and the positions missing before it."""
@@ -455,42 +437,13 @@ class Salvage:
         if frame.kind != EVENT:
             return True
         episode = EpisodeId(frame.episode)
-        before = self._open.get(episode)
-        if frame.sequence != (before.sequence if before else 0) + 1:
-            self._dropped.setdefault(episode, []).append(frame)
+        if frame.sequence != self.kept_to(episode) + 1:
+            self.dropped.setdefault(episode, []).append(frame)
             return False
         self._open[episode] = LastRecord(frame.sequence, frame.wall_ns, frame.monotonic_ns)
         if frame.type == EPISODE_ENDED.encode():
             del self._open[episode]
         return True
-
-    def _copy(self, number: int) -> None:
-        """Copy a segment from before the damage; end the last one at the cut and commit its records."""
-        source, target = segment_path(self._damaged, number), segment_path(self._repaired, number)
-        cut = self._survey.prefix.cut
-        if number < cut.number:
-            try:
-                os.link(source, target)
-            except OSError:  # the file system has no hard links
-                write_durably(target, read_segment(source))
-            return
-        content, uncommitted = read_segment(source)[: cut.offset], self._survey.uncommitted
-        if uncommitted:
-            content += encode_span(
-                [], after=self.position, salt=salt_of(self._recorder, number), uncommitted=uncommitted
-            )[1]
-        write_durably(target, content)
-
-    def _write(self, before: dict[EpisodeId, LastRecord], records: list[Frame]) -> None:
-        """Write the next segment, unless there are no records."""
-        if not records:
-            return
-        self._number += 1
-        header = encode_segment_header(SegmentHeader(self._recorder, self._number, self.position + 1, before))
-        span = encode_span(records, after=self.position, salt=salt_of(self._recorder, self._number))
-        self.position += len(records)
-        self.saved += len(records)
-        write_durably(segment_path(self._repaired, self._number), b"".join((header, *span)))
 
 
 def ranges(numbers: Iterable[int]) -> tuple[Range, ...]:
@@ -502,18 +455,6 @@ def ranges(numbers: Iterable[int]) -> tuple[Range, ...]:
         else:
             grouped.append((number, number))
     return tuple(grouped)
-
-
-# === repair ===================================================================================================
-#
-# Repair a dead recorder's damaged folder, so that its whole records can be drained, and report the records dropped.
-#
-# The damaged folder is renamed unchanged to `<recorder>.damaged`, and a new folder takes its name. The new folder holds
-# the segments before the damage and new segments with the whole records behind it, as far as `maintenance.py` can keep
-# them.
-#
-# The new folder is built beside the old one, scanned and synced before either is renamed. After a kill at any point the
-# next repair continues: it builds an unfinished folder again, and renames a finished one.
 
 
 @dataclass(frozen=True)
@@ -571,53 +512,30 @@ def repair_folder(folder: Path) -> RepairReport | None:
     `SpoolForeign` for a newer format or another recorder's file. Then the folder is unchanged.
     """
     with wrap_os_errors(folder), ExitStack() as locks:
-        alive = FileLock.take(folder / ALIVE, create=False)
-        if alive is None:
-            reason = "its recorder is alive, or another process drains it: stop that process first"
-            raise SpoolUnavailable(folder, reason)
-        locks.callback(alive.release)
-        drain = FileLock.take(folder / DRAIN)
-        if drain is None:
-            raise SpoolUnavailable(folder, "another process drains it: stop that process first")
-        locks.callback(drain.release)
-        result = survey(folder, parse_folder_name(folder.name).recorder)
-        return None if result.damage is None else _replace(folder, result, result.damage)
-
-
-def finish_repairs(spool: Path) -> list[Path]:
-    """Name the finished folders of repairs killed between their last two steps; return these folders."""
-    folders = []
-    with wrap_os_errors(spool):
-        for repaired in sorted(spool.glob(f"*{MENDED}")):
-            folder = repaired.with_name(repaired.name.removesuffix(MENDED))
-            if not folder.exists():  # the damaged folder is renamed only after the new one is whole and synced
-                repaired.rename(folder)
-                sync_folder(spool)
-                folders.append(folder)
-    return folders
-
-
-def _replace(folder: Path, result: Survey, damage: SpoolDamaged) -> RepairReport:
-    """Build a repaired folder, rename the damaged one, and give its name to the repaired one."""
-    repaired = folder.with_name(f"{folder.name}{MENDED}")
-    if repaired.exists():  # left by a killed repair
-        shutil.rmtree(repaired)
-    create_folder(repaired)
-    try:
-        salvage = _fill(repaired, folder, result)
-        damaged = _free_name(folder)
-        folder.rename(damaged)
-    except BaseException:
-        shutil.rmtree(repaired, ignore_errors=True)
-        raise
-    repaired.rename(folder)
-    sync_folder(folder.parent)
+        for name, holder in (
+            (ALIVE, "its recorder is alive, or another process drains it"),
+            (DRAIN, "another process drains it"),
+        ):
+            lock = FileLock.take(folder / name, create=name == DRAIN)
+            if lock is None:
+                raise SpoolUnavailable(folder, f"{holder}: stop that process first")
+            locks.callback(lock.release)
+        recorder = parse_folder_name(folder.name).recorder
+        prefix, damage, _ = survey(folder, recorder)
+        if damage is None:
+            return None
+        aside = _copy_aside(folder)
+        salvage = _Salvage(folder, prefix)
+        salvage.run()
+        written = scan(folder, recorder).cut.position
+        if written != salvage.position:
+            raise InternalError(f"{folder} holds records up to {written} instead of {salvage.position}; see {aside}")
     return RepairReport(
         name=folder.name,
-        set_aside=str(damaged),
-        damage=FileDamage(str(damaged / damage.path.name), damage.offset, damage.reason),
-        kept=result.prefix.cut.position - result.prefix.start.position,
-        saved=salvage.saved,
+        set_aside=str(aside),
+        damage=FileDamage(str(aside / damage.path.name), damage.offset, damage.reason),
+        kept=prefix.cut.position - prefix.start.position,
+        saved=salvage.position - max(prefix.cut.position, salvage.start),
         unreadable=tuple(salvage.unreadable),
         given_up=tuple(
             DroppedRecords(
@@ -632,25 +550,32 @@ def _replace(folder: Path, result: Survey, damage: SpoolDamaged) -> RepairReport
     )
 
 
-def _fill(repaired: Path, folder: Path, result: Survey) -> Salvage:
-    """Write the new folder, scan it again and sync it."""
-    os.close(open_file(repaired / ALIVE, os.O_WRONLY))
-    salvage = Salvage(folder, repaired, result)
-    salvage.run()
-    written = scan(repaired, parse_folder_name(folder.name).recorder).cut.position
-    if written != salvage.position:
-        raise InternalError(
-            f"{repaired} holds records up to position {written} instead of {salvage.position};"
-            " the damaged folder is unchanged"
-        )
-    sync_folder(repaired)
-    return salvage
+def _copy_aside(folder: Path) -> Path:
+    """Copy a damaged folder under a free name; return the copy. Links its files, because a repair replaces them."""
+    names = chain([""], map(".{}".format, count(2)))
+    copies = (folder.with_name(f"{folder.name}{DAMAGED_SUFFIX}{each}") for each in names)
+    aside = next(each for each in copies if not each.exists())
+    shutil.copytree(folder, aside, copy_function=_link, ignore=shutil.ignore_patterns(ALIVE, DRAIN, PROGRESS))
+    sync_folder(aside)
+    sync_folder(folder.parent)
+    return aside
 
 
-def _free_name(folder: Path) -> Path:
-    name = folder.with_name(f"{folder.name}{DAMAGED_SUFFIX}")
-    number = 1
-    while name.exists():
-        number += 1
-        name = folder.with_name(f"{folder.name}{DAMAGED_SUFFIX}.{number}")
-    return name
+def _link(source: str, target: str) -> None:
+    try:
+        os.link(source, target)
+    except OSError:  # the file system has no hard links
+        shutil.copyfile(source, target)
+
+
+def finish_repairs(spool: Path) -> list[Path]:
+    """Name the finished folders of repairs by an earlier version that were killed in their last step; return them."""
+    folders = []
+    with wrap_os_errors(spool):
+        for repaired in sorted(spool.glob(f"*{MENDED}")):
+            folder = repaired.with_name(repaired.name.removesuffix(MENDED))
+            if not folder.exists():  # the damaged folder was renamed only after the new one was whole and synced
+                repaired.rename(folder)
+                sync_folder(spool)
+                folders.append(folder)
+    return folders

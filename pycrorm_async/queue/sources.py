@@ -34,7 +34,7 @@ from pycrorm_async.queue.format import (
     segment_path,
     sync_folder,
 )
-from pycrorm_async.queue.locks import ALIVE, DRAIN, MENDED, REFUSED, FileLock, create_folder, is_locked
+from pycrorm_async.queue.locks import ALIVE, DRAIN, REFUSED, FileLock, create_folder, is_locked
 from pycrorm_async.queue.scan import (
     SegmentScanner,
     ValidPrefix,
@@ -224,7 +224,7 @@ def open_dead(folder: Path, *, stored: StoredSegments | None = None, check: bool
     """
     with wrap_os_errors(folder), ExitStack() as locks:
         own = folder.with_name(folder.name.partition(".")[0])
-        if own != folder and ((own / ALIVE).exists() or own.with_name(f"{own.name}{MENDED}").exists()):
+        if own != folder and (own / ALIVE).exists():
             return None
         for name in (ALIVE, DRAIN):
             lock = FileLock.take(folder / name, create=name == DRAIN)

@@ -2,7 +2,6 @@
 
 import os
 import random
-import shutil
 import tempfile
 import threading
 from collections import defaultdict
@@ -19,7 +18,7 @@ from pycrorm_async.events.codec import Record
 from pycrorm_async.events.ids import episode_text
 from pycrorm_async.queue import RecorderQueue, Spool, open_dead
 from pycrorm_async.queue.locks import FileLock
-from pycrorm_async.queue.maintenance import OpenEpisode, RepairReport, finish_repairs, inspect_spool, repair_folder
+from pycrorm_async.queue.maintenance import OpenEpisode, RepairReport, inspect_spool, repair_folder
 from pycrorm_async.queue.scan import scan
 from pycrorm_async.settings import Settings
 from tests.queue.factories import (
@@ -106,7 +105,9 @@ async def test_the_original_folder_is_kept_and_named(author: FolderWriter) -> No
     report = repair(author.folder)
     aside = author.folder.with_name(f"{author.folder.name}.damaged")
     assert report.set_aside == str(aside)
-    assert {path.name: path.read_bytes() for path in aside.iterdir()} == before | {"drain": b""}
+    assert {path.name: path.read_bytes() for path in aside.iterdir()} == {
+        name: content for name, content in before.items() if name != "alive"
+    }
     path, offset, _ = author.places[1]
     assert (report.damage.file, report.damage.offset) == (str(aside / path.name), offset)
     assert [each.name for each in Spool(author.folder.parent).recorders()] == [author.folder.name]
@@ -194,13 +195,9 @@ async def test_a_repaired_folder_that_is_damaged_again_is_reported(author: Folde
     author.sync()
     damage(author, 3)
     repair(author.folder)
-    for number in (1, 2):
-        path = author.folder / f"{number:08d}.segment"
-        before = path.read_bytes()
-        overwrite(path, 56 + 70 + (64 if number == 2 else 0), b"#")
-        with pytest.raises(SpoolDamaged):
-            scan(author.folder, RECORDER)
-        path.write_bytes(before)
+    overwrite(author.folder / "00000001.segment", 56 + 70, b"#")
+    with pytest.raises(SpoolDamaged):
+        scan(author.folder, RECORDER)
 
 
 # --- refusals ---------------------------------------------------------------------------------------------------
@@ -285,6 +282,7 @@ async def test_a_repair_killed_at_any_step_is_completed_by_the_next_one(
         author.put(node(2), b"y" * 900)
     author.sync()
     damage(author, 6)
+    damaged = {path.name: path.read_bytes() for path in author.segments}
     spool = author.folder.parent
     steps = 0
 
@@ -298,10 +296,8 @@ async def test_a_repair_killed_at_any_step_is_completed_by_the_next_one(
 
         return may_die
 
-    for of, name in ((os, "link"), (os, "fsync"), (os, "open"), (Path, "rename"), (Path, "replace"), (Path, "open")):
+    for of, name in ((os, "link"), (os, "fsync"), (os, "open"), (Path, "unlink"), (Path, "replace"), (Path, "open")):
         monkeypatch.setattr(of, name, counted(getattr(of, name)))
-    # The remains of the killed repair stay as they are.
-    monkeypatch.setattr(shutil, "rmtree", lambda *_, **__: None)
     done = False
     try:
         repair_folder(author.folder)
@@ -309,11 +305,11 @@ async def test_a_repair_killed_at_any_step_is_completed_by_the_next_one(
     except KeyboardInterrupt:
         pass
     monkeypatch.undo()
-    finish_repairs(spool)
     repair_folder(author.folder)
     kept = renumber([each for each in author.records if each.position not in (6, 8, 10)])
     assert await recover(author.folder) == [*kept, lost(8, 1, 6), lost(9, 2, 3)]
-    assert sorted(path.name for path in spool.iterdir()) == [author.folder.name, f"{author.folder.name}.damaged"]
+    copies = [each for each in spool.iterdir() if each != author.folder]
+    assert any({path.name: path.read_bytes() for path in each.iterdir()} == damaged for each in copies)
     assert done or killed_at < 39
 
 
