@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import itertools
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from hashlib import sha256
@@ -25,9 +25,11 @@ from pycrorm_async.errors import SpoolFull
 from pycrorm_async.queue.appender import FULL
 from pycrorm_async.queue.format import sync_folder
 from pycrorm_async.queue.gc_safe_lock import GcSafeLock, locked
-from pycrorm_async.queue.locks import BLOBS, KEPT_BLOBS, MAKING, STORED, create_folder, create_folders, open_file
+from pycrorm_async.queue.locks import BLOBS, KEPT_BLOBS, MAKING, STORED, create_folder, open_file
 
 # === blob files ===============================================================================================
+
+_BLOCK_BYTES: Final = 4_096
 
 
 def blob_files(folder: Path) -> list[Path]:
@@ -47,13 +49,19 @@ def blob_bytes(blobs: Iterable[Path]) -> int:
     return size
 
 
+def rounded(size: int) -> int:
+    """Return the bytes that a file of this size takes on the disk."""
+    return -(-size // _BLOCK_BYTES) * _BLOCK_BYTES
+
+
 def read_blob(spool: Path, name: str) -> bytes | None:
     """Read a blob from any folder of a spool; None if none holds it whole. Raises `OSError`."""
-    for path in _places(spool, name):
-        with suppress(FileNotFoundError, NotADirectoryError):
-            content = path.read_bytes()
-            if sha256(content).hexdigest() == name:
-                return content
+    for place in (f"*/{BLOBS}/{name}", f"{STORED}/*/*/*{KEPT_BLOBS}/{name}"):
+        for path in spool.glob(place):
+            with suppress(FileNotFoundError):
+                content = path.read_bytes()
+                if sha256(content).hexdigest() == name:
+                    return content
     return None
 
 
@@ -74,34 +82,6 @@ def kept_with(segment: Path) -> Path:
     return segment.with_name(f"{segment.name}{KEPT_BLOBS}")
 
 
-def keep_blobs(spool: Path, blobs: Iterable[Path], segment: Path) -> None:
-    """Move blobs to those kept with this segment. Raises `OSError`."""
-    target = kept_with(segment)
-    for blob in blobs:
-        create_folders(spool, target)
-        with suppress(FileNotFoundError):
-            blob.replace(target / blob.name)
-
-
-def _places(spool: Path, name: str) -> Iterator[Path]:
-    """Yield the paths at which a blob of this name may be: first those of recorders, then the kept ones."""
-    for recorder in _folders(spool):
-        yield recorder / BLOBS / name
-    for log in _folders(spool / STORED):
-        for recorder in _folders(log):
-            for segment in _folders(recorder):
-                if segment.suffix == KEPT_BLOBS:
-                    yield segment / name
-
-
-def _folders(folder: Path) -> list[Path]:
-    try:
-        with os.scandir(folder) as entries:
-            return [Path(entry.path) for entry in entries if entry.is_dir(follow_symlinks=False)]
-    except (FileNotFoundError, NotADirectoryError):
-        return []
-
-
 # === live blobs ===============================================================================================
 #
 # Keep the blobs of a living recorder: any thread puts them, the sync thread makes them durable and deletes them.
@@ -117,18 +97,14 @@ def _folders(folder: Path) -> list[Path]:
 #
 # One lock protects the registry; no file is read or written under it.
 
-_BLOCK_BYTES: Final = 4_096
-_FULL_REASON: Final = "spool_bytes_max is reached"
-
 
 @dataclass(slots=True)
 class _Blob:
     """A blob in the folder. `released` is the position behind which no record refers to it, once `holders` is 0."""
 
     size: int
-    holders: int = 1
+    holders: int = 0
     released: int = 0
-    synced: bool = False
 
 
 class LiveBlobs:
@@ -140,24 +116,24 @@ class LiveBlobs:
         self._make_room = make_room
         self._gc_lock = GcSafeLock()
         self._blobs: dict[str, _Blob] = {}
+        self._unsynced: set[str] = set()
         self._names = itertools.count(1)
 
     # --- any thread -------------------------------------------------------------------------------------------
 
     def put(self, content: bytes) -> str:
         """Write a blob unless it is here; hold it until `release`; return its name. Raises `SpoolFull`, `OSError`."""
-        name = sha256(content).hexdigest()
+        name, size = sha256(content).hexdigest(), max(_BLOCK_BYTES, rounded(len(content)))
         if self._hold(name):
             return name
-        size = _rounded(len(content))
         if not self._reserve(size):
-            raise SpoolFull(f"spool {self._folder.parent} is full: {_FULL_REASON}")
-        registered = False
+            raise SpoolFull(f"spool {self._folder.parent} is full: spool_bytes_max is reached")
+        is_new = False
         try:
             self._write(self._folder / BLOBS, name, content)
-            registered = self._register(name, size)
+            is_new = not self._hold(name, size)
         finally:
-            if not registered:
+            if not is_new:  # another thread has put it meanwhile, or it could not be written
                 self._reserve(-size)
         return name
 
@@ -173,18 +149,15 @@ class LiveBlobs:
         self._gc_lock, self._blobs = GcSafeLock(), {}
 
     @locked
-    def _hold(self, name: str) -> bool:
-        blob = self._blobs.get(name)
-        if blob is not None:
-            blob.holders += 1
-        return blob is not None
-
-    @locked
-    def _register(self, name: str, size: int) -> bool:
-        """Note the blob; return False if another thread has put it meanwhile, and hold that one."""
-        blob = self._blobs.setdefault(name, _Blob(size, holders=0))
-        blob.holders += 1
-        return blob.holders == 1
+    def _hold(self, name: str, size: int = 0) -> bool:
+        """Hold the blob; return False if it is not here, and register it if it has a size."""
+        is_here = name in self._blobs
+        if size and not is_here:
+            self._blobs[name] = _Blob(size)
+            self._unsynced.add(name)
+        if name in self._blobs:
+            self._blobs[name].holders += 1
+        return is_here
 
     @locked
     def release(self, name: str, position: int) -> None:
@@ -216,23 +189,13 @@ class LiveBlobs:
 
     def sync(self) -> None:
         """Write the new blobs to the disk. Raises `OSError`, also for one that another program has deleted."""
-        new = self._new()
+        new = tuple(self._unsynced)
         for name in new:
             _sync_file(self._folder / BLOBS / name)
         if new:
             sync_folder(self._folder / BLOBS)
             sync_folder(self._folder)
-            self._note_synced(new)
-
-    @locked
-    def _new(self) -> list[str]:
-        return [name for name, blob in self._blobs.items() if not blob.synced]
-
-    @locked
-    def _note_synced(self, names: list[str]) -> None:
-        for name in names:
-            if name in self._blobs:
-                self._blobs[name].synced = True
+            self._unsynced.difference_update(new)
 
     @locked
     def take_all(self) -> list[Path]:
@@ -267,7 +230,3 @@ def _sync_file(path: Path) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
-
-
-def _rounded(size: int) -> int:
-    return max(_BLOCK_BYTES, -(-size // _BLOCK_BYTES) * _BLOCK_BYTES)

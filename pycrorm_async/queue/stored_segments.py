@@ -24,7 +24,7 @@ from zlib import crc32
 
 from pycrorm_async.errors import SpoolUnavailable
 from pycrorm_async.events.ids import EpisodeId, episode_text, parse_episode_id
-from pycrorm_async.queue.blobs import blob_bytes, keep_blobs, kept_with
+from pycrorm_async.queue.blobs import blob_bytes, kept_with, rounded
 from pycrorm_async.queue.format import segment_numbers, segment_path
 from pycrorm_async.queue.locks import NUMBERS, STORED, create_folders, open_file
 from pycrorm_async.queue.spool import Spool
@@ -35,7 +35,6 @@ FILES_MAX: Final = 4_096
 
 _PRUNE_INTERVAL_NS: Final = 60 * 10**9
 """Interval at which a process that keeps segments deletes those that are too old."""
-_BLOCK_BYTES: Final = 4_096
 _ATTEMPTS: Final = 5
 
 _log = logging.getLogger("pycrorm_async")
@@ -81,16 +80,12 @@ def _segments(folder: Path) -> Iterator[KeptSegment]:
             with suppress(FileNotFoundError):
                 status = path.stat()
                 after_ns = max(after_ns, status.st_mtime_ns)  # keeps the order by number if the clock was set back
-                yield KeptSegment(after_ns, _rounded(status.st_size) + _blob_bytes(path), path)
+                yield KeptSegment(after_ns, rounded(status.st_size) + _blob_bytes(path), path)
 
 
 def _blob_bytes(segment: Path) -> int:
     blobs = kept_with(segment)
-    return sum(_rounded(blob_bytes([each])) for each in blobs.iterdir()) if blobs.is_dir() else 0
-
-
-def _rounded(size: int) -> int:
-    return -(-size // _BLOCK_BYTES) * _BLOCK_BYTES
+    return sum(rounded(blob_bytes([each])) for each in blobs.iterdir()) if blobs.is_dir() else 0
 
 
 class StoredSegments:
@@ -167,7 +162,11 @@ class StoredSegments:
             for _ in range(_ATTEMPTS):
                 create_folders(self._spool, target.parent)
                 with suppress(FileNotFoundError):  # another process deleted the folder, which was empty
-                    keep_blobs(self._spool, blobs, target)
+                    if blobs:
+                        create_folders(self._spool, kept_with(target))
+                    for blob in blobs:
+                        with suppress(FileNotFoundError):
+                            blob.replace(kept_with(target) / blob.name)
                     segment.rename(target)
                     return target.stat().st_size + _blob_bytes(target)
         except FileNotFoundError:  # a process that was then killed has moved it already
