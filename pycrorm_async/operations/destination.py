@@ -260,7 +260,8 @@ async def open_destination(
         log.blobs.source = _SpoolBlobs(spool.path)
         installed = installed_projections(projections, own=settings.recall)
         projector = Projector(log, views=views, projections=projections, installed=installed)
-        kept = spool.path if stored_in(spool.path, log.log_id) else None
+        keeps = settings.keep_stored_s and settings.keep_stored_bytes
+        kept = spool.path if keeps and stored_in(spool.path, log.log_id) else None
         destination = LogAndTables(log, projector, kept, batch_events_max=settings.batch_events_max, clock=clock)
         await destination.open_tables()
         yield destination

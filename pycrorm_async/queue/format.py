@@ -6,7 +6,7 @@ import errno
 import mmap
 import os
 import stat
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from struct import Struct, pack
@@ -499,12 +499,10 @@ class Reader:
         complete = full or len(records) >= events_max or total >= bytes_max
         return ReadBatch(records, total, ReadCursor(number, offset, position), complete)
 
-    def skip_to(self, position: int, *, on_records: Callable[[Sequence[Record]], None] = lambda _: None) -> None:
+    def skip_to(self, position: int) -> None:
         """Move the cursor behind this position; the records up to it must be readable. Raises as `read` does."""
         while self.cursor.position < position:
-            batch = self.read(last=position, events_max=10_000, bytes_max=2**22)
-            on_records(batch.records)
-            self.cursor = batch.after
+            self.cursor = self.read(last=position, events_max=10_000, bytes_max=2**22).after
 
     def close(self) -> None:
         """Close the current segment."""

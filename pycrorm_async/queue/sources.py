@@ -21,6 +21,7 @@ from pycrorm_async.queue.format import (
     EVENT,
     Frame,
     LastRecord,
+    ReadBatch,
     ReadCursor,
     Reader,
     ReadPlace,
@@ -248,7 +249,6 @@ class DeadSource:
     """
 
     is_alive = False
-    invisible: Mapping[EpisodeId, int] = {}
 
     def __init__(self, folder: Path, recorder: EpisodeId, locks: ExitStack, stored: StoredSegments | None) -> None:
         """Called by `open_dead` only. Takes over the locks, unless it raises."""
@@ -429,9 +429,9 @@ def computed_ends(prefix: ValidPrefix) -> tuple[Record, ...]:
 # Drain the folder of a recorder that lives in another process: supply its records as soon as they are synced.
 #
 # The holder of `drain` reads; only the recorder deletes segments, after it reads in `progress` that they are stored. So
-# either process may be killed at any time. After a killed drainer the next one starts behind the stored position and
-# appends the records in between again, which the log stores once. A flush of the recorder may wait for records that the
-# killed drainer stored and that are not visible yet; `invisible` lists them, so that their visibility is published.
+# either process may be killed at any time. After a killed drainer the next one starts behind the visible position and
+# appends again what was stored and is not visible yet, which the log stores once. So it publishes the visibility of all
+# records for which a flush of the recorder may wait.
 # After a killed recorder this source ends, and recovery supplies the whole folder again without regard to `progress`.
 
 _PAUSE_S_MIN = 0.002
@@ -446,10 +446,6 @@ class LiveSource:
     """A live recorder's folder as a source. Constructed by `take`, used by one task, ended by `release`.
 
     Implements the writer's `ClaimedSource`.
-
-    Attributes:
-        invisible: by episode, the last sequence that earlier drainers stored and that was not visible, as far as the
-            segments are left.
     """
 
     holds_dead_letters = False
@@ -464,12 +460,9 @@ class LiveSource:
         self._dead_letters = DeadLetters(folder)
         before = progress.drained()
         self._status = before._replace(note=DrainNote())  # drops the note of an earlier drainer
-        visible = min(before.stored, before.folded)
+        visible = min(before.stored, before.folded, progress.recorded().synced)
         self._reader = Reader(ReadPlace(folder, recorder, self._start_of(visible)))
-        self.invisible: dict[EpisodeId, int] = {}
-        stored = min(before.stored, progress.recorded().synced)
-        self._reader.skip_to(min(visible, stored))
-        self._reader.skip_to(stored, on_records=self._note_invisible)
+        self._reader.skip_to(visible)
         self._until: int | None = None
         self._alive_checked_s = 0.0
         progress.write_drain_status(self._status)
@@ -479,8 +472,7 @@ class LiveSource:
         """Open the folder as a source; None if it is not offered, drained by another process, closed and drained, or
         its recorder is dead.
 
-        Reads the segments from the first record that is not visible to the last one that is stored. Raises
-        `SpoolDamaged`, `SpoolForeign` and `SpoolUnavailable`; then it holds no lock.
+        Raises `SpoolDamaged`, `SpoolForeign` and `SpoolUnavailable`; then it holds no lock.
         """
         with wrap_os_errors(folder), ExitStack() as opened:
             progress = Progress.open(folder, writing=True)
@@ -516,7 +508,7 @@ class LiveSource:
             if last > self.supplied:
                 try:
                     with wrap_os_errors(self.folder):
-                        batch = self._reader.read(last=last, events_max=events_max, bytes_max=bytes_max)
+                        batch = self._read(last=last, events_max=events_max, bytes_max=bytes_max)
                 except (SpoolDamaged, SpoolUnavailable):
                     if self.is_alive:
                         raise
@@ -595,7 +587,7 @@ class LiveSource:
             self._progress.close()
             self._dead_letters.release()
             self._drain.release()
-        if is_alive and self.stored != self.supplied:
+        if is_alive and self.stored < self.supplied:
             return None
         return "has ended" if closed else "is still recording" if is_alive else "died"
 
@@ -614,8 +606,12 @@ class LiveSource:
         self._alive_checked_s = now_s
         return not self.is_alive
 
-    def _note_invisible(self, records: Sequence[Record]) -> None:
-        self.invisible.update((each.episode, each.sequence) for each in records if each.episode is not None)
+    def _read(self, *, last: int, events_max: int, bytes_max: int) -> ReadBatch:
+        try:
+            return self._reader.read(last=last, events_max=events_max, bytes_max=bytes_max)
+        except FileNotFoundError:  # the recorder has just deleted segments that an earlier drainer stored
+            self._reader.cursor = self._start_of(self.stored)
+            return self._reader.read(last=last, events_max=events_max, bytes_max=bytes_max)
 
     def _update_note(self, **fields: object) -> None:
         status = self._status._replace(note=msgspec.structs.replace(self._status.note, **fields))

@@ -260,7 +260,7 @@ class Daemon:
             await asyncio.sleep(_CONFIRM_S)
 
     async def _publish_visibility(self) -> None:
-        before = [(each, each.appended) for each in self._serving.values()]
+        before = [(each, each.drain.state.appended) for each in self._serving.values()]
         behind = await self._availability.observe(self._tables.behind())
         stopped = await self._availability.observe(self._tables.stopped())
         for tracker, appended in before:
@@ -395,11 +395,8 @@ class VisibilityTracker:
         self.source = source
         self.drain = Drain(source, append, settings=settings, on_append=self._track, report=report)
         self._on_append = on_append
-        self._stored_before = source.stored if source.invisible else 0
-        # Of each batch its last position, and each episode's last sequence up to it; first those stored before.
+        # Of each batch its last position, and each episode's last sequence up to it.
         self._invisible: deque[tuple[int, dict[str, int]]] = deque()
-        if source.invisible:
-            self._invisible.append((source.stored, _by_text(source.invisible)))
         self._stopped: dict[str, str] = {}
         self._updated = asyncio.Event()
         self._is_pending = False
@@ -414,16 +411,11 @@ class VisibilityTracker:
             self._updated.clear()
             await self._updated.wait()
 
-    @property
-    def appended(self) -> int:
-        """Position of the last appended record, by this process or an earlier one."""
-        return max(self.drain.state.appended, self._stored_before)
-
     def note(self, appended: int, behind: Mapping[str, int], stopped: Mapping[str, str]) -> None:
         """Publish to the recorder which records are visible.
 
         Args:
-            appended: this tracker's `appended` before `behind` and `stopped` were read.
+            appended: position of the last appended record before `behind` and `stopped` were read.
             behind: by id, the folded sequence of each episode with events that are not visible yet.
             stopped: by id, the reason why an episode is refused or parked.
         """
@@ -446,13 +438,10 @@ class VisibilityTracker:
         self.source.mark_pending(reason)
 
     def _track(self, batch: Sequence[Record]) -> None:
-        lasts = _by_text({each.episode: each.sequence for each in batch if each.episode is not None})
+        by_id = {each.episode: each.sequence for each in batch if each.episode is not None}
+        lasts = {episode_text(episode): last for episode, last in by_id.items()}
         if len(self._invisible) >= _BATCHES_MAX:
             _, before = self._invisible.pop()
             lasts = before | lasts
         self._invisible.append((batch[-1].position, lasts))
         self._on_append()
-
-
-def _by_text(lasts: Mapping[EpisodeId, int]) -> dict[str, int]:
-    return {episode_text(episode): last for episode, last in lasts.items()}

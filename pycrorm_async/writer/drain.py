@@ -374,16 +374,6 @@ class ClaimedSource(Source, Protocol):
         ...
 
     @property
-    def stored(self) -> int:
-        """Position last acknowledged, by this source or an earlier one."""
-        ...
-
-    @property
-    def invisible(self) -> Mapping[EpisodeId, int]:
-        """The last sequence, by episode, that earlier sources stored and that was not visible when this one began."""
-        ...
-
-    @property
     def holds_dead_letters(self) -> bool:
         """True for a folder of records that a database refused: only the next writer should offer them again."""
         ...

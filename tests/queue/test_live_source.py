@@ -15,7 +15,7 @@ import pytest
 from pycrorm_async.errors import SpoolDamaged, SpoolFull, SpoolStuck
 from pycrorm_async.events.codec import Record
 from pycrorm_async.queue import LiveSource, RecorderQueue, Spool, open_dead
-from pycrorm_async.queue.format import ReadBatch, Reader, segment_numbers, segment_path
+from pycrorm_async.queue.format import segment_numbers, segment_path
 from pycrorm_async.queue.locks import ALIVE, FileLock
 from pycrorm_async.queue.spool import DrainStatus, Progress, RecorderStatus
 from tests.queue.factories import (
@@ -188,24 +188,25 @@ async def test_segments_are_deleted_when_they_are_stored_and_not_before(offered:
     source.release()
 
 
-async def test_another_drainer_continues_after_the_stored_records(offered: RecorderQueue) -> None:
+async def test_another_drainer_continues_after_the_visible_records(offered: RecorderQueue) -> None:
     offered.put_nowait(started(), b"{}")
     fill(offered)
     await offered.synced_to()
-    for events, first in ((5, 1), (3, 5), (4, 7), (7, 10)):
-        source = take(offered)
-        positions = await next_positions(source, events_max=events)
-        assert positions == list(range(first, first + events))
-        await source.acknowledge(positions[-2])  # appended by the last drainer, which was killed then
-        source.release()
-        await asyncio.sleep(0.06)
     source = take(offered)
-    assert await next_positions(source) == [16, 17, 18, 19]
-    await source.acknowledge(19)
+    await next_positions(source, events_max=7)
+    await source.acknowledge(6)
+    source.mark_visible(5, {})
+    source.release()
+    await eventually(lambda: segments(offered)[0] == "00000002.segment")  # it holds records 5 to 8
+    source = take(offered)
+    assert await next_positions(source, events_max=100) == list(range(6, 2 + ORDINARY))
+    assert source.stored == 6
+    await source.acknowledge(1 + ORDINARY)
+    source.mark_visible(1 + ORDINARY, {})
     source.release()
     source = take(offered)
     offered.put_nowait(ended(), b"{}")
-    assert await next_positions(source) == [20]
+    assert await next_positions(source) == [2 + ORDINARY]
     source.release()
 
 
@@ -252,10 +253,8 @@ async def test_a_waiting_producer_learns_why_nothing_more_is_stored_and_waits_ag
     source.release()
 
 
-async def test_a_folder_whose_stored_segments_are_deleted_meanwhile_is_no_damage(
-    spool: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The recorder deletes the oldest segments just after the next drainer has opened the first one."""
+async def test_a_folder_whose_stored_segments_are_deleted_meanwhile_is_no_damage(spool: Path, tmp_path: Path) -> None:
+    """The recorder deletes the oldest segments while the next drainer reads the first one."""
     queue = make(spool, offered=True)
     for number in range(60):
         queue.put_nowait(started() if not number else node(), b"x" * 200)
@@ -263,30 +262,27 @@ async def test_a_folder_whose_stored_segments_are_deleted_meanwhile_is_no_damage
     folder = crashed_copy(queue, tmp_path / "other")  # no recorder deletes anything here by itself
     queue.release()
     alive = FileLock.take(folder / ALIVE)
-    assert alive is not None
     progress = Progress.open(folder, writing=True)
+    assert alive is not None
     assert progress is not None
     progress.write_drain_status(DrainStatus(stored=60, folded=0))
     progress.close()
     numbers = segment_numbers(folder)
     assert len(numbers) > 4
-    read, deleted = Reader.read, iter([numbers[:2]])
-
-    def read_after_deletion(reader: Reader, *, last: int, events_max: int, bytes_max: int) -> ReadBatch:
-        read(reader, last=reader.cursor.position + 1, events_max=1, bytes_max=bytes_max)  # opens the first segment
-        for each in next(deleted, ()):
-            segment_path(folder, each).unlink()
-        return read(reader, last=last, events_max=events_max, bytes_max=bytes_max)
-
-    with monkeypatch.context() as patched:
-        patched.setattr(Reader, "read", read_after_deletion)
-        assert LiveSource.take(folder) is None
     source = LiveSource.take(folder)
     assert source is not None
+    assert await next_positions(source, events_max=1) == [1]
+    for each in numbers[:2]:
+        segment_path(folder, each).unlink()
+    supplied = await next_positions(source, events_max=100)
+    assert supplied[-1] == 60
     source.release()
     segment_path(folder, numbers[3]).unlink()  # an older one is still there
+    source = LiveSource.take(folder)
+    assert source is not None
     with pytest.raises(SpoolDamaged, match="is missing"):
-        LiveSource.take(folder)
+        await next_positions(source, events_max=100)
+    source.release()
     alive.release()
 
 

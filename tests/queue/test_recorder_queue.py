@@ -1,6 +1,7 @@
 """The live queue: positions, safety levels, batches and acknowledging, and the beginning and end of its folder."""
 
 import asyncio
+import os
 import signal
 import threading
 import time
@@ -14,7 +15,7 @@ from pycrorm_async.clock import SYSTEM_CLOCK
 from pycrorm_async.errors import EpisodeRefused, InternalError, SpoolClosed, SpoolUnavailable
 from pycrorm_async.events.codec import Heading
 from pycrorm_async.queue import RecorderQueue, Spool
-from pycrorm_async.queue.format import Segment
+from pycrorm_async.queue.format import COMMIT, EVENT, Segment, decode_each, header_bytes, salt_of
 from pycrorm_async.queue.locks import FileLock
 from pycrorm_async.record.episode_writer import EventSink
 from pycrorm_async.settings import Settings
@@ -22,6 +23,7 @@ from pycrorm_async.writer.drain import Source
 from tests.queue.factories import (
     DECLARED,
     LONG_S,
+    RECORDER,
     SMALL,
     batch_of,
     crashed_copy,
@@ -445,3 +447,29 @@ def test_a_spool_that_cannot_be_made_is_reported_in_one_clear_line(tmp_path: Pat
         make(blocking / "spool" if deep else blocking)
     assert str(blocking) in str(refused.value)
     assert "\n" not in str(refused.value)
+
+
+# --- fdatasync --------------------------------------------------------------------------------------------------------
+
+
+async def test_a_record_is_synced_after_one_fdatasync_of_it_and_one_of_its_commit_frame(
+    spool: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without either call the list is shorter: no other test of a few milliseconds notices that."""
+    queue = make(spool, settings=replace(SMALL, sync_interval_ms=3_600_000))
+    written: list[tuple[list[int], int]] = []
+    fdatasync = os.fdatasync
+
+    def watched(descriptor: int) -> None:
+        content = Path(f"/proc/self/fd/{descriptor}").read_bytes()
+        frames = decode_each(content, header_bytes(0), salt_of(RECORDER, 1))
+        written.append(([kind for kind, *_ in frames], queue.synced))
+        fdatasync(descriptor)
+
+    monkeypatch.setattr(os, "fdatasync", watched)
+    queue.put_nowait(started(), b"{}")
+    queue.put_nowait(node(), b"{}")
+    await queue.synced_to()
+    assert written == [([EVENT, EVENT], 0), ([EVENT, EVENT, COMMIT], 0)]
+    assert queue.synced == 2
+    queue.release()

@@ -19,7 +19,7 @@ from pycrorm_async.queue.format import EVENT, read_segment, segment_path
 from pycrorm_async.queue.scan import survey
 from pycrorm_async.queue.spool import DrainNote, DrainStatus
 from pycrorm_async.writer.drain import ClaimedSource, Source
-from tests.queue.factories import RECORDER, crashed_copy, ended, episode, fill, make, node, started, take
+from tests.queue.factories import RECORDER, crashed_copy, ended, fill, make, node, started, take
 
 AnySource = RecorderQueue | LiveSource | DeadSource
 Opened = TypeVar("Opened")
@@ -253,16 +253,15 @@ async def test_a_finished_source_ends_behind_the_records_that_were_synced_before
     assert await batch(source) == []
 
 
-async def test_the_next_source_begins_behind_its_stored_position(claimable: SourceCase) -> None:
+async def test_the_next_source_supplies_again_what_is_left_and_was_not_visible(claimable: SourceCase) -> None:
     await claimable.record()
     source = claim(claimable)
-    assert source.stored == 0
     await batch(source, events_max=30)
     await source.acknowledge(25)
-    assert source.stored == 25
-    again = claim(claimable)
-    assert (0 < again.stored <= 25) if claimable.kind == "dead" else (again.stored == 25)
-    assert positions(await batch(again, events_max=1)) == [again.stored + 1]
+    source.mark_visible(24, {})
+    again = positions(await batch(claim(claimable), events_max=1000))
+    assert again == list(range(again[0], len(SIZES) + 1))
+    assert again[0] == 25 if claimable.kind == "living" else again[0] <= 25
 
 
 async def test_visibility_and_the_state_of_the_database_are_published_to_a_living_recorder(
@@ -287,22 +286,6 @@ async def test_visibility_and_the_state_of_the_database_are_published_to_a_livin
     source.mark_pending(None)
     source.mark_visible(3, {})
     assert claimable.queue.external_drain_status == DrainStatus(stored=20, folded=5)
-
-
-async def test_the_next_source_lists_what_a_living_recorder_waits_to_see(claimable: SourceCase) -> None:
-    await claimable.record()
-    source = claim(claimable)
-    assert source.invisible == {}
-    await batch(source)
-    await source.acknowledge(20)
-    source.mark_visible(5, {})
-    waited_for = {episode(1): 20} if claimable.kind == "living" else {}
-    again = claim(claimable)
-    assert again.invisible == waited_for
-    if claimable.kind == "dead":  # supplies the records again
-        await batch(again)
-    again.mark_visible(20, {})
-    assert claim(claimable).invisible == {}
 
 
 async def test_a_source_reports_whether_its_recorder_lives(claimable: SourceCase) -> None:
